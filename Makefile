@@ -1,0 +1,38 @@
+# Needs python3 (3.11 or newer, with venv) and make; everything else is installed into .venv.
+#
+#   make demo    install and run the demo
+#   make test    install, then lint, format check, types, tests
+#   make clean   remove .venv and everything that was built or cached
+#
+# PYTHON    the interpreter that .venv is made from.
+# PIP_ARGS  handed to pip install. From PyPI, torch on Linux brings gigabytes of CUDA libraries; its CPU build
+#           is much smaller: make demo PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"
+PYTHON ?= python3
+PIP_ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test clean
+
+demo: $(VENV)/.installed-demo
+	$(BIN)/clod-adapt demo
+
+test: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find clod_adapter cli tests examples benchmarks -type d -name __pycache__ -prune -exec rm -rf {} +
+
+# One stamp per extra: a second call installs nothing unless what is to be installed changed.
+$(VENV)/.installed-%: pyproject.toml constraints.txt | $(BIN)/pip
+	$(BIN)/python -m pip install $(PIP_ARGS) -c constraints.txt -e ".[$*]"
+	touch $@
+
+# pip and not python: it comes last, so a venv that was interrupted is made again.
+$(BIN)/pip:
+	$(PYTHON) -m venv $(VENV)

@@ -1,0 +1,185 @@
+"""``clod-adapt``: gives a checkpoint its dial, and writes the extended file, the adapter and a report."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from clod_adapter.adapter import Adapter, extract
+from clod_adapter.cameras import Scene
+from clod_adapter.cli.console import Console, announced_compiling, duration
+from clod_adapter.cli.evaluate import measure
+from clod_adapter.cli.files import Outputs, read_checkpoint, read_scene, size
+from clod_adapter.cli.report import Stopwatch, machine, report_dials, table, write_report
+from clod_adapter.cli.training import Follower, GracefulStop
+from clod_adapter.config import AdaptConfig, describe
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluate import Row
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.adapter_file import save_adapter
+from clod_adapter.io.ply import Checkpoint, save
+from clod_adapter.io.version import package_version
+from clod_adapter.train import Adapted, adapt
+
+SUMMARY = "Give a trained 3D Gaussian splat a quality dial."
+DESCRIPTION = """\
+Give a trained 3D Gaussian splat a quality dial: one file for every budget.
+
+Learns one number per Gaussian, sigma_d, with which a renderer fades detail out
+smoothly with distance, and tunes the rest lightly. The dial s is set when
+rendering: 1 is full quality, at s roughly s^-1.5 of the Gaussians are drawn.
+"""
+USAGE = "PLY --images DIR [--max-sv S] [--out OUT.ply] [options]"
+EPILOG = """\
+outputs, side by side; a file of that name is replaced:
+  OUT.ply          the splat with one more property, sigma_d
+  OUT.safetensors  the adapter: only what changed; "clod-adapt apply" makes
+                   OUT.ply again from it and the checkpoint
+  OUT.json         the report: settings, machine, times, and per dial value the
+                   quality on held-out photographs (every 8th by name)
+
+Ctrl-C while training stops after the step under way and writes what was learned
+so far (exit code 0, "interrupted": true in the report); once more aborts. While
+the result is measured it skips the rest. Before training nothing is written.
+
+exit codes: 0 written; 2 bad input, one line on stderr and nothing written;
+130 interrupted with nothing to write, or aborted
+
+examples:
+  clod-adapt garden.ply --images garden --max-sv 5
+  clod-adapt garden.ply --images garden --time-budget 120 --out out/dial.ply
+  clod-adapt garden.ply --images garden --quiet --json > report.json
+"""
+OPTIONS: dict[str, Any] = {
+    "max_sv": ("S", float), "iters": ("N", int), "time_budget": ("SEC", float), "seed": ("N", int)
+}  # fmt: skip
+# A base this far off its photographs is not a poor one but one that stands elsewhere.
+MISALIGNED_PSNR = 15.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("ply", metavar="PLY", help="the checkpoint, in Inria's 3DGS layout; it is never modified")
+    parser.add_argument(
+        "--images", metavar="DIR", required=True,
+        help="the scene: photographs in DIR/images and their COLMAP model in DIR/sparse/0",
+    )  # fmt: skip
+    helps, defaults = describe(AdaptConfig), AdaptConfig()
+    for name, (metavar, kind) in OPTIONS.items():
+        default = getattr(defaults, name)
+        shown = "" if default is None else f" (default: {default:g})"
+        parser.add_argument(
+            f"--{name.replace('_', '-')}", metavar=metavar, type=kind, default=default, help=helps[name] + shown
+        )
+    parser.add_argument("--out", metavar="OUT.ply", help="output (default: PLY's name with _clod, in this folder)")
+    parser.add_argument("--device", choices=["auto", "cpu"], default="auto", help="where to train (default: auto)")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    console, watch = Console(args.quiet), Stopwatch()
+    config = make_config(args)
+    outputs = Outputs.beside(Path(args.out or f"{Path(args.ply).stem}_clod.ply"))
+    outputs.check([args.ply])
+    with watch.time("load"):
+        base = read_checkpoint(args.ply, console)
+        scene = read_scene(args.images, console)
+    with announced_compiling(console):
+        with watch.time("evaluate"):
+            base_rows, notes = look_at_base(base.gaussians, scene, args, console)
+        adapted = train(base.gaussians, scene, config, console, base_rows)
+    watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
+    adapter = extract(base.gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config))
+    result = adapter.apply(base.gaussians)
+    write(base, adapter, result, outputs, console)
+    with watch.time("evaluate"):
+        rows, cut_short = measure(result, scene.test, report_dials(config.max_sv), console)
+    if cut_short:
+        notes.append("the measurements were interrupted: only the dial values that were finished are reported")
+        console.say(notes[-1])
+    report = {
+        "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
+        "base_count": len(result), "sh_degree": result.sh_degree, "config": asdict(config),
+        "attenuation": asdict(adapter.attenuation), "notes": [*base.notes, *scene.notes, *notes], "machine": machine(),
+        "seconds": watch.report(), "steps": adapted.steps, "interrupted": adapted.interrupted,
+        "adapter_bytes": outputs.adapter.stat().st_size, "ply_bytes": outputs.ply.stat().st_size,
+        "base_rows": [row.as_dict() for row in base_rows], "rows": [row.as_dict() for row in rows],
+        "outputs": outputs.names(),
+    }  # fmt: skip
+    write_report(outputs.report, report)
+    print_summary(outputs, table(rows, base_rows) if rows else "", args, watch)
+    return report
+
+
+def make_config(args: argparse.Namespace) -> AdaptConfig:
+    """The settings; what is wrong with one is said in the words of the command line."""
+    limit = 1 / AdaptConfig().tau
+    if args.max_sv >= limit:
+        raise ClodError(f"--max-sv is {args.max_sv:g}, it must be below {limit:g}, where nothing survives the cut")
+    try:
+        return AdaptConfig(**{name: getattr(args, name) for name in OPTIONS})
+    except ClodError as error:
+        name, _, rest = str(error).partition(" ")
+        raise ClodError(f"--{name.replace('_', '-')} {rest}" if name in OPTIONS else str(error)) from error
+
+
+def look_at_base(
+    base: Gaussians, scene: Scene, args: argparse.Namespace, console: Console
+) -> tuple[list[Row], list[str]]:
+    """The base's row at dial 1, and notes: on a dial it has, on photographs it does not fit."""
+    notes = []
+    if base.sigma_d is not None:
+        notes.append(f"{args.ply} has a dial already: continuing from its sigma_d")
+    rows: list[Row] = []
+    if scene.test:
+        rows, interrupted = measure(base, scene.test, [1.0], console, "base")
+        if interrupted:
+            raise KeyboardInterrupt
+        if rows[0].psnr < MISALIGNED_PSNR:
+            notes.append(
+                f"warning: {args.ply} is {rows[0].psnr:.1f} dB from the photographs in {args.images}: it is probably "
+                "of another scene, in other coordinates (some trainers normalise them) or on another background than "
+                "black, and then the result is of no use"
+            )
+    else:
+        notes.append("no photographs are held out, so nothing is measured; at least two are needed")
+    for note in notes:
+        console.say(note)
+    return rows, notes
+
+
+def train(base: Gaussians, scene: Scene, config: AdaptConfig, console: Console, base_rows: Sequence[Row]) -> Adapted:
+    """Adapts while the user watches. Raises KeyboardInterrupt when there is nothing worth writing."""
+    seconds_a_frame = base_rows[0].frame_ms / 1e3 if base_rows else 0.0
+    stop = GracefulStop()
+    with stop.listening(), closing(Follower(console, stop, scene.test, config.max_sv, seconds_a_frame)) as follower:
+        adapted = adapt(base, scene, config, follower)
+    if stop.requests > 1:
+        raise KeyboardInterrupt
+    how = "interrupted after" if adapted.interrupted else "trained"
+    console.say(f"{how} {adapted.steps} steps, {duration(adapted.seconds)}")
+    return adapted
+
+
+def write(base: Checkpoint, adapter: Adapter, result: Gaussians, outputs: Outputs, console: Console) -> None:
+    """Writes adapter and PLY, before the last measurements, which may be interrupted.
+
+    The adapter first: it is small, and from it ``apply`` makes the PLY should that not fit on the disk.
+    """
+    save_adapter(outputs.adapter, adapter)
+    save(outputs.ply, result, base)
+    console.say(f"wrote {outputs.adapter} and {outputs.ply}")
+
+
+def print_summary(outputs: Outputs, measured: str, args: argparse.Namespace, watch: Stopwatch) -> None:
+    if measured:
+        print(f"\n{measured}\n")
+    for path in vars(outputs).values():
+        print(f"{size(path):>9}  {path}")
+    print(f"\n{duration(watch.total())} in all; next, other dial values:")
+    sv = " ".join(f"{s:g}" for s in sorted({1.0, args.max_sv}))
+    print(f"  clod-adapt eval {shlex.quote(str(outputs.ply))} --images {shlex.quote(args.images)} --sv {sv}")

@@ -1,0 +1,112 @@
+"""What the user sees while something runs: lines and progress, all of it on stderr."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from tqdm import tqdm
+
+LINE_EVERY = 10.0  # seconds between progress lines where stderr is no terminal
+BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
+
+
+@dataclass(frozen=True)
+class Console:
+    """Writes lines to stderr, or with ``quiet`` nothing."""
+
+    quiet: bool = False
+
+    def say(self, text: str) -> None:
+        if not self.quiet:
+            with _unbreakable():
+                tqdm.write(text, file=sys.stderr)  # not print: a bar may be on this line
+                sys.stderr.flush()
+
+    @contextmanager
+    def meter(self, label: str) -> Iterator[Meter]:
+        """The progress of one phase, which ends with the block."""
+        meter = Meter(self, label)
+        try:
+            yield meter
+        finally:
+            meter.close()
+
+
+@dataclass
+class Meter:
+    """Progress with the time left: a bar on a terminal, elsewhere a line now and then."""
+
+    console: Console
+    label: str
+    bar: Any = None
+    began: float = field(default_factory=time.perf_counter)
+    printed: float = field(default_factory=time.perf_counter)
+
+    def __post_init__(self) -> None:
+        if not self.console.quiet and sys.stderr.isatty():
+            self.bar = tqdm(
+                total=1.0, desc=self.label, bar_format=BAR_FORMAT, file=sys.stderr,
+                leave=False, delay=0.5, miniters=0, dynamic_ncols=True,
+            )  # fmt: skip
+
+    def update(self, share: float, text: str = "") -> None:
+        """Shows the ``share`` that is done, in [0, 1], and ``text`` behind it."""
+        now = time.perf_counter()
+        if self.bar is not None:
+            with _unbreakable():
+                self.bar.set_postfix_str(text, refresh=False)
+                self.bar.update(min(share, 1.0) - self.bar.n)
+        elif now - self.printed >= LINE_EVERY:
+            self.printed = now
+            left = (now - self.began) * (1 / max(share, 1e-9) - 1)
+            self.console.say(f"{self.label} {share:4.0%}, {duration(left)} left, {text}".removesuffix(", "))
+
+    def close(self) -> None:
+        if self.bar is not None:
+            with _unbreakable():
+                self.bar.close()
+            self.bar = None
+
+
+@contextmanager
+def announced_compiling(console: Console) -> Iterator[None]:
+    """Says so, once, when a kernel has to be compiled within the block; it takes a while and happens once."""
+    from numba.core.event import Event, Listener, install_listener
+
+    class Announce(Listener):  # type: ignore[misc]
+        said = False
+
+        def on_start(self, event: Event) -> None:
+            if not self.said:
+                self.said = True
+                console.say("compiling kernels (first run only, well under a minute) ...")
+
+        def on_end(self, event: Event) -> None:
+            pass
+
+    with install_listener("numba:compile", Announce()):
+        yield
+
+
+def duration(seconds: float) -> str:
+    """``0.4 s``, ``42 s``, ``2:05``, ``1:02:05``."""
+    if seconds < 59.5:
+        return f"{seconds:.1f} s" if seconds < 9.95 else f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+@contextmanager
+def _unbreakable() -> Iterator[None]:
+    """When the reader of stderr is gone the work goes on unseen; a training run is not lost over it."""
+    try:
+        yield
+    except BrokenPipeError:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115

@@ -1,0 +1,99 @@
+"""What a run reports: a JSON row for scripts, a table for people."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from clod_adapter.evaluate import Row
+from clod_adapter.io.atomic import atomic_path
+
+
+class Stopwatch:
+    """Named wall times, for the report."""
+
+    def __init__(self) -> None:
+        self.began = time.perf_counter()
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def time(self, name: str) -> Iterator[None]:
+        """Adds the block's time to what ``name`` already has."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+
+    def report(self) -> dict[str, float]:
+        return {name: round(value, 3) for name, value in {**self.seconds, "total": self.total()}.items()}
+
+    def total(self) -> float:
+        return time.perf_counter() - self.began
+
+
+def machine() -> dict[str, Any]:
+    """What the times were taken on."""
+    import numba
+
+    return {
+        "cpu": _cpu_name(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numba": numba.__version__,
+    }
+
+
+def _cpu_name() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def jsonable(value: Any) -> Any:
+    """``value`` with what JSON has no word for (an infinite PSNR) as null."""
+    if isinstance(value, dict):
+        return {key: jsonable(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_report(path: Path, report: dict[str, Any]) -> None:
+    """Writes the report as an indented JSON file."""
+    with atomic_path(path) as temporary:
+        text = json.dumps(jsonable(report), indent=2, allow_nan=False, ensure_ascii=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def report_dials(max_sv: float) -> list[float]:
+    """Dial values worth a row: few, dense where most is lost, the last is ``max_sv``."""
+    if max_sv > 8:
+        inner = [float(f"{max_sv ** (i / 6):.2g}") for i in range(1, 6)]
+        return [1.0, *inner, max_sv]
+    return [float(s) for s in (1, 1.5, *range(2, 9)) if s < max_sv] + [max_sv]
+
+
+def table(rows: Sequence[Row], base_rows: Sequence[Row] = ()) -> str:
+    """The rows under each other, those of the base first and marked."""
+    lines = ["  dial  PSNR dB    SSIM        kept              in view  frame ms"]
+    for row, is_base in [(row, True) for row in base_rows] + [(row, False) for row in rows]:
+        dial = "base" if is_base else f"{row.virtual_scale:g}"
+        kept = f"{row.kept:10,.0f}  {row.kept_share:7.1%}"
+        lines.append(f"{dial:>6}  {row.psnr:7.2f}  {row.ssim:.4f}  {kept}  {row.in_view:10,.0f}  {row.frame_ms:8.1f}")
+    return "\n".join(lines)

@@ -1,0 +1,104 @@
+"""Training as the user follows it: progress, the held-out error so far, and Ctrl-C."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from statistics import fmean
+from types import FrameType
+
+import torch
+
+from clod_adapter.cameras import View
+from clod_adapter.cli.console import Console, Meter
+from clod_adapter.metrics import psnr
+from clod_adapter.render import render
+from clod_adapter.train import Progress
+
+CHECK_EVERY = 10.0  # seconds between looks at the held-out views, at least
+CHECK_COST = 0.03  # share of the time that they may take, at most
+CHECK_VIEWS = 4
+LABELS = {"start": "importance", "train": "training"}
+
+
+class GracefulStop:
+    """Counts Ctrl-C. The first is a request, which the step under way outlives; a second one interrupts at once."""
+
+    def __init__(self) -> None:
+        self.requests = 0
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        if threading.current_thread() is not threading.main_thread():  # Python allows handlers only there
+            yield
+            return
+        before = signal.signal(signal.SIGINT, self._request)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        self.requests += 1
+        if self.requests > 1:
+            raise KeyboardInterrupt
+
+
+class Follower:
+    """The progress callback of ``adapt``.
+
+    Args:
+        views: held out; at most four of them, spread evenly, are looked at.
+        max_sv: the error is shown at dial 1 and here.
+        seconds_a_frame: a first guess of what one view takes.
+    """
+
+    def __init__(
+        self, console: Console, stop: GracefulStop, views: tuple[View, ...], max_sv: float, seconds_a_frame: float
+    ) -> None:
+        self.console, self.stop = console, stop
+        self.views = views[:: -(-len(views) // CHECK_VIEWS)] if views else ()
+        self.dials = [1.0, max_sv] if max_sv > 1 else [1.0]
+        self.check_due, self.check_cost = CHECK_EVERY, seconds_a_frame * len(self.views) * len(self.dials)
+        self.error = self.phase = ""
+        self.meter: Meter | None = None
+
+    def __call__(self, progress: Progress) -> None:
+        if self.meter is None or progress.phase != self.phase:
+            self.close()
+            self.phase, self.meter = progress.phase, Meter(self.console, LABELS[progress.phase])
+        if progress.phase == "train" and progress.share < 1 and not self.stop.requests:
+            self._check(progress)
+        by_time = progress.share > progress.done / max(progress.total, 1)
+        steps = f"step {progress.done}" if by_time else f"{progress.done}/{progress.total}"
+        self.meter.update(progress.share, f"{steps}, {self.error}".removesuffix(", "))
+        if self.stop.requests:
+            self.close()
+            if self.phase == "train":
+                self.console.say("stopping (Ctrl-C again aborts without writing)")
+            raise KeyboardInterrupt
+
+    def close(self) -> None:
+        if self.meter is not None:
+            self.meter.close()
+
+    @torch.no_grad()
+    def _check(self, progress: Progress) -> None:
+        """Now and then, the error on the held-out views."""
+        if self.console.quiet or not self.views or progress.seconds < self.check_due:
+            return
+        if self.check_cost > CHECK_COST * progress.seconds / progress.share:
+            return  # even one look would be too many for so short a run
+        began = time.perf_counter()
+        gaussians, shown = progress.gaussians(), []
+        for dial in self.dials:
+            pictures = [render(gaussians, view.camera, dial) for view in self.views]
+            error = fmean(psnr(picture.image, view.image) for picture, view in zip(pictures, self.views, strict=True))
+            share = fmean(float(picture.kept.float().mean()) for picture in pictures)
+            shown.append(f"s={dial:g} {error:.2f} dB {share:.0%}")
+        self.error = ", ".join(shown)
+        self.check_cost = time.perf_counter() - began
+        self.check_due = progress.seconds + max(CHECK_EVERY, self.check_cost / CHECK_COST)

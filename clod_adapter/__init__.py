@@ -1,0 +1,57 @@
+"""A quality dial for Gaussian splats that are already trained.
+
+import clod_adapter as clod
+base = clod.load("pretrained.ply")
+scene = clod.load_scene("scene/")
+result = clod.adapt(base.gaussians, scene, clod.AdaptConfig(max_sv=5))
+clod.save("model.ply", result.gaussians, base)
+image = clod.render(result.gaussians, scene.test[0].camera, virtual_scale=3).image
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if "torch" not in sys.modules:
+    # GNU OpenMP's idle threads spin by default and take the cores from the splatting threads: measured at
+    # up to six times the time of a training step. Only the first import of torch reads this.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+from clod_adapter.adapter import Adapter, attach, detach, extract
+from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluate import evaluate
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.render import Rendering, render
+from clod_adapter.train import Adapted, adapt
+
+if TYPE_CHECKING:
+    from clod_adapter.io.adapter_file import load_adapter, save_adapter
+    from clod_adapter.io.colmap import load_scene
+    from clod_adapter.io.ply import Checkpoint, load, save
+
+# Imported on first use: the readers bring libraries that a mere import should not.
+_LAZY = {
+    "Checkpoint": "io.ply",
+    "load": "io.ply",
+    "load_adapter": "io.adapter_file",
+    "load_scene": "io.colmap",
+    "save": "io.ply",
+    "save_adapter": "io.adapter_file",
+}
+
+__all__ = [
+    "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Camera", "Checkpoint", "ClodError", "Gaussians",
+    "Rendering", "Scene", "View", "adapt", "attach", "detach", "evaluate", "extract", "load", "load_adapter",
+    "load_scene", "render", "save", "save_adapter",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,251 @@
+"""Front-to-back blending of each tile, and its gradient.
+
+A tile is worked through in blocks of 4x4 pixels, one vector lane a pixel. State of a block lies
+together: 16 transmittances, then 16 reds, greens and blues. A pixel whose transmittance would fall
+to 1e-4 is finished and carries its transmittance negated; a block ends when all its pixels have.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import float32
+
+from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.simd import (
+    anywhere,
+    both,
+    but_not,
+    exp2,
+    fetch_add,
+    fma,
+    ge,
+    gt,
+    load,
+    quotient,
+    select,
+    splat,
+    store,
+    store_sums,
+    vmin,
+)
+from clod_adapter._kernels.tiles import (
+    BLUE,
+    GREEN,
+    LOG,
+    MX,
+    MY,
+    QA,
+    QB,
+    QC,
+    RECORD,
+    RED,
+    TILE,
+    X0,
+    X1,
+    Y0,
+    Y1,
+    extent,
+)
+
+BLOCK = 4
+ACROSS = TILE // BLOCK
+BLOCKS = ACROSS * ACROSS
+ALPHA_MIN, ALPHA_MAX, T_MIN = float32(1 / 255), float32(0.999), float32(1e-4)
+PAIR = 9
+BLOCK_X = np.tile(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
+BLOCK_Y = np.repeat(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
+LANE_X = np.tile(np.arange(4, dtype=np.float32) + 0.5, 4)
+LANE_Y = np.repeat(np.arange(4, dtype=np.float32) + 0.5, 4)
+
+
+@part
+def start_tile(ox, oy, width, height, state, stride, live):  # type: ignore[no-untyped-def]
+    """Marks blocks with pixels in the image as live, pixels outside as finished; returns the live count."""
+    alive = 0
+    for block in range(BLOCKS):
+        x, y = ox + (block % ACROSS) * BLOCK, oy + (block // ACROSS) * BLOCK
+        live[block] = x < width and y < height
+        alive += live[block]
+        for lane in range(16):
+            inside = x + lane % 4 < width and y + lane // 4 < height
+            state[block * stride + lane] = 1.0 if inside else -1.0
+    return alive
+
+
+@part
+def blocks_of(records, r, ox, oy, live, touched):  # type: ignore[no-untyped-def]
+    """Lists the live blocks of the tile that the ellipse of the record at ``r`` touches; returns how many."""
+    y0, y1 = max(np.int32(records[r + Y0]) - oy, 0), min(np.int32(records[r + Y1]) - oy, TILE - 1)
+    x0, x1 = max(np.int32(records[r + X0]) - ox, 0), min(np.int32(records[r + X1]) - ox, TILE - 1)
+    tight = y1 // BLOCK > y0 // BLOCK and x1 // BLOCK > x0 // BLOCK
+    low, high, n = x0, x1, 0
+    for row in range(y0 // BLOCK, y1 // BLOCK + 1):
+        if tight:
+            first, last = extent(records, r, oy + max(row * BLOCK, y0), oy + min(row * BLOCK + BLOCK - 1, y1))
+            low, high = max(x0, first - ox), min(x1, last - ox)
+        if high >= low:
+            for block in range(row * ACROSS + low // BLOCK, row * ACROSS + high // BLOCK + 1):
+                touched[n] = block
+                n += live[block]
+    return n
+
+
+@kernel
+def blend(worker, workers, records, entries, offsets, across, width, height, background, tiles, cursor, image, alpha):  # type: ignore[no-untyped-def]
+    """Forward: writes ``image [H, W, 3]`` and ``alpha [H, W]``. Tiles are taken from ``tiles`` by an atomic cursor."""
+    state = np.empty(BLOCKS * 64, np.float32)
+    live, touched = np.empty(BLOCKS, np.uint8), np.empty(BLOCKS, np.int32)
+    zero, threshold, most, least = splat(float32(0)), splat(ALPHA_MIN), splat(ALPHA_MAX), splat(T_MIN)
+    lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
+    while True:
+        turn = fetch_add(cursor, 1)
+        if turn >= len(tiles):
+            break
+        tile = tiles[turn]
+        ox, oy = (tile % across) * TILE, (tile // across) * TILE
+        state[:] = float32(0)
+        alive = start_tile(ox, oy, width, height, state, 64, live)
+        for entry in range(offsets[tile], offsets[tile + 1]):
+            if alive == 0:
+                break
+            r = entries[entry] * RECORD
+            qa, qb, qc, log = (
+                splat(-records[r + QA]),
+                splat(-records[r + QB]),
+                splat(-records[r + QC]),
+                splat(records[r + LOG]),
+            )
+            red, green, blue = splat(records[r + RED]), splat(records[r + GREEN]), splat(records[r + BLUE])
+            base_x, base_y = (
+                lane_x + splat(float32(ox) - records[r + MX]),
+                lane_y + splat(float32(oy) - records[r + MY]),
+            )
+            for i in range(blocks_of(records, r, ox, oy, live, touched)):
+                block = touched[i]
+                at = block * 64
+                t = load(state, at)
+                dx, dy = base_x + splat(BLOCK_X[block]), base_y + splat(BLOCK_Y[block])
+                a = vmin(exp2(fma(dx, fma(qa, dx, qb * dy), fma(qc * dy, dy, log))), most)
+                mask = both(ge(a, threshold), gt(t, zero))
+                if not anywhere(mask):
+                    continue
+                after = t - t * a
+                keep = both(mask, gt(after, least))
+                done = but_not(mask, keep)
+                weight = select(keep, t * a, zero)
+                store(state, at + 16, fma(weight, red, load(state, at + 16)))
+                store(state, at + 32, fma(weight, green, load(state, at + 32)))
+                store(state, at + 48, fma(weight, blue, load(state, at + 48)))
+                t = select(keep, after, t)
+                if anywhere(done):
+                    t = select(done, zero - t, t)
+                    if not anywhere(gt(t, zero)):
+                        live[block] = 0
+                        alive -= 1
+                store(state, at, t)
+        write_tile(ox, oy, width, height, state, background, image, alpha)
+
+
+@part
+def write_tile(ox, oy, width, height, state, background, image, alpha):  # type: ignore[no-untyped-def]
+    """Composites the tile over the background into the image."""
+    for y in range(oy, min(oy + TILE, height)):
+        for x in range(ox, min(ox + TILE, width)):
+            block = ((y - oy) // BLOCK) * ACROSS + (x - ox) // BLOCK
+            at = block * 64 + ((y - oy) % BLOCK) * 4 + (x - ox) % BLOCK
+            t = abs(state[at])
+            alpha[y, x] = float32(1) - t
+            for channel in range(3):
+                image[y, x, channel] = state[at + 16 + 16 * channel] + t * background[channel]
+
+
+@part
+def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):  # type: ignore[no-untyped-def]
+    """Loads per pixel: what remains of v . C behind the current Gaussian, and v for the three channels."""
+    for y in range(oy, min(oy + TILE, height)):
+        for x in range(ox, min(ox + TILE, width)):
+            block = ((y - oy) // BLOCK) * ACROSS + (x - ox) // BLOCK
+            at = block * 80 + ((y - oy) % BLOCK) * 4 + (x - ox) % BLOCK
+            rest = -v_alpha[y, x] * (float32(1) - alpha[y, x])
+            for channel in range(3):
+                v = v_image[y, x, channel]
+                state[at + 32 + 16 * channel] = v
+                rest += v * image[y, x, channel]
+            state[at + 16] = rest
+
+
+@kernel
+def blend_gradient(  # type: ignore[no-untyped-def]
+    worker, workers, records, entries, entry_slots, offsets, across, width, height, image, alpha, v_image, v_alpha,
+    tiles, cursor, pair_sums,
+):  # fmt: skip
+    """Backward: per (Gaussian, tile) pair the nine sums over pixels that the projection's gradient needs.
+
+    With s = alpha dL/dalpha and (dx, dy) from the centre: three of weight * v, then s, s dx, s dy,
+    s dx^2, s dx dy, s dy^2. Walks front to back like the forward pass, keeping the running
+    remainder of v . C, so nothing is stored per pixel and Gaussian, and each pair has its own slot.
+    """
+    state = np.zeros(BLOCKS * 80, np.float32)
+    live, touched = np.empty(BLOCKS, np.uint8), np.empty(BLOCKS, np.int32)
+    zero, one = splat(float32(0)), splat(float32(1))
+    threshold, most, least = splat(ALPHA_MIN), splat(ALPHA_MAX), splat(T_MIN)
+    lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
+    while True:
+        turn = fetch_add(cursor, 1)
+        if turn >= len(tiles):
+            break
+        tile = tiles[turn]
+        ox, oy = (tile % across) * TILE, (tile // across) * TILE
+        alive = start_tile(ox, oy, width, height, state, 80, live)
+        read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state)
+        for entry in range(offsets[tile], offsets[tile + 1]):
+            slot = entry_slots[entry]
+            if alive == 0:
+                for k in range(PAIR):
+                    pair_sums[slot * PAIR + k] = float32(0)
+                continue
+            r = entries[entry] * RECORD
+            qa, qb, qc, log = (
+                splat(-records[r + QA]),
+                splat(-records[r + QB]),
+                splat(-records[r + QC]),
+                splat(records[r + LOG]),
+            )
+            red, green, blue = splat(records[r + RED]), splat(records[r + GREEN]), splat(records[r + BLUE])
+            base_x, base_y = (
+                lane_x + splat(float32(ox) - records[r + MX]),
+                lane_y + splat(float32(oy) - records[r + MY]),
+            )
+            s_r = s_g = s_b = s_0 = s_x = s_y = s_xx = s_xy = s_yy = zero
+            for i in range(blocks_of(records, r, ox, oy, live, touched)):
+                block = touched[i]
+                at = block * 80
+                t = load(state, at)
+                dx, dy = base_x + splat(BLOCK_X[block]), base_y + splat(BLOCK_Y[block])
+                raw = exp2(fma(dx, fma(qa, dx, qb * dy), fma(qc * dy, dy, log)))
+                a = vmin(raw, most)
+                mask = both(ge(a, threshold), gt(t, zero))
+                if not anywhere(mask):
+                    continue
+                after = t - t * a
+                keep = both(mask, gt(after, least))
+                done = but_not(mask, keep)
+                weight = select(keep, t * a, zero)
+                v_r, v_g, v_b = load(state, at + 32), load(state, at + 48), load(state, at + 64)
+                q = fma(v_r, red, fma(v_g, green, v_b * blue))
+                s_r, s_g, s_b = fma(weight, v_r, s_r), fma(weight, v_g, s_g), fma(weight, v_b, s_b)
+                rest = load(state, at + 16) - weight * q
+                store(state, at + 16, rest)
+                v_a = t * q - quotient(rest, one - a)
+                s = select(both(keep, ge(most, raw)), v_a * a, zero)
+                sx, sy = s * dx, s * dy
+                s_0, s_x, s_y = s_0 + s, s_x + sx, s_y + sy
+                s_xx, s_xy, s_yy = fma(sx, dx, s_xx), fma(sx, dy, s_xy), fma(sy, dy, s_yy)
+                t = select(keep, after, t)
+                if anywhere(done):
+                    t = select(done, zero - t, t)
+                    if not anywhere(gt(t, zero)):
+                        live[block] = 0
+                        alive -= 1
+                store(state, at, t)
+            store_sums(pair_sums, slot * PAIR, s_r, s_g, s_b, s_0, s_x, s_y, s_xx, s_xy, s_yy)

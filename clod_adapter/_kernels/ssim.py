@@ -1,0 +1,124 @@
+"""Fused SSIM with its gradient: separable 11-tap Gaussian (sigma 1.5), zero padding, data range 1.
+
+Images become planes ``[3, H, stride]`` with 16 zero lanes left and right of each row, so that the
+blurs need no edge cases along a row. Rows beyond the image are skipped, which is zero padding too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import float32
+
+from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.simd import fma, load, quotient, splat, store
+
+RADIUS, PAD = 5, 16
+_taps = np.exp(-((np.arange(11) - RADIUS) ** 2) / (2 * 1.5**2))
+TAPS = (_taps / _taps.sum()).astype(np.float32)
+C1, C2 = float32(0.01**2), float32(0.03**2)
+TWO = float32(2)
+
+
+def stride(width: int) -> int:
+    """Floats a padded row takes."""
+    return 2 * PAD + -(-width // 16) * 16
+
+
+@kernel
+def to_planes(worker, workers, image, target, x, y, scale):  # type: ignore[no-untyped-def]
+    """Splits two ``[H, W, 3]`` images into planes; ``target`` is multiplied by ``scale`` (1/255 for bytes)."""
+    height, width = image.shape[0], image.shape[1]
+    for row in range(height * worker // workers, height * (worker + 1) // workers):
+        for column in range(width):
+            for channel in range(3):
+                x[channel, row, PAD + column] = image[row, column, channel]
+                y[channel, row, PAD + column] = float32(target[row, column, channel]) * scale
+
+
+@part
+def blur_row(lines, line, length):  # type: ignore[no-untyped-def]
+    """Horizontal blur of 16 columns from ``line`` of a row buffer."""
+    out = splat(float32(0))
+    for tap in range(11):
+        out = fma(splat(TAPS[tap]), load(lines, line + length + tap - RADIUS), out)
+    return out
+
+
+@kernel
+def ssim_map(worker, workers, x, y, width, similarity, g_mean, g_square, g_product, sums):  # type: ignore[no-untyped-def]
+    """SSIM of each pixel into ``similarity`` and its derivatives to the blurred x, x^2 and x y.
+
+    The planes are flat. ``sums[worker]`` receives the sum of SSIM over the image's pixels.
+    """
+    channels, height, step = x.shape
+    x, y, similarity = x.reshape(-1), y.reshape(-1), similarity.reshape(-1)
+    g_mean, g_square, g_product = g_mean.reshape(-1), g_square.reshape(-1), g_product.reshape(-1)
+    lines, zero = np.zeros(5 * step, np.float32), splat(float32(0))
+    c1, c2, two = splat(C1), splat(C2), splat(TWO)
+    result = 0.0
+    for task in range(channels * height * worker // workers, channels * height * (worker + 1) // workers):
+        channel, row = task // height, task % height
+        for at in range(PAD, step - PAD, 16):
+            m_x = m_y = m_xx = m_yy = m_xy = zero
+            for near in range(max(row - RADIUS, 0), min(row + RADIUS, height - 1) + 1):
+                tap, where = splat(TAPS[near - row + RADIUS]), (channel * height + near) * step + at
+                p, q = load(x, where), load(y, where)
+                tp, tq = tap * p, tap * q
+                m_x, m_y = m_x + tp, m_y + tq
+                m_xx, m_yy, m_xy = fma(tp, p, m_xx), fma(tq, q, m_yy), fma(tp, q, m_xy)
+            store(lines, at, m_x)
+            store(lines, step + at, m_y)
+            store(lines, 2 * step + at, m_xx)
+            store(lines, 3 * step + at, m_yy)
+            store(lines, 4 * step + at, m_xy)
+        for at in range(PAD, step - PAD, 16):
+            mx, my = blur_row(lines, 0, at), blur_row(lines, step, at)
+            sxx = blur_row(lines, 2 * step, at) - mx * mx
+            syy = blur_row(lines, 3 * step, at) - my * my
+            sxy = blur_row(lines, 4 * step, at) - mx * my
+            a, b = fma(two * mx, my, c1), fma(two, sxy, c2)
+            c, d = fma(mx, mx, fma(my, my, c1)), sxx + syy + c2
+            inverse = quotient(splat(float32(1)), c * d)
+            value = a * b * inverse
+            where = task * step + at
+            store(similarity, where, value)
+            store(g_mean, where, two * (my * (b - a) - value * mx * (d - c)) * inverse)
+            store(g_square, where, zero - value * c * inverse)
+            store(g_product, where, two * a * inverse)
+        for column in range(width):
+            result += similarity[task * step + PAD + column]
+        # Lanes past the image hold SSIM of nothing; they must not flow back.
+        for column in range(task * step + PAD + width, (task + 1) * step - PAD):
+            g_mean[column] = g_square[column] = g_product[column] = float32(0)
+    sums[worker] = result
+
+
+@kernel
+def loss_gradient(worker, workers, x, y, width, g_mean, g_square, g_product, l1, dssim, v_image, sums):  # type: ignore[no-untyped-def]
+    """Gradient of ``l1 sum |x - y| - dssim sum SSIM`` to x, as ``[H, W, 3]``; ``sums[worker]``: sum of |x - y|."""
+    channels, height, step = x.shape
+    x, y = x.reshape(-1), y.reshape(-1)
+    g_mean, g_square, g_product = g_mean.reshape(-1), g_square.reshape(-1), g_product.reshape(-1)
+    lines, out, zero = np.zeros(3 * step, np.float32), np.empty(step, np.float32), splat(float32(0))
+    two, weight = splat(TWO), splat(float32(-dssim))
+    result = 0.0
+    for task in range(channels * height * worker // workers, channels * height * (worker + 1) // workers):
+        channel, row = task // height, task % height
+        for at in range(PAD, step - PAD, 16):
+            m, s, p = zero, zero, zero
+            for near in range(max(row - RADIUS, 0), min(row + RADIUS, height - 1) + 1):
+                tap, where = splat(TAPS[near - row + RADIUS]), (channel * height + near) * step + at
+                m, s = fma(tap, load(g_mean, where), m), fma(tap, load(g_square, where), s)
+                p = fma(tap, load(g_product, where), p)
+            store(lines, at, m)
+            store(lines, step + at, s)
+            store(lines, 2 * step + at, p)
+        for at in range(PAD, step - PAD, 16):
+            where = task * step + at
+            inner = fma(two * load(x, where), blur_row(lines, step, at), blur_row(lines, 0, at))
+            store(out, at, weight * fma(load(y, where), blur_row(lines, 2 * step, at), inner))
+        for column in range(width):
+            difference = x[task * step + PAD + column] - y[task * step + PAD + column]
+            result += abs(difference)
+            v_image[row, column, channel] = out[PAD + column] + float32(l1) * float32(np.sign(difference))
+    sums[worker] = result

@@ -1,0 +1,35 @@
+"""Runs compiled kernels on several cores from plain Python threads.
+
+Kernels are compiled with ``nogil=True`` and take ``(worker, workers, *arguments)``. Python's own
+threads avoid a second OpenMP runtime beside torch's, which would spin against it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import Any
+
+import torch
+
+
+@lru_cache(maxsize=1)
+def _pool(workers: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max_workers=workers, thread_name_prefix="clod-adapter")
+
+
+def worker_count() -> int:
+    """As many workers as torch uses threads (``torch.set_num_threads``, ``OMP_NUM_THREADS``)."""
+    return torch.get_num_threads()
+
+
+def run(kernel: Callable[..., Any], workers: int, *arguments: Any) -> None:
+    """Calls ``kernel(worker, workers, *arguments)`` for each worker and waits for all of them."""
+    if workers == 1:
+        kernel(0, 1, *arguments)
+        return
+    others = [_pool(workers - 1).submit(kernel, worker, workers, *arguments) for worker in range(1, workers)]
+    kernel(0, workers, *arguments)
+    for other in others:
+        other.result()

@@ -1,0 +1,114 @@
+"""Depth order and tile lists: which Gaussians each tile blends, front to back."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import float32
+
+from clod_adapter._kernels.compiling import kernel, part
+
+# Columns of a record, the 64 bytes the blending loops read of a visible Gaussian. The exponent of
+# its alpha is in powers of two: log2 alpha = LOG - (QA dx^2 + QB dx dy + QC dy^2).
+MX, MY, QA, QB, QC, LOG, RED, GREEN, BLUE, REACH, RX, DET, X0, Y0, X1, Y1 = range(16)
+RECORD = 16
+TILE = 64
+HALF = float32(0.5)
+# Extents widen by this many pixels, so that rounding never loses a pixel at the 1/255 edge.
+SLACK = float32(0.01)
+
+
+# Records travel as one flat array and the offset of the first column: a view per Gaussian would cost an
+# atomic reference count, and a slice its bounds.
+@part
+def extent(records, r, first, last):  # type: ignore[no-untyped-def]
+    """Columns the ellipse of the record at ``r`` covers between the pixel rows ``first`` and ``last``.
+
+    The ellipse is where alpha reaches 1/255. Between two rows it is widest at its own leftmost and
+    rightmost points where those lie between them, else on the nearer row.
+    """
+    my, rx, b = records[r + MY], records[r + RX], records[r + QB]
+    top, bottom = float32(first) + HALF - my, float32(last) + HALF - my
+    tip = -b / (records[r + QC] * float32(2)) * rx
+    right, left = min(max(tip, top), bottom), min(max(-tip, top), bottom)
+    half = HALF / records[r + QA]
+    det = records[r + DET]  # 4 QA QC - QB^2, from the covariance, where it does not cancel
+    reach = float32(4) * records[r + QA] * records[r + REACH]
+    x1 = rx if right == tip else (-b * right + math.sqrt(max(float32(0), reach - det * right * right))) * half
+    x0 = -rx if left == -tip else (-b * left - math.sqrt(max(float32(0), reach - det * left * left))) * half
+    mx = records[r + MX]
+    low = max(records[r + X0], math.ceil(mx + x0 - HALF - SLACK))
+    high = min(records[r + X1], math.floor(mx + x1 - HALF + SLACK))
+    return np.int32(low), np.int32(high)
+
+
+@kernel
+def radix_sort(keys, order, keys_other, order_other, n):  # type: ignore[no-untyped-def]
+    """Stable ascending sort of uint32 ``keys[:n]`` with ``order`` carried along; returns the sorted order."""
+    counts = np.empty(2048, np.int64)
+    for shift in (0, 11, 22):
+        counts[:] = 0
+        for i in range(n):
+            counts[(keys[i] >> np.uint32(shift)) & np.uint32(2047)] += 1
+        total = 0
+        for digit in range(2048):
+            total, counts[digit] = total + counts[digit], total
+        for i in range(n):
+            digit = (keys[i] >> np.uint32(shift)) & np.uint32(2047)
+            keys_other[counts[digit]] = keys[i]
+            order_other[counts[digit]] = order[i]
+            counts[digit] += 1
+        keys, keys_other = keys_other, keys
+        order, order_other = order_other, order
+    return order
+
+
+@kernel
+def count_tiles(worker, workers, records, visible, across, histogram, slots):  # type: ignore[no-untyped-def]
+    """Counts tiles per Gaussian (``slots[j + 1]``) and Gaussians per tile (``histogram[worker]``)."""
+    histogram[worker, :] = 0
+    for j in range(visible * worker // workers, visible * (worker + 1) // workers):
+        r = j * RECORD
+        y0, y1 = np.int32(records[r + Y0]), np.int32(records[r + Y1])
+        touched = 0
+        for ty in range(y0 // TILE, y1 // TILE + 1):
+            x0, x1 = extent(records, r, max(ty * TILE, y0), min(ty * TILE + TILE - 1, y1))
+            if x1 >= x0:
+                for tx in range(x0 // TILE, x1 // TILE + 1):
+                    histogram[worker, ty * across + tx] += 1
+                    touched += 1
+        slots[j + 1] = touched
+
+
+@kernel
+def tile_offsets(histogram, offsets, slots, visible):  # type: ignore[no-untyped-def]
+    """Turns the counts into offsets; returns the number of entries."""
+    total = 0
+    for tile in range(histogram.shape[1]):
+        offsets[tile] = total
+        for worker in range(histogram.shape[0]):
+            total, histogram[worker, tile] = total + histogram[worker, tile], total
+    offsets[histogram.shape[1]] = total
+    slots[0] = 0
+    for j in range(visible):
+        slots[j + 1] += slots[j]
+    return total
+
+
+@kernel
+def fill_tiles(worker, workers, records, visible, across, histogram, slots, entries, entry_slots):  # type: ignore[no-untyped-def]
+    """Writes each tile's Gaussians in depth order, with the slot that receives the pair's gradient."""
+    for j in range(visible * worker // workers, visible * (worker + 1) // workers):
+        r = j * RECORD
+        y0, y1 = np.int32(records[r + Y0]), np.int32(records[r + Y1])
+        slot = slots[j]
+        for ty in range(y0 // TILE, y1 // TILE + 1):
+            x0, x1 = extent(records, r, max(ty * TILE, y0), min(ty * TILE + TILE - 1, y1))
+            if x1 >= x0:
+                for tx in range(x0 // TILE, x1 // TILE + 1):
+                    at = histogram[worker, ty * across + tx]
+                    histogram[worker, ty * across + tx] = at + 1
+                    entries[at] = j
+                    entry_slots[at] = slot
+                    slot += 1

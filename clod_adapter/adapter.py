@@ -1,0 +1,135 @@
+"""The adapter: what training adds to a checkpoint, small, exact and removable.
+
+The adapter is the result. What a training run writes out is ``extract(...).apply(base)``, so applying
+the adapter to the same base gives the same Gaussians again, bit for bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from clod_adapter.attenuation import SIGMA_MAX
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+
+ATTRIBUTES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
+
+
+@dataclass(frozen=True)
+class Adapter:
+    """A learned dial and the light update of the other attributes.
+
+    Attributes:
+        sigma_d: ``[N]`` float32, finite.
+        attenuation: how sigma_d is to be read.
+        updates: for each Gaussians attribute that changed, in the attribute's shape, either the
+            difference from the base (float16) or the new values themselves (float32).
+        base_fingerprint: SHA-256 of the checkpoint file it was trained on, hex.
+        config: the training config, JSON-able, for the record.
+
+    Raises:
+        ClodError: a tensor has the wrong type or shape, or sigma_d is not finite.
+    """
+
+    sigma_d: Tensor
+    attenuation: AttenuationConfig
+    updates: dict[str, Tensor]
+    base_fingerprint: str
+    config: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        if self.sigma_d.dim() != 1 or self.sigma_d.dtype != torch.float32:
+            raise ClodError(f"Adapter.sigma_d is {_kind(self.sigma_d)}, it must be float32 [N]")
+        if not self.sigma_d.isfinite().all():
+            raise ClodError("Adapter.sigma_d holds a value that is not finite; the training has diverged")
+        for name, update in self.updates.items():
+            if name not in ATTRIBUTES:
+                raise ClodError(f"Adapter.updates has {name!r}, it may have {', '.join(ATTRIBUTES)}")
+            if update.dtype not in (torch.float16, torch.float32) or update.shape[:1] != self.sigma_d.shape:
+                wanted = f"float16 or float32 of {len(self.sigma_d)} rows"
+                raise ClodError(f"Adapter.updates[{name!r}] is {_kind(update)}, it must be {wanted}")
+
+    def apply(self, base: Gaussians, fingerprint: str | None = None) -> Gaussians:
+        """The adapted Gaussians: the base plus the differences in float32, and the dial.
+
+        Args:
+            base: the Gaussians of the checkpoint the adapter was trained on, as the reader gives them.
+            fingerprint: that checkpoint file's SHA-256; when given it must be the adapter's.
+
+        Raises:
+            ClodError: a different base was given.
+        """
+        if fingerprint is not None and fingerprint != self.base_fingerprint:
+            raise ClodError(
+                f"a different base was given: its SHA-256 is {fingerprint[:12]}..., the adapter was trained on "
+                f"{self.base_fingerprint[:12]}...; give that checkpoint"
+            )
+        if len(base) != len(self.sigma_d):
+            raise ClodError(
+                f"a different base was given: it has {len(base)} Gaussians, the adapter {len(self.sigma_d)}; "
+                "give the checkpoint it was trained on"
+            )
+        changes: dict[str, Tensor] = {}
+        for name, update in self.updates.items():
+            old = getattr(base, name)
+            if update.shape != old.shape:
+                raise ClodError(f"a different base was given: {name} is {_kind(old)}, the adapter's {_kind(update)}")
+            update = update.to(old.device)
+            if update.dtype == torch.float16:  # old, not old + 0, where nothing changed: that would turn -0 into 0
+                update = torch.where(update == 0, old, old + update.float())
+            changes[name] = update
+        return base.replace(**changes, sigma_d=self.sigma_d.to(base.means.device), attenuation=self.attenuation)
+
+
+def extract(base: Gaussians, adapted: Gaussians, *, fingerprint: str, config: dict[str, Any]) -> Adapter:
+    """What has to be added to ``base`` to get ``adapted``, rounded to float16 differences.
+
+    Attributes with identical values are left out. Where a difference does not fit float16 (it
+    overflows, or an infinite logit became finite) the attribute is kept as its float32 values. A
+    dial that ``base`` may already have plays no part.
+
+    Raises:
+        ClodError: ``adapted`` has no dial, is not finite, or is not the same Gaussians as ``base``.
+    """
+    if adapted.sigma_d is None or adapted.attenuation is None:
+        raise ClodError("the adapted Gaussians have no sigma_d; attach a dial first")
+    updates = {}
+    for name in ATTRIBUTES:
+        old, new = getattr(base, name).detach().float(), getattr(adapted, name).detach().float()
+        if old.shape != new.shape:
+            raise ClodError(f"{name} is {_kind(new)}, in the base {_kind(old)}; give the Gaussians that were adapted")
+        if not torch.equal(old, new):
+            updates[name] = _update(name, old, new).cpu()
+    sigma_d = adapted.sigma_d.detach().float().cpu().clone()
+    return Adapter(sigma_d, adapted.attenuation, updates, fingerprint, dict(config))
+
+
+def attach(
+    gaussians: Gaussians, sigma_d: Tensor | None = None, attenuation: AttenuationConfig | None = None
+) -> Gaussians:
+    """The Gaussians with a dial; without ``sigma_d`` one that changes nothing (SIGMA_MAX)."""
+    if sigma_d is None:
+        sigma_d = torch.full_like(gaussians.opacity_logits, SIGMA_MAX, dtype=torch.float32)
+    return gaussians.replace(sigma_d=sigma_d, attenuation=attenuation or AttenuationConfig())
+
+
+def detach(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians without their dial; the other attributes stay as they are."""
+    return gaussians.replace(sigma_d=None, attenuation=None)
+
+
+def _update(name: str, old: Tensor, new: Tensor) -> Tensor:
+    same = old == new  # inf - inf would be NaN
+    if not (new.isfinite() | same).all():
+        raise ClodError(f"{name} holds a new value that is not finite; the training has diverged")
+    delta = torch.where(same, 0.0, new - old).half()
+    return delta if delta.isfinite().all() else new.clone()
+
+
+def _kind(tensor: Tensor) -> str:
+    return f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"

@@ -1,0 +1,302 @@
+"""The dial's equation, in stable form: what distance does to opacity, and when a Gaussian leaves.
+
+Source: "CLoD-GS: Continuous Level-of-Detail via 3D Gaussian Splatting", ICLR 2026: the attenuated opacity
+is its Eq. 2 (section 3.2), the cut is the mask M_i of the same section. For activated opacity ``a``, decay
+``sigma``, normalised distance ``d`` and dial ``s`` (the paper's virtual distance scale)::
+
+    v   = relu(sigma)^2 + eps/2                     the variance of the decay
+    a'' = a exp(-(d s)^2 / (2 v))                   attenuated opacity
+    kept iff a'' > tau s                            compared as logarithms, which do not underflow
+
+Throughout: tensors are ``[N]``, one entry per Gaussian, on one device. ``opacity_logits`` may be +-inf,
+``sigma_d`` and the distances are finite, distances are >= 0. Half-precision inputs are computed, and their
+results returned, in float32; otherwise the result has the inputs' common dtype.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import reduce
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from clod_adapter.cameras import Camera
+from clod_adapter.config import AttenuationConfig, require
+from clod_adapter.errors import ClodError
+
+SIGMA_MAX = 1e9
+"""Stands for an infinite sigma_d. The factor is exactly 1 for d s < 2e5 in float32, d s < 10 in float64."""
+
+_NEAR = 0.01  # world units; nearer centres, and those behind the camera, are not in view
+_LOG_HUGE = 1e4  # above the logarithms that float64 products here can have
+
+
+class Attenuated(NamedTuple):
+    """What a dial value makes of the opacities.
+
+    Attributes:
+        opacities: ``[N]`` a'', in [0, 1].
+        log_opacities: ``[N]`` log a'', in [-inf, 0]; meaningful where a'' underflows.
+        keep: ``[N]`` bool, ``log a'' > log(tau s)``.
+    """
+
+    opacities: Tensor
+    log_opacities: Tensor
+    keep: Tensor
+
+
+@torch.no_grad()
+def normalized_distances(means: Tensor, camera: Camera, config: AttenuationConfig) -> Tensor:
+    """``[N]`` the equation's d: ``|mu - c| / D``, without unit, >= 0.
+
+    D is ``normalizing_distance``. A constant for autograd: no gradient reaches ``means``, whose light
+    update during training is left to the picture.
+
+    Args:
+        means: ``[N, 3]`` world units.
+    """
+    x, y, z = (means - camera.position.to(means)).unbind(1)  # three times as fast as a norm over rows of 3
+    distances = x.square().addcmul_(y, y).addcmul_(z, z).sqrt_()
+    return distances.div_(normalizing_distance(distances, means, camera, config))
+
+
+@torch.no_grad()
+def normalizing_distance(distances: Tensor, means: Tensor, camera: Camera, config: AttenuationConfig) -> Tensor:
+    """0-d, the D that distances are divided by, world units, > 0; ``config.normalizer`` says which.
+
+    ``scene`` is ``config.scene_distance``. ``max`` (the paper's) and ``quantile`` look at the Gaussians
+    whose centre projects into the image from more than 0.01 in front of the camera, or at all of them where
+    there is none; the quantile is an element, the ``ceil(q n)``-th smallest, not an interpolation. Never
+    below the smallest normal number, so that 0 / D is 0; 1 where there are no Gaussians at all.
+
+    Args:
+        distances: ``[N]`` from the camera's centre, world units.
+        means: ``[N, 3]`` world units.
+    """
+    if config.normalizer == "scene" or len(distances) == 0:
+        value = config.scene_distance if config.normalizer == "scene" else 1.0
+        return torch.full((), value, dtype=distances.dtype, device=distances.device)
+    visible = distances[in_frustum(means, camera)]
+    if len(visible) == 0:
+        visible = distances
+    if config.normalizer == "max":
+        found = visible.max()
+    else:
+        # Not torch.quantile: it sorts, and refuses more than 16M elements.
+        found = visible.kthvalue(min(max(math.ceil(config.quantile * len(visible)), 1), len(visible))).values
+    return found.clamp(min=torch.finfo(found.dtype).tiny)
+
+
+def in_frustum(means: Tensor, camera: Camera) -> Tensor:
+    """``[N]`` bool: the centre projects into the image, from more than 0.01 world units in front of the camera."""
+    projection = (camera.K @ camera.viewmat[:3].to(camera.K)).to(means)
+    x, y, z = projection[:, :3] @ means.T + projection[:, 3:]
+    return (z > _NEAR) & (x >= 0) & (x < camera.width * z) & (y >= 0) & (y < camera.height * z)
+
+
+def log_attenuation(sigma_d: Tensor, d: Tensor, virtual_scale: float, eps: float) -> Tensor:
+    """``[N]`` log of the attenuation factor, ``-(d s)^2 / (2 relu(sigma)^2 + eps)``, in [-inf, 0].
+
+    Differentiable in ``sigma_d`` only, once: with ``u = (d s)^2 / (2 v)`` the slope is
+    ``2 u relu(sigma) / v``. ``d = 0`` gives 0 whatever sigma is; ``sigma <= 0`` with ``eps = 0`` and d > 0
+    gives -inf. Where u or the slope overflows, the slope counts as 0: the value is saturated at -inf.
+    Never NaN.
+
+    Args:
+        virtual_scale: the dial s, >= 1.
+        eps: the paper's epsilon, >= 0.
+
+    Raises:
+        ClodError: the dial is below 1 or not finite, or the shapes differ.
+    """
+    require(1 <= virtual_scale < math.inf, "virtual_scale", virtual_scale, "at least 1 and finite")
+    sigma_d, d = _common(sigma_d=sigma_d, d=d)
+    return _LogAttenuation.apply(sigma_d, d.detach(), float(virtual_scale), eps)
+
+
+def attenuate(
+    opacity_logits: Tensor, sigma_d: Tensor, d: Tensor, virtual_scale: float, config: AttenuationConfig
+) -> Attenuated:
+    """The opacities at one dial value, and which Gaussians stay.
+
+    ``a'' = sigmoid(logit) exp(log_attenuation)`` and ``log a'' = logsigmoid(logit) + log_attenuation``,
+    both differentiable, once, in ``opacity_logits`` and ``sigma_d``. Where the factor is exactly 1, a'' is
+    ``sigmoid(logit)`` bit for bit: a dial that does nothing changes nothing. At a logit of +inf the opacity
+    is 1 and its gradient 0. Kept sets are nested: what is kept at s is kept at every smaller dial.
+
+    Args:
+        d: ``[N]`` from ``normalized_distances``.
+        virtual_scale: the dial s, >= 1.
+
+    Raises:
+        ClodError: the dial is below 1 or not finite, or the shapes differ.
+    """
+    opacity_logits, sigma_d, d = _common(opacity_logits=opacity_logits, sigma_d=sigma_d, d=d)
+    factor = log_attenuation(sigma_d, d, virtual_scale, config.eps)
+    opacities, log_opacities = _Attenuate.apply(opacity_logits, factor)
+    return Attenuated(opacities, log_opacities, log_opacities.detach() > _log_threshold(config.tau, virtual_scale))
+
+
+def soft_count(log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float) -> Tensor:
+    """0-d, the share of Gaussians kept, in [0, 1]: exact on the way forward, soft on the way back.
+
+    Forward: mean of ``log a'' > log(tau s)``; 0 for no Gaussians. Backward, straight through: the gradient
+    of the mean of ``sigmoid((log a'' - log(tau s)) / temperature)``, which is 0 at log a'' = -inf.
+
+    Args:
+        log_opacities: ``[N]`` from ``attenuate``, in [-inf, 0].
+        temperature: > 0, in units of log opacity; the larger, the farther from the cut it is felt.
+    """
+    (log_opacities,) = _common(log_opacities=log_opacities)
+    return _SoftCount.apply(log_opacities, _log_threshold(tau, virtual_scale), temperature)
+
+
+@torch.no_grad()
+def extinction_scale(opacity_logits: Tensor, sigma_d: Tensor, d: Tensor, config: AttenuationConfig) -> Tensor:
+    """``[N]`` the dial value s* at which each Gaussian leaves: kept at s iff ``s < s*`` (up to rounding).
+
+    The unique root of ``a exp(-(d s)^2 / (2 v)) = tau s``, which is
+    ``s*^2 = (v / d^2) W(a^2 d^2 / (tau^2 v))`` with W the principal Lambert function. In [0, a/tau]; below
+    1 means kept at no dial value. ``a/tau`` where d = 0 (or d^2 / v is negligible); 0 where sigma <= 0,
+    eps = 0 and d > 0. No gradient.
+
+    Accuracy: relative error within ``(6 + |log a|) * finfo.eps`` where ``a`` is a normal number.
+
+    Raises:
+        ClodError: the shapes differ.
+    """
+    opacity_logits, sigma_d, d = _common(opacity_logits=opacity_logits, sigma_d=sigma_d, d=d)
+    ratio = (d / _radius(sigma_d, config.eps)).masked_fill_(d == 0, 0)
+    upper = opacity_logits.sigmoid().div_(config.tau)
+    log_ratio = ratio.log().clamp_(max=_LOG_HUGE)  # ratio is inf where the variance is 0
+    w = _lambert_w_of_exp((F.logsigmoid(opacity_logits) - math.log(config.tau) + log_ratio).mul_(2))
+    # The same value twice: e^{-W/2} = sqrt(W / z). The first does not cancel at small W, the second does not
+    # amplify W's error at large W.
+    return torch.where(w < 1, upper * torch.exp(-0.5 * w), w.sqrt().div_(ratio))
+
+
+@torch.no_grad()
+def sigma_for_extinction(opacity_logits: Tensor, d: Tensor, extinction: Tensor, config: AttenuationConfig) -> Tensor:
+    """``[N]`` the sigma_d with which a Gaussian at distance d leaves at s*; inverse of ``extinction_scale``.
+
+    ``v = (d s*)^2 / (2 log(a / (tau s*)))``, ``sigma = sqrt(max(v - eps/2, 0))``, in [0, SIGMA_MAX].
+    ``SIGMA_MAX`` where ``s* >= a/tau``, which no finite sigma reaches. 0 where the wish lies below what
+    eps alone allows, and at d = 0, where no sigma matters. No gradient.
+
+    Accuracy: relative error of v + eps/2 within ``(4 + (|log a| + |log(tau s*)|) / log(a / (tau s*))) *
+    finfo.eps``: the last step before ``a/tau`` is a steep one.
+
+    Args:
+        extinction: ``[N]`` wanted s*, >= 0.
+
+    Raises:
+        ClodError: the shapes differ.
+    """
+    opacity_logits, d, extinction = _common(opacity_logits=opacity_logits, d=d, extinction=extinction)
+    drop = F.logsigmoid(opacity_logits) - (extinction * config.tau).log_()
+    radius = d * extinction / (2 * drop).sqrt_()
+    floor = math.sqrt(config.eps / 2)
+    # sqrt(r - f) sqrt(r + f) and not sqrt(r^2 - f^2): squares underflow.
+    sigma = (radius - floor).clamp_(min=0).sqrt_() * (radius + floor).sqrt_()
+    return torch.where(drop > 0, sigma, SIGMA_MAX).clamp_(max=SIGMA_MAX)
+
+
+class _LogAttenuation(Function):
+    """``log_attenuation`` with the slope in the form that gives 0, not NaN, where things overflow."""
+
+    @staticmethod
+    def forward(ctx: Any, sigma: Tensor, d: Tensor, virtual_scale: float, eps: float) -> Tensor:
+        radius = _radius(sigma, eps)
+        # Divided before it is squared: (d s)^2 and v both leave float32's range before their ratio does.
+        out = (d * virtual_scale).div_(radius).square_().mul_(-0.5)
+        if math.sqrt(eps / 2) < torch.finfo(out.dtype).tiny:  # then the radius may be 0, and 0/0 is to be 0
+            out.masked_fill_(d == 0, 0)
+        ctx.save_for_backward(sigma, radius, out)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, None, None]:
+        sigma, radius, out = ctx.saved_tensors
+        slope = sigma.relu().div_(radius).div_(radius).mul_(out).mul_(-2)
+        return slope.nan_to_num_(0.0, 0.0, 0.0).mul_(grad), None, None, None
+
+
+class _Attenuate(Function):
+    """``(sigmoid(l) e^f, logsigmoid(l) + f)`` for logit l and log factor f; with w = g1 a'' + g2, the gradient
+    is ``w sigmoid(-l)`` for l and w for f."""
+
+    @staticmethod
+    def forward(ctx: Any, logits: Tensor, factor: Tensor) -> tuple[Tensor, Tensor]:
+        opacities = factor.exp().mul_(logits.sigmoid())
+        ctx.save_for_backward(logits, opacities)
+        ctx.set_materialize_grads(False)
+        return opacities, F.logsigmoid(logits).add_(factor)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor | None, grad_log: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+        logits, opacities = ctx.saved_tensors
+        if grad is None:
+            total = grad_log
+        else:
+            total = grad * opacities if grad_log is None else torch.addcmul(grad_log, grad, opacities)
+        if total is None:
+            return None, None
+        return logits.neg().sigmoid_().mul_(total) if ctx.needs_input_grad[0] else None, total
+
+
+class _SoftCount(Function):
+    """``soft_count`` above a log threshold."""
+
+    @staticmethod
+    def forward(ctx: Any, log_opacities: Tensor, threshold: float, temperature: float) -> Tensor:
+        ctx.save_for_backward(log_opacities)
+        ctx.settings = threshold, temperature
+        return (log_opacities > threshold).sum() / log_opacities.new_full((), max(len(log_opacities), 1))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        (log_opacities,) = ctx.saved_tensors
+        threshold, temperature = ctx.settings
+        p = (log_opacities - threshold).div_(temperature).sigmoid_()
+        return (1 - p).mul_(p).mul_(grad / (temperature * max(len(p), 1))), None, None
+
+
+def _radius(sigma: Tensor, eps: float) -> Tensor:
+    """``sqrt(v) = sqrt(relu(sigma)^2 + eps/2)``, without squares that underflow."""
+    return torch.hypot(sigma.relu(), sigma.new_full((), math.sqrt(eps / 2)))
+
+
+def _lambert_w_of_exp(x: Tensor) -> Tensor:
+    """W(e^x): the w > 0 with ``w + log w = x``, to rounding; x is clamped to [-80, 1e4].
+
+    Two steps of Fritsch, Shafer and Crowley (CACM 16(2), 1973, Algorithm 443), each of fourth order.
+    """
+    x = x.clamp(-80, _LOG_HUGE)  # e^-80 is nothing beside 1
+    w = torch.where(x > 1, x - x.clamp(min=1).log_(), x.sigmoid())
+    for _ in range(2):
+        r = x - w.log() - w
+        q = 2 * (1 + w) * (1 + w + r * (2 / 3))
+        w = w * (1 + r / (1 + w) * ((q - r) / (q - 2 * r)))
+    return w
+
+
+def _log_threshold(tau: float, virtual_scale: float) -> float:
+    """``log(tau s)``, what log a'' must exceed."""
+    return math.log(tau * virtual_scale)
+
+
+def _common(**tensors: Tensor) -> list[Tensor]:
+    """The tensors in their common dtype, at least float32; raises ClodError unless they share one [N]."""
+    shapes = {name: tuple(t.shape) for name, t in tensors.items()}
+    if len(set(shapes.values())) != 1 or any(len(shape) != 1 for shape in shapes.values()):
+        raise ClodError("expected one shape [N], got " + ", ".join(f"{name} {shape}" for name, shape in shapes.items()))
+    dtype = reduce(torch.promote_types, (t.dtype for t in tensors.values()), torch.float32)
+    return [t.to(dtype) for t in tensors.values()]

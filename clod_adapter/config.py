@@ -1,0 +1,119 @@
+"""Every choice the paper leaves open, as documented fields of frozen configs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from clod_adapter.errors import ClodError
+
+NORMALIZERS = ("max", "quantile", "scene")
+
+
+def option(default: Any, help: str) -> Any:
+    """A config field whose help is also the command line's."""
+    return field(default=default, metadata={"help": help})
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttenuationConfig:
+    """How a stored ``sigma_d`` is to be read. Travels with the file.
+
+    The cut keeps a Gaussian iff its attenuated opacity exceeds ``tau * virtual_scale``. The
+    normaliser D turns a distance into the ``d'`` of the equation:
+
+    - ``scene``: one constant, ``scene_distance``, for every view;
+    - ``quantile``: the ``quantile`` of the distances of the Gaussians in the view frustum;
+    - ``max``: their maximum, the paper's form.
+    """
+
+    tau: float = option(
+        1 / 255, "base opacity threshold; 1/255 is what rasterizers drop anyway, so s = 1 cuts nothing visible"
+    )
+    eps: float = option(1e-8, "the paper's epsilon under sigma_d squared; keeps sigma_d = 0 defined")
+    normalizer: str = option("scene", "what distances are divided by: scene, quantile or max")
+    quantile: float = option(0.95, "share of the frustum's Gaussians nearer than D (normalizer quantile)")
+    scene_distance: float = option(1.0, "D in world units (normalizer scene)")
+    max_sv: float = option(5.0, "largest dial value the file was trained for")
+
+    def __post_init__(self) -> None:
+        require(0 < self.tau < 1, "tau", self.tau, "between 0 and 1")
+        require(0 <= self.eps < 1, "eps", self.eps, "at least 0 and below 1")
+        require(self.normalizer in NORMALIZERS, "normalizer", self.normalizer, f"one of {', '.join(NORMALIZERS)}")
+        require(0 < self.quantile <= 1, "quantile", self.quantile, "above 0 and at most 1")
+        require(0 < self.scene_distance < math.inf, "scene_distance", self.scene_distance, "positive and finite")
+        require(1 <= self.max_sv < math.inf, "max_sv", self.max_sv, "at least 1 and finite")
+        require(
+            self.tau * self.max_sv < 1,
+            "tau",
+            self.tau,
+            f"below 1/max_sv = {1 / self.max_sv:.3g}, or nothing survives the cut",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptConfig:
+    """How an adaptation is run. Every default was measured; docs/method.md has the tables."""
+
+    max_sv: float = option(5.0, "largest dial value to train for")
+    iters: int = option(1500, "training steps")
+    time_budget: float | None = option(
+        None, "stop training after this many seconds, schedule included (default: no limit)"
+    )
+    seed: int = option(0, "seed of view order, dial values and the importance estimate")
+    tau: float = option(1 / 255, "base opacity threshold of the cut")
+    eps: float = option(1e-8, "the paper's epsilon")
+    normalizer: str = option("scene", "what distances are divided by: scene, quantile or max (the paper's)")
+    quantile: float = option(0.95, "quantile of distances that becomes D (normalizers scene and quantile)")
+    start_share: float = option(0.6, "share of Gaussians the start keeps at s = 1")
+    full_share: float = option(0.2, "share of steps at s = 1; the others draw s log-uniform in [1, max_sv]")
+    exponent: float = option(1.5, "the count law: the share to keep at s is s^-exponent")
+    reg_weight: float = option(1.0, "weight of the count term (the paper's lambda_reg)")
+    weight_slope: float = option(
+        0.5, "k of w_s = (1 - k s/max_sv)^2; the paper has 0.5, 0 weighs all dial values alike"
+    )
+    temperature: float = option(0.5, "width of the straight-through count's sigmoid, in log opacity")
+    ssim_weight: float = option(0.2, "weight of 1 - SSIM against L1")
+    lr_sigma: float = option(0.1, "step size of log sigma_d (relative change a step)")
+    lr_means: float = option(1.3e-4, "step size of means, times the cameras' extent")
+    lr_quats: float = option(8e-4, "step size of quats")
+    lr_scales: float = option(4e-3, "step size of log_scales")
+    lr_opacities: float = option(5e-2, "step size of opacity_logits")
+    lr_sh0: float = option(2e-3, "step size of sh0")
+    lr_shN: float = option(1e-4, "step size of shN")
+    lr_final: float = option(0.05, "step sizes fall exponentially to this share of their start")
+
+    def __post_init__(self) -> None:
+        require(1 <= self.max_sv < math.inf, "max_sv", self.max_sv, "at least 1 and finite")
+        require(self.iters >= 0, "iters", self.iters, "at least 0")
+        require(0 <= self.seed < 2**63, "seed", self.seed, "at least 0 and below 2^63")
+        require(self.time_budget is None or self.time_budget > 0, "time_budget", self.time_budget, "positive seconds")
+        require(0.5 < self.start_share <= 1, "start_share", self.start_share, "above 0.5 and at most 1")
+        require(0 <= self.full_share <= 1, "full_share", self.full_share, "between 0 and 1")
+        require(0 < self.exponent < math.inf, "exponent", self.exponent, "positive and finite")
+        require(0 <= self.reg_weight < math.inf, "reg_weight", self.reg_weight, "at least 0 and finite")
+        require(self.temperature > 0, "temperature", self.temperature, "positive")
+        require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
+        require(0 < self.lr_final <= 1, "lr_final", self.lr_final, "above 0 and at most 1")
+        for name in ("sigma", "means", "quats", "scales", "opacities", "sh0", "shN"):
+            require(getattr(self, f"lr_{name}") >= 0, f"lr_{name}", getattr(self, f"lr_{name}"), "at least 0")
+        self.attenuation(1.0)  # checks the rest
+
+    def attenuation(self, scene_distance: float) -> AttenuationConfig:
+        """What travels with the file."""
+        return AttenuationConfig(
+            tau=self.tau, eps=self.eps, normalizer=self.normalizer, quantile=self.quantile,
+            scene_distance=scene_distance, max_sv=self.max_sv,
+        )  # fmt: skip
+
+
+def require(ok: bool, name: str, value: object, what: str) -> None:
+    """Raises ClodError naming the field, its value and what it must be."""
+    if not ok:
+        raise ClodError(f"{name} is {value}, it must be {what}")
+
+
+def describe(config: Any) -> dict[str, str]:
+    """The help text of each field of a config."""
+    return {f.name: f.metadata["help"] for f in fields(config)}

@@ -1,0 +1,60 @@
+"""A base checkpoint for the demo's capture, trained from its point cloud with the project's own rasterizer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from clod_adapter.adapter import attach, detach
+from clod_adapter.cameras import Scene
+from clod_adapter.config import AdaptConfig
+from clod_adapter.gaussians import SH_COUNTS, Gaussians
+from clod_adapter.train import Progress, adapt
+
+SH_DC = 0.28209479177387814
+
+
+def fit_base(
+    points: np.ndarray,
+    colors: np.ndarray,
+    scene: Scene,
+    *,
+    iters: int,
+    progress: Callable[[Progress], None] | None = None,
+) -> Gaussians:
+    """Trains one Gaussian per point at full detail: adapting with a dial that does nothing and 3DGS's step sizes.
+
+    Args:
+        points: ``[N, 3]`` world units; colors: ``[N, 3]`` uint8.
+        iters: training steps.
+    """
+    config = AdaptConfig(
+        max_sv=1, iters=iters, full_share=1, lr_sigma=0, lr_means=1.6e-4, lr_quats=1e-3, lr_scales=5e-3,
+        lr_opacities=5e-2, lr_sh0=2.5e-3, lr_shN=1.25e-4, lr_final=0.05,
+    )  # fmt: skip
+    return detach(adapt(attach(from_points(points, colors)), scene, config, progress).gaussians)
+
+
+def from_points(points: np.ndarray, colors: np.ndarray, *, sh_degree: int = 3) -> Gaussians:
+    """3DGS's start: round Gaussians as wide as the distance to the nearest points, opacity 0.1, flat colour."""
+    means = torch.from_numpy(points).float()
+    n = len(means)
+    rgb = torch.from_numpy(colors).float() / 255
+    spacing = neighbour_distance(means).clamp(min=1e-4)
+    return Gaussians(
+        means=means,
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        log_scales=spacing.log()[:, None].repeat(1, 3),
+        opacity_logits=torch.full((n,), 0.1).logit(),
+        sh0=((rgb - 0.5) / SH_DC)[:, None],
+        shN=torch.zeros(n, SH_COUNTS[sh_degree] - 1, 3),
+    )
+
+
+def neighbour_distance(means: Tensor) -> Tensor:
+    """``[N]`` root mean square distance to the three nearest others."""
+    found = [torch.cdist(block, means).topk(4, largest=False).values[:, 1:] for block in means.split(1024)]
+    return torch.cat(found).square().mean(1).sqrt()

@@ -1,0 +1,211 @@
+"""The demo scene: a small gallery of framed photographs and solids, ray-traced, and written as a COLMAP capture.
+
+World axes: x right, y DOWN, z into the room, in metres; so upright photographs have the usual COLMAP orientation. The
+room is 6 m wide (x from -3 to 3), 8 m long (z from 0 to 8) and 3 m high (floor at y = 0, ceiling at y = -3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from clod_adapter.cameras import Camera
+from clod_adapter.config import require
+from clod_adapter.demo import textures as tx
+from clod_adapter.demo.lightmaps import bake
+from clod_adapter.demo.paths import path_cameras
+from clod_adapter.demo.raytrace import Tables, camera_rays, encode_srgb, render_linear, trace_rays
+from clod_adapter.demo.shapes import Finish, SceneBuilder
+from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.colmap import write_model
+
+LOW, HIGH = np.array([-3.0, -3.0, 0.0]), np.array([3.0, 0.0, 8.0])
+HOLD_OUT = 8  # every 8th view by name is a test view; the point cloud must not see it
+OAK, BLACK, WHITE, GOLD = (122, 84, 52), (34, 32, 32), (226, 222, 214), (168, 128, 66)
+
+# name, wall, metres along the wall, height of the centre, width and height in metres, frame
+PICTURES = (
+    ("astronaut.png", "left", 1.6, 1.6, (1.1, 1.3), OAK),
+    ("coffee.png", "left", 3.7, 1.6, (1.5, 1.1), BLACK),
+    ("chelsea.png", "left", 6.0, 1.6, (1.5, 1.1), GOLD),
+    ("motorcycle_left.png", "right", 1.8, 1.6, (1.6, 1.15), BLACK),
+    ("retina.jpg", "right", 4.0, 1.6, (1.2, 1.2), OAK),
+    ("rocket.jpg", "right", 6.2, 1.6, (1.5, 1.1), WHITE),
+    ("hubble_deep_field.jpg", "end", 0.0, 1.65, (2.3, 1.8), BLACK),
+    ("ihc.png", "start", -1.3, 1.6, (1.2, 1.2), BLACK),
+    ("camera.png", "start", 1.3, 1.6, (1.2, 1.2), OAK),
+)
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """The lit scene. Make it with `make_gallery`.
+
+    Attributes:
+        tables: the ray tracer's scene.
+        samples: rays per pixel along x and along y.
+    """
+
+    tables: Tables
+    samples: int = 3
+
+    def render(self, camera: Camera) -> np.ndarray:
+        """``[H, W, 3]`` uint8 sRGB, anti-aliased: the mean of linear light over each pixel's square."""
+        return encode_srgb(render_linear(self.tables, camera, self.samples))
+
+    def cameras(self, width: int = 320, height: int = 240, count: int = 64) -> list[Camera]:
+        """`count` cameras named ``view_000.png`` on, along smooth paths: some look across the room, some pass by close.
+
+        With the default count the held-out views, every 8th, lie between neighbours on their path.
+        """
+        return path_cameras(width, height, count)
+
+    def sample_points(self, n: int, seed: int = 0, views: int = 64) -> tuple[np.ndarray, np.ndarray]:
+        """A point cloud as structure from motion would give it, from rays of the training cameras.
+
+        Args:
+            n: number of points; near surfaces get more, as in a real capture.
+            seed: of the pixels that are chosen and of the noise.
+            views: how many cameras the capture has, at least 2, of which every 8th is left out.
+
+        Returns:
+            points ``[n, 3]`` float32 metres, off by about 0.3 % of their distance, and colours ``[n, 3]`` uint8 sRGB.
+        """
+        require(views >= 2, "views", views, "at least 2")
+        random = np.random.default_rng(seed)
+        cameras = [c for k, c in enumerate(self.cameras(count=views)) if k % HOLD_OUT]
+        shares = np.array_split(np.arange(n), len(cameras))
+        points, colors = [], []
+        for camera, share in zip(cameras, shares, strict=True):
+            eye, rays = camera_rays(camera)
+            pixels = random.random((len(share), 2)) * [camera.width, camera.height]
+            directions = np.column_stack([pixels, np.ones(len(share))]) @ rays.T
+            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+            seen = np.empty((len(share), 4))
+            trace_rays(self.tables, np.tile(eye, (len(share), 1)), directions, 1 / float(camera.K[0, 0]), seen)
+            noise = random.normal(0, 0.003 / np.sqrt(3), directions.shape)
+            points.append(eye + seen[:, 3:] * (directions + noise))
+            colors.append(encode_srgb(seen[:, :3]))
+        return np.concatenate(points).astype(np.float32), np.concatenate(colors)
+
+
+def make_gallery(samples: int = 3) -> Gallery:
+    """Builds the room and bakes its light; several seconds."""
+    return Gallery(bake(unlit_room()), samples)
+
+
+def unlit_room() -> Tables:
+    """The room before any light is computed: every surface has its texture's own colours."""
+    scene = SceneBuilder(materials())
+    add_room(scene)
+    add_pictures(scene)
+    add_solids(scene)
+    return scene.tables()
+
+
+def materials() -> dict[str, np.ndarray]:
+    """Every texture of the scene by name; pictures carry their file's name."""
+    pictures = {name: tx.framed(name, size, frame) for name, _, _, _, size, frame in PICTURES}
+    return pictures | {
+        "floor": tx.planks((108, 74, 46), (176, 132, 88)),
+        "cream": tx.plaster((222, 212, 192), 0.025, seed=1),
+        "blue": tx.plaster((84, 118, 132), 0.05, seed=2),
+        "ceiling": tx.plain((236, 234, 228)),
+        "bricks": tx.brickwork((124, 60, 44), (204, 158, 130)),
+        "gravel": tx.toned("gravel.png", (70, 66, 62), (196, 188, 176)),
+        "grass": tx.toned("grass.png", (28, 52, 20), (134, 166, 74)),
+        "terrazzo": tx.toned("gravel.png", (136, 112, 104), (242, 234, 222)),
+        "oak": tx.planks((120, 82, 48), (168, 122, 76), rows=5, seed=8),
+        "chequers": tx.chequers(12, 6, (196, 62, 44), (240, 226, 196)),
+        "coffee": tx.linear(tx.photograph("coffee.png").crop((100, 0, 500, 400))),
+        "white": tx.plain((238, 236, 232)),
+        "dark": tx.plain((46, 40, 36)),
+        "enamel": tx.plain((20, 92, 112)),
+    }
+
+
+def add_room(scene: SceneBuilder) -> None:
+    """Walls, floor, ceiling, skirting boards and three lamps under the ceiling."""
+    cream, skirting = Finish("cream", tile=2.0, light_texel=0.07), Finish("dark")
+    scene.panel((0, 0, 4), (0, 1, 0), (6, 8), Finish("floor", tile=1.6, light_texel=0.04), down=(0, 0, -1))
+    scene.panel((0, -3, 4), (0, -1, 0), (6, 8), Finish("ceiling", light_texel=0.12), down=(0, 0, 1))
+    scene.panel((-3, -1.5, 4), (-1, 0, 0), (8, 3), cream)
+    scene.panel((3, -1.5, 4), (1, 0, 0), (8, 3), cream)
+    scene.panel((0, -1.5, 8), (0, 0, 1), (6, 3), Finish("bricks", tile=1.8, light_texel=0.07))
+    scene.panel((0, -1.5, 0), (0, 0, -1), (6, 3), Finish("blue", tile=2.0, light_texel=0.07))
+    for x, turn in ((-2.985, -np.pi / 2), (2.985, np.pi / 2)):
+        scene.box((x, 0, 4), (7.94, 0.12, 0.03), skirting, turn=turn, faces="front top")
+    for z, turn in ((0.015, np.pi), (7.985, 0.0)):
+        scene.box((0, 0, z), (6, 0.12, 0.03), skirting, turn=turn, faces="front top")
+    for z in (1.5, 4.0, 6.5):
+        scene.box((0, -2.94, z), (2.2, 0.06, 0.5), Finish("dark"), faces="front back left right")
+        scene.panel((0, -2.945, z), (0, -1, 0), (2.19, 0.49), Finish("white", glow=21.0), down=(0, 0, 1))
+
+
+def add_pictures(scene: SceneBuilder) -> None:
+    """Every picture as a thin box on its wall."""
+    depth = 0.05
+    walls = {"left": -np.pi / 2, "right": np.pi / 2, "end": 0.0, "start": np.pi}
+    for name, wall, along, middle, (width, height), _ in PICTURES:
+        x = {"left": LOW[0] + depth / 2, "right": HIGH[0] - depth / 2}.get(wall, along)
+        z = {"end": HIGH[2] - depth / 2, "start": LOW[2] + depth / 2}.get(wall, along)
+        scene.box(
+            (float(x), height / 2 - middle, float(z)), (width, height, depth), Finish("dark"), front=Finish(name),
+            turn=walls[wall], faces="front left right top bottom",
+        )  # fmt: skip
+
+
+def add_solids(scene: SceneBuilder) -> None:
+    """What stands on the floor: plinths with balls and a box, a brick column, a bench and a planter."""
+    white, oak = Finish("white"), Finish("oak", tile=0.6, light_texel=0.03)
+    scene.box((0, 0, 4), (0.56, 0.85, 0.56), white, turn=0.4)
+    scene.ball((0, -1.12, 4), 0.27, Finish("enamel", gloss=0.12, light_texel=0.03))
+    scene.column((-1.15, 0, 5.7), 0.28, 1.0, Finish("bricks", tile=0.7, light_texel=0.03), Finish("gravel", tile=0.4))
+    scene.box((-1.15, -1.0, 5.7), (0.32, 0.32, 0.32), Finish("coffee", light_texel=0.02), turn=-0.5)
+    scene.box((1.15, 0, 5.7), (0.5, 0.8, 0.5), white, turn=-0.3)
+    scene.ball((1.15, -1.05, 5.7), 0.25, Finish("terrazzo", tile=0.55, light_texel=0.03))
+    scene.box((-1.1, 0, 2.2), (0.9, 0.4, 0.5), oak, turn=0.25, top=Finish("grass", tile=0.5, light_texel=0.03))
+    scene.ball((-1.1, -0.58, 2.2), 0.18, Finish("chequers", light_texel=0.02))
+    scene.box((1.1, -0.38, 2.3), (0.45, 0.06, 1.3), oak, turn=-0.1, faces="front back left right top bottom")
+    for z in (-0.45, 0.45):
+        foot = (1.1 + z * np.sin(-0.1), 0.0, 2.3 + z * np.cos(-0.1))
+        scene.box(foot, (0.35, 0.379, 0.06), Finish("dark"), turn=-0.1, faces="front back left right")
+
+
+def write_gallery(
+    folder: str | Path,
+    *,
+    width: int = 320,
+    height: int = 240,
+    count: int = 64,
+    points: int = 20000,
+    progress: Callable[[int, int], None] | None = None,
+) -> Gallery:
+    """Renders the capture into a new `folder`: ``images/*.png`` and a COLMAP model with a point cloud.
+
+    Args:
+        folder: does not exist or is empty; it appears when everything in it is complete.
+        count: number of views, at least 2, of which every 8th by name is meant for testing.
+        points: size of the point cloud.
+        progress: called with (views done, views in all) after each view.
+
+    Raises:
+        ClodError: the folder cannot be written, count is too small, or a bundled photograph is missing.
+    """
+    require(count >= 2, "count", count, "at least 2")
+    with atomic_path(folder) as part:
+        gallery = make_gallery()
+        cameras = gallery.cameras(width, height, count)
+        images = part / "images"
+        images.mkdir(parents=True)
+        for done, camera in enumerate(cameras, 1):
+            Image.fromarray(gallery.render(camera)).save(images / camera.name)
+            if progress:
+                progress(done, count)
+        xyz, rgb = gallery.sample_points(points, views=count)
+        write_model(part, cameras, [camera.name for camera in cameras], xyz, rgb)
+    return gallery

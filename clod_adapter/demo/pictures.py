@@ -1,0 +1,186 @@
+"""The demo's two pictures: one view at several dial values, and quality against the number of Gaussians kept.
+
+matplotlib is an optional dependency and is imported when a picture is drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.atomic import atomic_path
+
+INK, QUIET, GRID = "#1c1c1e", "#6b6b70", "#e4e4e7"
+PSNR_COLOUR, SSIM_COLOUR = "#1f5fa8", "#c2571a"
+DPI = 200
+STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",  # matplotlib brings it, so captions fit everywhere
+    "text.color": INK,
+    "axes.edgecolor": QUIET,
+    "axes.labelcolor": INK,
+    "axes.linewidth": 0.8,
+    "xtick.color": QUIET,
+    "ytick.color": QUIET,
+    "font.size": 9,
+}
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One picture of the strip.
+
+    Attributes:
+        image: ``[H, W, 3]`` uint8, or float in 0..1; the same size in every panel.
+        virtual_scale: the dial value; None for the ground truth.
+        kept: Gaussians that the dial leaves in.
+        kept_share: that, divided by all.
+        psnr: dB against the ground truth.
+        frame_ms: time of a frame, milliseconds.
+    """
+
+    image: np.ndarray
+    virtual_scale: float | None = None
+    kept: float = 0.0
+    kept_share: float = 0.0
+    psnr: float = 0.0
+    frame_ms: float = 0.0
+
+
+def dial_strip(
+    path: str | Path, panels: Sequence[Panel], title: str, crop: tuple[int, int, int, int] | None = None
+) -> None:
+    """Draws one view at several dial values side by side.
+
+    Args:
+        path: the picture to write; its suffix chooses the format.
+        panels: from left to right, the ground truth first.
+        title: one line above.
+        crop: left, top, width, height in pixels of a part to show enlarged in a second row.
+
+    Raises:
+        ClodError: matplotlib is missing, or the file cannot be written.
+    """
+    height, width = panels[0].image.shape[:2]
+    rows = [height / width] + ([crop[3] / crop[2]] if crop else [])
+    cell, gap, head, caption = 2.6, 0.08, 0.42, 0.66  # inches
+    across, down = len(panels) * (cell + gap) + gap, sum(rows) * (cell + gap) + head + caption
+    with new_figure((across, down)) as figure:
+        figure.text(gap / across, 1 - 0.5 * head / down, title, fontsize=11, weight="bold", va="center")
+        for k, panel in enumerate(panels):
+            left, top = gap + k * (cell + gap), down - head
+            for row, aspect in enumerate(rows):
+                tall = cell * aspect
+                axes = figure.add_axes((left / across, (top - tall) / down, cell / across, tall / down))
+                show(axes, panel.image, crop, enlarged=row == 1)
+                top -= tall + gap
+            write_caption(figure, panel, (left + cell / 2) / across, top, down)
+        save(figure, path)
+
+
+def show(axes: Any, image: np.ndarray, crop: tuple[int, int, int, int] | None, enlarged: bool) -> None:
+    """Puts an image, or with `enlarged` the crop of it, into its axes; the whole image gets the crop's outline."""
+    axes.axis("off")
+    pixels = image if image.dtype == np.uint8 else np.clip(image, 0, 1)
+    if enlarged and crop:
+        left, top, width, height = crop
+        axes.imshow(pixels[top : top + height, left : left + width], interpolation="nearest", aspect="auto")
+        return
+    axes.imshow(pixels, interpolation="antialiased", aspect="auto")
+    if crop:
+        x, y = (crop[0] - 0.5, crop[0] + crop[2] - 0.5), (crop[1] - 0.5, crop[1] + crop[3] - 0.5)
+        outline = [x[0], x[1], x[1], x[0], x[0]], [y[0], y[0], y[1], y[1], y[0]]
+        axes.plot(*outline, color="white", linewidth=1.4, scalex=False, scaley=False)
+
+
+def write_caption(figure: Any, panel: Panel, x: float, y: float, down: float) -> None:
+    """The dial value, then count, PSNR and frame time, centred on x (share of the width) below y (inches of `down`)."""
+    heading, detail = "ground truth", "held out from training"
+    if panel.virtual_scale is not None:
+        heading = f"s = {panel.virtual_scale:g}"
+        detail = f"{panel.kept:,.0f} Gaussians ({panel.kept_share:.0%})\n{panel.psnr:.2f} dB,  {panel.frame_ms:.1f} ms"
+    figure.text(x, (y - 0.04) / down, heading, fontsize=10.5, weight="bold", ha="center", va="top")
+    figure.text(x, (y - 0.24) / down, detail, fontsize=8.5, color=QUIET, ha="center", va="top", linespacing=1.35)
+
+
+def quality_curve(
+    path: str | Path, rows: Sequence[Mapping[str, float]], base_row: Mapping[str, float] | None, title: str
+) -> None:
+    """Draws PSNR, and below it SSIM, against the number of Gaussians kept, one labelled point per dial value.
+
+    Args:
+        path: the picture to write; its suffix chooses the format.
+        rows: with virtual_scale, psnr, ssim, kept and kept_share, in any order.
+        base_row: the checkpoint before the adaptation, with psnr, ssim and kept; drawn as a point by itself.
+        title: one line above.
+
+    Raises:
+        ClodError: matplotlib is missing, or the file cannot be written.
+    """
+    ordered = sorted(rows, key=lambda row: row["virtual_scale"])
+    with new_figure((6.4, 5.6), layout="constrained") as figure:
+        figure.suptitle(title, fontsize=11, weight="bold", x=0.02, ha="left")
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1.5, 1])
+        draw_curve(above, ordered, base_row, "psnr", PSNR_COLOUR)
+        draw_curve(below, ordered, base_row, "ssim", SSIM_COLOUR)
+        above.set_ylabel("PSNR (dB)")
+        above.legend(loc="lower right", frameon=False, fontsize=8.5)
+        below.set_ylabel("SSIM")
+        label_counts(below)
+        save(figure, path)
+
+
+def draw_curve(
+    axes: Any, rows: Sequence[Mapping[str, float]], base_row: Mapping[str, float] | None, key: str, colour: str
+) -> None:
+    """One quality measure against count, the points labelled with their dial values."""
+    counts, values = [row["kept"] for row in rows], [row[key] for row in rows]
+    axes.set_xscale("log")
+    axes.margins(x=0.1, y=0.16)
+    axes.plot(counts, values, "-o", color=colour, markersize=5.5, linewidth=1.8, label="dial, one file", zorder=3)
+    for row, count, value in zip(rows, counts, values, strict=True):
+        name = f"s = {row['virtual_scale']:g}"
+        axes.annotate(name, (count, value), (-4, 5), textcoords="offset points", ha="right", fontsize=8.5)
+    if base_row:
+        style = {"color": "white", "markeredgecolor": INK, "markersize": 7, "zorder": 2}
+        axes.plot(base_row["kept"], base_row[key], "D", label="base", **style)
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def label_counts(axes: Any) -> None:
+    """Round numbers on the log axis, 1-2-5 in each decade that is shown, written out."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_xlabel("Gaussians kept (log scale)")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda count, _: f"{count:,.0f}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+@contextmanager
+def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
+    """A matplotlib figure in the house style; without pyplot, so a notebook's own figures are left alone.
+
+    Raises:
+        ClodError: matplotlib is not installed.
+    """
+    try:
+        import matplotlib
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ClodError("pictures need matplotlib: pip install 'clod-adapter[demo]'") from error
+    with matplotlib.rc_context(STYLE):
+        yield Figure(figsize=inches, dpi=DPI, facecolor="white", **options)
+
+
+def save(figure: Any, path: str | Path) -> None:
+    """Writes the figure; the file appears whole or not at all."""
+    with atomic_path(path) as part:
+        figure.savefig(part, facecolor="white")

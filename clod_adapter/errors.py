@@ -1,0 +1,11 @@
+"""The one exception type for bad input and bad use."""
+
+from __future__ import annotations
+
+
+class ClodError(Exception):
+    """Something the user gave cannot be used.
+
+    The message is one line that names the file or field, says what is wrong with it and what to do
+    about it. The command line prints it and exits with code 2.
+    """

@@ -1,0 +1,92 @@
+"""The container of a splat: a frozen, shape-checked set of Gaussians."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+
+SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians in the form checkpoints store them, and, once adapted, their distance decay.
+
+    Attributes:
+        means: ``[N, 3]`` centres, world units.
+        quats: ``[N, 4]`` rotations, wxyz; not necessarily of unit length.
+        log_scales: ``[N, 3]`` logarithms of the standard deviations along the axes, world units.
+        opacity_logits: ``[N]``; the opacity is their sigmoid. +inf means fully opaque.
+        sh0: ``[N, 1, 3]`` degree-0 spherical harmonics.
+        shN: ``[N, K-1, 3]`` higher bands, K in {1, 4, 9, 16, 25}.
+        sigma_d: ``[N]`` distance decay of opacity, or None for a checkpoint without a dial.
+        attenuation: how ``sigma_d`` is to be read; present exactly when ``sigma_d`` is.
+
+    Raises:
+        ClodError: a tensor has the wrong shape, or one of sigma_d and attenuation is missing.
+    """
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    sh0: Tensor
+    shN: Tensor
+    sigma_d: Tensor | None = None
+    attenuation: AttenuationConfig | None = None
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0]
+        expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,), "sh0": (n, 1, 3)}
+        if self.sigma_d is not None:
+            expected["sigma_d"] = (n,)
+        for name, shape in expected.items():
+            found = tuple(getattr(self, name).shape)
+            if found != shape:
+                raise ClodError(f"Gaussians.{name} has shape {found}, expected {shape}")
+        if self.shN.shape[0] != n or self.shN.shape[2:] != (3,) or self.shN.shape[1] + 1 not in SH_COUNTS.values():
+            raise ClodError(
+                f"Gaussians.shN has shape {tuple(self.shN.shape)}, expected ({n}, K-1, 3) with K-1 in 0, 3, 8, 15, 24"
+            )
+        if (self.sigma_d is None) != (self.attenuation is None):
+            raise ClodError("Gaussians needs both sigma_d and attenuation, or neither")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        return {k - 1: d for d, k in SH_COUNTS.items()}[self.shN.shape[1]]
+
+    @property
+    def scales(self) -> Tensor:
+        """``[N, 3]`` standard deviations, ``exp(log_scales)``."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        """``[N]`` in [0, 1], ``sigmoid(opacity_logits)``."""
+        return self.opacity_logits.sigmoid()
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensor fields by name, without an absent sigma_d."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return {name: value for name, value in values.items() if isinstance(value, Tensor)}
+
+    def replace(self, **changes: Tensor | AttenuationConfig | None) -> Gaussians:
+        """A copy with the named fields replaced."""
+        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
+
+    def select(self, rows: Tensor) -> Gaussians:
+        """The Gaussians at ``rows`` (a boolean mask ``[N]`` or indices ``[M]``)."""
+        return self.replace(**{name: value[rows] for name, value in self.tensors().items()})
+
+    def to(self, device: torch.device | str) -> Gaussians:
+        """A copy on another device."""
+        return self.replace(**{name: value.to(device) for name, value in self.tensors().items()})

@@ -1,0 +1,89 @@
+"""Adapters as safetensors files: tensors, and one JSON document that says what they are.
+
+Tensors: ``sigma_d`` float32, and under its attribute's name each update, whose type tells what it is:
+float16 a difference from the base, float32 the new values. The JSON stands under the metadata key
+``clod_adapter``; being one key it is written in one order, so equal adapters give equal files.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from safetensors import safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from clod_adapter.adapter import Adapter
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.version import package_version
+
+KEY = "clod_adapter"
+FORMAT = "clod-adapter"
+FORMAT_VERSION = 1
+
+
+def save_adapter(path: str | Path, adapter: Adapter) -> None:
+    """Writes an adapter; loading it gives the same tensors and settings, bit for bit.
+
+    Raises:
+        ClodError: its config is not plain JSON, or the file cannot be written.
+    """
+    about = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "package_version": package_version(),
+        "base_sha256": adapter.base_fingerprint,
+        "attenuation": asdict(adapter.attenuation),
+        "config": adapter.config,
+    }
+    try:
+        metadata = {KEY: json.dumps(about, sort_keys=True, allow_nan=False)}
+    except (TypeError, ValueError) as error:
+        raise ClodError(f"{path}: the adapter's config is not plain JSON ({error}); use numbers and strings") from error
+    tensors = {"sigma_d": adapter.sigma_d, **adapter.updates}
+    with atomic_path(path) as temporary:
+        # Not save_file, which makes files that only their owner can read.
+        temporary.write_bytes(save({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, metadata))
+
+
+def load_adapter(path: str | Path) -> Adapter:
+    """Reads an adapter.
+
+    Raises:
+        ClodError: the file cannot be read, is damaged, no adapter, or of a newer format.
+    """
+    tensors, metadata = _read(Path(path))
+    if KEY not in metadata:
+        raise ClodError(f"{path}: is a safetensors file but no clod-adapter; give a file that this package wrote")
+    try:
+        about = json.loads(metadata[KEY])
+        version = about["format_version"]
+        if about["format"] != FORMAT or version > FORMAT_VERSION:
+            raise ClodError(f"format {about['format']} {version} is too new for this version; upgrade clod-adapter")
+        return Adapter(
+            sigma_d=tensors.pop("sigma_d"),
+            attenuation=AttenuationConfig(**about["attenuation"]),
+            updates=tensors,
+            base_fingerprint=about["base_sha256"],
+            config=about["config"],
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ClodError(f"{path}: its description is damaged ({error!r}); copy or export the adapter again") from error
+    except ClodError as error:
+        raise ClodError(f"{path}: {error}") from error
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    try:
+        with safe_open(path, framework="pt") as file:
+            # Copies, since the file may change under a memory map.
+            return {name: file.get_tensor(name).clone() for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+    except OSError as error:
+        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    except Exception as error:  # SafetensorError, and whatever a crafted header provokes
+        raise ClodError(f"{path}: is no safetensors file or damaged ({error}); copy or export it again") from error

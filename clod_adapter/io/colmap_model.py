@@ -1,0 +1,130 @@
+"""COLMAP models: finding one, refusing damaged ones, and the posed pinhole cameras in it."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from clod_adapter.errors import ClodError
+
+PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE")
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """An image of a model: its name, ``[4, 4]`` world to camera, ``[3, 3]`` intrinsics (pixels), size."""
+
+    name: str
+    viewmat: np.ndarray
+    K: np.ndarray
+    width: int
+    height: int
+
+
+def find_model(folder: Path) -> Path:
+    """The folder of the model: ``sparse/0``, ``sparse`` or ``folder`` itself, the first that has one.
+
+    Then the first two beside ``folder``, which may be the images' own.
+
+    Raises:
+        ClodError: none of them has.
+    """
+    beside = folder.resolve().parent / "sparse"
+    for candidate in (folder / "sparse" / "0", folder / "sparse", folder, beside / "0", beside):
+        for suffix in ("bin", "txt"):
+            if all((candidate / f"{name}.{suffix}").is_file() for name in ("cameras", "images", "points3D")):
+                return candidate
+    raise ClodError(
+        f"{folder}: no COLMAP model (cameras, images, points3D as .bin or .txt) in sparse/0, sparse or the folder "
+        "itself; give the folder that holds images/ and sparse/0"
+    )
+
+
+def read_model(model: Path) -> tuple[list[PosedImage], list[str]]:
+    """The registered images of a model, sorted by name, and notes.
+
+    Raises:
+        ClodError: the model is damaged or empty, or a camera is not an undistorted pinhole.
+    """
+    _check_complete(model)
+    try:
+        reconstruction = pycolmap.Reconstruction(str(model))
+        images = sorted(reconstruction.images.values(), key=lambda image: image.name)
+        posed = [_posed_image(model, image) for image in images if image.has_pose]
+    except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ClodError(f"{model}: COLMAP cannot read this model ({reason}); copy or export it again") from error
+    if not posed:
+        raise ClodError(f"{model}: the model has no registered image; run COLMAP's mapper again")
+    unposed = len(images) - len(posed)
+    return posed, [f"{unposed} images of the model have no pose and are left out"] if unposed else []
+
+
+def _posed_image(model: Path, image: pycolmap.Image) -> PosedImage:
+    camera = image.camera
+    assert camera is not None  # a Reconstruction gives every image its camera
+    if camera.model_name not in PINHOLE_MODELS:
+        raise ClodError(
+            f"{model}: image {image.name} has camera model {camera.model_name}, only {' and '.join(PINHOLE_MODELS)} "
+            "can be rendered; undistort first: colmap image_undistorter --image_path IMAGES --input_path SPARSE "
+            "--output_path OUT"
+        )
+    K = np.asarray(camera.calibration_matrix(), np.float64)
+    viewmat = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+    finite = np.isfinite(K).all() and np.isfinite(viewmat).all()
+    if not finite or K[0, 0] <= 0 or K[1, 1] <= 0 or not 0 < camera.width * camera.height < math.inf:
+        raise ClodError(f"{model}: image {image.name} has a camera or pose that is not usable; copy the model again")
+    return PosedImage(image.name, viewmat, K, camera.width, camera.height)
+
+
+def _check_complete(model: Path) -> None:
+    """Walks the binary records, as COLMAP reads past the end of a cut file until memory runs out."""
+    for name, after in _RECORDS.items():
+        path = model / name
+        if not path.is_file():
+            continue
+        data = path.read_bytes()
+        try:
+            at = 8
+            for _ in range(struct.unpack_from("<Q", data)[0]):
+                at = after(data, at)
+        except (struct.error, ValueError, OverflowError):
+            at = len(data) + 1
+        if at > len(data):
+            raise ClodError(f"{path}: is truncated or damaged; copy or export the model again")
+
+
+def _count(data: bytes, at: int) -> int:
+    return struct.unpack_from("<Q", data, at)[0]
+
+
+def _camera_end(data: bytes, at: int) -> int:
+    model = pycolmap.CameraModelId(struct.unpack_from("<i", data, at + 4)[0])
+    parameters = pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params  # ValueError: no such model
+    return at + 24 + 8 * len(parameters)  # id, model, width, height, parameters
+
+
+def _rig_end(data: bytes, at: int) -> int:
+    sensors = struct.unpack_from("<I", data, at + 4)[0]
+    at += 16 if sensors else 8  # id, count, the reference sensor
+    for _ in range(sensors - 1):
+        at += 65 if struct.unpack_from("<?", data, at + 8)[0] else 9  # sensor, whether it has a pose, the pose
+    return at
+
+
+# Where the record that starts at a position ends, by file.
+_RECORDS = {
+    "cameras.bin": _camera_end,
+    "rigs.bin": _rig_end,
+    # id, rotation, translation, camera id, name, keypoints
+    "images.bin": lambda data, at: (end := data.index(b"\0", at + 64) + 1) + 8 + 24 * _count(data, end),
+    # id, position, colour, error, track
+    "points3D.bin": lambda data, at: at + 51 + 8 * _count(data, at + 43),
+    # id, rig id, rotation, translation, members (the count has 32 bits here)
+    "frames.bin": lambda data, at: at + 68 + 16 * struct.unpack_from("<I", data, at + 64)[0],
+}

@@ -1,0 +1,205 @@
+"""Checkpoints as PLY files: a tolerant reader, and a strict writer of the extended file."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement
+
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, read_table, sh_degree_of
+from clod_adapter.io.ply_header import all_comments, read_attenuation, read_header, write_comments
+
+NORMALS = ("nx", "ny", "nz")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A PLY as read: its Gaussians, and what the writer needs to give the rest back untouched.
+
+    Attributes:
+        gaussians: the usable Gaussians, float32; with sigma_d and attenuation if the file is extended.
+        vertex: ``[N]`` structured array, the same rows with every column of the file, in file order
+            and type, native byte order.
+        comments: the header's comments.
+        notes: what was dropped or noticed, one line each, for the report.
+        fingerprint: SHA-256 of the file's bytes, hex.
+        path: where it was read from.
+    """
+
+    gaussians: Gaussians
+    vertex: np.ndarray
+    comments: tuple[str, ...]
+    notes: tuple[str, ...]
+    fingerprint: str
+    path: Path
+
+
+def load(path: str | Path) -> Checkpoint:
+    """Reads a checkpoint of plain Gaussians, in Inria's, MaskGaussian's or our extended layout.
+
+    Any property order, byte order or ascii, with or without normals, SH degree 0 to 4. Rows with a
+    value that is not finite in a used column, or with a zero rotation, are dropped and counted in
+    the notes; opacity = +inf stays and means fully opaque. In MaskGaussian's old layout
+    (``masks_0, masks_1``) rows with existence probability sigmoid(masks_0 - masks_1) < 0.5 go too.
+
+    Raises:
+        ClodError: not a PLY, damaged, another kind of PLY, or nothing usable in it.
+    """
+    path = Path(path)
+    header = read_header(path)
+    if "vertex" not in header:
+        found = ", ".join(element.name for element in header) or "none"
+        raise ClodError(f"{path}: has no vertex element (elements: {found}); give a splat in Inria's 3DGS layout")
+    columns = column_map(sh_degree_of(path, header["vertex"]))
+    vertex = _read_vertex(path)
+    names = [name for group in columns.values() for name in group]
+    extras = [name for name in (SIGMA, *MASKS) if name in (vertex.dtype.names or ())]
+    table = read_table(vertex, names + extras)
+    keep, notes = _usable_rows(path, table, names + extras)
+    if not keep.all():
+        vertex, table = vertex[keep], table[keep]
+    gaussians = _gaussians(table, columns)
+    comments = all_comments(header)
+    if SIGMA in extras:
+        attenuation, remarks = read_attenuation(path, comments)
+        sigma_d = torch.from_numpy(table[:, len(names)].copy())
+        gaussians = gaussians.replace(sigma_d=sigma_d, attenuation=attenuation)
+        notes += remarks
+    return Checkpoint(gaussians, vertex, comments, (*notes, *_not_kept(header)), _sha256(path), path)
+
+
+def save(path: str | Path, gaussians: Gaussians, base: Checkpoint | None = None) -> None:
+    """Writes ``gaussians`` as an extended file: the base's columns, then ``sigma_d``.
+
+    Without a base the columns are those of Inria's layout.
+
+    Row ``i`` of ``gaussians`` is row ``i`` of ``base``. Columns keep name, order and type; a value is
+    overwritten only where it differs from the base's float32 reading, so what was not tuned stays
+    byte-equal. The settings follow the element line as comments. Without a sigma_d a plain file results.
+
+    Raises:
+        ClodError: the Gaussians do not match the base, a new value is not finite, the target is the
+            base itself or cannot be written.
+    """
+    path, base = Path(path), base or blank(len(gaussians), gaussians.sh_degree)
+    if path.is_file() and base.path.is_file() and path.samefile(base.path):
+        raise ClodError(f"{path}: is the input file, which is never overwritten; choose another output")
+    if len(gaussians) != len(base.vertex) or gaussians.sh_degree != base.gaussians.sh_degree:
+        raise ClodError(
+            f"{path}: {len(gaussians)} Gaussians of SH degree {gaussians.sh_degree} do not fit their base {base.path} "
+            f"({len(base.vertex)} of degree {base.gaussians.sh_degree}); save with the checkpoint they came from"
+        )
+    comments = write_comments(gaussians.attenuation, base.comments)
+    element = PlyElement.describe(_merged(path, gaussians, base.vertex), "vertex", comments=comments)
+    with atomic_path(path) as temporary:
+        PlyData([element], byte_order="<").write(str(temporary))
+
+
+def blank(count: int, sh_degree: int) -> Checkpoint:
+    """A base of zeros in Inria's layout (normals included), for Gaussians that come from no file."""
+    groups = column_map(sh_degree)
+    order = ("means", None, "sh0", "shN", "opacity_logits", "log_scales", "quats")
+    names = [name for attribute in order for name in (_in_file_order(groups[attribute]) if attribute else NORMALS)]
+    vertex = np.zeros(count, [(name, "f4") for name in names])
+    return Checkpoint(_gaussians(read_table(vertex, sum(groups.values(), ())), groups), vertex, (), (), "", Path())
+
+
+def _in_file_order(group: tuple[str, ...]) -> list[str]:
+    """f_rest_0, f_rest_1, ...: the column map lists them by coefficient."""
+    return sorted(group, key=lambda name: int(name.rsplit("_", 1)[1])) if group and "_" in group[0] else list(group)
+
+
+def _read_vertex(path: Path) -> np.ndarray:
+    try:
+        with np.errstate(over="ignore"):
+            data = PlyData.read(str(path), mmap="r")["vertex"].data
+            return np.array(data, dtype=data.dtype.newbyteorder("="))  # a copy, so that the file is let go
+    except Exception as error:  # plyfile lets ValueError and more through, besides its own errors
+        raise ClodError(f"{path}: damaged or truncated ({error}); copy or export it again") from error
+
+
+def _usable_rows(path: Path, table: np.ndarray, names: list[str]) -> tuple[np.ndarray, list[str]]:
+    """``[N]`` bool, which rows to keep, and a note for every reason by which some went."""
+    total = len(table)
+    opacity = table[:, names.index("opacity")]
+    finite = np.isfinite(table)
+    finite[:, names.index("opacity")] |= opacity == np.inf
+    rotated = (table[:, [names.index(name) for name in column_map(0)["quats"]]] != 0).any(1)
+    exists = np.ones(total, bool)
+    if all(name in names for name in MASKS):
+        first, second = (table[:, names.index(name)] for name in MASKS)
+        exists = ~(first < second)  # as sigmoid(first - second) >= 0.5; NaN is for the next rule
+    notes, keep = [], np.ones(total, bool)
+    for rule, reason in (
+        (exists, "MaskGaussian existence probability below 0.5"),
+        (finite.all(1), "a value is not finite"),
+        (rotated, "rotation is zero"),
+    ):
+        gone = int((keep & ~rule).sum())
+        keep = keep & rule
+        if gone:
+            notes.append(f"{gone} of {total} Gaussians dropped: {reason}")
+    if not keep.any():
+        raise ClodError(f"{path}: no usable Gaussian in it ({'; '.join(notes) or 'it has 0 rows'}); export it again")
+    opaque = int((opacity[keep] == np.inf).sum())
+    return keep, notes + ([f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque"] if opaque else [])
+
+
+def _gaussians(table: np.ndarray, columns: dict[str, tuple[str, ...]]) -> Gaussians:
+    tensors: dict[str, Any] = {}
+    start = 0
+    for name, group in columns.items():
+        shape = {"opacity_logits": (), "sh0": (1, 3), "shN": (len(group) // 3, 3)}.get(name, (len(group),))
+        values = table[:, start : start + len(group)].copy()
+        tensors[name] = torch.from_numpy(values.reshape(len(table), *shape))
+        start += len(group)
+    return Gaussians(**tensors)
+
+
+def _merged(path: Path, gaussians: Gaussians, vertex: np.ndarray) -> np.ndarray:
+    """The base's rows with changed values written in and sigma_d as the last column."""
+    names = [name for name in vertex.dtype.names or () if name != SIGMA]
+    dtype = [(name, vertex.dtype[name]) for name in names]
+    merged = np.empty(len(vertex), dtype + ([(SIGMA, np.dtype("f4"))] if gaussians.sigma_d is not None else []))
+    for name in names:
+        merged[name] = vertex[name]
+    for attribute, group in column_map(gaussians.sh_degree).items():
+        new = _numpy(getattr(gaussians, attribute)).reshape(len(vertex), -1)
+        changed = new.view(np.uint32) != read_table(vertex, group).view(np.uint32)
+        if not np.isfinite(new[changed]).all():
+            raise ClodError(f"{path}: {attribute} holds a new value that is not finite; the tuning has diverged")
+        for column in np.flatnonzero(changed.any(0)):
+            rows = changed[:, column]
+            merged[group[column]][rows] = new[rows, column]
+    if gaussians.sigma_d is not None:
+        merged[SIGMA] = _numpy(gaussians.sigma_d)
+        if not np.isfinite(merged[SIGMA]).all():
+            raise ClodError(f"{path}: {SIGMA} holds a value that is not finite; use a large number for no decay")
+    return merged
+
+
+def _numpy(tensor: torch.Tensor) -> np.ndarray:
+    return np.ascontiguousarray(tensor.detach().float().cpu().numpy())
+
+
+def _not_kept(header: PlyData) -> list[str]:
+    """A note on the parts of the file that an output will not carry."""
+    parts = [f"element {element.name}" for element in header if element.name != "vertex"]
+    parts += ["obj_info"] if header.obj_info else []
+    return [f"not carried over to outputs: {', '.join(parts)}"] if parts else []
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        for block in iter(lambda: file.read(1 << 20), b""):
+            digest.update(block)
+    return digest.hexdigest()

@@ -1,0 +1,103 @@
+"""The columns of a splat PLY: what they are called and which files are not plain splats.
+
+The names ``f_dc_*`` and ``f_rest_*`` exist nowhere else; the reader and the writer share this map.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyElement, PlyListProperty
+
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import SH_COUNTS
+
+SIGMA = "sigma_d"
+MASKS = ("masks_0", "masks_1")
+
+# (column pattern, what such a file is, what to do about it)
+FOREIGN = (
+    (r"packed_\w+", "a compressed PLY", "decompress it first: splat-transform IN.ply OUT.ply"),
+    (
+        r"f_offset_\d+|f_anchor_feat_\d+",
+        "a Scaffold-GS or Octree-GS file: anchors from which a network makes Gaussians per view",
+        "use a checkpoint of 3DGS or of a method that keeps plain Gaussians",
+    ),
+    (
+        r"filter_3D",
+        "a Mip-Splatting file whose 3D filter is not yet part of scale and opacity",
+        "fuse it first with Mip-Splatting's create_fused_ply.py",
+    ),
+)
+
+
+def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
+    """The columns of each Gaussians attribute, in the order of its flattened values.
+
+    ``f_rest`` is channel-major in the file: ``f_rest_{c * (K-1) + k}`` is ``shN[:, k, c]``.
+    """
+    bands = SH_COUNTS[sh_degree] - 1
+    return {
+        "means": ("x", "y", "z"),
+        "quats": tuple(f"rot_{i}" for i in range(4)),
+        "log_scales": tuple(f"scale_{i}" for i in range(3)),
+        "opacity_logits": ("opacity",),
+        "sh0": tuple(f"f_dc_{c}" for c in range(3)),
+        "shN": tuple(f"f_rest_{c * bands + k}" for k in range(bands) for c in range(3)),
+    }
+
+
+def read_table(vertex: np.ndarray, names: Iterable[str]) -> np.ndarray:
+    """``[N, P]`` float32 copy of the named columns; values beyond float32's range become infinite."""
+    names = list(names)
+    table = np.empty((len(vertex), len(names)), np.float32)
+    rows = 4096  # a block of rows stays in cache while its columns are picked out, which is 8 times faster
+    with np.errstate(over="ignore"):
+        for start in range(0, len(vertex), rows):
+            block = vertex[start : start + rows]
+            for column, name in enumerate(names):
+                table[start : start + rows, column] = block[name]
+    return table
+
+
+def sh_degree_of(path: Path, vertex: PlyElement) -> int:
+    """The SH degree of a file with plain Gaussians, judged by its header.
+
+    Raises:
+        ClodError: the file holds something else, or a needed column is missing or of a wrong type.
+    """
+    types = {p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype for p in vertex.properties}
+    _refuse_foreign(path, set(types))
+    rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in types)
+    degrees = {3 * (count - 1): degree for degree, count in SH_COUNTS.items()}
+    if rest not in degrees:
+        wanted = ", ".join(map(str, degrees))
+        raise ClodError(f"{path}: {rest} f_rest_* properties fit no SH degree ({wanted} do); export the file again")
+    for name in [name for group in column_map(degrees[rest]).values() for name in group]:
+        if name not in types:
+            raise ClodError(f"{path}: property {name} is missing; export the file again in Inria's 3DGS layout")
+        if types[name] not in ("f4", "f8"):
+            raise ClodError(f"{path}: property {name} is not float or double; export the file again with float columns")
+    lists = [name for name, kind in types.items() if kind == "list"]
+    if lists:
+        raise ClodError(f"{path}: property {lists[0]} is a list, which splat viewers cannot read; remove it")
+    return degrees[rest]
+
+
+def _refuse_foreign(path: Path, names: set[str]) -> None:
+    for pattern, what, remedy in FOREIGN:
+        found = sorted(name for name in names if re.fullmatch(pattern, name))
+        if found:
+            raise ClodError(f"{path}: property {found[0]} says this is {what}; {remedy}")
+    if not names & {"f_dc_0", "scale_0"}:
+        raise ClodError(
+            f"{path}: properties f_dc_0 and scale_0 are missing, so this is a mesh or a point cloud; "
+            "give the point_cloud.ply that a 3DGS trainer writes"
+        )
+    if {"scale_0", "scale_1"} <= names and "scale_2" not in names:
+        raise ClodError(
+            f"{path}: property scale_2 is missing, so this is a 2DGS file of flat disks; use a 3DGS checkpoint"
+        )

@@ -1,0 +1,96 @@
+"""PLY headers: a look before the data is read, and the comments that carry the dial's settings."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from plyfile import PlyData
+
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.io.version import package_version
+
+PREFIX = "clod_adapter "
+_HEADER_LIMIT = 1 << 20  # bytes; a longer header is no header
+
+
+def read_header(path: Path) -> PlyData:
+    """The elements, properties and comments of a PLY without its data; every element has 0 rows.
+
+    A large mesh given by mistake is so refused at once instead of after minutes of parsing faces.
+
+    Raises:
+        ClodError: the file cannot be read or is not a PLY.
+    """
+    try:
+        with open(path, "rb") as file:
+            start = file.read(_HEADER_LIMIT)
+    except OSError as error:
+        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    if not re.match(rb"ply\r?\n|ply\r", start):
+        raise ClodError(f"{path}: is not a PLY file; convert it to a .ply in Inria's 3DGS layout first")
+    end = re.search(rb"[\r\n]end_header(\r?\n|\r)", start)
+    if end is None:
+        raise ClodError(f"{path}: the PLY header has no end, so the file is truncated; copy or export it again")
+    header = re.sub(rb"\r\n?", b"\n", start[: end.end()])
+    if not header.isascii():
+        raise ClodError(f"{path}: the PLY header holds a character that is not ASCII; remove it from the comments")
+    header = re.sub(rb"(?m)^([ \t]*element[ \t]+\S+[ \t]+)\d+", rb"\g<1>0", header)
+    try:
+        return PlyData.read(io.BytesIO(header), mmap=False)
+    except Exception as error:  # plyfile lets ValueError and more through, besides its own errors
+        raise ClodError(f"{path}: the PLY header is damaged ({error}); export the file again") from error
+
+
+def all_comments(ply: PlyData) -> tuple[str, ...]:
+    """Every comment of the header: the file's own, then each element's."""
+    return (*ply.comments, *(comment for element in ply for comment in element.comments))
+
+
+def write_comments(config: AttenuationConfig | None, inherited: Iterable[str]) -> list[str]:
+    """The comments of an output: the base's, then ours, which replace any the base had.
+
+    One comment per field of ``config``, as ``clod_adapter tau 0.00392156862745098``: the shortest
+    decimal that gives back the same double.
+    """
+    comments = [comment for comment in inherited if not comment.startswith(PREFIX)]
+    comments.append(f"{PREFIX}version {package_version()}")
+    for field in fields(config) if config is not None else ():
+        value = getattr(config, field.name)
+        kind: Any = type(field.default)
+        comments.append(f"{PREFIX}{field.name} {value if value is None else kind(value)}")
+    return comments
+
+
+def read_attenuation(path: Path, comments: Iterable[str]) -> tuple[AttenuationConfig, list[str]]:
+    """The settings in the header's comments, defaults where they are silent, and notes on both.
+
+    Raises:
+        ClodError: a comment of ours holds a value that is no setting.
+    """
+    ours = [comment[len(PREFIX) :].split(maxsplit=1) for comment in comments if comment.startswith(PREFIX)]
+    stored = {words[0]: words[1].strip() for words in ours if len(words) == 2}
+    stored.pop("version", None)
+    kinds = {field.name: type(field.default) for field in fields(AttenuationConfig)}
+    missing = [name for name in kinds if name not in stored]
+    notes = []
+    if missing:
+        notes.append(f"sigma_d without header comments on {', '.join(missing)}: defaults used")
+    if unknown := [name for name in stored if name not in kinds]:
+        notes.append(f"settings unknown to this version ignored: {', '.join(unknown)}")
+    try:
+        values = {name: _parse(stored[name], kind) for name, kind in kinds.items() if name in stored}
+        return AttenuationConfig(**values), notes
+    except (ValueError, ClodError) as error:
+        raise ClodError(f"{path}: a clod_adapter header comment is unusable ({error}); restore or remove it") from error
+
+
+def _parse(text: str, kind: type) -> Any:
+    if text == "None":
+        return None
+    return text == "True" if kind is bool else kind(text)

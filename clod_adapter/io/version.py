@@ -1,0 +1,13 @@
+"""The package's version, for the headers of the files it writes."""
+
+from __future__ import annotations
+
+from importlib import metadata
+
+
+def package_version() -> str:
+    """The installed version, or "0" when run from a checkout that is not installed."""
+    try:
+        return metadata.version("clod-adapter")
+    except metadata.PackageNotFoundError:
+        return "0"

@@ -1,0 +1,28 @@
+"""Image metrics as the field reports them: clamped renders against 8-bit photographs."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor
+
+from clod_adapter.losses import ssim
+
+
+def psnr(image: Tensor, target: Tensor) -> float:
+    """PSNR in dB of a ``[H, W, 3]`` float render, clamped to [0, 1], against a uint8 photograph.
+
+    ``-10 log10 mean (image - target)^2``; infinite for equal images.
+    """
+    shown, wanted = _comparable(image, target)
+    error = float((shown - wanted).double().square().mean())
+    return -10 * math.log10(error) if error > 0 else math.inf
+
+
+def psnr_ssim(image: Tensor, target: Tensor) -> tuple[float, float]:
+    """``psnr``, and SSIM as in ``losses.ssim``, which takes much longer."""
+    return psnr(image, target), float(ssim(*_comparable(image, target)))
+
+
+def _comparable(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    return image.detach().clamp(0, 1), target.to(image) / 255

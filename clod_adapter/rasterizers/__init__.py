@@ -1,0 +1,47 @@
+"""Rasterizers behind one protocol. They know nothing of ``sigma_d``: opacities go in, pixels come out."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from clod_adapter.cameras import Camera
+from clod_adapter.errors import ClodError
+
+
+class Rasterizer(Protocol):
+    """Splats activated Gaussians into one camera.
+
+    Args:
+        means: ``[N, 3]`` world units.
+        quats: ``[N, 4]`` wxyz, any length but zero.
+        scales: ``[N, 3]`` standard deviations, world units.
+        opacities: ``[N]`` in [0, 1]; rows below 1/255 are skipped before any other work.
+        sh0: ``[N, 1, 3]``; shN: ``[N, K-1, 3]``.
+        camera: where from; no gradient.
+        background: ``[3]``.
+
+    Returns:
+        The image ``[H, W, 3]``, not clamped, and the accumulated alpha ``[H, W]``; both
+        differentiable in every tensor argument.
+    """
+
+    def __call__(
+        self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor,
+        camera: Camera, background: Tensor,
+    ) -> tuple[Tensor, Tensor]: ...  # fmt: skip
+
+
+def for_device(device: torch.device) -> Rasterizer:
+    """The fastest rasterizer for tensors on ``device``, imported on first use.
+
+    Raises:
+        ClodError: there is none for that kind of device.
+    """
+    if device.type == "cpu":
+        from clod_adapter.rasterizers import cpu
+
+        return cpu.rasterize
+    raise ClodError(f"no rasterizer for device {device}: move the Gaussians to the CPU with .to('cpu')")

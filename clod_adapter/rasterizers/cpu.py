@@ -1,0 +1,171 @@
+"""Tile-based splatting on the CPU, compiled by Numba: forward and all gradients, several threads."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from clod_adapter._kernels import blend, project, threads, tiles
+from clod_adapter.cameras import Camera
+
+
+class _Buffers:
+    """Scratch arrays kept between calls: a fresh large array costs more in page faults than the work in it."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, np.ndarray] = {}
+
+    def get(self, name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+        size = int(np.prod(shape))
+        flat = self._arrays.get(name)
+        if flat is None or flat.size < size:
+            flat = self._arrays[name] = np.empty(size + size // 4, dtype)
+        return flat[:size].reshape(shape)
+
+
+_idle: list[_Buffers] = []
+_lock = threading.Lock()
+
+
+def _take() -> _Buffers:
+    with _lock:
+        return _idle.pop() if _idle else _Buffers()
+
+
+def _give(buffers: _Buffers) -> None:
+    with _lock:
+        if len(_idle) < 4:
+            _idle.append(buffers)
+
+
+@dataclass
+class _Frame:
+    """What the forward pass leaves for the backward pass. The arrays are views of pooled buffers."""
+
+    buffers: _Buffers
+    camera: np.ndarray
+    width: int
+    height: int
+    across: int
+    records: np.ndarray
+    packed_ids: np.ndarray
+    counts: np.ndarray
+    ranks: np.ndarray
+    slots: np.ndarray
+    entries: np.ndarray
+    entry_slots: np.ndarray
+    offsets: np.ndarray
+    tiles: np.ndarray
+    workers: int
+
+
+def camera_vector(camera: Camera) -> np.ndarray:
+    """The camera as the kernels read it (layout in ``_kernels/project.py``)."""
+    out = np.empty(project.CAMERA, np.float32)
+    K = camera.K.detach().cpu().double()
+    fx, fy, cx, cy = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    out[:16] = camera.viewmat.detach().cpu().numpy().reshape(-1)
+    out[16:22] = fx, fy, cx, cy, camera.width, camera.height
+    margin_x, margin_y = 0.15 * camera.width / fx, 0.15 * camera.height / fy
+    out[22:24] = -(cx / fx + margin_x), (camera.width - cx) / fx + margin_x
+    out[24:26] = -(cy / fy + margin_y), (camera.height - cy) / fy + margin_y
+    out[26:29] = camera.position.detach().cpu().numpy()
+    return out
+
+
+def _project(buffers: _Buffers, arrays: list[np.ndarray], degree: int, cam: np.ndarray, workers: int) -> Any:
+    """Visible records in depth order; and of the packed, unsorted ones: row numbers, counts, ranks in depth order."""
+    n = len(arrays[0])
+    packed = buffers.get("packed", (n * tiles.RECORD,), np.float32)
+    depths, packed_ids = buffers.get("depths", (n,), np.float32), buffers.get("packed_ids", (n,), np.int32)
+    counts = np.zeros(workers, np.int64)
+    threads.run(project.project, workers, *arrays, degree, cam, packed, depths, packed_ids, counts)
+    visible = int(counts.sum())
+    keys, order = buffers.get("keys", (visible,), np.uint32), buffers.get("order", (visible,), np.int32)
+    other = buffers.get("keys2", (visible,), np.uint32), buffers.get("order2", (visible,), np.int32)
+    at = 0
+    for worker, count in enumerate(counts.tolist()):
+        first = n * worker // workers
+        keys[at : at + count] = depths[first : first + count].view(np.uint32)
+        order[at : at + count] = np.arange(first, first + count, dtype=np.int32)
+        at += count
+    order = tiles.radix_sort(keys, order, *other, visible)
+    records, ranks = buffers.get("records", (visible * tiles.RECORD,), np.float32), buffers.get("ranks", (n,), np.int32)
+    threads.run(project.gather, workers, order, packed, records, ranks)
+    return records, packed_ids, counts, ranks
+
+
+def _prepare(arrays: list[np.ndarray], degree: int, camera: Camera, workers: int) -> _Frame:
+    """Projection, depth order and tile lists."""
+    buffers, cam = _take(), camera_vector(camera)
+    records, packed_ids, counts, ranks = _project(buffers, arrays, degree, cam, workers)
+    visible = int(counts.sum())
+    across, down = -(-camera.width // tiles.TILE), -(-camera.height // tiles.TILE)
+    histogram = np.empty((workers, across * down), np.int64)
+    offsets, slots = np.empty(across * down + 1, np.int64), buffers.get("slots", (visible + 1,), np.int64)
+    threads.run(tiles.count_tiles, workers, records, visible, across, histogram, slots)
+    total = tiles.tile_offsets(histogram, offsets, slots, visible)
+    entries, entry_slots = buffers.get("entries", (total,), np.int32), buffers.get("entry_slots", (total,), np.int32)
+    threads.run(tiles.fill_tiles, workers, records, visible, across, histogram, slots, entries, entry_slots)
+    # The longest lists first, so that no thread starts a long tile when the others are done.
+    longest_first = np.argsort(-np.diff(offsets), kind="stable")
+    return _Frame(
+        buffers, cam, camera.width, camera.height, across, records, packed_ids, counts, ranks, slots, entries,
+        entry_slots, offsets, longest_first, workers,
+    )  # fmt: skip
+
+
+def _arrays(tensors: Any) -> list[np.ndarray]:
+    """Contiguous float32 arrays of means, quats, scales, opacities, sh0 and shN; the SH flat."""
+    arrays = [x.detach().contiguous().numpy() for x in tensors]
+    return [*arrays[:4], arrays[4].reshape(-1), arrays[5].reshape(-1)]
+
+
+class _Splat(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, means, quats, scales, opacities, sh0, shN, background, camera, degree):  # type: ignore[no-untyped-def]
+        frame = _prepare(_arrays((means, quats, scales, opacities, sh0, shN)), degree, camera, threads.worker_count())
+        image, alpha = torch.empty(frame.height, frame.width, 3), torch.empty(frame.height, frame.width)
+        threads.run(
+            blend.blend, frame.workers, frame.records, frame.entries, frame.offsets, frame.across, frame.width,
+            frame.height, background.detach().numpy(), frame.tiles, np.zeros(1, np.int64), image.numpy(), alpha.numpy(),
+        )  # fmt: skip
+        ctx.frame, ctx.degree = frame, degree
+        ctx.save_for_backward(means, quats, scales, opacities, sh0, shN, background, image, alpha)
+        weakref.finalize(frame, _give, frame.buffers)
+        return image, alpha
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor):  # type: ignore[no-untyped-def, override]
+        *inputs, background, image, alpha = ctx.saved_tensors
+        frame: _Frame = ctx.frame
+        v_image, v_alpha = (g.contiguous().numpy() for g in gradients)
+        *arrays, _sh0, shN = _arrays(inputs)
+        pair_sums = frame.buffers.get("pair_sums", (len(frame.entries) * blend.PAIR,), np.float32)
+        threads.run(
+            blend.blend_gradient, frame.workers, frame.records, frame.entries, frame.entry_slots, frame.offsets,
+            frame.across, frame.width, frame.height, image.numpy(), alpha.numpy(), v_image, v_alpha, frame.tiles,
+            np.zeros(1, np.int64), pair_sums,
+        )  # fmt: skip
+        grads = [torch.empty(x.shape) for x in inputs]
+        threads.run(
+            project.project_gradient, frame.workers, *arrays, shN, ctx.degree, frame.camera, frame.records,
+            frame.packed_ids, frame.counts, frame.ranks, frame.slots, pair_sums, *_arrays(grads),
+        )  # fmt: skip
+        v_background = ((1 - alpha)[..., None] * gradients[0]).sum((0, 1)) if ctx.needs_input_grad[6] else None
+        return *grads, v_background, None, None
+
+
+def rasterize(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor, camera: Camera,
+    background: Tensor,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """See ``clod_adapter.rasterizers.Rasterizer``."""
+    degree = round((shN.shape[1] + 1) ** 0.5) - 1
+    return _Splat.apply(means, quats, scales, opacities, sh0, shN, background, camera, degree)  # type: ignore[no-any-return, no-untyped-call]

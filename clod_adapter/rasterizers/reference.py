@@ -1,0 +1,102 @@
+"""The oracle: plain torch splatting, every Gaussian at every pixel, gradients by autograd.
+
+Any device, any float type, no speed. Same conventions as the fast backends: pixel centres at +0.5,
+blur 0.3, near plane 0.01, alpha clamped to 0.999 and dropped below 1/255, a pixel ends before its
+transmittance would fall to 1e-4.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from clod_adapter.cameras import Camera
+
+BLUR, NEAR, ALPHA_MIN, ALPHA_MAX, T_MIN = 0.3, 0.01, 1 / 255, 0.999, 1e-4
+
+
+def rasterize(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor, camera: Camera,
+    background: Tensor,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """See ``clod_adapter.rasterizers.Rasterizer``."""
+    viewmat, K = camera.viewmat.to(means), camera.K.to(means)
+    points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    rows = ((points[:, 2] >= NEAR) & (opacities >= ALPHA_MIN) & (quats.norm(dim=1) > 0)).nonzero()[:, 0]
+    rows = rows[points[rows, 2].argsort(stable=True)]
+    centres, covariance = project(points[rows], quats[rows], scales[rows], viewmat, K, camera)
+    colors = shade(means[rows], sh0[rows], shN[rows], camera.position.to(means))
+    x, y = torch.arange(camera.width).to(means) + 0.5, torch.arange(camera.height).to(means) + 0.5
+    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 1, 2)
+    offsets = pixels - centres
+    power = -0.5 * torch.einsum("pni,nij,pnj->pn", offsets, torch.linalg.inv(covariance), offsets)
+    alphas = (opacities[rows] * power.exp()).clamp(max=ALPHA_MAX)
+    weights, transmittance = blend(torch.where(alphas >= ALPHA_MIN, alphas, 0))
+    image = weights @ colors + transmittance[:, None] * background
+    return image.reshape(camera.height, camera.width, 3), (1 - transmittance).reshape(camera.height, camera.width)
+
+
+def project(
+    points: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor]:
+    """Image centres ``[n, 2]`` and covariances ``[n, 2, 2]`` by the local affine approximation (EWA)."""
+    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
+    rotations = torch.stack(
+        [
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ], 1,
+    ).reshape(-1, 3, 3)  # fmt: skip
+    depth = points[:, 2]
+    focal = torch.stack([K[0, 0], K[1, 1]])
+    size = torch.tensor([camera.width, camera.height]).to(points)
+    margin = 0.15 * size / focal
+    low, high = -K[:2, 2] / focal - margin, (size - K[:2, 2]) / focal + margin
+    ray = torch.minimum(torch.maximum(points[:, :2] / depth[:, None], low), high)
+    jacobian = torch.zeros(len(points), 2, 3).to(points)
+    jacobian[:, 0, 0], jacobian[:, 1, 1] = focal[0] / depth, focal[1] / depth
+    jacobian[:, :, 2] = -focal * ray / depth[:, None]
+    half = jacobian @ viewmat[:3, :3] @ rotations * scales[:, None, :]
+    centres = focal * points[:, :2] / depth[:, None] + K[:2, 2]
+    return centres, half @ half.transpose(1, 2) + BLUR * torch.eye(2).to(points)
+
+
+def blend(alphas: Tensor) -> tuple[Tensor, Tensor]:
+    """Front-to-back weights ``[pixels, n]`` and what is left behind them ``[pixels]``."""
+    through = torch.cumprod(1 - alphas, 1)
+    before = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], 1)
+    alive = (through > T_MIN) | (alphas == 0) & (before > T_MIN)
+    alive = torch.cummin(alive.to(torch.int8), 1).values.bool()
+    weights = torch.where(alive, alphas * before, 0)
+    return weights, torch.where(alive, 1 - alphas, 1).prod(1)
+
+
+def shade(means: Tensor, sh0: Tensor, shN: Tensor, eye: Tensor) -> Tensor:
+    """Colours ``max(0, 0.5 + SH(direction))``, ``[n, 3]``."""
+    directions = means - eye
+    basis = sh_basis(directions / directions.norm(dim=1, keepdim=True))[:, : shN.shape[1] + 1]
+    return (0.5 + (basis[:, :, None] * torch.cat([sh0, shN], 1)).sum(1)).clamp(min=0)
+
+
+def sh_basis(directions: Tensor) -> Tensor:
+    """The 25 real spherical harmonics up to degree 4 of unit ``directions [n, 3]``, order and signs of 3DGS."""
+    x, y, z = directions.unbind(1)
+    xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
+    return torch.stack(
+        [
+            torch.full_like(x, 0.28209479177387814),
+            -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
+            1.0925484305920792 * xy, -1.0925484305920792 * yz, 0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * xz, 0.5462742152960396 * (xx - yy),
+            -0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * xy * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy), 0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy), 1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+            2.5033429417967046 * xy * (xx - yy), -1.7701307697799304 * yz * (3 * xx - yy),
+            0.9461746957575601 * xy * (7 * zz - 1), -0.6690465435572892 * yz * (7 * zz - 3),
+            0.10578554691520431 * (zz * (35 * zz - 30) + 3), -0.6690465435572892 * xz * (7 * zz - 3),
+            0.47308734787878004 * (xx - yy) * (7 * zz - 1), -1.7701307697799304 * xz * (xx - 3 * yy),
+            0.6258357354491761 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
+        ], 1,
+    )  # fmt: skip

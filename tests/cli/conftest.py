@@ -1,0 +1,56 @@
+"""The command as users run it, in its own process and, for speed, in this one."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from clod_adapter.cli.main import main
+
+
+class Outcome:
+    """Exit code and what was printed."""
+
+    def __init__(self, code: int, out: str, err: str) -> None:
+        self.code, self.out, self.err = code, out, err
+
+    def __repr__(self) -> str:
+        return f"exit {self.code}\n--- stdout\n{self.out}\n--- stderr\n{self.err}"
+
+
+@pytest.fixture
+def clod(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Outcome]:
+    """Runs ``clod-adapt`` with these words, in this process, with the test's folder as the current one."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: object) -> Outcome:
+        capsys.readouterr()
+        try:
+            code = main([str(word) for word in words])
+        except SystemExit as done:  # argparse, for --help
+            code = int(done.code or 0)
+        return Outcome(code, *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def spawn() -> Callable[..., subprocess.Popen[str]]:
+    """Starts ``clod-adapt`` with these words in a process of its own, with a progress line every ``line_every`` s."""
+
+    def start(*words: object, cwd: Path, line_every: float = 10) -> subprocess.Popen[str]:
+        code = f"import sys; from clod_adapter.cli import console, main; console.LINE_EVERY = {line_every}"
+        command = [sys.executable, "-c", f"{code}; sys.exit(main.main())", *map(str, words)]
+        # Where the tests run in the background Ctrl-C may be ignored, and children inherit that.
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            return subprocess.Popen(command, cwd=cwd, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    return start

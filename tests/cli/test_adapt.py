@@ -1,0 +1,211 @@
+"""The main job: ``clod-adapt PLY --images DIR``."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+from plyfile import PlyData
+
+import clod_adapter
+from clod_adapter.cli import evaluate as eval_command
+from clod_adapter.cli.report import report_dials
+from clod_adapter.config import AdaptConfig
+from clod_adapter.io.colmap import write_model
+from clod_adapter.train import Progress
+
+THREE = ["dial.json", "dial.ply", "dial.safetensors"]
+TINY = ("--iters", 12, "--max-sv", 4, "--out", "dial.ply")
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_writes_three_files(clod: Any, capture: Any, tmp_path: Path) -> None:
+    before = capture.ply.read_bytes()
+    done = clod(capture.ply, "--images", capture.scene, *TINY)
+    assert done.code == 0, done
+    assert len({path.stat().st_mode for path in tmp_path.iterdir()}) == 1
+    assert names(tmp_path) == THREE and capture.ply.read_bytes() == before
+    report = json.loads((tmp_path / "dial.json").read_text())
+    assert report["command"] == "adapt" and report["version"]
+    assert (report["model"], report["scene"]) == (str(capture.ply), str(capture.scene))
+    assert (report["base_count"], report["sh_degree"], report["steps"]) == (300, 1, 12)
+    assert report["interrupted"] is False and report["notes"] == []
+    assert set(report["config"]) == set(AdaptConfig.__dataclass_fields__) and report["config"]["max_sv"] == 4
+    assert report["attenuation"]["max_sv"] == 4
+    assert set(report["machine"]) >= {"cpu", "cores", "python", "torch", "numba"}
+    assert set(report["seconds"]) == {"load", "start", "train", "evaluate", "total"}
+    assert report["adapter_bytes"] == (tmp_path / "dial.safetensors").stat().st_size
+    assert report["outputs"] == {"ply": "dial.ply", "adapter": "dial.safetensors", "report": "dial.json"}
+    assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2, 3, 4]
+    assert [row["kept"] for row in report["base_rows"]] == [300]
+    shares = [row["kept_share"] for row in report["rows"]]
+    assert shares == sorted(shares, reverse=True) and 0 < shares[-1] < 0.5
+    assert list(PlyData.read(str(tmp_path / "dial.ply"))["vertex"].data.dtype.names or ())[-1] == "sigma_d"
+
+
+def test_says_what_it_did(clod: Any, capture: Any) -> None:
+    done = clod(capture.ply, "--images", capture.scene, *TINY)
+    table = [line.split() for line in done.out.splitlines() if line.startswith("  ")]
+    assert [line[0] for line in table[:7]] == ["dial", "base", "1", "1.5", "2", "3", "4"]
+    assert len({len(line) for line in done.out.splitlines()[1:8]}) == 1  # aligned
+    assert f"clod-adapt eval dial.ply --images {capture.scene} --sv 1 4" in done.out
+    assert "300 Gaussians, SH degree 1" in done.err and "8 photographs to train on, 2 held out, 64x48" in done.err
+    assert "trained 12 steps" in done.err and "\r" not in done.err
+    quiet = clod(capture.ply, "--images", capture.scene, *TINY, "--quiet")
+    assert (quiet.err, quiet.out.splitlines()[2].split()[:2]) == ("", done.out.splitlines()[2].split()[:2])
+
+
+def test_progress_has_eta_and_held_out_error(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("clod_adapter.cli.console.LINE_EVERY", 0)
+    monkeypatch.setattr("clod_adapter.cli.training.CHECK_EVERY", 0)
+    monkeypatch.setattr("clod_adapter.cli.training.CHECK_COST", 1e9)
+    done = clod(capture.ply, "--images", capture.scene, *TINY)
+    error = r"\d+\.\d\d dB \d+%"
+    assert re.search(r"^importance  50%, \d.* left, 4/8$", done.err, re.M), done
+    assert re.search(rf"^training  50%, \d.* left, 6/12, s=1 {error}, s=4 {error}$", done.err, re.M), done
+
+
+def test_json_is_alone_on_stdout(spawn: Any, capture: Any, tmp_path: Path) -> None:
+    process = spawn(capture.ply, "--images", capture.scene, *TINY, "--json", cwd=tmp_path)
+    out, err = process.communicate(timeout=100)
+    assert process.returncode == 0, err
+    printed, written = json.loads(out), json.loads((tmp_path / "dial.json").read_text())
+    assert out.count("\n") == 1 and printed == written and "base" in err
+
+
+def test_default_name(clod: Any, capture: Any, tmp_path: Path) -> None:
+    assert clod(capture.ply, "--images", capture.scene, "--iters", 0, "--quiet").code == 0
+    assert names(tmp_path) == ["base_clod.json", "base_clod.ply", "base_clod.safetensors"]
+
+
+def test_same_seed_same_files(clod: Any, capture: Any, tmp_path: Path) -> None:
+    files = []
+    for seed in (3, 3, 4):
+        assert clod(capture.ply, "--images", capture.scene, *TINY, "--seed", seed, "--quiet").code == 0
+        files.append([(tmp_path / name).read_bytes() for name in THREE[1:]])
+    assert files[0] == files[1] and files[0][0] != files[2][0]
+
+
+def test_reported_quality_is_that_of_the_file(clod: Any, capture: Any, tmp_path: Path) -> None:
+    clod(capture.ply, "--images", capture.scene, *TINY)
+    report = json.loads((tmp_path / "dial.json").read_text())
+    evaluated = json.loads(clod("eval", "dial.ply", "--images", capture.scene, "--sv", 1, 4, "--json").out)
+    for ours, theirs in zip([report["rows"][0], report["rows"][-1]], evaluated["rows"], strict=True):
+        assert {**ours, "frame_ms": 0} == {**theirs, "frame_ms": 0}
+
+
+def test_continues_from_sigma_d(clod: Any, capture: Any, tmp_path: Path) -> None:
+    clod(capture.ply, "--images", capture.scene, *TINY)
+    again = clod("dial.ply", "--images", capture.scene, "--iters", 2, "--max-sv", 4, "--out", "again.ply")
+    assert again.code == 0 and "continuing from its sigma_d" in again.err
+    assert clod("apply", "dial.ply", "again.safetensors", "-o", "same.ply").code == 0
+    assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "again.ply").read_bytes()
+
+
+def test_time_budget(clod: Any, capture: Any, tmp_path: Path) -> None:
+    done = clod(capture.ply, "--images", capture.scene, "--iters", 10**6, "--time-budget", 1, "--out", "dial.ply")
+    report = json.loads((tmp_path / "dial.json").read_text())
+    assert done.code == 0 and 0 < report["steps"] < 10**6
+    assert 0.9 < report["seconds"]["train"] < 3  # a budget ends after the step under way
+
+
+def test_interrupt_leaves_a_usable_result(spawn: Any, capture: Any, tmp_path: Path, clod: Any) -> None:
+    words = (capture.ply, "--images", capture.scene, "--iters", 10**6, "--out", "dial.ply", "--json")
+    process = spawn(*words, cwd=tmp_path, line_every=0.1)
+    while not (line := process.stderr.readline()).startswith("training"):
+        assert line, process.communicate()
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0 and "interrupted after" in err, err
+    report = json.loads(out)
+    assert report["interrupted"] is True and 0 < report["steps"] < 10**6 and len(report["rows"]) > 3
+    assert names(tmp_path) == THREE
+    assert clod_adapter.load(tmp_path / "dial.ply").gaussians.sigma_d is not None
+    assert clod("apply", capture.ply, "dial.safetensors", "-o", "same.ply").code == 0
+    assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
+
+
+@pytest.mark.parametrize("presses", [1, 2])
+def test_interrupt_with_nothing_to_write(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, presses: int
+) -> None:
+    """One press before training, or two while it runs."""
+
+    def adapt(base: Any, scene: Any, config: Any, progress: Any) -> Any:
+        for _ in range(presses):
+            signal.raise_signal(signal.SIGINT)
+        if presses == 1:
+            progress(Progress("start", 1, 8, 0.1, 0.1, 0.0, lambda: base))
+        pytest.fail("went on")
+
+    monkeypatch.setattr("clod_adapter.cli.adapt.adapt", adapt)
+    done = clod(capture.ply, "--images", capture.scene, *TINY)
+    assert done.code == 130 and done.err.splitlines()[-1] == "clod-adapt: interrupted"
+    assert names(tmp_path) == [] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_interrupt_of_the_measuring(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = eval_command.evaluate
+
+    def evaluate(gaussians: Any, views: Any, dials: list[float], **rest: Any) -> Any:
+        if dials == [2.0]:
+            raise KeyboardInterrupt
+        return real(gaussians, views, dials, **rest)
+
+    monkeypatch.setattr(eval_command, "evaluate", evaluate)
+    done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
+    report = json.loads(done.out)
+    assert done.code == 0 and [row["virtual_scale"] for row in report["rows"]] == [1, 1.5]
+    assert "measurements were interrupted" in report["notes"][0] in done.err and report["interrupted"] is False
+    assert names(tmp_path) == THREE
+
+
+def test_a_base_of_another_place_is_noticed(clod: Any, capture: Any, tmp_path: Path) -> None:
+    moved = capture.gaussians.replace(means=capture.gaussians.means + 100)
+    done = clod(capture.write(tmp_path / "moved.ply", moved), "--images", capture.scene, *TINY)
+    assert done.code == 0 and "in other coordinates" in done.err
+
+
+def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -> None:
+    view = clod_adapter.load_scene(capture.scene).train[0]
+    (tmp_path / "one" / "images").mkdir(parents=True)
+    write_model(tmp_path / "one", [view.camera], ["a.png"])
+    Image.fromarray(view.image.numpy()).save(tmp_path / "one" / "images" / "a.png")
+    done = clod(capture.ply, "--images", "one", *TINY, "--json")
+    report = json.loads(done.out)
+    assert done.code == 0 and report["rows"] == report["base_rows"] == [] and "no photographs" in done.err
+    assert clod("eval", "dial.ply", "--images", "one").code == 2
+
+
+@pytest.mark.parametrize(
+    ("max_sv", "dials"),
+    [
+        (1, [1]),
+        (1.2, [1, 1.2]),
+        (4.5, [1, 1.5, 2, 3, 4, 4.5]),
+        (8, [1, 1.5, 2, 3, 4, 5, 6, 7, 8]),
+        (64, [1, 2, 4, 8, 16, 32, 64]),
+    ],
+)
+def test_report_dials(max_sv: float, dials: list[float]) -> None:
+    assert report_dials(max_sv) == dials
+
+
+def test_ci_banana(clod: Any, shared_data: Callable[[str], Path], tmp_path: Path) -> None:
+    scene = shared_data("ci_banana")
+    done = clod(scene / "pretrained.ply", "--images", scene / "images", "--iters", 20, "--out", "dial.ply", "--json")
+    assert done.code == 0, done
+    report = json.loads(done.out)
+    assert report["base_count"] == 20_000 and report["base_rows"][0]["psnr"] == pytest.approx(25.81, abs=0.02)
+    assert report["rows"][-1]["kept_share"] < 0.3
+    assert clod("apply", scene / "pretrained.ply", "dial.safetensors", "-o", "same.ply").code == 0
+    assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()

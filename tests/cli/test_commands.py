@@ -1,0 +1,157 @@
+"""``eval``, ``apply``, the help, and what every command does with bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clod_adapter.cli.main import COMMANDS
+from clod_adapter.io.version import package_version
+
+ROW = {"virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"}
+TINY = ("--iters", 3, "--quiet", "--out", "dial.ply")
+
+
+def test_eval_prints_one_object(spawn: Any, clod: Any, capture: Any, tmp_path: Path) -> None:
+    clod(capture.ply, "--images", capture.scene, *TINY)
+    process = spawn("eval", "dial.ply", "--images", capture.scene, "--sv", "1", "2.5", "--json", cwd=tmp_path)
+    out, err = process.communicate(timeout=100)
+    assert process.returncode == 0, err
+    report = json.loads(out)
+    assert (report["model"], report["scene"], report["base_count"]) == ("dial.ply", str(capture.scene), 300)
+    assert [row["virtual_scale"] for row in report["rows"]] == [1, 2.5]
+    for row in report["rows"]:
+        assert set(row) == ROW and row["kept_share"] == row["kept"] / 300 and row["in_view"] <= row["kept"]
+        assert row["frame_ms"] > 0 and 0 < row["psnr"] < 100 and 0 < row["ssim"] <= 1
+    assert "PSNR dB" in err and "PSNR dB" not in out
+
+
+def test_eval_of_a_plain_file(clod: Any, capture: Any) -> None:
+    done = clod("eval", capture.ply, "--images", capture.scene, "--json")
+    report = json.loads(done.out)
+    assert [row["virtual_scale"] for row in report["rows"]] == [1, 2, 3, 5]
+    assert {row["kept_share"] for row in report["rows"]} == {1.0} and len({row["psnr"] for row in report["rows"]}) == 1
+    assert report["attenuation"] is None and "has no sigma_d" in done.err
+    shown = clod("eval", capture.ply, "--images", capture.scene, "--quiet")
+    assert len(shown.out.splitlines()) == 5 and shown.err == ""
+
+
+def test_apply_gives_the_same_file(clod: Any, capture: Any, tmp_path: Path) -> None:
+    clod(capture.ply, "--images", capture.scene, *TINY)
+    done = clod("apply", capture.ply, "dial.safetensors", "-o", "again.ply", "--json")
+    assert done.code == 0 and (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
+    assert json.loads(done.out)["outputs"] == {"ply": "again.ply"}
+
+
+def test_apply_refuses_another_base(clod: Any, capture: Any, tmp_path: Path) -> None:
+    clod(capture.ply, "--images", capture.scene, *TINY)
+    other = capture.write(tmp_path / "other.ply", capture.gaussians.replace(sh0=capture.gaussians.sh0 + 1e-3))
+    done = clod("apply", other, "dial.safetensors", "-o", "again.ply")
+    assert_refused(done, f"{other}: a different base")
+    assert not (tmp_path / "again.ply").exists()
+
+
+@pytest.fixture
+def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
+    """Things that may be given by mistake."""
+    (tmp_path / "text.ply").write_text("hello")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "cut.ply").write_bytes(capture.ply.read_bytes()[:-100])
+    (tmp_path / "mine.ply").write_bytes(capture.ply.read_bytes())
+    (tmp_path / "folder.ply").mkdir()
+    return {"PLY": capture.ply, "SCENE": capture.scene}
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("", "arguments are required: PLY, --images .*--help"),
+        ("PLY", "required: --images"),
+        ("missing.ply --images SCENE", "missing.ply: .*No such file.*check the path"),
+        ("text.ply --images SCENE", "text.ply: is not a PLY.*convert"),
+        ("cut.ply --images SCENE", "cut.ply: .*truncated.*again"),
+        ("PLY --images nowhere", "nowhere: is not a folder; give"),
+        ("PLY --images empty", "empty: no COLMAP model.*give the folder"),
+        ("PLY --images SCENE --max-sv 0.5", "--max-sv is 0.5, it must be at least 1"),
+        ("PLY --images SCENE --max-sv nan", "--max-sv is nan"),
+        ("PLY --images SCENE --max-sv 300", "--max-sv is 300, it must be below 255"),
+        ("PLY --images SCENE --max-sv big", "--max-sv: invalid float value: 'big'"),
+        ("PLY --images SCENE --iters -1", "--iters is -1, it must be at least 0"),
+        ("PLY --images SCENE --seed -1", "--seed is -1, it must be at least 0"),
+        ("PLY --images SCENE --time-budget 0", "--time-budget is 0.0, it must be positive"),
+        ("PLY --images SCENE --device tpu", "invalid choice: 'tpu'"),
+        ("PLY --images SCENE --out nowhere/dial.ply", "nowhere/dial.ply: folder nowhere does not exist; create"),
+        ("PLY --images SCENE --out dial.splat", "dial.splat: .*must end in .ply"),
+        ("PLY --images SCENE --out folder.ply", "folder.ply: is a folder"),
+        ("mine.ply --images SCENE --out mine.ply", "mine.ply: is an input file.*choose another"),
+        ("mine.ply --images SCENE --out ./empty/../mine.ply", "mine.ply: is an input file"),
+        ("eval missing.ply --images SCENE", "missing.ply: .*check the path"),
+        ("eval PLY --images SCENE --sv 1 0.5", "--sv has 0.5, dial values must be at least 1"),
+        ("eval PLY --images SCENE --sv", "--sv: expected at least one argument.*clod-adapt eval --help"),
+        ("apply PLY missing.safetensors -o x.ply", "missing.safetensors: .*No such file"),
+        ("apply PLY text.ply -o x.ply", "text.ply: is no safetensors file"),
+        ("apply mine.ply text.ply -o mine.ply", "mine.ply: is an input file"),
+        ("apply PLY text.ply -o text.ply", "text.ply: is an input file"),
+        ("apply PLY text.ply -o x.splat", "x.splat: .*must end in .ply"),
+    ],
+)
+@pytest.mark.parametrize("json_too", [False, True])
+def test_bad_input(clod: Any, bad: dict[str, Path], tmp_path: Path, line: str, said: str, json_too: bool) -> None:
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    done = clod(*[bad.get(word, word) for word in line.split()], *(["--json"] if json_too else []))
+    assert_refused(done, said)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def assert_refused(done: Any, said: str) -> None:
+    """Exit code 2, an empty stdout, and one last line on stderr that is the error."""
+    assert (done.code, done.out) == (2, ""), done
+    errors = [line for line in done.err.splitlines() if "error" in line]
+    assert len(errors) == 1 and errors[0] == done.err.splitlines()[-1], done
+    assert errors[0].startswith("clod-adapt: error: ") and re.search(said, errors[0]), done
+
+
+def test_bad_input_exits_with_2(spawn: Any, tmp_path: Path) -> None:
+    process = spawn("missing.ply", "--images", ".", "--json", cwd=tmp_path)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err.count("\n")) == (2, "", 1)
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help(clod: Any, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    done = clod(*command.split(), "--help")
+    assert done.code == 0 and done.out.startswith("usage: clod-adapt") and "--json" in done.out
+    assert max(map(len, done.out.splitlines())) <= 80
+    if not command:
+        assert all(f"clod-adapt {other}" in done.out for other in COMMANDS)
+        assert clod("--version").out.split() == ["clod-adapt", package_version()]
+
+
+def test_closed_pipe(spawn: Any, capture: Any, tmp_path: Path) -> None:
+    process = spawn("eval", capture.ply, "--images", capture.scene, cwd=tmp_path)
+    process.stdout.close()
+    assert "Traceback" not in process.stderr.read()
+    assert process.wait(timeout=60) == 1
+
+
+def test_threads_do_not_spin() -> None:
+    """The console entry sets OpenMP's waiting policy before torch can read it."""
+    code = (
+        "import sys, os\n"
+        "class Spy:\n"
+        "    def find_spec(self, name, *rest):\n"
+        "        if name == 'torch': print(os.environ.get('OMP_WAIT_POLICY'))\n"
+        "sys.meta_path.insert(0, Spy())\n"
+        "import clod_adapter.cli.main"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split()[0] == "PASSIVE"

@@ -1,0 +1,76 @@
+"""Progress, on a terminal and off it."""
+
+from __future__ import annotations
+
+import io
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from clod_adapter.cli.console import Console, Meter, duration
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+class Closed(io.StringIO):
+    def write(self, text: str) -> int:
+        raise BrokenPipeError
+
+
+@pytest.mark.parametrize("width", [30, 80])
+def test_a_bar_fits_its_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    monkeypatch.setattr("tqdm.std._screen_shape_wrapper", lambda: lambda file: (width, 24))
+    with Console().meter("training") as meter:
+        meter.bar.delay = meter.bar.mininterval = 0
+        for step in range(1, 5):
+            meter.update(step / 4, f"{step}/4, s=1 25.81 dB 100%, s=5 21.02 dB 9%")
+    lines = terminal.getvalue().split("\r")
+    assert any("50%" in line for line in lines) and max(map(len, lines)) <= width
+    assert "\n" not in terminal.getvalue() and not lines[-1].strip()  # cleared away in the end
+
+
+def test_lines_off_a_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    monkeypatch.setattr("clod_adapter.cli.console.time", SimpleNamespace(perf_counter=lambda: now))
+    meter = Meter(Console(), "training", began=0, printed=0)
+    for now in range(1, 31):
+        meter.update(now / 90, f"step {now}")
+    assert capsys.readouterr().err.splitlines() == [
+        "training  11%, 1:20 left, step 10",
+        "training  22%, 1:10 left, step 20",
+        "training  33%, 1:00 left, step 30",
+    ]
+
+
+@pytest.mark.parametrize("stream", [Terminal, Closed])
+def test_quiet_and_closed(stream: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is written, and nothing is lost when it cannot be."""
+    monkeypatch.setattr(sys, "stderr", first := stream())
+    console = Console(quiet=stream is Terminal)
+    console.say("a line")
+    with console.meter("training") as meter:
+        meter.update(0.5)
+    console.say("another")
+    assert first.getvalue() == ""
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.04, "0.0 s"),
+        (9.94, "9.9 s"),
+        (9.96, "10 s"),
+        (59.4, "59 s"),
+        (59.7, "1:00"),
+        (125, "2:05"),
+        (3725, "1:02:05"),
+    ],
+)
+def test_duration(seconds: float, text: str) -> None:
+    assert duration(seconds) == text

@@ -1,0 +1,109 @@
+"""Fixtures for more than one folder: the shared data, and a tiny capture made here."""
+
+from __future__ import annotations
+
+# Before anything imports torch, whose idle threads would else spin and take the cores from the kernels.
+import clod_adapter  # noqa: F401
+
+# isort: split
+import math
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from plyfile import PlyData, PlyElement
+
+from clod_adapter.cameras import Camera
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.colmap import write_model
+from clod_adapter.io.ply_columns import column_map
+from clod_adapter.render import render
+
+
+@pytest.fixture
+def shared_data() -> Callable[[str], Path]:
+    """A path in the shared data folder (CLOD_SHARED_DATA, or shared/data beside the checkout); skips without it."""
+    default = Path(__file__).resolve().parents[2] / "shared" / "data"
+    root = Path(os.environ.get("CLOD_SHARED_DATA", default))
+
+    def get(relative: str) -> Path:
+        path = root / relative
+        if not path.exists():
+            pytest.skip(f"shared data absent: {path} (set CLOD_SHARED_DATA)")
+        return path
+
+    return get
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A scene folder with ten 64x48 photographs, the checkpoint they are pictures of, and how to write such a one."""
+
+    scene: Path
+    ply: Path
+    gaussians: Gaussians
+    write: Callable[[Path, Gaussians], Path]
+
+
+@pytest.fixture(scope="session")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """300 Gaussians in Inria's layout, seen from a circle around them."""
+    folder = tmp_path_factory.mktemp("capture")
+    scene = folder / "scene"
+    (scene / "images").mkdir(parents=True)
+    gaussians = _blob(300)
+    cameras = [_camera(2 * math.pi * i / 10) for i in range(10)]
+    names = [f"{i:03}.png" for i in range(10)]
+    write_model(scene, cameras, names)
+    for camera, name in zip(cameras, names, strict=True):
+        image = (render(gaussians, camera).image.clamp(0, 1) * 255).round().to(torch.uint8)
+        Image.fromarray(image.numpy()).save(scene / "images" / name)
+    return Capture(scene, _write_inria(folder / "base.ply", gaussians), gaussians, _write_inria)
+
+
+def _write_inria(path: Path, gaussians: Gaussians) -> Path:
+    """A plain file as Inria's trainer writes it, normals included."""
+    columns = column_map(gaussians.sh_degree)
+    order = ["means", "", "sh0", "shN", "opacity_logits", "log_scales", "quats"]
+    names = [name for key in order for name in sorted(columns.get(key, ("nx", "ny", "nz")), key=_by_number)]
+    vertex = np.zeros(len(gaussians), [(name, "<f4") for name in names])
+    for key, group in columns.items():
+        values = getattr(gaussians, key).reshape(len(gaussians), -1).numpy()
+        for column, name in enumerate(group):
+            vertex[name] = values[:, column]
+    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
+    return path
+
+
+def _by_number(name: str) -> tuple[int, str]:
+    number = name.rpartition("_")[2]
+    return (int(number) if number.isdigit() else 0, name)
+
+
+def _blob(count: int) -> Gaussians:
+    random = torch.Generator().manual_seed(1)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=random)
+
+    return Gaussians(
+        means=normal(count, 3), quats=normal(count, 4), log_scales=normal(count, 3) * 0.5 - 2.0,
+        opacity_logits=normal(count) * 1.5 + 1.0, sh0=normal(count, 1, 3), shN=normal(count, 3, 3) * 0.1,
+    )  # fmt: skip
+
+
+def _camera(angle: float) -> Camera:
+    """On the circle of radius 5, looking at the origin, y down."""
+    forward = -torch.tensor([math.sin(angle), 0.1, math.cos(angle)])
+    forward = forward / forward.norm()
+    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
+    right = right / right.norm()
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat[:3, 3] = torch.tensor([0.0, 0.0, 5.0])
+    return Camera(viewmat, torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)

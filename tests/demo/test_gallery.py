@@ -1,0 +1,118 @@
+"""The demo scene: cameras stand where they can, the point cloud lies on what they see, the capture can be read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clod_adapter.cameras import Camera
+from clod_adapter.demo import gallery as module
+from clod_adapter.demo.gallery import HIGH, LOW, Gallery, unlit_room, write_gallery
+from clod_adapter.demo.raytrace import camera_rays, trace_rays
+from clod_adapter.demo.textures import photograph
+from clod_adapter.errors import ClodError
+
+
+@pytest.fixture(scope="module")
+def gallery() -> Gallery:
+    """Without its light, which takes seconds to bake and moves nothing."""
+    return Gallery(unlit_room(), samples=2)
+
+
+def depth_map(gallery: Gallery, camera: Camera) -> np.ndarray:
+    """``[H, W]`` distance along the ray through each pixel's centre."""
+    eye, rays = camera_rays(camera)
+    y, x = np.indices((camera.height, camera.width)).reshape(2, -1) + 0.5
+    directions = np.column_stack([x, y, np.ones(len(x))]) @ rays.T
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    out = np.empty((len(x), 4))
+    trace_rays(gallery.tables, np.tile(eye, (len(x), 1)), directions, 1e-3, out)
+    return out[:, 3].reshape(camera.height, camera.width)
+
+
+def test_cameras_stand_in_the_room_and_not_in_things(gallery: Gallery) -> None:
+    eyes = np.array([camera.position.numpy() for camera in gallery.cameras()])
+    assert (eyes > LOW + 0.3).all() and (eyes < HIGH - 0.3).all()
+    groups = gallery.tables.groups
+    low = np.stack([groups[f"low_{axis}"] for axis in "xyz"], 1)
+    high = np.stack([groups[f"high_{axis}"] for axis in "xyz"], 1)
+    gap = np.maximum(np.maximum(low[None] - eyes[:, None], eyes[:, None] - high[None]), 0)
+    assert np.linalg.norm(gap, axis=2).min() > 0.15
+
+
+def test_cameras_are_upright_named_in_order_and_both_near_and_far(gallery: Gallery) -> None:
+    cameras = gallery.cameras(40, 30)
+    assert [camera.name for camera in cameras] == [f"view_{k:03d}.png" for k in range(64)]
+    for camera in cameras:
+        R = camera.viewmat[:3, :3].double().numpy()
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-6)
+        assert np.linalg.det(R) > 0 and abs(R[0, 1]) < 1e-6 and R[1, 1] > 0.8  # image down is world down
+    middle = np.array([np.median(depth_map(gallery, camera)) for camera in cameras])
+    assert middle.min() < 1.5 and middle.max() > 4
+    assert np.isfinite(depth_map(gallery, cameras[0])).all()
+
+
+@pytest.mark.parametrize("count", [1, 7, 24, 64, 100])
+def test_any_number_of_cameras(gallery: Gallery, count: int) -> None:
+    assert len(gallery.cameras(count=count)) == count
+
+
+def test_a_held_out_view_has_training_views_beside_it(gallery: Gallery) -> None:
+    cameras = gallery.cameras()
+    pose = [(camera.position, camera.viewmat[2, :3]) for camera in cameras]
+    for k in range(0, len(cameras), module.HOLD_OUT):
+        beside = [
+            float((pose[k][0] - eye).norm())
+            for j, (eye, axis) in enumerate(pose)
+            if j % module.HOLD_OUT and axis @ pose[k][1] > 0.85
+        ]
+        assert sorted(beside)[1] < 1.1, cameras[k].name
+
+
+def test_points_lie_on_what_the_cameras_see(gallery: Gallery) -> None:
+    points, colors = gallery.sample_points(4000, seed=1)
+    assert points.shape == colors.shape == (4000, 3) and points.dtype == np.float32 and colors.dtype == np.uint8
+    for camera in gallery.cameras()[3:50:20]:
+        local = points @ camera.viewmat[:3, :3].numpy().T + camera.viewmat[:3, 3].numpy()
+        pixel = local @ camera.K.numpy().T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y = (pixel[:, :2] / pixel[:, 2:]).T
+        inside = (local[:, 2] > 0.1) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        x, y, distance = x[inside].astype(int), y[inside].astype(int), np.linalg.norm(local[inside], axis=1)
+        visible = np.abs(depth_map(gallery, camera)[y, x] / distance - 1) < 0.02
+        assert visible.sum() > 50
+        difference = np.abs(gallery.render(camera)[y, x].astype(int) - colors[inside])[visible]
+        assert np.median(difference) < 12, camera.name
+
+
+def test_points_follow_the_seed(gallery: Gallery) -> None:
+    first, again, other = (gallery.sample_points(50, seed)[0] for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_capture_is_written_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    monkeypatch.setattr(module, "bake", lambda tables: tables)
+    seen: list[tuple[int, int]] = []
+    folder = tmp_path / "capture"
+    write_gallery(folder, width=32, height=24, count=9, points=500, progress=lambda *done: seen.append(done))
+    assert seen == [(k, 9) for k in range(1, 10)]
+    names = [f"view_{k:03d}.png" for k in range(9)]
+    assert sorted(p.name for p in (folder / "images").iterdir()) == names
+    image = np.asarray(Image.open(folder / "images" / names[0]))
+    assert image.shape == (24, 32, 3) and image.std() > 20
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    assert sorted(image.name for image in model.images.values()) == names and len(model.points3D) == 500
+    with pytest.raises(ClodError, match="not empty"):
+        write_gallery(folder)
+    with pytest.raises(ClodError, match="count"):
+        write_gallery(tmp_path / "one", count=1)
+
+
+def test_missing_photograph_is_named() -> None:
+    with pytest.raises(ClodError, match="no_such.png"):
+        photograph("no_such.png")

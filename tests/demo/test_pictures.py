@@ -1,0 +1,53 @@
+"""The demo's pictures are drawn and are not empty; a missing matplotlib says how to get it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clod_adapter.demo.pictures import Panel, dial_strip, quality_curve
+from clod_adapter.errors import ClodError
+
+ROWS = [
+    {"virtual_scale": s, "psnr": 30.0 - s, "ssim": 0.95 - 0.02 * s, "kept": 40000 / s**1.5, "kept_share": s**-1.5}
+    for s in (3.0, 1.0, 2.0, 5.0)
+]
+
+
+def load(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path).convert("RGB"))
+
+
+def test_strip_shows_every_panel(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    colours = [(200, 30, 30), (30, 160, 30), (30, 30, 200)]
+    images = [np.full((30, 40, 3), colour, np.uint8) for colour in colours]
+    panels = [Panel(images[0]), Panel(images[1] / 255, 1.0, 40000, 1.0, 29.0, 20.0), Panel(images[2], 3.0, 8000, 0.2)]
+    dial_strip(tmp_path / "strip.png", panels, "one view")
+    plain = load(tmp_path / "strip.png")
+    for k, colour in enumerate(colours):
+        third = plain[:, k * plain.shape[1] // 3 : (k + 1) * plain.shape[1] // 3]
+        assert (np.abs(third.astype(int) - colour).max(2) <= 1).mean() > 0.4
+    assert (plain[0] == 255).all()
+    dial_strip(tmp_path / "zoomed.png", panels, "one view", crop=(10, 5, 16, 12))
+    added = load(tmp_path / "zoomed.png").shape[0] - plain.shape[0]
+    assert added == pytest.approx(12 / 16 * plain.shape[1] / 3, rel=0.1)
+
+
+@pytest.mark.parametrize("base", [None, {"psnr": 29.5, "ssim": 0.94, "kept": 41000}])
+def test_curve_is_drawn(tmp_path: Path, base: dict[str, float] | None) -> None:
+    pytest.importorskip("matplotlib")
+    quality_curve(tmp_path / "curve.png", ROWS, base, "quality")
+    picture = load(tmp_path / "curve.png")
+    assert min(picture.shape[:2]) > 500 and 0.01 < (picture < 128).any(2).mean() < 0.5
+
+
+def test_without_matplotlib_the_install_line_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ClodError, match="pip install"):
+        quality_curve(tmp_path / "curve.png", ROWS, None, "quality")
+    assert not (tmp_path / "curve.png").exists()

@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from clod_adapter.adapter import Adapter
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.io.adapter_file import load_adapter, save_adapter
+
+CONFIG = {"steps": 3, "lr": 0.1, "names": ["a", None], "nested": {"b": True}, "ü": "é"}
+
+
+def adapter(n: int = 5, config: dict[str, object] | None = None, tau: float = 0.1 / 3) -> Adapter:
+    generator = torch.Generator().manual_seed(n)
+    updates = {
+        "means": torch.randn(n, 3, generator=generator).half(),
+        "opacity_logits": torch.randn(n, generator=generator),
+        "shN": torch.zeros(n, 0, 3).half(),
+    }
+    attenuation = AttenuationConfig(tau=tau, scene_distance=np.float64(1) / 3, max_sv=7.0)
+    return Adapter(torch.rand(n, generator=generator), attenuation, updates, "ab" * 32, config or {})
+
+
+@settings(deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(0, 20), st.floats(1e-9, 0.1, exclude_min=True))
+def test_round_trip(tmp_path: Path, n: int, tau: float) -> None:
+    saved = adapter(n, CONFIG, tau)
+    save_adapter(tmp_path / "a.safetensors", saved)
+    loaded = load_adapter(str(tmp_path / "a.safetensors"))
+    assert (loaded.attenuation, loaded.config, loaded.base_fingerprint) == (saved.attenuation, CONFIG, "ab" * 32)
+    assert torch.equal(loaded.sigma_d, saved.sigma_d) and loaded.updates.keys() == saved.updates.keys()
+    for name, update in saved.updates.items():
+        assert loaded.updates[name].dtype == update.dtype and torch.equal(loaded.updates[name], update)
+    save_adapter(tmp_path / "b.safetensors", loaded)
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+
+
+def test_the_file_says_what_it_is(tmp_path: Path) -> None:
+    save_adapter(tmp_path / "a", adapter())
+    with safe_open(tmp_path / "a", framework="pt") as file:
+        about = json.loads(file.metadata()["clod_adapter"])
+    assert about["format"] == "clod-adapter" and about["format_version"] == 1 and "package_version" in about
+    assert about["base_sha256"] == "ab" * 32 and about["attenuation"]["tau"] == 0.1 / 3
+
+
+@pytest.mark.parametrize("value", [{1, 2}, torch.ones(1), float("nan"), object()])
+def test_config_must_be_json(tmp_path: Path, value: object) -> None:
+    with pytest.raises(ClodError, match="not plain JSON"):
+        save_adapter(tmp_path / "a", adapter(config={"x": value}))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unwritable(tmp_path: Path) -> None:
+    with pytest.raises(ClodError, match="does not exist"):
+        save_adapter(tmp_path / "no" / "a", adapter())
+
+
+def test_unreadable(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "missing"):
+        with pytest.raises(ClodError, match=str(path)):
+            load_adapter(path)
+    save_file({"a": torch.ones(1)}, tmp_path / "other")
+    with pytest.raises(ClodError, match="no clod-adapter"):
+        load_adapter(tmp_path / "other")
+
+
+@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject) -> None:
+    save_adapter(tmp_path / "a", adapter())
+    whole = (tmp_path / "a").read_bytes()
+    path = tmp_path / "damaged"
+    path.write_bytes(whole[: data.draw(st.integers(0, len(whole) - 1))])
+    with pytest.raises(ClodError, match="damaged"):
+        load_adapter(path)
+    damaged = bytearray(whole)
+    for _ in range(data.draw(st.integers(1, 3))):
+        damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(damaged)
+    try:
+        load_adapter(path)
+    except ClodError as error:
+        assert str(path) in str(error) and "\n" not in str(error)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format_version": 2}, "upgrade"),
+        ({"format": "other"}, "upgrade"),
+        ({"format_version": "x"}, "description is damaged"),
+        ({"attenuation": {"tau": 2.0}}, "tau is 2.0"),
+        ({"attenuation": {"new_field": 1}}, "new_field"),
+        ({"attenuation": 3}, "description is damaged"),
+    ],
+)
+def test_other_descriptions(tmp_path: Path, change: dict[str, object], message: str) -> None:
+    save_adapter(tmp_path / "a", adapter())
+    with safe_open(tmp_path / "a", framework="pt") as file:
+        about = json.loads(file.metadata()["clod_adapter"]) | change
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    save_file(tensors, tmp_path / "b", {"clod_adapter": json.dumps(about)})
+    with pytest.raises(ClodError, match=message):
+        load_adapter(tmp_path / "b")
+
+
+def test_other_tensors(tmp_path: Path) -> None:
+    save_adapter(tmp_path / "a", adapter())
+    with safe_open(tmp_path / "a", framework="pt") as file:
+        metadata = file.metadata()
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    for change, message in (
+        ({"extra": torch.ones(5)}, "updates has 'extra'"),
+        ({"means": torch.ones(4, 3)}, "5 rows"),
+        ({"means": torch.ones(5, 3, dtype=torch.int32)}, "float16 or float32"),
+        ({"sigma_d": torch.full((5,), torch.nan)}, "not finite"),
+        ({"sigma_d": torch.ones(5, 1)}, "float32"),
+    ):
+        save_file(tensors | change, tmp_path / "b", metadata)
+        with pytest.raises(ClodError, match=message):
+            load_adapter(tmp_path / "b")
+    del tensors["sigma_d"]
+    save_file(tensors, tmp_path / "b", metadata)
+    with pytest.raises(ClodError, match="sigma_d"):
+        load_adapter(tmp_path / "b")

@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.atomic import atomic_path
+
+
+def test_appears_only_after_success(tmp_path: Path) -> None:
+    final = tmp_path / "out.ply"
+    with atomic_path(final) as temporary:
+        assert temporary.parent == tmp_path and temporary.suffix == ".ply"
+        temporary.write_bytes(b"new")
+        assert not final.exists()
+    assert final.read_bytes() == b"new"
+    assert os.listdir(tmp_path) == ["out.ply"]
+
+
+def test_replaces_a_file(tmp_path: Path) -> None:
+    final = tmp_path / "out"
+    final.write_bytes(b"old")
+    with atomic_path(final) as temporary:
+        temporary.write_bytes(b"new")
+    assert final.read_bytes() == b"new"
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
+def test_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path, error: type[BaseException]) -> None:
+    final = tmp_path / "out"
+    final.write_bytes(b"old")
+    with pytest.raises(error), atomic_path(final) as temporary:
+        temporary.write_bytes(b"half")
+        raise error
+    assert final.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_full_disk_is_a_clod_error(tmp_path: Path) -> None:
+    with pytest.raises(ClodError, match="No space left"), atomic_path(tmp_path / "out"):
+        raise OSError(28, "No space left on device")
+    assert os.listdir(tmp_path) == []
+
+
+def test_folders(tmp_path: Path) -> None:
+    final = tmp_path / "model"
+    with atomic_path(final) as temporary:
+        (temporary / "deep").mkdir(parents=True)
+        (temporary / "deep" / "a").write_bytes(b"a")
+    assert (final / "deep" / "a").read_bytes() == b"a"
+    with pytest.raises(ClodError, match="not empty"), atomic_path(final):
+        raise AssertionError("the body must not run")
+    with pytest.raises(RuntimeError), atomic_path(tmp_path / "other") as temporary:
+        (temporary / "deep").mkdir(parents=True)
+        raise RuntimeError
+    assert os.listdir(tmp_path) == ["model"]
+
+
+def test_missing_folder(tmp_path: Path) -> None:
+    with pytest.raises(ClodError, match="does not exist"), atomic_path(tmp_path / "no" / "out"):
+        raise AssertionError("the body must not run")
+
+
+def test_unwritable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere, so chmod proves nothing
+    with pytest.raises(ClodError, match="not writable"), atomic_path(tmp_path / "out"):
+        raise AssertionError("the body must not run")

@@ -1,0 +1,306 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from PIL import Image
+
+from clod_adapter.cameras import Camera
+from clod_adapter.errors import ClodError
+from clod_adapter.io.colmap import load_scene, write_model
+
+
+def pose(seed: int) -> torch.Tensor:
+    rotation, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    rotation *= np.sign(np.linalg.det(rotation))
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, [seed, -1, 2]
+    return torch.from_numpy(viewmat).float()
+
+
+def camera(seed: int, width: int = 40, height: int = 30, focal: float = 35.5) -> Camera:
+    K = torch.tensor([[focal, 0, 19.25], [0, focal + 1, 15.5], [0, 0, 1]])
+    return Camera(pose(seed), K, width, height)
+
+
+def pixels(seed: int, width: int = 40, height: int = 30) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def scene(folder: Path, count: int = 10) -> tuple[list[Camera], list[str]]:
+    """A scene whose model lists its images in another order than their names."""
+    cameras = [camera(i, focal=30.0 + i % 2) for i in range(count)]
+    names = [f"sub/{count - i:03d}.png" for i in range(count)]
+    write_model(folder, cameras, names)
+    (folder / "images" / "sub").mkdir(parents=True)
+    for i, name in enumerate(names):
+        Image.fromarray(pixels(i)).save(folder / "images" / name)
+    return cameras, names
+
+
+def as_text(folder: Path) -> None:
+    model = folder / "sparse" / "0"
+    reconstruction = pycolmap.Reconstruction(str(model))
+    for file in model.iterdir():
+        file.unlink()
+    reconstruction.write_text(str(model))
+
+
+def model_of(folder: Path, kind: str, params: list[float], name: str = "a.png", cameras: int = 1, **size: int) -> None:
+    """A model of one image, through pycolmap alone."""
+    size = size or {"width": 40, "height": 30}
+    reconstruction = pycolmap.Reconstruction()
+    for i in range(1, cameras + 1):
+        reconstruction.add_camera_with_trivial_rig(pycolmap.Camera(model=kind, params=params, camera_id=i, **size))
+    image = pycolmap.Image(name=name, camera_id=1, image_id=1)
+    reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    (folder / "sparse" / "0").mkdir(parents=True)
+    reconstruction.write_binary(str(folder / "sparse" / "0"))
+
+
+@pytest.mark.parametrize("form", ["binary", "text", "before rigs"])
+def test_round_trip(tmp_path: Path, form: str) -> None:
+    cameras, names = scene(tmp_path)
+    if form == "text":
+        as_text(tmp_path)
+    if form == "before rigs":
+        for name in ("rigs.bin", "frames.bin"):
+            (tmp_path / "sparse" / "0" / name).unlink()
+    loaded = load_scene(str(tmp_path))
+    assert loaded.notes == ()
+    order = sorted(range(10), key=lambda i: names[i])
+    held_out = [order[0], order[8]]
+    assert [view.camera.name for view in loaded.test] == [names[i] for i in held_out]
+    assert [view.camera.name for view in loaded.train] == [names[i] for i in order if i not in held_out]
+    for view in (*loaded.train, *loaded.test):
+        i = names.index(view.camera.name)
+        torch.testing.assert_close(view.camera.viewmat, cameras[i].viewmat, atol=1e-6, rtol=0)
+        torch.testing.assert_close(view.camera.K, cameras[i].K, atol=0, rtol=0)
+        assert view.camera.viewmat.dtype == view.camera.K.dtype == torch.float32
+        np.testing.assert_array_equal(view.image, pixels(i))
+
+
+def test_progress(tmp_path: Path) -> None:
+    scene(tmp_path, 3)
+    seen: list[tuple[int, int]] = []
+    load_scene(tmp_path, progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_split_and_single_image(tmp_path: Path) -> None:
+    (tmp_path / "ten").mkdir()
+    (tmp_path / "one").mkdir()
+    scene(tmp_path / "ten")
+    loaded = load_scene(tmp_path / "ten", test_every=3)
+    assert (len(loaded.train), len(loaded.test)) == (6, 4)
+    scene(tmp_path / "one", 1)
+    loaded = load_scene(tmp_path / "one")
+    assert (len(loaded.train), len(loaded.test)) == (1, 0)
+    with pytest.raises(ClodError, match="test_every is 1"):
+        load_scene(tmp_path / "one", test_every=1)
+
+
+def test_model_and_images_elsewhere(tmp_path: Path) -> None:
+    scene(tmp_path, 2)
+    model = tmp_path / "sparse" / "0"
+    assert len(load_scene(model).train) == 1  # images beside the model's parent
+    for file in model.iterdir():
+        file.rename(tmp_path / "sparse" / file.name)
+    model.rmdir()
+    assert len(load_scene(tmp_path).train) == 1
+    assert len(load_scene(tmp_path / "images").train) == 1  # the images' own folder
+    (tmp_path / "images" / "sub").rename(tmp_path / "sub")  # images beside sparse/
+    assert len(load_scene(tmp_path).train) == 1
+    with pytest.raises(ClodError, match="no COLMAP model"):
+        load_scene(tmp_path / "images" / "deeper")
+
+
+def test_written_points_and_cameras(tmp_path: Path) -> None:
+    xyz, rgb = np.arange(12.0).reshape(4, 3), np.arange(12, dtype=np.uint8).reshape(4, 3)
+    same = [camera(0), camera(1), camera(2, focal=50.0)]
+    write_model(tmp_path, same, ["a.png", "b.png", "c.png"], xyz, rgb)
+    assert {p.name for p in (tmp_path / "sparse").iterdir()} == {"0"}
+    reconstruction = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    assert len(reconstruction.cameras) == 2 and {c.model_name for c in reconstruction.cameras.values()} == {"PINHOLE"}
+    points = [reconstruction.points3D[i] for i in sorted(reconstruction.points3D)]
+    np.testing.assert_array_equal([p.xyz for p in points], xyz)
+    np.testing.assert_array_equal([p.color for p in points], rgb)
+    with pytest.raises(ClodError, match="not empty"):
+        write_model(tmp_path, same[:1], ["a.png"])
+    with pytest.raises(ClodError, match="as many different names"):
+        write_model(tmp_path, same[:2], ["a.png", "a.png"])
+    with pytest.raises(ClodError, match="does not exist"):
+        write_model(tmp_path / "no", same[:1], ["a.png"])
+
+
+def test_simple_pinhole(tmp_path: Path) -> None:
+    model_of(tmp_path, "SIMPLE_PINHOLE", [33.0, 20.0, 15.0])
+    Image.fromarray(pixels(0)).save(tmp_path / "a.png")
+    K = load_scene(tmp_path).train[0].camera.K
+    assert K.tolist() == [[33, 0, 20], [0, 33, 15], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "params"), [("SIMPLE_RADIAL", [33, 20, 15, 0]), ("OPENCV", [33, 33, 20, 15, 0, 0, 0, 0])]
+)
+def test_distorted_cameras_are_refused(tmp_path: Path, kind: str, params: list[float]) -> None:
+    model_of(tmp_path, kind, params, cameras=3)
+    with pytest.raises(ClodError, match=f"{kind}.*image_undistorter"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["../a.png", "sub/../../a.png", "/etc/a.png", "..\\a.png", "C:\\a.png"])
+def test_names_that_leave_the_folder_are_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "scene").mkdir()
+    model_of(tmp_path / "scene", "PINHOLE", [33, 33, 20, 15], name)
+    Image.fromarray(pixels(0)).save(tmp_path / "a.png")
+    with pytest.raises(ClodError, match="leaves the images folder"):
+        load_scene(tmp_path / "scene")
+
+
+def test_names_made_on_windows(tmp_path: Path) -> None:
+    model_of(tmp_path, "PINHOLE", [33, 33, 20, 15], "sub\\a.png")
+    (tmp_path / "images" / "sub").mkdir(parents=True)
+    Image.fromarray(pixels(0)).save(tmp_path / "images" / "sub" / "a.png")
+    assert len(load_scene(tmp_path).train) == 1
+
+
+def test_missing_images(tmp_path: Path) -> None:
+    _, names = scene(tmp_path)
+    for name in sorted(names)[2:7]:
+        (tmp_path / "images" / name).unlink()
+    with pytest.raises(ClodError, match=r"5 of 10 images .* missing \(sub/003.png, sub/004.png, sub/005.png, \.\.\.\)"):
+        load_scene(tmp_path)
+
+
+def test_wide_images_are_scaled_with_their_intrinsics(tmp_path: Path) -> None:
+    scene(tmp_path, 3)
+    loaded = load_scene(tmp_path, max_width=15)
+    assert loaded.notes == ("3 of 3 images scaled from 40x30 to 15x11 (Pillow bicubic, as in Inria's code)",)
+    view, names = loaded.train[0], [view.camera.name for view in loaded.train]
+    assert tuple(view.image.shape) == (11, 15, 3) and names == ["sub/002.png", "sub/003.png"]
+    original = camera(1, focal=31.0).K  # names count down: 002 is the model's second image
+    scale = torch.tensor([[15 / 40], [11 / 30], [1.0]])
+    torch.testing.assert_close(view.camera.K, original * scale)
+    expected = Image.fromarray(pixels(1)).resize((15, 11), Image.Resampling.BICUBIC)
+    np.testing.assert_array_equal(view.image, np.asarray(expected))
+    assert load_scene(tmp_path, max_width=40).notes == ()
+
+
+def test_images_of_another_size_than_the_camera(tmp_path: Path) -> None:
+    model_of(tmp_path, "PINHOLE", [330, 340, 200, 150], width=400, height=300)
+    Image.fromarray(pixels(0)).save(tmp_path / "a.png")
+    loaded = load_scene(tmp_path)
+    assert loaded.notes == ("1 of 1 images are 40x30 where the model says 400x300: intrinsics scaled",)
+    torch.testing.assert_close(loaded.train[0].camera.K, torch.tensor([[33.0, 0, 20], [0, 34, 15], [0, 0, 1]]))
+    Image.fromarray(pixels(0, 30, 40)).save(tmp_path / "a.png")
+    with pytest.raises(ClodError, match="a.png: is 30x40, its camera 400x300, another shape"):
+        load_scene(tmp_path)
+
+
+def test_image_modes(tmp_path: Path) -> None:
+    model_of(tmp_path, "PINHOLE", [33, 33, 20, 15])
+    path = tmp_path / "a.png"
+    grey = pixels(0)[..., 0]
+    Image.fromarray(grey).save(path)
+    np.testing.assert_array_equal(load_scene(tmp_path).train[0].image[..., 2], grey)
+    Image.fromarray(np.dstack([pixels(0), np.where(grey > 99, 255, 0).astype(np.uint8)])).save(path)
+    loaded = load_scene(tmp_path)
+    assert loaded.notes == ("1 of 1 images have transparency: laid over black",)
+    np.testing.assert_array_equal(loaded.train[0].image, pixels(0) * (grey > 99)[..., None])
+    Image.fromarray(grey.astype(np.uint16) * 257).save(path)
+    with pytest.raises(ClodError, match="more than 8 bits"):
+        load_scene(tmp_path)
+    path.write_bytes(b"no image")
+    with pytest.raises(ClodError, match="a.png: cannot be decoded"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin", "frames.bin", "rigs.bin"])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.95])
+def test_cut_models(tmp_path: Path, file: str, share: float) -> None:
+    # Handed to COLMAP as it is, a cut points3D.bin makes it allocate until memory runs out.
+    xyz = np.zeros((4, 3))
+    write_model(tmp_path, [camera(0), camera(1)], ["a.png", "b.png"], xyz)
+    path = tmp_path / "sparse" / "0" / file
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+    with pytest.raises(ClodError, match=f"{file}: is truncated"):
+        load_scene(tmp_path)
+
+
+def test_rigs_of_several_cameras(tmp_path: Path) -> None:
+    reconstruction = pycolmap.Reconstruction()
+    for i in (1, 2, 3):
+        size = {"width": 40, "height": 30}
+        reconstruction.add_camera(pycolmap.Camera(model="PINHOLE", params=[33, 33, 20, 15], camera_id=i, **size))
+    rig = pycolmap.Rig(rig_id=1)
+    sensors = [pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=i) for i in (1, 2, 3)]
+    rig.add_ref_sensor(sensors[0])
+    rig.add_sensor(sensors[1], pycolmap.Rigid3d(pose(1)[:3].double().numpy()))
+    rig.add_sensor(sensors[2], None)
+    reconstruction.add_rig(rig)
+    frame = pycolmap.Frame(rig_id=1, frame_id=1)
+    frame.add_data_id(pycolmap.data_t(sensor_id=sensors[0], id=1))
+    frame.add_data_id(pycolmap.data_t(sensor_id=sensors[1], id=2))
+    frame.rig_from_world = pycolmap.Rigid3d(pose(2)[:3].double().numpy())
+    reconstruction.add_frame(frame)
+    for i in (1, 2):
+        image = pycolmap.Image(name=f"{i}.png", camera_id=i, image_id=i)
+        image.frame_id = 1
+        reconstruction.add_image(image)
+        Image.fromarray(pixels(i)).save(tmp_path / f"{i}.png")
+    reconstruction.register_frame(1)
+    (tmp_path / "sparse").mkdir()
+    reconstruction.write_binary(str(tmp_path / "sparse"))
+    loaded = load_scene(tmp_path)
+    torch.testing.assert_close(loaded.test[0].camera.viewmat, pose(2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(loaded.train[0].camera.viewmat, pose(1) @ pose(2), atol=1e-5, rtol=0)
+    rigs = (tmp_path / "sparse" / "rigs.bin").read_bytes()
+    (tmp_path / "sparse" / "rigs.bin").write_bytes(rigs[:-1])
+    with pytest.raises(ClodError, match="rigs.bin: is truncated"):
+        load_scene(tmp_path)
+
+
+def test_empty_and_broken_models(tmp_path: Path) -> None:
+    write_model(tmp_path, [], [])
+    with pytest.raises(ClodError, match="no registered image"):
+        load_scene(tmp_path)
+    as_text(tmp_path)
+    (tmp_path / "sparse" / "0" / "images.txt").write_text("1 nonsense\n\n")
+    with pytest.raises(ClodError, match="COLMAP cannot read this model"):
+        load_scene(tmp_path)
+
+
+def test_zero_focal_length(tmp_path: Path) -> None:
+    model_of(tmp_path, "PINHOLE", [0, 33, 20, 15])
+    with pytest.raises(ClodError, match="not usable"):
+        load_scene(tmp_path)
+
+
+def test_library_core_does_not_import_colmap() -> None:
+    code = "import sys, clod_adapter.io.ply, clod_adapter.io.adapter_file; sys.exit('pycolmap' in sys.modules)"
+    root = Path(__file__).resolve().parents[2]
+    assert subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(root)}).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "train", "test", "size"),
+    [("ci_banana", 12, 2, (332, 221)), ("plush_half", 84, 13, (494, 370)), ("bonsai146", 127, 19, (798, 531))],
+)
+def test_real_scenes(
+    shared_data: Callable[[str], Path], name: str, train: int, test: int, size: tuple[int, int]
+) -> None:
+    loaded = load_scene(shared_data(name))
+    assert (len(loaded.train), len(loaded.test), loaded.notes) == (train, test, ())
+    first = loaded.test[0].camera
+    assert (first.width, first.height) == size and first.name < loaded.train[0].camera.name
+    assert first.K[0, 2] == size[0] / 2
+    rotation = first.viewmat[:3, :3]
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)

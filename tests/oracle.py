@@ -1,0 +1,110 @@
+"""Comparison of a rasterizer with the float64 reference, forward and backward.
+
+What agreement means here: away from pixels where a cut may fall either way (alpha at 1/255, a pixel's
+end at 1e-4) the image and alpha differ by at most IMAGE, the gradient of each input by at most GRADIENT
+of its length. Pixels on a cut are counted, must be few, and may be off by what one Gaussian at 1/255 can do.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+from torch import Tensor
+
+from clod_adapter.cameras import Camera
+from clod_adapter.rasterizers import Rasterizer, reference
+
+IMAGE, GRADIENT, ON_A_CUT = 2e-5, 5e-4, 0.02
+BACKGROUND = torch.tensor([0.2, 0.5, 0.7])
+Parameters = dict[str, Tensor]
+
+
+class Result(NamedTuple):
+    """A picture and, by name, the gradients of a weighted sum of its pixels."""
+
+    image: Tensor
+    alpha: Tensor
+    gradients: dict[str, Tensor]
+
+
+def weights(camera: Camera, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Random weights of the image's and alpha's pixels."""
+    g = torch.Generator().manual_seed(seed)
+    return (
+        torch.randn(camera.height, camera.width, 3, generator=g),
+        torch.randn(camera.height, camera.width, generator=g),
+    )
+
+
+def differentiate(
+    rasterize: Rasterizer, scene: Parameters, camera: Camera, v: tuple[Tensor, Tensor], background: Tensor = BACKGROUND
+) -> Result:
+    """Forward and backward, in the scene's float type."""
+    dtype = scene["means"].dtype
+    leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
+    behind = background.to(dtype, copy=True).requires_grad_()
+    image, alpha = rasterize(**leaves, camera=camera, background=behind)
+    total = (image * v[0].to(dtype)).sum() + (alpha * v[1].to(dtype)).sum()
+    found = torch.autograd.grad(total, [*leaves.values(), behind])
+    return Result(image.detach(), alpha.detach(), dict(zip([*leaves, "background"], found, strict=True)))
+
+
+def on_a_cut(scene: Parameters, camera: Camera, nudge: float) -> Tensor:
+    """``[H, W]`` bool: the reference's pixel changes when its cuts move by the relative ``nudge``."""
+    images = []
+    for factor in (1 - nudge, 1 + nudge):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(reference, "ALPHA_MIN", reference.ALPHA_MIN * factor)
+            patch.setattr(reference, "T_MIN", reference.T_MIN * factor)
+            images.append(reference.rasterize(**scene, camera=camera, background=BACKGROUND.double())[0])
+    return (images[0] != images[1]).any(-1)
+
+
+def assert_agrees(
+    rasterize: Rasterizer, scene: Parameters, camera: Camera, *, image: float = IMAGE, gradient: float = GRADIENT,
+    cut: float = ON_A_CUT, nudge: float = 1e-4, rows: Tensor | None = None,
+) -> None:  # fmt: skip
+    """Asserts agreement; with ``rows``, of the scene with the reference's picture of those rows alone.
+
+    The gradients of all other rows must then be 0.
+    """
+    twin = {name: (value if rows is None else value[rows]).double() for name, value in scene.items()}
+    unsure = on_a_cut(twin, camera, nudge)
+    share = unsure.double().mean().item() if unsure.numel() else 0.0
+    assert share <= cut, f"{share:.2%} of the pixels are on a cut: this scene tests nothing"
+    v_image, v_alpha = weights(camera)
+    v = v_image * ~unsure[..., None], v_alpha * ~unsure
+    found, want = (differentiate(*case, camera, v) for case in ((rasterize, scene), (reference.rasterize, twin)))
+    colors = want.image.abs().max().clamp(min=1)
+    for name in ("image", "alpha"):
+        error = (getattr(found, name) - getattr(want, name)).abs()
+        worst = error[~unsure].max().item() if (~unsure).any() else 0.0
+        assert worst <= image, f"{name} is off by {worst:.1e}"
+        assert (error[unsure] <= 4 / 255 * colors).all(), f"{name} on a cut is off by {error[unsure].max():.1e}"
+    for name, expected in want.gradients.items():
+        got = found.gradients[name].double()
+        if rows is not None and name != "background":
+            others = got.clone()
+            others[rows] = 0
+            assert (others == 0).all(), f"rows that are not drawn have a gradient of {name}"
+            got = got[rows]
+        error = (got - expected).norm().item()
+        length = expected.norm().item()
+        assert error <= gradient * length, (
+            f"gradient of {name} is off by {error / max(length, 1e-300):.1e} of its length"
+        )
+
+
+def assert_same(a: Result, b: Result, **tolerance: Any) -> None:
+    """Asserts equality: bit for bit, or within ``torch.testing.assert_close``'s tolerances."""
+    for name, x, y in [
+        ("image", a.image, b.image),
+        ("alpha", a.alpha, b.alpha),
+        *((name, a.gradients[name], b.gradients[name]) for name in a.gradients),
+    ]:
+        if tolerance:
+            torch.testing.assert_close(x, y, **tolerance, msg=lambda m, name=name: f"{name}: {m}")
+        else:
+            assert torch.equal(x, y), f"{name} differs by {(x - y).abs().max():.1e}"

@@ -1,0 +1,149 @@
+"""Every backend draws and differentiates what the float64 reference does."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from clod_adapter.rasterizers import Rasterizer
+from oracle import IMAGE, assert_agrees
+from scenes import camera, in_front, scene
+
+# Neither multiples of 4 nor of a tile, but one; principal points on either side.
+SIZES = [(61, 45), (33, 70), (97, 31), (64, 64), (5, 7), (130, 50)]
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("degree", range(5))
+def test_random_scenes(rasterize: Rasterizer, degree: int, seed: int) -> None:
+    width, height = SIZES[(degree + 3 * seed) % len(SIZES)]
+    size = (0.05, 0.1, 0.3)[(degree + seed) % 3]
+    view = camera(width, height, off_centre=(0.52, 0.47) if seed else (0.31, 0.72))
+    assert_agrees(rasterize, scene(200, degree, 100 * seed + degree, size=size), view)
+
+
+@pytest.mark.parametrize("size", [*SIZES, (1, 1), (3, 200), (200, 3), (33, 1)], ids=lambda s: "x".join(map(str, s)))
+def test_image_sizes(rasterize: Rasterizer, size: tuple[int, int]) -> None:
+    assert_agrees(rasterize, scene(100, 1, sum(size), size=0.3), camera(*size), cut=0.05)
+
+
+@pytest.mark.parametrize("fov", [5.0, 150.0])
+def test_narrow_and_wide_lenses(rasterize: Rasterizer, fov: float) -> None:
+    # Wide: centres far outside the image, where the Jacobian's ray is clamped.
+    assert_agrees(rasterize, scene(150, 1, 7, size=0.2), camera(50, 40, fov=fov))
+
+
+def test_principal_point_outside_the_image(rasterize: Rasterizer) -> None:
+    assert_agrees(rasterize, scene(150, 1, 8, size=0.2), camera(50, 40, off_centre=(1.3, -0.2)))
+
+
+def test_near_the_camera_plane(rasterize: Rasterizer) -> None:
+    """Centres just before, on and just beyond the near plane: those before it are not drawn."""
+    view = camera(40, 30)
+    some = scene(60, 2, 3)
+    z = torch.cat([torch.linspace(-0.05, 0.0099, 30), torch.linspace(0.0101, 0.05, 30)])
+    sideways = torch.linspace(-1, 1, 60).roll(17)
+    some["means"] = in_front(view, torch.stack([sideways * z, 0.3 * sideways.flip(0) * z, z], 1))
+    depths = some["means"] @ view.viewmat[2, :3] + view.viewmat[2, 3]
+    assert 20 <= (depths < 0.01).sum() <= 40
+    some["scales"] = some["scales"] * 0.02
+    assert_agrees(rasterize, some, view, rows=depths >= 0.01)
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1 / 255 * 0.999, 0.5, 0.9995, 1.0])
+def test_opacity_of_a_few(rasterize: Rasterizer, opacity: float) -> None:
+    some = scene(120, 1, 1, size=0.15)
+    some["opacities"][::3] = opacity
+    assert_agrees(rasterize, some, camera(), rows=some["opacities"] >= 1 / 255)
+
+
+def test_pixels_that_end_early(rasterize: Rasterizer) -> None:
+    """Many opaque layers: what lies behind the end of a pixel plays no part, forward or backward."""
+    some = scene(1500, 1, 0, size=0.3)
+    some["opacities"] = 0.9 + 0.1 * some["opacities"]
+    assert_agrees(rasterize, some, camera(26, 19))
+
+
+def test_saturated_layers(rasterize: Rasterizer) -> None:
+    """Opacity 1 everywhere: alpha is clamped to 0.999 around each centre, where it has no gradient."""
+    some = scene(300, 1, 0, size=1.0)
+    some["opacities"][:] = 1
+    assert_agrees(rasterize, some, camera(40, 30))
+
+
+def test_alpha_is_clamped(rasterize: Rasterizer) -> None:
+    """One opaque Gaussian, so wide that every pixel is at the clamp."""
+    view = camera(19, 13)
+    one = {
+        "means": in_front(view, torch.tensor([[0.0, 0.0, 2.0]])), "quats": torch.tensor([[1.0, 0.2, -0.1, 0.3]]),
+        "scales": torch.full((1, 3), 1e3), "opacities": torch.ones(1), "sh0": torch.full((1, 1, 3), 0.3),
+        "shN": torch.zeros(1, 0, 3),
+    }  # fmt: skip
+    leaves = {name: value.requires_grad_() for name, value in one.items()}
+    image, alpha = rasterize(**leaves, camera=view, background=torch.zeros(3))
+    torch.testing.assert_close(alpha, torch.full((13, 19), 0.999))
+    image.sum().backward()
+    for name in ("means", "quats", "scales", "opacities"):
+        assert (leaves[name].grad == 0).all(), name
+    torch.testing.assert_close(
+        leaves["sh0"].grad, torch.full((1, 1, 3), 19 * 13 * 0.999 * 0.28209479), rtol=1e-5, atol=0
+    )
+
+
+@pytest.mark.parametrize("opacity", [0.3, 0.998])
+def test_one_that_covers_the_whole_image(rasterize: Rasterizer, opacity: float) -> None:
+    view = camera(70, 50)
+    one = scene(1, 2, 4)
+    one["means"] = in_front(view, torch.tensor([[0.3, 0.2, 2.0]]))
+    one["scales"] = torch.tensor([[3.0, 5.0, 4.0]])
+    one["opacities"][:] = opacity
+    one["sh0"][:] = 1.0  # clear of the colour's clamp at 0
+    assert_agrees(rasterize, one, view)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "scales", [(1.0, 1e-6, 1e-6), (0.3, 3e-7, 3e-7), (0.3, 0.3, 3e-7)], ids=["needle", "short", "disc"]
+)
+def test_axis_ratio_of_a_million(rasterize: Rasterizer, scales: tuple[float, float, float], seed: int) -> None:
+    """A needle of a thousand pixels cancels three digits of its exponent: the image's bound is wider here."""
+    some = scene(80, 1, seed)
+    some["scales"] = torch.tensor(scales).repeat(80, 1)
+    assert_agrees(rasterize, some, camera(), image=3e-4)
+
+
+@pytest.mark.parametrize("length", [1e-8, 0.0, 1e2, 1e3, 1e4])
+@pytest.mark.parametrize("axes", [1, 3])
+def test_extreme_scales(rasterize: Rasterizer, axes: int, length: float) -> None:
+    some = scene(100, 1, 5)
+    some["scales"][::30, :axes] = length
+    assert_agrees(rasterize, some, camera(), image=IMAGE if axes == 3 or length < 1 else 1e-4)
+
+
+@pytest.mark.parametrize("length", [1e-12, 1e-3, 1e12])
+def test_quaternions_of_any_length(rasterize: Rasterizer, length: float) -> None:
+    some = scene(100, 1, 6)
+    some["quats"][::2] *= length
+    assert_agrees(rasterize, some, camera())
+
+
+@pytest.mark.parametrize("distance", [1e3, 1e6])
+def test_far_away(rasterize: Rasterizer, distance: float) -> None:
+    """Sub-pixel Gaussians at great distance, each as wide as the blur."""
+    view = camera(40, 30)
+    some = scene(60, 1, 9)
+    g = torch.Generator().manual_seed(9)
+    rays = torch.cat([torch.rand(60, 2, generator=g) - 0.5, torch.ones(60, 1)], 1)
+    some["means"] = in_front(view, rays * distance * torch.linspace(1, 2, 60)[:, None])
+    assert_agrees(rasterize, some, view, image=1e-3 if distance > 1e5 else IMAGE, gradient=math.inf)
+
+
+def test_thousands_in_one_tile(rasterize: Rasterizer) -> None:
+    """20,000 faint ones before 5x4 pixels, of which some end early."""
+    some = scene(20_000, 1, 2, size=0.02)
+    some["means"] *= 0.5
+    some["opacities"] = some["opacities"] * 0.02 + 1 / 255
+    # So many alphas per pixel that a cut is nearby in most: look closer.
+    assert_agrees(rasterize, some, camera(5, 4), cut=0.1, nudge=1e-5)

@@ -1,0 +1,155 @@
+"""The oracle itself, against closed forms, plain loops and numerical derivatives."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import sph_harm_y
+from torch import Tensor
+
+from clod_adapter.cameras import Camera
+from clod_adapter.rasterizers import reference
+from scenes import camera, in_front, scene
+
+BLACK = torch.zeros(3, dtype=torch.float64)
+
+
+def pixels_of(view: Camera, points: Tensor) -> Tensor:
+    """Pinhole projection of camera-space ``points [n, 3]``."""
+    focal = view.K.double().diagonal()[:2]
+    return focal * points[:, :2] / points[:, 2:] + view.K[:2, 2].double()
+
+
+def one(view: Camera, **changes: Tensor) -> dict[str, Tensor]:
+    """A white, isotropic Gaussian before the camera."""
+    values = {
+        "means": in_front(view, torch.tensor([[0.1, -0.05, 2.5]])), "quats": torch.tensor([[1.0, 0, 0, 0]]),
+        "scales": torch.full((1, 3), 0.2), "opacities": torch.tensor([0.8]), "sh0": torch.zeros(1, 1, 3),
+        "shN": torch.zeros(1, 0, 3),
+    }  # fmt: skip
+    return {name: value.double() for name, value in (values | changes).items()}
+
+
+def test_a_gaussian_looks_like_one() -> None:
+    """On the optical axis: variance (f s / z)^2 + 0.3 along x and y, peak at the projected centre, grey 0.5."""
+    view = camera(41, 31)
+    focal = view.K.double().diagonal()[:2]
+    some = one(view, means=in_front(view, torch.tensor([[0.0, 0.0, 2.5]])))
+    image, alpha = reference.rasterize(**some, camera=view, background=BLACK)
+    variance = (focal * 0.2 / 2.5) ** 2 + 0.3
+    x, y = torch.arange(41).double() + 0.5 - view.K[0, 2], torch.arange(31).double() + 0.5 - view.K[1, 2]
+    want = 0.8 * torch.exp(-0.5 * (x**2 / variance[0] + y[:, None] ** 2 / variance[1]))
+    want[want < 1 / 255] = 0
+    torch.testing.assert_close(alpha, want, rtol=1e-4, atol=1e-6)  # the fixture's centre is rounded to float32
+    torch.testing.assert_close(image, 0.5 * alpha[..., None].expand(31, 41, 3))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_projection_is_the_first_order_one(seed: int) -> None:
+    """``J W Sigma W^T J^T + 0.3`` with J from finite differences of the pinhole, Sigma from a rotation matrix."""
+    g = torch.Generator().manual_seed(seed)
+    view = camera(80, 60)
+    points = torch.tensor([[0.3, 0.2, 2.0]]).double() + 0.3 * torch.randn(5, 3, generator=g).double()
+    quats, scales = torch.randn(5, 4, generator=g).double(), torch.rand(5, 3, generator=g).double() + 0.01
+    viewmat, K = view.viewmat.double(), view.K.double()
+    centres, covariances = reference.project(points, quats, scales, viewmat, K, view)
+    torch.testing.assert_close(centres, pixels_of(view, points))
+    for point, (w, *v), scale, found in zip(points, quats, scales, covariances, strict=True):
+        h = 1e-6 * torch.eye(3, dtype=torch.float64)
+        jacobian = (pixels_of(view, point + h) - pixels_of(view, point - h)).T / 2e-6
+        axis, half = torch.stack(v), torch.atan2(torch.stack(v).norm(), w)
+        x, y, z = axis / axis.norm()
+        cross = torch.stack([torch.stack([0 * x, -z, y]), torch.stack([z, 0 * x, -x]), torch.stack([-y, x, 0 * x])])
+        rotation = torch.linalg.matrix_exp(2 * half * cross)
+        sigma = rotation @ torch.diag(scale**2) @ rotation.T
+        W = viewmat[:3, :3]
+        want = jacobian @ W @ sigma @ W.T @ jacobian.T + 0.3 * torch.eye(2, dtype=torch.float64)
+        torch.testing.assert_close(found, want, rtol=1e-6, atol=1e-6, msg=lambda m: f"seed {seed}: {m}")
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_ray_is_clamped_beyond_the_image(axis: int) -> None:
+    """From 0.15 of the image's size beyond its edge on, the Jacobian's ray stays; the centre does not."""
+    view = camera(80, 60)
+    K, size = view.K.double(), torch.tensor([80.0, 60.0]).double()
+    edge = ((1.15 * size - K[:2, 2]) / K.diagonal()[:2])[axis]
+    points = torch.zeros(3, 3).double()
+    points[:, 2], points[:, axis] = 1.0, torch.stack([edge * 0.99, edge, edge * 3])
+    arguments = torch.tensor([[1.0, 0, 0, 0]]).double().repeat(3, 1), torch.full((3, 3), 0.1).double()
+    centres, covariances = reference.project(points, *arguments, torch.eye(4).double(), K, view)
+    torch.testing.assert_close(centres, pixels_of(view, points))
+    torch.testing.assert_close(covariances[1], covariances[2])
+    assert (covariances[0] - covariances[1])[axis, axis].abs() > 1e-3
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_blending_is_front_to_back(seed: int) -> None:
+    """A loop over each pixel's list, as every rasterizer's shader has it."""
+    g = torch.Generator().manual_seed(seed)
+    alphas = torch.rand(40, 30, generator=g).double() ** 2
+    alphas[torch.rand(40, 30, generator=g) < 0.3] = 0
+    alphas[::2] *= 0.2  # some pixels that do not end
+    weights, through = reference.blend(alphas)
+    for p in range(40):
+        t, want = 1.0, [0.0] * 30
+        for i, a in enumerate(alphas[p].tolist()):
+            if a == 0:
+                continue
+            if t * (1 - a) <= 1e-4:
+                break
+            want[i], t = a * t, t * (1 - a)
+        torch.testing.assert_close(weights[p].tolist(), want, msg=lambda m, p=p: f"seed {seed}, pixel {p}: {m}")
+        assert through[p].item() == pytest.approx(t, abs=1e-12)
+    assert (through < 1e-3).any() and (through > 1e-2).any()
+
+
+def test_harmonics_are_the_real_ones() -> None:
+    """sqrt(2) Im Y_lm for m < 0 and Re for m > 0, with the Condon-Shortley phase, in the order of l, then m."""
+    g = torch.Generator().manual_seed(0)
+    directions = torch.randn(50, 3, generator=g).double()
+    directions /= directions.norm(dim=1, keepdim=True)
+    x, y, z = directions.numpy().T
+    found = reference.sh_basis(directions).numpy()
+    polar, azimuth = np.arccos(z), np.arctan2(y, x)
+    for degree in range(5):
+        for m in range(-degree, degree + 1):
+            value = sph_harm_y(degree, abs(m), polar, azimuth)
+            want = value.real if m == 0 else math.sqrt(2) * (value.imag if m < 0 else value.real)
+            np.testing.assert_allclose(
+                found[:, degree * degree + degree + m], want, atol=1e-12, err_msg=f"l {degree}, m {m}"
+            )
+
+
+def test_colours_do_not_go_below_black() -> None:
+    eye = torch.zeros(3).double()
+    means = torch.tensor([[0.0, 0, 1.0], [0, 0, -2.0]]).double()
+    sh0, shN = torch.tensor([0.0, -10.0]).double()[:, None, None].expand(2, 1, 3), torch.zeros(2, 3, 3).double()
+    shN[0, 1] = 0.5  # along z
+    want = torch.tensor([0.5 + 0.5 * 0.4886025119, 0.0]).double()[:, None].expand(2, 3)
+    torch.testing.assert_close(reference.shade(means, sh0, shN, eye), want)
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_gradients_numerically(degree: int) -> None:
+    """Autograd of the oracle passes through its cuts as through constants, so the scene stays clear of them."""
+    view = camera(6, 5)
+    some = {name: value.double() for name, value in scene(3, degree, 1).items()}
+    some["means"] = in_front(view, torch.tensor([[0.1, 0, 2.0], [-0.1, 0.1, 3.0], [0.0, -0.2, 4.0]])).double()
+    some["scales"] = some["scales"] + 2.0
+    some["opacities"] = torch.tensor([0.6, 0.5, 0.7]).double()
+    some["sh0"] = some["sh0"].abs()
+    leaves = [value.requires_grad_() for value in some.values()]
+    background = torch.tensor([0.1, 0.2, 0.3]).double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda *p: reference.rasterize(*p[:6], view, p[6]), [*leaves, background])
+
+
+def test_background_shows_through() -> None:
+    view = camera(12, 9)
+    some = one(view)
+    behind = torch.tensor([0.3, 0.6, 0.9]).double()
+    dark, alpha = reference.rasterize(**some, camera=view, background=BLACK)
+    image, _ = reference.rasterize(**some, camera=view, background=behind)
+    torch.testing.assert_close(image, dark + (1 - alpha)[..., None] * behind)

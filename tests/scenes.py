@@ -1,0 +1,99 @@
+"""Random scenes, cameras and captures that the tests share."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.render import render
+
+
+def camera(
+    width: int = 61, height: int = 45, *, fov: float = 60.0, off_centre: tuple[float, float] = (0.52, 0.47)
+) -> Camera:
+    """At (0.3, -0.2, -3), looking roughly along +z, principal point at ``off_centre`` shares of the image."""
+    yaw, pitch = 0.12, -0.07
+    ry = torch.tensor([[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]])
+    rx = torch.tensor([[1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)], [0, math.sin(pitch), math.cos(pitch)]])
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = rx @ ry
+    viewmat[:3, 3] = -(rx @ ry) @ torch.tensor([0.3, -0.2, -3.0])
+    focal = 0.5 * width / math.tan(math.radians(fov) / 2)
+    K = torch.tensor([[focal, 0, width * off_centre[0]], [0, focal * 1.03, height * off_centre[1]], [0, 0, 1.0]])
+    return Camera(viewmat, K, width, height)
+
+
+def in_front(view: Camera, points: Tensor) -> Tensor:
+    """World positions of camera-space ``points [n, 3]``."""
+    return view.position + points @ view.viewmat[:3, :3]
+
+
+def scene(n: int, degree: int, seed: int, *, size: float = 0.08) -> dict[str, Tensor]:
+    """Activated float32 parameters of n Gaussians in front of, beside and behind the camera."""
+    g = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g)
+
+    return {
+        "means": normal(n, 3) * torch.tensor([1.5, 1.2, 1.5]),
+        "quats": normal(n, 4),
+        "scales": (normal(n, 3) * 0.6 + math.log(size)).exp(),
+        "opacities": (normal(n) * 2.5).sigmoid(),
+        "sh0": normal(n, 1, 3) * 0.8,
+        "shN": normal(n, (degree + 1) ** 2 - 1, 3) * 0.2,
+    }
+
+
+def gaussians(n: int, degree: int, seed: int, *, size: float = 0.08) -> Gaussians:
+    """The same as a checkpoint stores them."""
+    s = scene(n, degree, seed, size=size)
+    logs, logits = s["scales"].log(), s["opacities"].logit()
+    return Gaussians(s["means"], s["quats"], logs, logits, s["sh0"], s["shN"])
+
+
+def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Camera]:
+    """Cameras on a circle around the origin, looking at it, at slightly different heights and distances."""
+    cameras = []
+    for k in range(count):
+        turn = 2 * math.pi * k / count
+        eye = (
+            radius
+            * (1 + 0.1 * math.cos(3 * turn))
+            * torch.tensor([math.cos(turn), 0.2 * math.sin(2 * turn), math.sin(turn)])
+        )
+        forward = -eye / eye.norm()
+        right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
+        right = right / right.norm()
+        viewmat = torch.eye(4)
+        viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+        K = torch.tensor([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1.0]])
+        cameras.append(Camera(viewmat, K, width, height, f"view_{k}.png"))
+    return cameras
+
+
+@torch.no_grad()
+def photograph(truth: Gaussians, cameras: list[Camera]) -> tuple[View, ...]:
+    """What the cameras see of ``truth``, in bytes."""
+    return tuple(View(c, (render(truth, c).image.clamp(0, 1) * 255).round().to(torch.uint8)) for c in cameras)
+
+
+def capture(n: int = 300, views: int = 8, width: int = 48, height: int = 36, seed: int = 0) -> tuple[Gaussians, Scene]:
+    """A slightly wrong checkpoint and the photographs of what it should be; every fourth one is held out."""
+    truth = gaussians(n, 1, seed, size=0.15)
+    g = torch.Generator().manual_seed(seed + 1)
+
+    def near(values: Tensor, by: float) -> Tensor:
+        return values + by * torch.randn(values.shape, generator=g)
+
+    base = truth.replace(
+        means=near(truth.means, 0.01), log_scales=near(truth.log_scales, 0.05), sh0=near(truth.sh0, 0.05),
+        opacity_logits=near(truth.opacity_logits, 0.2),
+    )  # fmt: skip
+    seen = photograph(truth, ring(views, width, height))
+    return base, Scene(tuple(v for k, v in enumerate(seen) if k % 4), seen[::4])

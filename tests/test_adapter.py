@@ -1,0 +1,162 @@
+"""The adapter's contract: it is the result, it comes off without a trace, and it knows its base."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clod_adapter.adapter import ATTRIBUTES, SIGMA_MAX, Adapter, attach, detach, extract
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+
+CONFIG = AttenuationConfig(tau=0.01, scene_distance=3.5)
+
+
+def gaussians(n: int = 6, seed: int = 0, bands: int = 8) -> Gaussians:
+    g = torch.Generator().manual_seed(seed)
+    shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, bands, 3))
+    return Gaussians(*(torch.randn(shape, generator=g) for shape in shapes))
+
+
+def bits(g: Gaussians) -> dict[str, list[int]]:
+    return {name: value.detach().view(torch.int32).flatten().tolist() for name, value in g.tensors().items()}
+
+
+def adapt(base: Gaussians, names: list[str], scale: float = 0.01, seed: int = 1) -> Gaussians:
+    g = torch.Generator().manual_seed(seed)
+    changes = {}
+    for name in names:
+        old = getattr(base, name)
+        changes[name] = old + scale * torch.randn(old.shape, generator=g)
+    return attach(base.replace(**changes), torch.rand(len(base), generator=g), CONFIG)
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.sampled_from(ATTRIBUTES), unique=True),
+    st.sampled_from([1e-9, 1e-3, 1.0, 1e4, 1e6]),
+    st.integers(0, 1000),
+    st.sampled_from([0, 3, 15]),
+)
+def test_applying_is_the_result(names: list[str], scale: float, seed: int, bands: int) -> None:
+    base = gaussians(seed=seed, bands=bands)
+    adapted = adapt(base, names, scale, seed + 1)
+    before = bits(base)
+    adapter = extract(base, adapted, fingerprint="f", config={"steps": 1})
+    result = adapter.apply(base, "f")
+    assert bits(adapter.apply(base)) == bits(result) and bits(base) == before
+    assert result.attenuation == CONFIG and adapter.sigma_d is not adapted.sigma_d
+    assert bits(result)["sigma_d"] == bits(adapted)["sigma_d"]
+    # Extracting the result from itself changes nothing any more.
+    assert bits(extract(base, result, fingerprint="f", config={}).apply(base)) == bits(result)
+    for name in ATTRIBUTES:
+        if name not in names:
+            assert name not in adapter.updates and getattr(result, name) is getattr(base, name)
+        step = 2.0**-10 * (getattr(adapted, name) - getattr(base, name)).abs() + 1e-6
+        assert ((getattr(result, name) - getattr(adapted, name)).abs() <= step).all()
+
+
+def test_differences_are_half_the_size() -> None:
+    base = gaussians()
+    adapter = extract(base, adapt(base, ["sh0"]), fingerprint="f", config={})
+    assert {name: update.dtype for name, update in adapter.updates.items()} == {"sh0": torch.float16}
+
+
+def test_overflowing_differences_are_kept_as_values() -> None:
+    base = gaussians()
+    adapted = adapt(base, ["means"], 1e6)
+    adapter = extract(base, adapted, fingerprint="f", config={})
+    assert adapter.updates["means"].dtype == torch.float32
+    assert bits(adapter.apply(base))["means"] == bits(adapted)["means"]
+
+
+def test_infinite_logits() -> None:
+    base = gaussians()
+    base.opacity_logits[0] = torch.inf
+    stays = adapt(base, ["opacity_logits"])
+    adapter = extract(base, stays, fingerprint="f", config={})
+    assert adapter.updates["opacity_logits"].dtype == torch.float16
+    assert adapter.apply(base).opacity_logits[0] == torch.inf
+    logits = stays.opacity_logits.clone()
+    logits[0] = 5.0
+    adapter = extract(base, stays.replace(opacity_logits=logits), fingerprint="f", config={})
+    assert adapter.updates["opacity_logits"].dtype == torch.float32
+    assert torch.equal(adapter.apply(base).opacity_logits, logits)
+
+
+def test_unchanged_values_keep_their_bits() -> None:
+    base = gaussians()
+    base.means[0] = torch.tensor([-0.0, 0.0, 1e-42])
+    means = base.means.clone()
+    means[1] += 1
+    result = extract(base, attach(base.replace(means=means)), fingerprint="f", config={}).apply(base)
+    assert bits(result)["means"][:3] == bits(base)["means"][:3]
+
+
+def test_disabled_means_the_base() -> None:
+    base = gaussians()
+    on = attach(base)
+    assert on.attenuation == AttenuationConfig() and bits(detach(on)) == bits(base)
+    assert detach(on).sigma_d is None and detach(on).attenuation is None
+    distance = torch.logspace(-6, 4, 1000)
+    for sigma in (torch.tensor(SIGMA_MAX), torch.tensor(SIGMA_MAX, dtype=torch.float64)):
+        assert (torch.exp(-(distance**2) / (2 * sigma**2 + 1e-8)).float() == 1).all()
+    assert (on.sigma_d == SIGMA_MAX).all()
+
+
+def test_attach_gives_the_dial() -> None:
+    sigma_d = torch.rand(6)
+    on = attach(gaussians(), sigma_d, CONFIG)
+    assert on.sigma_d is sigma_d and on.attenuation is CONFIG
+    with pytest.raises(ClodError, match="sigma_d"):
+        attach(gaussians(), torch.rand(5), CONFIG)
+
+
+def test_an_old_dial_of_the_base_plays_no_part() -> None:
+    base = gaussians()
+    adapted = adapt(base, ["sh0"])
+    old = attach(base, torch.ones(6))
+    fresh = extract(base, adapted, fingerprint="f", config={})
+    again = extract(old, adapted, fingerprint="f", config={})
+    assert bits(fresh.apply(old)) == bits(again.apply(base))
+
+
+def test_a_different_base_is_refused() -> None:
+    base = gaussians()
+    adapter = extract(base, adapt(base, ["shN"]), fingerprint="a" * 64, config={})
+    with pytest.raises(ClodError, match="different base.*SHA-256 is bbbb"):
+        adapter.apply(base, "b" * 64)
+    with pytest.raises(ClodError, match="different base.*7 Gaussians, the adapter 6"):
+        adapter.apply(gaussians(7))
+    with pytest.raises(ClodError, match="different base.*shN"):
+        adapter.apply(gaussians(bands=3))
+
+
+def test_extract_refuses_what_is_no_adaptation() -> None:
+    base = gaussians()
+    with pytest.raises(ClodError, match="no sigma_d"):
+        extract(base, base, fingerprint="f", config={})
+    with pytest.raises(ClodError, match="means is float32"):
+        extract(base, attach(gaussians(5)), fingerprint="f", config={})
+    with pytest.raises(ClodError, match="diverged"):
+        extract(base, attach(base, torch.full((6,), torch.nan)), fingerprint="f", config={})
+    for bad in (torch.nan, torch.inf):
+        with pytest.raises(ClodError, match="sh0 holds a new value"):
+            extract(base, attach(base.replace(sh0=torch.full((6, 1, 3), bad))), fingerprint="f", config={})
+
+
+def test_training_tensors_are_let_go() -> None:
+    base = gaussians()
+    adapted = base.replace(means=(base.means + 1).requires_grad_())
+    adapter = extract(base, attach(adapted, torch.ones(6).requires_grad_()), fingerprint="f", config={})
+    assert not adapter.sigma_d.requires_grad and not adapter.updates["means"].requires_grad
+
+
+def test_adapter_checks_its_tensors() -> None:
+    with pytest.raises(ClodError, match="float32"):
+        Adapter(torch.ones(3).double(), CONFIG, {}, "f", {})
+    with pytest.raises(ClodError, match="'colour'"):
+        Adapter(torch.ones(3), CONFIG, {"colour": torch.ones(3)}, "f", {})

@@ -1,0 +1,380 @@
+"""The equation against mpmath, autograd against finite differences, and the properties the dial stands on."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from functools import cache
+from typing import NamedTuple
+
+import mpmath
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from clod_adapter.attenuation import (
+    SIGMA_MAX,
+    attenuate,
+    extinction_scale,
+    log_attenuation,
+    normalized_distances,
+    normalizing_distance,
+    sigma_for_extinction,
+    soft_count,
+)
+from clod_adapter.cameras import Camera
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+
+DTYPES = [torch.float32, torch.float64]
+LOGITS = [-200.0, -40.0, -6.0, -1.0, 0.0, 2.0, 9.0, 200.0, math.inf]
+SIGMAS = [-1.0, 0.0, 1e-12, 1e-6, 1e-3, 0.05, 0.4, 1.0, 30.0, 1e6, 1e12]
+DISTANCES = [0.0, 1e-7, 1e-3, 0.1, 0.7, 1.5]
+SCALES = [1.0, 1.75, 7.0, 1e4]
+TAUS = [1e-6, 1 / 255, 0.5]
+EPSILONS = [0.0, 1e-8, 1e-2]
+
+mpmath.mp.dps = 50
+ZERO = mpmath.mpf(0)
+
+
+def grid(*axes: list[float]) -> list[Tensor]:
+    """Columns of the axes' product. Values are float32's, so both dtypes share one mpmath reference."""
+    return list(torch.tensor(list(itertools.product(*axes)), dtype=torch.float32).double().unbind(1))
+
+
+def assert_close(
+    got: Tensor, want: list[mpmath.mpf], ulps: float | list[float], floor: float | list[float] = 0.0
+) -> None:
+    """Relative error within ulps * finfo.eps, absolute within floor or the smallest normal; too large means inf."""
+    info = torch.finfo(got.dtype)
+    ulps = ulps if isinstance(ulps, list) else [ulps] * len(want)
+    floor = floor if isinstance(floor, list) else [floor] * len(want)
+    for i, (g, w) in enumerate(zip(got.tolist(), want, strict=True)):
+        if abs(w) > info.max:
+            assert g == math.copysign(math.inf, w), (i, g, w)
+        else:
+            error = abs(mpmath.mpf(g) - w)
+            assert error <= max(ulps[i] * info.eps * abs(w), info.tiny, floor[i]), (
+                i,
+                g,
+                w,
+                float(error / info.eps / abs(w)),
+            )
+
+
+class Reference(NamedTuple):
+    """log factor and its slope by sigma, at 50 digits."""
+
+    log_factor: mpmath.mpf
+    slope: mpmath.mpf
+
+
+@cache
+def reference(sigma: float, d: float, s: float, eps: float) -> Reference:
+    sigma_plus = max(mpmath.mpf(sigma), ZERO)
+    v = sigma_plus**2 + mpmath.mpf(eps) / 2
+    if d == 0:
+        return Reference(ZERO, ZERO)
+    if v == 0:
+        return Reference(-mpmath.inf, ZERO)
+    u = (mpmath.mpf(d) * s) ** 2 / (2 * v)
+    return Reference(-u, 2 * u * sigma_plus / v)
+
+
+def log_opacity(logit: float) -> mpmath.mpf:
+    return ZERO if logit == math.inf else -mpmath.log1p(mpmath.exp(-mpmath.mpf(logit)))
+
+
+@cache
+def reference_extinction(logit: float, sigma: float, d: float, tau: float, eps: float) -> mpmath.mpf:
+    upper = mpmath.exp(log_opacity(logit)) / mpmath.mpf(tau)
+    v = max(mpmath.mpf(sigma), ZERO) ** 2 + mpmath.mpf(eps) / 2
+    if d == 0:
+        return upper
+    if v == 0:
+        return ZERO
+    return upper * mpmath.exp(-mpmath.lambertw((upper * d) ** 2 / v).real / 2)
+
+
+def config(tau: float = 1 / 255, eps: float = 1e-8, **other: object) -> AttenuationConfig:
+    return AttenuationConfig(tau=tau, eps=eps, **{"max_sv": 1.0} | other)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("eps", EPSILONS)
+@pytest.mark.parametrize("scale", SCALES)
+def test_log_attenuation_and_its_slope_match_mpmath(dtype: torch.dtype, eps: float, scale: float) -> None:
+    sigma, d = (t.to(dtype) for t in grid(SIGMAS, DISTANCES))
+    sigma.requires_grad_()
+    out = log_attenuation(sigma, d, scale, eps)
+    out.sum().backward()
+    want = [reference(a, b, scale, eps) for a, b in zip(sigma.tolist(), d.tolist(), strict=True)]
+    assert_close(out.detach(), [w.log_factor for w in want], ulps=4)
+    limit = torch.finfo(dtype).max
+    slopes = [ZERO if max(abs(w.slope), abs(w.log_factor)) > limit else w.slope for w in want]
+    assert sigma.grad is not None
+    assert_close(sigma.grad, slopes, ulps=7)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("eps", EPSILONS)
+@pytest.mark.parametrize("scale", SCALES)
+def test_opacities_and_their_gradients_match_mpmath(dtype: torch.dtype, eps: float, scale: float) -> None:
+    columns = grid(LOGITS, SIGMAS, DISTANCES)
+    logits, sigma, d = (t.to(dtype) for t in columns)
+    logits.requires_grad_()
+    sigma.requires_grad_()
+    out = attenuate(logits, sigma, d, scale, config(eps=eps))
+    by_logit, by_sigma = torch.autograd.grad(out.opacities.sum(), (logits, sigma), retain_graph=True)
+    (log_by_logit,) = torch.autograd.grad(out.log_opacities.sum(), logits)
+    rows = list(zip(*(c.tolist() for c in columns), strict=True))
+    factors = [reference(a, b, scale, eps) for _, a, b in rows]
+    logs = [log_opacity(r[0]) + f.log_factor for r, f in zip(rows, factors, strict=True)]
+    opacities = [mpmath.exp(x) for x in logs]
+    transparency = [ZERO if r[0] == math.inf else 1 / (1 + mpmath.exp(mpmath.mpf(r[0]))) for r in rows]
+    # exp turns an absolute error into a relative one: what is allowed grows with |log a''|.
+    soft = [6 + 3 * float(min(abs(x), 1e4)) for x in logs]
+    tiny = torch.finfo(dtype).tiny
+    assert_close(out.log_opacities.detach(), logs, ulps=5)
+    assert_close(out.opacities.detach(), opacities, soft)
+    assert_close(log_by_logit, transparency, ulps=4)
+    assert_close(by_logit, [a * t for a, t in zip(opacities, transparency, strict=True)], soft)
+    slopes = [ZERO if f.slope > 1 / tiny else f.slope for f in factors]
+    # Where a'' itself is denormal its product with a steep slope has that error and no other.
+    floors = [float(4 * tiny * s) for s in slopes]
+    assert_close(by_sigma, [a * s for a, s in zip(opacities, slopes, strict=True)], [x + 8 for x in soft], floors)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("eps", EPSILONS)
+@pytest.mark.parametrize("tau", TAUS)
+def test_extinction_scale_matches_mpmath(dtype: torch.dtype, eps: float, tau: float) -> None:
+    columns = grid(LOGITS, SIGMAS, DISTANCES)
+    logits, sigma, d = (t.to(dtype) for t in columns)
+    got = extinction_scale(logits, sigma, d, config(tau, eps))
+    rows = list(zip(*(c.tolist() for c in columns), strict=True))
+    want = [reference_extinction(*row, tau, eps) for row in rows]
+    allowed = [6 + float(abs(log_opacity(row[0]))) for row in rows]
+    assert_close(got, want, allowed, floor=torch.finfo(dtype).tiny / tau)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("eps", EPSILONS)
+@pytest.mark.parametrize("tau", TAUS)
+def test_sigma_for_extinction_matches_mpmath(dtype: torch.dtype, eps: float, tau: float) -> None:
+    columns = grid(LOGITS[2:], DISTANCES, [0.0, 1e-6, 0.3, 1.0, 1.75, 6.0, 100.0, 1e4])
+    got = sigma_for_extinction(*(t.to(dtype) for t in columns), config(tau, eps)).double()
+    info = torch.finfo(dtype)
+    for row, g in zip(zip(*(c.tolist() for c in columns), strict=True), got.tolist(), strict=True):
+        logit, d, s = row
+        drop = log_opacity(logit) - mpmath.log(tau * mpmath.mpf(s)) if s > 0 else mpmath.inf
+        if abs(drop) < 16 * info.eps:
+            continue  # s* is a/tau to rounding: both answers are right
+        if drop < 0:
+            assert g == float(torch.tensor(SIGMA_MAX, dtype=dtype)), row
+            continue
+        total = (mpmath.mpf(d) * s) ** 2 / (2 * drop)
+        want = min(mpmath.sqrt(max(total - mpmath.mpf(eps) / 2, ZERO)), mpmath.mpf(SIGMA_MAX))
+        condition = 4 + float((abs(log_opacity(logit)) + abs(mpmath.log(tau * mpmath.mpf(s)))) / drop) if s > 0 else 4
+        # Stated for v + eps/2 = r^2, of which sigma^2 is what lies above eps/2.
+        error = abs(mpmath.mpf(g) ** 2 - want**2)
+        assert error <= condition * info.eps * max(total, mpmath.mpf(eps) / 2) + info.tiny, (row, g, want)
+
+
+def test_gradcheck() -> None:
+    generator = torch.Generator().manual_seed(0)
+    draw = [torch.rand(12, generator=generator, dtype=torch.float64) for _ in range(3)]
+    logits, sigma, d = (8 * draw[0] - 4).requires_grad_(), (draw[1] + 0.05).requires_grad_(), draw[2]
+
+    def both(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        out = attenuate(a, b, d, 2.5, config(eps=1e-2))
+        return out.opacities, out.log_opacities
+
+    assert torch.autograd.gradcheck(both, (logits, sigma))
+    assert torch.autograd.gradcheck(lambda a, b: both(a, b)[0], (logits, sigma))
+    assert torch.autograd.gradcheck(lambda b: log_attenuation(b, d, 2.5, 1e-2), (sigma,))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_identity_is_bit_exact(dtype: torch.dtype) -> None:
+    logits = torch.cat([torch.linspace(-120, 60, 4001), torch.tensor([math.inf, -math.inf])]).to(dtype)
+    d = torch.linspace(0, 1.5, len(logits)).to(dtype)
+    far = attenuate(logits, torch.full_like(d, SIGMA_MAX), d, 6.0, config())
+    assert torch.equal(far.opacities, logits.sigmoid())
+    near = attenuate(logits, torch.linspace(-1, 1, len(logits)).to(dtype), torch.zeros_like(d), 6.0, config(eps=0.0))
+    assert torch.equal(near.opacities, logits.sigmoid())
+    widest = torch.full_like(d, 2e5 if dtype == torch.float32 else 10.0)
+    assert torch.equal(log_attenuation(torch.full_like(d, SIGMA_MAX), widest, 1.0, 0.0).exp(), torch.ones_like(d))
+
+
+@pytest.mark.parametrize("eps", [0.0, 1e-100, 1e-8])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_edges_are_never_nan(dtype: torch.dtype, eps: float) -> None:
+    edge = [0.0, 1e-45, 1e-30, 1e-12, 1.0, 1e12, 1e30]
+    logits, sigma, d = (
+        torch.tensor(c, dtype=dtype)
+        for c in zip(*itertools.product([*LOGITS, -math.inf, -1e4, -1e30], [*edge, -1.0, -1e30], edge), strict=True)
+    )
+    logits.requires_grad_()
+    sigma.requires_grad_()
+    out = attenuate(logits, sigma, d, 7.0, config(eps=eps))
+    count = soft_count(out.log_opacities, 7.0, 1 / 255, 0.1)
+    results: list[Tensor] = [*out, count, extinction_scale(logits, sigma, d, config(eps=eps))]
+    results += [sigma_for_extinction(logits, d, d, config(eps=eps))]
+    for loss in (out.opacities.sum(), count, out.log_opacities.sum(), 0 * out.opacities.sum()):
+        results += torch.autograd.grad(loss, (logits, sigma), retain_graph=True)
+    results += torch.autograd.grad(out.log_opacities, (logits, sigma), torch.zeros_like(d), retain_graph=True)
+    assert not any(r.isnan().any() for r in results)
+    assert all((r == 0).all() for r in results[-2:])
+    if eps == 0:
+        gone = (sigma <= 0) & (d > 0)
+        assert (log_attenuation(sigma, d, 1.0, eps)[gone] == -math.inf).all()
+        assert (extinction_scale(logits, sigma, d, config(eps=eps))[gone] == 0).all()
+    assert (log_attenuation(sigma, d, 1.0, eps)[d == 0] == 0).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
+    logits, sigma, d = (torch.linspace(a, b, 50).to(dtype) for a, b in ((-4, 4), (0.01, 1), (0, 1)))
+    sigma.requires_grad_()
+    out = attenuate(logits, sigma, d, 3.0, config())
+    want = attenuate(logits.float(), sigma.float(), d.float(), 3.0, config())
+    assert out.opacities.dtype == torch.float32 and torch.equal(out.opacities, want.opacities)
+    (grad,) = torch.autograd.grad(out.opacities.sum(), sigma)
+    assert grad.dtype == dtype and grad.isfinite().all()
+    assert extinction_scale(logits, sigma, d, config()).dtype == torch.float32
+
+
+unit = st.floats(0, 1.5, width=32)
+decay = st.one_of(st.floats(-1, 2, width=32), st.floats(0.0009765625, 1e6, width=32))
+logit = st.floats(-30, 30, width=32)
+dial = st.floats(1, 100)
+rows = st.lists(st.tuples(logit, decay, unit), min_size=1, max_size=20)
+epsilon = st.sampled_from(EPSILONS)
+quick = settings(deadline=None, max_examples=50)
+
+
+def columns(data: list[tuple[float, ...]], dtype: torch.dtype = torch.float64) -> list[Tensor]:
+    return [torch.tensor(c, dtype=dtype) for c in zip(*data, strict=True)]
+
+
+@given(rows, dial, dial, epsilon, st.sampled_from(DTYPES))
+@quick
+def test_kept_sets_are_nested(
+    data: list[tuple[float, ...]], a: float, b: float, eps: float, dtype: torch.dtype
+) -> None:
+    at = [attenuate(*columns(data, dtype), s, config(eps=eps)) for s in sorted((a, b))]
+    assert (at[1].keep <= at[0].keep).all()
+    assert (at[1].opacities <= at[0].opacities).all()
+
+
+@given(rows, epsilon, st.sampled_from(TAUS[1:]), dial)
+@quick
+def test_kept_until_the_extinction_scale(data: list[tuple[float, ...]], eps: float, tau: float, scale: float) -> None:
+    inputs = columns(data)
+    chosen = config(tau, eps)
+    leaves = extinction_scale(*inputs, chosen)
+    kept = attenuate(*inputs, scale, chosen).keep
+    clear = (leaves / scale - 1).abs() > 1e-12
+    assert torch.equal(kept[clear], (scale < leaves)[clear])
+    for row, s in zip(data, leaves.tolist(), strict=True):
+        one = columns([row])
+        if s * (1 - 1e-12) >= 1:
+            assert attenuate(*one, s * (1 - 1e-12), chosen).keep.all()
+            assert not attenuate(*one, s * (1 + 1e-12), chosen).keep.any()
+
+
+@given(rows, st.floats(0.01, 0.999), epsilon)
+@quick
+def test_sigma_for_extinction_round_trip(data: list[tuple[float, ...]], share: float, eps: float) -> None:
+    logits, _, d = columns(data)
+    wanted = share * logits.sigmoid() * 255
+    sigma = sigma_for_extinction(logits, d, wanted, config(eps=eps))
+    reached = extinction_scale(logits, sigma, d, config(eps=eps))
+    fits = (sigma > 1e-6) & (d > 0)
+    torch.testing.assert_close(reached[fits], wanted[fits], rtol=1e-9, atol=0)
+    assert (reached[d > 0] >= wanted[d > 0] * (1 - 1e-9)).all()  # eps may keep one longer, never shorter
+
+
+@given(logit, st.lists(decay, min_size=2, max_size=20), unit, dial, epsilon, st.sampled_from(DTYPES))
+@quick
+def test_monotone_in_sigma(
+    a: float, sigmas: list[float], d: float, scale: float, eps: float, dtype: torch.dtype
+) -> None:
+    sigma = torch.tensor(sorted(sigmas), dtype=dtype)
+    logits, distances = torch.full_like(sigma, a), torch.full_like(sigma, d)
+    out = attenuate(logits, sigma, distances, scale, config(eps=eps))
+    slack = 4 * torch.finfo(dtype).eps
+    assert (out.opacities.diff() >= -slack * out.opacities[1:]).all()
+    leaves = extinction_scale(logits, sigma, distances, config(eps=eps))
+    assert (leaves.diff() >= -8 * slack * leaves[1:]).all()
+
+
+def test_soft_count_is_hard_forward_and_soft_backward() -> None:
+    tau, scale, temperature = 1 / 255, 2.0, 0.5
+    logs = torch.tensor([-math.inf, -30.0, -5.0, -4.8, -1.0, 0.0], dtype=torch.float64, requires_grad=True)
+    count = soft_count(logs, scale, tau, temperature)
+    assert count.shape == () and count.item() == 3 / 6
+    (grad,) = torch.autograd.grad(3 * count, logs)
+    plain = torch.sigmoid((logs - math.log(tau * scale)) / temperature).mean()
+    (want,) = torch.autograd.grad(3 * plain, logs)
+    torch.testing.assert_close(grad[1:], want[1:])
+    assert grad[0] == 0
+    assert soft_count(torch.empty(0), scale, tau, temperature).item() == 0
+
+
+def looking_down_z(fx: float = 100.0) -> Camera:
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 2.0  # the camera is at z = -2
+    return Camera(viewmat, torch.tensor([[fx, 0, 50], [0, 100, 40], [0, 0, 1]]), width=100, height=80)
+
+
+def test_distances_are_divided_by_the_configured_normalizer() -> None:
+    # Along the axis at distances 1..10, then one behind the camera, one outside the image, one too near.
+    axis = torch.tensor([[0.0, 0.0, z - 2.0] for z in range(1, 11)])
+    unseen = torch.tensor([[0.0, 0.0, -52.0], [30.0, 0.0, -1.0], [0.0, 0.0, -1.995]])
+    means = torch.cat([axis, unseen])
+    distances = (means - torch.tensor([0.0, 0.0, -2.0])).norm(dim=1)
+    camera = looking_down_z()
+    for kind, other, want in [
+        ("scene", {"scene_distance": 4.0}, 4.0),
+        ("max", {}, 10.0),
+        ("quantile", {"quantile": 0.75}, 8.0),
+        ("quantile", {"quantile": 1.0}, 10.0),
+        ("quantile", {"quantile": 1e-9}, 1.0),
+    ]:
+        chosen = config(normalizer=kind, **other)
+        assert normalizing_distance(distances, means, camera, chosen).item() == want
+        torch.testing.assert_close(normalized_distances(means, camera, chosen), distances / want)
+    assert normalizing_distance(distances[10:12], means[10:12], camera, config(normalizer="max")).item() == 50.0
+
+
+def test_normalizing_distance_at_the_edges() -> None:
+    camera = looking_down_z()
+    at_camera = torch.tensor([[0.0, 0.0, -2.0]], requires_grad=True)
+    for kind in ("max", "quantile", "scene"):
+        found = normalized_distances(at_camera, camera, config(normalizer=kind))
+        assert found.tolist() == [0.0] and not found.requires_grad
+        assert normalized_distances(torch.empty(0, 3), camera, config(normalizer=kind)).shape == (0,)
+
+
+def test_frustum_follows_the_image_border() -> None:
+    # At depth 1, fx = fy = 100 and the principal point (50, 40): x in [-0.5, 0.5), y in [-0.4, 0.4).
+    for x, y, inside in [(-0.49, 0, True), (-0.51, 0, False), (0.49, 0, True), (0.51, 0, False), (0, 0.41, False)]:
+        means = torch.tensor([[0.0, 0.0, -1.0], [x, y, -1.0]])
+        distances = torch.tensor([1.0, 9.0])
+        found = normalizing_distance(distances, means, looking_down_z(), config(normalizer="max"))
+        assert found.item() == (9.0 if inside else 1.0), (x, y)
+
+
+def test_bad_calls_are_named() -> None:
+    three, four = torch.ones(3), torch.ones(4)
+    with pytest.raises(ClodError, match="virtual_scale is 0.5"):
+        attenuate(three, three, three, 0.5, config())
+    with pytest.raises(ClodError, match=r"sigma_d \(4,\)"):
+        extinction_scale(three, four, three, config())
+    with pytest.raises(ClodError, match="virtual_scale is nan"):
+        log_attenuation(three, three, math.nan, 0.0)

@@ -1,0 +1,55 @@
+"""Cameras and views: conventions and what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.errors import ClodError
+from scenes import camera, in_front, ring
+
+
+@pytest.mark.parametrize("view", [camera(), *ring(3, 20, 16)], ids=range(4))
+def test_position_is_where_the_world_is_zero(view: Camera) -> None:
+    at_itself = view.viewmat @ torch.cat([view.position, torch.ones(1)])
+    torch.testing.assert_close(at_itself, torch.tensor([0.0, 0, 0, 1]), rtol=0, atol=1e-6)
+
+
+def test_axes_are_opencv_s() -> None:
+    """The shared test cameras look down +z with y down, as the package reads them."""
+    view = camera()
+    back = (view.viewmat[:3, :3] @ in_front(view, torch.tensor([[0.1, 0.2, 3.0]]))[0]) + view.viewmat[:3, 3]
+    torch.testing.assert_close(back, torch.tensor([0.1, 0.2, 3.0]))
+    for other in ring(5, 20, 16):
+        torch.testing.assert_close(torch.linalg.det(other.viewmat[:3, :3]), torch.tensor(1.0))
+        ahead = other.viewmat[:3, 3]  # the origin, which they look at
+        assert ahead[2] > 3 and ahead[:2].abs().max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    "change", [{"viewmat": torch.eye(3)}, {"K": torch.eye(4)}, {"width": 0}, {"height": -1}], ids=str
+)
+def test_impossible_cameras_are_named(change: dict[str, object]) -> None:
+    with pytest.raises(ClodError, match=r"camera 'x\.png'"):
+        dataclasses.replace(camera(), name="x.png", **change)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [torch.zeros(45, 61, 3), torch.zeros(61, 45, 3, dtype=torch.uint8), torch.zeros(45, 61, dtype=torch.uint8)],
+    ids=range(3),
+)
+def test_images_that_do_not_fit_are_named(image: torch.Tensor) -> None:
+    with pytest.raises(ClodError, match=r"view 'x\.png': image must be uint8 of shape \(45, 61, 3\)"):
+        View(dataclasses.replace(camera(), name="x.png"), image)
+
+
+def test_all_three_are_frozen() -> None:
+    view = View(camera(), torch.zeros(45, 61, 3, dtype=torch.uint8))
+    for thing, name in ((view.camera, "width"), (view, "image"), (Scene((view,), ()), "train")):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(thing, name, None)
+    assert Scene((view,), ()).notes == ()

@@ -1,0 +1,83 @@
+"""Configs: every field explained, every impossible value named."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+
+from clod_adapter.config import AdaptConfig, AttenuationConfig, describe, require
+from clod_adapter.errors import ClodError
+
+BOTH = {
+    "tau": [0.0, -0.1, 1.0, 0.2, math.nan], "eps": [-1e-9, 1.0, math.nan], "normalizer": ["mean", ""],
+    "quantile": [0.0, 1.01, math.nan], "max_sv": [0.99, math.inf, math.nan],
+}  # fmt: skip
+ADAPT = BOTH | {
+    "iters": [-1], "time_budget": [0.0, -1.0, math.nan], "start_share": [0.5, 1.01, math.nan],
+    "full_share": [-0.1, 1.1, math.nan], "exponent": [0.0, -1.5, math.inf, math.nan], "reg_weight": [-1.0, math.nan],
+    "temperature": [0.0, math.nan], "ssim_weight": [-0.1, 1.1], "lr_final": [0.0, 1.1, math.nan],
+    **{f"lr_{name}": [-1e-9, math.nan] for name in ("sigma", "means", "quats", "scales", "opacities", "sh0", "shN")},
+}  # fmt: skip
+ATTENUATION = BOTH | {"scene_distance": [0.0, -1.0, math.inf, math.nan]}
+BAD = [
+    (kind, name, value)
+    for kind, table in ((AdaptConfig, ADAPT), (AttenuationConfig, ATTENUATION))
+    for name, values in table.items()
+    for value in values
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "value"), BAD, ids=lambda v: v.__name__ if isinstance(v, type) else str(v))
+def test_impossible_values_are_named(kind: type, name: str, value: object) -> None:
+    with pytest.raises(ClodError, match=f"^{name} is {value}, it must be "):
+        kind(**{name: value})
+
+
+EDGES = {
+    "tau": 1e-6, "eps": 0.0, "quantile": 1.0, "max_sv": 1.0, "iters": 0, "time_budget": 0.1, "start_share": 1.0,
+    "full_share": 0.0, "exponent": 0.1, "reg_weight": 0.0, "ssim_weight": 1.0, "lr_final": 1.0, "lr_means": 0.0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", EDGES)
+def test_values_at_the_edge_are_taken(name: str) -> None:
+    assert getattr(AdaptConfig(**{name: EDGES[name]}), name) == EDGES[name]
+
+
+@pytest.mark.parametrize("kind", [AdaptConfig, AttenuationConfig])
+def test_every_field_has_help_and_a_default(kind: type) -> None:
+    kind()
+    texts = describe(kind)
+    assert list(texts) == [field.name for field in dataclasses.fields(kind)]
+    assert all(len(text) > 10 and text == text.strip().rstrip(".") for text in texts.values())
+    assert describe(kind()) == texts
+
+
+@pytest.mark.parametrize("kind", [AdaptConfig, AttenuationConfig])
+def test_frozen_and_by_keyword(kind: type) -> None:
+    with pytest.raises(TypeError):
+        kind(0.5)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        kind().tau = 0.5
+
+
+def test_what_travels_with_the_file() -> None:
+    chosen = AdaptConfig(tau=0.01, eps=1e-6, normalizer="quantile", quantile=0.7, max_sv=7.0)
+    want = AttenuationConfig(tau=0.01, eps=1e-6, normalizer="quantile", quantile=0.7, scene_distance=2.5, max_sv=7.0)
+    assert chosen.attenuation(2.5) == want
+    with pytest.raises(ClodError, match="scene_distance is 0"):
+        chosen.attenuation(0.0)
+
+
+def test_something_survives_the_cut() -> None:
+    AttenuationConfig(tau=0.19, max_sv=5.0)
+    with pytest.raises(ClodError, match="below 1/max_sv = 0.2"):
+        AttenuationConfig(tau=0.21, max_sv=5.0)
+
+
+def test_require() -> None:
+    require(True, "a", 1, "b")
+    with pytest.raises(ClodError, match="^a is 1, it must be b$"):
+        require(False, "a", 1, "b")

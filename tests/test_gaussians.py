@@ -1,0 +1,100 @@
+"""The container: shapes are checked, nothing is shared by accident, copies are copies."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import SH_COUNTS, Gaussians
+
+CONFIG = AttenuationConfig()
+SHAPES = {
+    "means": (5, 3),
+    "quats": (5, 4),
+    "log_scales": (5, 3),
+    "opacity_logits": (5,),
+    "sh0": (5, 1, 3),
+    "shN": (5, 8, 3),
+}
+
+
+def gaussians(**changes: object) -> Gaussians:
+    g = torch.Generator().manual_seed(0)
+    return Gaussians(**({name: torch.randn(shape, generator=g) for name, shape in SHAPES.items()} | changes))
+
+
+def adapted() -> Gaussians:
+    return gaussians(sigma_d=torch.arange(5.0), attenuation=CONFIG)
+
+
+def test_activations() -> None:
+    some = gaussians(opacity_logits=torch.tensor([0.0, torch.inf, -torch.inf, 1.0, -1.0]))
+    assert len(some) == 5
+    torch.testing.assert_close(some.opacities, torch.tensor([0.5, 1.0, 0.0, 0.7310586, 0.2689414]))
+    torch.testing.assert_close(some.scales.log(), some.log_scales)
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_sh_degree(degree: int) -> None:
+    some = gaussians(shN=torch.zeros(5, (degree + 1) ** 2 - 1, 3))
+    assert some.sh_degree == degree and SH_COUNTS[degree] == (degree + 1) ** 2
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("means", (5, 2)), ("quats", (5, 3)), ("log_scales", (4, 3)), ("opacity_logits", (5, 1)), ("sh0", (5, 3)),
+        ("shN", (5, 7, 3)), ("shN", (4, 8, 3)), ("shN", (5, 8, 4)), ("shN", (5, 35, 3)), ("sigma_d", (4,)),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_wrong_shapes_are_named(name: str, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ClodError) as caught:
+        adapted().replace(**{name: torch.zeros(shape)})
+    assert f"Gaussians.{name}" in str(caught.value) and str(shape) in str(caught.value)
+
+
+def test_a_sigma_comes_with_its_reading() -> None:
+    for changes in ({"sigma_d": torch.ones(5)}, {"attenuation": CONFIG}):
+        with pytest.raises(ClodError, match="both sigma_d and attenuation"):
+            gaussians(**changes)
+
+
+def test_is_frozen() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        gaussians().means = torch.zeros(5, 3)
+
+
+def test_tensors_are_the_fields() -> None:
+    some = adapted()
+    assert list(some.tensors()) == [*SHAPES, "sigma_d"] and list(gaussians().tensors()) == list(SHAPES)
+    assert all(value is getattr(some, name) for name, value in some.tensors().items())
+
+
+def test_replace_changes_what_is_named() -> None:
+    some = adapted()
+    new = some.replace(means=torch.zeros(5, 3))
+    assert (new.means == 0).all() and (some.means != 0).any()
+    assert all(getattr(new, name) is getattr(some, name) for name in some.tensors() if name != "means")
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [torch.tensor([3, 0]), torch.tensor([False, True, True, False, True]), torch.tensor([], dtype=torch.long)],
+    ids=str,
+)
+def test_select(rows: torch.Tensor) -> None:
+    some = adapted()
+    found = some.select(rows)
+    assert found.attenuation is CONFIG
+    for name, value in found.tensors().items():
+        assert torch.equal(value, getattr(some, name)[rows]), name
+
+
+def test_to_a_device() -> None:
+    moved = adapted().to("meta")
+    assert all(value.device.type == "meta" for value in moved.tensors().values()) and moved.attenuation is CONFIG

@@ -1,0 +1,127 @@
+"""The importance estimate against brute force, and the count law of the sigma_d that follows from it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from clod_adapter.attenuation import attenuate, extinction_scale, normalized_distances
+from clod_adapter.cameras import View
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.importance import removal_error, sigma_from_importance, typical_distance
+from clod_adapter.render import splat
+from scenes import gaussians, photograph, ring
+
+CONFIG = AttenuationConfig(scene_distance=4.0)
+
+
+def changes(some: Gaussians, view: View) -> Tensor:
+    """``[N, pixels]`` what removing each Gaussian alone does to the picture. Opacity is its only factor, so
+    where nothing is clamped and no pixel ends the first order is all there is."""
+    whole, _ = splat(some, some.opacities, view.camera)
+    rows = []
+    for i in range(len(some)):
+        without = some.opacities.clone()
+        without[i] = 0
+        rows.append((splat(some, without, view.camera)[0] - whole).flatten())
+    return torch.stack(rows).double()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_estimates_the_exact_removal_error(seed: int, draws: int = 150) -> None:
+    """The mean over many draws within 5 of its standard deviations, which follow from the changes themselves.
+
+    With random signs z, ``(sum_p z_p v_p)^2`` has the mean |v|^2 and the variance 2 (|v|^4 - sum v^4).
+    """
+    some = gaussians(15, 1, seed, size=0.4)
+    some = some.replace(opacity_logits=(0.02 + 0.3 * some.opacities).logit())
+    views = photograph(some, ring(3, 16, 12))
+    v = [changes(some, view) for view in views]
+    exact = sum(x.square().sum(1) for x in v) / 3
+    variance = sum(2 * (x.square().sum(1).square() - x.pow(4).sum(1)) for x in v) / 9
+    found = torch.stack([removal_error(some, views, seed=1000 * seed + k) for k in range(draws)]).double()
+    error = (found.mean(0) - exact).abs()
+    spread = (variance / draws).sqrt()
+    assert (exact > 0).sum() > 10
+    assert (error <= 5 * spread + 1e-5 * exact.max()).all(), f"seed {seed}: {(error / spread).max():.1f} deviations"
+    assert (spread < 0.15 * exact + 1e-9).all()  # so the test could tell a factor of 2, or a missing view
+
+
+def test_is_the_mean_over_views_and_reports_them() -> None:
+    some = gaussians(100, 1, 0)
+    (view,) = photograph(some, ring(1, 20, 16))
+    seen = []
+    both = removal_error(some, [view, view], seed=3, progress=seen.append)
+    assert seen == [1, 2]
+    assert torch.equal(both, removal_error(some, [view, view], seed=3))
+    assert not torch.equal(both, removal_error(some, [view, view], seed=4))
+    assert both.shape == (100,) and not both.requires_grad and (both >= 0).all()
+    once = removal_error(some, [view], seed=3)
+    assert (both >= once / 2).all()  # the same first draw, and a second one
+
+
+def test_what_no_view_shows_counts_nothing() -> None:
+    some = gaussians(50, 0, 0)
+    some = some.replace(means=torch.cat([some.means[:25], some.means[25:] + 1e3]))
+    found = removal_error(some, photograph(some, ring(2, 20, 16)))
+    assert (found[25:] == 0).all() and (found[:25] > 0).any()
+    assert torch.equal(removal_error(some, []), torch.zeros(50))
+
+
+def test_typical_distance_is_a_geometric_mean() -> None:
+    some = gaussians(30, 0, 0)
+    views = photograph(some, ring(3, 8, 6))
+    logs = [normalized_distances(some.means, view.camera, CONFIG).log() for view in views]
+    torch.testing.assert_close(typical_distance(some, views, CONFIG), (sum(logs) / 3).exp())
+    on_top = some.replace(means=views[0].camera.position.repeat(30, 1))  # of one camera: that view counts as 1e-6
+    found = typical_distance(on_top, views[:2], CONFIG)
+    apart = (views[0].camera.position - views[1].camera.position).norm() / 4
+    torch.testing.assert_close(found, (1e-6 * apart).sqrt().expand(30))
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.5, 2.5])
+@pytest.mark.parametrize("share", [0.51, 0.6, 0.8, 1.0])
+def test_shares_kept_follow_the_law(share: float, exponent: float, n: int = 1000) -> None:
+    """At the distances it was made for, ``1 / (s^p + (1/share - 1) s^-p)``, to one Gaussian."""
+    g = torch.Generator().manual_seed(0)
+    some = gaussians(n, 0, 0).replace(opacity_logits=2 * torch.rand(n, generator=g))  # lasting until s = 127
+    importance, distances = torch.rand(n, generator=g), 0.1 + torch.rand(n, generator=g)
+    sigma = sigma_from_importance(some, importance, distances, CONFIG, share=share, exponent=exponent)
+    for s in (1.0, 1.2, 1.7, 2.0, 3.0, 5.0, 7.0, 20.0):
+        kept = attenuate(some.opacity_logits, sigma, distances, s, CONFIG).keep
+        want = 1 / (s**exponent + (1 / share - 1) * s**-exponent)
+        assert abs(kept.sum().item() - n * want) <= 1, f"s {s}"
+        if kept.any() and not kept.all():
+            assert importance[kept].min() > importance[~kept].max(), f"s {s}"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sigma_grows_with_importance(seed: int, n: int = 200) -> None:
+    """All else equal; and whatever the opacity, those of small importance leave first."""
+    g = torch.Generator().manual_seed(seed)
+    importance = torch.rand(n, generator=g)
+    distances, order = torch.full((n,), 0.7), importance.argsort()
+    alike = gaussians(n, 0, 0).replace(opacity_logits=torch.full((n,), 1.0))
+    sigma = sigma_from_importance(alike, importance, distances, CONFIG, share=0.7, exponent=1.5)
+    assert (sigma[order].diff() > 0).all() and sigma.isfinite().all(), f"seed {seed}"
+    some = gaussians(n, 0, seed)
+    sigma = sigma_from_importance(some, importance, distances, CONFIG, share=0.7, exponent=1.5)
+    leaves = extinction_scale(some.opacity_logits, sigma, distances, CONFIG)
+    lasting = (some.opacities * 255 * 0.99 > leaves)[order]  # the others stay until their opacity ends them
+    assert lasting.sum() > n / 2
+    assert (leaves[order][lasting].diff() >= -1e-4).all(), f"seed {seed}"
+
+
+def test_equal_importance_is_ranked_all_the_same() -> None:
+    """Nothing is known (no Gaussian in any view): the law still holds."""
+    some = gaussians(100, 0, 0).replace(opacity_logits=torch.zeros(100))
+    sigma = sigma_from_importance(some, torch.zeros(100), torch.ones(100), CONFIG, share=0.6, exponent=1.5)
+    assert abs(attenuate(some.opacity_logits, sigma, torch.ones(100), 1.0, CONFIG).keep.sum().item() - 60) <= 1
+
+
+def test_of_no_gaussians() -> None:
+    none = gaussians(0, 0, 0)
+    sigma = sigma_from_importance(none, torch.empty(0), torch.empty(0), CONFIG, share=0.6, exponent=1.5)
+    assert sigma.shape == (0,)

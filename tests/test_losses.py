@@ -1,0 +1,141 @@
+"""The fused loss against its plain twin, and the plain one against numerical derivatives and scikit-image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+from torch import Tensor
+
+from clod_adapter.losses import photometric_loss, photometric_loss_plain, ssim
+
+# Smaller than the window of 11, one larger, multiples of 16 and not.
+SIZES = [(1, 1), (1, 30), (3, 7), (10, 11), (11, 11), (12, 16), (33, 50), (64, 48), (17, 101)]
+
+
+def pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """A smooth photograph with black and white parts, and a render of it that also leaves [0, 1]."""
+    g = torch.Generator().manual_seed(seed)
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    waves = torch.sin(x[..., None] / torch.tensor([3.0, 5.0, 9.0]) + y[..., None] / 4)
+    clean = (0.5 + 0.8 * waves).clamp(0, 1)
+    target = (clean * 255).round().to(torch.uint8)
+    image = clean + 0.1 * torch.randn(height, width, 3, generator=g)
+    image[:, : width // 4] = clean[:, : width // 4].round()  # exactly the photograph where it is black
+    return image, target
+
+
+def value_and_gradient(function, image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+    leaf = image.clone().requires_grad_()
+    loss = function(leaf, target, weight)
+    (gradient,) = torch.autograd.grad(loss, leaf)
+    return loss.detach(), gradient
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("size", SIZES, ids=lambda s: "x".join(map(str, s)))
+def test_fused_is_plain(size: tuple[int, int], weight: float) -> None:
+    """In float32, against float64: the value within 2e-6, the gradient within 1e-4 of its length."""
+    image, target = pair(*size)
+    loss, gradient = value_and_gradient(photometric_loss, image, target, weight)
+    want, expected = value_and_gradient(photometric_loss_plain, image.double(), target, weight)
+    assert loss.dtype == torch.float32 and loss.shape == () and gradient.shape == image.shape
+    assert abs(loss.item() - want.item()) <= 2e-6
+    # |x| has no slope at 0, where float32 may see a difference that float64 does not.
+    clear = ((image.double() - target.double() / 255).abs() > 1e-6) | (image == 0)
+    error = (gradient.double() - expected)[clear].norm().item()
+    assert error <= 1e-4 * expected.norm().item()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_threads_change_nothing(count: int) -> None:
+    image, target = pair(33, 50)
+    want = value_and_gradient(photometric_loss, image, target, 0.2)
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        loss, gradient = value_and_gradient(photometric_loss, image, target, 0.2)
+        again = value_and_gradient(photometric_loss, image, target, 0.2)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(loss, again[0]) and torch.equal(gradient, again[1])
+    torch.testing.assert_close(loss, want[0], rtol=1e-6, atol=0)
+    assert torch.equal(gradient, want[1])
+
+
+def test_strided_images() -> None:
+    image, target = pair(20, 30)
+    wide = torch.stack([image, image * 0], -1)[..., 0]
+    turned = target.transpose(0, 1).contiguous().transpose(0, 1)
+    assert not wide.is_contiguous() and not turned.is_contiguous()
+    for found, want in zip(
+        value_and_gradient(photometric_loss, wide, turned, 0.2),
+        value_and_gradient(photometric_loss, image, target, 0.2),
+        strict=True,
+    ):
+        assert torch.equal(found, want)
+
+
+def test_the_gradient_scales_with_what_follows() -> None:
+    image, target = pair(20, 30)
+    _, want = value_and_gradient(photometric_loss, image, target, 0.2)
+    _, scaled = value_and_gradient(lambda *a: 8 * photometric_loss(*a), image, target, 0.2)
+    assert torch.equal(scaled, 8 * want)
+
+
+def test_a_perfect_render_costs_nothing() -> None:
+    _, target = pair(20, 30)
+    loss, gradient = value_and_gradient(photometric_loss, target.float() / 255, target, 0.2)
+    assert abs(loss.item()) < 1e-6
+    assert gradient.abs().max() <= 0.8 / (20 * 30 * 3) + 1e-6  # the slope of |x| at 0, either way
+
+
+def test_float64_takes_the_plain_way() -> None:
+    image, target = pair(12, 13)
+    assert photometric_loss(image.double(), target).dtype == torch.float64
+    assert photometric_loss(image.double(), target) == photometric_loss_plain(image.double(), target)
+
+
+@pytest.mark.parametrize("size", [(2, 3), (6, 5), (13, 12)], ids=str)
+def test_gradient_of_the_plain_loss_numerically(size: tuple[int, int]) -> None:
+    g = torch.Generator().manual_seed(1)
+    target = torch.randint(0, 256, (*size, 3), generator=g).to(torch.uint8)
+    offset = (0.05 + 0.1 * torch.rand(*size, 3, generator=g)) * torch.randn(*size, 3, generator=g).sign()
+    image = (target.double() / 255 + offset).requires_grad_()  # clear of the kink of |x|
+    assert torch.autograd.gradcheck(lambda x: photometric_loss_plain(x, target), image)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_ssim_is_scikit_image_s(seed: int) -> None:
+    """Alike near the border, where the two pad differently and both then find 1."""
+    g = torch.Generator().manual_seed(seed)
+    x = torch.rand(60, 50, 3, generator=g).double()
+    y = x.clone()
+    middle = slice(12, -12)  # twice the window's radius of 5, and then some
+    y[middle, middle] = (x[middle, middle] + 0.3 * torch.randn(36, 26, 3, generator=g)).clamp(0, 1)
+    _, similarity = structural_similarity(
+        x.numpy(), y.numpy(), gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1,
+        channel_axis=2, full=True,
+    )  # fmt: skip
+    assert similarity.mean() < 0.9
+    assert ssim(x, y).item() == pytest.approx(similarity.mean(), abs=1e-9), f"seed {seed}"
+    assert ssim(x.float(), y.float()).item() == pytest.approx(similarity.mean(), abs=1e-5), f"seed {seed}"
+
+
+def test_ssim_pads_with_zeros() -> None:
+    """The window's mean, variance and covariance at a corner, by hand, with black beyond the image."""
+    g = np.random.default_rng(0)
+    x, y = g.random((2, 1, 1, 3))
+    a = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
+    w = (a / a.sum())[5] ** 2  # the only pixel's share of its window
+    mx, my = w * x, w * y
+    vx, vy, cov = w * x * x - mx * mx, w * y * y - my * my, w * x * y - mx * my
+    want = ((2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))).mean()
+    assert ssim(torch.tensor(x), torch.tensor(y)).item() == pytest.approx(want, abs=1e-12)
+
+
+def test_ssim_of_equal_images_is_one() -> None:
+    image, _ = pair(20, 30)
+    assert ssim(image, image).item() == pytest.approx(1, abs=1e-6)
+    assert ssim(image.double(), 1 - image.double()).item() < 0.2

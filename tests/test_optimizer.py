@@ -1,0 +1,139 @@
+"""RowAdam is torch's Adam on the rows that are stepped, and does not touch the others."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from clod_adapter.optimizer import RowAdam
+
+SHAPES = {"means": (3,), "opacity_logits": (), "sh0": (1, 3), "shN": (8, 3)}
+
+
+class PlainRowAdam(RowAdam):
+    """Always takes the plain way."""
+
+    def _step_fused(self, name: str, gradient: Tensor, rows: Tensor, rate: float) -> None:
+        self._step_plain(name, gradient, rows, rate)
+
+
+def parameters(n: int, seed: int = 0) -> dict[str, Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    return {name: torch.randn(n, *shape, generator=g) for name, shape in SHAPES.items()}
+
+
+def gradients(n: int, seed: int) -> dict[str, Tensor]:
+    """Over many orders of magnitude, and some zeros."""
+    g = torch.Generator().manual_seed(seed)
+    out = {}
+    for name, shape in SHAPES.items():
+        size = 10 ** (8 * torch.rand(n, *[1] * len(shape), generator=g) - 6)
+        out[name] = torch.randn(n, *shape, generator=g) * size * (torch.rand(n, *shape, generator=g) > 0.1)
+    return out
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_fused_is_plain(seed: int, n: int = 203) -> None:
+    """Different rows each step, in any order."""
+    fused, plain = RowAdam(parameters(n)), PlainRowAdam(parameters(n))
+    g = torch.Generator().manual_seed(seed)
+    for step in range(8):
+        rows = torch.randperm(n, generator=g)[: int(torch.randint(0, n + 1, (), generator=g))]
+        for name, gradient in gradients(len(rows), 100 * seed + step).items():
+            for optimizer in (fused, plain):
+                optimizer.step(name, gradient, rows, 0.01)
+    start = parameters(n)
+    for name in SHAPES:
+        moved = (fused.parameters[name] - start[name]).abs()
+        assert (moved > 0.01).any()
+        torch.testing.assert_close(
+            fused.parameters[name], plain.parameters[name], rtol=1e-6, atol=1e-6, msg=lambda m: f"seed {seed}: {m}"
+        )
+
+
+def test_all_rows_is_torch_s_adam(n: int = 57) -> None:
+    ours, theirs = parameters(n), {name: p.requires_grad_() for name, p in parameters(n).items()}
+    optimizer = RowAdam(ours)
+    adam = torch.optim.Adam(theirs.values(), lr=0.02, betas=(0.9, 0.999), eps=1e-15)
+    for step in range(12):
+        for name, gradient in gradients(n, step).items():
+            optimizer.step(name, gradient, torch.arange(n), 0.02)
+            theirs[name].grad = gradient
+        adam.step()
+    for name in SHAPES:
+        torch.testing.assert_close(ours[name], theirs[name].detach(), rtol=2e-6, atol=2e-6)
+
+
+def test_betas_and_epsilon_are_used(n: int = 20) -> None:
+    ours, theirs = parameters(n)["means"], parameters(n)["means"].requires_grad_()
+    optimizer = RowAdam({"means": ours}, beta1=0.5, beta2=0.7, epsilon=1e-2)
+    adam = torch.optim.Adam([theirs], lr=0.02, betas=(0.5, 0.7), eps=1e-2)
+    for step in range(5):
+        theirs.grad = gradients(n, step)["means"]
+        optimizer.step("means", theirs.grad, torch.arange(n), 0.02)
+        adam.step()
+    torch.testing.assert_close(ours, theirs.detach(), rtol=2e-6, atol=2e-6)
+
+
+@pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
+def test_other_rows_keep_every_bit(kind: type[RowAdam], n: int = 40) -> None:
+    values = parameters(n)
+    values["means"][5] = torch.nan
+    optimizer = kind(values)
+    before = {name: value.clone().view(torch.int32) for name, value in values.items()}
+    rows = torch.tensor([31, 2, 17])
+    others = torch.ones(n, dtype=torch.bool)
+    others[rows] = False
+    for step in range(3):
+        for name, gradient in gradients(3, step).items():
+            optimizer.step(name, gradient + 1, rows, 0.1)
+    for name, value in values.items():
+        assert optimizer.parameters[name] is value  # in place
+        assert torch.equal(value.view(torch.int32)[others], before[name][others]), name
+        assert (value.view(torch.int32)[rows] != before[name][rows]).all(), name
+
+
+@pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
+@pytest.mark.parametrize("size", [1e-8, 1e-3, 1.0, 1e6])
+def test_a_first_step_is_as_long_as_the_rate(kind: type[RowAdam], size: float) -> None:
+    """Whatever the gradient's size, and however many steps other rows have had."""
+    values = torch.zeros(10, 3)
+    optimizer = kind({"means": values})
+    for _ in range(5):
+        optimizer.step("means", torch.ones(5, 3), torch.arange(5), 0.01)
+    gradient = size * torch.tensor([1.0, -1.0, 0.0]).repeat(5, 1)
+    optimizer.step("means", gradient, torch.arange(5, 10), 0.25)
+    torch.testing.assert_close(values[5:], torch.tensor([-0.25, 0.25, 0.0]).repeat(5, 1), rtol=1e-5, atol=0)
+
+
+def test_rows_and_threads_do_not_matter_to_a_row(n: int = 100) -> None:
+    """A row's value does not depend on which rows are stepped beside it, nor on who steps it."""
+    gradient = gradients(n, 0)["shN"]
+    before = torch.get_num_threads()
+    results = []
+    for count, order in [(1, torch.arange(n)), (2, torch.arange(n).flip(0)), (3, torch.arange(n).roll(31))]:
+        torch.set_num_threads(count)
+        try:
+            optimizer = RowAdam(parameters(n))
+            for _ in range(3):
+                optimizer.step("shN", gradient[order], order, 0.01)
+        finally:
+            torch.set_num_threads(before)
+        results.append(optimizer.parameters["shN"])
+    assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
+
+
+def test_no_rows() -> None:
+    for n in (4, 0):
+        optimizer = RowAdam(parameters(n))
+        for name, shape in SHAPES.items():
+            optimizer.step(name, torch.empty(0, *shape), torch.empty(0, dtype=torch.long), 0.1)
+            assert torch.equal(optimizer.parameters[name], parameters(n)[name])
+
+
+def test_no_columns() -> None:
+    """shN of a checkpoint of SH degree 0."""
+    optimizer = RowAdam({"shN": torch.empty(4, 0, 3)})
+    optimizer.step("shN", torch.empty(2, 0, 3), torch.tensor([0, 2]), 0.1)
+    assert optimizer.parameters["shN"].shape == (4, 0, 3)

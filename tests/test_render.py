@@ -1,0 +1,150 @@
+"""The joint: what the dial does to a picture, and what it leaves alone."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from clod_adapter.adapter import attach, detach
+from clod_adapter.attenuation import attenuate, normalized_distances
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.rasterizers import reference
+from clod_adapter.render import Rendering, dial, render, splat
+from scenes import camera, gaussians
+
+SCALES = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
+CONFIG = AttenuationConfig(scene_distance=3.0)
+
+
+def adapted(n: int = 300, seed: int = 0, **config: object) -> Gaussians:
+    g = torch.Generator().manual_seed(seed + 100)
+    sigma = (0.8 * torch.randn(n, generator=g)).exp()
+    return attach(gaussians(n, 1, seed), sigma, AttenuationConfig(**({"scene_distance": 3.0} | config)))
+
+
+def assert_identical(a: Rendering, b: Rendering) -> None:
+    assert torch.equal(a.image, b.image) and torch.equal(a.alpha, b.alpha) and torch.equal(a.kept, b.kept)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_disabled_adapter_is_the_base(seed: int) -> None:
+    """Bit for bit: detached, and with a dial that was attached without a sigma_d, at s = 1."""
+    base, view = gaussians(300, seed % 4, seed), camera()
+    want = render(base, view)
+    assert want.image.abs().sum() > 0 and want.kept.all()
+    assert_identical(render(detach(adapted(seed=seed).replace(**base.tensors())), view, 3.0), want)
+    for config in (None, CONFIG, AttenuationConfig(normalizer="max"), AttenuationConfig(normalizer="quantile")):
+        identity = render(attach(base, attenuation=config), view)
+        assert torch.equal(identity.image, want.image) and torch.equal(identity.alpha, want.alpha), f"seed {seed}"
+        # tau = 1/255: what this drops, the rasterizer skips
+        assert torch.equal(identity.kept, base.opacities > 1 / 255)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_without_a_sigma_the_dial_does_nothing(seed: int) -> None:
+    base, view = gaussians(300, 1, seed), camera()
+    want = render(base, view)
+    for s in SCALES:
+        assert_identical(render(base, view, s), want)
+    untouched = dial(base, view, 3.0)
+    assert torch.equal(untouched.opacities, base.opacities) and untouched.keep.all()
+    torch.testing.assert_close(untouched.log_opacities.exp(), base.opacities)
+
+
+@pytest.mark.parametrize("normalizer", ["scene", "quantile", "max"])
+@pytest.mark.parametrize("seed", range(3))
+def test_kept_sets_are_nested(normalizer: str, seed: int) -> None:
+    some, view = adapted(seed=seed, normalizer=normalizer), camera()
+    kept = [render(some, view, s).kept for s in SCALES]
+    for more, less in zip(kept, kept[1:], strict=False):
+        assert (less <= more).all() and less.sum() < more.sum(), f"seed {seed}"
+    assert kept[-1].sum() > 0 and kept[0].sum() < len(some)
+
+
+@pytest.mark.parametrize("s", SCALES)
+def test_is_the_picture_of_the_attenuated_opacities(s: float) -> None:
+    """Baked by hand: dropped ones gone, the rest with the opacity of this view and dial value."""
+    some, view = adapted(), camera()
+    found = render(some, view, s, background=torch.tensor([0.1, 0.5, 0.9]))
+    distances = normalized_distances(some.means, view, some.attenuation)
+    torch.testing.assert_close(distances, (some.means - view.position).norm(dim=1) / 3)
+    by_hand = some.opacities * torch.exp(-((distances * s) ** 2) / (2 * some.sigma_d**2 + 1e-8))
+    assert torch.equal(found.kept, by_hand > s / 255)
+    baked = detach(some.select(found.kept))
+    baked = baked.replace(opacity_logits=by_hand[found.kept].logit())
+    want = render(baked, view, background=torch.tensor([0.1, 0.5, 0.9]))
+    torch.testing.assert_close(found.image, want.image, rtol=0, atol=1e-5)
+    torch.testing.assert_close(found.alpha, want.alpha, rtol=0, atol=1e-5)
+
+
+def test_the_rasterizer_sees_only_what_is_kept() -> None:
+    seen = []
+
+    def spy(means, quats, scales, opacities, sh0, shN, camera, background):
+        seen.append(opacities)
+        return torch.zeros(camera.height, camera.width, 3), torch.zeros(camera.height, camera.width)
+
+    some, view = adapted(), camera()
+    rendering = render(some, view, 3.0, rasterizer=spy)
+    assert torch.equal(seen[0] > 0, rendering.kept)
+    expected = attenuate(some.opacity_logits, some.sigma_d, normalized_distances(some.means, view, CONFIG), 3.0, CONFIG)
+    assert torch.equal(seen[0][rendering.kept], expected.opacities[expected.keep])
+
+
+def test_black_behind_by_default() -> None:
+    view = camera()
+    far = gaussians(20, 0, 0).replace(means=torch.full((20, 3), 1e4))
+    assert (render(far, view).image == 0).all()
+    behind = torch.tensor([0.2, 0.4, 0.6])
+    assert torch.equal(render(far, view, background=behind).image, behind.expand(45, 61, 3))
+    assert torch.equal(splat(far, far.opacities, view, background=behind)[0], behind.expand(45, 61, 3))
+
+
+@pytest.mark.parametrize("s", [1.0, 2.5])
+def test_gradients_reach_sigma_and_all_attributes(s: float) -> None:
+    """The chain through attenuation, cut and rasterizer, against central differences in float64."""
+    view = camera(20, 16)
+    some = adapted(40, 3)
+    doubles = {name: value.double() for name, value in some.replace(log_scales=some.log_scales + 1.5).tensors().items()}
+    weights = torch.randn(16, 20, 3, generator=torch.Generator().manual_seed(0)).double()
+
+    def loss(values: dict[str, torch.Tensor]) -> torch.Tensor:
+        return (render(some.replace(**values), view, s, rasterizer=reference.rasterize).image * weights).sum()
+
+    leaves = {name: value.clone().requires_grad_() for name, value in doubles.items()}
+    found = dict(zip(leaves, torch.autograd.grad(loss(leaves), leaves.values()), strict=True))
+    for name in ("sigma_d", "opacity_logits"):
+        # Along one direction for all rows; a step so small that no alpha crosses a cut.
+        direction = torch.randn(40, generator=torch.Generator().manual_seed(1)).double()
+        h = 1e-7
+        ahead, back = (loss(doubles | {name: doubles[name] + side * h * direction}) for side in (1, -1))
+        numeric = (ahead - back).item() / (2 * h)
+        assert (found[name] * direction).sum().item() == pytest.approx(numeric, rel=1e-4)
+    assert all(gradient.isfinite().all() and gradient.abs().sum() > 0 for gradient in found.values())
+    dropped = ~render(some.replace(**doubles), view, s, rasterizer=reference.rasterize).kept
+    assert dropped.any() and (found["sigma_d"][dropped] == 0).all()
+    # The fast rasterizer's gradients, through the same chain.
+    singles = {name: value.detach().float().requires_grad_() for name, value in doubles.items()}
+    image = render(some.replace(**singles), view, s).image
+    fast = torch.autograd.grad((image * weights.float()).sum(), singles.values())
+    for (name, want), gradient in zip(found.items(), fast, strict=True):
+        assert (gradient - want).norm() <= 2e-3 * want.norm(), name
+
+
+@pytest.mark.parametrize("value", [0.999, 0.0, -1.0, math.inf, math.nan])
+@pytest.mark.parametrize("with_sigma", [True, False])
+def test_bad_dial_values_are_named(value: float, with_sigma: bool) -> None:
+    some = adapted() if with_sigma else gaussians(5, 0, 0)
+    with pytest.raises(ClodError, match="virtual_scale"):
+        render(some, camera(), value)
+
+
+def test_of_no_gaussians() -> None:
+    none = gaussians(0, 1, 0)
+    for some in (none, attach(none), attach(none, attenuation=AttenuationConfig(normalizer="max"))):
+        rendering = render(some, camera(), 2.0)
+        assert rendering.kept.shape == (0,) and (rendering.image == 0).all() and (rendering.alpha == 0).all()

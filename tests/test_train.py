@@ -1,0 +1,275 @@
+"""Adapting a small generated scene: it gets better, the dial works, and runs end as they should."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from clod_adapter import train
+from clod_adapter.adapter import ATTRIBUTES, attach
+from clod_adapter.attenuation import attenuate, normalized_distances
+from clod_adapter.cameras import Scene
+from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluate import evaluate
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.losses import photometric_loss
+from clod_adapter.render import render
+from clod_adapter.train import Adapted, Progress, adapt, camera_extent, scene_distance, start
+from scenes import capture, gaussians, photograph, ring
+
+SCALES = (1.0, 1.5, 2.0, 3.0, 5.0)
+
+
+@pytest.fixture(scope="module")
+def captured() -> tuple[Gaussians, Scene]:
+    return capture()
+
+
+@pytest.fixture(scope="module")
+def trained(captured: tuple[Gaussians, Scene]) -> tuple[Adapted, list[Progress]]:
+    seen: list[Progress] = []
+    return adapt(*captured, AdaptConfig(iters=120), seen.append), seen
+
+
+def assert_equal(a: Gaussians, b: Gaussians) -> None:
+    for name, value in a.tensors().items():
+        assert torch.equal(value, b.tensors()[name]), name
+    assert a.attenuation == b.attenuation
+
+
+def test_pictures_get_better(captured: tuple[Gaussians, Scene], trained: tuple[Adapted, list[Progress]]) -> None:
+    base, scene = captured
+    before = start(base, scene.train, AdaptConfig())
+    for views in (scene.train, scene.test):
+        rows = zip(evaluate(before, views, SCALES), evaluate(trained[0].gaussians, views, SCALES), strict=True)
+        for old, new in rows:
+            assert new.psnr > old.psnr + 0.5, f"s {new.virtual_scale}"
+    losses = [p.loss for p in trained[1] if p.phase == "train"]
+    assert losses[-1] < 0.6 * losses[0]
+
+
+def test_the_dial_works_after_training(
+    captured: tuple[Gaussians, Scene], trained: tuple[Adapted, list[Progress]]
+) -> None:
+    adapted = trained[0].gaussians
+    sigma = adapted.sigma_d
+    assert sigma.isfinite().all() and (sigma >= 0.9e-4).all()
+    assert sigma.unique().numel() > len(sigma) / 2
+    rows = evaluate(adapted, captured[1].train, SCALES)
+    for more, less in zip(rows, rows[1:], strict=False):
+        assert less.kept < 0.9 * more.kept and less.psnr < more.psnr
+    assert rows[0].kept_share > 0.5 and 0 < rows[-1].kept_share < 0.2
+    # What the count term is for: near the law, with Gaussians to spare at no dial value.
+    assert all(row.kept_share < 1.5 * row.virtual_scale**-1.5 for row in rows)
+
+
+def test_sigma_is_learned(captured: tuple[Gaussians, Scene], trained: tuple[Adapted, list[Progress]]) -> None:
+    old, new = start(*captured_views(captured), AdaptConfig()).sigma_d, trained[0].gaussians.sigma_d
+    assert ((new / old).log().abs() > 0.02).float().mean() > 0.3
+    for name in ATTRIBUTES:
+        assert not torch.equal(getattr(trained[0].gaussians, name), getattr(captured[0], name)), name
+
+
+def captured_views(captured: tuple[Gaussians, Scene]):
+    return captured[0], captured[1].train
+
+
+def test_progress_is_reported(captured: tuple[Gaussians, Scene], trained: tuple[Adapted, list[Progress]]) -> None:
+    result, seen = trained
+    views = len(captured[1].train)
+    assert [(p.phase, p.done, p.total) for p in seen[:views]] == [("start", k + 1, views) for k in range(views)]
+    assert [(p.phase, p.done, p.total) for p in seen[views:]] == [("train", k + 1, 120) for k in range(120)]
+    for phase in (seen[:views], seen[views:]):
+        assert all(a.share < b.share and a.seconds <= b.seconds for a, b in zip(phase, phase[1:], strict=False))
+        assert phase[-1].share == 1
+    assert all(p.loss != p.loss for p in seen[:views]) and all(p.loss > 0 for p in seen[views:])
+    assert result.steps == 120 and not result.interrupted and result.seconds > 0 and result.start_seconds > 0
+
+
+@pytest.mark.parametrize("config", [{}, {"normalizer": "quantile"}, {"normalizer": "max"}], ids=str)
+def test_a_seed_decides_everything(captured: tuple[Gaussians, Scene], config: dict[str, str]) -> None:
+    runs = [adapt(*captured, AdaptConfig(iters=15, seed=seed, **config)).gaussians for seed in (7, 7, 8)]
+    assert_equal(runs[0], runs[1])
+    assert not torch.equal(runs[0].sigma_d, runs[2].sigma_d)
+
+
+def test_the_base_is_left_alone(captured: tuple[Gaussians, Scene]) -> None:
+    base, scene = captured
+    with_dial = start(base, scene.train, AdaptConfig())
+    for some in (base, with_dial):
+        before = {name: value.clone() for name, value in some.tensors().items()}
+        adapt(some, scene, AdaptConfig(iters=5))
+        for name, value in some.tensors().items():
+            assert torch.equal(value, before[name]) and not value.requires_grad, name
+
+
+def test_no_steps_give_the_start(captured: tuple[Gaussians, Scene]) -> None:
+    base, scene = captured
+    result = adapt(base, scene, AdaptConfig(iters=0))
+    want = start(base, scene.train, AdaptConfig())
+    assert result.steps == 0 and not result.interrupted
+    for name in ATTRIBUTES:
+        assert torch.equal(getattr(result.gaussians, name), getattr(base, name)), name
+    torch.testing.assert_close(result.gaussians.sigma_d, want.sigma_d, rtol=1e-5, atol=0)  # by way of its logarithm
+    assert result.gaussians.attenuation == want.attenuation
+
+
+def test_the_start_follows_the_count_law(captured: tuple[Gaussians, Scene]) -> None:
+    base, scene = captured
+    base = base.replace(opacity_logits=base.opacity_logits.abs())  # all able to last
+    found = start(base, scene.train, AdaptConfig(start_share=0.7, exponent=1.5))
+    assert found.attenuation.scene_distance == pytest.approx(scene_distance(base, scene.train, 0.95))
+    for row in evaluate(found, scene.train, SCALES):
+        s = row.virtual_scale
+        assert row.kept_share == pytest.approx(1 / (s**1.5 + (1 / 0.7 - 1) * s**-1.5), rel=0.25)
+
+
+def test_continues_from_a_sigma(captured: tuple[Gaussians, Scene], trained: tuple[Adapted, list[Progress]]) -> None:
+    """No importance pass, the same D, and from where the first run was."""
+    first, seen = trained[0].gaussians, []
+    config = AdaptConfig(iters=1, max_sv=3.0)
+    result = adapt(first, captured[1], config, seen.append)
+    assert [p.phase for p in seen] == ["train"]
+    moved = (result.gaussians.sigma_d / first.sigma_d).log().abs()
+    assert moved.max() <= 1.01e-2  # a step of log sigma
+    assert result.gaussians.attenuation == replace(first.attenuation, max_sv=3.0)
+    assert start(first, captured[1].train, config).sigma_d is first.sigma_d
+
+
+def test_a_dead_sigma_is_revived(captured: tuple[Gaussians, Scene]) -> None:
+    """A relu at 0 never recovers by itself; training keeps sigma above a floor."""
+    base, scene = captured
+    dead = attach(base, torch.where(torch.arange(len(base)) % 2 == 0, 0.0, 1.0), AttenuationConfig(scene_distance=4.0))
+    sigma = adapt(dead, scene, AdaptConfig(iters=2)).gaussians.sigma_d
+    assert (sigma > 0).all() and sigma.isfinite().all()
+
+
+def test_the_count_term_pulls_the_count_down(captured: tuple[Gaussians, Scene]) -> None:
+    base, scene = captured
+    everything = attach(base, torch.full((len(base),), 1.5), AttenuationConfig(scene_distance=4.0))
+    kept = []
+    for weight in (0.0, 20.0):
+        result = adapt(everything, scene, AdaptConfig(iters=60, reg_weight=weight, full_share=0.0))
+        kept.append(evaluate(result.gaussians, scene.train, [3.0])[0].kept)
+    assert kept[1] < 0.9 * kept[0]
+
+
+def test_only_sigma_where_other_rates_are_zero(captured: tuple[Gaussians, Scene]) -> None:
+    still = {f"lr_{name}": 0.0 for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
+    result = adapt(*captured, AdaptConfig(iters=10, **still)).gaussians
+    for name in ATTRIBUTES:
+        assert torch.equal(getattr(result, name), getattr(captured[0], name)), name
+    want = start(*captured_views(captured), AdaptConfig()).sigma_d
+    assert ((result.sigma_d / want - 1).abs() > 1e-3).any()
+
+
+def test_one_step_by_hand(captured: tuple[Gaussians, Scene]) -> None:
+    """At s = 1 on one view: the loss is the render's, kept rows move by their rates, dropped rows by nothing."""
+    base, scene = captured
+    alone = Scene(scene.train[:2], ())
+    config = AdaptConfig(iters=1, full_share=1.0, reg_weight=0.0, seed=3)
+    before, seen = start(base, alone.train, config), []
+    after = adapt(before, alone, config, seen.append).gaussians
+    losses = [photometric_loss(render(before, view.camera).image, view.image).item() for view in alone.train]
+    view = alone.train[min(range(2), key=lambda k: abs(losses[k] - seen[0].loss))]
+    assert seen[0].loss == pytest.approx(
+        photometric_loss(render(before, view.camera).image, view.image).item(), rel=1e-5
+    )
+    kept = render(before, view.camera).kept
+    rates = {
+        "means": config.lr_means * camera_extent(alone.train),
+        "quats": config.lr_quats,
+        "log_scales": config.lr_scales,
+        "sh0": config.lr_sh0,
+    }
+    for name, rate in rates.items():
+        old, new = getattr(before, name), getattr(after, name)
+        assert torch.equal(old[~kept], new[~kept]), name
+        moved = (new - old)[kept].abs().flatten(1).amax(1)
+        assert (moved > 0).sum() > 20 and moved.max() == pytest.approx(rate, rel=1e-2), name
+    moved = (after.sigma_d / before.sigma_d).log().abs()
+    assert moved.max() == pytest.approx(config.lr_sigma, rel=1e-3) and (moved[~kept] < 1e-5).all()
+    assert photometric_loss(render(after, view.camera).image, view.image) < seen[0].loss
+
+
+def test_dial_values_are_drawn_as_documented(
+    captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``full_share`` of them 1, the others log-uniform up to max_sv; each view once a round."""
+    scales, images = [], []
+    monkeypatch.setattr(train, "attenuate", lambda *a: scales.append(a[3]) or attenuate(*a))
+    monkeypatch.setattr(train, "photometric_loss", lambda *a: images.append(a[1]) or photometric_loss(*a))
+    views = captured[1].train
+    some = attach(gaussians(5, 0, 0), torch.ones(5))
+    adapt(some, captured[1], AdaptConfig(iters=80 * len(views), full_share=0.25, max_sv=4.0))
+    drawn = torch.tensor(scales).log() / torch.tensor(4.0).log()
+    full = drawn == 0
+    assert 0.19 < full.double().mean() < 0.31  # 480 draws: 3 standard deviations
+    rest = drawn[~full].sort().values.double()
+    assert (rest - torch.linspace(0, 1, len(rest))).abs().max() < 1.7 / len(rest) ** 0.5  # Kolmogorov-Smirnov, 0.6 %
+    for k in range(0, len(images), len(views)):
+        assert {id(image) for image in images[k : k + len(views)]} == {id(view.image) for view in views}
+
+
+def test_a_time_budget_ends_it(captured: tuple[Gaussians, Scene]) -> None:
+    result = adapt(*captured, AdaptConfig(iters=10_000_000, time_budget=0.3))
+    assert 0 < result.steps < 10_000 and 0.3 <= result.seconds < 5 and not result.interrupted
+    assert adapt(*captured, AdaptConfig(iters=3, time_budget=60.0)).steps == 3
+
+
+def test_an_interrupt_returns_what_there_is(captured: tuple[Gaussians, Scene]) -> None:
+    states = []
+
+    def stop(p: Progress) -> None:
+        if p.phase == "train":
+            states.append({name: value.clone() for name, value in p.gaussians().tensors().items()})
+            if p.done == 5:
+                raise KeyboardInterrupt
+
+    result = adapt(*captured, AdaptConfig(iters=50), stop)
+    assert result.interrupted and result.steps == 5
+    for name, value in result.gaussians.tensors().items():
+        assert torch.equal(value, states[-1][name]) and value.isfinite().all() and not value.requires_grad, name
+
+
+def test_max_sv_of_one(captured: tuple[Gaussians, Scene]) -> None:
+    """Plain fine-tuning of what s = 1 keeps."""
+    base, scene = captured
+    result = adapt(base, scene, AdaptConfig(iters=40, max_sv=1.0)).gaussians
+    before = evaluate(start(base, scene.train, AdaptConfig(max_sv=1.0)), scene.train, [1.0])[0]
+    assert evaluate(result, scene.train, [1.0])[0].psnr > before.psnr + 0.5
+    assert result.attenuation.max_sv == 1.0
+
+
+def test_one_gaussian_and_one_that_is_never_seen() -> None:
+    views = photograph(gaussians(20, 0, 0), ring(2, 20, 16))
+    for means in ([[0.0, 0.0, 0.0]], [[1e3, 0.0, 0.0]]):
+        one = gaussians(1, 0, 0).replace(means=torch.tensor(means))
+        found = adapt(one, Scene(views, ()), AdaptConfig(iters=5)).gaussians
+        assert all(value.isfinite().all() for value in found.tensors().values())
+
+
+def test_what_cannot_be_adapted_is_named(captured: tuple[Gaussians, Scene]) -> None:
+    base, scene = captured
+    with pytest.raises(ClodError, match="no training views"):
+        adapt(base, Scene((), scene.test))
+    with pytest.raises(ClodError, match="no Gaussians"):
+        adapt(gaussians(0, 1, 0), scene)
+
+
+def test_scene_units(captured: tuple[Gaussians, Scene]) -> None:
+    views = photograph(gaussians(5, 0, 0), ring(4, 8, 6, radius=2.0))
+    centres = torch.stack([view.camera.position for view in views])
+    assert camera_extent(views) == pytest.approx(1.1 * (centres - centres.mean(0)).norm(dim=1).max().item())
+    assert camera_extent(views[:1]) == 1.0  # one camera has no extent
+    base, scene = captured
+    config = AttenuationConfig(normalizer="quantile", quantile=0.5)
+    ratios = [
+        (base.means - v.camera.position).norm(dim=1) / normalized_distances(base.means, v.camera, config)
+        for v in scene.train
+    ]
+    want = torch.stack([ratio.median() for ratio in ratios]).mean().item()
+    assert scene_distance(base, scene.train, 0.5) == pytest.approx(want, rel=1e-5)
