@@ -71,7 +71,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         "base_count": len(model.gaussians), "sh_degree": model.gaussians.sh_degree, "views": len(scene.test),
         "rows": [row.as_dict() for row in rows], "interrupted": interrupted,
         "attenuation": asdict(attenuation) if attenuation else None,
-        "notes": [*model.notes, *scene.notes], "machine": machine(), "seconds": watch.report(),
+        "notes": [*model.notes, *scene.notes], "machine": machine(),
+        "device": str(model.gaussians.means.device), "seconds": watch.report(),
     }  # fmt: skip
 
 

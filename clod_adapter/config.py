@@ -67,7 +67,7 @@ class AdaptConfig:
     normalizer: str = option("scene", "what distances are divided by: scene, quantile or max (the paper's)")
     quantile: float = option(0.95, "quantile of distances that becomes D (normalizers scene and quantile)")
     start_share: float = option(0.6, "share of Gaussians the start keeps at s = 1")
-    full_share: float = option(0.2, "share of steps at s = 1; the others draw s log-uniform in [1, max_sv]")
+    full_share: float = option(0.3, "share of steps at s = 1; the others draw s log-uniform in [1, max_sv]")
     exponent: float = option(1.5, "the count law: the share to keep at s is s^-exponent")
     reg_weight: float = option(1.0, "weight of the count term (the paper's lambda_reg)")
     weight_slope: float = option(
@@ -93,6 +93,7 @@ class AdaptConfig:
         require(0 <= self.full_share <= 1, "full_share", self.full_share, "between 0 and 1")
         require(0 < self.exponent < math.inf, "exponent", self.exponent, "positive and finite")
         require(0 <= self.reg_weight < math.inf, "reg_weight", self.reg_weight, "at least 0 and finite")
+        require(0 <= self.weight_slope <= 1, "weight_slope", self.weight_slope, "between 0 and 1")
         require(self.temperature > 0, "temperature", self.temperature, "positive")
         require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
         require(0 < self.lr_final <= 1, "lr_final", self.lr_final, "above 0 and at most 1")

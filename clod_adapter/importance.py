@@ -20,7 +20,7 @@ def removal_error(
     """``[N]`` estimate of the squared picture error that removing each Gaussian alone would cause.
 
     To first order removing Gaussian i changes pixel p by ``a_i dC_p/da_i``. Its sum of squares over
-    all pixels and views is estimated without a bias by one backward pass a view: with random signs
+    the pixels, mean over the views, is estimated without a bias by one backward pass a view: with random signs
     z, ``E[(sum_p z_p dC_p/da_i)^2] = sum_p (dC_p/da_i)^2`` (Hutchinson's estimator on the
     Gauss-Newton matrix). Works with every differentiable rasterizer.
 

@@ -13,12 +13,19 @@ WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
 
 
-def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Mean structural similarity of two ``[H, W, 3]`` float images in [0, 1], a 0-d tensor.
+def ssim(image: Tensor, target: Tensor) -> float:
+    """Mean structural similarity of a ``[H, W, 3]`` float image in [0, 1] and a uint8 photograph.
 
     11-tap Gaussian window with sigma 1.5, zero padding, data range 1: the form 3DGS and its
-    descendants report (Wang et al. 2004). Differentiable; plain torch, any device.
+    descendants report (Wang et al. 2004). On the CPU in float32 fused, elsewhere plain torch.
     """
+    if _fusable(image):
+        return float(_Fused(image, target).ssim_sum / image.numel())
+    return float(ssim_plain(image.detach(), target.to(image) / 255))
+
+
+def ssim_plain(image: Tensor, target: Tensor) -> Tensor:
+    """The plain twin of ``ssim``: two float images, a 0-d tensor, differentiable."""
     taps = torch.exp(-((torch.arange(WINDOW).to(image) - WINDOW // 2) ** 2) / (2 * SIGMA**2))
     taps = taps / taps.sum()
 
@@ -41,7 +48,7 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
 
     On the CPU in float32 one fused pass computes the loss and its gradient; elsewhere plain torch.
     """
-    if image.device.type == "cpu" and image.dtype == torch.float32:
+    if _fusable(image):
         return _FusedLoss.apply(image, target, ssim_weight)  # type: ignore[no-any-return, no-untyped-call]
     return photometric_loss_plain(image, target, ssim_weight)
 
@@ -49,29 +56,48 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
 def photometric_loss_plain(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
     """The plain twin of ``photometric_loss``."""
     wanted = target.to(image) / 255
-    return (1 - ssim_weight) * (image - wanted).abs().mean() + ssim_weight * (1 - ssim(image, wanted))
+    return (1 - ssim_weight) * (image - wanted).abs().mean() + ssim_weight * (1 - ssim_plain(image, wanted))
+
+
+def _fusable(image: Tensor) -> bool:
+    return image.device.type == "cpu" and image.dtype == torch.float32
+
+
+class _Fused:
+    """One comparison of a render with a photograph on the CPU; the kernels' scratch planes live as long as it."""
+
+    def __init__(self, image: Tensor, target: Tensor) -> None:
+        from clod_adapter._kernels import ssim as kernels
+        from clod_adapter._kernels import threads
+
+        self.kernels, self.threads, self.workers = kernels, threads, threads.worker_count()
+        self.height, self.width, _ = image.shape
+        planes = np.zeros((6, 3, self.height, kernels.stride(self.width)), np.float32)
+        self.x, self.y, similarity, *self.slopes = planes
+        pixels, sums = image.detach().contiguous().numpy(), np.zeros(self.workers)
+        threads.run(
+            kernels.to_planes, self.workers, pixels, target.contiguous().numpy(), self.x, self.y, np.float32(1 / 255)
+        )
+        threads.run(kernels.ssim_map, self.workers, self.x, self.y, self.width, similarity, *self.slopes, sums)
+        self.ssim_sum = sums.sum()
+
+    def gradient(self, l1: float, dssim: float) -> tuple[Tensor, float]:
+        """Of ``l1 sum |x - y| - dssim sum SSIM`` to the image; and ``sum |x - y|``."""
+        out, sums = torch.empty(self.height, self.width, 3), np.zeros(self.workers)
+        self.threads.run(
+            self.kernels.loss_gradient, self.workers, self.x, self.y, self.width, *self.slopes, l1, dssim, out.numpy(),
+            sums,
+        )  # fmt: skip
+        return out, float(sums.sum())
 
 
 class _FusedLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-        from clod_adapter._kernels import ssim as kernels
-        from clod_adapter._kernels import threads
-
-        workers = threads.worker_count()
-        height, width, _ = image.shape
-        x, y, similarity, g_mean, g_square, g_product = np.zeros((6, 3, height, kernels.stride(width)), np.float32)
-        pixels = image.detach().contiguous().numpy()
-        threads.run(kernels.to_planes, workers, pixels, target.contiguous().numpy(), x, y, np.float32(1 / 255))
-        similarities, differences, gradient = np.zeros(workers), np.zeros(workers), torch.empty(height, width, 3)
-        threads.run(kernels.ssim_map, workers, x, y, width, similarity, g_mean, g_square, g_product, similarities)
-        l1, dssim = (1 - ssim_weight) / pixels.size, ssim_weight / pixels.size
-        threads.run(
-            kernels.loss_gradient, workers, x, y, width, g_mean, g_square, g_product, l1, dssim, gradient.numpy(),
-            differences,
-        )  # fmt: skip
+        fused, l1, dssim = _Fused(image, target), (1 - ssim_weight) / image.numel(), ssim_weight / image.numel()
+        gradient, difference = fused.gradient(l1, dssim)
         ctx.save_for_backward(gradient)
-        return torch.tensor(l1 * differences.sum() + ssim_weight - dssim * similarities.sum(), dtype=torch.float32)
+        return torch.tensor(l1 * difference + ssim_weight - dssim * fused.ssim_sum, dtype=torch.float32)
 
     @staticmethod
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]

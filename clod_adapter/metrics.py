@@ -14,15 +14,10 @@ def psnr(image: Tensor, target: Tensor) -> float:
 
     ``-10 log10 mean (image - target)^2``; infinite for equal images.
     """
-    shown, wanted = _comparable(image, target)
-    error = float((shown - wanted).double().square().mean())
+    error = float((image.detach().clamp(0, 1) - target.to(image) / 255).double().square().mean())
     return -10 * math.log10(error) if error > 0 else math.inf
 
 
 def psnr_ssim(image: Tensor, target: Tensor) -> tuple[float, float]:
-    """``psnr``, and SSIM as in ``losses.ssim``, which takes much longer."""
-    return psnr(image, target), float(ssim(*_comparable(image, target)))
-
-
-def _comparable(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    return image.detach().clamp(0, 1), target.to(image) / 255
+    """``psnr``, and SSIM of the clamped render (``losses.ssim``)."""
+    return psnr(image, target), ssim(image.detach().clamp(0, 1), target)

@@ -1,12 +1,14 @@
 """Comparison of a rasterizer with the float64 reference, forward and backward.
 
-What agreement means here: away from pixels where a cut may fall either way (alpha at 1/255, a pixel's
-end at 1e-4) the image and alpha differ by at most IMAGE, the gradient of each input by at most GRADIENT
-of its length. Pixels on a cut are counted, must be few, and may be off by what one Gaussian at 1/255 can do.
+What agreement means here: away from pixels where a cut may fall either way (an alpha at 1/255 or at
+the clamp, a pixel's end at 1e-4) the image and alpha differ by at most IMAGE, the gradient of each input
+by at most GRADIENT of its length. Pixels on a cut are counted, must be few, and may be off by what one
+Gaussian at 1/255 can do.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import pytest
@@ -52,14 +54,24 @@ def differentiate(
 
 
 def on_a_cut(scene: Parameters, camera: Camera, nudge: float) -> Tensor:
-    """``[H, W]`` bool: the reference's pixel changes when its cuts move by the relative ``nudge``."""
-    images = []
+    """``[H, W]`` bool: the reference's pixel changes when its cuts move by the relative ``nudge``.
+
+    Or has an alpha as near to the clamp, where the gradient stops.
+    """
+
+    def draw(patch: pytest.MonkeyPatch, **constants: object) -> Tensor:
+        for name, value in constants.items():
+            patch.setattr(reference, name, value)
+        return reference.rasterize(**scene, camera=camera, background=BACKGROUND.double())[0]
+
+    images, seen, blend = [], [], reference.blend
     for factor in (1 - nudge, 1 + nudge):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(reference, "ALPHA_MIN", reference.ALPHA_MIN * factor)
-            patch.setattr(reference, "T_MIN", reference.T_MIN * factor)
-            images.append(reference.rasterize(**scene, camera=camera, background=BACKGROUND.double())[0])
-    return (images[0] != images[1]).any(-1)
+            images.append(draw(patch, ALPHA_MIN=reference.ALPHA_MIN * factor, T_MIN=reference.T_MIN * factor))
+    with pytest.MonkeyPatch.context() as patch:
+        draw(patch, ALPHA_MAX=math.inf, blend=lambda alphas: seen.append(alphas) or blend(alphas.clamp(max=0.5)))
+    at_the_clamp = ((seen[0] / reference.ALPHA_MAX - 1).abs() < nudge).any(1)
+    return (images[0] != images[1]).any(-1) | at_the_clamp.reshape(camera.height, camera.width)
 
 
 def assert_agrees(

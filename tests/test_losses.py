@@ -8,7 +8,7 @@ import torch
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from clod_adapter.losses import photometric_loss, photometric_loss_plain, ssim
+from clod_adapter.losses import photometric_loss, photometric_loss_plain, ssim, ssim_plain
 
 # Smaller than the window of 11, one larger, multiples of 16 and not.
 SIZES = [(1, 1), (1, 30), (3, 7), (10, 11), (11, 11), (12, 16), (33, 50), (64, 48), (17, 101)]
@@ -119,8 +119,8 @@ def test_ssim_is_scikit_image_s(seed: int) -> None:
         channel_axis=2, full=True,
     )  # fmt: skip
     assert similarity.mean() < 0.9
-    assert ssim(x, y).item() == pytest.approx(similarity.mean(), abs=1e-9), f"seed {seed}"
-    assert ssim(x.float(), y.float()).item() == pytest.approx(similarity.mean(), abs=1e-5), f"seed {seed}"
+    assert ssim_plain(x, y).item() == pytest.approx(similarity.mean(), abs=1e-9), f"seed {seed}"
+    assert ssim_plain(x.float(), y.float()).item() == pytest.approx(similarity.mean(), abs=1e-5), f"seed {seed}"
 
 
 def test_ssim_pads_with_zeros() -> None:
@@ -132,10 +132,20 @@ def test_ssim_pads_with_zeros() -> None:
     mx, my = w * x, w * y
     vx, vy, cov = w * x * x - mx * mx, w * y * y - my * my, w * x * y - mx * my
     want = ((2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))).mean()
-    assert ssim(torch.tensor(x), torch.tensor(y)).item() == pytest.approx(want, abs=1e-12)
+    assert ssim_plain(torch.tensor(x), torch.tensor(y)).item() == pytest.approx(want, abs=1e-12)
 
 
 def test_ssim_of_equal_images_is_one() -> None:
     image, _ = pair(20, 30)
-    assert ssim(image, image).item() == pytest.approx(1, abs=1e-6)
-    assert ssim(image.double(), 1 - image.double()).item() < 0.2
+    assert ssim_plain(image, image).item() == pytest.approx(1, abs=1e-6)
+    assert ssim_plain(image.double(), 1 - image.double()).item() < 0.2
+
+
+@pytest.mark.parametrize("size", [(3, 4), (11, 11), (37, 53)])
+def test_fused_ssim_is_its_plain_twin(size: tuple[int, int]) -> None:
+    generator = torch.Generator().manual_seed(sum(size))
+    target = (torch.rand(*size, 3, generator=generator) * 255).to(torch.uint8)
+    image = (target / 255 + 0.1 * torch.randn(*size, 3, generator=generator)).clamp(0, 1)
+    want = ssim_plain(image.double(), target.double() / 255).item()
+    assert ssim(image, target) == pytest.approx(want, abs=2e-6)
+    assert ssim(image.double(), target) == pytest.approx(want, abs=1e-12)

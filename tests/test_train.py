@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -23,6 +24,15 @@ from scenes import capture, gaussians, photograph, ring
 SCALES = (1.0, 1.5, 2.0, 3.0, 5.0)
 
 
+def config_of(**changes: Any) -> AdaptConfig:
+    """Gentle settings of our own: what these tests find does not hang on the defaults of the day."""
+    settings = {
+        "start_share": 0.6, "full_share": 0.5, "lr_sigma": 1e-2, "lr_means": 3e-5, "lr_quats": 4e-4,
+        "lr_scales": 2e-3, "lr_opacities": 1e-2, "lr_sh0": 1e-3, "lr_shN": 5e-5,
+    }  # fmt: skip
+    return AdaptConfig(**(settings | changes))
+
+
 @pytest.fixture(scope="module")
 def captured() -> tuple[Gaussians, Scene]:
     return capture()
@@ -31,7 +41,7 @@ def captured() -> tuple[Gaussians, Scene]:
 @pytest.fixture(scope="module")
 def trained(captured: tuple[Gaussians, Scene]) -> tuple[Adapted, list[Progress]]:
     seen: list[Progress] = []
-    return adapt(*captured, AdaptConfig(iters=120), seen.append), seen
+    return adapt(*captured, config_of(iters=120), seen.append), seen
 
 
 def assert_equal(a: Gaussians, b: Gaussians) -> None:
@@ -42,13 +52,24 @@ def assert_equal(a: Gaussians, b: Gaussians) -> None:
 
 def test_pictures_get_better(captured: tuple[Gaussians, Scene], trained: tuple[Adapted, list[Progress]]) -> None:
     base, scene = captured
-    before = start(base, scene.train, AdaptConfig())
+    before = start(base, scene.train, config_of())
     for views in (scene.train, scene.test):
         rows = zip(evaluate(before, views, SCALES), evaluate(trained[0].gaussians, views, SCALES), strict=True)
         for old, new in rows:
             assert new.psnr > old.psnr + 0.5, f"s {new.virtual_scale}"
     losses = [p.loss for p in trained[1] if p.phase == "train"]
     assert losses[-1] < 0.6 * losses[0]
+
+
+def test_the_defaults_do_that_too(captured: tuple[Gaussians, Scene]) -> None:
+    base, scene = captured
+    config = AdaptConfig(iters=120)
+    old, new = (
+        evaluate(some, scene.test, SCALES)
+        for some in (start(base, scene.train, config), adapt(base, scene, config).gaussians)
+    )
+    assert sum(row.psnr for row in new) > sum(row.psnr for row in old) + 0.5 * len(SCALES)
+    assert all(more.kept > less.kept for more, less in zip(new, new[1:], strict=False))
 
 
 def test_the_dial_works_after_training(
@@ -67,7 +88,7 @@ def test_the_dial_works_after_training(
 
 
 def test_sigma_is_learned(captured: tuple[Gaussians, Scene], trained: tuple[Adapted, list[Progress]]) -> None:
-    old, new = start(*captured_views(captured), AdaptConfig()).sigma_d, trained[0].gaussians.sigma_d
+    old, new = start(*captured_views(captured), config_of()).sigma_d, trained[0].gaussians.sigma_d
     assert ((new / old).log().abs() > 0.02).float().mean() > 0.3
     for name in ATTRIBUTES:
         assert not torch.equal(getattr(trained[0].gaussians, name), getattr(captured[0], name)), name
@@ -91,25 +112,25 @@ def test_progress_is_reported(captured: tuple[Gaussians, Scene], trained: tuple[
 
 @pytest.mark.parametrize("config", [{}, {"normalizer": "quantile"}, {"normalizer": "max"}], ids=str)
 def test_a_seed_decides_everything(captured: tuple[Gaussians, Scene], config: dict[str, str]) -> None:
-    runs = [adapt(*captured, AdaptConfig(iters=15, seed=seed, **config)).gaussians for seed in (7, 7, 8)]
+    runs = [adapt(*captured, config_of(iters=15, seed=seed, **config)).gaussians for seed in (7, 7, 8)]
     assert_equal(runs[0], runs[1])
     assert not torch.equal(runs[0].sigma_d, runs[2].sigma_d)
 
 
 def test_the_base_is_left_alone(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
-    with_dial = start(base, scene.train, AdaptConfig())
+    with_dial = start(base, scene.train, config_of())
     for some in (base, with_dial):
         before = {name: value.clone() for name, value in some.tensors().items()}
-        adapt(some, scene, AdaptConfig(iters=5))
+        adapt(some, scene, config_of(iters=5))
         for name, value in some.tensors().items():
             assert torch.equal(value, before[name]) and not value.requires_grad, name
 
 
 def test_no_steps_give_the_start(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
-    result = adapt(base, scene, AdaptConfig(iters=0))
-    want = start(base, scene.train, AdaptConfig())
+    result = adapt(base, scene, config_of(iters=0))
+    want = start(base, scene.train, config_of())
     assert result.steps == 0 and not result.interrupted
     for name in ATTRIBUTES:
         assert torch.equal(getattr(result.gaussians, name), getattr(base, name)), name
@@ -120,7 +141,7 @@ def test_no_steps_give_the_start(captured: tuple[Gaussians, Scene]) -> None:
 def test_the_start_follows_the_count_law(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     base = base.replace(opacity_logits=base.opacity_logits.abs())  # all able to last
-    found = start(base, scene.train, AdaptConfig(start_share=0.7, exponent=1.5))
+    found = start(base, scene.train, config_of(start_share=0.7, exponent=1.5))
     assert found.attenuation.scene_distance == pytest.approx(scene_distance(base, scene.train, 0.95))
     for row in evaluate(found, scene.train, SCALES):
         s = row.virtual_scale
@@ -130,7 +151,7 @@ def test_the_start_follows_the_count_law(captured: tuple[Gaussians, Scene]) -> N
 def test_continues_from_a_sigma(captured: tuple[Gaussians, Scene], trained: tuple[Adapted, list[Progress]]) -> None:
     """No importance pass, the same D, and from where the first run was."""
     first, seen = trained[0].gaussians, []
-    config = AdaptConfig(iters=1, max_sv=3.0)
+    config = config_of(iters=1, max_sv=3.0)
     result = adapt(first, captured[1], config, seen.append)
     assert [p.phase for p in seen] == ["train"]
     moved = (result.gaussians.sigma_d / first.sigma_d).log().abs()
@@ -143,7 +164,7 @@ def test_a_dead_sigma_is_revived(captured: tuple[Gaussians, Scene]) -> None:
     """A relu at 0 never recovers by itself; training keeps sigma above a floor."""
     base, scene = captured
     dead = attach(base, torch.where(torch.arange(len(base)) % 2 == 0, 0.0, 1.0), AttenuationConfig(scene_distance=4.0))
-    sigma = adapt(dead, scene, AdaptConfig(iters=2)).gaussians.sigma_d
+    sigma = adapt(dead, scene, config_of(iters=2)).gaussians.sigma_d
     assert (sigma > 0).all() and sigma.isfinite().all()
 
 
@@ -152,17 +173,17 @@ def test_the_count_term_pulls_the_count_down(captured: tuple[Gaussians, Scene]) 
     everything = attach(base, torch.full((len(base),), 1.5), AttenuationConfig(scene_distance=4.0))
     kept = []
     for weight in (0.0, 20.0):
-        result = adapt(everything, scene, AdaptConfig(iters=60, reg_weight=weight, full_share=0.0))
+        result = adapt(everything, scene, config_of(iters=60, reg_weight=weight, full_share=0.0))
         kept.append(evaluate(result.gaussians, scene.train, [3.0])[0].kept)
     assert kept[1] < 0.9 * kept[0]
 
 
 def test_only_sigma_where_other_rates_are_zero(captured: tuple[Gaussians, Scene]) -> None:
     still = {f"lr_{name}": 0.0 for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
-    result = adapt(*captured, AdaptConfig(iters=10, **still)).gaussians
+    result = adapt(*captured, config_of(iters=10, **still)).gaussians
     for name in ATTRIBUTES:
         assert torch.equal(getattr(result, name), getattr(captured[0], name)), name
-    want = start(*captured_views(captured), AdaptConfig()).sigma_d
+    want = start(*captured_views(captured), config_of()).sigma_d
     assert ((result.sigma_d / want - 1).abs() > 1e-3).any()
 
 
@@ -170,7 +191,7 @@ def test_one_step_by_hand(captured: tuple[Gaussians, Scene]) -> None:
     """At s = 1 on one view: the loss is the render's, kept rows move by their rates, dropped rows by nothing."""
     base, scene = captured
     alone = Scene(scene.train[:2], ())
-    config = AdaptConfig(iters=1, full_share=1.0, reg_weight=0.0, seed=3)
+    config = config_of(iters=1, full_share=1.0, reg_weight=0.0, seed=3)
     before, seen = start(base, alone.train, config), []
     after = adapt(before, alone, config, seen.append).gaussians
     losses = [photometric_loss(render(before, view.camera).image, view.image).item() for view in alone.train]
@@ -204,7 +225,7 @@ def test_dial_values_are_drawn_as_documented(
     monkeypatch.setattr(train, "photometric_loss", lambda *a: images.append(a[1]) or photometric_loss(*a))
     views = captured[1].train
     some = attach(gaussians(5, 0, 0), torch.ones(5))
-    adapt(some, captured[1], AdaptConfig(iters=80 * len(views), full_share=0.25, max_sv=4.0))
+    adapt(some, captured[1], config_of(iters=80 * len(views), full_share=0.25, max_sv=4.0))
     drawn = torch.tensor(scales).log() / torch.tensor(4.0).log()
     full = drawn == 0
     assert 0.19 < full.double().mean() < 0.31  # 480 draws: 3 standard deviations
@@ -215,9 +236,9 @@ def test_dial_values_are_drawn_as_documented(
 
 
 def test_a_time_budget_ends_it(captured: tuple[Gaussians, Scene]) -> None:
-    result = adapt(*captured, AdaptConfig(iters=10_000_000, time_budget=0.3))
+    result = adapt(*captured, config_of(iters=10_000_000, time_budget=0.3))
     assert 0 < result.steps < 10_000 and 0.3 <= result.seconds < 5 and not result.interrupted
-    assert adapt(*captured, AdaptConfig(iters=3, time_budget=60.0)).steps == 3
+    assert adapt(*captured, config_of(iters=3, time_budget=60.0)).steps == 3
 
 
 def test_an_interrupt_returns_what_there_is(captured: tuple[Gaussians, Scene]) -> None:
@@ -229,7 +250,7 @@ def test_an_interrupt_returns_what_there_is(captured: tuple[Gaussians, Scene]) -
             if p.done == 5:
                 raise KeyboardInterrupt
 
-    result = adapt(*captured, AdaptConfig(iters=50), stop)
+    result = adapt(*captured, config_of(iters=50), stop)
     assert result.interrupted and result.steps == 5
     for name, value in result.gaussians.tensors().items():
         assert torch.equal(value, states[-1][name]) and value.isfinite().all() and not value.requires_grad, name
@@ -238,8 +259,8 @@ def test_an_interrupt_returns_what_there_is(captured: tuple[Gaussians, Scene]) -
 def test_max_sv_of_one(captured: tuple[Gaussians, Scene]) -> None:
     """Plain fine-tuning of what s = 1 keeps."""
     base, scene = captured
-    result = adapt(base, scene, AdaptConfig(iters=40, max_sv=1.0)).gaussians
-    before = evaluate(start(base, scene.train, AdaptConfig(max_sv=1.0)), scene.train, [1.0])[0]
+    result = adapt(base, scene, config_of(iters=40, max_sv=1.0)).gaussians
+    before = evaluate(start(base, scene.train, config_of(max_sv=1.0)), scene.train, [1.0])[0]
     assert evaluate(result, scene.train, [1.0])[0].psnr > before.psnr + 0.5
     assert result.attenuation.max_sv == 1.0
 
@@ -248,7 +269,7 @@ def test_one_gaussian_and_one_that_is_never_seen() -> None:
     views = photograph(gaussians(20, 0, 0), ring(2, 20, 16))
     for means in ([[0.0, 0.0, 0.0]], [[1e3, 0.0, 0.0]]):
         one = gaussians(1, 0, 0).replace(means=torch.tensor(means))
-        found = adapt(one, Scene(views, ()), AdaptConfig(iters=5)).gaussians
+        found = adapt(one, Scene(views, ()), config_of(iters=5)).gaussians
         assert all(value.isfinite().all() for value in found.tensors().values())
 
 

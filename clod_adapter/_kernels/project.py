@@ -43,8 +43,8 @@ HALF, ZERO, ONE, TWO = float32(0.5), float32(0), float32(1), float32(2)
 FX, FY, CX, CY, WIDTH, HEIGHT, LOW_X, HIGH_X, LOW_Y, HIGH_Y, EYE = range(16, 27)
 CAMERA = 29
 # workspace of one Gaussian: camera point (3), rotation (9), U = J R_view (6), P = U R S (6), covariance (3),
-# determinant, unit quaternion (4), 1 / |quaternion|
-POINT, ROT, UMAT, PMAT, COV, COVDET, QUAT, QINV, SCRATCH = 0, 3, 12, 18, 24, 27, 28, 32, 33
+# determinant, unit quaternion (4), 1 / |quaternion|, gradient of P (6)
+POINT, ROT, UMAT, PMAT, COV, COVDET, QUAT, QINV, VP, SCRATCH = 0, 3, 12, 18, 24, 27, 28, 32, 33, 39
 
 
 @part
@@ -118,15 +118,17 @@ def view_direction(means, i, cam, d):  # type: ignore[no-untyped-def]
 
 @part
 def color(means, sh0, shN, i, degree, cam, basis, direction, records, r):  # type: ignore[no-untyped-def]
-    """Colour ``max(0, 0.5 + SH)`` into the record at ``r``."""
+    """Colour ``max(0, 0.5 + SH)`` into the record at ``r``; False if it is not finite."""
     view_direction(means, i, cam, direction)
     sh_basis(degree, direction[0], direction[1], direction[2], basis)
-    bands = (degree + 1) * (degree + 1) - 1
+    bands, size = (degree + 1) * (degree + 1) - 1, ZERO
     for channel in range(3):
         value = HALF + basis[0] * sh0[3 * i + channel]
         for k in range(bands):
             value += basis[k + 1] * shN[3 * (i * bands + k) + channel]
         records[r + RED + channel] = max(value, ZERO)
+        size += abs(value)
+    return size < float32(3e38)
 
 
 @part
@@ -165,7 +167,8 @@ def project(worker, workers, means, quats, scales, opacities, sh0, shN, degree, 
             continue
         if not record(records, n * RECORD, w, opacities[i], cam):
             continue
-        color(means, sh0, shN, i, degree, cam, basis, direction, records, n * RECORD)
+        if not color(means, sh0, shN, i, degree, cam, basis, direction, records, n * RECORD):
+            continue
         depths[n] = w[POINT + 2]
         ids[n] = i
         n += 1
@@ -186,24 +189,31 @@ def covariance_gradient(w, v, records, r, scales, i, cam, v_scales, v_rot, v_poi
     """From the sums ``v`` over pixels to the gradients of scale, rotation matrix and camera point."""
     ln2 = ONE / LOG2E
     a, b, c = TWO * ln2 * records[r + QA], ln2 * records[r + QB], TWO * ln2 * records[r + QC]
-    # -K vK K with the conic K = [[a, b], [b, c]] and vK = [[-xx/2, -xy/2], [-xy/2, -yy/2]]
-    m00, m01 = a * v[6] + b * v[7], a * v[7] + b * v[8]
-    m10, m11 = b * v[6] + c * v[7], b * v[7] + c * v[8]
-    v00, v01, v11 = HALF * (m00 * a + m01 * b), HALF * (m00 * b + m01 * c), HALF * (m10 * b + m11 * c)
+    # dL/dP = K M (K P) with the conic K = [[a, b], [b, c]] and the second moments M of v. K P comes from
+    # K = adj(P P^T + blur) / det term by term: for a needle, K times its long column of P would cancel to noise.
+    idet = ONE / w[COVDET]
     for k in range(3):
-        vp0 = TWO * (v00 * w[PMAT + k] + v01 * w[PMAT + 3 + k])
-        vp1 = TWO * (v01 * w[PMAT + k] + v11 * w[PMAT + 3 + k])
+        p0, p1 = w[PMAT + k], w[PMAT + 3 + k]
+        t0, t1 = BLUR * p0, BLUR * p1
+        for j in range(3):
+            cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
+            t0 += w[PMAT + 3 + j] * cross
+            t1 -= w[PMAT + j] * cross
+        t0, t1 = t0 * idet, t1 * idet
+        m0, m1 = v[6] * t0 + v[7] * t1, v[7] * t0 + v[8] * t1
+        vp0, vp1 = a * m0 + b * m1, b * m0 + c * m1
+        w[VP + k], w[VP + 3 + k] = vp0, vp1
         total = ZERO
         for d in range(3):
             vq = w[UMAT + d] * vp0 + w[UMAT + 3 + d] * vp1
             total += vq * w[ROT + 3 * d + k]
             v_rot[3 * d + k] = vq * scales[i, k]
         v_scales[i, k] = total
-    point_gradient(w, v00, v01, v11, a * v[4] + b * v[5], b * v[4] + c * v[5], scales, i, cam, v_point)
+    point_gradient(w, a * v[4] + b * v[5], b * v[4] + c * v[5], scales, i, cam, v_point)
 
 
 @part
-def point_gradient(w, v00, v01, v11, v_x, v_y, scales, i, cam, v_point):  # type: ignore[no-untyped-def]
+def point_gradient(w, v_x, v_y, scales, i, cam, v_point):  # type: ignore[no-untyped-def]
     """Gradient of the camera-space point: through the projected centre and through the Jacobian."""
     x, y, iz = w[POINT], w[POINT + 1], ONE / w[POINT + 2]
     rx, ry = x * iz, y * iz
@@ -213,8 +223,8 @@ def point_gradient(w, v00, v01, v11, v_x, v_y, scales, i, cam, v_point):  # type
         u0 = u1 = ZERO
         for k in range(3):
             q = w[ROT + 3 * d + k] * scales[i, k]
-            u0 += TWO * (v00 * w[PMAT + k] + v01 * w[PMAT + 3 + k]) * q
-            u1 += TWO * (v01 * w[PMAT + k] + v11 * w[PMAT + 3 + k]) * q
+            u0 += w[VP + k] * q
+            u1 += w[VP + 3 + k] * q
         j00 += u0 * cam[d]
         j02 += u0 * cam[8 + d]
         j11 += u1 * cam[4 + d]

@@ -24,6 +24,7 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.colmap import write_model
 
 LOW, HIGH = np.array([-3.0, -3.0, 0.0]), np.array([3.0, 0.0, 8.0])
+CANDIDATES = 4  # pixels looked at per point, of which those with detail are preferred
 HOLD_OUT = 8  # every 8th view by name is a test view; the point cloud must not see it
 OAK, BLACK, WHITE, GOLD = (122, 84, 52), (34, 32, 32), (226, 222, 214), (168, 128, 66)
 
@@ -68,7 +69,7 @@ class Gallery:
         """A point cloud as structure from motion would give it, from rays of the training cameras.
 
         Args:
-            n: number of points; near surfaces get more, as in a real capture.
+            n: number of points; near surfaces and detail get more, as from feature matches.
             seed: of the pixels that are chosen and of the noise.
             views: how many cameras the capture has, at least 2, of which every 8th is left out.
 
@@ -81,16 +82,29 @@ class Gallery:
         shares = np.array_split(np.arange(n), len(cameras))
         points, colors = [], []
         for camera, share in zip(cameras, shares, strict=True):
-            eye, rays = camera_rays(camera)
-            pixels = random.random((len(share), 2)) * [camera.width, camera.height]
-            directions = np.column_stack([pixels, np.ones(len(share))]) @ rays.T
-            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-            seen = np.empty((len(share), 4))
-            trace_rays(self.tables, np.tile(eye, (len(share), 1)), directions, 1 / float(camera.K[0, 0]), seen)
-            noise = random.normal(0, 0.003 / np.sqrt(3), directions.shape)
-            points.append(eye + seen[:, 3:] * (directions + noise))
-            colors.append(encode_srgb(seen[:, :3]))
+            if len(share) == 0:
+                continue
+            pixels = random.random((CANDIDATES * len(share), 2)) * [camera.width, camera.height]
+            seen, directions = self._look(camera, pixels)
+            shades = [encode_srgb(seen[:, :3]).astype(float)]
+            shades += [encode_srgb(self._look(camera, pixels + step)[0][:, :3]) for step in ([1, 0], [0, 1])]
+            detail = abs(shades[1] - shades[0]).sum(1) + abs(shades[2] - shades[0]).sum(1)
+            detail += 0.2 * detail.mean() + 1e-3
+            chosen = random.choice(len(pixels), len(share), replace=False, p=detail / detail.sum())
+            noise = random.normal(0, 0.003 / np.sqrt(3), (len(share), 3))
+            eye = camera.position.numpy().astype(float)
+            points.append(eye + seen[chosen, 3:] * (directions[chosen] + noise))
+            colors.append(shades[0][chosen].astype(np.uint8))
         return np.concatenate(points).astype(np.float32), np.concatenate(colors)
+
+    def _look(self, camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Linear colour and distance ``[n, 4]`` along rays through ``pixels [n, 2]``, and the rays' directions."""
+        eye, rays = camera_rays(camera)
+        directions = np.column_stack([pixels, np.ones(len(pixels))]) @ rays.T
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        seen = np.empty((len(pixels), 4))
+        trace_rays(self.tables, np.tile(eye, (len(pixels), 1)), directions, 1 / float(camera.K[0, 0]), seen)
+        return seen, directions
 
 
 def make_gallery(samples: int = 3) -> Gallery:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from clod_adapter._kernels import blend, project, threads, tiles
 from clod_adapter.cameras import Camera
@@ -134,7 +135,7 @@ class _Splat(torch.autograd.Function):
         image, alpha = torch.empty(frame.height, frame.width, 3), torch.empty(frame.height, frame.width)
         threads.run(
             blend.blend, frame.workers, frame.records, frame.entries, frame.offsets, frame.across, frame.width,
-            frame.height, background.detach().numpy(), frame.tiles, np.zeros(1, np.int64), image.numpy(), alpha.numpy(),
+            frame.height, background.detach().contiguous().numpy(), frame.tiles, np.zeros(1, np.int64), image.numpy(), alpha.numpy(),
         )  # fmt: skip
         ctx.frame, ctx.degree = frame, degree
         ctx.save_for_backward(means, quats, scales, opacities, sh0, shN, background, image, alpha)
@@ -142,6 +143,7 @@ class _Splat(torch.autograd.Function):
         return image, alpha
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor):  # type: ignore[no-untyped-def, override]
         *inputs, background, image, alpha = ctx.saved_tensors
         frame: _Frame = ctx.frame

@@ -7,9 +7,10 @@ import sys
 from types import SimpleNamespace
 from typing import Any
 
+import numba
 import pytest
 
-from clod_adapter.cli.console import Console, Meter, duration
+from clod_adapter.cli.console import Console, Meter, announced_compiling, duration
 
 
 class Terminal(io.StringIO):
@@ -58,6 +59,14 @@ def test_quiet_and_closed(stream: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         meter.update(0.5)
     console.say("another")
     assert first.getvalue() == ""
+
+
+def test_compiling_is_announced_once(capsys: pytest.CaptureFixture[str]) -> None:
+    function = numba.njit(lambda x: x + 1)
+    with announced_compiling(Console()):
+        function(1)
+        function(1.0)
+    assert capsys.readouterr().err.count("compiling kernels (first run only") == 1
 
 
 @pytest.mark.parametrize(

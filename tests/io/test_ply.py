@@ -322,7 +322,9 @@ def test_no_rows(tmp_path: Path, kind: str) -> None:
 @given(st.data(), st.sampled_from(["<", ">", "ascii"]))
 def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject, kind: str) -> None:
     whole = write(tmp_path / "in.ply", make(3, needed(0)), kind, ("a comment",)).read_bytes()
-    damaged = bytearray(whole[: data.draw(st.integers(0, len(whole) - 2))])
+    # An ascii file cut within its last number is a whole file with another number.
+    least = len(whole) - whole.rstrip().rfind(b" ") if kind == "ascii" else 2
+    damaged = bytearray(whole[: data.draw(st.integers(0, len(whole) - least))])
     path = tmp_path / "damaged.ply"
     path.write_bytes(damaged)
     with pytest.raises(ClodError):

@@ -70,7 +70,7 @@ def test_saturated_layers(rasterize: Rasterizer) -> None:
     """Opacity 1 everywhere: alpha is clamped to 0.999 around each centre, where it has no gradient."""
     some = scene(300, 1, 0, size=1.0)
     some["opacities"][:] = 1
-    assert_agrees(rasterize, some, camera(40, 30))
+    assert_agrees(rasterize, some, camera(40, 30), cut=0.05)  # most of it at the clamp
 
 
 def test_alpha_is_clamped(rasterize: Rasterizer) -> None:
