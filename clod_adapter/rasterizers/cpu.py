@@ -135,7 +135,8 @@ class _Splat(torch.autograd.Function):
         image, alpha = torch.empty(frame.height, frame.width, 3), torch.empty(frame.height, frame.width)
         threads.run(
             blend.blend, frame.workers, frame.records, frame.entries, frame.offsets, frame.across, frame.width,
-            frame.height, background.detach().contiguous().numpy(), frame.tiles, np.zeros(1, np.int64), image.numpy(), alpha.numpy(),
+            frame.height, background.detach().contiguous().numpy(), frame.tiles, np.zeros(1, np.int64), image.numpy(),
+            alpha.numpy(),
         )  # fmt: skip
         ctx.frame, ctx.degree = frame, degree
         ctx.save_for_backward(means, quats, scales, opacities, sh0, shN, background, image, alpha)
