@@ -2,6 +2,8 @@
 
     python benchmarks/adapt.py plush_half bonsai146 ci_banana plush_half/pretrained_mask
     python benchmarks/adapt.py plush_half --set lr_sigma=0.05 --set full_share=0 --label "slow sigma"
+    python benchmarks/adapt.py plush_half --ablations      # one row for each choice in docs/method.md
+    python benchmarks/adapt.py --table                     # the rows as a Markdown table
 
 A scene is a folder of the shared data, with a checkpoint's name where it is not ``pretrained``. Each run
 adds one row to ``results/adapt.jsonl``: the settings, the commit, the machine, the base and the dial.
@@ -11,27 +13,71 @@ from __future__ import annotations
 
 import argparse
 import ast
-import resource
+import json
 from dataclasses import asdict
 
-from common import append, capture
+from common import RESULTS, append, capture
 
 import clod_adapter as clod
 
+FILE = "adapt.jsonl"
 DIALS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
+ABLATION_STEPS = 600
+# The default is an entry too: the others are compared with it at the same number of steps.
+ABLATIONS: dict[str, dict[str, object]] = {
+    "default, 600 steps": {},
+    "never s = 1 on purpose": {"full_share": 0.0},
+    "half the steps at s = 1": {"full_share": 0.5},
+    "sigma ten times slower": {"lr_sigma": 0.01},
+    "sigma three times faster": {"lr_sigma": 0.3},
+    "other attributes half as fast": {
+        "lr_means": 6.5e-5, "lr_quats": 4e-4, "lr_scales": 2e-3, "lr_opacities": 2.5e-2, "lr_sh0": 1e-3,
+    },
+    "other attributes frozen": {
+        "lr_means": 0.0, "lr_quats": 0.0, "lr_scales": 0.0, "lr_opacities": 0.0, "lr_sh0": 0.0,
+    },
+    "higher bands tuned": {"lr_shN": 1e-4},
+    "all dial values weigh alike": {"weight_slope": 0.0},
+    "wider soft count": {"temperature": 1.0},
+    "no count term": {"reg_weight": 0.0},
+    "higher threshold": {"tau": 0.01},
+    "normaliser quantile": {"normalizer": "quantile"},
+    "normaliser max (the paper's)": {"normalizer": "max"},
+    "start keeps more at s = 1": {"start_share": 0.8},
+}  # fmt: skip
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+")
+    parser.add_argument("scenes", nargs="*")
+    parser.add_argument("--ablations", action="store_true", help=f"every choice by itself, {ABLATION_STEPS} steps each")
+    parser.add_argument("--table", action="store_true", help="print the rows there are")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a field of AdaptConfig")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--label", default="default", help="what the row is for")
     args = parser.parse_args()
-    changed = dict(_setting(text) for text in args.set)
+    if args.table:
+        print_table()
+    runs = {args.label: dict(_setting(text) for text in args.set)}
+    if args.ablations:
+        runs = {label: {"iters": ABLATION_STEPS, **changed} for label, changed in ABLATIONS.items()}
     for scene in args.scenes:
-        for seed in args.seeds:
-            run(scene, args.label, clod.AdaptConfig(**{"seed": seed, **changed}), changed)
+        for label, changed in runs.items():
+            for seed in args.seeds:
+                run(scene, label, clod.AdaptConfig(**{"seed": seed, **changed}), changed)
+
+
+def print_table() -> None:
+    """PSNR and share per dial value, a line a row of the results."""
+    dials = [f"s = {s:g}" for s in DIALS]
+    print("| scene | what | steps | seconds | base | " + " | ".join(dials) + " |")
+    print("|---" * (5 + len(dials)) + "|")
+    for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
+        row = json.loads(line)
+        seconds = row["start_seconds"] + row["train_seconds"]
+        cells = [f"{r['psnr']:.2f} @ {r['kept_share']:.1%}" for r in row["rows"] if r["virtual_scale"] in DIALS]
+        head = [row["scene"], row["label"], str(row["steps"]), f"{seconds:.0f}", f"{row['base']['psnr']:.2f}"]
+        print("| " + " | ".join(head + cells) + " |")
 
 
 def _setting(text: str) -> tuple[str, object]:
@@ -51,12 +97,11 @@ def run(scene: str, label: str, config: clod.AdaptConfig, changed: dict[str, obj
     adapted = clod.adapt(base.gaussians, photographs, config)
     adapter = clod.extract(base.gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config))
     rows = clod.evaluate(adapter.apply(base.gaussians), photographs.test, dials)
-    append("adapt.jsonl", {
+    append(FILE, {
         "benchmark": "adapt", "scene": scene, "label": label, "changed": changed, "config": asdict(config),
         "base_count": len(base.gaussians), "base": base_row.as_dict(), "rows": [row.as_dict() for row in rows],
         "steps": adapted.steps, "start_seconds": round(adapted.start_seconds, 2),
         "train_seconds": round(adapted.seconds, 2),
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
     })  # fmt: skip
 
 

@@ -28,9 +28,7 @@ class AttenuationConfig:
     - ``max``: their maximum, the paper's form.
     """
 
-    tau: float = option(
-        1 / 255, "base opacity threshold; 1/255 is what rasterizers drop anyway, so s = 1 cuts nothing visible"
-    )
+    tau: float = option(1 / 255, "base opacity threshold of the cut; 1/255 is what rasterizers drop anyway")
     eps: float = option(1e-8, "the paper's epsilon under sigma_d squared; keeps sigma_d = 0 defined")
     normalizer: str = option("scene", "what distances are divided by: scene, quantile or max")
     quantile: float = option(0.95, "share of the frustum's Gaussians nearer than D (normalizer quantile)")
@@ -54,7 +52,7 @@ class AttenuationConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptConfig:
-    """How an adaptation is run. Every default was measured; docs/method.md has the tables."""
+    """How an adaptation is run. docs/method.md says which defaults were measured, and what the others stand on."""
 
     max_sv: float = option(5.0, "largest dial value to train for")
     iters: int = option(1500, "training steps")
@@ -75,17 +73,19 @@ class AdaptConfig:
     )
     temperature: float = option(0.5, "width of the straight-through count's sigmoid, in log opacity")
     ssim_weight: float = option(0.2, "weight of 1 - SSIM against L1")
-    lr_sigma: float = option(0.1, "step size of log sigma_d (relative change a step)")
+    lr_sigma: float = option(0.1, "step size of log sigma_d: its largest relative change a step")
     lr_means: float = option(1.3e-4, "step size of means, times the cameras' extent")
     lr_quats: float = option(8e-4, "step size of quats")
     lr_scales: float = option(4e-3, "step size of log_scales")
     lr_opacities: float = option(5e-2, "step size of opacity_logits")
     lr_sh0: float = option(2e-3, "step size of sh0")
-    lr_shN: float = option(1e-4, "step size of shN")
+    lr_shN: float = option(0.0, "step size of shN; 0 leaves the higher bands as they are: measured at 0.01 dB")
     lr_final: float = option(0.05, "step sizes fall exponentially to this share of their start")
 
     def __post_init__(self) -> None:
-        require(1 <= self.max_sv < math.inf, "max_sv", self.max_sv, "at least 1 and finite")
+        for name, value in vars(self).items():
+            require(not isinstance(value, float) or math.isfinite(value), name, value, "finite")
+        require(self.max_sv >= 1, "max_sv", self.max_sv, "at least 1")
         require(self.iters >= 0, "iters", self.iters, "at least 0")
         require(0 <= self.seed < 2**63, "seed", self.seed, "at least 0 and below 2^63")
         require(self.time_budget is None or self.time_budget > 0, "time_budget", self.time_budget, "positive seconds")

@@ -1,17 +1,54 @@
-"""What each Gaussian contributes to the training views, and the sigma_d that follows from its rank."""
+"""The training-free start: what each Gaussian contributes to the views, and the sigma_d that follows from its rank."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import normalized_distances, sigma_for_extinction
+from clod_adapter.attenuation import SIGMA_MAX, normalized_distances, normalizing_distance, sigma_for_extinction
 from clod_adapter.cameras import View
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import splat
+
+# A start beyond this many times the normalised distance at the largest dial value would fade by less than a
+# thousandth there, and its gradient with it: such a sigma would never move again.
+WIDEST = 22.0
+
+
+def start(
+    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Callable[[int], None] | None = None
+) -> Gaussians:
+    """The Gaussians with a sigma_d to train from.
+
+    A dial that ``base`` already has is kept, with its own settings but the config's ``max_sv``; one
+    that does nothing (``SIGMA_MAX`` throughout, as ``attach`` makes it) counts as none.
+
+    Args:
+        progress: called with the number of views looked at.
+    """
+    if base.sigma_d is not None and base.attenuation is not None and bool((base.sigma_d < SIGMA_MAX).any()):
+        return base.replace(attenuation=dataclasses.replace(base.attenuation, max_sv=config.max_sv))
+    attenuation = config.attenuation(scene_distance(base, views, config.quantile))
+    importance = removal_error(base, views, seed=config.seed, progress=progress)
+    distances = typical_distance(base, views, attenuation)
+    sigma = sigma_from_importance(
+        base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent
+    )
+    return base.replace(sigma_d=sigma.minimum(WIDEST * config.max_sv * distances), attenuation=attenuation)
+
+
+def scene_distance(base: Gaussians, views: Sequence[View], quantile: float) -> float:
+    """D of the scene normaliser: mean over views of the ``quantile`` distance in the frustum, world units."""
+    probe = AttenuationConfig(normalizer="quantile", quantile=quantile)
+    total = 0.0
+    for view in views:
+        distances = (base.means - view.camera.position).norm(dim=1)
+        total += float(normalizing_distance(distances, base.means, view.camera, probe))
+    return total / len(views)
 
 
 def removal_error(

@@ -11,7 +11,7 @@ from torch import Tensor
 class RowAdam:
     """Adam (Kingma and Ba 2015) over named ``[N, ...]`` parameters, a subset of rows a step.
 
-    A row that no view shows keeps its value and its moments, and costs nothing; the bias
+    A row that is not handed in keeps its value and its moments, and costs nothing; the bias
     correction counts a row's own steps, so its first step is as long as anyone's.
 
     Args:

@@ -10,6 +10,7 @@ from torch import Tensor
 from clod_adapter.attenuation import Attenuated, attenuate, normalized_distances
 from clod_adapter.cameras import Camera
 from clod_adapter.config import require
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import Rasterizer, for_device
 
@@ -56,9 +57,18 @@ def splat(
     background: Tensor | None = None,
     rasterizer: Rasterizer | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Image ``[H, W, 3]`` and alpha ``[H, W]`` of the Gaussians with the given ``opacities [N]``, black behind."""
+    """Image ``[H, W, 3]`` and alpha ``[H, W]`` of the Gaussians with the given ``opacities [N]``, black behind.
+
+    Raises:
+        ClodError: the opacities or the background have the wrong shape.
+    """
     rasterize = rasterizer or for_device(gaussians.means.device)
     behind = torch.zeros(3, device=gaussians.means.device) if background is None else background
+    if behind.shape != (3,) or opacities.shape != (len(gaussians),):
+        raise ClodError(
+            f"background is {tuple(behind.shape)} and must be (3,), opacities {tuple(opacities.shape)} and must be "
+            f"({len(gaussians)},)"
+        )
     return rasterize(
         gaussians.means, gaussians.quats, gaussians.scales, opacities, gaussians.sh0, gaussians.shN, camera, behind
     )

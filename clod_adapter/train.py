@@ -12,18 +12,18 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.attenuation import attenuate, normalized_distances, normalizing_distance, soft_count
+from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances, soft_count
 from clod_adapter.cameras import Scene, View
-from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.importance import removal_error, sigma_from_importance, typical_distance
+from clod_adapter.importance import start
 from clod_adapter.losses import photometric_loss
 from clod_adapter.optimizer import RowAdam
 from clod_adapter.render import splat
 
-# Adam keeps log sigma within what the equation can tell apart (SIGMA_MAX is the identity).
-LOG_SIGMA_RANGE = (math.log(1e-4), math.log(1e9))
+# Log sigma stays where the equation still tells values apart; below, a Gaussian would be gone for good.
+LOG_SIGMA_RANGE = (math.log(1e-4), math.log(SIGMA_MAX))
 
 
 @dataclass(frozen=True)
@@ -87,45 +87,15 @@ def adapt(
         raise ClodError("the scene has no training views: give at least one photograph that is not held out")
     if len(base) == 0:
         raise ClodError("the checkpoint has no Gaussians, so there is nothing to adapt")
-    started = time.perf_counter()
-    gaussians = start(base, scene.train, config, progress)
-    return _Run(gaussians, scene.train, config, progress).run(time.perf_counter() - started)
-
-
-def start(
-    base: Gaussians, views: tuple[View, ...], config: AdaptConfig, progress: Callable[[Progress], None] | None = None
-) -> Gaussians:
-    """The training-free start: sigma_d from the importance of each Gaussian (``importance.py``)."""
-    if base.sigma_d is not None and base.attenuation is not None:
-        kept = config.attenuation(base.attenuation.scene_distance)
-        return base.replace(attenuation=kept, sigma_d=base.sigma_d)
-    attenuation = config.attenuation(scene_distance(base, views, config.quantile))
-    began = time.perf_counter()
+    began, total = time.perf_counter(), len(scene.train)
 
     def report(done: int) -> None:
         if progress:
-            progress(
-                Progress(
-                    "start", done, len(views), time.perf_counter() - began, done / len(views), math.nan, lambda: base
-                )
-            )
+            seconds = time.perf_counter() - began
+            progress(Progress("start", done, total, seconds, done / total, math.nan, lambda: base))
 
-    importance = removal_error(base, views, seed=config.seed, progress=report)
-    distances = typical_distance(base, views, attenuation)
-    sigma = sigma_from_importance(
-        base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent
-    )
-    return base.replace(sigma_d=sigma, attenuation=attenuation)
-
-
-def scene_distance(base: Gaussians, views: tuple[View, ...], quantile: float) -> float:
-    """D of the scene normaliser: mean over views of the ``quantile`` distance in the frustum, world units."""
-    probe = AttenuationConfig(normalizer="quantile", quantile=quantile)
-    total = 0.0
-    for view in views:
-        distances = (base.means - view.camera.position).norm(dim=1)
-        total += float(normalizing_distance(distances, base.means, view.camera, probe))
-    return total / len(views)
+    gaussians = start(base, scene.train, config, report)
+    return _Run(gaussians, scene.train, config, progress).run(time.perf_counter() - began)
 
 
 def camera_extent(views: tuple[View, ...]) -> float:
@@ -147,8 +117,9 @@ class _Run:
         self.config, self.views, self.progress = config, views, progress
         assert start.sigma_d is not None and start.attenuation is not None
         self.attenuation = start.attenuation
-        self.parameters = {name: getattr(start, name).clone() for name in ATTRIBUTES}
-        self.parameters["log_sigma"] = start.sigma_d.clamp(min=1e-30).log().clamp(*LOG_SIGMA_RANGE)
+        own = {"dtype": torch.float32, "copy": True, "memory_format": torch.contiguous_format}
+        self.parameters = {name: getattr(start, name).detach().to(**own) for name in ATTRIBUTES}
+        self.parameters["log_sigma"] = start.sigma_d.detach().float().clamp(min=1e-30).log().clamp(*LOG_SIGMA_RANGE)
         self.optimizer = RowAdam(self.parameters)
         self.rates = {
             "means": config.lr_means * camera_extent(views), "quats": config.lr_quats, "log_scales": config.lr_scales,
@@ -157,7 +128,10 @@ class _Run:
         }  # fmt: skip
         self.random = np.random.default_rng(config.seed)
         self.order: list[int] = []
-        self.by_row = set(ATTRIBUTES) - {"opacity_logits"}
+        # What is stepped by row; a frozen attribute asks the rasterizer for no gradient.
+        self.tuned = [
+            n for n in ATTRIBUTES if n != "opacity_logits" and self.rates[n] > 0 and getattr(start, n).numel()
+        ]
         self.loss = math.nan
 
     def run(self, start_seconds: float) -> Adapted:
@@ -199,14 +173,14 @@ class _Run:
         dialled = attenuate(logits, log_sigma.exp(), distances, s, self.attenuation)
         rows = dialled.keep.nonzero()[:, 0]
         # Only the kept rows take part: gradients, moments and steps of the others do not exist this step.
-        leaves = {name: p[name].index_select(0, rows).requires_grad_() for name in ATTRIBUTES if name in self.by_row}
-        kept = Gaussians(**leaves, opacity_logits=logits.detach()[rows])
+        chosen = {name: p[name].index_select(0, rows) for name in ATTRIBUTES}
+        leaves = {name: chosen[name].requires_grad_() for name in self.tuned}
+        kept = Gaussians(**chosen)
         image, _ = splat(kept, dialled.opacities.index_select(0, rows), view.camera)
         loss = photometric_loss(image, view.image, config.ssim_weight)
         self.loss = float(loss.detach()) if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * float(loss.detach())
-        excess = (soft_count(dialled.log_opacities, s, config.tau, config.temperature) - s**-config.exponent).clamp(
-            min=0
-        )
+        count = soft_count(dialled.log_opacities, s, self.attenuation.tau, config.temperature)
+        excess = (count - s**-config.exponent).clamp(min=0)
         weight = (1 - config.weight_slope * s / config.max_sv) ** 2
         total = weight * (loss + config.reg_weight * (s - 1) ** 2 * excess**2)
         of_logits, of_sigma, *of_leaves = torch.autograd.grad(total, [logits, log_sigma, *leaves.values()])
@@ -217,8 +191,7 @@ class _Run:
     ) -> None:
         """Steps the kept rows of most attributes; logits and sigma of all rows, which the count term reaches."""
         for name, gradient in leaves.items():
-            if gradient.numel() and self.rates[name] > 0:
-                self.optimizer.step(name, gradient, rows, self.rates[name] * decay)
+            self.optimizer.step(name, gradient, rows, self.rates[name] * decay)
         everything = torch.arange(len(of_logits))
         self.optimizer.step("opacity_logits", of_logits, everything, self.rates["opacity_logits"] * decay)
         self.optimizer.step("log_sigma", of_sigma, everything, self.rates["log_sigma"] * decay)

@@ -16,9 +16,10 @@ from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.importance import scene_distance, start
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import render
-from clod_adapter.train import Adapted, Progress, adapt, camera_extent, scene_distance, start
+from clod_adapter.train import Adapted, Progress, adapt, camera_extent
 from scenes import capture, gaussians, photograph, ring
 
 SCALES = (1.0, 1.5, 2.0, 3.0, 5.0)

@@ -8,9 +8,30 @@ to 1e-4 is finished and carries its transmittance negated; a block ends when all
 from __future__ import annotations
 
 import numpy as np
-from numba import float32
+from numba import float32, int32, uint8
 
-from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.compiling import kernel, part, pointer, scratch
+from clod_adapter._kernels.conventions import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    BLUE,
+    GREEN,
+    LOG,
+    MX,
+    MY,
+    PAIR,
+    QA,
+    QB,
+    QC,
+    RECORD,
+    RED,
+    T_MIN,
+    TILE,
+    X0,
+    X1,
+    Y0,
+    Y1,
+)
 from clod_adapter._kernels.simd import (
     anywhere,
     both,
@@ -28,30 +49,12 @@ from clod_adapter._kernels.simd import (
     store_sums,
     vmin,
 )
-from clod_adapter._kernels.tiles import (
-    BLUE,
-    GREEN,
-    LOG,
-    MX,
-    MY,
-    QA,
-    QB,
-    QC,
-    RECORD,
-    RED,
-    TILE,
-    X0,
-    X1,
-    Y0,
-    Y1,
-    extent,
-)
+from clod_adapter._kernels.tiles import extent
 
 BLOCK = 4
 ACROSS = TILE // BLOCK
 BLOCKS = ACROSS * ACROSS
-ALPHA_MIN, ALPHA_MAX, T_MIN = float32(1 / 255), float32(0.999), float32(1e-4)
-PAIR = 9
+FORWARD_STATE, BACKWARD_STATE = BLOCKS * 64, BLOCKS * 80
 BLOCK_X = np.tile(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
 BLOCK_Y = np.repeat(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
 LANE_X = np.tile(np.arange(4, dtype=np.float32) + 0.5, 4)
@@ -91,19 +94,26 @@ def blocks_of(records, r, ox, oy, live, touched):  # type: ignore[no-untyped-def
 
 
 @kernel
-def blend(worker, workers, records, entries, offsets, across, width, height, background, tiles, cursor, image, alpha):  # type: ignore[no-untyped-def]
-    """Forward: writes ``image [H, W, 3]`` and ``alpha [H, W]``. Tiles are taken from ``tiles`` by an atomic cursor."""
-    state = np.empty(BLOCKS * 64, np.float32)
-    live, touched = np.empty(BLOCKS, np.uint8), np.empty(BLOCKS, np.int32)
+def blend(  # type: ignore[no-untyped-def]
+    worker, workers, records, entries, offsets, across, width, height, background, tiles, cursor, room, image, alpha,
+):  # fmt: skip
+    """Forward: writes ``image [H, W, 3]`` and ``alpha [H, W]``. Tiles are taken from ``tiles`` by an atomic cursor.
+
+    ``room[worker]`` holds FORWARD_STATE floats of scratch (on the stack, LLVM would take minutes to compile it).
+    """
+    count, tiles, records, entries = len(tiles), pointer(tiles), pointer(records), pointer(entries)
+    offsets, background, image, alpha = pointer(offsets), pointer(background), pointer(image), pointer(alpha)
+    state, live, touched = pointer(room[worker]), scratch(uint8, BLOCKS), scratch(int32, BLOCKS)
     zero, threshold, most, least = splat(float32(0)), splat(ALPHA_MIN), splat(ALPHA_MAX), splat(T_MIN)
     lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
     while True:
         turn = fetch_add(cursor, 1)
-        if turn >= len(tiles):
+        if turn >= count:
             break
         tile = tiles[turn]
         ox, oy = (tile % across) * TILE, (tile // across) * TILE
-        state[:] = float32(0)
+        for k in range(FORWARD_STATE):
+            state[k] = float32(0)
         alive = start_tile(ox, oy, width, height, state, 64, live)
         for entry in range(offsets[tile], offsets[tile + 1]):
             if alive == 0:
@@ -154,9 +164,9 @@ def write_tile(ox, oy, width, height, state, background, image, alpha):  # type:
             block = ((y - oy) // BLOCK) * ACROSS + (x - ox) // BLOCK
             at = block * 64 + ((y - oy) % BLOCK) * 4 + (x - ox) % BLOCK
             t = abs(state[at])
-            alpha[y, x] = float32(1) - t
+            alpha[y * width + x] = float32(1) - t
             for channel in range(3):
-                image[y, x, channel] = state[at + 16 + 16 * channel] + t * background[channel]
+                image[3 * (y * width + x) + channel] = state[at + 16 + 16 * channel] + t * background[channel]
 
 
 @part
@@ -166,18 +176,18 @@ def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):  # 
         for x in range(ox, min(ox + TILE, width)):
             block = ((y - oy) // BLOCK) * ACROSS + (x - ox) // BLOCK
             at = block * 80 + ((y - oy) % BLOCK) * 4 + (x - ox) % BLOCK
-            rest = -v_alpha[y, x] * (float32(1) - alpha[y, x])
+            rest = -v_alpha[y * width + x] * (float32(1) - alpha[y * width + x])
             for channel in range(3):
-                v = v_image[y, x, channel]
+                v = v_image[3 * (y * width + x) + channel]
                 state[at + 32 + 16 * channel] = v
-                rest += v * image[y, x, channel]
+                rest += v * image[3 * (y * width + x) + channel]
             state[at + 16] = rest
 
 
 @kernel
 def blend_gradient(  # type: ignore[no-untyped-def]
     worker, workers, records, entries, entry_slots, offsets, across, width, height, image, alpha, v_image, v_alpha,
-    tiles, cursor, pair_sums,
+    tiles, cursor, room, pair_sums,
 ):  # fmt: skip
     """Backward: per (Gaussian, tile) pair the nine sums over pixels that the projection's gradient needs.
 
@@ -185,17 +195,22 @@ def blend_gradient(  # type: ignore[no-untyped-def]
     s dx^2, s dx dy, s dy^2. Walks front to back like the forward pass, keeping the running
     remainder of v . C, so nothing is stored per pixel and Gaussian, and each pair has its own slot.
     """
-    state = np.zeros(BLOCKS * 80, np.float32)
-    live, touched = np.empty(BLOCKS, np.uint8), np.empty(BLOCKS, np.int32)
+    count, tiles, records, entries = len(tiles), pointer(tiles), pointer(records), pointer(entries)
+    entry_slots, offsets, pair_sums = pointer(entry_slots), pointer(offsets), pointer(pair_sums)
+    image, alpha, v_image, v_alpha = pointer(image), pointer(alpha), pointer(v_image), pointer(v_alpha)
+    state, live, touched = pointer(room[worker]), scratch(uint8, BLOCKS), scratch(int32, BLOCKS)
     zero, one = splat(float32(0)), splat(float32(1))
     threshold, most, least = splat(ALPHA_MIN), splat(ALPHA_MAX), splat(T_MIN)
     lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
     while True:
         turn = fetch_add(cursor, 1)
-        if turn >= len(tiles):
+        if turn >= count:
             break
         tile = tiles[turn]
         ox, oy = (tile % across) * TILE, (tile // across) * TILE
+        if ox + TILE > width or oy + TILE > height:
+            for k in range(BACKWARD_STATE):  # pixels outside weigh nothing, but nothing times NaN is NaN
+                state[k] = float32(0)
         alive = start_tile(ox, oy, width, height, state, 80, live)
         read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state)
         for entry in range(offsets[tile], offsets[tile + 1]):

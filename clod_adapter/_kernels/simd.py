@@ -4,9 +4,9 @@ Numba's loop vectoriser gives up on the splatting loops (aliasing, masks), so th
 they mean: ``F32x16`` is LLVM's ``<16 x float>`` and ``Mask16`` its ``<16 x i1>``. LLVM lowers them
 to one AVX-512, two AVX or four SSE/NEON registers, whichever the processor has.
 
-Vectors are made by ``splat`` and ``load`` and combined by ``+ - *``, ``fma``, ``vmin``, ``vmax``,
-comparisons ``ge``, ``gt``, ``select`` and ``zero_unless``. Loads and stores take a 1-D contiguous
-float32 array and the index of the first lane; nothing checks the bounds.
+Vectors are made by ``splat`` and ``load`` and combined by ``+ - *``, ``fma``, ``vmin``, comparisons
+``ge``, ``gt``, and ``select``. Loads and stores take a 1-D contiguous
+float32 array, or a pointer to one, and the index of the first lane; nothing checks the bounds.
 """
 
 from __future__ import annotations
@@ -61,9 +61,13 @@ def _call(builder, name, result, arguments):  # type: ignore[no-untyped-def]
     return builder.call(function, arguments)
 
 
-def _pointer(context, builder, array_type, array, index):  # type: ignore[no-untyped-def]
-    data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _vector.as_pointer())
+def _data(context, builder, kind, value):  # type: ignore[no-untyped-def]
+    """The address of an array's elements, or the pointer that was given."""
+    return value if isinstance(kind, types.CPointer) else context.make_array(kind)(context, builder, value).data
+
+
+def _pointer(context, builder, kind, value, index):  # type: ignore[no-untyped-def]
+    return builder.bitcast(builder.gep(_data(context, builder, kind, value), [index]), _vector.as_pointer())
 
 
 @intrinsic
@@ -175,7 +179,7 @@ def _extremum(predicate: str):  # type: ignore[no-untyped-def]
     return operation
 
 
-vmin, vmax = _extremum("<"), _extremum(">")
+vmin = _extremum("<")
 
 
 @intrinsic
@@ -237,7 +241,7 @@ def store_sums(typingctx, array, index, a, b, c, d, e, f, g, h, i):  # type: ign
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         sums = _pairwise(builder, list(args[2:]))
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        data = _data(context, builder, signature.args[0], args[0])
         pointer = builder.gep(data, [args[1]])
         eight = builder.shuffle_vector(sums, sums, ir.Constant(ir.VectorType(ir.IntType(32), 8), list(range(8))))
         builder.store(eight, builder.bitcast(pointer, eight.type.as_pointer()), align=4)
@@ -285,7 +289,7 @@ def fetch_add(typingctx, array, amount):  # type: ignore[no-untyped-def]
     """Atomically adds to ``array[0]`` (int64) and returns what it was."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        data = _data(context, builder, signature.args[0], args[0])
         return builder.atomic_rmw("add", data, args[1], "monotonic")
 
     return types.int64(array, types.int64), codegen

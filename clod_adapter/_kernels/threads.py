@@ -6,8 +6,9 @@ threads avoid a second OpenMP runtime beside torch's, which would spin against i
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
 from typing import Any
 
@@ -17,6 +18,10 @@ import torch
 @lru_cache(maxsize=1)
 def _pool(workers: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=workers, thread_name_prefix="clod-adapter")
+
+
+if hasattr(os, "register_at_fork"):  # a forked child has the pool's bookkeeping, but not its threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def worker_count() -> int:
@@ -30,6 +35,9 @@ def run(kernel: Callable[..., Any], workers: int, *arguments: Any) -> None:
         kernel(0, 1, *arguments)
         return
     others = [_pool(workers - 1).submit(kernel, worker, workers, *arguments) for worker in range(1, workers)]
-    kernel(0, workers, *arguments)
+    try:
+        kernel(0, workers, *arguments)
+    finally:
+        wait(others)  # also when interrupted: nobody may still write into arrays that are handed back
     for other in others:
         other.result()

@@ -7,20 +7,27 @@ import math
 import numpy as np
 from numba import float32
 
-from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.compiling import kernel, part, pointer
+from clod_adapter._kernels.conventions import (
+    DET,
+    HALF,
+    MX,
+    MY,
+    QA,
+    QB,
+    QC,
+    REACH,
+    RECORD,
+    RX,
+    SLACK,
+    TILE,
+    X0,
+    X1,
+    Y0,
+    Y1,
+)
 
-# Columns of a record, the 64 bytes the blending loops read of a visible Gaussian. The exponent of
-# its alpha is in powers of two: log2 alpha = LOG - (QA dx^2 + QB dx dy + QC dy^2).
-MX, MY, QA, QB, QC, LOG, RED, GREEN, BLUE, REACH, RX, DET, X0, Y0, X1, Y1 = range(16)
-RECORD = 16
-TILE = 64
-HALF = float32(0.5)
-# Extents widen by this many pixels, so that rounding never loses a pixel at the 1/255 edge.
-SLACK = float32(0.01)
 
-
-# Records travel as one flat array and the offset of the first column: a view per Gaussian would cost an
-# atomic reference count, and a slice its bounds.
 @part
 def extent(records, r, first, last):  # type: ignore[no-untyped-def]
     """Columns the ellipse of the record at ``r`` covers between the pixel rows ``first`` and ``last``.
@@ -66,8 +73,9 @@ def radix_sort(keys, order, keys_other, order_other, n):  # type: ignore[no-unty
 
 @kernel
 def count_tiles(worker, workers, records, visible, across, histogram, slots):  # type: ignore[no-untyped-def]
-    """Counts tiles per Gaussian (``slots[j + 1]``) and Gaussians per tile (``histogram[worker]``)."""
+    """Counts tiles per Gaussian (``slots[j + 1]``) and Gaussians per tile (row ``worker`` of the histogram)."""
     histogram[worker, :] = 0
+    tally, records, slots = pointer(histogram[worker]), pointer(records), pointer(slots)
     for j in range(visible * worker // workers, visible * (worker + 1) // workers):
         r = j * RECORD
         y0, y1 = np.int32(records[r + Y0]), np.int32(records[r + Y1])
@@ -76,7 +84,7 @@ def count_tiles(worker, workers, records, visible, across, histogram, slots):  #
             x0, x1 = extent(records, r, max(ty * TILE, y0), min(ty * TILE + TILE - 1, y1))
             if x1 >= x0:
                 for tx in range(x0 // TILE, x1 // TILE + 1):
-                    histogram[worker, ty * across + tx] += 1
+                    tally[ty * across + tx] += 1
                     touched += 1
         slots[j + 1] = touched
 
@@ -99,6 +107,8 @@ def tile_offsets(histogram, offsets, slots, visible):  # type: ignore[no-untyped
 @kernel
 def fill_tiles(worker, workers, records, visible, across, histogram, slots, entries, entry_slots):  # type: ignore[no-untyped-def]
     """Writes each tile's Gaussians in depth order, with the slot that receives the pair's gradient."""
+    cursor, records, slots = pointer(histogram[worker]), pointer(records), pointer(slots)
+    entries, entry_slots = pointer(entries), pointer(entry_slots)
     for j in range(visible * worker // workers, visible * (worker + 1) // workers):
         r = j * RECORD
         y0, y1 = np.int32(records[r + Y0]), np.int32(records[r + Y1])
@@ -107,8 +117,8 @@ def fill_tiles(worker, workers, records, visible, across, histogram, slots, entr
             x0, x1 = extent(records, r, max(ty * TILE, y0), min(ty * TILE + TILE - 1, y1))
             if x1 >= x0:
                 for tx in range(x0 // TILE, x1 // TILE + 1):
-                    at = histogram[worker, ty * across + tx]
-                    histogram[worker, ty * across + tx] = at + 1
+                    at = cursor[ty * across + tx]
+                    cursor[ty * across + tx] = at + 1
                     entries[at] = j
                     entry_slots[at] = slot
                     slot += 1

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import attach, detach
+from clod_adapter.attenuation import SIGMA_MAX
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import SH_COUNTS, Gaussians
@@ -35,7 +36,9 @@ def fit_base(
         max_sv=1, iters=iters, full_share=1, lr_sigma=0, lr_means=1.6e-4, lr_quats=1e-3, lr_scales=5e-3,
         lr_opacities=5e-2, lr_sh0=2.5e-3, lr_shN=1.25e-4, lr_final=0.05,
     )  # fmt: skip
-    return detach(adapt(attach(from_points(points, colors)), scene, config, progress).gaussians)
+    initial = from_points(points, colors)
+    frozen = torch.full((len(initial),), SIGMA_MAX / 10)  # fades nothing, and is no unset dial that would be started
+    return detach(adapt(attach(initial, frozen), scene, config, progress).gaussians)
 
 
 def from_points(points: np.ndarray, colors: np.ndarray, *, sh_degree: int = 3) -> Gaussians:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import weakref
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from clod_adapter._kernels import blend, project, threads, tiles
+from clod_adapter._kernels import blend, conventions, project, project_gradient, threads, tiles
 from clod_adapter.cameras import Camera
 
 
@@ -31,18 +30,19 @@ class _Buffers:
 
 
 _idle: list[_Buffers] = []
-_lock = threading.Lock()
 
 
 def _take() -> _Buffers:
-    with _lock:
-        return _idle.pop() if _idle else _Buffers()
+    try:
+        return _idle.pop()
+    except IndexError:
+        return _Buffers()
 
 
 def _give(buffers: _Buffers) -> None:
-    with _lock:
-        if len(_idle) < 4:
-            _idle.append(buffers)
+    # No lock: this runs as a finalizer, perhaps within _take of the same thread. List operations are atomic.
+    if len(_idle) < 4:
+        _idle.append(buffers)
 
 
 @dataclass
@@ -65,10 +65,14 @@ class _Frame:
     tiles: np.ndarray
     workers: int
 
+    def room(self, size: int) -> np.ndarray:
+        """Scratch floats for each worker."""
+        return self.buffers.get("room", (self.workers, size), np.float32)
+
 
 def camera_vector(camera: Camera) -> np.ndarray:
-    """The camera as the kernels read it (layout in ``_kernels/project.py``)."""
-    out = np.empty(project.CAMERA, np.float32)
+    """The camera as the kernels read it (layout in ``_kernels/conventions.py``)."""
+    out = np.empty(conventions.CAMERA, np.float32)
     K = camera.K.detach().cpu().double()
     fx, fy, cx, cy = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
     out[:16] = camera.viewmat.detach().cpu().numpy().reshape(-1)
@@ -83,7 +87,7 @@ def camera_vector(camera: Camera) -> np.ndarray:
 def _project(buffers: _Buffers, arrays: list[np.ndarray], degree: int, cam: np.ndarray, workers: int) -> Any:
     """Visible records in depth order; and of the packed, unsorted ones: row numbers, counts, ranks in depth order."""
     n = len(arrays[0])
-    packed = buffers.get("packed", (n * tiles.RECORD,), np.float32)
+    packed = buffers.get("packed", (n * conventions.RECORD,), np.float32)
     depths, packed_ids = buffers.get("depths", (n,), np.float32), buffers.get("packed_ids", (n,), np.int32)
     counts = np.zeros(workers, np.int64)
     threads.run(project.project, workers, *arrays, degree, cam, packed, depths, packed_ids, counts)
@@ -97,7 +101,10 @@ def _project(buffers: _Buffers, arrays: list[np.ndarray], degree: int, cam: np.n
         order[at : at + count] = np.arange(first, first + count, dtype=np.int32)
         at += count
     order = tiles.radix_sort(keys, order, *other, visible)
-    records, ranks = buffers.get("records", (visible * tiles.RECORD,), np.float32), buffers.get("ranks", (n,), np.int32)
+    records, ranks = (
+        buffers.get("records", (visible * conventions.RECORD,), np.float32),
+        buffers.get("ranks", (n,), np.int32),
+    )
     threads.run(project.gather, workers, order, packed, records, ranks)
     return records, packed_ids, counts, ranks
 
@@ -107,7 +114,7 @@ def _prepare(arrays: list[np.ndarray], degree: int, camera: Camera, workers: int
     buffers, cam = _take(), camera_vector(camera)
     records, packed_ids, counts, ranks = _project(buffers, arrays, degree, cam, workers)
     visible = int(counts.sum())
-    across, down = -(-camera.width // tiles.TILE), -(-camera.height // tiles.TILE)
+    across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
     histogram = np.empty((workers, across * down), np.int64)
     offsets, slots = np.empty(across * down + 1, np.int64), buffers.get("slots", (visible + 1,), np.int64)
     threads.run(tiles.count_tiles, workers, records, visible, across, histogram, slots)
@@ -135,8 +142,8 @@ class _Splat(torch.autograd.Function):
         image, alpha = torch.empty(frame.height, frame.width, 3), torch.empty(frame.height, frame.width)
         threads.run(
             blend.blend, frame.workers, frame.records, frame.entries, frame.offsets, frame.across, frame.width,
-            frame.height, background.detach().contiguous().numpy(), frame.tiles, np.zeros(1, np.int64), image.numpy(),
-            alpha.numpy(),
+            frame.height, background.detach().contiguous().numpy(), frame.tiles, np.zeros(1, np.int64),
+            frame.room(blend.FORWARD_STATE), image.numpy(), alpha.numpy(),
         )  # fmt: skip
         ctx.frame, ctx.degree = frame, degree
         ctx.save_for_backward(means, quats, scales, opacities, sh0, shN, background, image, alpha)
@@ -150,19 +157,22 @@ class _Splat(torch.autograd.Function):
         frame: _Frame = ctx.frame
         v_image, v_alpha = (g.contiguous().numpy() for g in gradients)
         *arrays, _sh0, shN = _arrays(inputs)
-        pair_sums = frame.buffers.get("pair_sums", (len(frame.entries) * blend.PAIR,), np.float32)
+        pair_sums = frame.buffers.get("pair_sums", (len(frame.entries) * conventions.PAIR,), np.float32)
         threads.run(
             blend.blend_gradient, frame.workers, frame.records, frame.entries, frame.entry_slots, frame.offsets,
             frame.across, frame.width, frame.height, image.numpy(), alpha.numpy(), v_image, v_alpha, frame.tiles,
-            np.zeros(1, np.int64), pair_sums,
+            np.zeros(1, np.int64), frame.room(blend.BACKWARD_STATE), pair_sums,
         )  # fmt: skip
         grads = [torch.empty(x.shape) for x in inputs]
+        if not ctx.needs_input_grad[5]:  # most of the memory and some of the work, so left out where it can be
+            grads[5] = torch.empty(0)
         threads.run(
-            project.project_gradient, frame.workers, *arrays, shN, ctx.degree, frame.camera, frame.records,
+            project_gradient.project_gradient, frame.workers, *arrays, shN, ctx.degree, frame.camera, frame.records,
             frame.packed_ids, frame.counts, frame.ranks, frame.slots, pair_sums, *_arrays(grads),
         )  # fmt: skip
         v_background = ((1 - alpha)[..., None] * gradients[0]).sum((0, 1)) if ctx.needs_input_grad[6] else None
-        return *grads, v_background, None, None
+        wanted = [g if need else None for g, need in zip(grads, ctx.needs_input_grad, strict=False)]
+        return *wanted, v_background, None, None
 
 
 def rasterize(

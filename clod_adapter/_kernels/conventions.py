@@ -1,0 +1,32 @@
+"""What every kernel agrees on: gsplat's conventions, and the layouts of records, cameras and workspaces."""
+
+from __future__ import annotations
+
+from numba import float32
+
+# Blur added to the covariance (px^2), near plane, alpha below which nothing is drawn, largest alpha, and the
+# transmittance before which a pixel ends.
+BLUR, NEAR, ALPHA_MIN, ALPHA_MAX, T_MIN = (float32(v) for v in (0.3, 0.01, 1 / 255, 0.999, 1e-4))
+LOG2E, LOG2_255, TWO_LN2 = float32(1.4426950408889634), float32(7.994353436858858), float32(1.3862943611198906)
+HALF, ZERO, ONE, TWO = float32(0.5), float32(0), float32(1), float32(2)
+
+# Columns of a record, the 64 bytes the blending loops read of a visible Gaussian. The exponent of
+# its alpha is in powers of two: log2 alpha = LOG - (QA dx^2 + QB dx dy + QC dy^2).
+MX, MY, QA, QB, QC, LOG, RED, GREEN, BLUE, REACH, RX, DET, X0, Y0, X1, Y1 = range(16)
+RECORD = 16
+
+# A camera: viewmat row-major (16), fx, fy, cx, cy, width, height, ray clamp low x, high x, low y, high y,
+# centre in world coordinates (3).
+FX, FY, CX, CY, WIDTH, HEIGHT, LOW_X, HIGH_X, LOW_Y, HIGH_Y, EYE = range(16, 27)
+CAMERA = 29
+
+# The workspace of one Gaussian: camera point (3), rotation (9), U = J R_view (6), P = U R S (6), covariance (3),
+# its determinant, unit quaternion (4), 1 / |quaternion|, gradient of P (6).
+POINT, ROT, UMAT, PMAT, COV, COVDET, QUAT, QINV, VP, SCRATCH = 0, 3, 12, 18, 24, 27, 28, 32, 33, 39
+
+# Edge of a tile in pixels: a multiple of the 4 of a block.
+TILE = 64
+# Extents widen by this many pixels, so that rounding never loses a pixel at the 1/255 edge.
+SLACK = float32(0.01)
+# Sums over pixels that a (Gaussian, tile) pair hands to the projection's gradient.
+PAIR = 9
