@@ -2,7 +2,7 @@
 #
 #   make demo    install and run the demo
 #   make test    install, then lint, format check, types, tests
-#   make clean   remove .venv and everything that was built or cached
+#   make clean   remove .venv and everything that was built or cached; what the demo made, in demo/, stays
 #
 # PYTHON    the interpreter that .venv is made from.
 # PIP_ARGS  handed to pip install. From PyPI, torch on Linux brings gigabytes of CUDA libraries; its CPU build
@@ -35,4 +35,6 @@ $(VENV)/.installed-%: pyproject.toml constraints.txt | $(BIN)/pip
 
 # pip and not python: it comes last, so a venv that was interrupted is made again.
 $(BIN)/pip:
-	$(PYTHON) -m venv $(VENV)
+	$(PYTHON) -m venv $(VENV) || { \
+	    echo "$(PYTHON) cannot make a virtual environment; Debian and Ubuntu need the package python3-venv" >&2; \
+	    exit 1; }

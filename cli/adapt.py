@@ -10,15 +10,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from clod_adapter.adapter import Adapter, extract
+from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.cameras import Scene
 from clod_adapter.cli.console import Console, announced_compiling, duration
 from clod_adapter.cli.evaluate import measure
 from clod_adapter.cli.files import Outputs, read_checkpoint, read_scene, size
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, table, write_report
+from clod_adapter.cli.settings import add_settings, make_config, pick_device
 from clod_adapter.cli.training import Follower, GracefulStop
-from clod_adapter.config import AdaptConfig, describe
-from clod_adapter.errors import ClodError
+from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluate import Row
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import save_adapter
@@ -45,7 +45,8 @@ outputs, side by side; a file of that name is replaced:
 
 Ctrl-C while training stops after the step under way and writes what was learned
 so far (exit code 0, "interrupted": true in the report); once more aborts. While
-the result is measured it skips the rest. Before training nothing is written.
+the result is written it is finished first, while it is measured the rest is
+skipped. Before training nothing is written.
 
 exit codes: 0 written; 2 bad input, one line on stderr and nothing written;
 130 interrupted with nothing to write, or aborted
@@ -55,9 +56,6 @@ examples:
   clod-adapt garden.ply --images garden --time-budget 120 --out out/dial.ply
   clod-adapt garden.ply --images garden --quiet --json > report.json
 """
-OPTIONS: dict[str, Any] = {
-    "max_sv": ("S", float), "iters": ("N", int), "time_budget": ("SEC", float), "seed": ("N", int)
-}  # fmt: skip
 # A base this far off its photographs is not a poor one but one that stands elsewhere.
 MISALIGNED_PSNR = 15.0
 
@@ -68,64 +66,60 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--images", metavar="DIR", required=True,
         help="the scene: photographs in DIR/images and their COLMAP model in DIR/sparse/0",
     )  # fmt: skip
-    helps, defaults = describe(AdaptConfig), AdaptConfig()
-    for name, (metavar, kind) in OPTIONS.items():
-        default = getattr(defaults, name)
-        shown = "" if default is None else f" (default: {default:g})"
-        parser.add_argument(
-            f"--{name.replace('_', '-')}", metavar=metavar, type=kind, default=default, help=helps[name] + shown
-        )
+    add_settings(parser)
     parser.add_argument("--out", metavar="OUT.ply", help="output (default: PLY's name with _clod, in this folder)")
     parser.add_argument("--device", choices=["auto", "cpu"], default="auto", help="where to train (default: auto)")
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    console, watch = Console(args.quiet), Stopwatch()
+    console, watch, stop = Console(args.quiet), Stopwatch(), GracefulStop()
     config = make_config(args)
     outputs = Outputs.beside(Path(args.out or f"{Path(args.ply).stem}_clod.ply"))
     outputs.check([args.ply])
     with watch.time("load"):
         base = read_checkpoint(args.ply, console)
         scene = read_scene(args.images, console)
+    gaussians = base.gaussians.to(pick_device(args.device))
     with announced_compiling(console):
         with watch.time("evaluate"):
-            base_rows, notes = look_at_base(base.gaussians, scene, args, console)
-        adapted = train(base.gaussians, scene, config, console, base_rows)
-    watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
-    adapter = extract(base.gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config))
-    result = adapter.apply(base.gaussians)
-    write(base, adapter, result, outputs, console)
+            base_rows, notes = look_at_base(gaussians, scene, args, console)
+        with stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
+            adapted = train(gaussians, scene, config, console, stop, base_rows)
+            watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
+            adapter = extract(gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config))
+            result = adapter.apply(gaussians)
+            write(base, adapter, result, outputs, console)
+            report = describe_run(args, outputs, adapter, adapted) | {
+                "sh_degree": result.sh_degree, "device": str(result.means.device), "seconds": watch.report(),
+                "notes": [*base.notes, *scene.notes, *notes, "the result was not measured"],
+                "base_rows": [row.as_dict() for row in base_rows], "rows": [], "detached_row": None,
+            }  # fmt: skip
+            write_report(outputs.report, report)
+    skip = stop.requests > 0 and not adapted.interrupted
     with watch.time("evaluate"):
-        rows, cut_short = measure(result, scene.test, report_dials(config.max_sv), console)
+        rows, plain, cut_short = ([], [], True) if skip else measure_result(result, scene, config, console)
     if cut_short:
         notes.append("the measurements were interrupted: only the dial values that were finished are reported")
         console.say(notes[-1])
-    report = {
-        "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
-        "base_count": len(result), "sh_degree": result.sh_degree, "config": asdict(config),
-        "attenuation": asdict(adapter.attenuation), "notes": [*base.notes, *scene.notes, *notes], "machine": machine(),
-        "device": str(result.means.device), "seconds": watch.report(),
-        "steps": adapted.steps, "interrupted": adapted.interrupted,
-        "adapter_bytes": outputs.adapter.stat().st_size, "ply_bytes": outputs.ply.stat().st_size,
-        "base_rows": [row.as_dict() for row in base_rows], "rows": [row.as_dict() for row in rows],
-        "outputs": outputs.names(),
+    report |= {
+        "rows": [row.as_dict() for row in rows], "detached_row": plain[0].as_dict() if plain else None,
+        "notes": [*base.notes, *scene.notes, *notes], "seconds": watch.report(),
     }  # fmt: skip
     write_report(outputs.report, report)
-    print_summary(outputs, table(rows, base_rows) if rows else "", args, watch)
+    print_summary(outputs, table(rows, base_rows, plain) if rows else "", args, watch)
     return report
 
 
-def make_config(args: argparse.Namespace) -> AdaptConfig:
-    """The settings; what is wrong with one is said in the words of the command line."""
-    limit = 1 / AdaptConfig().tau
-    if args.max_sv >= limit:
-        raise ClodError(f"--max-sv is {args.max_sv:g}, it must be below {limit:g}, where nothing survives the cut")
-    try:
-        return AdaptConfig(**{name: getattr(args, name) for name in OPTIONS})
-    except ClodError as error:
-        name, _, rest = str(error).partition(" ")
-        raise ClodError(f"--{name.replace('_', '-')} {rest}" if name in OPTIONS else str(error)) from error
+def describe_run(args: argparse.Namespace, outputs: Outputs, adapter: Adapter, adapted: Adapted) -> dict[str, Any]:
+    """The part of the report that is known before anything is measured."""
+    return {
+        "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
+        "base_count": len(adapter.sigma_d), "config": adapter.config, "attenuation": asdict(adapter.attenuation),
+        "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
+        "adapter_bytes": outputs.adapter.stat().st_size, "ply_bytes": outputs.ply.stat().st_size,
+        "outputs": outputs.names(),
+    }  # fmt: skip
 
 
 def look_at_base(
@@ -140,6 +134,7 @@ def look_at_base(
         rows, interrupted = measure(base, scene.test, [1.0], console, "base")
         if interrupted:
             raise KeyboardInterrupt
+        console.say(f"base: {rows[0].psnr:.2f} dB on the held-out photographs")
         if rows[0].psnr < MISALIGNED_PSNR:
             notes.append(
                 f"warning: {args.ply} is {rows[0].psnr:.1f} dB from the photographs in {args.images}: it is probably "
@@ -153,11 +148,12 @@ def look_at_base(
     return rows, notes
 
 
-def train(base: Gaussians, scene: Scene, config: AdaptConfig, console: Console, base_rows: Sequence[Row]) -> Adapted:
+def train(
+    base: Gaussians, scene: Scene, config: AdaptConfig, console: Console, stop: GracefulStop, base_rows: Sequence[Row]
+) -> Adapted:
     """Adapts while the user watches. Raises KeyboardInterrupt when there is nothing worth writing."""
-    seconds_a_frame = base_rows[0].frame_ms / 1e3 if base_rows else 0.0
-    stop = GracefulStop()
-    with stop.listening(), closing(Follower(console, stop, scene.test, config.max_sv, seconds_a_frame)) as follower:
+    base_row = base_rows[0] if base_rows else None
+    with closing(Follower(console, stop, scene.test, config.max_sv, base_row)) as follower:
         adapted = adapt(base, scene, config, follower)
     if stop.requests > 1:
         raise KeyboardInterrupt
@@ -169,16 +165,31 @@ def train(base: Gaussians, scene: Scene, config: AdaptConfig, console: Console, 
 def write(base: Checkpoint, adapter: Adapter, result: Gaussians, outputs: Outputs, console: Console) -> None:
     """Writes adapter and PLY, before the last measurements, which may be interrupted.
 
-    The adapter first: it is small, and from it ``apply`` makes the PLY should that not fit on the disk.
+    The adapter first: it is small, and from it ``apply`` makes the PLY should that not fit on the disk. An earlier
+    run's report goes, since it is of other files.
     """
+    outputs.report.unlink(missing_ok=True)
     save_adapter(outputs.adapter, adapter)
-    save(outputs.ply, result, base)
+    save(outputs.ply, result, base, version=adapter.version)
     console.say(f"wrote {outputs.adapter} and {outputs.ply}")
+
+
+def measure_result(
+    result: Gaussians, scene: Scene, config: AdaptConfig, console: Console
+) -> tuple[list[Row], list[Row], bool]:
+    """The rows over the dial, the one without the dial at all, and whether Ctrl-C cut them short."""
+    rows, cut_short = measure(result, scene.test, report_dials(config.max_sv), console)
+    if cut_short:
+        return rows, [], True
+    plain, cut_short = measure(detach(result), scene.test, [1.0], console, "plain")
+    return rows, plain, cut_short
 
 
 def print_summary(outputs: Outputs, measured: str, args: argparse.Namespace, watch: Stopwatch) -> None:
     if measured:
         print(f"\n{measured}\n")
+        if "plain" in measured:
+            print(f"plain: what a viewer that does not know the dial makes of {outputs.ply}\n")
     for path in vars(outputs).values():
         print(f"{size(path):>9}  {path}")
     print(f"\n{duration(watch.total())} in all; next, other dial values:")

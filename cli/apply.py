@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         adapted = adapter.apply(base.gaussians, base.fingerprint)
     except ClodError as error:
         raise ClodError(f"{args.base}: {error}") from error
-    save(out, adapted, base)
+    save(out, adapted, base, version=adapter.version)
     print(f"wrote {args.out} ({size(out)}): {len(adapted):,} Gaussians with their dial")
     return {
         "command": "apply", "version": package_version(), "base": args.base, "adapter": args.adapter,

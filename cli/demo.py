@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,8 @@ import torch
 from clod_adapter.cli import adapt
 from clod_adapter.cli.console import Console, announced_compiling, duration
 from clod_adapter.cli.files import check_output
+from clod_adapter.cli.parser import make_parser
 from clod_adapter.cli.report import Stopwatch
-from clod_adapter.config import AdaptConfig
 from clod_adapter.demo.pictures import Panel, dial_strip, quality_curve
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import evaluate
@@ -41,6 +42,7 @@ in DIR afterwards:
 """
 POINTS, FIT_STEPS, MAX_SV = 40_000, 1500, 5.0
 DIALS = (1.0, 2.0, 3.0, 5.0)
+EXTRA = {"matplotlib": "matplotlib", "skimage": "scikit-image"}  # module, and the package that brings it
 VIEW = 0  # the held-out view on the strip: across the whole room
 CROP = (100, 70, 96, 72)
 
@@ -52,24 +54,55 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     folder, console, watch = Path(args.out), Console(args.quiet), Stopwatch()
-    if folder.exists() and not folder.is_dir():
-        raise ClodError(f"{folder}: is a file; give --out the name of a folder")
-    folder.mkdir(parents=True, exist_ok=True)
+    check_extra()
+    make_folder(folder)
     capture, base, model = folder / "capture", folder / "base.ply", folder / "gallery.ply"
     pictures = {"dial": folder / "dial.png", "curve": folder / "curve.png"}
     for path in (base, model, *pictures.values()):
         check_output(path, [])
     with announced_compiling(console):
         prepare(capture, base, console)
-    given = argparse.Namespace(
-        ply=str(base), images=str(capture), max_sv=MAX_SV, iters=AdaptConfig().iters, time_budget=None, seed=0,
-        out=str(model), device="auto", quiet=args.quiet, json=args.json,
-    )  # fmt: skip
-    report = adapt.run(given)
+    report = adapt.run(adapt_arguments(args, base, capture, model))
+    for path in pictures.values():  # those of an earlier run are of other files
+        path.unlink(missing_ok=True)
     if report["rows"]:
         draw(capture, model, report, pictures)
-        print(f"\npictures: {pictures['dial']} and {pictures['curve']}; {duration(watch.total())} for the demo")
+    else:
+        pictures = {}
+    print_next(folder, pictures, watch)
     return report | {"command": "demo", "folder": str(folder), "pictures": {k: str(v) for k, v in pictures.items()}}
+
+
+def check_extra() -> None:
+    """Refuses, before minutes are spent, to start without the packages that only the demo needs."""
+    for module, package in EXTRA.items():
+        if importlib.util.find_spec(module) is None:
+            raise ClodError(f"the demo needs {package}: pip install 'clod-adapter[demo]'")
+
+
+def make_folder(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise ClodError(f"{folder}: is a file; give --out the name of a folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ClodError(f"{folder}: cannot be made ({error.strerror or error}); choose another --out") from error
+
+
+def adapt_arguments(args: argparse.Namespace, base: Path, capture: Path, model: Path) -> argparse.Namespace:
+    """What the main job's own parser makes of the command line for the demo's files."""
+    words = [f"--images={capture}", f"--max-sv={MAX_SV:g}", f"--out={model}"]
+    words += [f"--{name}" for name in ("quiet", "json") if getattr(args, name)]
+    return make_parser(adapt, "clod-adapt").parse_args([*words, "--", str(base)])
+
+
+def print_next(folder: Path, pictures: dict[str, Path], watch: Stopwatch) -> None:
+    print(f"\n{duration(watch.total())} for the demo; everything is in {folder.resolve()}")
+    if pictures:
+        print("look at dial.png, a view over the dial, and curve.png, quality against the number of Gaussians")
+    else:
+        print("no pictures: the measurements that they show were interrupted")
+    print("next, a splat of your own:\n  clod-adapt YOURS.ply --images YOUR_SCENE")
 
 
 def prepare(capture: Path, base: Path, console: Console) -> None:

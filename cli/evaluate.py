@@ -12,6 +12,7 @@ from clod_adapter.cameras import View
 from clod_adapter.cli.console import Console, announced_compiling
 from clod_adapter.cli.files import read_checkpoint, read_scene
 from clod_adapter.cli.report import Stopwatch, machine, table
+from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import Row, evaluate
 from clod_adapter.gaussians import Gaussians
@@ -36,21 +37,22 @@ examples:
   clod-adapt eval garden.ply --images garden --sv 1
   clod-adapt eval garden_clod.ply --images garden --sv 1 4 --json > eval.json
 """
+DIALS = (1.0, 2.0, 3.0, 5.0)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one as the baseline")
     parser.add_argument("--images", metavar="DIR", required=True, help="the scene: photographs and their COLMAP model")
     parser.add_argument(
-        "--sv", metavar="S", type=float, nargs="+", default=[1.0, 2.0, 3.0, 5.0],
-        help="dial values, 1 (full quality) and up (default: 1 2 3 5)",
+        "--sv", metavar="S", type=float, nargs="+",
+        help="dial values, 1 (full quality) and up (default: 1 2 3 5 as far as trained, and the last one trained)",
     )  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch = Console(args.quiet), Stopwatch()
-    for virtual_scale in args.sv:
+    for virtual_scale in args.sv or ():
         if not 1 <= virtual_scale < math.inf:
             raise ClodError(f"--sv has {virtual_scale:g}, dial values must be at least 1 (1 is full quality)")
     with watch.time("load"):
@@ -60,20 +62,33 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
     if model.gaussians.sigma_d is None:
         console.say(f"{args.model} has no sigma_d: every dial value shows it in full")
+    attenuation = model.gaussians.attenuation
+    dials, notes = choose_dials(args.sv, attenuation)
+    for note in notes:
+        console.say(note)
     with watch.time("evaluate"), announced_compiling(console):
-        rows, interrupted = measure(model.gaussians, scene.test, args.sv, console)
+        rows, interrupted = measure(model.gaussians, scene.test, dials, console)
     if interrupted and not rows:
         raise KeyboardInterrupt
     print(table(rows))
-    attenuation = model.gaussians.attenuation
     return {
         "command": "eval", "version": package_version(), "model": args.model, "scene": args.images,
         "base_count": len(model.gaussians), "sh_degree": model.gaussians.sh_degree, "views": len(scene.test),
         "rows": [row.as_dict() for row in rows], "interrupted": interrupted,
         "attenuation": asdict(attenuation) if attenuation else None,
-        "notes": [*model.notes, *scene.notes], "machine": machine(),
+        "notes": [*model.notes, *scene.notes, *notes], "machine": machine(),
         "device": str(model.gaussians.means.device), "seconds": watch.report(),
     }  # fmt: skip
+
+
+def choose_dials(given: list[float] | None, attenuation: AttenuationConfig | None) -> tuple[list[float], list[str]]:
+    """The dial values to measure, and a note where they are beyond what the file was trained for."""
+    trained = attenuation.max_sv if attenuation else None
+    if given is None:
+        return [s for s in DIALS if trained is None or s < trained] + ([trained] if trained else []), []
+    if trained is None or max(given) <= trained:
+        return given, []
+    return given, [f"trained up to s = {trained:g}; beyond that nothing was learned"]
 
 
 def measure(

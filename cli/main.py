@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
+import io
 import json
 import os
 import sys
 from contextlib import nullcontext, redirect_stdout
-from typing import Any, NoReturn
+from typing import Any
 
 from clod_adapter.cli import adapt, apply, demo, evaluate
+from clod_adapter.cli.parser import Parser, make_parser
 from clod_adapter.cli.report import jsonable
 from clod_adapter.errors import ClodError
 from clod_adapter.io.version import package_version
@@ -27,7 +28,8 @@ def main(argv: list[str] | None = None) -> int:
     name = words[0] if words and words[0] in COMMANDS else ""
     try:
         args = build_parser(name).parse_args(words[1:] if name else words)
-        with redirect_stdout(sys.stderr) if args.json else nullcontext():
+        aside = io.StringIO() if args.quiet else sys.stderr
+        with redirect_stdout(aside) if args.json else nullcontext():
             report = COMMANDS.get(name, adapt).run(args)
         if args.json:
             print(json.dumps(jsonable(report), allow_nan=False))
@@ -42,26 +44,17 @@ def main(argv: list[str] | None = None) -> int:
         # The reader of a pipe is gone; without this Python complains once more when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:
+        name = f"{error.filename}: " if error.filename is not None else ""
+        print(f"{PROG}: error: {name}{error.strerror or error}; check the path and its permissions", file=sys.stderr)
+        return 2
     return 0
 
 
-class Parser(argparse.ArgumentParser):
-    """Reports misuse like any other bad input: in one line, by ``main``."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ClodError(f"{message} ({self.prog} --help explains)")
-
-
-def build_parser(name: str) -> argparse.ArgumentParser:
+def build_parser(name: str) -> Parser:
     """The parser of a command; of the main job for an empty name."""
     command = COMMANDS.get(name, adapt)
-    prog = f"{PROG} {name}".strip()
-    parser = Parser(
-        prog=prog, usage=f"{prog} {command.USAGE}", description=command.DESCRIPTION, epilog=command.EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
-    command.add_arguments(parser)
-    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, all else on stderr")
+    parser = make_parser(command, f"{PROG} {name}".strip())
     if not name:
         others = "\n".join(f"  {PROG} {word:<6} {module.SUMMARY}" for word, module in COMMANDS.items())
         parser.epilog = f"other commands, each with its own --help:\n{others}\n\n{command.EPILOG}"

@@ -89,11 +89,11 @@ def report_dials(max_sv: float) -> list[float]:
     return [float(s) for s in (1, 1.5, *range(2, 9)) if s < max_sv] + [max_sv]
 
 
-def table(rows: Sequence[Row], base_rows: Sequence[Row] = ()) -> str:
-    """The rows under each other, those of the base first and marked."""
+def table(rows: Sequence[Row], base_rows: Sequence[Row] = (), plain_rows: Sequence[Row] = ()) -> str:
+    """The rows under each other, those of the base first and those without the dial last, both marked."""
     lines = ["  dial  PSNR dB    SSIM        kept              in view  frame ms"]
-    for row, is_base in [(row, True) for row in base_rows] + [(row, False) for row in rows]:
-        dial = "base" if is_base else f"{row.virtual_scale:g}"
+    marked = [("base", row) for row in base_rows] + [(f"{row.virtual_scale:g}", row) for row in rows]
+    for dial, row in marked + [("plain", row) for row in plain_rows]:
         kept = f"{row.kept:10,.0f}  {row.kept_share:7.1%}"
         lines.append(f"{dial:>6}  {row.psnr:7.2f}  {row.ssim:.4f}  {kept}  {row.in_view:10,.0f}  {row.frame_ms:8.1f}")
     return "\n".join(lines)

@@ -14,6 +14,7 @@ import torch
 
 from clod_adapter.cameras import View
 from clod_adapter.cli.console import Console, Meter
+from clod_adapter.evaluate import Row
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
 from clod_adapter.train import Progress
@@ -53,17 +54,19 @@ class Follower:
     Args:
         views: held out; at most four of them, spread evenly, are looked at.
         max_sv: the error is shown at dial 1 and here.
-        seconds_a_frame: a first guess of what one view takes.
+        base_row: how the base was measured: the error shown until there is a newer one, and a guess of a frame's time.
     """
 
     def __init__(
-        self, console: Console, stop: GracefulStop, views: tuple[View, ...], max_sv: float, seconds_a_frame: float
+        self, console: Console, stop: GracefulStop, views: tuple[View, ...], max_sv: float, base_row: Row | None
     ) -> None:
         self.console, self.stop = console, stop
         self.views = views[:: -(-len(views) // CHECK_VIEWS)] if views else ()
         self.dials = [1.0, max_sv] if max_sv > 1 else [1.0]
+        seconds_a_frame = base_row.frame_ms / 1e3 if base_row else 0.0
         self.check_due, self.check_cost = CHECK_EVERY, seconds_a_frame * len(self.views) * len(self.dials)
-        self.error = self.phase = ""
+        self.error = f"base {base_row.psnr:.2f} dB" if base_row else ""
+        self.phase = ""
         self.meter: Meter | None = None
 
     def __call__(self, progress: Progress) -> None:
@@ -74,7 +77,8 @@ class Follower:
             self._check(progress)
         by_time = progress.share > progress.done / max(progress.total, 1)
         steps = f"step {progress.done}" if by_time else f"{progress.done}/{progress.total}"
-        self.meter.update(progress.share, f"{steps}, {self.error}".removesuffix(", "))
+        error = self.error if progress.phase == "train" else ""
+        self.meter.update(progress.share, f"{steps}, {error}".removesuffix(", "))
         if self.stop.requests:
             self.close()
             if self.phase == "train":

@@ -6,7 +6,7 @@ the adapter to the same base gives the same Gaussians again, bit for bit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -16,6 +16,7 @@ from clod_adapter.attenuation import SIGMA_MAX
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.version import package_version
 
 ATTRIBUTES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 
@@ -31,9 +32,10 @@ class Adapter:
             difference from the base (float16) or the new values themselves (float32).
         base_fingerprint: SHA-256 of the checkpoint file it was trained on, hex.
         config: the training config, JSON-able, for the record.
+        version: of the package that made it; it stands in the header of the PLY, which is so the same again.
 
     Raises:
-        ClodError: a tensor has the wrong type or shape, or sigma_d is not finite.
+        ClodError: a tensor has the wrong type or shape, sigma_d is not finite, or version is no plain text.
     """
 
     sigma_d: Tensor
@@ -41,12 +43,15 @@ class Adapter:
     updates: dict[str, Tensor]
     base_fingerprint: str
     config: dict[str, Any]
+    version: str = field(default_factory=package_version)
 
     def __post_init__(self) -> None:
         if self.sigma_d.dim() != 1 or self.sigma_d.dtype != torch.float32:
             raise ClodError(f"Adapter.sigma_d is {_kind(self.sigma_d)}, it must be float32 [N]")
         if not self.sigma_d.isfinite().all():
             raise ClodError("Adapter.sigma_d holds a value that is not finite; the training has diverged")
+        if not (self.version.isascii() and self.version.isprintable()):
+            raise ClodError(f"Adapter.version is {self.version!r}, it must be printable ASCII")
         for name, update in self.updates.items():
             if name not in ATTRIBUTES:
                 raise ClodError(f"Adapter.updates has {name!r}, it may have {', '.join(ATTRIBUTES)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -11,6 +12,7 @@ import torch
 
 from clod_adapter.attenuation import in_frustum
 from clod_adapter.cameras import View
+from clod_adapter.config import require
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.metrics import psnr_ssim
@@ -58,12 +60,15 @@ def evaluate(
         progress: called with (frames done, frames in all).
 
     Raises:
-        ClodError: no views, no dial values, or a dial value below 1.
+        ClodError: no views, no dial values, a dial value below 1 or not finite, or repeats below 1.
     """
     if not views:
         raise ClodError("there are no held-out views to evaluate on")
     if not virtual_scales:
         raise ClodError("there are no dial values to evaluate at")
+    for virtual_scale in virtual_scales:
+        require(1 <= virtual_scale < math.inf, "virtual_scale", virtual_scale, "at least 1 and finite")
+    require(repeats >= 1, "repeats", repeats, "at least 1")
     render(gaussians, views[0].camera, max(virtual_scales))  # compiled and warm before the clock starts
     rows = []
     for i, virtual_scale in enumerate(virtual_scales):

@@ -2,7 +2,8 @@
 
     python examples/02_render_the_dial.py adapted.ply [scene/]
 
-The view is the scene's first held-out camera; without a scene, one that looks at the middle of the splat.
+The view is the scene's first held-out camera, or its first one where none is held out; without a scene, one that
+looks at the middle of the splat.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ DIALS = (1, 2, 3, 5)
 
 def main(model: str, folder: str | None = None) -> None:
     gaussians = clod.load(model).gaussians
-    camera = clod.load_scene(folder).test[0].camera if folder else camera_facing(gaussians)
+    scene = clod.load_scene(folder) if folder else None
+    camera = (scene.test or scene.train)[0].camera if scene else camera_facing(gaussians)
     for virtual_scale in DIALS:
         rendering = clod.render(gaussians, camera, virtual_scale)
         name = f"{Path(model).stem}_sv{virtual_scale}.png"

@@ -160,3 +160,6 @@ def test_adapter_checks_its_tensors() -> None:
         Adapter(torch.ones(3).double(), CONFIG, {}, "f", {})
     with pytest.raises(ClodError, match="'colour'"):
         Adapter(torch.ones(3), CONFIG, {"colour": torch.ones(3)}, "f", {})
+    for bad in ("1.0\nproperty float x", "1.0ä"):
+        with pytest.raises(ClodError, match="version"):
+            Adapter(torch.ones(3), CONFIG, {}, "f", {}, bad)

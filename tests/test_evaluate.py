@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import pytest
 import torch
@@ -98,3 +99,18 @@ def test_bad_calls_are_named() -> None:
         evaluate(row_of_four(), [view], [])
     with pytest.raises(ClodError, match="virtual_scale is 0.5"):
         evaluate(row_of_four(), [view], [1.0, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("dials", "repeats", "said"),
+    [
+        ([1.0, math.nan], 1, "virtual_scale is nan"),
+        ([1.0, math.inf], 1, "virtual_scale is inf"),
+        ([1.0], 0, "repeats is 0, it must be at least 1"),
+    ],
+)
+def test_bad_calls_cost_nothing(dials: list[float], repeats: int, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[evaluate.__module__], "render", lambda *_: pytest.fail("rendered"))
+    view = View(camera(20, 16), torch.zeros(16, 20, 3, dtype=torch.uint8))
+    with pytest.raises(ClodError, match=said):
+        evaluate(row_of_four(), [view], dials, repeats=repeats)

@@ -44,6 +44,12 @@ def test_both(run: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monkey
         assert len({picture.tobytes() for picture in pictures}) == 4
 
 
+def test_a_scene_without_held_out_views(run: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = clod_adapter.load_scene(capture.scene)
+    monkeypatch.setattr(clod_adapter, "load_scene", lambda folder: clod_adapter.Scene(scene.train, (), ()))
+    assert "of 300 Gaussians" in run(2, capture.ply, capture.scene)
+
+
 @pytest.mark.parametrize("number", [1, 2])
 def test_misuse_is_explained(run: Any, number: int) -> None:
     with pytest.raises(SystemExit, match=f"python examples/{EXAMPLES[number - 1].name}"):

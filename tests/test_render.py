@@ -148,3 +148,11 @@ def test_of_no_gaussians() -> None:
     for some in (none, attach(none), attach(none, attenuation=AttenuationConfig(normalizer="max"))):
         rendering = render(some, camera(), 2.0)
         assert rendering.kept.shape == (0,) and (rendering.image == 0).all() and (rendering.alpha == 0).all()
+
+
+def test_shapes_that_would_be_read_past_their_end_are_refused() -> None:
+    base = gaussians(5, 0, 0)
+    with pytest.raises(ClodError, match="background"):
+        render(base, camera(), background=torch.ones(1))
+    with pytest.raises(ClodError, match="opacities"):
+        splat(base, base.opacities[:3], camera())

@@ -10,7 +10,7 @@ import torch
 
 from clod_adapter import train
 from clod_adapter.adapter import ATTRIBUTES, attach
-from clod_adapter.attenuation import attenuate, normalized_distances
+from clod_adapter.attenuation import SIGMA_MAX, attenuate, log_attenuation, normalized_distances
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
@@ -159,6 +159,33 @@ def test_continues_from_a_sigma(captured: tuple[Gaussians, Scene], trained: tupl
     assert moved.max() <= 1.01e-2  # a step of log sigma
     assert result.gaussians.attenuation == replace(first.attenuation, max_sv=3.0)
     assert start(first, captured[1].train, config).sigma_d is first.sigma_d
+
+
+def test_a_file_s_own_settings_outlive_other_defaults(captured: tuple[Gaussians, Scene]) -> None:
+    """A sigma_d learned under one tau and normaliser means something else under others."""
+    own = AttenuationConfig(tau=0.02, eps=1e-6, normalizer="max", scene_distance=2.0, max_sv=4.0)
+    dialled = attach(captured[0], torch.full((len(captured[0]),), 1.5), own)
+    result = adapt(dialled, captured[1], config_of(iters=1, max_sv=3.0)).gaussians
+    assert result.attenuation == replace(own, max_sv=3.0)
+
+
+def test_a_dial_that_does_nothing_is_started(captured: tuple[Gaussians, Scene]) -> None:
+    """At SIGMA_MAX there is no gradient to learn from, so attach, then adapt must be as adapt alone."""
+    base, scene = captured
+    config = config_of(iters=0)
+    plain, attached = (adapt(g, scene, config).gaussians for g in (base, attach(base)))
+    assert_equal(plain, attached)
+    assert (plain.sigma_d < SIGMA_MAX).all()
+
+
+def test_every_sigma_of_the_start_feels_the_dial(captured: tuple[Gaussians, Scene]) -> None:
+    """An opacity too low for its rank asks for an infinite sigma, which could never be learned away."""
+    base, scene = captured
+    faint = base.replace(opacity_logits=torch.full_like(base.opacity_logits, -5.4))
+    begun = start(faint, scene.train, config_of())
+    distances = normalized_distances(begun.means, scene.train[0].camera, begun.attenuation)
+    fades = -log_attenuation(begun.sigma_d, distances, begun.attenuation.max_sv, begun.attenuation.eps)
+    assert fades.min() > 1e-4
 
 
 def test_a_dead_sigma_is_revived(captured: tuple[Gaussians, Scene]) -> None:

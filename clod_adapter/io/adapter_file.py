@@ -20,7 +20,6 @@ from clod_adapter.adapter import Adapter
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.version import package_version
 
 KEY = "clod_adapter"
 FORMAT = "clod-adapter"
@@ -36,19 +35,25 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
     about = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        "package_version": package_version(),
+        "package_version": adapter.version,
         "base_sha256": adapter.base_fingerprint,
         "attenuation": asdict(adapter.attenuation),
         "config": adapter.config,
     }
-    try:
-        metadata = {KEY: json.dumps(about, sort_keys=True, allow_nan=False)}
-    except (TypeError, ValueError) as error:
-        raise ClodError(f"{path}: the adapter's config is not plain JSON ({error}); use numbers and strings") from error
+    check_config(adapter.config)
+    metadata = {KEY: json.dumps(about, sort_keys=True, allow_nan=False)}
     tensors = {"sigma_d": adapter.sigma_d, **adapter.updates}
     with atomic_path(path) as temporary:
         # Not save_file, which makes files that only their owner can read.
         temporary.write_bytes(save({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, metadata))
+
+
+def check_config(config: dict[str, Any]) -> None:
+    """Raises the ClodError of a config that ``save_adapter`` would refuse; to be called before time is spent on it."""
+    try:
+        json.dumps(config, sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ClodError(f"the adapter's config is not plain JSON ({error}); use finite numbers and strings") from error
 
 
 def load_adapter(path: str | Path) -> Adapter:
@@ -62,15 +67,20 @@ def load_adapter(path: str | Path) -> Adapter:
         raise ClodError(f"{path}: is a safetensors file but no clod-adapter; give a file that this package wrote")
     try:
         about = json.loads(metadata[KEY])
-        version = about["format_version"]
-        if about["format"] != FORMAT or version > FORMAT_VERSION:
-            raise ClodError(f"format {about['format']} {version} is too new for this version; upgrade clod-adapter")
+        if about["format"] != FORMAT:
+            raise ClodError(f"is not a clod-adapter file but {about['format']!r}; give a file that this package wrote")
+        if about["format_version"] > FORMAT_VERSION:
+            raise ClodError(f"its format {about['format_version']} is too new for this version; upgrade clod-adapter")
+        for name in ("base_sha256", "package_version"):
+            if not isinstance(about[name], str):
+                raise TypeError(f"{name} is {about[name]!r}, not a string")
         return Adapter(
             sigma_d=tensors.pop("sigma_d"),
             attenuation=AttenuationConfig(**about["attenuation"]),
             updates=tensors,
             base_fingerprint=about["base_sha256"],
             config=about["config"],
+            version=about["package_version"],
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ClodError(f"{path}: its description is damaged ({error!r}); copy or export the adapter again") from error

@@ -6,7 +6,7 @@ import os
 import shutil
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from clod_adapter.errors import ClodError
@@ -33,7 +33,8 @@ def atomic_path(final: str | Path) -> Iterator[Path]:
         for path in [*temporary.rglob("*"), temporary]:
             _flush(path)
         os.replace(temporary, final)
-        _flush(final.parent)
+        with suppress(OSError):  # the file is in place; some file systems cannot flush a folder
+            _flush(final.parent)
     except OSError as error:
         raise ClodError(f"{final}: cannot be written: {error.strerror or error}") from error
     finally:

@@ -88,7 +88,10 @@ def _check_complete(model: Path) -> None:
         path = model / name
         if not path.is_file():
             continue
-        data = path.read_bytes()
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
         try:
             at = 8
             for _ in range(struct.unpack_from("<Q", data)[0]):

@@ -76,7 +76,7 @@ def load(path: str | Path) -> Checkpoint:
     return Checkpoint(gaussians, vertex, comments, (*notes, *_not_kept(header)), _sha256(path), path)
 
 
-def save(path: str | Path, gaussians: Gaussians, base: Checkpoint | None = None) -> None:
+def save(path: str | Path, gaussians: Gaussians, base: Checkpoint | None = None, *, version: str | None = None) -> None:
     """Writes ``gaussians`` as an extended file: the base's columns, then ``sigma_d``.
 
     Without a base the columns are those of Inria's layout.
@@ -85,11 +85,17 @@ def save(path: str | Path, gaussians: Gaussians, base: Checkpoint | None = None)
     overwritten only where it differs from the base's float32 reading, so what was not tuned stays
     byte-equal. The settings follow the element line as comments. Without a sigma_d a plain file results.
 
+    Args:
+        version: of the package that made the values, for the header (``Adapter.version``); by default the running one.
+
     Raises:
-        ClodError: the Gaussians do not match the base, a new value is not finite, the target is the
+        ClodError: there are no Gaussians, they do not match the base, a new value is not finite, the target is the
             base itself or cannot be written.
     """
-    path, base = Path(path), base or blank(len(gaussians), gaussians.sh_degree)
+    path = Path(path)
+    if len(gaussians) == 0:
+        raise ClodError(f"{path}: there are no Gaussians to write, and no reader takes a file without any")
+    base = base or blank(len(gaussians), gaussians.sh_degree)
     if path.is_file() and base.path.is_file() and path.samefile(base.path):
         raise ClodError(f"{path}: is the input file, which is never overwritten; choose another output")
     if len(gaussians) != len(base.vertex) or gaussians.sh_degree != base.gaussians.sh_degree:
@@ -97,7 +103,7 @@ def save(path: str | Path, gaussians: Gaussians, base: Checkpoint | None = None)
             f"{path}: {len(gaussians)} Gaussians of SH degree {gaussians.sh_degree} do not fit their base {base.path} "
             f"({len(base.vertex)} of degree {base.gaussians.sh_degree}); save with the checkpoint they came from"
         )
-    comments = write_comments(gaussians.attenuation, base.comments)
+    comments = write_comments(gaussians.attenuation, base.comments, version)
     element = PlyElement.describe(_merged(path, gaussians, base.vertex), "vertex", comments=comments)
     with atomic_path(path) as temporary:
         PlyData([element], byte_order="<").write(str(temporary))
@@ -199,7 +205,10 @@ def _not_kept(header: PlyData) -> list[str]:
 
 def _sha256(path: Path) -> str:
     digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        for block in iter(lambda: file.read(1 << 20), b""):
-            digest.update(block)
+    try:
+        with open(path, "rb") as file:
+            for block in iter(lambda: file.read(1 << 20), b""):
+                digest.update(block)
+    except OSError as error:
+        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
     return digest.hexdigest()

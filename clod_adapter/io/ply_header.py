@@ -52,14 +52,14 @@ def all_comments(ply: PlyData) -> tuple[str, ...]:
     return (*ply.comments, *(comment for element in ply for comment in element.comments))
 
 
-def write_comments(config: AttenuationConfig | None, inherited: Iterable[str]) -> list[str]:
+def write_comments(config: AttenuationConfig | None, inherited: Iterable[str], version: str | None = None) -> list[str]:
     """The comments of an output: the base's, then ours, which replace any the base had.
 
     One comment per field of ``config``, as ``clod_adapter tau 0.00392156862745098``: the shortest
-    decimal that gives back the same double.
+    decimal that gives back the same double. Before them the ``version`` that made the values, by default this one.
     """
     comments = [comment for comment in inherited if not comment.startswith(PREFIX)]
-    comments.append(f"{PREFIX}version {package_version()}")
+    comments.append(f"{PREFIX}version {version or package_version()}")
     for field in fields(config) if config is not None else ():
         value = getattr(config, field.name)
         kind: Any = type(field.default)

@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from PIL import Image
 from plyfile import PlyData
 
 import clod_adapter
+from clod_adapter.cli import adapt as adapt_command
 from clod_adapter.cli import evaluate as eval_command
 from clod_adapter.cli.report import report_dials
 from clod_adapter.config import AdaptConfig
@@ -22,6 +24,9 @@ from clod_adapter.train import Progress
 
 THREE = ["dial.json", "dial.ply", "dial.safetensors"]
 TINY = ("--iters", 12, "--max-sv", 4, "--out", "dial.ply")
+
+
+EARLIER = "an earlier run's"
 
 
 def names(folder: Path) -> list[str]:
@@ -54,9 +59,10 @@ def test_writes_three_files(clod: Any, capture: Any, tmp_path: Path) -> None:
 
 def test_says_what_it_did(clod: Any, capture: Any) -> None:
     done = clod(capture.ply, "--images", capture.scene, *TINY)
-    table = [line.split() for line in done.out.splitlines() if line.startswith("  ")]
-    assert [line[0] for line in table[:7]] == ["dial", "base", "1", "1.5", "2", "3", "4"]
-    assert len({len(line) for line in done.out.splitlines()[1:8]}) == 1  # aligned
+    table = [line.split() for line in done.out.splitlines()[1:9]]
+    assert [line[0] for line in table] == ["dial", "base", "1", "1.5", "2", "3", "4", "plain"]
+    assert len({len(line) for line in done.out.splitlines()[1:9]}) == 1  # aligned
+    assert "plain: what a viewer that does not know the dial makes of dial.ply" in done.out
     assert f"clod-adapt eval dial.ply --images {capture.scene} --sv 1 4" in done.out
     assert "300 Gaussians, SH degree 1" in done.err and "8 photographs to train on, 2 held out, 64x48" in done.err
     assert "trained 12 steps" in done.err and "\r" not in done.err
@@ -69,6 +75,7 @@ def test_progress_has_eta_and_held_out_error(clod: Any, capture: Any, monkeypatc
     monkeypatch.setattr("clod_adapter.cli.training.CHECK_EVERY", 0)
     monkeypatch.setattr("clod_adapter.cli.training.CHECK_COST", 1e9)
     done = clod(capture.ply, "--images", capture.scene, *TINY)
+    assert re.search(r"^base: \d+\.\d\d dB on the held-out photographs$", done.err, re.M), done
     error = r"\d+\.\d\d dB \d+%"
     assert re.search(r"^importance  50%, \d.* left, 4/8$", done.err, re.M), done
     assert re.search(rf"^training  50%, \d.* left, 6/12, s=1 {error}, s=4 {error}$", done.err, re.M), done
@@ -80,6 +87,48 @@ def test_json_is_alone_on_stdout(spawn: Any, capture: Any, tmp_path: Path) -> No
     assert process.returncode == 0, err
     printed, written = json.loads(out), json.loads((tmp_path / "dial.json").read_text())
     assert out.count("\n") == 1 and printed == written and "base" in err
+
+
+def test_a_short_run_shows_the_base_error(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("clod_adapter.cli.console.LINE_EVERY", 0)
+    done = clod(capture.ply, "--images", capture.scene, *TINY)
+    assert re.search(r"^training   8%, \d.* left, 1/12, base \d+\.\d\d dB$", done.err, re.M), done
+
+
+def test_quiet_json_leaves_stderr_alone(clod: Any, capture: Any) -> None:
+    for words in (TINY, ("--iters", -1)):
+        done = clod(capture.ply, "--images", capture.scene, *words, "--quiet", "--json")
+        assert done.err == "" if words is TINY else done.err.count("\n") == 1 and "error" in done.err, done
+    assert clod("eval", "dial.ply", "--images", capture.scene, "--quiet", "--json").err == ""
+    assert clod("apply", capture.ply, "dial.safetensors", "-o", "again.ply", "--quiet", "--json").err == ""
+
+
+def test_the_plain_row_is_the_file_without_its_dial(clod: Any, capture: Any, tmp_path: Path) -> None:
+    clod(capture.ply, "--images", capture.scene, *TINY)
+    report = json.loads((tmp_path / "dial.json").read_text())
+    adapted, views = clod_adapter.load(tmp_path / "dial.ply").gaussians, clod_adapter.load_scene(capture.scene).test
+    (want,) = clod_adapter.evaluate(clod_adapter.detach(adapted), views, [1.0])
+    assert {**report["detached_row"], "frame_ms": 0} == {**want.as_dict(), "frame_ms": 0}
+    assert report["detached_row"]["kept"] == 300
+
+
+@pytest.mark.parametrize("device", ["auto", "cpu"])
+def test_device(clod: Any, capture: Any, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    moved = []
+    to = clod_adapter.Gaussians.to
+    monkeypatch.setattr(clod_adapter.Gaussians, "to", lambda self, where: moved.append(where) or to(self, where))
+    done = clod(capture.ply, "--images", capture.scene, "--iters", 0, "--device", device, "--json")
+    assert moved == [torch.device("cpu")] and json.loads(done.out)["device"] == "cpu"
+
+
+def test_apply_of_another_version_gives_the_same_file(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert clod(capture.ply, "--images", capture.scene, *TINY).code == 0
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "99.0")
+    assert clod("--version").out == "clod-adapt 99.0\n"
+    assert clod("apply", capture.ply, "dial.safetensors", "-o", "same.ply").code == 0
+    assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
 
 
 def test_default_name(clod: Any, capture: Any, tmp_path: Path) -> None:
@@ -167,6 +216,72 @@ def test_interrupt_of_the_measuring(clod: Any, capture: Any, tmp_path: Path, mon
     assert done.code == 0 and [row["virtual_scale"] for row in report["rows"]] == [1, 1.5]
     assert "measurements were interrupted" in report["notes"][0] in done.err and report["interrupted"] is False
     assert names(tmp_path) == THREE
+
+
+@pytest.mark.parametrize("step", ["extract", "save_adapter", "save"])
+def test_one_interrupt_after_training_loses_nothing(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    press_during(monkeypatch, step, 1)
+    done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
+    report = json.loads(done.out)
+    assert done.code == 0 and names(tmp_path) == THREE and report["steps"] == 12
+    assert report["rows"] == [] and report["detached_row"] is None and report["interrupted"] is False
+    assert "measurements were interrupted" in report["notes"][0] in done.err
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    assert clod("apply", capture.ply, "dial.safetensors", "-o", "same.ply").code == 0
+    assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
+
+
+def test_a_second_interrupt_aborts_the_writing(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    press_during(monkeypatch, "save_adapter", 2)
+    done = clod(capture.ply, "--images", capture.scene, *TINY)
+    assert (done.code, names(tmp_path)) == (130, [])
+
+
+def press_during(monkeypatch: pytest.MonkeyPatch, step: str, presses: int) -> None:
+    """Ctrl-C at the beginning of a step of the command."""
+    real = getattr(adapt_command, step)
+
+    def interrupted(*args: Any, **rest: Any) -> Any:
+        for _ in range(presses):
+            signal.raise_signal(signal.SIGINT)
+        return real(*args, **rest)
+
+    monkeypatch.setattr(adapt_command, step, interrupted)
+
+
+def test_a_report_is_never_that_of_an_earlier_run(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the run is killed while it measures."""
+    (tmp_path / "dial.json").write_text(EARLIER)
+    save, seen = adapt_command.save, []
+
+    def watched(*args: Any, **rest: Any) -> None:
+        seen.append((tmp_path / "dial.json").exists())
+        save(*args, **rest)
+
+    def killed(*_: Any) -> None:
+        raise SystemExit(9)
+
+    monkeypatch.setattr(adapt_command, "save", watched)
+    monkeypatch.setattr(adapt_command, "measure_result", killed)
+    assert clod(capture.ply, "--images", capture.scene, *TINY).code == 9
+    report = json.loads((tmp_path / "dial.json").read_text())
+    assert seen == [False] and names(tmp_path) == THREE
+    assert (report["rows"], report["steps"], report["notes"]) == ([], 12, ["the result was not measured"])
+
+
+def test_an_unusable_config_fails_before_the_work(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("clod_adapter.cli.settings.asdict", lambda config: {"time_budget": float("inf")})
+    monkeypatch.setattr(adapt_command, "read_checkpoint", lambda *_: pytest.fail("read"))
+    done = clod(capture.ply, "--images", capture.scene, *TINY)
+    assert done.code == 2 and "not plain JSON" in done.err
 
 
 def test_a_base_of_another_place_is_noticed(clod: Any, capture: Any, tmp_path: Path) -> None:

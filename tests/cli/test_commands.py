@@ -43,6 +43,16 @@ def test_eval_of_a_plain_file(clod: Any, capture: Any) -> None:
     assert len(shown.out.splitlines()) == 5 and shown.err == ""
 
 
+def test_eval_stays_within_what_was_trained(clod: Any, capture: Any) -> None:
+    for max_sv, dials in ((2.5, [1, 2, 2.5]), (1, [1]), (7, [1, 2, 3, 5, 7])):
+        clod(capture.ply, "--images", capture.scene, *TINY, "--max-sv", max_sv)
+        report = json.loads(clod("eval", "dial.ply", "--images", capture.scene, "--json").out)
+        assert [row["virtual_scale"] for row in report["rows"]] == dials and report["notes"] == []
+    done = clod("eval", "dial.ply", "--images", capture.scene, "--sv", 8, "--json")
+    (note,) = json.loads(done.out)["notes"]
+    assert note.startswith("trained up to s = 7") and note in done.err
+
+
 def test_apply_gives_the_same_file(clod: Any, capture: Any, tmp_path: Path) -> None:
     clod(capture.ply, "--images", capture.scene, *TINY)
     done = clod("apply", capture.ply, "dial.safetensors", "-o", "again.ply", "--json")
@@ -86,6 +96,8 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("PLY --images SCENE --iters -1", "--iters is -1, it must be at least 0"),
         ("PLY --images SCENE --seed -1", "--seed is -1, it must be at least 0"),
         ("PLY --images SCENE --time-budget 0", "--time-budget is 0.0, it must be positive"),
+        ("PLY --images SCENE --time-budget inf", "--time-budget is inf, it must be"),
+        ("PLY --images SCENE --time-budget nan", "--time-budget is nan, it must be"),
         ("PLY --images SCENE --device tpu", "invalid choice: 'tpu'"),
         ("PLY --images SCENE --out nowhere/dial.ply", "nowhere/dial.ply: folder nowhere does not exist; create"),
         ("PLY --images SCENE --out dial.splat", "dial.splat: .*must end in .ply"),
@@ -116,6 +128,15 @@ def assert_refused(done: Any, said: str) -> None:
     errors = [line for line in done.err.splitlines() if "error" in line]
     assert len(errors) == 1 and errors[0] == done.err.splitlines()[-1], done
     assert errors[0].startswith("clod-adapt: error: ") and re.search(said, errors[0]), done
+
+
+def test_an_error_of_the_system_is_one_line(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device", "some/file")
+
+    monkeypatch.setattr("clod_adapter.cli.evaluate.read_scene", full)
+    done = clod("eval", capture.ply, "--images", capture.scene)
+    assert_refused(done, "some/file: No space left on device")
 
 
 def test_bad_input_exits_with_2(spawn: Any, tmp_path: Path) -> None:

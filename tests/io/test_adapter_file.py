@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from clod_adapter.adapter import Adapter
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.io.adapter_file import load_adapter, save_adapter
+from clod_adapter.io.adapter_file import check_config, load_adapter, save_adapter
 
 CONFIG = {"steps": 3, "lr": 0.1, "names": ["a", None], "nested": {"b": True}, "ü": "é"}
 
@@ -56,7 +56,19 @@ def test_the_file_says_what_it_is(tmp_path: Path) -> None:
 def test_config_must_be_json(tmp_path: Path, value: object) -> None:
     with pytest.raises(ClodError, match="not plain JSON"):
         save_adapter(tmp_path / "a", adapter(config={"x": value}))
+    with pytest.raises(ClodError, match="not plain JSON"):
+        check_config({"x": value})
+    check_config(CONFIG)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_version_that_made_it_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "7.8.9")
+    save_adapter(tmp_path / "a", adapter())
+    monkeypatch.undo()
+    loaded = load_adapter(tmp_path / "a")
+    save_adapter(tmp_path / "b", loaded)
+    assert loaded.version == "7.8.9" and (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def test_unwritable(tmp_path: Path) -> None:
@@ -96,7 +108,13 @@ def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject) 
     ("change", "message"),
     [
         ({"format_version": 2}, "upgrade"),
-        ({"format": "other"}, "upgrade"),
+        ({"format": "other"}, "not a clod-adapter file but 'other'"),
+        ({"format": "other", "format_version": 2}, "not a clod-adapter file"),
+        ({"format": None}, "not a clod-adapter file"),
+        ({"base_sha256": None}, "base_sha256 is None"),
+        ({"base_sha256": 5}, "base_sha256 is 5"),
+        ({"package_version": 1}, "package_version is 1"),
+        ({"package_version": "1\n2"}, "printable"),
         ({"format_version": "x"}, "description is damaged"),
         ({"attenuation": {"tau": 2.0}}, "tau is 2.0"),
         ({"attenuation": {"new_field": 1}}, "new_field"),

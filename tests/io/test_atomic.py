@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,21 @@ def test_full_disk_is_a_clod_error(tmp_path: Path) -> None:
     with pytest.raises(ClodError, match="No space left"), atomic_path(tmp_path / "out"):
         raise OSError(28, "No space left on device")
     assert os.listdir(tmp_path) == []
+
+
+def test_a_folder_that_cannot_be_flushed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rename is done by then, so the file is written."""
+    fsync = os.fsync
+
+    def refuse(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(22, "Invalid argument")
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with atomic_path(tmp_path / "out") as temporary:
+        temporary.write_bytes(b"new")
+    assert (tmp_path / "out").read_bytes() == b"new"
 
 
 def test_folders(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from PIL import Image
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
 from clod_adapter.io.colmap import load_scene, write_model
+from clod_adapter.io.colmap_model import read_model
 
 
 def pose(seed: int) -> torch.Tensor:
@@ -304,3 +305,14 @@ def test_real_scenes(
     assert first.K[0, 2] == size[0] / 2
     rotation = first.viewmat[:3, :3]
     torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
+
+
+def test_a_model_that_cannot_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "cameras.bin").write_bytes(b"")
+
+    def refuse(path: Path) -> bytes:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    with pytest.raises(ClodError, match="cameras.bin: cannot be read .Permission denied"):
+        read_model(tmp_path)

@@ -384,6 +384,20 @@ def test_refused_saves(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+def test_no_gaussians_are_not_written(tmp_path: Path) -> None:
+    none = ply.load(write(tmp_path / "in.ply", make(1, needed(1)))).gaussians.select(torch.tensor([False]))
+    with pytest.raises(ClodError, match="out.ply: there are no Gaussians"):
+        ply.save(tmp_path / "out.ply", none)
+    assert not (tmp_path / "out.ply").exists()
+
+
+def test_a_file_that_goes_away_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "in.ply", make(1, needed(0)))
+    monkeypatch.setattr(ply, "_usable_rows", lambda *args, real=ply._usable_rows: (path.unlink(), real(*args))[1])
+    with pytest.raises(ClodError, match="in.ply: cannot be read"):
+        ply.load(path)
+
+
 def test_saves_what_training_hands_over(tmp_path: Path) -> None:
     base = ply.load(write(tmp_path / "in.ply", make(3, needed(0))))
     g = base.gaussians.replace(means=(base.gaussians.means + 1).requires_grad_())
@@ -436,3 +450,9 @@ def test_an_adapter_reproduces_the_file(tmp_path: Path) -> None:
     ply.save(tmp_path / "again.ply", again, base)
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "out.ply").read_bytes()
     assert same(ply.load(tmp_path / "out.ply").gaussians, again)
+
+
+def test_the_header_names_the_version_that_is_given(tmp_path: Path) -> None:
+    base = ply.load(write(tmp_path / "in.ply", make(1, needed(0))))
+    ply.save(tmp_path / "out.ply", attach(base.gaussians), base, version="7.8.9")
+    assert "comment clod_adapter version 7.8.9" in read_back(tmp_path / "out.ply")[0]

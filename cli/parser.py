@@ -1,0 +1,26 @@
+"""The parser of a command, for ``main`` and for a command that runs another one."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any, NoReturn
+
+from clod_adapter.errors import ClodError
+
+
+class Parser(argparse.ArgumentParser):
+    """Reports misuse like any other bad input: in one line, by ``main``."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ClodError(f"{message} ({self.prog} --help explains)")
+
+
+def make_parser(command: Any, prog: str) -> Parser:
+    """The parser of a command module (see ``main.COMMANDS``), with the options that all commands have."""
+    parser = Parser(
+        prog=prog, usage=f"{prog} {command.USAGE}", description=command.DESCRIPTION, epilog=command.EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    command.add_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, all else on stderr")
+    return parser

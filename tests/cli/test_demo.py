@@ -1,0 +1,88 @@
+"""``clod-adapt demo``, with the long parts replaced."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clod_adapter.cli import adapt, demo
+from clod_adapter.cli.main import build_parser
+
+PICTURES = ("dial.png", "curve.png")
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch, capture: Any) -> None:
+    """The tests' own capture in place of the gallery, a few steps, and empty pictures."""
+
+    def prepare(scene: Path, base: Path, console: object) -> None:
+        shutil.copytree(capture.scene, scene, dirs_exist_ok=True)
+        shutil.copyfile(capture.ply, base)
+
+    def draw(scene: Path, model: Path, report: dict[str, Any], pictures: dict[str, Path]) -> None:
+        for path in pictures.values():
+            path.write_bytes(b"")
+
+    monkeypatch.setattr(demo, "prepare", prepare)
+    monkeypatch.setattr(demo, "draw", draw)
+    real, few = adapt.adapt, partial(replace, iters=2)
+    monkeypatch.setattr(adapt, "adapt", lambda base, scene, config, *rest: real(base, scene, few(config), *rest))
+
+
+def test_says_where_things_are_and_what_is_next(clod: Any, short: None, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    done = clod("demo", "--out", "here")
+    assert done.code == 0, done
+    assert f"everything is in {tmp_path / 'here'}" in done.out and "clod-adapt YOURS.ply" in done.out
+    report = json.loads(clod("demo", "--out", "here", "--quiet", "--json").out)
+    assert report["command"] == "demo" and report["folder"] == "here"
+    assert report["pictures"] == {"dial": "here/dial.png", "curve": "here/curve.png"}
+    made = {path.name for path in (tmp_path / "here").iterdir()}
+    assert made == {"capture", "base.ply", "gallery.ply", "gallery.safetensors", "gallery.json", *PICTURES}
+
+
+def test_pictures_that_were_not_drawn_are_not_reported(
+    clod: Any, short: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(adapt, "measure_result", lambda *_: ([], [], True))
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo" / "dial.png").write_text("an earlier run's")
+    done = clod("demo", "--json")
+    assert done.code == 0 and json.loads(done.out)["pictures"] == {} and "no pictures" in done.err
+    assert not any((tmp_path / "demo" / name).exists() for name in PICTURES)
+
+
+@pytest.mark.parametrize(("module", "package"), [("matplotlib", "matplotlib"), ("skimage", "scikit-image")])
+def test_what_is_missing_is_said_at_the_start(
+    clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, package: str
+) -> None:
+    monkeypatch.setattr(demo, "EXTRA", {module: package})
+    monkeypatch.setitem(sys.modules, module, None)
+    done = clod("demo")
+    assert done.code == 2 and f"the demo needs {package}: pip install 'clod-adapter[demo]'" in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_made(clod: Any, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    (tmp_path / "file").write_text("")
+    for out, said in (("file", "file: is a file"), ("file/below", "file/below: cannot be made")):
+        done = clod("demo", "--out", out)
+        assert done.code == 2 and said in done.err and done.err.count("\n") == 1, done
+
+
+@pytest.mark.parametrize("flags", [[], ["--quiet", "--json"]])
+def test_the_main_job_gets_its_own_defaults(flags: list[str]) -> None:
+    args = build_parser("demo").parse_args(["--out=-odd", *flags])
+    files = [Path("-odd") / name for name in ("base.ply", "capture", "gallery.ply")]
+    given = demo.adapt_arguments(args, *files)
+    words = ["--images=-odd/capture", "--max-sv=5", "--out=-odd/gallery.ply", *flags, "--", "-odd/base.ply"]
+    assert vars(given) == vars(build_parser("").parse_args(words))
