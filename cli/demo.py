@@ -40,7 +40,7 @@ in DIR afterwards:
   dial.png          one held-out view at several dial values
   curve.png         quality against the number of Gaussians
 """
-POINTS, FIT_STEPS, MAX_SV = 40_000, 1500, 5.0
+POINTS, FIT_STEPS, MAX_SV = 60_000, 2000, 5.0
 DIALS = (1.0, 2.0, 3.0, 5.0)
 EXTRA = {"matplotlib": "matplotlib", "skimage": "scikit-image"}  # module, and the package that brings it
 VIEW = 0  # the held-out view on the strip: across the whole room
