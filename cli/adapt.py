@@ -153,7 +153,7 @@ def train(
 ) -> Adapted:
     """Adapts while the user watches. Raises KeyboardInterrupt when there is nothing worth writing."""
     base_row = base_rows[0] if base_rows else None
-    with closing(Follower(console, stop, scene.test, config.max_sv, base_row)) as follower:
+    with closing(Follower(console, stop, base, scene.test, config.max_sv, base_row)) as follower:
         adapted = adapt(base, scene, config, follower)
     if stop.requests > 1:
         raise KeyboardInterrupt

@@ -15,6 +15,7 @@ import torch
 from clod_adapter.cameras import View
 from clod_adapter.cli.console import Console, Meter
 from clod_adapter.evaluate import Row
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
 from clod_adapter.train import Progress
@@ -52,13 +53,20 @@ class Follower:
     """The progress callback of ``adapt``.
 
     Args:
+        base: what the error so far is compared with.
         views: held out; at most four of them, spread evenly, are looked at.
         max_sv: the error is shown at dial 1 and here.
         base_row: how the base was measured: the error shown until there is a newer one, and a guess of a frame's time.
     """
 
     def __init__(
-        self, console: Console, stop: GracefulStop, views: tuple[View, ...], max_sv: float, base_row: Row | None
+        self,
+        console: Console,
+        stop: GracefulStop,
+        base: Gaussians,
+        views: tuple[View, ...],
+        max_sv: float,
+        base_row: Row | None,
     ) -> None:
         self.console, self.stop = console, stop
         self.views = views[:: -(-len(views) // CHECK_VIEWS)] if views else ()
@@ -66,6 +74,7 @@ class Follower:
         seconds_a_frame = base_row.frame_ms / 1e3 if base_row else 0.0
         self.check_due, self.check_cost = CHECK_EVERY, seconds_a_frame * len(self.views) * len(self.dials)
         self.error = f"base {base_row.psnr:.2f} dB" if base_row else ""
+        self.base, self.base_error = base, ""
         self.phase = ""
         self.meter: Meter | None = None
 
@@ -97,12 +106,16 @@ class Follower:
         if self.check_cost > CHECK_COST * progress.seconds / progress.share:
             return  # even one look would be too many for so short a run
         began = time.perf_counter()
-        gaussians, shown = progress.gaussians(), []
-        for dial in self.dials:
-            pictures = [render(gaussians, view.camera, dial) for view in self.views]
-            error = fmean(psnr(picture.image, view.image) for picture, view in zip(pictures, self.views, strict=True))
-            share = fmean(float(picture.kept.float().mean()) for picture in pictures)
-            shown.append(f"s={dial:g} {error:.2f} dB {share:.0%}")
-        self.error = ", ".join(shown)
+        if not self.base_error:  # of the same views: some are harder than others
+            self.base_error = f"base {self._look(self.base, 1.0)[0]:.2f} dB on these {len(self.views)} views"
+        looks = [(dial, *self._look(progress.gaussians(), dial)) for dial in self.dials]
+        shown = [f"s={dial:g} {error:.2f} dB {share:.0%}" for dial, error, share in looks]
+        self.error = ", ".join([*shown, self.base_error])
         self.check_cost = time.perf_counter() - began
         self.check_due = progress.seconds + max(CHECK_EVERY, self.check_cost / CHECK_COST)
+
+    def _look(self, gaussians: Gaussians, dial: float) -> tuple[float, float]:
+        """PSNR and share kept, means over the views that are looked at."""
+        pictures = [render(gaussians, view.camera, dial) for view in self.views]
+        error = fmean(psnr(picture.image, view.image) for picture, view in zip(pictures, self.views, strict=True))
+        return error, fmean(float(picture.kept.float().mean()) for picture in pictures)

@@ -76,9 +76,9 @@ def test_progress_has_eta_and_held_out_error(clod: Any, capture: Any, monkeypatc
     monkeypatch.setattr("clod_adapter.cli.training.CHECK_COST", 1e9)
     done = clod(capture.ply, "--images", capture.scene, *TINY)
     assert re.search(r"^base: \d+\.\d\d dB on the held-out photographs$", done.err, re.M), done
-    error = r"\d+\.\d\d dB \d+%"
+    error, base = r"\d+\.\d\d dB \d+%", r"\d+\.\d\d dB on these \d views"
     assert re.search(r"^importance  50%, \d.* left, 4/8$", done.err, re.M), done
-    assert re.search(rf"^training  50%, \d.* left, 6/12, s=1 {error}, s=4 {error}$", done.err, re.M), done
+    assert re.search(rf"^training  50%, \d.* left, 6/12, s=1 {error}, s=4 {error}, base {base}$", done.err, re.M), done
 
 
 def test_json_is_alone_on_stdout(spawn: Any, capture: Any, tmp_path: Path) -> None:
