@@ -23,7 +23,10 @@ OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"
 
 def kernel(function: Callable[..., Any]) -> Any:
     """A compiled function that Python calls, usually on several threads."""
-    dispatcher: Any = njit(cache=True, **OPTIONS)(function)
+    try:
+        dispatcher: Any = njit(cache=True, **OPTIONS)(function)
+    except RuntimeError:  # nowhere to write a cache: neither beside the package nor in the user's cache folder
+        return njit(**OPTIONS)(function)
     dispatcher._cache._cache_file._source_stamp = _STAMP
     return dispatcher
 
