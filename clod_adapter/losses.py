@@ -75,9 +75,7 @@ class _Fused:
         planes = np.zeros((6, 3, self.height, kernels.stride(self.width)), np.float32)
         self.x, self.y, similarity, *self.slopes = planes
         pixels, sums = image.detach().contiguous().numpy(), np.zeros(self.workers)
-        threads.run(
-            kernels.to_planes, self.workers, pixels, target.contiguous().numpy(), self.x, self.y, np.float32(1 / 255)
-        )
+        threads.run(kernels.to_planes, self.workers, pixels, target.contiguous().numpy(), self.x, self.y)
         threads.run(kernels.ssim_map, self.workers, self.x, self.y, self.width, similarity, *self.slopes, sums)
         self.ssim_sum = sums.sum()
 

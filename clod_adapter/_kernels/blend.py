@@ -93,6 +93,21 @@ def blocks_of(records, r, ox, oy, live, touched):  # type: ignore[no-untyped-def
     return n
 
 
+@part
+def spread(records, r):  # type: ignore[no-untyped-def]
+    """Exponent ``-QA, -QB, -QC, LOG`` and colour of the record at ``r``, the same in every lane."""
+    qa, qb, qc = splat(-records[r + QA]), splat(-records[r + QB]), splat(-records[r + QC])
+    red, green, blue = splat(records[r + RED]), splat(records[r + GREEN]), splat(records[r + BLUE])
+    return qa, qb, qc, splat(records[r + LOG]), red, green, blue
+
+
+@part
+def offsets_from(records, r, ox, oy):  # type: ignore[no-untyped-def]
+    """From the centre of the record at ``r`` to the pixels of the tile's first block, along x and along y."""
+    base_x = load(LANE_X, 0) + splat(float32(ox) - records[r + MX])
+    return base_x, load(LANE_Y, 0) + splat(float32(oy) - records[r + MY])
+
+
 @kernel
 def blend(  # type: ignore[no-untyped-def]
     worker, workers, records, entries, offsets, across, width, height, background, tiles, cursor, room, image, alpha,
@@ -105,7 +120,6 @@ def blend(  # type: ignore[no-untyped-def]
     offsets, background, image, alpha = pointer(offsets), pointer(background), pointer(image), pointer(alpha)
     state, live, touched = pointer(room[worker]), scratch(uint8, BLOCKS), scratch(int32, BLOCKS)
     zero, threshold, most, least = splat(float32(0)), splat(ALPHA_MIN), splat(ALPHA_MAX), splat(T_MIN)
-    lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
     while True:
         turn = fetch_add(cursor, 1)
         if turn >= count:
@@ -119,17 +133,8 @@ def blend(  # type: ignore[no-untyped-def]
             if alive == 0:
                 break
             r = entries[entry] * RECORD
-            qa, qb, qc, log = (
-                splat(-records[r + QA]),
-                splat(-records[r + QB]),
-                splat(-records[r + QC]),
-                splat(records[r + LOG]),
-            )
-            red, green, blue = splat(records[r + RED]), splat(records[r + GREEN]), splat(records[r + BLUE])
-            base_x, base_y = (
-                lane_x + splat(float32(ox) - records[r + MX]),
-                lane_y + splat(float32(oy) - records[r + MY]),
-            )
+            qa, qb, qc, log, red, green, blue = spread(records, r)
+            base_x, base_y = offsets_from(records, r, ox, oy)
             for i in range(blocks_of(records, r, ox, oy, live, touched)):
                 block = touched[i]
                 at = block * 64
@@ -201,7 +206,6 @@ def blend_gradient(  # type: ignore[no-untyped-def]
     state, live, touched = pointer(room[worker]), scratch(uint8, BLOCKS), scratch(int32, BLOCKS)
     zero, one = splat(float32(0)), splat(float32(1))
     threshold, most, least = splat(ALPHA_MIN), splat(ALPHA_MAX), splat(T_MIN)
-    lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
     while True:
         turn = fetch_add(cursor, 1)
         if turn >= count:
@@ -220,17 +224,8 @@ def blend_gradient(  # type: ignore[no-untyped-def]
                     pair_sums[slot * PAIR + k] = float32(0)
                 continue
             r = entries[entry] * RECORD
-            qa, qb, qc, log = (
-                splat(-records[r + QA]),
-                splat(-records[r + QB]),
-                splat(-records[r + QC]),
-                splat(records[r + LOG]),
-            )
-            red, green, blue = splat(records[r + RED]), splat(records[r + GREEN]), splat(records[r + BLUE])
-            base_x, base_y = (
-                lane_x + splat(float32(ox) - records[r + MX]),
-                lane_y + splat(float32(oy) - records[r + MY]),
-            )
+            qa, qb, qc, log, red, green, blue = spread(records, r)
+            base_x, base_y = offsets_from(records, r, ox, oy)
             s_r = s_g = s_b = s_0 = s_x = s_y = s_xx = s_xy = s_yy = zero
             for i in range(blocks_of(records, r, ox, oy, live, touched)):
                 block = touched[i]

@@ -16,7 +16,7 @@ RADIUS, PAD = 5, 16
 _taps = np.exp(-((np.arange(11) - RADIUS) ** 2) / (2 * 1.5**2))
 TAPS = (_taps / _taps.sum()).astype(np.float32)
 C1, C2 = float32(0.01**2), float32(0.03**2)
-TWO = float32(2)
+TWO, BYTE = float32(2), float32(1 / 255)
 
 
 def stride(width: int) -> int:
@@ -25,14 +25,14 @@ def stride(width: int) -> int:
 
 
 @kernel
-def to_planes(worker, workers, image, target, x, y, scale):  # type: ignore[no-untyped-def]
-    """Splits two ``[H, W, 3]`` images into planes; ``target`` is multiplied by ``scale`` (1/255 for bytes)."""
+def to_planes(worker, workers, image, target, x, y):  # type: ignore[no-untyped-def]
+    """Splits two ``[H, W, 3]`` images into planes; ``target`` is uint8 and becomes [0, 1]."""
     height, width = image.shape[0], image.shape[1]
     for row in range(height * worker // workers, height * (worker + 1) // workers):
         for column in range(width):
             for channel in range(3):
                 x[channel, row, PAD + column] = image[row, column, channel]
-                y[channel, row, PAD + column] = float32(target[row, column, channel]) * scale
+                y[channel, row, PAD + column] = float32(target[row, column, channel]) * BYTE
 
 
 @part
