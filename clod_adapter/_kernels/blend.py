@@ -8,14 +8,17 @@ to 1e-4 is finished and carries its transmittance negated; a block ends when all
 from __future__ import annotations
 
 import numpy as np
-from numba import float32, int32, uint8
+from numba import float32, uint64
 
 from clod_adapter._kernels.compiling import kernel, part, pointer, scratch
 from clod_adapter._kernels.conventions import (
+    AHEAD,
     ALPHA_MAX,
     ALPHA_MIN,
     BLUE,
+    DET,
     GREEN,
+    HALF,
     LOG,
     MX,
     MY,
@@ -23,8 +26,11 @@ from clod_adapter._kernels.conventions import (
     QA,
     QB,
     QC,
+    REACH,
     RECORD,
     RED,
+    RX,
+    SLACK,
     T_MIN,
     TILE,
     X0,
@@ -36,61 +42,81 @@ from clod_adapter._kernels.simd import (
     anywhere,
     both,
     but_not,
+    eq,
     exp2,
     fetch_add,
     fma,
     ge,
     gt,
     load,
-    quotient,
+    lowest,
+    prefetch,
     select,
+    set_spans,
     splat,
     store,
     store_sums,
+    vceil,
+    vfloor,
+    vmax,
     vmin,
+    vsqrt,
 )
-from clod_adapter._kernels.tiles import extent
 
 BLOCK = 4
 ACROSS = TILE // BLOCK
 BLOCKS = ACROSS * ACROSS
+WORDS = BLOCKS // 64
 FORWARD_STATE, BACKWARD_STATE = BLOCKS * 64, BLOCKS * 80
 BLOCK_X = np.tile(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
 BLOCK_Y = np.repeat(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
 LANE_X = np.tile(np.arange(4, dtype=np.float32) + 0.5, 4)
 LANE_Y = np.repeat(np.arange(4, dtype=np.float32) + 0.5, 4)
+# A lane a row of blocks: centre of its first pixel row. Lanes beyond the tile are far below every image.
+ROW_Y = np.where(np.arange(16) < ACROSS, np.arange(16) * BLOCK + 0.5, 1e9).astype(np.float32)
+LAST = float32(ACROSS - 1)
 
 
 @part
 def start_tile(ox, oy, width, height, state, stride, live):  # type: ignore[no-untyped-def]
-    """Marks blocks with pixels in the image as live, pixels outside as finished; returns the live count."""
-    alive = 0
+    """Marks blocks with pixels in the image as live, pixels outside as finished."""
+    for word in range(WORDS):
+        live[word] = uint64(0)
     for block in range(BLOCKS):
         x, y = ox + (block % ACROSS) * BLOCK, oy + (block // ACROSS) * BLOCK
-        live[block] = x < width and y < height
-        alive += live[block]
+        if x < width and y < height:
+            live[block // 64] |= uint64(1) << uint64(block % 64)
         for lane in range(16):
             inside = x + lane % 4 < width and y + lane // 4 < height
             state[block * stride + lane] = 1.0 if inside else -1.0
-    return alive
 
 
 @part
-def blocks_of(records, r, ox, oy, live, touched):  # type: ignore[no-untyped-def]
-    """Lists the live blocks of the tile that the ellipse of the record at ``r`` touches; returns how many."""
-    y0, y1 = max(np.int32(records[r + Y0]) - oy, 0), min(np.int32(records[r + Y1]) - oy, TILE - 1)
-    x0, x1 = max(np.int32(records[r + X0]) - ox, 0), min(np.int32(records[r + X1]) - ox, TILE - 1)
-    tight = y1 // BLOCK > y0 // BLOCK and x1 // BLOCK > x0 // BLOCK
-    low, high, n = x0, x1, 0
-    for row in range(y0 // BLOCK, y1 // BLOCK + 1):
-        if tight:
-            first, last = extent(records, r, oy + max(row * BLOCK, y0), oy + min(row * BLOCK + BLOCK - 1, y1))
-            low, high = max(x0, first - ox), min(x1, last - ox)
-        if high >= low:
-            for block in range(row * ACROSS + low // BLOCK, row * ACROSS + high // BLOCK + 1):
-                touched[n] = block
-                n += live[block]
-    return n
+def find_blocks(records, r, ox, oy, masks, at):  # type: ignore[no-untyped-def]
+    """Sets in ``masks[at : at + WORDS]`` the tile's blocks that the ellipse of the record at ``r`` touches.
+
+    The ellipse is where alpha reaches 1/255; see ``tiles.extent``, of which this does all rows of blocks at once.
+    """
+    my, rx, b = splat(records[r + MY]), splat(records[r + RX]), splat(records[r + QB])
+    row = load(ROW_Y, 0) + splat(float32(oy))
+    top = vmax(row, splat(records[r + Y0] + HALF)) - my
+    bottom = vmin(row + splat(float32(BLOCK - 1)), splat(records[r + Y1] + HALF)) - my
+    tip_y = -records[r + QB] / (records[r + QC] * float32(2)) * records[r + RX]
+    zero, half, det = splat(float32(0)), splat(HALF / records[r + QA]), splat(records[r + DET])
+    reach = splat(float32(4) * records[r + QA] * records[r + REACH])
+    tip = splat(tip_y)
+    right, left = vmin(vmax(tip, top), bottom), vmin(vmax(zero - tip, top), bottom)
+    wide = vsqrt(vmax(reach - det * right * right, zero))
+    x1 = select(eq(right, tip), rx, (wide - b * right) * half)
+    wide = vsqrt(vmax(reach - det * left * left, zero))
+    x0 = select(eq(left, zero - tip), zero - rx, (zero - wide - b * left) * half)
+    mx = splat(records[r + MX] - HALF)
+    low = vmax(vceil(mx + x0 - splat(SLACK)), splat(records[r + X0])) - splat(float32(ox))
+    high = vmin(vfloor(mx + x1 + splat(SLACK)), splat(records[r + X1])) - splat(float32(ox))
+    quarter = splat(float32(1 / BLOCK))
+    low, high = vmax(vfloor(low * quarter), zero), vmin(vfloor(high * quarter), splat(LAST))
+    high = select(both(ge(bottom, top), ge(high, low)), high, splat(float32(-1)))
+    set_spans(masks, at, low, high, ACROSS)
 
 
 @part
@@ -110,15 +136,17 @@ def offsets_from(records, r, ox, oy):  # type: ignore[no-untyped-def]
 
 @kernel
 def blend(  # type: ignore[no-untyped-def]
-    worker, workers, records, entries, offsets, across, width, height, background, tiles, cursor, room, image, alpha,
+    worker, workers, records, entries, offsets, across, width, height, background, tiles, cursor, room, masks,
+    image, alpha,
 ):  # fmt: skip
     """Forward: writes ``image [H, W, 3]`` and ``alpha [H, W]``. Tiles are taken from ``tiles`` by an atomic cursor.
 
+    ``masks`` receives WORDS words an entry, a bit for each block of the tile that takes part in blending it.
     ``room[worker]`` holds FORWARD_STATE floats of scratch (on the stack, LLVM would take minutes to compile it).
     """
     count, tiles, records, entries = len(tiles), pointer(tiles), pointer(records), pointer(entries)
     offsets, background, image, alpha = pointer(offsets), pointer(background), pointer(image), pointer(alpha)
-    state, live, touched = pointer(room[worker]), scratch(uint8, BLOCKS), scratch(int32, BLOCKS)
+    state, live, masks = pointer(room[worker]), scratch(uint64, WORDS), pointer(masks)
     zero, threshold, most, least = splat(float32(0)), splat(ALPHA_MIN), splat(ALPHA_MAX), splat(T_MIN)
     while True:
         turn = fetch_add(cursor, 1)
@@ -128,36 +156,37 @@ def blend(  # type: ignore[no-untyped-def]
         ox, oy = (tile % across) * TILE, (tile // across) * TILE
         for k in range(FORWARD_STATE):
             state[k] = float32(0)
-        alive = start_tile(ox, oy, width, height, state, 64, live)
+        start_tile(ox, oy, width, height, state, 64, live)
         for entry in range(offsets[tile], offsets[tile + 1]):
-            if alive == 0:
-                break
             r = entries[entry] * RECORD
+            prefetch(records, entries[min(entry + AHEAD, offsets[tile + 1] - 1)] * RECORD)
             qa, qb, qc, log, red, green, blue = spread(records, r)
             base_x, base_y = offsets_from(records, r, ox, oy)
-            for i in range(blocks_of(records, r, ox, oy, live, touched)):
-                block = touched[i]
-                at = block * 64
-                t = load(state, at)
-                dx, dy = base_x + splat(BLOCK_X[block]), base_y + splat(BLOCK_Y[block])
-                a = vmin(exp2(fma(dx, fma(qa, dx, qb * dy), fma(qc * dy, dy, log))), most)
-                mask = both(ge(a, threshold), gt(t, zero))
-                if not anywhere(mask):
-                    continue
-                after = t - t * a
-                keep = both(mask, gt(after, least))
-                done = but_not(mask, keep)
-                weight = select(keep, t * a, zero)
-                store(state, at + 16, fma(weight, red, load(state, at + 16)))
-                store(state, at + 32, fma(weight, green, load(state, at + 32)))
-                store(state, at + 48, fma(weight, blue, load(state, at + 48)))
-                t = select(keep, after, t)
-                if anywhere(done):
-                    t = select(done, zero - t, t)
-                    if not anywhere(gt(t, zero)):
-                        live[block] = 0
-                        alive -= 1
-                store(state, at, t)
+            find_blocks(records, r, ox, oy, masks, entry * WORDS)
+            for word in range(WORDS):
+                bits = masks[entry * WORDS + word] & live[word]
+                masks[entry * WORDS + word] = bits
+                while bits != uint64(0):
+                    block = lowest(bits) + 64 * word
+                    bits &= bits - uint64(1)
+                    at = block * 64
+                    t = load(state, at)
+                    dx, dy = base_x + splat(BLOCK_X[block]), base_y + splat(BLOCK_Y[block])
+                    a = vmin(exp2(fma(dx, fma(qa, dx, qb * dy), fma(qc * dy, dy, log))), most)
+                    mask = both(ge(a, threshold), gt(t, zero))
+                    after = t - t * a
+                    keep = both(mask, gt(after, least))
+                    done = but_not(mask, keep)
+                    weight = select(keep, t * a, zero)
+                    store(state, at + 16, fma(weight, red, load(state, at + 16)))
+                    store(state, at + 32, fma(weight, green, load(state, at + 32)))
+                    store(state, at + 48, fma(weight, blue, load(state, at + 48)))
+                    t = select(keep, after, t)
+                    if anywhere(done):
+                        t = select(done, zero - t, t)
+                        if not anywhere(gt(t, zero)):
+                            live[word] &= ~(uint64(1) << uint64(block % 64))
+                    store(state, at, t)
         write_tile(ox, oy, width, height, state, background, image, alpha)
 
 
@@ -192,7 +221,7 @@ def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):  # 
 @kernel
 def blend_gradient(  # type: ignore[no-untyped-def]
     worker, workers, records, entries, entry_slots, offsets, across, width, height, image, alpha, v_image, v_alpha,
-    tiles, cursor, room, pair_sums,
+    tiles, cursor, room, masks, pair_sums,
 ):  # fmt: skip
     """Backward: per (Gaussian, tile) pair the nine sums over pixels that the projection's gradient needs.
 
@@ -203,7 +232,7 @@ def blend_gradient(  # type: ignore[no-untyped-def]
     count, tiles, records, entries = len(tiles), pointer(tiles), pointer(records), pointer(entries)
     entry_slots, offsets, pair_sums = pointer(entry_slots), pointer(offsets), pointer(pair_sums)
     image, alpha, v_image, v_alpha = pointer(image), pointer(alpha), pointer(v_image), pointer(v_alpha)
-    state, live, touched = pointer(room[worker]), scratch(uint8, BLOCKS), scratch(int32, BLOCKS)
+    state, live, masks = pointer(room[worker]), scratch(uint64, WORDS), pointer(masks)
     zero, one = splat(float32(0)), splat(float32(1))
     threshold, most, least = splat(ALPHA_MIN), splat(ALPHA_MAX), splat(T_MIN)
     while True:
@@ -215,47 +244,39 @@ def blend_gradient(  # type: ignore[no-untyped-def]
         if ox + TILE > width or oy + TILE > height:
             for k in range(BACKWARD_STATE):  # pixels outside weigh nothing, but nothing times NaN is NaN
                 state[k] = float32(0)
-        alive = start_tile(ox, oy, width, height, state, 80, live)
+        start_tile(ox, oy, width, height, state, 80, live)
         read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state)
         for entry in range(offsets[tile], offsets[tile + 1]):
             slot = entry_slots[entry]
-            if alive == 0:
-                for k in range(PAIR):
-                    pair_sums[slot * PAIR + k] = float32(0)
-                continue
             r = entries[entry] * RECORD
+            prefetch(records, entries[min(entry + AHEAD, offsets[tile + 1] - 1)] * RECORD)
             qa, qb, qc, log, red, green, blue = spread(records, r)
             base_x, base_y = offsets_from(records, r, ox, oy)
             s_r = s_g = s_b = s_0 = s_x = s_y = s_xx = s_xy = s_yy = zero
-            for i in range(blocks_of(records, r, ox, oy, live, touched)):
-                block = touched[i]
-                at = block * 80
-                t = load(state, at)
-                dx, dy = base_x + splat(BLOCK_X[block]), base_y + splat(BLOCK_Y[block])
-                raw = exp2(fma(dx, fma(qa, dx, qb * dy), fma(qc * dy, dy, log)))
-                a = vmin(raw, most)
-                mask = both(ge(a, threshold), gt(t, zero))
-                if not anywhere(mask):
-                    continue
-                after = t - t * a
-                keep = both(mask, gt(after, least))
-                done = but_not(mask, keep)
-                weight = select(keep, t * a, zero)
-                v_r, v_g, v_b = load(state, at + 32), load(state, at + 48), load(state, at + 64)
-                q = fma(v_r, red, fma(v_g, green, v_b * blue))
-                s_r, s_g, s_b = fma(weight, v_r, s_r), fma(weight, v_g, s_g), fma(weight, v_b, s_b)
-                rest = load(state, at + 16) - weight * q
-                store(state, at + 16, rest)
-                v_a = t * q - quotient(rest, one - a)
-                s = select(both(keep, ge(most, raw)), v_a * a, zero)
-                sx, sy = s * dx, s * dy
-                s_0, s_x, s_y = s_0 + s, s_x + sx, s_y + sy
-                s_xx, s_xy, s_yy = fma(sx, dx, s_xx), fma(sx, dy, s_xy), fma(sy, dy, s_yy)
-                t = select(keep, after, t)
-                if anywhere(done):
-                    t = select(done, zero - t, t)
-                    if not anywhere(gt(t, zero)):
-                        live[block] = 0
-                        alive -= 1
-                store(state, at, t)
+            for word in range(WORDS):
+                bits = masks[entry * WORDS + word]
+                while bits != uint64(0):
+                    block = lowest(bits) + 64 * word
+                    bits &= bits - uint64(1)
+                    at = block * 80
+                    t = load(state, at)
+                    dx, dy = base_x + splat(BLOCK_X[block]), base_y + splat(BLOCK_Y[block])
+                    raw = exp2(fma(dx, fma(qa, dx, qb * dy), fma(qc * dy, dy, log)))
+                    a = vmin(raw, most)
+                    mask = both(ge(a, threshold), gt(t, zero))
+                    after = t - t * a
+                    keep = both(mask, gt(after, least))
+                    done = but_not(mask, keep)
+                    weight = select(keep, t * a, zero)
+                    v_r, v_g, v_b = load(state, at + 32), load(state, at + 48), load(state, at + 64)
+                    q = fma(v_r, red, fma(v_g, green, v_b * blue))
+                    s_r, s_g, s_b = fma(weight, v_r, s_r), fma(weight, v_g, s_g), fma(weight, v_b, s_b)
+                    rest = load(state, at + 16) - weight * q
+                    store(state, at + 16, rest)
+                    v_a = t * q - rest / (one - a)
+                    s = select(both(keep, ge(most, raw)), v_a * a, zero)
+                    sx, sy = s * dx, s * dy
+                    s_0, s_x, s_y = s_0 + s, s_x + sx, s_y + sy
+                    s_xx, s_xy, s_yy = fma(sx, dx, s_xx), fma(sx, dy, s_xy), fma(sy, dy, s_yy)
+                    store(state, at, select(keep, after, select(done, zero - t, t)))
             store_sums(pair_sums, slot * PAIR, s_r, s_g, s_b, s_0, s_x, s_y, s_xx, s_xy, s_yy)

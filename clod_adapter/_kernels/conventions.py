@@ -9,6 +9,7 @@ from numba import float32
 BLUR, NEAR, ALPHA_MIN, ALPHA_MAX, T_MIN = (float32(v) for v in (0.3, 0.01, 1 / 255, 0.999, 1e-4))
 LOG2E, LOG2_255, TWO_LN2 = float32(1.4426950408889634), float32(7.994353436858858), float32(1.3862943611198906)
 HALF, ZERO, ONE, TWO = float32(0.5), float32(0), float32(1), float32(2)
+HUGE = float32(3e38)  # what is not below it is dropped as not finite
 
 # Columns of a record, the 64 bytes the blending loops read of a visible Gaussian. The exponent of
 # its alpha is in powers of two: log2 alpha = LOG - (QA dx^2 + QB dx dy + QC dy^2).
@@ -20,9 +21,11 @@ RECORD = 16
 FX, FY, CX, CY, WIDTH, HEIGHT, LOW_X, HIGH_X, LOW_Y, HIGH_Y, EYE = range(16, 27)
 CAMERA = 29
 
-# The workspace of one Gaussian: camera point (3), rotation (9), U = J R_view (6), P = U R S (6), covariance (3),
-# its determinant, unit quaternion (4), 1 / |quaternion|, gradient of P (6).
-POINT, ROT, UMAT, PMAT, COV, COVDET, QUAT, QINV, VP, SCRATCH = 0, 3, 12, 18, 24, 27, 28, 32, 33, 39
+# The workspace of sixteen Gaussians, a vector each, a lane a Gaussian. As stored: mean (3), quaternion (4), scales (3).
+# Then camera point (3), rotation (9), U = J R_view (6), P = U R S (6), covariance (3), its determinant, unit
+# quaternion (4), 1 / |quaternion|.
+MEAN, STORED, SCALE, POINT, ROT, UMAT, PMAT, COV, COVDET, QUAT, QINV = 0, 3, 7, 10, 13, 22, 28, 34, 37, 38, 42
+WORKSPACE = 43 + 16  # load_rows fills sixteen vectors, however few columns it reads
 
 # Edge of a tile in pixels: a multiple of the 4 of a block.
 TILE = 64
@@ -30,3 +33,5 @@ TILE = 64
 SLACK = float32(0.01)
 # Sums over pixels that a (Gaussian, tile) pair hands to the projection's gradient.
 PAIR = 9
+# Records are asked for this many entries before they are read.
+AHEAD = 4

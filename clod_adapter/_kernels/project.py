@@ -2,18 +2,17 @@
 
 Conventions of gsplat: pixel centres at +0.5, a blur of 0.3 px^2 added to the covariance, the
 Jacobian's ray clamped to 1.3 times the field of view (0.3 beyond the image on either side), near
-plane 0.01, alpha below 1/255 dropped.
+plane 0.01, alpha below 1/255 dropped. Sixteen Gaussians at a time, a lane each.
 """
 
 from __future__ import annotations
 
-import math
-
-from numba import float32
+from numba import float32, int64, uint64
 
 from clod_adapter._kernels.compiling import kernel, part, pointer, scratch
 from clod_adapter._kernels.conventions import (
     ALPHA_MIN,
+    BLUE,
     BLUR,
     COV,
     COVDET,
@@ -23,15 +22,18 @@ from clod_adapter._kernels.conventions import (
     EYE,
     FX,
     FY,
+    GREEN,
     HALF,
     HEIGHT,
     HIGH_X,
     HIGH_Y,
+    HUGE,
     LOG,
     LOG2_255,
     LOG2E,
     LOW_X,
     LOW_Y,
+    MEAN,
     MX,
     MY,
     NEAR,
@@ -48,12 +50,14 @@ from clod_adapter._kernels.conventions import (
     RED,
     ROT,
     RX,
-    SCRATCH,
+    SCALE,
     SLACK,
+    STORED,
     TWO,
     TWO_LN2,
     UMAT,
     WIDTH,
+    WORKSPACE,
     X0,
     X1,
     Y0,
@@ -61,52 +65,72 @@ from clod_adapter._kernels.conventions import (
     ZERO,
 )
 from clod_adapter._kernels.sh import sh_basis
+from clod_adapter._kernels.simd import (
+    bits_of,
+    both,
+    f32x16,
+    fma,
+    ge,
+    gt,
+    load,
+    load_rows,
+    log2,
+    splat,
+    store,
+    store_rows,
+    vabs,
+    vceil,
+    vfloor,
+    vmax,
+    vmin,
+    vsqrt,
+)
 
 
 @part
-def covariance(means, quats, scales, i, cam, w):  # type: ignore[no-untyped-def]
-    """Fills the workspace ``w``; False if the Gaussian is behind the near plane or has no rotation."""
-    mx, my, mz = means[3 * i], means[3 * i + 1], means[3 * i + 2]
+def covariance(means, quats, scales, rows, cam, w):  # type: ignore[no-untyped-def]
+    """Fills the workspace ``w`` for sixteen rows; returns which are in front of the near plane and have a rotation."""
+    load_rows(means, rows, 3, 0, 3, w, MEAN)
+    load_rows(quats, rows, 4, 0, 4, w, STORED)
+    load_rows(scales, rows, 3, 0, 3, w, SCALE)
     for d in range(3):
-        w[POINT + d] = cam[4 * d] * mx + cam[4 * d + 1] * my + cam[4 * d + 2] * mz + cam[4 * d + 3]
-    z = w[POINT + 2]
-    q0, q1, q2, q3 = quats[4 * i], quats[4 * i + 1], quats[4 * i + 2], quats[4 * i + 3]
-    norm2 = q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3
-    if not (z >= NEAR and norm2 > ZERO):
-        return False
-    inverse = ONE / math.sqrt(norm2)
-    w[QINV] = inverse
-    q0, q1, q2, q3 = q0 * inverse, q1 * inverse, q2 * inverse, q3 * inverse
-    w[QUAT], w[QUAT + 1], w[QUAT + 2], w[QUAT + 3] = q0, q1, q2, q3
-    w[ROT], w[ROT + 1], w[ROT + 2] = (
-        ONE - TWO * (q2 * q2 + q3 * q3),
-        TWO * (q1 * q2 - q0 * q3),
-        TWO * (q1 * q3 + q0 * q2),
-    )
-    w[ROT + 3], w[ROT + 4], w[ROT + 5] = (
-        TWO * (q1 * q2 + q0 * q3),
-        ONE - TWO * (q1 * q1 + q3 * q3),
-        TWO * (q2 * q3 - q0 * q1),
-    )
-    w[ROT + 6], w[ROT + 7], w[ROT + 8] = (
-        TWO * (q1 * q3 - q0 * q2),
-        TWO * (q2 * q3 + q0 * q1),
-        ONE - TWO * (q1 * q1 + q2 * q2),
-    )
-    iz = ONE / z
-    rx = min(max(w[POINT] * iz, cam[LOW_X]), cam[HIGH_X])
-    ry = min(max(w[POINT + 1] * iz, cam[LOW_Y]), cam[HIGH_Y])
-    jx, jy = cam[FX] * iz, cam[FY] * iz
+        row = 4 * d
+        w[POINT + d] = cam[row] * w[MEAN] + cam[row + 1] * w[MEAN + 1] + cam[row + 2] * w[MEAN + 2] + cam[row + 3]
+    norm2 = w[STORED] * w[STORED] + w[STORED + 1] * w[STORED + 1]
+    norm2 = norm2 + w[STORED + 2] * w[STORED + 2] + w[STORED + 3] * w[STORED + 3]
+    valid = both(ge(w[POINT + 2], splat(NEAR)), gt(norm2, splat(ZERO)))
+    w[QINV] = ONE / vsqrt(norm2)
+    for d in range(4):
+        w[QUAT + d] = w[STORED + d] * w[QINV]
+    rotation(w)
+    iz = ONE / w[POINT + 2]
+    rx = vmin(vmax(w[POINT] * iz, splat(cam[LOW_X])), splat(cam[HIGH_X]))
+    ry = vmin(vmax(w[POINT + 1] * iz, splat(cam[LOW_Y])), splat(cam[HIGH_Y]))
     for k in range(3):
-        w[UMAT + k] = jx * (cam[k] - rx * cam[8 + k])
-        w[UMAT + 3 + k] = jy * (cam[4 + k] - ry * cam[8 + k])
+        w[UMAT + k] = cam[FX] * iz * (splat(cam[k]) - rx * cam[8 + k])
+        w[UMAT + 3 + k] = cam[FY] * iz * (splat(cam[4 + k]) - ry * cam[8 + k])
     for row in range(2):
+        u = UMAT + 3 * row
         for k in range(3):
-            u = UMAT + 3 * row
-            w[PMAT + 3 * row + k] = (
-                w[u] * w[ROT + k] + w[u + 1] * w[ROT + 3 + k] + w[u + 2] * w[ROT + 6 + k]
-            ) * scales[3 * i + k]
-    return finish_covariance(w)
+            along = w[u] * w[ROT + k] + w[u + 1] * w[ROT + 3 + k] + w[u + 2] * w[ROT + 6 + k]
+            w[PMAT + 3 * row + k] = along * w[SCALE + k]
+    finish_covariance(w)
+    return both(valid, gt(splat(HUGE), w[COVDET]))
+
+
+@part
+def rotation(w):  # type: ignore[no-untyped-def]
+    """Rotation matrix, row-major, of the unit quaternion."""
+    q0, q1, q2, q3 = w[QUAT], w[QUAT + 1], w[QUAT + 2], w[QUAT + 3]
+    w[ROT] = ONE - TWO * (q2 * q2 + q3 * q3)
+    w[ROT + 1] = TWO * (q1 * q2 - q0 * q3)
+    w[ROT + 2] = TWO * (q1 * q3 + q0 * q2)
+    w[ROT + 3] = TWO * (q1 * q2 + q0 * q3)
+    w[ROT + 4] = ONE - TWO * (q1 * q1 + q3 * q3)
+    w[ROT + 5] = TWO * (q2 * q3 - q0 * q1)
+    w[ROT + 6] = TWO * (q1 * q3 - q0 * q2)
+    w[ROT + 7] = TWO * (q2 * q3 + q0 * q1)
+    w[ROT + 8] = ONE - TWO * (q1 * q1 + q2 * q2)
 
 
 @part
@@ -116,89 +140,120 @@ def finish_covariance(w):  # type: ignore[no-untyped-def]
     xx, yy = p0 * p0 + p1 * p1 + p2 * p2, p3 * p3 + p4 * p4 + p5 * p5
     w[COV], w[COV + 1], w[COV + 2] = xx + BLUR, p0 * p3 + p1 * p4 + p2 * p5, yy + BLUR
     cx, cy, cz = p1 * p5 - p2 * p4, p2 * p3 - p0 * p5, p0 * p4 - p1 * p3
-    det = cx * cx + cy * cy + cz * cz + BLUR * (xx + yy) + BLUR * BLUR
-    w[COVDET] = det
-    return det < float32(3e38)
+    w[COVDET] = cx * cx + cy * cy + cz * cz + BLUR * (xx + yy) + BLUR * BLUR
 
 
 @part
-def view_direction(means, i, cam, d):  # type: ignore[no-untyped-def]
-    """Unit direction from the camera to the Gaussian into ``d``; returns 1 / distance."""
-    x, y, z = means[3 * i] - cam[EYE], means[3 * i + 1] - cam[EYE + 1], means[3 * i + 2] - cam[EYE + 2]
-    inverse = ONE / math.sqrt(x * x + y * y + z * z)
-    d[0], d[1], d[2] = x * inverse, y * inverse, z * inverse
+def view_direction(w, cam, out):  # type: ignore[no-untyped-def]
+    """Unit directions from the camera to the Gaussians into ``out[:3]``; returns 1 / distance."""
+    x, y, z = w[MEAN] - cam[EYE], w[MEAN + 1] - cam[EYE + 1], w[MEAN + 2] - cam[EYE + 2]
+    inverse = ONE / vsqrt(x * x + y * y + z * z)
+    out[0], out[1], out[2] = x * inverse, y * inverse, z * inverse
     return inverse
 
 
 @part
-def color(means, sh0, shN, i, degree, cam, basis, direction, records, r):  # type: ignore[no-untyped-def]
-    """Colour ``max(0, 0.5 + SH)`` into the record at ``r``; False if it is not finite."""
-    view_direction(means, i, cam, direction)
-    sh_basis(degree, direction[0], direction[1], direction[2], basis)
-    bands, size = (degree + 1) * (degree + 1) - 1, ZERO
-    for channel in range(3):
-        value = HALF + basis[0] * sh0[3 * i + channel]
-        for k in range(bands):
-            value += basis[k + 1] * shN[3 * (i * bands + k) + channel]
-        records[r + RED + channel] = max(value, ZERO)
-        size += abs(value)
-    return size < float32(3e38)
+def make_records(w, opacity, cam, record):  # type: ignore[no-untyped-def]
+    """The sixteen columns of the records from the workspace, without the colour; which of them reach a pixel centre."""
+    iz = ONE / w[POINT + 2]
+    mx, my = cam[FX] * w[POINT] * iz + cam[CX], cam[FY] * w[POINT + 1] * iz + cam[CY]
+    idet = ONE / w[COVDET]
+    record[MX], record[MY] = mx, my
+    record[QA], record[QC] = HALF * LOG2E * w[COV + 2] * idet, HALF * LOG2E * w[COV] * idet
+    record[QB], record[DET] = -(LOG2E * w[COV + 1] * idet), LOG2E * LOG2E * idet
+    record[LOG] = log2(opacity)
+    record[RED] = record[GREEN] = record[BLUE] = splat(ZERO)
+    reach = vmax(record[LOG] + LOG2_255, splat(ZERO))
+    rx, ry = vsqrt(TWO_LN2 * reach * w[COV]), vsqrt(TWO_LN2 * reach * w[COV + 2])
+    record[REACH], record[RX] = reach, rx
+    record[X0] = vmax(vceil(mx - rx - HALF - SLACK), splat(ZERO))
+    record[X1] = vmin(vfloor(mx + rx - HALF + SLACK), splat(cam[WIDTH] - ONE))
+    record[Y0] = vmax(vceil(my - ry - HALF - SLACK), splat(ZERO))
+    record[Y1] = vmin(vfloor(my + ry - HALF + SLACK), splat(cam[HEIGHT] - ONE))
+    return both(ge(record[X1], record[X0]), ge(record[Y1], record[Y0]))
 
 
 @part
-def record(records, r, w, opacity, cam):  # type: ignore[no-untyped-def]
-    """Fills the record at ``r`` from the workspace; False if no pixel centre is reached."""
-    iz = ONE / w[POINT + 2]
-    records[r + MX], records[r + MY] = cam[FX] * w[POINT] * iz + cam[CX], cam[FY] * w[POINT + 1] * iz + cam[CY]
-    idet = ONE / w[COVDET]
-    records[r + QA], records[r + QB], records[r + QC] = (
-        HALF * LOG2E * w[COV + 2] * idet,
-        -LOG2E * w[COV + 1] * idet,
-        HALF * LOG2E * w[COV] * idet,
-    )
-    records[r + DET] = LOG2E * LOG2E * idet
-    records[r + LOG] = math.log2(opacity)
-    records[r + REACH] = max(records[r + LOG] + LOG2_255, ZERO)
-    records[r + RX] = math.sqrt(TWO_LN2 * records[r + REACH] * w[COV])
-    ry = math.sqrt(TWO_LN2 * records[r + REACH] * w[COV + 2])
-    records[r + X0] = max(ZERO, math.ceil(records[r + MX] - records[r + RX] - HALF - SLACK))
-    records[r + X1] = min(cam[WIDTH] - ONE, math.floor(records[r + MX] + records[r + RX] - HALF + SLACK))
-    records[r + Y0] = max(ZERO, math.ceil(records[r + MY] - ry - HALF - SLACK))
-    records[r + Y1] = min(cam[HEIGHT] - ONE, math.floor(records[r + MY] + ry - HALF + SLACK))
-    return records[r + X0] <= records[r + X1] and records[r + Y0] <= records[r + Y1]
+def load_sh(shN, rows, bands, w):  # type: ignore[no-untyped-def]
+    """The higher bands' coefficients of sixteen rows, three a band, into ``w``."""
+    for first in range(0, 3 * bands, 16):
+        load_rows(shN, rows, 3 * bands, first, min(3 * bands - first, 16), w, first)
 
 
 @kernel
 def project(worker, workers, means, quats, scales, opacities, sh0, shN, degree, cam, records, depths, ids, counts):  # type: ignore[no-untyped-def]
-    """Writes records, depths and row numbers of this worker's visible Gaussians, packed from its first row."""
-    w, basis, direction = scratch(float32, SCRATCH), scratch(float32, 25), scratch(float32, 3)
-    rows = len(opacities)
+    """Writes records, depths and row numbers of this worker's visible Gaussians, packed from its first row.
+
+    Behind its N records, ``records`` has a spare one for each worker.
+    """
+    spare = len(opacities) + worker
+    first, last = len(opacities) * worker // workers, len(opacities) * (worker + 1) // workers
     means, quats, scales, opacities = pointer(means), pointer(quats), pointer(scales), pointer(opacities)
     sh0, shN, cam, records = pointer(sh0), pointer(shN), pointer(cam), pointer(records)
     depths, ids = pointer(depths), pointer(ids)
-    first = rows * worker // workers
-    n = first
-    for i in range(first, rows * (worker + 1) // workers):
-        if not opacities[i] >= ALPHA_MIN:
-            continue
-        if not covariance(means, quats, scales, i, cam, w):
-            continue
-        if not record(records, n * RECORD, w, opacities[i], cam):
-            continue
-        if not color(means, sh0, shN, i, degree, cam, basis, direction, records, n * RECORD):
-            continue
-        depths[n] = w[POINT + 2]
-        ids[n] = i
-        n += 1
-    counts[worker] = n - first
+    found = find_visible(first, last, spare, means, quats, scales, opacities, cam, records, depths, ids)
+    counts[worker] = color(first, found, means, sh0, shN, degree, cam, records, depths, ids)
 
 
-@kernel
-def gather(worker, workers, order, packed, records, ranks):  # type: ignore[no-untyped-def]
-    """Brings the records into depth order; ``ranks`` tells where each packed one went."""
-    visible = len(order)
-    order, packed, records, ranks = pointer(order), pointer(packed), pointer(records), pointer(ranks)
-    for j in range(visible * worker // workers, visible * (worker + 1) // workers):
-        for k in range(RECORD):
-            records[j * RECORD + k] = packed[order[j] * RECORD + k]
-        ranks[order[j]] = j
+@part
+def find_visible(first, last, spare, means, quats, scales, opacities, cam, records, depths, ids):  # type: ignore[no-untyped-def]
+    """Packs the Gaussians that reach a pixel centre, from ``first`` on; returns how many there are."""
+    w, record, opacity = scratch(f32x16, WORKSPACE), scratch(f32x16, RECORD), scratch(float32, 16)
+    rows, targets = scratch(int64, 16), scratch(int64, 16)
+    i = packed = first
+    while i < last:
+        filled = 0
+        while i < last and filled < 16:
+            rows[filled], opacity[filled] = i, opacities[i]
+            filled += opacities[i] >= ALPHA_MIN and opacities[i] < HUGE  # else the next one takes its place
+            i += 1
+        for lane in range(filled, 16):
+            rows[lane], opacity[lane] = rows[0], ONE
+        valid = covariance(means, quats, scales, rows, cam, w)
+        bits = bits_of(both(valid, make_records(w, load(opacity, 0), cam, record)))
+        bits &= (uint64(1) << uint64(filled)) - uint64(1)
+        if bits == uint64(0):
+            continue
+        store(opacity, 0, w[POINT + 2])
+        for lane in range(16):
+            targets[lane] = spare
+            if (bits >> uint64(lane)) & uint64(1):
+                depths[packed], ids[packed], targets[lane] = opacity[lane], rows[lane], packed
+                packed += 1
+        store_rows(records, targets, RECORD, 0, RECORD, record, 0)
+    return packed - first
+
+
+@part
+def color(first, found, means, sh0, shN, degree, cam, records, depths, ids):  # type: ignore[no-untyped-def]
+    """Writes the colours ``max(0, 0.5 + SH)`` of the packed records; returns how many are left: only finite ones."""
+    w, sh, basis = scratch(f32x16, 16), scratch(f32x16, 80), scratch(f32x16, 25)
+    rows, targets = scratch(int64, 16), scratch(int64, 16)
+    bands = (degree + 1) * (degree + 1) - 1
+    packed = first
+    for start in range(first, first + found, 16):
+        for lane in range(16):
+            targets[lane] = min(start + lane, first + found - 1)
+            rows[lane] = ids[targets[lane]]
+        load_rows(means, rows, 3, 0, 3, w, MEAN)
+        view_direction(w, cam, sh)
+        sh_basis(degree, sh[0], sh[1], sh[2], basis)
+        load_rows(sh0, rows, 3, 0, 3, w, 0)
+        load_sh(shN, rows, bands, sh)
+        red, green, blue = HALF + basis[0] * w[0], HALF + basis[0] * w[1], HALF + basis[0] * w[2]
+        for k in range(bands):
+            red, green = fma(basis[k + 1], sh[3 * k], red), fma(basis[k + 1], sh[3 * k + 1], green)
+            blue = fma(basis[k + 1], sh[3 * k + 2], blue)
+        finite = gt(splat(HUGE), vabs(red) + vabs(green) + vabs(blue))
+        w[0], w[1], w[2] = vmax(red, splat(ZERO)), vmax(green, splat(ZERO)), vmax(blue, splat(ZERO))
+        store_rows(records, targets, RECORD, RED, 3, w, 0)
+        bits = bits_of(finite)
+        for lane in range(16):
+            at = start + lane
+            if at < first + found and (bits >> uint64(lane)) & uint64(1):
+                if packed < at:
+                    depths[packed], ids[packed] = depths[at], ids[at]
+                    for k in range(RECORD):
+                        records[packed * RECORD + k] = records[at * RECORD + k]
+                packed += 1
+    return packed - first

@@ -5,6 +5,7 @@ from __future__ import annotations
 from numba import float32
 
 from clod_adapter._kernels.compiling import part
+from clod_adapter._kernels.simd import splat
 
 C0 = float32(0.28209479177387814)
 C1 = float32(0.4886025119029199)
@@ -22,7 +23,7 @@ ONE = float32(1)
 @part
 def sh_basis(degree, x, y, z, out):  # type: ignore[no-untyped-def]
     """Values of the (degree + 1)^2 basis functions in the unit direction (x, y, z)."""
-    out[0] = C0
+    out[0] = splat(C0)
     if degree < 1:
         return
     out[1], out[2], out[3] = -C1 * y, C1 * z, -C1 * x
@@ -49,7 +50,7 @@ def sh_basis(degree, x, y, z, out):  # type: ignore[no-untyped-def]
 @part
 def sh_basis_gradient(degree, x, y, z, v):  # type: ignore[no-untyped-def]
     """Gradient of ``sum_k v[k] * basis_k`` to (x, y, z), taken as free variables."""
-    gx = gy = gz = float32(0)
+    gx = gy = gz = splat(float32(0))
     if degree >= 1:
         gx, gy, gz = -C1 * v[3], -C1 * v[1], C1 * v[2]
     if degree >= 2:

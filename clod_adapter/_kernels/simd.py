@@ -5,20 +5,22 @@ they mean: ``F32x16`` is LLVM's ``<16 x float>`` and ``Mask16`` its ``<16 x i1>`
 to one AVX-512, two AVX or four SSE/NEON registers, whichever the processor has.
 
 Vectors are made by ``splat`` and ``load`` and combined by ``+ - *``, ``fma``, ``vmin``, comparisons
-``ge``, ``gt``, and ``select``. Loads and stores take a 1-D contiguous
+``ge``, ``gt``, ``eq``, and ``select``. Loads and stores take a 1-D contiguous
 float32 array, or a pointer to one, and the index of the first lane; nothing checks the bounds.
 """
 
 from __future__ import annotations
 
+import math
 import operator
 
 from llvmlite import ir
-from numba import types
+from numba import float32, types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
 LANES = 16
+ZERO = float32(0)
 _vector = ir.VectorType(ir.FloatType(), LANES)
 _ivector = ir.VectorType(ir.IntType(32), LANES)
 _mask = ir.VectorType(ir.IntType(1), LANES)
@@ -115,28 +117,34 @@ def _binary(name: str):  # type: ignore[no-untyped-def]
     return operation
 
 
-_add, _sub, _mul = _binary("fadd"), _binary("fsub"), _binary("fmul")
+_add, _sub, _mul, _div = (_binary(name) for name in ("fadd", "fsub", "fmul", "fdiv"))
 
 
-@overload(operator.add, inline="always")
-def _overload_add(a, b):  # type: ignore[no-untyped-def]
-    if a is f32x16 and b is f32x16:
-        return lambda a, b: _add(a, b)
-    return None
+def _overload(operators, operation):  # type: ignore[no-untyped-def]
+    """Defines operators of two vectors, or of a vector and a float32."""
+
+    def of(a, b):  # type: ignore[no-untyped-def]
+        if a is f32x16 and b is f32x16:
+            return lambda a, b: operation(a, b)
+        if a is f32x16 and b is types.float32:
+            return lambda a, b: operation(a, splat(b))
+        if a is types.float32 and b is f32x16:
+            return lambda a, b: operation(splat(a), b)
+        return None
+
+    for each in operators:
+        overload(each, inline="always")(of)
 
 
-@overload(operator.sub, inline="always")
-def _overload_sub(a, b):  # type: ignore[no-untyped-def]
-    if a is f32x16 and b is f32x16:
-        return lambda a, b: _sub(a, b)
-    return None
+_overload((operator.add, operator.iadd), _add)
+_overload((operator.sub, operator.isub), _sub)
+_overload((operator.mul, operator.imul), _mul)
+_overload((operator.truediv, operator.itruediv), _div)
 
 
-@overload(operator.mul, inline="always")
-def _overload_mul(a, b):  # type: ignore[no-untyped-def]
-    if a is f32x16 and b is f32x16:
-        return lambda a, b: _mul(a, b)
-    return None
+@overload(operator.neg, inline="always")
+def _overload_neg(a):  # type: ignore[no-untyped-def]
+    return (lambda a: _sub(splat(ZERO), a)) if a is f32x16 else None
 
 
 def _compare(predicate: str):  # type: ignore[no-untyped-def]
@@ -150,7 +158,7 @@ def _compare(predicate: str):  # type: ignore[no-untyped-def]
     return operation
 
 
-ge, gt = _compare(">="), _compare(">")
+ge, gt, eq = _compare(">="), _compare(">"), _compare("==")
 
 
 def _ternary(intrinsic_name: str):  # type: ignore[no-untyped-def]
@@ -179,7 +187,22 @@ def _extremum(predicate: str):  # type: ignore[no-untyped-def]
     return operation
 
 
-vmin = _extremum("<")
+# Where one is NaN, the second is the result.
+vmin, vmax = _extremum("<"), _extremum(">")
+
+
+def _unary(intrinsic_name: str):  # type: ignore[no-untyped-def]
+    @intrinsic
+    def operation(typingctx, a):  # type: ignore[no-untyped-def]
+        def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+            return _call(builder, intrinsic_name, _vector, args)
+
+        return f32x16(f32x16), codegen
+
+    return operation
+
+
+vsqrt, vfloor, vceil, vabs = (_unary(f"llvm.{name}.v16f32") for name in ("sqrt", "floor", "ceil", "fabs"))
 
 
 @intrinsic
@@ -274,14 +297,154 @@ def exp2(typingctx, x):  # type: ignore[no-untyped-def]
     return f32x16(f32x16), codegen
 
 
+_TINY = 0x3F3504F3  # bits of sqrt(1/2)
+
+
 @intrinsic
-def quotient(typingctx, a, b):  # type: ignore[no-untyped-def]
-    """``a / b``."""
+def log2(typingctx, x):  # type: ignore[no-untyped-def]
+    """``log2(x)`` of positive normal numbers, to 1e-7 beside its own rounding; 0 at 1."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.fdiv(*args)
+        def whole(value):  # type: ignore[no-untyped-def]
+            return ir.Constant(_ivector, [value] * LANES)
 
-    return f32x16(f32x16, f32x16), codegen
+        bits = builder.bitcast(args[0], _ivector)
+        exponent = builder.ashr(builder.sub(bits, whole(_TINY)), whole(23))
+        m = builder.bitcast(builder.sub(bits, builder.shl(exponent, whole(23))), _vector)  # in [sqrt(1/2), sqrt(2))
+        s = builder.fdiv(builder.fsub(m, _constant(1.0)), builder.fadd(m, _constant(1.0)))
+        square, p = builder.fmul(s, s), _constant(2 / math.log(2) / 9)
+        for k in (7, 5, 3, 1):
+            p = _call(builder, "llvm.fmuladd.v16f32", _vector, [p, square, _constant(2 / math.log(2) / k)])
+        return _call(builder, "llvm.fmuladd.v16f32", _vector, [p, s, builder.sitofp(exponent, _vector)])
+
+    return f32x16(f32x16), codegen
+
+
+def _transposed(builder, rows):  # type: ignore[no-untyped-def]
+    """Sixteen vectors whose i-th lane of the j-th is the j-th lane of the i-th given."""
+    half = LANES // 2
+    low = ir.Constant(_ivector, [lane for k in range(half) for lane in (k, LANES + k)])
+    high = ir.Constant(_ivector, [lane for k in range(half, LANES) for lane in (k, LANES + k)])
+    for _ in range(4):
+        pairs = [(rows[i], rows[i + half]) for i in range(half)]
+        rows = [builder.shuffle_vector(*pair, order) for pair in pairs for order in (low, high)]
+    return rows
+
+
+def _row_access(builder, source, rows, width, first, count):  # type: ignore[no-untyped-def]
+    """Addresses of sixteen rows' ``[first : first + count]`` and the mask of so many lanes."""
+    i64, i32 = ir.IntType(64), ir.IntType(32)
+    addresses = []
+    for lane in range(LANES):
+        row = builder.load(builder.gep(rows, [ir.Constant(i32, lane)]))
+        index = builder.add(builder.mul(row, width), first)
+        addresses.append(builder.bitcast(builder.gep(source, [index]), _vector.as_pointer()))
+    numbers = ir.Constant(ir.VectorType(i64, LANES), list(range(LANES)))
+    one = builder.insert_element(ir.Constant(numbers.type, ir.Undefined), count, ir.Constant(i32, 0))
+    many = builder.shuffle_vector(one, one, ir.Constant(_ivector, [0] * LANES))
+    return addresses, builder.icmp_signed("<", numbers, many)
+
+
+@intrinsic
+def load_rows(typingctx, source, rows, width, first, count, lanes, at):  # type: ignore[no-untyped-def]
+    """``lanes[at + k]`` = column ``first + k`` of sixteen rows of ``source [*, width]``, for k < count <= 16.
+
+    ``rows`` points to their sixteen numbers (int64), ``lanes`` to vectors; those up to at + 15 are overwritten.
+    """
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        source, rows, width, first, count, lanes, at = args
+        addresses, mask = _row_access(builder, source, rows, width, first, count)
+        empty = ir.Constant(_vector, [0.0] * LANES)
+        arguments = [ir.Constant(ir.IntType(32), 4), mask, empty]
+        found = [_call(builder, "llvm.masked.load.v16f32.p0v16f32", _vector, [a, *arguments]) for a in addresses]
+        for k, vector in enumerate(_transposed(builder, found)):
+            builder.store(vector, builder.gep(lanes, [builder.add(at, ir.Constant(ir.IntType(64), k))]), align=4)
+        return context.get_dummy_value()
+
+    i64 = types.int64
+    return types.none(source, types.CPointer(i64), i64, i64, i64, types.CPointer(f32x16), i64), codegen
+
+
+@intrinsic
+def store_rows(typingctx, destination, rows, width, first, count, lanes, at):  # type: ignore[no-untyped-def]
+    """The reverse of ``load_rows``; of rows that are named twice the last counts."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        destination, rows, width, first, count, lanes, at = args
+        addresses, mask = _row_access(builder, destination, rows, width, first, count)
+        found = [
+            builder.load(builder.gep(lanes, [builder.add(at, ir.Constant(ir.IntType(64), k))]), align=4)
+            for k in range(LANES)
+        ]
+        for address, row in zip(addresses, _transposed(builder, found), strict=True):
+            arguments = [row, address, ir.Constant(ir.IntType(32), 4), mask]
+            _call(builder, "llvm.masked.store.v16f32.p0v16f32", ir.VoidType(), arguments)
+        return context.get_dummy_value()
+
+    i64 = types.int64
+    return types.none(destination, types.CPointer(i64), i64, i64, i64, types.CPointer(f32x16), i64), codegen
+
+
+@intrinsic
+def bits_of(typingctx, mask):  # type: ignore[no-untyped-def]
+    """The mask as the low sixteen bits of a uint64."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), ir.IntType(64))
+
+    return types.uint64(mask16), codegen
+
+
+@intrinsic(prefer_literal=True)
+def set_spans(typingctx, words, index, low, high, quarter):  # type: ignore[no-untyped-def]
+    """In the r-th of ``quarter`` groups of ``quarter`` bits from ``words[index]`` on, sets bits low[r] to high[r].
+
+    Both are rounded towards zero; where high < low no bit is set. ``quarter`` is 8 or 16, words are uint64.
+    """
+    rows = quarter.literal_value
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        low, high = (builder.fptosi(x, _ivector) for x in args[2:4])
+        ones = ir.Constant(_ivector, [1] * LANES)
+        bits = builder.sub(builder.shl(ir.Constant(_ivector, [2] * LANES), high), builder.shl(ones, low))
+        bits = builder.select(builder.icmp_signed(">=", high, low), bits, ir.Constant(_ivector, [0] * LANES))
+        narrow = builder.trunc(bits, ir.VectorType(ir.IntType(rows), LANES))
+        first = ir.Constant(ir.VectorType(ir.IntType(32), rows), list(range(rows)))
+        narrow = builder.shuffle_vector(narrow, narrow, first)
+        data = builder.gep(args[0], [args[1]])
+        builder.store(narrow, builder.bitcast(data, narrow.type.as_pointer()), align=8)
+        return context.get_dummy_value()
+
+    return types.none(words, types.intp, f32x16, f32x16, quarter), codegen
+
+
+@intrinsic
+def lowest(typingctx, bits):  # type: ignore[no-untyped-def]
+    """Index of the lowest bit that is set in a uint64 other than 0."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        i64 = ir.IntType(64)
+        kind = ir.FunctionType(i64, [i64, ir.IntType(1)])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.cttz.i64")
+        return builder.call(function, [args[0], ir.Constant(ir.IntType(1), 1)])
+
+    return types.int64(types.uint64), codegen
+
+
+@intrinsic
+def prefetch(typingctx, array, index):  # type: ignore[no-untyped-def]
+    """Asks for the cache line of ``array[index]``, which will be read soon."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        data = builder.gep(_data(context, builder, signature.args[0], args[0]), [args[1]])
+        byte, i32 = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, i32, i32, i32])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        builder.call(function, [builder.bitcast(data, byte), *(ir.Constant(i32, v) for v in (0, 3, 1))])
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp), codegen
 
 
 @intrinsic

@@ -10,7 +10,7 @@ import numpy as np
 from numba import float32
 
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.simd import fma, load, quotient, splat, store
+from clod_adapter._kernels.simd import fma, load, splat, store
 
 RADIUS, PAD = 5, 16
 _taps = np.exp(-((np.arange(11) - RADIUS) ** 2) / (2 * 1.5**2))
@@ -78,7 +78,7 @@ def ssim_map(worker, workers, x, y, width, similarity, g_mean, g_square, g_produ
             sxy = blur_row(lines, 4 * step, at) - mx * my
             a, b = fma(two * mx, my, c1), fma(two, sxy, c2)
             c, d = fma(mx, mx, fma(my, my, c1)), sxx + syy + c2
-            inverse = quotient(splat(float32(1)), c * d)
+            inverse = float32(1) / (c * d)
             value = a * b * inverse
             where = task * step + at
             store(similarity, where, value)

@@ -9,6 +9,7 @@ from numba import float32
 
 from clod_adapter._kernels.compiling import kernel, part, pointer
 from clod_adapter._kernels.conventions import (
+    AHEAD,
     DET,
     HALF,
     MX,
@@ -26,6 +27,7 @@ from clod_adapter._kernels.conventions import (
     Y0,
     Y1,
 )
+from clod_adapter._kernels.simd import prefetch
 
 
 @part
@@ -71,26 +73,37 @@ def radix_sort(keys, order, keys_other, order_other, n):  # type: ignore[no-unty
     return order
 
 
+@part
+def tiles_across(records, r, ty, y0, y1):  # type: ignore[no-untyped-def]
+    """First and last column of tiles that the record at ``r`` touches in the tile row ``ty``; none: last < first."""
+    x0, x1 = np.int32(records[r + X0]), np.int32(records[r + X1])
+    if y0 // TILE == y1 // TILE and x0 // TILE == x1 // TILE:
+        return x0 // TILE, x1 // TILE
+    x0, x1 = extent(records, r, max(ty * TILE, y0), min(ty * TILE + TILE - 1, y1))
+    return (x0 // TILE, x1 // TILE) if x1 >= x0 else (np.int32(0), np.int32(-1))
+
+
 @kernel
-def count_tiles(worker, workers, records, visible, across, histogram, slots):  # type: ignore[no-untyped-def]
-    """Counts tiles per Gaussian (``slots[j + 1]``) and Gaussians per tile (row ``worker`` of the histogram)."""
+def count_tiles(worker, workers, records, order, across, histogram, totals):  # type: ignore[no-untyped-def]
+    """Counts this worker's Gaussians per tile (its row of the histogram) and pairs of Gaussian and tile (its total)."""
     histogram[worker, :] = 0
-    tally, records, slots = pointer(histogram[worker]), pointer(records), pointer(slots)
-    for j in range(visible * worker // workers, visible * (worker + 1) // workers):
-        r = j * RECORD
+    first, last = len(order) * worker // workers, len(order) * (worker + 1) // workers
+    tally, records, order = pointer(histogram[worker]), pointer(records), pointer(order)
+    total = 0
+    for j in range(first, last):
+        prefetch(records, order[min(j + AHEAD, last - 1)] * RECORD)
+        r = order[j] * RECORD
         y0, y1 = np.int32(records[r + Y0]), np.int32(records[r + Y1])
-        touched = 0
         for ty in range(y0 // TILE, y1 // TILE + 1):
-            x0, x1 = extent(records, r, max(ty * TILE, y0), min(ty * TILE + TILE - 1, y1))
-            if x1 >= x0:
-                for tx in range(x0 // TILE, x1 // TILE + 1):
-                    tally[ty * across + tx] += 1
-                    touched += 1
-        slots[j + 1] = touched
+            low, high = tiles_across(records, r, ty, y0, y1)
+            for tx in range(low, high + 1):
+                tally[ty * across + tx] += 1
+            total += high + 1 - low
+    totals[worker] = total
 
 
 @kernel
-def tile_offsets(histogram, offsets, slots, visible):  # type: ignore[no-untyped-def]
+def tile_offsets(histogram, offsets, totals):  # type: ignore[no-untyped-def]
     """Turns the counts into offsets; returns the number of entries."""
     total = 0
     for tile in range(histogram.shape[1]):
@@ -98,27 +111,34 @@ def tile_offsets(histogram, offsets, slots, visible):  # type: ignore[no-untyped
         for worker in range(histogram.shape[0]):
             total, histogram[worker, tile] = total + histogram[worker, tile], total
     offsets[histogram.shape[1]] = total
-    slots[0] = 0
-    for j in range(visible):
-        slots[j + 1] += slots[j]
+    slot = 0
+    for worker in range(len(totals)):
+        slot, totals[worker] = slot + totals[worker], slot
     return total
 
 
 @kernel
-def fill_tiles(worker, workers, records, visible, across, histogram, slots, entries, entry_slots):  # type: ignore[no-untyped-def]
-    """Writes each tile's Gaussians in depth order, with the slot that receives the pair's gradient."""
-    cursor, records, slots = pointer(histogram[worker]), pointer(records), pointer(slots)
+def fill_tiles(worker, workers, records, order, across, histogram, totals, slots, entries, entry_slots):  # type: ignore[no-untyped-def]
+    """Writes each tile's Gaussians in depth order, with the slot that receives the pair's gradient.
+
+    ``slots[2 p]`` to ``slots[2 p + 1]`` are the slots of the record p.
+    """
+    first, last = len(order) * worker // workers, len(order) * (worker + 1) // workers
+    cursor, records, order, slots = pointer(histogram[worker]), pointer(records), pointer(order), pointer(slots)
     entries, entry_slots = pointer(entries), pointer(entry_slots)
-    for j in range(visible * worker // workers, visible * (worker + 1) // workers):
-        r = j * RECORD
+    slot = totals[worker]
+    for j in range(first, last):
+        prefetch(records, order[min(j + AHEAD, last - 1)] * RECORD)
+        p = order[j]
+        r = p * RECORD
         y0, y1 = np.int32(records[r + Y0]), np.int32(records[r + Y1])
-        slot = slots[j]
+        slots[2 * p] = slot
         for ty in range(y0 // TILE, y1 // TILE + 1):
-            x0, x1 = extent(records, r, max(ty * TILE, y0), min(ty * TILE + TILE - 1, y1))
-            if x1 >= x0:
-                for tx in range(x0 // TILE, x1 // TILE + 1):
-                    at = cursor[ty * across + tx]
-                    cursor[ty * across + tx] = at + 1
-                    entries[at] = j
-                    entry_slots[at] = slot
-                    slot += 1
+            low, high = tiles_across(records, r, ty, y0, y1)
+            for tx in range(low, high + 1):
+                at = cursor[ty * across + tx]
+                cursor[ty * across + tx] = at + 1
+                entries[at] = p
+                entry_slots[at] = slot
+                slot += 1
+        slots[2 * p + 1] = slot

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from clod_adapter._kernels import blend, conventions, project, project_gradient, threads, tiles
+from clod_adapter._kernels.memory import aligned, recycled
 from clod_adapter.cameras import Camera
 
 
@@ -25,7 +26,7 @@ class _Buffers:
         size = int(np.prod(shape))
         flat = self._arrays.get(name)
         if flat is None or flat.size < size:
-            flat = self._arrays[name] = np.empty(size + size // 4, dtype)
+            flat = self._arrays[name] = aligned(size + size // 4, dtype)
         return flat[:size].reshape(shape)
 
 
@@ -57,10 +58,10 @@ class _Frame:
     records: np.ndarray
     packed_ids: np.ndarray
     counts: np.ndarray
-    ranks: np.ndarray
     slots: np.ndarray
     entries: np.ndarray
     entry_slots: np.ndarray
+    masks: np.ndarray
     offsets: np.ndarray
     tiles: np.ndarray
     workers: int
@@ -85,12 +86,12 @@ def camera_vector(camera: Camera) -> np.ndarray:
 
 
 def _project(buffers: _Buffers, arrays: list[np.ndarray], degree: int, cam: np.ndarray, workers: int) -> Any:
-    """Visible records in depth order; and of the packed, unsorted ones: row numbers, counts, ranks in depth order."""
+    """Packed records of what is visible, their row numbers, how many each worker found, and their depth order."""
     n = len(arrays[0])
-    packed = buffers.get("packed", (n * conventions.RECORD,), np.float32)
+    records = buffers.get("records", ((n + workers) * conventions.RECORD,), np.float32)
     depths, packed_ids = buffers.get("depths", (n,), np.float32), buffers.get("packed_ids", (n,), np.int32)
     counts = np.zeros(workers, np.int64)
-    threads.run(project.project, workers, *arrays, degree, cam, packed, depths, packed_ids, counts)
+    threads.run(project.project, workers, *arrays, degree, cam, records, depths, packed_ids, counts)
     visible = int(counts.sum())
     keys, order = buffers.get("keys", (visible,), np.uint32), buffers.get("order", (visible,), np.int32)
     other = buffers.get("keys2", (visible,), np.uint32), buffers.get("order2", (visible,), np.int32)
@@ -100,32 +101,25 @@ def _project(buffers: _Buffers, arrays: list[np.ndarray], degree: int, cam: np.n
         keys[at : at + count] = depths[first : first + count].view(np.uint32)
         order[at : at + count] = np.arange(first, first + count, dtype=np.int32)
         at += count
-    order = tiles.radix_sort(keys, order, *other, visible)
-    records, ranks = (
-        buffers.get("records", (visible * conventions.RECORD,), np.float32),
-        buffers.get("ranks", (n,), np.int32),
-    )
-    threads.run(project.gather, workers, order, packed, records, ranks)
-    return records, packed_ids, counts, ranks
+    return records, packed_ids, counts, tiles.radix_sort(keys, order, *other, visible)
 
 
 def _prepare(arrays: list[np.ndarray], degree: int, camera: Camera, workers: int) -> _Frame:
     """Projection, depth order and tile lists."""
     buffers, cam = _take(), camera_vector(camera)
-    records, packed_ids, counts, ranks = _project(buffers, arrays, degree, cam, workers)
-    visible = int(counts.sum())
+    records, packed_ids, counts, order = _project(buffers, arrays, degree, cam, workers)
     across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
-    histogram = np.empty((workers, across * down), np.int64)
-    offsets, slots = np.empty(across * down + 1, np.int64), buffers.get("slots", (visible + 1,), np.int64)
-    threads.run(tiles.count_tiles, workers, records, visible, across, histogram, slots)
-    total = tiles.tile_offsets(histogram, offsets, slots, visible)
+    histogram, totals = np.empty((workers, across * down), np.int64), np.empty(workers, np.int64)
+    offsets, slots = np.empty(across * down + 1, np.int64), buffers.get("slots", (2 * len(arrays[0]),), np.int64)
+    threads.run(tiles.count_tiles, workers, records, order, across, histogram, totals)
+    total = tiles.tile_offsets(histogram, offsets, totals)
     entries, entry_slots = buffers.get("entries", (total,), np.int32), buffers.get("entry_slots", (total,), np.int32)
-    threads.run(tiles.fill_tiles, workers, records, visible, across, histogram, slots, entries, entry_slots)
+    threads.run(tiles.fill_tiles, workers, records, order, across, histogram, totals, slots, entries, entry_slots)
     # The longest lists first, so that no thread starts a long tile when the others are done.
     longest_first = np.argsort(-np.diff(offsets), kind="stable")
     return _Frame(
-        buffers, cam, camera.width, camera.height, across, records, packed_ids, counts, ranks, slots, entries,
-        entry_slots, offsets, longest_first, workers,
+        buffers, cam, camera.width, camera.height, across, records, packed_ids, counts, slots, entries,
+        entry_slots, buffers.get("masks", (total * blend.WORDS,), np.uint64), offsets, longest_first, workers,
     )  # fmt: skip
 
 
@@ -139,11 +133,11 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means, quats, scales, opacities, sh0, shN, background, camera, degree):  # type: ignore[no-untyped-def]
         frame = _prepare(_arrays((means, quats, scales, opacities, sh0, shN)), degree, camera, threads.worker_count())
-        image, alpha = torch.empty(frame.height, frame.width, 3), torch.empty(frame.height, frame.width)
+        image, alpha = recycled((frame.height, frame.width, 3)), recycled((frame.height, frame.width))
         threads.run(
             blend.blend, frame.workers, frame.records, frame.entries, frame.offsets, frame.across, frame.width,
             frame.height, background.detach().contiguous().numpy(), frame.tiles, np.zeros(1, np.int64),
-            frame.room(blend.FORWARD_STATE), image.numpy(), alpha.numpy(),
+            frame.room(blend.FORWARD_STATE), frame.masks, image.numpy(), alpha.numpy(),
         )  # fmt: skip
         ctx.frame, ctx.degree = frame, degree
         ctx.save_for_backward(means, quats, scales, opacities, sh0, shN, background, image, alpha)
@@ -157,18 +151,19 @@ class _Splat(torch.autograd.Function):
         frame: _Frame = ctx.frame
         v_image, v_alpha = (g.contiguous().numpy() for g in gradients)
         *arrays, _sh0, shN = _arrays(inputs)
-        pair_sums = frame.buffers.get("pair_sums", (len(frame.entries) * conventions.PAIR,), np.float32)
+        # Sixteen floats are read at the last pair too.
+        pair_sums = frame.buffers.get("pair_sums", (len(frame.entries) * conventions.PAIR + 16,), np.float32)
         threads.run(
             blend.blend_gradient, frame.workers, frame.records, frame.entries, frame.entry_slots, frame.offsets,
             frame.across, frame.width, frame.height, image.numpy(), alpha.numpy(), v_image, v_alpha, frame.tiles,
-            np.zeros(1, np.int64), frame.room(blend.BACKWARD_STATE), pair_sums,
+            np.zeros(1, np.int64), frame.room(blend.BACKWARD_STATE), frame.masks, pair_sums,
         )  # fmt: skip
-        grads = [torch.empty(x.shape) for x in inputs]
+        grads = [recycled(x.shape) for x in inputs]
         if not ctx.needs_input_grad[5]:  # most of the memory and some of the work, so left out where it can be
             grads[5] = torch.empty(0)
         threads.run(
             project_gradient.project_gradient, frame.workers, *arrays, shN, ctx.degree, frame.camera, frame.records,
-            frame.packed_ids, frame.counts, frame.ranks, frame.slots, pair_sums, *_arrays(grads),
+            frame.packed_ids, frame.counts, frame.slots, pair_sums, *_arrays(grads),
         )  # fmt: skip
         v_background = ((1 - alpha)[..., None] * gradients[0]).sum((0, 1)) if ctx.needs_input_grad[6] else None
         wanted = [g if need else None for g, need in zip(grads, ctx.needs_input_grad, strict=False)]

@@ -19,7 +19,6 @@ from clod_adapter._kernels.simd import (
     ge,
     gt,
     load,
-    quotient,
     select,
     splat,
     store,
@@ -40,7 +39,7 @@ def every_operation(a, b, c, out):
         store(out[0], at, x + y)
         store(out[1], at, x - y)
         store(out[2], at, x * y)
-        store(out[3], at, quotient(x, y))
+        store(out[3], at, x / y)
         store(out[4], at, fma(x, y, z))
         store(out[5], at, vmin(x, y))
         store(out[6], at, select(ge(x, y), one, zero))
