@@ -1,17 +1,21 @@
-"""Adam that steps only the rows (Gaussians) that had a gradient."""
+"""Adam that steps only some rows (Gaussians) at a time."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
+
+# After so many steps of its own a row's bias corrections are 1 in float32, for the default betas.
+CORRECTED = 20_000
 
 
 class RowAdam:
     """Adam (Kingma and Ba 2015) over named ``[N, ...]`` parameters, a subset of rows a step.
 
-    A row that is not handed in keeps its value and its moments, and costs nothing; the bias
+    A row that is not stepped keeps its value and its moments, and costs next to nothing; the bias
     correction counts a row's own steps, so its first step is as long as anyone's.
 
     Args:
@@ -25,11 +29,13 @@ class RowAdam:
         self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
         self._moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in parameters.items()}
         self._steps = {name: torch.zeros(len(p), dtype=torch.int32, device=p.device) for name, p in parameters.items()}
+        count = np.arange(1, CORRECTED)
+        corrections = 1 / (1 - beta1**count), 1 / np.sqrt(1 - beta2**count)
+        self._corrections = np.pad(np.stack(corrections), ((0, 0), (1, 0))).astype(np.float32)
 
     @torch.no_grad()
     def step(self, name: str, gradient: Tensor, rows: Tensor, rate: float) -> None:
-        """Steps ``parameters[name][rows]`` (``rows [M]`` int64, unique) with ``gradient [M, ...]``."""
-        self._steps[name][rows] += 1
+        """Steps ``parameters[name]`` where ``rows`` (bool ``[N]``) is set, with ``gradient`` of its shape."""
         if gradient.device.type == "cpu":
             self._step_fused(name, gradient, rows, rate)
         else:
@@ -38,18 +44,19 @@ class RowAdam:
     def _step_fused(self, name: str, gradient: Tensor, rows: Tensor, rate: float) -> None:
         from clod_adapter._kernels import adam, threads
 
-        first, second = self._moments[name]
         parameter = self.parameters[name]
         width = math.prod(parameter.shape[1:])
-        flat = [x.view(len(x), width).numpy() for x in (parameter, first, second)]
+        tensors = (parameter, *self._moments[name], gradient.contiguous())
         threads.run(
-            adam.adam_rows, threads.worker_count(), *flat, gradient.contiguous().view(len(rows), width).numpy(),
-            rows.numpy(), self._steps[name].numpy(), rate, self.beta1, self.beta2, self.epsilon,
+            adam.adam_rows, threads.worker_count(), *(x.view(len(x), width).numpy() for x in tensors),
+            rows.numpy(), self._steps[name].numpy(), self._corrections, rate, self.beta1, self.beta2, self.epsilon,
         )  # fmt: skip
 
     def _step_plain(self, name: str, gradient: Tensor, rows: Tensor, rate: float) -> None:
         """The plain twin of the fused step."""
         first, second = self._moments[name]
+        gradient = gradient[rows]
+        self._steps[name][rows] += 1
         count = self._steps[name][rows].to(gradient).view(-1, *[1] * (gradient.dim() - 1))
         m = self.beta1 * first[rows] + (1 - self.beta1) * gradient
         v = self.beta2 * second[rows] + (1 - self.beta2) * gradient * gradient

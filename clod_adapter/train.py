@@ -121,6 +121,7 @@ class _Run:
         self.parameters = {name: getattr(start, name).detach().to(**own) for name in ATTRIBUTES}
         self.parameters["log_sigma"] = start.sigma_d.detach().float().clamp(min=1e-30).log().clamp(*LOG_SIGMA_RANGE)
         self.optimizer = RowAdam(self.parameters)
+        self.all_rows = torch.ones(len(start), dtype=torch.bool)
         self.rates = {
             "means": config.lr_means * camera_extent(views), "quats": config.lr_quats, "log_scales": config.lr_scales,
             "opacity_logits": config.lr_opacities, "sh0": config.lr_sh0, "shN": config.lr_shN,
@@ -171,28 +172,19 @@ class _Run:
         logits, log_sigma = p["opacity_logits"].detach().requires_grad_(), p["log_sigma"].detach().requires_grad_()
         distances = normalized_distances(p["means"], view.camera, self.attenuation)
         dialled = attenuate(logits, log_sigma.exp(), distances, s, self.attenuation)
-        rows = dialled.keep.nonzero()[:, 0]
-        # Only the kept rows take part: gradients, moments and steps of the others do not exist this step.
-        chosen = {name: p[name].index_select(0, rows) for name in ATTRIBUTES}
-        leaves = {name: chosen[name].requires_grad_() for name in self.tuned}
-        kept = Gaussians(**chosen)
-        image, _ = splat(kept, dialled.opacities.index_select(0, rows), view.camera)
+        # Dropped rows have opacity 0: the rasterizer leaves them out before anything else, and they get no gradient.
+        leaves = {name: p[name].detach().requires_grad_(name in self.tuned) for name in ATTRIBUTES}
+        opacities = torch.where(dialled.keep, dialled.opacities, 0)
+        image, _ = splat(Gaussians(**leaves), opacities, view.camera)
         loss = photometric_loss(image, view.image, config.ssim_weight)
         self.loss = float(loss.detach()) if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * float(loss.detach())
         count = soft_count(dialled.log_opacities, s, self.attenuation.tau, config.temperature)
         excess = (count - s**-config.exponent).clamp(min=0)
         weight = (1 - config.weight_slope * s / config.max_sv) ** 2
         total = weight * (loss + config.reg_weight * (s - 1) ** 2 * excess**2)
-        of_logits, of_sigma, *of_leaves = torch.autograd.grad(total, [logits, log_sigma, *leaves.values()])
-        self._update(rows, dict(zip(leaves, of_leaves, strict=True)), of_logits, of_sigma, config.lr_final**share_done)
-
-    def _update(
-        self, rows: Tensor, leaves: dict[str, Tensor], of_logits: Tensor, of_sigma: Tensor, decay: float
-    ) -> None:
-        """Steps the kept rows of most attributes; logits and sigma of all rows, which the count term reaches."""
-        for name, gradient in leaves.items():
-            self.optimizer.step(name, gradient, rows, self.rates[name] * decay)
-        everything = torch.arange(len(of_logits))
-        self.optimizer.step("opacity_logits", of_logits, everything, self.rates["opacity_logits"] * decay)
-        self.optimizer.step("log_sigma", of_sigma, everything, self.rates["log_sigma"] * decay)
+        names = ["opacity_logits", "log_sigma", *self.tuned]
+        gradients = torch.autograd.grad(total, [logits, log_sigma, *(leaves[name] for name in self.tuned)])
+        for name, gradient in zip(names, gradients, strict=True):
+            rows = dialled.keep if name in self.tuned else self.all_rows  # the count term reaches the others
+            self.optimizer.step(name, gradient, rows, self.rates[name] * config.lr_final**share_done)
         self.parameters["log_sigma"].clamp_(*LOG_SIGMA_RANGE)

@@ -1,32 +1,81 @@
-"""Adam on selected rows: one pass over exactly the rows that had a gradient."""
+"""Adam on chosen rows, sixteen of them at a time."""
 
 from __future__ import annotations
 
-import math
+from numba import float32, int64
 
-import numpy as np
-from numba import float32
+from clod_adapter._kernels.compiling import kernel, part, pointer, scratch
+from clod_adapter._kernels.simd import f32x16, load, load_rows, store_rows, vsqrt
 
-from clod_adapter._kernels.compiling import kernel
+ONE = float32(1)
+
+
+@part
+def find_rows(mask, i, end, rows):  # type: ignore[no-untyped-def]
+    """Lists up to sixteen rows from ``i`` on that are to be stepped; returns how many, and where to go on."""
+    found = 0
+    while i < end and found < 16:
+        rows[found] = i
+        found += mask[i]  # not a branch: it would be guessed wrong half the time
+        i += 1
+    return found, i
+
+
+@part
+def step_columns(parameter, first, second, gradient, rows, width, at, many, lanes, length, correction, constants):  # type: ignore[no-untyped-def]
+    """Steps the columns from ``at`` on, ``many`` of them, of sixteen rows."""
+    beta1, beta2, epsilon = constants
+    load_rows(parameter, rows, width, at, many, lanes, 0)
+    load_rows(first, rows, width, at, many, lanes, 16)
+    load_rows(second, rows, width, at, many, lanes, 32)
+    load_rows(gradient, rows, width, at, many, lanes, 48)
+    for k in range(many):
+        g = lanes[48 + k]
+        m = beta1 * lanes[16 + k] + (ONE - beta1) * g
+        v = beta2 * lanes[32 + k] + (ONE - beta2) * g * g
+        lanes[16 + k], lanes[32 + k] = m, v
+        lanes[k] = lanes[k] - load(length, 0) * m / (vsqrt(v) * load(correction, 0) + epsilon)
+    store_rows(parameter, rows, width, at, many, lanes, 0)
+    store_rows(first, rows, width, at, many, lanes, 16)
+    store_rows(second, rows, width, at, many, lanes, 32)
 
 
 @kernel
-def adam_rows(worker, workers, parameter, first, second, gradient, rows, steps, rate, beta1, beta2, epsilon):  # type: ignore[no-untyped-def]
-    """Updates ``parameter[rows]`` (``[N, C]`` and its moments) with ``gradient [len(rows), C]``.
+def adam_rows(  # type: ignore[no-untyped-def]
+    worker, workers, parameter, first, second, gradient, mask, steps, corrections, rate, beta1, beta2, epsilon
+):
+    """Updates the rows of ``parameter [N, width]`` and of its moments where ``mask [N]`` is set, with ``gradient``.
 
-    ``steps[row]`` counts the row's own updates, this one included: its bias correction.
+    ``steps[row]`` counts the row's own updates. ``corrections[0]`` is ``1 / (1 - beta1^n)`` by their number n,
+    ``corrections[1]`` is ``1 / sqrt(1 - beta2^n)``; beyond its last, the last holds.
     """
-    one = float32(1)
-    width = parameter.shape[1]
-    for i in range(len(rows) * worker // workers, len(rows) * (worker + 1) // workers):
-        row = rows[i]
-        count = float32(steps[row])
-        scale = float32(rate) / (one - float32(beta1) ** count)
-        correction = one / math.sqrt(one - float32(beta2) ** count)
-        for c in range(width):
-            g = gradient[i, c]
-            m = float32(beta1) * first[row, c] + (one - float32(beta1)) * g
-            v = float32(beta2) * second[row, c] + (one - float32(beta2)) * g * g
-            first[row, c] = m
-            second[row, c] = v
-            parameter[row, c] -= scale * m / (np.sqrt(v) * correction + float32(epsilon))
+    width, most, rate = parameter.shape[1], corrections.shape[1] - 1, float32(rate)
+    i, end = len(parameter) * worker // workers, len(parameter) * (worker + 1) // workers
+    lanes, rows = scratch(f32x16, 64), scratch(int64, 16)
+    length, correction = scratch(float32, 16), scratch(float32, 16)
+    parameter, first, second, gradient = pointer(parameter), pointer(first), pointer(second), pointer(gradient)
+    constants = float32(beta1), float32(beta2), float32(epsilon)
+    while i < end:
+        found, i = find_rows(mask, i, end, rows)
+        if found == 0:
+            break
+        for lane in range(16):
+            if lane < found:
+                steps[rows[lane]] += 1
+            else:
+                rows[lane] = rows[0]
+            count = min(steps[rows[lane]], most)
+            length[lane], correction[lane] = rate * corrections[0, count], corrections[1, count]
+        # Constant widths, so that what is known of them is left out of the transpositions.
+        if width == 1:
+            step_columns(parameter, first, second, gradient, rows, 1, 0, 1, lanes, length, correction, constants)
+        elif width == 3:
+            step_columns(parameter, first, second, gradient, rows, 3, 0, 3, lanes, length, correction, constants)
+        elif width == 4:
+            step_columns(parameter, first, second, gradient, rows, 4, 0, 4, lanes, length, correction, constants)
+        else:
+            for at in range(0, width, 16):
+                many = min(width - at, 16)
+                step_columns(
+                    parameter, first, second, gradient, rows, width, at, many, lanes, length, correction, constants
+                )

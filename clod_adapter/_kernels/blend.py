@@ -221,7 +221,7 @@ def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):  # 
 @kernel
 def blend_gradient(  # type: ignore[no-untyped-def]
     worker, workers, records, entries, entry_slots, offsets, across, width, height, image, alpha, v_image, v_alpha,
-    tiles, cursor, room, masks, pair_sums,
+    tiles, cursor, room, masks, shaped, colored, pair_sums,
 ):  # fmt: skip
     """Backward: per (Gaussian, tile) pair the nine sums over pixels that the projection's gradient needs.
 
@@ -270,13 +270,16 @@ def blend_gradient(  # type: ignore[no-untyped-def]
                     weight = select(keep, t * a, zero)
                     v_r, v_g, v_b = load(state, at + 32), load(state, at + 48), load(state, at + 64)
                     q = fma(v_r, red, fma(v_g, green, v_b * blue))
-                    s_r, s_g, s_b = fma(weight, v_r, s_r), fma(weight, v_g, s_g), fma(weight, v_b, s_b)
+                    if colored:
+                        s_r, s_g, s_b = fma(weight, v_r, s_r), fma(weight, v_g, s_g), fma(weight, v_b, s_b)
                     rest = load(state, at + 16) - weight * q
                     store(state, at + 16, rest)
                     v_a = t * q - rest / (one - a)
                     s = select(both(keep, ge(most, raw)), v_a * a, zero)
-                    sx, sy = s * dx, s * dy
-                    s_0, s_x, s_y = s_0 + s, s_x + sx, s_y + sy
-                    s_xx, s_xy, s_yy = fma(sx, dx, s_xx), fma(sx, dy, s_xy), fma(sy, dy, s_yy)
+                    s_0 = s_0 + s
+                    if shaped:
+                        sx, sy = s * dx, s * dy
+                        s_x, s_y = s_x + sx, s_y + sy
+                        s_xx, s_xy, s_yy = fma(sx, dx, s_xx), fma(sx, dy, s_xy), fma(sy, dy, s_yy)
                     store(state, at, select(keep, after, select(done, zero - t, t)))
             store_sums(pair_sums, slot * PAIR, s_r, s_g, s_b, s_0, s_x, s_y, s_xx, s_xy, s_yy)

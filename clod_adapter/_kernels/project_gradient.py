@@ -15,6 +15,7 @@ from clod_adapter._kernels.conventions import (
     HIGH_Y,
     LOW_X,
     LOW_Y,
+    MEAN,
     ONE,
     PAIR,
     PMAT,
@@ -31,7 +32,7 @@ from clod_adapter._kernels.conventions import (
     ZERO,
 )
 from clod_adapter._kernels.project import covariance, load_sh, view_direction
-from clod_adapter._kernels.sh import sh_basis, sh_basis_gradient
+from clod_adapter._kernels.sh import C0, sh_basis, sh_basis_gradient
 from clod_adapter._kernels.simd import eq, f32x16, gt, load, load_rows, select, splat, store, store_rows, vmax, vmin
 
 # Sixteen Gaussians' gradients, a vector each: sums over pixels (9), P (6), rotation matrix (9), then what is stored:
@@ -108,12 +109,11 @@ def quat_gradient(w, g):  # type: ignore[no-untyped-def]
 
 @part
 def color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN):  # type: ignore[no-untyped-def]
-    """Gradients of the SH coefficients (the higher bands if ``tuned``), and of the mean through the direction."""
+    """Gradients of the higher bands if ``tuned``, and of the mean through the direction."""
     inverse = view_direction(w, cam, sh)
     x, y, z = sh[0], sh[1], sh[2]
     sh_basis(degree, x, y, z, basis)
     red, green, blue = g[SUMS], g[SUMS + 1], g[SUMS + 2]
-    g[V_SH0], g[V_SH0 + 1], g[V_SH0 + 2] = basis[0] * red, basis[0] * green, basis[0] * blue
     bands = (degree + 1) * (degree + 1) - 1
     load_sh(shN, rows, bands, sh)
     for k in range(bands):
@@ -130,16 +130,23 @@ def color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN):  # ty
 
 
 @part
-def no_gradient(first, last, bands, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN):  # type: ignore[no-untyped-def]
+def clear(values, first, last):  # type: ignore[no-untyped-def]
+    """Zeros for the elements from ``first`` up to ``last``."""
+    for k in range(first, last):
+        values[k] = ZERO
+
+
+@part
+def no_gradient(first, last, shaped, colored, bands, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN):  # type: ignore[no-untyped-def]
     """Zeros for the rows from ``first`` up to ``last``, which took no part."""
-    for i in range(first, last):
-        v_opacities[i] = ZERO
-        for d in range(3):
-            v_means[3 * i + d] = v_scales[3 * i + d] = v_sh0[3 * i + d] = ZERO
-        for d in range(4):
-            v_quats[4 * i + d] = ZERO
-    for k in range(3 * bands * first, 3 * bands * last):
-        v_shN[k] = ZERO
+    clear(v_opacities, first, last)
+    if shaped:
+        clear(v_means, 3 * first, 3 * last)
+        clear(v_quats, 4 * first, 4 * last)
+        clear(v_scales, 3 * first, 3 * last)
+    if colored:
+        clear(v_sh0, 3 * first, 3 * last)
+    clear(v_shN, 3 * bands * first, 3 * bands * last)
 
 
 @kernel
@@ -149,13 +156,13 @@ def project_gradient(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Sums each visible Gaussian's slots and carries them back to its parameters; row order, so memory streams.
 
-    An empty ``v_shN`` leaves the gradient of the higher bands out.
+    Empty arrays for means, quats and scales leave their gradients out, an empty ``v_sh0`` or ``v_shN`` its own.
     """
     w, g = scratch(f32x16, WORKSPACE), scratch(f32x16, GRADIENTS)
-    sh, basis, color = scratch(f32x16, 80), scratch(f32x16, 25), scratch(f32x16, 16)
+    sh, basis = scratch(f32x16, 80), scratch(f32x16, 25)
     rows, packed, lanes, sums = scratch(int64, 16), scratch(int64, 16), scratch(int64, 16), scratch(float32, 256)
-    tuned = len(v_shN) > 0
-    tuned_bands = (degree + 1) * (degree + 1) - 1 if tuned else 0
+    shaped, colored, tuned = len(v_means) > 0, len(v_sh0) > 0, len(v_shN) > 0
+    bands = (degree + 1) * (degree + 1) - 1 if tuned else 0
     first, last = len(opacities) * worker // workers, len(opacities) * (worker + 1) // workers
     end = first + counts[worker]
     means, quats, scales, opacities = pointer(means), pointer(quats), pointer(scales), pointer(opacities)
@@ -166,27 +173,43 @@ def project_gradient(  # type: ignore[no-untyped-def]
     done = first
     for start in range(first, end, 16):
         for lane in range(16):
-            p = min(start + lane, end - 1)
-            packed[lane], rows[lane], lanes[lane] = p, packed_ids[p], lane
-            if rows[lane] > done:
-                no_gradient(done, rows[lane], tuned_bands, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN)
-            done = max(done, rows[lane] + 1)
-            total = splat(ZERO)
-            for slot in range(slots[2 * p], slots[2 * p + 1]):
-                total = total + load(pair_sums, slot * PAIR)
-            store(sums, 16 * lane, total)
-        load_rows(sums, lanes, 16, 0, PAIR, g, SUMS)
-        load_rows(records, packed, RECORD, RED, 3, color, 0)
-        for k in range(3):  # a colour that was cut at 0 has no gradient
-            g[SUMS + k] = select(gt(color[k], splat(ZERO)), g[SUMS + k], splat(ZERO))
-        covariance(means, quats, scales, rows, cam, w)
-        color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN)
-        covariance_gradient(w, g, cam)
-        quat_gradient(w, g)
-        store_rows(v_means, rows, 3, 0, 3, g, V_MEAN)
-        store_rows(v_quats, rows, 4, 0, 4, g, V_QUAT)
-        store_rows(v_scales, rows, 3, 0, 3, g, V_SCALE)
-        store_rows(v_sh0, rows, 3, 0, 3, g, V_SH0)
+            packed[lane], lanes[lane] = min(start + lane, end - 1), lane
+            row = rows[lane] = packed_ids[packed[lane]]
+            if row > done:
+                no_gradient(done, row, shaped, colored, bands, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN)
+            done = max(done, row + 1)
+        add_slots(pair_sums, slots, records, packed, lanes, sums, g)
         for lane in range(16):
             v_opacities[rows[lane]] = sums[16 * lane + 3] / opacities[rows[lane]]
-    no_gradient(done, last, tuned_bands, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN)
+        if shaped or tuned:
+            load_rows(means, rows, 3, 0, 3, w, MEAN)
+            color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN)
+        if shaped:
+            covariance(means, quats, scales, rows, cam, w)
+            covariance_gradient(w, g, cam)
+            quat_gradient(w, g)
+            store_rows(v_means, rows, 3, 0, 3, g, V_MEAN)
+            store_rows(v_quats, rows, 4, 0, 4, g, V_QUAT)
+            store_rows(v_scales, rows, 3, 0, 3, g, V_SCALE)
+        if colored:
+            for k in range(3):
+                g[V_SH0 + k] = C0 * g[SUMS + k]
+            store_rows(v_sh0, rows, 3, 0, 3, g, V_SH0)
+    no_gradient(done, last, shaped, colored, bands, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN)
+
+
+@part
+def add_slots(pair_sums, slots, records, packed, lanes, sums, g):  # type: ignore[no-untyped-def]
+    """Adds up the slots of sixteen packed Gaussians into ``g[SUMS]``, and into a row each of ``sums [16, 16]``."""
+    for lane in range(16):
+        total = splat(ZERO)
+        for slot in range(slots[2 * packed[lane]], slots[2 * packed[lane] + 1]):
+            total = total + load(pair_sums, slot * PAIR)
+        store(sums, 16 * lane, total)
+    load_rows(records, packed, RECORD, RED, 3, g, SUMS + PAIR)
+    red, green, blue = g[SUMS + PAIR], g[SUMS + PAIR + 1], g[SUMS + PAIR + 2]
+    load_rows(sums, lanes, 16, 0, PAIR, g, SUMS)
+    # A colour that was cut at 0 has no gradient.
+    g[SUMS] = select(gt(red, splat(ZERO)), g[SUMS], splat(ZERO))
+    g[SUMS + 1] = select(gt(green, splat(ZERO)), g[SUMS + 1], splat(ZERO))
+    g[SUMS + 2] = select(gt(blue, splat(ZERO)), g[SUMS + 2], splat(ZERO))

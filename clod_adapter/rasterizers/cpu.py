@@ -151,16 +151,18 @@ class _Splat(torch.autograd.Function):
         frame: _Frame = ctx.frame
         v_image, v_alpha = (g.contiguous().numpy() for g in gradients)
         *arrays, _sh0, shN = _arrays(inputs)
+        # What nobody asks for is left out of the sums. Where there are bands, a mean changes the colour too.
+        shaped = any(ctx.needs_input_grad[:3])
+        colored = any(ctx.needs_input_grad[4:6]) or (shaped and ctx.degree > 0)
         # Sixteen floats are read at the last pair too.
         pair_sums = frame.buffers.get("pair_sums", (len(frame.entries) * conventions.PAIR + 16,), np.float32)
         threads.run(
             blend.blend_gradient, frame.workers, frame.records, frame.entries, frame.entry_slots, frame.offsets,
             frame.across, frame.width, frame.height, image.numpy(), alpha.numpy(), v_image, v_alpha, frame.tiles,
-            np.zeros(1, np.int64), frame.room(blend.BACKWARD_STATE), frame.masks, pair_sums,
+            np.zeros(1, np.int64), frame.room(blend.BACKWARD_STATE), frame.masks, shaped, colored, pair_sums,
         )  # fmt: skip
-        grads = [recycled(x.shape) for x in inputs]
-        if not ctx.needs_input_grad[5]:  # most of the memory and some of the work, so left out where it can be
-            grads[5] = torch.empty(0)
+        wanted = [shaped] * 3 + [True, ctx.needs_input_grad[4], ctx.needs_input_grad[5]]
+        grads = [recycled(x.shape if want else (0, *x.shape[1:])) for x, want in zip(inputs, wanted, strict=True)]
         threads.run(
             project_gradient.project_gradient, frame.workers, *arrays, shN, ctx.degree, frame.camera, frame.records,
             frame.packed_ids, frame.counts, frame.slots, pair_sums, *_arrays(grads),
