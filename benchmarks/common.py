@@ -35,9 +35,9 @@ def commit() -> str:
 
 
 def append(file: str, row: dict[str, Any]) -> None:
-    """Adds a row to ``results/<file>`` and prints it."""
+    """Adds a row to ``results/<file>`` and prints it to stderr."""
     full = jsonable({"commit": commit(), "machine": machine(), **row})
     RESULTS.mkdir(exist_ok=True)
     with open(RESULTS / file, "a", encoding="utf-8") as out:
         out.write(json.dumps(full) + "\n")
-    print(json.dumps(full), flush=True)
+    print(json.dumps(full), file=sys.stderr, flush=True)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances, soft_count
