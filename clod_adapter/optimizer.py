@@ -34,32 +34,39 @@ class RowAdam:
         self._corrections = np.pad(np.stack(corrections), ((0, 0), (1, 0))).astype(np.float32)
 
     @torch.no_grad()
-    def step(self, name: str, gradient: Tensor, rows: Tensor, rate: float) -> None:
-        """Steps ``parameters[name]`` where ``rows`` (bool ``[N]``) is set, with ``gradient`` of its shape."""
-        if gradient.device.type == "cpu":
-            self._step_fused(name, gradient, rows, rate)
-        else:
-            self._step_plain(name, gradient, rows, rate)
+    def step(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
+        """Steps the parameters named in ``gradients``, each at its rate, where ``rows`` (bool ``[N]``) is set.
 
-    def _step_fused(self, name: str, gradient: Tensor, rows: Tensor, rate: float) -> None:
+        A gradient has the shape of its parameter; what it holds elsewhere does not matter.
+        """
+        if rows.device.type == "cpu":
+            self._step_fused(gradients, rows, rates)
+        else:
+            self._step_plain(gradients, rows, rates)
+
+    def _step_fused(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
         from clod_adapter._kernels import adam, threads
 
-        parameter = self.parameters[name]
-        width = math.prod(parameter.shape[1:])
-        tensors = (parameter, *self._moments[name], gradient.contiguous())
-        threads.run(
-            adam.adam_rows, threads.worker_count(), *(x.view(len(x), width).numpy() for x in tensors),
-            rows.numpy(), self._steps[name].numpy(), self._corrections, rate, self.beta1, self.beta2, self.epsilon,
-        )  # fmt: skip
+        jobs = []
+        for name, gradient in gradients.items():
+            tensors = (self.parameters[name], *self._moments[name], gradient.contiguous())
+            flat = [x.view(len(x), math.prod(x.shape[1:])).numpy() for x in tensors]
+            jobs.append((*flat, rows.numpy(), self._steps[name].numpy(), self._corrections, rates[name]))
 
-    def _step_plain(self, name: str, gradient: Tensor, rows: Tensor, rate: float) -> None:
+        def work(worker: int, workers: int) -> None:
+            for job in jobs:
+                adam.adam_rows(worker, workers, *job, self.beta1, self.beta2, self.epsilon)
+
+        threads.run(work, threads.worker_count())
+
+    def _step_plain(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
         """The plain twin of the fused step."""
-        first, second = self._moments[name]
-        gradient = gradient[rows]
-        self._steps[name][rows] += 1
-        count = self._steps[name][rows].to(gradient).view(-1, *[1] * (gradient.dim() - 1))
-        m = self.beta1 * first[rows] + (1 - self.beta1) * gradient
-        v = self.beta2 * second[rows] + (1 - self.beta2) * gradient * gradient
-        first[rows], second[rows] = m, v
-        length = m / (1 - self.beta1**count) / ((v / (1 - self.beta2**count)).sqrt() + self.epsilon)
-        self.parameters[name][rows] -= rate * length
+        for name, whole in gradients.items():
+            gradient, (first, second) = whole[rows], self._moments[name]
+            self._steps[name][rows] += 1
+            count = self._steps[name][rows].to(gradient).view(-1, *[1] * (gradient.dim() - 1))
+            m = self.beta1 * first[rows] + (1 - self.beta1) * gradient
+            v = self.beta2 * second[rows] + (1 - self.beta2) * gradient * gradient
+            first[rows], second[rows] = m, v
+            length = m / (1 - self.beta1**count) / ((v / (1 - self.beta2**count)).sqrt() + self.epsilon)
+            self.parameters[name][rows] -= rates[name] * length

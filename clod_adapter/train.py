@@ -181,9 +181,10 @@ class _Run:
         excess = (count - s**-config.exponent).clamp(min=0)
         weight = (1 - config.weight_slope * s / config.max_sv) ** 2
         total = weight * (loss + config.reg_weight * (s - 1) ** 2 * excess**2)
-        names = ["opacity_logits", "log_sigma", *self.tuned]
-        gradients = torch.autograd.grad(total, [logits, log_sigma, *(leaves[name] for name in self.tuned)])
-        for name, gradient in zip(names, gradients, strict=True):
-            rows = dialled.keep if name in self.tuned else self.all_rows  # the count term reaches the others
-            self.optimizer.step(name, gradient, rows, self.rates[name] * config.lr_final**share_done)
+        leaves = {name: leaves[name] for name in self.tuned}
+        of_logits, of_sigma, *of_leaves = torch.autograd.grad(total, [logits, log_sigma, *leaves.values()])
+        rates = {name: rate * config.lr_final**share_done for name, rate in self.rates.items()}
+        self.optimizer.step(dict(zip(leaves, of_leaves, strict=True)), dialled.keep, rates)
+        # The count term reaches the dropped ones too.
+        self.optimizer.step({"opacity_logits": of_logits, "log_sigma": of_sigma}, self.all_rows, rates)
         self.parameters["log_sigma"].clamp_(*LOG_SIGMA_RANGE)

@@ -14,8 +14,8 @@ SHAPES = {"means": (3,), "quats": (4,), "opacity_logits": (), "sh0": (1, 3), "sh
 class PlainRowAdam(RowAdam):
     """Always takes the plain way."""
 
-    def _step_fused(self, name: str, gradient: Tensor, rows: Tensor, rate: float) -> None:
-        self._step_plain(name, gradient, rows, rate)
+    def _step_fused(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
+        self._step_plain(gradients, rows, rates)
 
 
 def parameters(n: int, seed: int = 0) -> dict[str, Tensor]:
@@ -33,6 +33,10 @@ def gradients(n: int, seed: int) -> dict[str, Tensor]:
     return out
 
 
+def rates(rate: float) -> dict[str, float]:
+    return dict.fromkeys(SHAPES, rate)
+
+
 def everything(n: int) -> Tensor:
     return torch.ones(n, dtype=torch.bool)
 
@@ -44,9 +48,8 @@ def test_fused_is_plain(seed: int, n: int = 203) -> None:
     g = torch.Generator().manual_seed(seed)
     for step in range(8):
         rows = torch.rand(n, generator=g) < torch.rand((), generator=g)
-        for name, gradient in gradients(n, 100 * seed + step).items():
-            for optimizer in (fused, plain):
-                optimizer.step(name, gradient, rows, 0.01)
+        for optimizer in (fused, plain):
+            optimizer.step(gradients(n, 100 * seed + step), rows, rates(0.01))
     start = parameters(n)
     for name in SHAPES:
         moved = (fused.parameters[name] - start[name]).abs()
@@ -61,8 +64,8 @@ def test_all_rows_is_torch_s_adam(n: int = 57) -> None:
     optimizer = RowAdam(ours)
     adam = torch.optim.Adam(theirs.values(), lr=0.02, betas=(0.9, 0.999), eps=1e-15)
     for step in range(12):
+        optimizer.step(gradients(n, step), everything(n), rates(0.02))
         for name, gradient in gradients(n, step).items():
-            optimizer.step(name, gradient, everything(n), 0.02)
             theirs[name].grad = gradient
         adam.step()
     for name in SHAPES:
@@ -75,7 +78,7 @@ def test_betas_and_epsilon_are_used(n: int = 20) -> None:
     adam = torch.optim.Adam([theirs], lr=0.02, betas=(0.5, 0.7), eps=1e-2)
     for step in range(5):
         theirs.grad = gradients(n, step)["means"]
-        optimizer.step("means", theirs.grad, everything(n), 0.02)
+        optimizer.step({"means": theirs.grad}, everything(n), {"means": 0.02})
         adam.step()
     torch.testing.assert_close(ours, theirs.detach(), rtol=2e-6, atol=2e-6)
 
@@ -90,8 +93,7 @@ def test_other_rows_keep_every_bit(kind: type[RowAdam], n: int = 40) -> None:
     rows[[31, 2, 17]] = True
     others = ~rows
     for step in range(3):
-        for name, gradient in gradients(n, step).items():
-            optimizer.step(name, gradient + 1, rows, 0.1)
+        optimizer.step({name: gradient + 1 for name, gradient in gradients(n, step).items()}, rows, rates(0.1))
     for name, value in values.items():
         assert optimizer.parameters[name] is value  # in place
         assert torch.equal(value.view(torch.int32)[others], before[name][others]), name
@@ -106,9 +108,9 @@ def test_a_first_step_is_as_long_as_the_rate(kind: type[RowAdam], size: float) -
     optimizer = kind({"means": values})
     rows = torch.arange(10) < 5
     for _ in range(5):
-        optimizer.step("means", torch.ones(10, 3), rows, 0.01)
+        optimizer.step({"means": torch.ones(10, 3)}, rows, {"means": 0.01})
     gradient = size * torch.tensor([1.0, -1.0, 0.0]).repeat(10, 1)
-    optimizer.step("means", gradient, ~rows, 0.25)
+    optimizer.step({"means": gradient}, ~rows, {"means": 0.25})
     torch.testing.assert_close(values[5:], torch.tensor([-0.25, 0.25, 0.0]).repeat(5, 1), rtol=1e-5, atol=0)
 
 
@@ -122,7 +124,7 @@ def test_rows_and_threads_do_not_matter_to_a_row(n: int = 100) -> None:
         try:
             optimizer = RowAdam(parameters(n))
             for _ in range(3):
-                optimizer.step("shN", gradient, some, 0.01)
+                optimizer.step({"shN": gradient}, some, {"shN": 0.01})
         finally:
             torch.set_num_threads(before)
         results.append(optimizer.parameters["shN"])
@@ -137,7 +139,7 @@ def test_bias_corrections_end(monkeypatch: pytest.MonkeyPatch, n: int = 20) -> N
     adam = torch.optim.Adam([theirs], lr=0.02, betas=(0.5, 0.8), eps=1e-15)
     for step in range(220):
         theirs.grad = gradients(n, step)["means"]
-        optimizer.step("means", theirs.grad, everything(n), 0.02)
+        optimizer.step({"means": theirs.grad}, everything(n), {"means": 0.02})
         adam.step()
     torch.testing.assert_close(ours, theirs.detach(), rtol=1e-5, atol=1e-5)
 
@@ -145,13 +147,13 @@ def test_bias_corrections_end(monkeypatch: pytest.MonkeyPatch, n: int = 20) -> N
 def test_no_rows() -> None:
     for n in (4, 0):
         optimizer = RowAdam(parameters(n))
-        for name, shape in SHAPES.items():
-            optimizer.step(name, torch.ones(n, *shape), torch.zeros(n, dtype=torch.bool), 0.1)
-            assert torch.equal(optimizer.parameters[name], parameters(n)[name])
+        optimizer.step(gradients(n, 0), torch.zeros(n, dtype=torch.bool), rates(0.1))
+        for name, value in parameters(n).items():
+            assert torch.equal(optimizer.parameters[name], value)
 
 
 def test_no_columns() -> None:
     """shN of a checkpoint of SH degree 0."""
     optimizer = RowAdam({"shN": torch.empty(4, 0, 3)})
-    optimizer.step("shN", torch.empty(4, 0, 3), everything(4), 0.1)
+    optimizer.step({"shN": torch.empty(4, 0, 3)}, everything(4), {"shN": 0.1})
     assert optimizer.parameters["shN"].shape == (4, 0, 3)
