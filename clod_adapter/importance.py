@@ -17,21 +17,24 @@ from clod_adapter.render import splat
 # A start beyond this many times the normalised distance at the largest dial value would fade by less than a
 # thousandth there, and its gradient with it: such a sigma would never move again.
 WIDEST = 22.0
+# Views that are looked at, at most: twice as many changed the trained result by 0.01 to 0.04 dB (docs/method.md).
+MOST_VIEWS = 64
 
 
 def start(
-    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Callable[[int], None] | None = None
+    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Callable[[int, int], None] | None = None
 ) -> Gaussians:
-    """The Gaussians with a sigma_d to train from.
+    """The Gaussians with a sigma_d to train from, by what they do in up to MOST_VIEWS of the views, evenly spread.
 
     A dial that ``base`` already has is kept, with its own settings but the config's ``max_sv``; one
     that does nothing (``SIGMA_MAX`` throughout, as ``attach`` makes it) counts as none.
 
     Args:
-        progress: called with the number of views looked at.
+        progress: called with the number of views done, and of those that are looked at in all.
     """
     if base.sigma_d is not None and base.attenuation is not None and bool((base.sigma_d < SIGMA_MAX).any()):
         return base.replace(attenuation=dataclasses.replace(base.attenuation, max_sv=config.max_sv))
+    views = [views[k * len(views) // MOST_VIEWS] for k in range(MOST_VIEWS)] if len(views) > MOST_VIEWS else views
     attenuation = config.attenuation(scene_distance(base, views, config.quantile))
     importance = removal_error(base, views, seed=config.seed, progress=progress)
     distances = typical_distance(base, views, attenuation)
@@ -52,7 +55,7 @@ def scene_distance(base: Gaussians, views: Sequence[View], quantile: float) -> f
 
 
 def removal_error(
-    gaussians: Gaussians, views: Sequence[View], *, seed: int = 0, progress: Callable[[int], None] | None = None
+    gaussians: Gaussians, views: Sequence[View], *, seed: int = 0, progress: Callable[[int, int], None] | None = None
 ) -> Tensor:
     """``[N]`` estimate of the squared picture error that removing each Gaussian alone would cause.
 
@@ -62,7 +65,7 @@ def removal_error(
     Gauss-Newton matrix). Works with every differentiable rasterizer.
 
     Args:
-        progress: called with the number of views done after each.
+        progress: called with the number of views done after each, and of all of them.
     """
     generator = torch.Generator().manual_seed(seed)
     total = torch.zeros(len(gaussians))
@@ -73,7 +76,7 @@ def removal_error(
         (gradient,) = torch.autograd.grad(image, opacities, signs)
         total += (gradient * opacities.detach()).square()
         if progress:
-            progress(done)
+            progress(done, len(views))
     return total / max(len(views), 1)
 
 

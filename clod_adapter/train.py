@@ -86,9 +86,9 @@ def adapt(
         raise ClodError("the scene has no training views: give at least one photograph that is not held out")
     if len(base) == 0:
         raise ClodError("the checkpoint has no Gaussians, so there is nothing to adapt")
-    began, total = time.perf_counter(), len(scene.train)
+    began = time.perf_counter()
 
-    def report(done: int) -> None:
+    def report(done: int, total: int) -> None:
         if progress:
             seconds = time.perf_counter() - began
             progress(Progress("start", done, total, seconds, done / total, math.nan, lambda: base))

@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from clod_adapter import importance
 from clod_adapter.attenuation import attenuate, extinction_scale, normalized_distances
 from clod_adapter.cameras import View
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import removal_error, sigma_from_importance, typical_distance
 from clod_adapter.render import splat
@@ -53,13 +54,27 @@ def test_is_the_mean_over_views_and_reports_them() -> None:
     some = gaussians(100, 1, 0)
     (view,) = photograph(some, ring(1, 20, 16))
     seen = []
-    both = removal_error(some, [view, view], seed=3, progress=seen.append)
-    assert seen == [1, 2]
+    both = removal_error(some, [view, view], seed=3, progress=lambda *count: seen.append(count))
+    assert seen == [(1, 2), (2, 2)]
     assert torch.equal(both, removal_error(some, [view, view], seed=3))
     assert not torch.equal(both, removal_error(some, [view, view], seed=4))
     assert both.shape == (100,) and not both.requires_grad and (both >= 0).all()
     once = removal_error(some, [view], seed=3)
     assert (both >= once / 2).all()  # the same first draw, and a second one
+
+
+def test_start_looks_at_some_of_many_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evenly spread ones, first to last; all where there are few."""
+    some, looked, counts = gaussians(50, 0, 0), [], []
+    views = photograph(some, ring(7, 12, 10))
+    monkeypatch.setattr(importance, "splat", lambda g, o, c: looked.append(c.name) or splat(g, o, c))
+    for most, expected in [(3, [0, 2, 4]), (7, range(7)), (64, range(7))]:
+        looked.clear()
+        counts.clear()
+        monkeypatch.setattr(importance, "MOST_VIEWS", most)
+        importance.start(some, views, AdaptConfig(), lambda *count: counts.append(count))
+        assert looked == [views[k].camera.name for k in expected]
+        assert counts == [(k + 1, len(looked)) for k in range(len(looked))]
 
 
 def test_what_no_view_shows_counts_nothing() -> None:

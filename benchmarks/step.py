@@ -1,0 +1,103 @@
+"""Where a training step's time goes, on real checkpoints.
+
+    python benchmarks/step.py                  # plush_half and bonsai146
+    python benchmarks/step.py plush_half --record --label before
+
+Wall time by section and by kernel, means over the steps after the first few, with the default settings at the
+start of training. ``splat_share`` is what the rasterizer takes of a step, forward and backward. A row says
+which commit of the package was imported, so an older one is measured by putting it first on PYTHONPATH.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any
+
+import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
+
+# isort: split
+import torch
+from common import append, capture
+
+from clod_adapter import optimizer, train
+from clod_adapter._kernels import threads
+from clod_adapter.importance import start
+from clod_adapter.rasterizers import cpu
+
+FILE = "step.jsonl"
+THREADS = 2
+
+
+class Clock:
+    """Adds up the time spent in functions, by name; a function called from another one counts in both."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+
+    def wrap(self, owner: Any, attribute: str, name: str | None = None) -> None:
+        """Times ``owner.attribute``, under its first argument's name where ``name`` is None."""
+        inner: Callable[..., Any] = getattr(owner, attribute)
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            began = time.perf_counter()
+            try:
+                return inner(*args, **kwargs)
+            finally:
+                self.seconds[name or f"kernel {args[0].__name__}"] += time.perf_counter() - began
+
+        static = isinstance(owner, type) and isinstance(owner.__dict__[attribute], staticmethod)
+        setattr(owner, attribute, staticmethod(timed) if static else timed)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*", default=["plush_half", "bonsai146"])
+    parser.add_argument("--steps", type=int, default=120)
+    parser.add_argument("--label", default="default")
+    parser.add_argument("--record", action="store_true", help=f"add the rows to results/{FILE}")
+    args = parser.parse_args()
+    torch.set_num_threads(THREADS)
+    clock = Clock()
+    clock.wrap(threads, "run")
+    clock.wrap(train, "attenuate", "attenuate")
+    clock.wrap(train, "soft_count", "count")
+    clock.wrap(train, "splat", "splat forward")
+    clock.wrap(train, "photometric_loss", "loss")
+    clock.wrap(torch.autograd, "grad", "backward")
+    clock.wrap(cpu._Splat, "backward", "splat backward")
+    clock.wrap(optimizer.RowAdam, "step", "optimiser")
+    for scene in args.scenes:
+        row = {"benchmark": "step", "scene": scene, "label": args.label, "threads": THREADS,
+               **profile(scene, args.steps, clock)}  # fmt: skip
+        print(table(row), flush=True)
+        if args.record:
+            append(FILE, row)
+
+
+def profile(scene: str, steps: int, clock: Clock, warm: int = 5) -> dict[str, Any]:
+    """Milliseconds a step, in all and by section."""
+    base, views = clod.load(capture(scene) / "pretrained.ply").gaussians, clod.load_scene(capture(scene)).train
+    config = clod.AdaptConfig()
+    run = train._Run(start(base, views, config), views, config, None)
+    for _ in range(warm):
+        run.step(0.0)
+    clock.seconds.clear()
+    began = time.perf_counter()
+    for _ in range(steps):
+        run.step(0.0)
+    total = (time.perf_counter() - began) / steps
+    sections = {name: round(seconds / steps * 1e3, 2) for name, seconds in clock.seconds.items()}
+    splat = (clock.seconds["splat forward"] + clock.seconds["splat backward"]) / steps
+    return {"steps": steps, "step_ms": round(total * 1e3, 2), "splat_share": round(splat / total, 3), "ms": sections}
+
+
+def table(row: dict[str, Any]) -> str:
+    lines = [f"{row['scene']}: {row['step_ms']} ms a step, {row['splat_share']:.0%} of it in the rasterizer"]
+    return "\n".join(lines + [f"  {name:26} {ms:7.2f}" for name, ms in row["ms"].items()])
+
+
+if __name__ == "__main__":
+    main()
