@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances, soft_count
 from clod_adapter.cameras import Scene, View
@@ -164,6 +165,7 @@ class _Run:
         uniform, full = self.random.random(), self.random.random() < self.config.full_share
         return view, 1.0 if full else self.config.max_sv**uniform
 
+    @torch_on_one_thread()
     def step(self, share_done: float) -> None:
         """One view, one dial value, one update."""
         view, s = self._draw()
