@@ -87,6 +87,13 @@ class Gaussians:
         """The Gaussians at ``rows`` (a boolean mask ``[N]`` or indices ``[M]``)."""
         return self.replace(**{name: value[rows] for name, value in self.tensors().items()})
 
+    def without_empty_bands(self) -> Gaussians:
+        """The same without the highest SH bands that are 0 throughout: the same pictures, for less work."""
+        degree = self.sh_degree
+        while degree > 0 and not self.shN[:, SH_COUNTS[degree - 1] - 1 : SH_COUNTS[degree] - 1].any():
+            degree -= 1
+        return self if degree == self.sh_degree else self.replace(shN=self.shN[:, : SH_COUNTS[degree] - 1].contiguous())
+
     def to(self, device: torch.device | str) -> Gaussians:
         """A copy on another device."""
         return self.replace(**{name: value.to(device) for name, value in self.tensors().items()})

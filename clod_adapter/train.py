@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -94,8 +94,11 @@ def adapt(
             seconds = time.perf_counter() - began
             progress(Progress("start", done, total, seconds, done / total, math.nan, lambda: base))
 
-    gaussians = start(base, scene.train, config, report)
-    return _Run(gaussians, scene.train, config, progress).run(time.perf_counter() - began)
+    # Where the higher bands are not tuned, empty ones stay empty.
+    lean = base if config.lr_shN > 0 else base.without_empty_bands()
+    gaussians = start(lean, scene.train, config, report)
+    adapted = _Run(gaussians, scene.train, config, progress).run(time.perf_counter() - began)
+    return replace(adapted, gaussians=adapted.gaussians.replace(shN=base.shN)) if lean is not base else adapted
 
 
 def camera_extent(views: tuple[View, ...]) -> float:

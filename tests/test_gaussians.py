@@ -10,6 +10,7 @@ import torch
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_COUNTS, Gaussians
+from scenes import gaussians as some_gaussians
 
 CONFIG = AttenuationConfig()
 SHAPES = {
@@ -98,3 +99,23 @@ def test_select(rows: torch.Tensor) -> None:
 def test_to_a_device() -> None:
     moved = adapted().to("meta")
     assert all(value.device.type == "meta" for value in moved.tensors().values()) and moved.attenuation is CONFIG
+
+
+@pytest.mark.parametrize("degree", range(5))
+@pytest.mark.parametrize("used", range(5))
+def test_empty_bands_go(degree: int, used: int) -> None:
+    """The highest ones, as long as they are 0 throughout; a single coefficient keeps its band and all below."""
+    some = some_gaussians(7, degree, 0)
+    used = min(used, degree)
+    bands = (used + 1) ** 2 - 1
+    some.shN[:, bands:] = 0
+    if used:
+        some.shN[:, used**2 - 1 :] = 0
+        some.shN[4, bands - 1, 2] = -1e-30
+    found = some.without_empty_bands()
+    assert found.sh_degree == used and torch.equal(found.shN, some.shN[:, :bands])
+    assert found is some if used == degree else torch.equal(found.means, some.means)
+
+
+def test_no_gaussians_have_no_bands() -> None:
+    assert some_gaussians(0, 3, 0).without_empty_bands().sh_degree == 0

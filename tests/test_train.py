@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from clod_adapter import train
+from clod_adapter import importance, train
 from clod_adapter.adapter import ATTRIBUTES, attach
 from clod_adapter.attenuation import SIGMA_MAX, attenuate, log_attenuation, normalized_distances
 from clod_adapter.cameras import Scene
@@ -18,7 +18,7 @@ from clod_adapter.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import scene_distance, start
 from clod_adapter.losses import photometric_loss
-from clod_adapter.render import render
+from clod_adapter.render import render, splat
 from clod_adapter.train import Adapted, Progress, adapt, camera_extent
 from scenes import capture, gaussians, photograph, ring
 
@@ -213,6 +213,19 @@ def test_only_sigma_where_other_rates_are_zero(captured: tuple[Gaussians, Scene]
         assert torch.equal(getattr(result, name), getattr(captured[0], name)), name
     want = start(*captured_views(captured), config_of()).sigma_d
     assert ((result.sigma_d / want - 1).abs() > 1e-3).any()
+
+
+@pytest.mark.parametrize(("rate", "evaluated"), [(0.0, 0), (1e-3, 3)])
+def test_empty_bands_are_not_evaluated(
+    captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch, rate: float, evaluated: int
+) -> None:
+    """Unless they are to be tuned; the result has them either way."""
+    base, bands = captured[0].replace(shN=torch.zeros_like(captured[0].shN)), []
+    for module in (train, importance):
+        monkeypatch.setattr(module, "splat", lambda g, *rest: bands.append(g.shN.shape[1]) or splat(g, *rest))
+    found = adapt(base, captured[1], config_of(iters=4, lr_shN=rate)).gaussians
+    assert set(bands) == {evaluated}
+    assert found.shN.shape == base.shN.shape and found.shN.any() == (rate > 0)
 
 
 def test_one_step_by_hand(captured: tuple[Gaussians, Scene]) -> None:
