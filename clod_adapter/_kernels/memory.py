@@ -35,6 +35,8 @@ def recycled(shape: torch.Size | tuple[int, ...]) -> Tensor:
     room = -(-size // step) * step  # at most an eighth too large, so that nearly equal sizes share
     try:
         whole = _idle[room].pop()
+        with contextlib.suppress(ValueError):
+            _recent.remove(room)
     except (KeyError, IndexError):
         whole = aligned(room, np.float32)
     array = whole[:size].reshape(shape)

@@ -52,9 +52,10 @@ def covariance_gradient(w, g, cam):  # type: ignore[no-untyped-def]
         p0, p1 = w[PMAT + k], w[PMAT + 3 + k]
         t0, t1 = BLUR * p0, BLUR * p1
         for j in range(3):
-            cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
-            t0 += w[PMAT + 3 + j] * cross
-            t1 -= w[PMAT + j] * cross
+            if j != k:  # else it is 0, but not where one of the products is fused with the difference
+                cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
+                t0 += w[PMAT + 3 + j] * cross
+                t1 -= w[PMAT + j] * cross
         t0, t1 = t0 * idet, t1 * idet
         m0, m1 = g[SUMS + 6] * t0 + g[SUMS + 7] * t1, g[SUMS + 7] * t0 + g[SUMS + 8] * t1
         g[V_P + k], g[V_P + 3 + k] = a * m0 + b * m1, b * m0 + c * m1
