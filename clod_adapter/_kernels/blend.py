@@ -92,6 +92,15 @@ def start_tile(ox, oy, width, height, state, stride, live):  # type: ignore[no-u
 
 
 @part
+def none_set(words, at):  # type: ignore[no-untyped-def]
+    """Whether the WORDS words from ``at`` on are 0."""
+    any_set = uint64(0)
+    for word in range(WORDS):
+        any_set |= words[at + word]
+    return any_set == uint64(0)
+
+
+@part
 def find_blocks(records, r, ox, oy, masks, at):  # type: ignore[no-untyped-def]
     """Sets in ``masks[at : at + WORDS]`` the tile's blocks that the ellipse of the record at ``r`` touches.
 
@@ -158,6 +167,10 @@ def blend(  # type: ignore[no-untyped-def]
             state[k] = float32(0)
         start_tile(ox, oy, width, height, state, 64, live)
         for entry in range(offsets[tile], offsets[tile + 1]):
+            if none_set(live, 0):
+                for k in range(entry * WORDS, offsets[tile + 1] * WORDS):
+                    masks[k] = uint64(0)
+                break
             r = entries[entry] * RECORD
             prefetch(records, entries[min(entry + AHEAD, offsets[tile + 1] - 1)] * RECORD)
             qa, qb, qc, log, red, green, blue = spread(records, r)
@@ -248,6 +261,10 @@ def blend_gradient(  # type: ignore[no-untyped-def]
         read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state)
         for entry in range(offsets[tile], offsets[tile + 1]):
             slot = entry_slots[entry]
+            if none_set(masks, entry * WORDS):
+                for k in range(PAIR):
+                    pair_sums[slot * PAIR + k] = float32(0)
+                continue
             r = entries[entry] * RECORD
             prefetch(records, entries[min(entry + AHEAD, offsets[tile + 1] - 1)] * RECORD)
             qa, qb, qc, log, red, green, blue = spread(records, r)

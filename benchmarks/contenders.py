@@ -1,0 +1,188 @@
+"""What ``rasterize.py`` times, each in a process of its own: ours, the yardstick and gsplat."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import importlib.util
+import multiprocessing
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import peer_gsplat
+import torch
+import workloads
+from torch import Tensor
+from workloads import Workload
+
+from clod_adapter.rasterizers import cpu
+
+THREADS = 2
+SHARES = (1.0, 0.5, 0.25, 0.1)
+FEW = slice(100)  # rows that libraries are loaded and warmed with
+Jobs = dict[str, Callable[[], Any]]
+
+
+class Worker:
+    """A rasterizer in a process of its own: what its libraries set there and what it allocates is its own.
+
+    The yardstick's library, for one, makes its process flush denormal numbers. A worker that died answers None.
+    """
+
+    def __init__(self, title: str, make: Callable[..., Jobs], *arguments: Any) -> None:
+        spawn = multiprocessing.get_context("spawn")
+        self.title = title
+        self._pipe, theirs = spawn.Pipe()
+        self._process = spawn.Process(target=_serve, args=(theirs, make, arguments), daemon=True)
+        self._process.start()
+        theirs.close()
+
+    def __call__(self, job: str) -> Any:
+        try:
+            self._pipe.send(job)
+            return self._pipe.recv()
+        except (EOFError, OSError):
+            return None
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            self._pipe.send(None)
+        self._process.join()
+        if self._process.exitcode:
+            print(f"{self.title} ended with exit code {self._process.exitcode}", file=sys.stderr)
+
+
+def _serve(pipe: Any, make: Callable[..., Jobs], arguments: tuple[Any, ...]) -> None:
+    """A worker's process: runs jobs by name until there is none."""
+    torch.set_num_threads(THREADS)
+    jobs = make(*arguments)
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)  # what is free already must not hide what the steps take
+    before = _memory("VmRSS")
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak starts anew
+    jobs["memory"] = lambda: before and round(_memory("VmHWM") - before)
+    while (job := pipe.recv()) is not None:
+        pipe.send(jobs[job]())
+
+
+def _memory(field: str) -> float:
+    """Megabytes, from what Linux says of this process; 0 elsewhere."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+            if line.startswith(field):
+                return int(line.split()[1]) / 1024
+    return 0.0
+
+
+def timed_step(draw: Callable[[], Tensor], leaves: list[Tensor], weights: Tensor) -> list[float]:
+    """Milliseconds of the forward part and of a whole step: all gradients of a weighted sum of the pixels."""
+    for leaf in leaves:
+        leaf.grad = None
+    began = time.perf_counter()
+    image = draw()
+    drawn = time.perf_counter()
+    (image * weights).sum().backward()
+    return [(drawn - began) * 1e3, (time.perf_counter() - began) * 1e3]
+
+
+def ours(workload: Workload) -> tuple[Callable[[], Tensor], list[Tensor]]:
+    """Draws the workload with our rasterizer; and the leaves that gradients go to."""
+    leaves = {name: value.clone().requires_grad_() for name, value in workload.parameters().items()}
+    background = torch.zeros(3)
+    return lambda: cpu.rasterize(**leaves, camera=workload.camera, background=background)[0], list(leaves.values())
+
+
+@torch.no_grad()
+def timed_frame(draw: Callable[[], Tensor]) -> float:
+    """Milliseconds of a frame without gradients."""
+    began = time.perf_counter()
+    draw()
+    return (time.perf_counter() - began) * 1e3
+
+
+def our_jobs(name: str) -> Jobs:
+    """A step, a frame, and frames of fewer Gaussians."""
+    workload = workloads.make(name)
+    timed_step(*ours(workload.changed("", FEW)), workload.weights)
+    draw, leaves = ours(workload)
+    fewer: list[Callable[[], Tensor]] = []
+
+    def kept() -> list[float]:
+        fewer.extend([] if fewer else (ours(part)[0] for part in _fewer(workload)))
+        return [timed_frame(one) for one in fewer]
+
+    return {
+        "step": lambda: timed_step(draw, leaves, workload.weights), "frame": lambda: timed_frame(draw), "kept": kept
+    }  # fmt: skip
+
+
+def _fewer(workload: Workload) -> list[Workload]:
+    """The most opaque of SHARES: the others' rows removed, then the others' opacities set to 0 as the dial does."""
+    rank = workload.opacities.argsort(descending=True).argsort()
+    keep = [rank < share * len(rank) for share in SHARES]
+    removed = [workload.changed("", rows) for rows in keep]
+    return removed + [workload.changed("", opacities=torch.where(rows, workload.opacities, 0)) for rows in keep]
+
+
+def yardstick_jobs(name: str, folder: Path, library: Path) -> Jobs:
+    """A step, and how many pairs of Gaussian and pixel it blends."""
+    binding, workload = load_module(folder / "binding.py"), workloads.make(name)
+    kernel = binding.Lib(str(library), THREADS)
+
+    def step_of(part: Workload) -> Callable[[], list[float]]:
+        fields = ("means", "scales", "quats", "opacities", "sh")
+        leaves = {field: getattr(part, field).clone().requires_grad_() for field in fields}
+        camera = part.camera
+        scene = {**leaves, "viewmat": camera.viewmat, "K": camera.K, "W": camera.width, "H": camera.height}
+        return lambda: timed_step(lambda: binding.render(kernel, scene)[0], list(leaves.values()), part.weights)
+
+    step_of(workload.changed("", FEW))()
+    return {"step": step_of(workload), "pairs": lambda: int(kernel.count()[0])}
+
+
+def gsplat_jobs(name: str) -> Jobs:
+    workload = workloads.make(name)
+
+    def step_of(part: Workload) -> Callable[[], list[float]]:
+        fields = ("means", "quats", "scales", "opacities", "sh")
+        leaves = [getattr(part, field).clone().requires_grad_() for field in fields]
+        camera, black = part.camera, torch.zeros(3)
+        given = (*leaves, camera.viewmat, camera.K, camera.width, camera.height, black)
+        return lambda: timed_step(lambda: peer_gsplat.render(*given), leaves, part.weights)
+
+    step_of(workload.changed("", FEW))()
+    return {"step": step_of(workload)}
+
+
+def build_yardstick(source: Path, folder: Path) -> Path | None:
+    """The yardstick's library, built as its ``measure.py`` does; None where that cannot be done.
+
+    Leaves with a message where it would time other scenes than ours.
+    """
+    if not (source / "kernel.cpp").is_file() or not shutil.which("g++"):
+        print(f"the yardstick is left out: there is no {source / 'kernel.cpp'}, or no g++", file=sys.stderr)
+        return None
+    theirs = load_module(source / "workload.py")
+    for name, size in workloads.SIZES.items():
+        different = workloads.differences(workloads.make(name), theirs.make(*size))
+        if different:
+            sys.exit(f"{name} is not the yardstick's: {', '.join(different)} differ")
+    library = folder / "libyardstick.so"
+    options = ["-O3", "-march=native", "-ffast-math", "-std=c++17", "-fopenmp", "-shared", "-fPIC", "-DTS=32"]
+    subprocess.run(["g++", *options, str(source / "kernel.cpp"), "-o", str(library)], check=True)
+    return library
+
+
+def load_module(path: Path) -> Any:
+    """A module from a file that is not on the path."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

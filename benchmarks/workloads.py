@@ -1,0 +1,200 @@
+"""The scenes that the rasterizer is timed on: W1 and W2, made up but shaped like a room, and extreme ones.
+
+W1 and W2 are a room with spheres and boxes in it, its surfaces covered with small flat Gaussians of mixed
+opacity and with one in twenty large and faint. The yardstick makes the same ones: ``differences`` compares.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from clod_adapter.cameras import Camera
+
+# Gaussians, width, height, seed.
+SIZES = {"W1": (50_000, 480, 320, 1), "W2": (300_000, 960, 640, 2)}
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class Workload:
+    """Activated float32 parameters, a camera, and the weights of the loss ``(image * weights).sum()``."""
+
+    name: str
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh: Tensor
+    camera: Camera
+    weights: Tensor
+
+    def parameters(self) -> dict[str, Tensor]:
+        """What a rasterizer takes, by name: views or copies, all contiguous."""
+        sh0, shN = self.sh[:, :1].contiguous(), self.sh[:, 1:].contiguous()
+        fields = {name: getattr(self, name) for name in ("means", "quats", "scales", "opacities")}
+        return {**fields, "sh0": sh0, "shN": shN}
+
+    def changed(self, name: str, rows: Tensor | slice = slice(None), **fields: Tensor) -> Workload:
+        """Those rows under another name, with some fields replaced."""
+        old = {f: getattr(self, f)[rows].contiguous() for f in ("means", "quats", "scales", "opacities", "sh")}
+        return Workload(name, **{**old, **fields}, camera=self.camera, weights=self.weights)
+
+
+def make(name: str) -> Workload:
+    """W1 or W2; the draws come in a fixed order, which the numbers depend on."""
+    count, width, height, seed = SIZES[name]
+    draw = np.random.default_rng(seed)
+    rotation, translation, focal = _pose(width)
+    points = _surface_points(draw, count)
+    depths = np.maximum((points @ rotation.T + translation)[:, 2], 0.3)
+    pixels, opacities = _sizes_and_opacities(draw, count)
+    quats = draw.normal(size=(count, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    sh = _colors(draw, points)
+    weights = draw.normal(size=(height, width, 3)) / (height * width) * 100
+    viewmat = np.block([[rotation, translation[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return Workload(
+        name, *map(_tensor, (points, quats, pixels * depths[:, None] / focal, opacities, sh)),
+        Camera(_tensor(viewmat), _tensor(K), width, height), _tensor(weights),
+    )  # fmt: skip
+
+
+def _tensor(array: Array) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array, np.float32))
+
+
+def _pose(width: int) -> tuple[Array, Array, float]:
+    """Rotation and translation of the view matrix, and the focal length in pixels."""
+    yaw, pitch = np.radians(6.0), np.radians(-4.0)
+    about_y = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
+    about_x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
+    rotation = about_x @ about_y
+    return rotation, -rotation @ np.array([0.3, -0.2, -4.2]), 0.5 * width / np.tan(np.radians(60) / 2)
+
+
+def _surface_points(draw: np.random.Generator, count: int) -> Array:
+    """Points near the surfaces: back, left, right, floor and ceiling of a room, four spheres, two boxes."""
+    kinds = draw.choice(7, count, p=[0.22, 0.10, 0.10, 0.12, 0.06, 0.28, 0.12])
+    within = draw.uniform(-1, 1, (count, 3))
+    points = within * [3, 2, 3]
+    for kind, (axis, at) in enumerate([(2, 3), (0, -3), (0, 3), (1, 2), (1, -2)]):
+        points[kinds == kind, axis] = at
+    centres = np.array([[-1.2, 0.6, 0.2], [0.9, 0.2, -0.6], [0.1, -0.7, 1.2], [1.6, 1.1, 0.9]])
+    radii = np.array([0.8, 0.6, 0.7, 0.5])
+    directions = draw.normal(size=((kinds == 5).sum(), 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    which = draw.integers(0, len(radii), len(directions))
+    points[kinds == 5] = centres[which] + directions * radii[which, None]
+    faces = within[kinds == 6]
+    rows, axes = np.arange(len(faces)), draw.integers(0, 3, len(faces))
+    faces[rows, axes] = np.sign(faces[rows, axes])
+    which = draw.integers(0, 2, len(faces))
+    centres, halves = np.array([[-0.2, 1.3, -1.2], [-2.2, 0, 1.8]]), np.array([[0.5, 0.6, 0.4], [0.5, 1.2, 0.5]])
+    points[kinds == 6] = centres[which] + faces * halves[which]
+    return points + draw.normal(scale=0.015, size=points.shape)
+
+
+def _sizes_and_opacities(draw: np.random.Generator, count: int) -> tuple[Array, Array]:
+    """Standard deviations in pixels, and opacities: many faint, some nearly opaque; one in twenty large and faint."""
+    pixels = np.exp(np.log(1.2) + 0.5 * draw.normal(size=(count, 1)) + 0.35 * draw.normal(size=(count, 3)))
+    pixels[:, 2] *= 0.25
+    kinds = draw.random(count)
+    faint, medium = 0.005 + 0.5 * draw.beta(0.9, 4, count), draw.beta(2, 2, count)
+    opacities = np.where(kinds < 0.85, medium, draw.uniform(0.93, 0.999, count))
+    opacities = np.where(kinds < 0.55, faint, opacities)
+    large = draw.random(count) < 0.05
+    sizes = draw.uniform(np.log(6), np.log(30), (large.sum(), 1))
+    pixels[large] = np.exp(sizes + 0.3 * draw.normal(size=(len(sizes), 3)))
+    opacities[large] = 0.02 + 0.3 * draw.beta(1, 3, len(sizes))
+    return pixels, opacities
+
+
+def _colors(draw: np.random.Generator, points: Array) -> Array:
+    """Spherical harmonics of degree 3: waves of colour through the room, higher bands at random."""
+    waves = 0.35 * np.sin(points @ draw.normal(size=(3, 3)) * 1.7 + 1.0)
+    base = 0.5 + waves + 0.08 * draw.normal(size=points.shape)
+    sh = np.empty((len(points), 16, 3))
+    sh[:, 0] = (base - 0.5) / 0.28209479177387814
+    sh[:, 1:] = draw.normal(size=(len(points), 15, 3)) * np.repeat([0.10, 0.06, 0.04], [3, 5, 7])[None, :, None]
+    return sh
+
+
+def differences(ours: Workload, theirs: dict[str, Array | int]) -> list[str]:
+    """Names of the yardstick's arrays that are not ours bit for bit."""
+    camera = ours.camera
+    mine = {
+        "means": ours.means, "scales": ours.scales, "quats": ours.quats, "opacities": ours.opacities, "sh": ours.sh,
+        "viewmat": camera.viewmat, "K": camera.K, "G": ours.weights, "width": camera.width, "height": camera.height,
+    }  # fmt: skip
+    return [name for name, value in mine.items() if not np.array_equal(np.asarray(value), np.asarray(theirs[name]))]
+
+
+def extremes() -> dict[str, Callable[[Workload], Workload]]:
+    """Scenes made from W1, with its camera and, where they need no other, its parameters."""
+    return {
+        "W1": lambda w1: w1,
+        "one that covers the image": lambda w1: covering(w1, 1),
+        "1,000 that cover the image": lambda w1: covering(w1, 1000),
+        "a million in one patch": lambda w1: patch(w1, 1_000_000),
+        "needles": needles,
+        "on and behind the camera plane": near_plane,
+        "empty view": lambda w1: w1.changed("", means=_in_front(w1.camera, _in_camera(w1) * torch.tensor([1, 1, -1]))),
+    }
+
+
+def covering(w1: Workload, count: int) -> Workload:
+    """Gaussians so large and faint that each is drawn at every pixel, and no pixel ends before the last."""
+    depths = torch.linspace(3, 5, count)
+    means = torch.stack([torch.zeros(count), torch.zeros(count), depths], 1)
+    return w1.changed(
+        "", slice(count), means=_in_front(w1.camera, means), scales=torch.full((count, 3), 20.0),
+        opacities=torch.full((count,), 0.5 if count == 1 else 8 / count),
+    )  # fmt: skip
+
+
+def patch(w1: Workload, count: int, edge: int = 16) -> Workload:
+    """Gaussians with one footprint, the circle around a square patch; its pixels end early, those on the rim never."""
+    camera, draw = w1.camera, torch.Generator().manual_seed(3)
+    focal = camera.K[0, 0]
+    depths = 3 + 2 * torch.rand(count, generator=draw)
+    centre = torch.tensor([camera.width, camera.height]) // (4 * edge) * 2 * edge + edge / 2 - camera.K[:2, 2]
+    points = torch.cat([centre / focal * depths[:, None], depths[:, None]], 1)
+    sigma = edge / 2 * math.sqrt(2) / math.sqrt(2 * math.log(255 * 0.02))  # alpha is 1/255 at the corners
+    rows = torch.arange(count) % len(w1.means)
+    return w1.changed(
+        "", rows, means=_in_front(camera, points), scales=(sigma * depths / focal)[:, None].repeat(1, 3),
+        opacities=torch.full((count,), 0.02),
+    )  # fmt: skip
+
+
+def needles(w1: Workload) -> Workload:
+    """W1's Gaussians, 0.3 long and a millionth of that thick: lines of about a hundred pixels."""
+    return w1.changed("", scales=torch.tensor([0.3, 3e-7, 3e-7]).repeat(len(w1.means), 1))
+
+
+def near_plane(w1: Workload) -> Workload:
+    """W1's Gaussians moved along their depth: thirds behind the camera's plane, on it, and up to 0.05 before it."""
+    points, draw = _in_camera(w1), torch.Generator().manual_seed(4)
+    third = torch.arange(len(points)) % 3
+    before = 0.05 * torch.rand(len(points), generator=draw)
+    depths = torch.where(third == 0, -points[:, 2], torch.where(third == 1, 0, before))
+    rays = points[:, :2] / points[:, 2:].clamp(min=0.3)
+    sideways = torch.where(third[:, None] == 2, rays * before[:, None], points[:, :2])
+    return w1.changed("", means=_in_front(w1.camera, torch.cat([sideways, depths[:, None]], 1)))
+
+
+def _in_camera(workload: Workload) -> Tensor:
+    viewmat = workload.camera.viewmat
+    return workload.means @ viewmat[:3, :3].T + viewmat[:3, 3]
+
+
+def _in_front(camera: Camera, points: Tensor) -> Tensor:
+    """World positions of camera-space ``points [n, 3]``."""
+    return (points - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
