@@ -13,11 +13,14 @@ from __future__ import annotations
 
 import math
 import operator
+from collections.abc import Callable
 
 from llvmlite import ir
 from numba import float32, types
 from numba.core import cgutils
-from numba.extending import intrinsic, models, overload, register_model
+from numba.core.typing.templates import AbstractTemplate, infer_global
+from numba.core.typing.templates import signature as typing_signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
 
 LANES = 16
 ZERO = float32(0)
@@ -77,9 +80,7 @@ def splat(typingctx, value):  # type: ignore[no-untyped-def]
     """Sixteen copies of a float32."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        one = builder.insert_element(ir.Constant(_vector, ir.Undefined), args[0], ir.Constant(ir.IntType(32), 0))
-        zeros = ir.Constant(_ivector, [0] * LANES)
-        return builder.shuffle_vector(one, ir.Constant(_vector, ir.Undefined), zeros)
+        return _spread(builder, args[0])
 
     return f32x16(types.float32), codegen
 
@@ -106,45 +107,47 @@ def store(typingctx, array, index, value):  # type: ignore[no-untyped-def]
     return types.none(array, types.intp, f32x16), codegen
 
 
-def _binary(name: str):  # type: ignore[no-untyped-def]
-    @intrinsic
-    def operation(typingctx, a, b):  # type: ignore[no-untyped-def]
-        def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-            return getattr(builder, name)(*args, flags=("nsz", "contract"))
-
-        return f32x16(f32x16, f32x16), codegen
-
-    return operation
+def _spread(builder, value):  # type: ignore[no-untyped-def]
+    """Sixteen copies of a float; a vector as it is."""
+    if value.type == _vector:
+        return value
+    one = builder.insert_element(ir.Constant(_vector, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(one, ir.Constant(_vector, ir.Undefined), ir.Constant(_ivector, [0] * LANES))
 
 
-_add, _sub, _mul, _div = (_binary(name) for name in ("fadd", "fsub", "fmul", "fdiv"))
-
-
-def _overload(operators, operation):  # type: ignore[no-untyped-def]
+def _operators(name: str, *operators: Callable[..., object]) -> None:
     """Defines operators of two vectors, or of a vector and a float32."""
+    pairs = (f32x16, f32x16), (f32x16, types.float32), (types.float32, f32x16)
 
-    def of(a, b):  # type: ignore[no-untyped-def]
-        if a is f32x16 and b is f32x16:
-            return lambda a, b: operation(a, b)
-        if a is f32x16 and b is types.float32:
-            return lambda a, b: operation(a, splat(b))
-        if a is types.float32 and b is f32x16:
-            return lambda a, b: operation(splat(a), b)
-        return None
+    class Typing(AbstractTemplate):  # type: ignore[misc]
+        def generic(self, args, kws):  # type: ignore[no-untyped-def]
+            return typing_signature(f32x16, *args) if tuple(args) in pairs else None
+
+    def lower(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return getattr(builder, name)(*(_spread(builder, arg) for arg in args), flags=("nsz", "contract"))
 
     for each in operators:
-        overload(each, inline="always")(of)
+        infer_global(each)(Typing)
+        for pair in pairs:
+            lower_builtin(each, *pair)(lower)
 
 
-_overload((operator.add, operator.iadd), _add)
-_overload((operator.sub, operator.isub), _sub)
-_overload((operator.mul, operator.imul), _mul)
-_overload((operator.truediv, operator.itruediv), _div)
+# Not ``overload``: inlining hundreds of operators takes numba minutes.
+_operators("fadd", operator.add, operator.iadd)
+_operators("fsub", operator.sub, operator.isub)
+_operators("fmul", operator.mul, operator.imul)
+_operators("fdiv", operator.truediv, operator.itruediv)
 
 
-@overload(operator.neg, inline="always")
-def _overload_neg(a):  # type: ignore[no-untyped-def]
-    return (lambda a: _sub(splat(ZERO), a)) if a is f32x16 else None
+@infer_global(operator.neg)
+class _Negative(AbstractTemplate):  # type: ignore[misc]
+    def generic(self, args, kws):  # type: ignore[no-untyped-def]
+        return typing_signature(f32x16, f32x16) if tuple(args) == (f32x16,) else None
+
+
+@lower_builtin(operator.neg, f32x16)
+def _negative(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    return builder.fneg(args[0])
 
 
 def _compare(predicate: str):  # type: ignore[no-untyped-def]

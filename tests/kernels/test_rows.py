@@ -1,0 +1,193 @@
+"""Sixteen rows of a matrix as vectors, a lane a row, and back."""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import os
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numba import int64, njit
+
+from clod_adapter._kernels.compiling import pointer, scratch
+from clod_adapter._kernels.simd import f32x16, load, load_rows, store, store_rows
+
+LANES, VECTORS = 16, 40
+WIDTHS = [3, 4, 9, 16, 45, 72]
+# Width, first column, number of columns.
+SPANS = [
+    (width, first, count)
+    for width in WIDTHS
+    for count in range(1, LANES + 1)
+    for first in {0, 1, (width - count) // 2, width - count}
+    if 0 <= first <= width - count
+]
+CONSTANTS = [(1, 0, 1), (3, 0, 3), (4, 0, 4), (16, 0, 16), (16, 6, 3), (9, 1, 8), (45, 32, 13), (72, 16, 16)]
+
+
+@njit
+def to_vectors(source, rows, width, first, count, lanes, at):
+    """``lanes [VECTORS, 16]`` go through the vectors, so that those which are not written are seen."""
+    vectors = scratch(f32x16, VECTORS)
+    for k in range(VECTORS):
+        vectors[k] = load(lanes[k], 0)
+    load_rows(pointer(source), pointer(rows), width, first, count, vectors, at)
+    for k in range(VECTORS):
+        store(lanes[k], 0, vectors[k])
+
+
+@njit
+def to_rows(destination, rows, width, first, count, lanes, at):
+    vectors = scratch(f32x16, VECTORS)
+    for k in range(VECTORS):
+        vectors[k] = load(lanes[k], 0)
+    store_rows(pointer(destination), pointer(rows), width, first, count, vectors, at)
+
+
+def with_constants(width: int, first: int, count: int) -> tuple[Callable[..., None], Callable[..., None]]:
+    """Both, compiled for these numbers as the kernels have them."""
+
+    @njit
+    def load_constant(source, rows, lanes):
+        vectors = scratch(f32x16, VECTORS)
+        load_rows(pointer(source), pointer(rows), width, first, count, vectors, 2)
+        for k in range(count):
+            store(lanes[k], 0, vectors[2 + k])
+
+    @njit
+    def store_constant(destination, rows, lanes):
+        vectors = scratch(f32x16, VECTORS)
+        for k in range(LANES):
+            vectors[2 + k] = load(lanes[k], 0)
+        store_rows(pointer(destination), pointer(rows), width, first, count, vectors, 2)
+
+    return load_constant, store_constant
+
+
+def matrix(rows: int, width: int) -> np.ndarray:
+    return np.arange(1, rows * width + 1, dtype=np.float32).reshape(rows, width)
+
+
+ORDERS = {
+    "in order": np.arange(LANES),
+    "backwards": np.arange(LANES)[::-1],
+    "apart": np.arange(LANES) * 3 % 50,
+    "the last": np.full(LANES, 49),
+    "padded": np.minimum(np.arange(LANES), 5) + 44,
+    "mixed": np.random.default_rng(0).integers(0, 50, LANES),
+}
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("width", WIDTHS)
+def test_load_rows(width: int, order: str) -> None:
+    """Column by column; of the vectors, those before ``at`` and after ``at + 15`` are left alone."""
+    source, rows = matrix(50, width), ORDERS[order].astype(np.int64)
+    for _, first, count in (s for s in SPANS if s[0] == width):
+        for at in (0, 7, VECTORS - LANES):
+            lanes = np.full((VECTORS, LANES), -1, np.float32)
+            to_vectors(source, rows, width, first, count, lanes, at)
+            np.testing.assert_array_equal(lanes[at : at + count], source[rows, first : first + count].T)
+            assert (lanes[:at] == -1).all() and (lanes[at + LANES :] == -1).all()
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("width", WIDTHS)
+def test_store_rows(width: int, order: str) -> None:
+    """Nothing beside the columns is written, and of a row that is named twice the last counts."""
+    rows = ORDERS[order].astype(np.int64)
+    lanes = -matrix(VECTORS, LANES)
+    for _, first, count in (s for s in SPANS if s[0] == width):
+        for at in (0, 7, VECTORS - LANES):
+            found, want = matrix(50, width), matrix(50, width)
+            for lane, row in enumerate(rows):
+                want[row, first : first + count] = lanes[at : at + count, lane]
+            to_rows(found, rows, width, first, count, lanes, at)
+            np.testing.assert_array_equal(found, want)
+
+
+@pytest.mark.parametrize(("width", "first", "count"), CONSTANTS)
+def test_constant_columns(width: int, first: int, count: int) -> None:
+    load_constant, store_constant = with_constants(width, first, count)
+    source, rows = matrix(50, width), ORDERS["mixed"].astype(np.int64)
+    lanes = np.zeros((LANES, LANES), np.float32)
+    load_constant(source, rows, lanes)
+    np.testing.assert_array_equal(lanes[:count], source[rows, first : first + count].T)
+    for order in ORDERS.values():
+        found, want, lanes = matrix(50, width), matrix(50, width), -matrix(LANES, LANES)
+        for lane, row in enumerate(order):
+            want[row, first : first + count] = lanes[:count, lane]
+        store_constant(found, order.astype(np.int64), lanes)
+        np.testing.assert_array_equal(found, want)
+
+
+def test_any_bits_pass() -> None:
+    """NaN with its payload, infinities, -0 and subnormal numbers, there and back."""
+    bits = np.random.default_rng(0).integers(0, 2**32, (LANES, 9), dtype=np.uint32)
+    bits[:, :5] = np.array([0x7FC12345, 0xFF800000, 0x80000000, 1, 0x7F800001], np.uint32)
+    source, back = bits.view(np.float32), np.zeros((LANES, 9), np.float32)
+    rows, lanes = np.arange(LANES), np.zeros((VECTORS, LANES), np.float32)
+    to_vectors(source, rows, 9, 0, 9, lanes, 0)
+    to_rows(back, rows, 9, 0, 9, lanes, 0)
+    np.testing.assert_array_equal(back.view(np.uint32), bits)
+
+
+def test_no_columns() -> None:
+    """A count of 0, as of the higher bands of degree 0."""
+    lanes, found = np.ones((VECTORS, LANES), np.float32), matrix(50, 3)
+    to_rows(found, np.arange(LANES), 3, 0, 0, lanes, 0)
+    np.testing.assert_array_equal(found, matrix(50, 3))
+    to_vectors(found, np.arange(LANES), 3, 0, 0, lanes, 0)
+    assert (lanes[LANES:] == 1).all()
+
+
+@njit
+def all_rows(source, destination, width, first, count):
+    """Copies the columns of all rows, sixteen at a time, the last row again where there are fewer."""
+    vectors, rows = scratch(f32x16, LANES), scratch(int64, LANES)
+    for start in range(0, len(source) // width, LANES):
+        for lane in range(LANES):
+            rows[lane] = min(start + lane, len(source) // width - 1)
+        load_rows(pointer(source), rows, width, first, count, vectors, 0)
+        store_rows(pointer(destination), rows, width, first, count, vectors, 0)
+
+
+def island(size: int, at_the_end: bool) -> np.ndarray:
+    """A float32 array that ends, or begins, where memory may be touched: beside it a touch ends the process."""
+    pages = -(-4 * size // mmap.PAGESIZE)
+    whole = mmap.mmap(-1, (pages + 2) * mmap.PAGESIZE)
+    address, end = ctypes.addressof(ctypes.c_char.from_buffer(whole)), (pages + 1) * mmap.PAGESIZE
+    for guard in (address, address + end):
+        assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(guard), ctypes.c_size_t(mmap.PAGESIZE), 0) == 0
+    return np.frombuffer(whole, np.float32, size, end - 4 * size if at_the_end else mmap.PAGESIZE)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs mprotect")
+@pytest.mark.parametrize("at_the_end", [True, False])
+@pytest.mark.parametrize("width", WIDTHS)
+def test_nothing_beyond_the_array_is_touched(width: int, at_the_end: bool) -> None:
+    for n in (1, 15, 16, 21):
+        values = matrix(n, width)
+        source, destination = (island(n * width, at_the_end) for _ in range(2))
+        source[:] = values.ravel()
+        for _, first, count in (s for s in SPANS if s[0] == width):
+            destination[:] = 0
+            all_rows(source, destination, width, first, count)
+            want = np.zeros((n, width), np.float32)
+            want[:, first : first + count] = values[:, first : first + count]
+            np.testing.assert_array_equal(destination.reshape(n, width), want)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs mprotect")
+@pytest.mark.parametrize(("width", "first", "count"), CONSTANTS)
+def test_nothing_beyond_the_array_is_touched_by_constant_columns(width: int, first: int, count: int) -> None:
+    load_constant, store_constant = with_constants(width, first, count)
+    for at_the_end in (True, False):
+        array, lanes = island(LANES * width, at_the_end), np.zeros((LANES, LANES), np.float32)
+        array[:] = matrix(LANES, width).ravel()
+        load_constant(array, np.arange(LANES), lanes)
+        np.testing.assert_array_equal(lanes[:count], array.reshape(LANES, width)[:, first : first + count].T)
+        store_constant(array, np.arange(LANES), lanes)
+        np.testing.assert_array_equal(array, matrix(LANES, width).ravel())
