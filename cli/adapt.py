@@ -7,95 +7,56 @@ import shlex
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
+
+import torch
 
 from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.cameras import Scene
-from clod_adapter.cli.console import Console, announced_compiling, duration
+from clod_adapter.cli.console import Console, duration
 from clod_adapter.cli.evaluate import measure
-from clod_adapter.cli.files import Outputs, read_checkpoint, read_scene, size
+from clod_adapter.cli.files import Outputs, size
+from clod_adapter.cli.inputs import read_checkpoint, read_scene
+from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, table, write_report
-from clod_adapter.cli.settings import add_settings, make_config, pick_device
+from clod_adapter.cli.settings import make_config
 from clod_adapter.cli.training import Follower, GracefulStop
 from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluate import Row
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.adapter_file import save_adapter
+from clod_adapter.io.adapter_file import check_config, save_adapter
 from clod_adapter.io.ply import Checkpoint, save
 from clod_adapter.io.version import package_version
 from clod_adapter.train import Adapted, adapt
 
-SUMMARY = "Give a trained 3D Gaussian splat a quality dial."
-DESCRIPTION = """\
-Give a trained 3D Gaussian splat a quality dial: one file for every budget.
-
-Learns one number per Gaussian, sigma_d, with which a renderer fades detail out
-smoothly with distance, and tunes the rest lightly. The dial s is set when
-rendering: 1 is full quality, at s roughly s^-1.5 of the Gaussians are drawn.
-"""
-USAGE = "PLY --images DIR [--max-sv S] [--out OUT.ply] [options]"
-EPILOG = """\
-outputs, side by side; a file of that name is replaced:
-  OUT.ply          the splat with one more property, sigma_d
-  OUT.safetensors  the adapter: only what changed; "clod-adapt apply" makes
-                   OUT.ply again from it and the checkpoint
-  OUT.json         the report: settings, machine, times, and per dial value the
-                   quality on held-out photographs (every 8th by name)
-
-Ctrl-C while training stops after the step under way and writes what was learned
-so far (exit code 0, "interrupted": true in the report); once more aborts. While
-the result is written it is finished first, while it is measured the rest is
-skipped. Before training nothing is written.
-
-exit codes: 0 written; 2 bad input, one line on stderr and nothing written;
-130 interrupted with nothing to write, or aborted
-
-examples:
-  clod-adapt garden.ply --images garden --max-sv 5
-  clod-adapt garden.ply --images garden --time-budget 120 --out out/dial.ply
-  clod-adapt garden.ply --images garden --quiet --json > report.json
-"""
 # A base this far off its photographs is not a poor one but one that stands elsewhere.
 MISALIGNED_PSNR = 15.0
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("ply", metavar="PLY", help="the checkpoint, in Inria's 3DGS layout; it is never modified")
-    parser.add_argument(
-        "--images", metavar="DIR", required=True,
-        help="the scene: photographs in DIR/images and their COLMAP model in DIR/sparse/0",
-    )  # fmt: skip
-    add_settings(parser)
-    parser.add_argument("--out", metavar="OUT.ply", help="output (default: PLY's name with _clod, in this folder)")
-    parser.add_argument("--device", choices=["auto", "cpu"], default="auto", help="where to train (default: auto)")
-    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
-
-
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, stop = Console(args.quiet), Stopwatch(), GracefulStop()
-    config = make_config(args)
-    outputs = Outputs.beside(Path(args.out or f"{Path(args.ply).stem}_clod.ply"))
-    outputs.check([args.ply])
+    config, outputs = make_config(args), Outputs.of(args.ply, args.out)
+    check_config(asdict(config))
     with watch.time("load"):
         base = read_checkpoint(args.ply, console)
         scene = read_scene(args.images, console)
     gaussians = base.gaussians.to(pick_device(args.device))
-    with announced_compiling(console):
-        with watch.time("evaluate"):
-            base_rows, notes = look_at_base(gaussians, scene, args, console)
-        with stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
-            adapted = train(gaussians, scene, config, console, stop, base_rows)
-            watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
-            adapter = extract(gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config))
-            result = adapter.apply(gaussians)
-            write(base, adapter, result, outputs, console)
-            report = describe_run(args, outputs, adapter, adapted) | {
-                "sh_degree": result.sh_degree, "device": str(result.means.device), "seconds": watch.report(),
-                "notes": [*base.notes, *scene.notes, *notes, "the result was not measured"],
-                "base_rows": [row.as_dict() for row in base_rows], "rows": [], "detached_row": None,
-            }  # fmt: skip
-            write_report(outputs.report, report)
+    with watch.time("kernels"):
+        prepare_kernels(console)
+    with watch.time("evaluate"):
+        base_rows, notes = look_at_base(gaussians, scene, args, console)
+    with stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
+        adapted = train(gaussians, scene, config, console, stop, base_rows)
+        watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
+        adapter = extract(gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config))
+        result = adapter.apply(gaussians)
+        write(base, adapter, result, outputs, console)
+        report = describe_run(args, outputs, adapter, adapted) | {
+            "sh_degree": result.sh_degree, "device": str(result.means.device), "seconds": watch.report(),
+            "notes": [*base.notes, *scene.notes, *notes, "the result was not measured"],
+            "base_rows": [row.as_dict() for row in base_rows], "rows": [], "detached_row": None,
+        }  # fmt: skip
+        write_report(outputs.report, report)
     skip = stop.requests > 0 and not adapted.interrupted
     with watch.time("evaluate"):
         rows, plain, cut_short = ([], [], True) if skip else measure_result(result, scene, config, console)
@@ -120,6 +81,11 @@ def describe_run(args: argparse.Namespace, outputs: Outputs, adapter: Adapter, a
         "adapter_bytes": outputs.adapter.stat().st_size, "ply_bytes": outputs.ply.stat().st_size,
         "outputs": outputs.names(),
     }  # fmt: skip
+
+
+def pick_device(name: str) -> torch.device:
+    """Where to train; ``auto`` is the fastest device that there is a rasterizer for, which is the CPU."""
+    return torch.device("cpu" if name == "auto" else name)
 
 
 def look_at_base(
@@ -169,8 +135,9 @@ def write(base: Checkpoint, adapter: Adapter, result: Gaussians, outputs: Output
     run's report goes, since it is of other files.
     """
     outputs.report.unlink(missing_ok=True)
-    save_adapter(outputs.adapter, adapter)
-    save(outputs.ply, result, base, version=adapter.version)
+    with console.status(f"writing {outputs.ply} ..."):
+        save_adapter(outputs.adapter, adapter)
+        save(outputs.ply, result, base, version=adapter.version)
     console.say(f"wrote {outputs.adapter} and {outputs.ply}")
 
 

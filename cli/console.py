@@ -29,6 +29,20 @@ class Console:
                 sys.stderr.flush()
 
     @contextmanager
+    def status(self, text: str) -> Iterator[None]:
+        """Shows on a terminal what is being done, while it is, where there is no telling how far it is."""
+        shown = None
+        if not self.quiet and sys.stderr.isatty():
+            with _unbreakable():
+                shown = tqdm(bar_format="{desc}", desc=text, file=sys.stderr, leave=False, dynamic_ncols=True)
+        try:
+            yield
+        finally:
+            if shown is not None:
+                with _unbreakable():
+                    shown.close()
+
+    @contextmanager
     def meter(self, label: str) -> Iterator[Meter]:
         """The progress of one phase, which ends with the block."""
         meter = Meter(self, label)
@@ -40,10 +54,15 @@ class Console:
 
 @dataclass
 class Meter:
-    """Progress with the time left: a bar on a terminal, elsewhere a line now and then."""
+    """Progress with the time left: a bar on a terminal, elsewhere a line now and then.
+
+    Args:
+        slow: of few and uneven steps: shown from the start, and judged by all of its time so far.
+    """
 
     console: Console
     label: str
+    slow: bool = False
     bar: Any = None
     began: float = field(default_factory=time.perf_counter)
     printed: float = field(default_factory=time.perf_counter)
@@ -52,7 +71,8 @@ class Meter:
         if not self.console.quiet and sys.stderr.isatty():
             self.bar = tqdm(
                 total=1.0, desc=self.label, bar_format=BAR_FORMAT, file=sys.stderr,
-                leave=False, delay=0.5, miniters=0, dynamic_ncols=True,
+                leave=False, delay=0 if self.slow else 0.5, smoothing=0 if self.slow else 0.3,
+                miniters=0, dynamic_ncols=True,
             )  # fmt: skip
 
     def update(self, share: float, text: str = "") -> None:
@@ -72,26 +92,6 @@ class Meter:
             with _unbreakable():
                 self.bar.close()
             self.bar = None
-
-
-@contextmanager
-def announced_compiling(console: Console) -> Iterator[None]:
-    """Says so, once, when a kernel has to be compiled within the block; it takes a while and happens once."""
-    from numba.core.event import Event, Listener, install_listener
-
-    class Announce(Listener):  # type: ignore[misc]
-        said = False
-
-        def on_start(self, event: Event) -> None:
-            if not self.said:
-                self.said = True
-                console.say("compiling kernels (first run only, well under a minute) ...")
-
-        def on_end(self, event: Event) -> None:
-            pass
-
-    with install_listener("numba:compile", Announce()):
-        yield
 
 
 def duration(seconds: float) -> str:

@@ -10,8 +10,10 @@ from typing import Any
 import torch
 
 from clod_adapter.cli import adapt
-from clod_adapter.cli.console import Console, announced_compiling, duration
+from clod_adapter.cli.commands import ADAPT
+from clod_adapter.cli.console import Console, duration
 from clod_adapter.cli.files import check_output
+from clod_adapter.cli.kernels import announced_compiling, prepare_kernels
 from clod_adapter.cli.parser import make_parser
 from clod_adapter.cli.report import Stopwatch
 from clod_adapter.demo.pictures import Panel, dial_strip, quality_curve
@@ -22,34 +24,11 @@ from clod_adapter.io.ply import load, save
 from clod_adapter.render import render
 from clod_adapter.train import Progress
 
-SUMMARY = "Run everything on a built-in scene; nothing to download."
-DESCRIPTION = """\
-Run the whole job on a scene that comes with the package.
-
-Ray-traces a small gallery (its ground truth owes nothing to splatting), trains
-a plain checkpoint on it, gives that a dial, measures it on held-out views and
-draws two pictures. A few minutes on two cores without a GPU, the first time;
-the gallery and the checkpoint are kept and used again.
-"""
-USAGE = "[--out DIR] [options]"
-EPILOG = """\
-in DIR afterwards:
-  capture/          64 images and their COLMAP model
-  base.ply          the checkpoint, as any 3DGS trainer would leave it
-  gallery.ply       the same with a dial; gallery.safetensors, gallery.json
-  dial.png          one held-out view at several dial values
-  curve.png         quality against the number of Gaussians
-"""
 POINTS, FIT_STEPS, MAX_SV = 60_000, 2000, 5.0
 DIALS = (1.0, 2.0, 3.0, 5.0)
 EXTRA = {"matplotlib": "matplotlib", "skimage": "scikit-image"}  # module, and the package that brings it
 VIEW = 0  # the held-out view on the strip: across the whole room
 CROP = (100, 70, 96, 72)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", metavar="DIR", default="demo", help="where everything goes (default: demo)")
-    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
@@ -60,6 +39,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     pictures = {"dial": folder / "dial.png", "curve": folder / "curve.png"}
     for path in (base, model, *pictures.values()):
         check_output(path, [])
+    prepare_kernels(console)
     with announced_compiling(console):
         prepare(capture, base, console)
     report = adapt.run(adapt_arguments(args, base, capture, model))
@@ -93,7 +73,7 @@ def adapt_arguments(args: argparse.Namespace, base: Path, capture: Path, model: 
     """What the main job's own parser makes of the command line for the demo's files."""
     words = [f"--images={capture}", f"--max-sv={MAX_SV:g}", f"--out={model}"]
     words += [f"--{name}" for name in ("quiet", "json") if getattr(args, name)]
-    return make_parser(adapt, "clod-adapt").parse_args([*words, "--", str(base)])
+    return make_parser(ADAPT, "clod-adapt").parse_args([*words, "--", str(base)])
 
 
 def print_next(folder: Path, pictures: dict[str, Path], watch: Stopwatch) -> None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 from clod_adapter.cameras import View
-from clod_adapter.cli.console import Console, announced_compiling
-from clod_adapter.cli.files import read_checkpoint, read_scene
+from clod_adapter.cli.console import Console
+from clod_adapter.cli.inputs import read_checkpoint, read_scene
+from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.report import Stopwatch, machine, table
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
@@ -18,43 +18,11 @@ from clod_adapter.evaluate import Row, evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.version import package_version
 
-SUMMARY = "Measure quality, count and time at some dial values."
-DESCRIPTION = "Measure quality, Gaussians kept and frame time at several dial values."
-USAGE = "MODEL.ply --images DIR [--sv S [S ...]] [options]"
-EPILOG = """\
-All numbers are over the held-out photographs (every 8th by name):
-  PSNR, SSIM  means against the photographs
-  kept        Gaussians that the dial leaves in, and their share of all
-  in view     those of them that have their centre in the picture
-  frame ms    median time to render a picture
-A checkpoint without a dial shows the same at every value: the baseline.
-
-Ctrl-C skips the dial values that are not finished (exit code 0, "interrupted":
-true); before the first one is, there is nothing to print (exit code 130).
-
-examples:
-  clod-adapt eval garden_clod.ply --images garden
-  clod-adapt eval garden.ply --images garden --sv 1
-  clod-adapt eval garden_clod.ply --images garden --sv 1 4 --json > eval.json
-"""
 DIALS = (1.0, 2.0, 3.0, 5.0)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one as the baseline")
-    parser.add_argument("--images", metavar="DIR", required=True, help="the scene: photographs and their COLMAP model")
-    parser.add_argument(
-        "--sv", metavar="S", type=float, nargs="+",
-        help="dial values, 1 (full quality) and up (default: 1 2 3 5 as far as trained, and the last one trained)",
-    )  # fmt: skip
-    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch = Console(args.quiet), Stopwatch()
-    for virtual_scale in args.sv or ():
-        if not 1 <= virtual_scale < math.inf:
-            raise ClodError(f"--sv has {virtual_scale:g}, dial values must be at least 1 (1 is full quality)")
     with watch.time("load"):
         model = read_checkpoint(args.model, console)
         scene = read_scene(args.images, console)
@@ -66,7 +34,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     dials, notes = choose_dials(args.sv, attenuation)
     for note in notes:
         console.say(note)
-    with watch.time("evaluate"), announced_compiling(console):
+    with watch.time("kernels"):
+        prepare_kernels(console, training=False)
+    with watch.time("evaluate"):
         rows, interrupted = measure(model.gaussians, scene.test, dials, console)
     if interrupted and not rows:
         raise KeyboardInterrupt

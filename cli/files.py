@@ -1,4 +1,4 @@
-"""Inputs and outputs as the commands share them: read with a word to the user, checked before work is spent."""
+"""The files of the commands: their names, checked before work is spent."""
 
 from __future__ import annotations
 
@@ -6,12 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from clod_adapter.cameras import Scene
-from clod_adapter.cli.console import Console
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import check_target
-from clod_adapter.io.colmap import load_scene
-from clod_adapter.io.ply import Checkpoint, load
 
 
 @dataclass(frozen=True)
@@ -23,7 +19,9 @@ class Outputs:
     report: Path
 
     @classmethod
-    def beside(cls, ply: Path) -> Outputs:
+    def of(cls, checkpoint: str, out: str | None) -> Outputs:
+        """Beside ``out``, by default the checkpoint's name with _clod in the current folder."""
+        ply = Path(out or f"{Path(checkpoint).stem}_clod.ply")
         return cls(ply, ply.with_suffix(".safetensors"), ply.with_suffix(".json"))
 
     def check(self, inputs: Sequence[str]) -> None:
@@ -34,31 +32,6 @@ class Outputs:
 
     def names(self) -> dict[str, str]:
         return {name: str(path) for name, path in vars(self).items()}
-
-
-def read_checkpoint(path: str, console: Console) -> Checkpoint:
-    """Reads a PLY and says what is in it."""
-    checkpoint = load(path)
-    gaussians = checkpoint.gaussians
-    dial = ", with sigma_d" if gaussians.sigma_d is not None else ""
-    console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{dial}")
-    for note in checkpoint.notes:
-        console.say(f"  note: {note}")
-    return checkpoint
-
-
-def read_scene(folder: str, console: Console) -> Scene:
-    """Reads the photographs and says how they are used."""
-    if not Path(folder).is_dir():
-        raise ClodError(f"{folder}: is not a folder; give the one that holds images/ and sparse/0")
-    with console.meter("photographs") as meter:
-        scene = load_scene(folder, progress=lambda done, total: meter.update(done / total, f"{done}/{total}"))
-    camera = scene.train[0].camera
-    size = f"{camera.width}x{camera.height}"
-    console.say(f"{folder}: {len(scene.train)} photographs to train on, {len(scene.test)} held out, {size}")
-    for note in scene.notes:
-        console.say(f"  note: {note}")
-    return scene
 
 
 def check_output(path: Path, inputs: Sequence[str]) -> None:

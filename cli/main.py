@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+import argparse
+import gc
 import io
 import json
 import os
 import sys
 from contextlib import nullcontext, redirect_stdout
+from importlib import import_module
 from typing import Any
 
-from clod_adapter.cli import adapt, apply, demo, evaluate
+from clod_adapter.cli.commands import ADAPT, APPLY, DEMO, EVALUATE, Command
 from clod_adapter.cli.parser import Parser, make_parser
-from clod_adapter.cli.report import jsonable
 from clod_adapter.errors import ClodError
 from clod_adapter.io.version import package_version
 
 PROG = "clod-adapt"
 
-# A command is a module with the texts SUMMARY, USAGE, DESCRIPTION and EPILOG, ``add_arguments(parser)`` and
-# ``run(args)``, which returns the object that --json prints. Adapting is the main job and needs no word.
-COMMANDS: dict[str, Any] = {"eval": evaluate, "apply": apply, "demo": demo}
+# Adapting is the main job and needs no word.
+COMMANDS: dict[str, Command] = {"eval": EVALUATE, "apply": APPLY, "demo": DEMO}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -28,11 +29,7 @@ def main(argv: list[str] | None = None) -> int:
     name = words[0] if words and words[0] in COMMANDS else ""
     try:
         args = build_parser(name).parse_args(words[1:] if name else words)
-        aside = io.StringIO() if args.quiet else sys.stderr
-        with redirect_stdout(aside) if args.json else nullcontext():
-            report = COMMANDS.get(name, adapt).run(args)
-        if args.json:
-            print(json.dumps(jsonable(report), allow_nan=False))
+        run(COMMANDS.get(name, ADAPT), args)
         sys.stdout.flush()
     except ClodError as error:
         print(f"{PROG}: error: {' '.join(str(error).splitlines())}", file=sys.stderr)
@@ -51,13 +48,43 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
+def run(command: Command, args: argparse.Namespace) -> None:
+    """Runs a command and prints its report where --json asks for it."""
+    from clod_adapter.cli.checks import CHECKS  # here and not above, as --help needs nothing of what it imports
+    from clod_adapter.cli.report import jsonable
+
+    CHECKS[command.module](args)
+    module = import_command(command, args)
+    aside = io.StringIO() if args.quiet else sys.stderr
+    with redirect_stdout(aside) if args.json else nullcontext():
+        report = module.run(args)
+    if args.json:
+        print(json.dumps(jsonable(report), allow_nan=False))
+
+
+def import_command(command: Command, args: argparse.Namespace) -> Any:
+    """The command's module, with torch and all, which takes a second or two."""
+    from clod_adapter.cli.console import Console
+
+    name = f"clod_adapter.cli.{command.module}"
+    if name in sys.modules:
+        return sys.modules[name]
+    gc.disable()  # a tenth of the time, with nothing to collect
+    try:
+        with Console(args.quiet).status("starting ..."):
+            return import_module(name)
+    finally:
+        gc.freeze()  # what was imported stays: later collections, one of them at exit, need not go through it
+        gc.enable()
+
+
 def build_parser(name: str) -> Parser:
     """The parser of a command; of the main job for an empty name."""
-    command = COMMANDS.get(name, adapt)
+    command = COMMANDS.get(name, ADAPT)
     parser = make_parser(command, f"{PROG} {name}".strip())
     if not name:
-        others = "\n".join(f"  {PROG} {word:<6} {module.SUMMARY}" for word, module in COMMANDS.items())
-        parser.epilog = f"other commands, each with its own --help:\n{others}\n\n{command.EPILOG}"
+        others = "\n".join(f"  {PROG} {word:<6} {other.summary}" for word, other in COMMANDS.items())
+        parser.epilog = f"other commands, each with its own --help:\n{others}\n\n{command.epilog}"
         parser.add_argument("--version", action="version", version=f"{PROG} {package_version()}")
     return parser
 

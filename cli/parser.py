@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any, NoReturn
+from typing import NoReturn
 
+from clod_adapter.cli.commands import Command
 from clod_adapter.errors import ClodError
 
 
@@ -15,10 +16,10 @@ class Parser(argparse.ArgumentParser):
         raise ClodError(f"{message} ({self.prog} --help explains)")
 
 
-def make_parser(command: Any, prog: str) -> Parser:
-    """The parser of a command module (see ``main.COMMANDS``), with the options that all commands have."""
+def make_parser(command: Command, prog: str) -> Parser:
+    """The parser of a command, with the options that all commands have."""
     parser = Parser(
-        prog=prog, usage=f"{prog} {command.USAGE}", description=command.DESCRIPTION, epilog=command.EPILOG,
+        prog=prog, usage=f"{prog} {command.usage}", description=command.description, epilog=command.epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     command.add_arguments(parser)

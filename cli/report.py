@@ -10,12 +10,12 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-
-from clod_adapter.evaluate import Row
 from clod_adapter.io.atomic import atomic_path
+
+if TYPE_CHECKING:
+    from clod_adapter.evaluate import Row
 
 
 class Stopwatch:
@@ -44,6 +44,7 @@ class Stopwatch:
 def machine() -> dict[str, Any]:
     """What the times were taken on."""
     import numba
+    import torch
 
     return {
         "cpu": _cpu_name(),

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from typing import Any
-
-import torch
 
 from clod_adapter.config import AdaptConfig, describe
 from clod_adapter.errors import ClodError
-from clod_adapter.io.adapter_file import check_config
 
 OPTIONS: dict[str, Any] = {
     "max_sv": ("S", float), "iters": ("N", int), "time_budget": ("SEC", float), "seed": ("N", int)
@@ -28,7 +24,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
 
 
 def make_config(args: argparse.Namespace) -> AdaptConfig:
-    """The settings, fit for the adapter's file; what is wrong with one is said in the words of the command line."""
+    """The settings; what is wrong with one is said in the words of the command line."""
     limit = 1 / AdaptConfig().tau
     if args.max_sv >= limit:
         raise ClodError(f"--max-sv is {args.max_sv:g}, it must be below {limit:g}, where nothing survives the cut")
@@ -38,15 +34,8 @@ def make_config(args: argparse.Namespace) -> AdaptConfig:
             AdaptConfig(**{name: value})
         except ClodError as error:
             raise ClodError(f"--{name.replace('_', '-')}{_without_name(str(error), name)}") from error
-    config = AdaptConfig(**given)
-    check_config(asdict(config))
-    return config
+    return AdaptConfig(**given)
 
 
 def _without_name(message: str, name: str) -> str:
     return message.removeprefix(name) if message.startswith(f"{name} ") else f": {message}"
-
-
-def pick_device(name: str) -> torch.device:
-    """Where to train; ``auto`` is the fastest device that there is a rasterizer for, which is the CPU."""
-    return torch.device("cpu" if name == "auto" else name)

@@ -12,46 +12,45 @@ from __future__ import annotations
 
 import os
 import sys
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from clod_adapter._lazy import on_first_use
 
 if "torch" not in sys.modules:
     # GNU OpenMP's idle threads spin by default and take the cores from the splatting threads: measured at
     # up to six times the time of a training step. Only the first import of torch reads this.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from clod_adapter.adapter import Adapter, attach, detach, extract
-from clod_adapter.cameras import Camera, Scene, View
-from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.errors import ClodError
-from clod_adapter.evaluate import evaluate
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.render import Rendering, render
-from clod_adapter.train import Adapted, adapt
-
 if TYPE_CHECKING:
+    from clod_adapter.adapter import Adapter, attach, detach, extract
+    from clod_adapter.cameras import Camera, Scene, View
+    from clod_adapter.config import AdaptConfig, AttenuationConfig
+    from clod_adapter.errors import ClodError
+    from clod_adapter.evaluate import evaluate
+    from clod_adapter.gaussians import Gaussians
     from clod_adapter.io.adapter_file import load_adapter, save_adapter
     from clod_adapter.io.colmap import load_scene
     from clod_adapter.io.ply import Checkpoint, load, save
+    from clod_adapter.render import Rendering, render
+    from clod_adapter.train import Adapted, adapt
 
-# Imported on first use: the readers bring libraries that a mere import should not.
-_LAZY = {
-    "Checkpoint": "io.ply",
-    "load": "io.ply",
-    "load_adapter": "io.adapter_file",
-    "load_scene": "io.colmap",
-    "save": "io.ply",
-    "save_adapter": "io.adapter_file",
-}
+# Imported on first use: torch takes a second or two, which the command's --help and most of its errors do without.
+on_first_use(__name__, {
+    "adapter": ("Adapter", "attach", "detach", "extract"),
+    "cameras": ("Camera", "Scene", "View"),
+    "config": ("AdaptConfig", "AttenuationConfig"),
+    "errors": ("ClodError",),
+    "evaluate": ("evaluate",),
+    "gaussians": ("Gaussians",),
+    "io.adapter_file": ("load_adapter", "save_adapter"),
+    "io.colmap": ("load_scene",),
+    "io.ply": ("Checkpoint", "load", "save"),
+    "render": ("Rendering", "render"),
+    "train": ("Adapted", "adapt"),
+})  # fmt: skip
 
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Camera", "Checkpoint", "ClodError", "Gaussians",
     "Rendering", "Scene", "View", "adapt", "attach", "detach", "evaluate", "extract", "load", "load_adapter",
     "load_scene", "render", "save", "save_adapter",
 ]  # fmt: skip
-
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -9,6 +9,7 @@ from typing import Any
 from clod_adapter.errors import ClodError
 
 NORMALIZERS = ("max", "quantile", "scene")
+SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
 
 
 def option(default: Any, help: str) -> Any:

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import SH_COUNTS, AttenuationConfig
 from clod_adapter.errors import ClodError
-
-SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from torch import Tensor
 from clod_adapter.adapter import attach, detach
 from clod_adapter.attenuation import SIGMA_MAX
 from clod_adapter.cameras import Scene
-from clod_adapter.config import AdaptConfig
-from clod_adapter.gaussians import SH_COUNTS, Gaussians
+from clod_adapter.config import SH_COUNTS, AdaptConfig
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.train import Progress, adapt
 
 SH_DC = 0.28209479177387814

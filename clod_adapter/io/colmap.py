@@ -15,7 +15,8 @@ from PIL import Image
 from clod_adapter.cameras import Camera, Scene, View
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.colmap_model import PosedImage, find_model, read_model
+from clod_adapter.io.colmap_folder import find_model
+from clod_adapter.io.colmap_model import PosedImage, read_model
 
 DEEP_MODES = ("I", "F")  # Pillow's modes of more than 8 bits begin with these; it would clip, not scale, them
 

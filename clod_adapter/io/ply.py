@@ -55,10 +55,7 @@ def load(path: str | Path) -> Checkpoint:
     """
     path = Path(path)
     header = read_header(path)
-    if "vertex" not in header:
-        found = ", ".join(element.name for element in header) or "none"
-        raise ClodError(f"{path}: has no vertex element (elements: {found}); give a splat in Inria's 3DGS layout")
-    columns = column_map(sh_degree_of(path, header["vertex"]))
+    columns = column_map(sh_degree_of(path, header))
     vertex = _read_vertex(path)
     names = [name for group in columns.values() for name in group]
     extras = [name for name in (SIGMA, *MASKS) if name in (vertex.dtype.names or ())]

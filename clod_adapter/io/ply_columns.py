@@ -10,10 +10,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyElement, PlyListProperty
+from plyfile import PlyData, PlyListProperty
 
+from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import SH_COUNTS
 
 SIGMA = "sigma_d"
 MASKS = ("masks_0", "masks_1")
@@ -63,13 +63,17 @@ def read_table(vertex: np.ndarray, names: Iterable[str]) -> np.ndarray:
     return table
 
 
-def sh_degree_of(path: Path, vertex: PlyElement) -> int:
+def sh_degree_of(path: Path, header: PlyData) -> int:
     """The SH degree of a file with plain Gaussians, judged by its header.
 
     Raises:
         ClodError: the file holds something else, or a needed column is missing or of a wrong type.
     """
-    types = {p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype for p in vertex.properties}
+    if "vertex" not in header:
+        found = ", ".join(element.name for element in header) or "none"
+        raise ClodError(f"{path}: has no vertex element (elements: {found}); give a splat in Inria's 3DGS layout")
+    properties = header["vertex"].properties
+    types = {p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype for p in properties}
     _refuse_foreign(path, set(types))
     rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in types)
     degrees = {3 * (count - 1): degree for degree, count in SH_COUNTS.items()}

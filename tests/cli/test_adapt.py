@@ -47,7 +47,7 @@ def test_writes_three_files(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert set(report["config"]) == set(AdaptConfig.__dataclass_fields__) and report["config"]["max_sv"] == 4
     assert report["attenuation"]["max_sv"] == 4
     assert set(report["machine"]) >= {"cpu", "cores", "python", "torch", "numba"}
-    assert set(report["seconds"]) == {"load", "start", "train", "evaluate", "total"}
+    assert set(report["seconds"]) == {"load", "kernels", "start", "train", "evaluate", "total"}
     assert report["adapter_bytes"] == (tmp_path / "dial.safetensors").stat().st_size
     assert report["outputs"] == {"ply": "dial.ply", "adapter": "dial.safetensors", "report": "dial.json"}
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2, 3, 4]
@@ -278,7 +278,7 @@ def test_a_report_is_never_that_of_an_earlier_run(
 
 
 def test_an_unusable_config_fails_before_the_work(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("clod_adapter.cli.settings.asdict", lambda config: {"time_budget": float("inf")})
+    monkeypatch.setattr(adapt_command, "asdict", lambda config: {"time_budget": float("inf")})
     monkeypatch.setattr(adapt_command, "read_checkpoint", lambda *_: pytest.fail("read"))
     done = clod(capture.ply, "--images", capture.scene, *TINY)
     assert done.code == 2 and "not plain JSON" in done.err

@@ -156,6 +156,46 @@ def test_help(clod: Any, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
         assert clod("--version").out.split() == ["clod-adapt", package_version()]
 
 
+@pytest.mark.parametrize(
+    ("line", "code"),
+    [
+        ("--help", 0),
+        ("eval --help", 0),
+        ("--version", 0),
+        ("--nonsense", 2),
+        ("missing.ply --images SCENE", 2),
+        ("mesh.ply --images SCENE", 2),
+        ("PLY --images empty", 2),
+        ("PLY --images SCENE --max-sv 0", 2),
+        ("PLY --images SCENE --out nowhere/dial.ply", 2),
+        ("eval PLY --images SCENE --sv 0", 2),
+        ("apply text.ply dial.safetensors -o dial.ply", 2),
+    ],
+)
+def test_help_and_refusals_do_without_torch(bad: dict[str, Path], tmp_path: Path, line: str, code: int) -> None:
+    (tmp_path / "mesh.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
+    words = [str(bad.get(word, word)) for word in line.split()]
+    script = (
+        "import sys\n"
+        "sys.modules.update(torch=None, pycolmap=None, numba=None)\n"  # importing one is an error
+        f"from clod_adapter.cli.main import main; sys.exit(main({words}))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == code and "Traceback" not in done.stderr, done.stderr
+
+
+def test_importing_leaves_the_collector_on() -> None:
+    code = (
+        "import gc, sys\n"
+        "from argparse import Namespace\n"
+        "from clod_adapter.cli.main import APPLY, import_command\n"
+        "module = import_command(APPLY, Namespace(quiet=True))\n"
+        "assert module is import_command(APPLY, Namespace(quiet=True)) and 'torch' in sys.modules\n"
+        "assert gc.isenabled() and gc.get_freeze_count() > 1000\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_closed_pipe(spawn: Any, capture: Any, tmp_path: Path) -> None:
     process = spawn("eval", capture.ply, "--images", capture.scene, cwd=tmp_path)
     process.stdout.close()
@@ -171,7 +211,7 @@ def test_threads_do_not_spin() -> None:
         "    def find_spec(self, name, *rest):\n"
         "        if name == 'torch': print(os.environ.get('OMP_WAIT_POLICY'))\n"
         "sys.meta_path.insert(0, Spy())\n"
-        "import clod_adapter.cli.main"
+        "import clod_adapter.cli.adapt"
     )
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)

@@ -7,10 +7,9 @@ import sys
 from types import SimpleNamespace
 from typing import Any
 
-import numba
 import pytest
 
-from clod_adapter.cli.console import Console, Meter, announced_compiling, duration
+from clod_adapter.cli.console import Console, Meter, duration
 
 
 class Terminal(io.StringIO):
@@ -49,24 +48,33 @@ def test_lines_off_a_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: p
     ]
 
 
+def test_a_slow_meter_shows_from_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    Meter(Console(), "compiling", slow=True).close()
+    Meter(Console(), "training").close()
+    assert "compiling   0%" in terminal.getvalue() and "training" not in terminal.getvalue()
+
+
+def test_status(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a terminal, while it lasts."""
+    for quiet, stream in ((False, Terminal()), (True, Terminal()), (False, io.StringIO())):
+        monkeypatch.setattr(sys, "stderr", stream)
+        with pytest.raises(KeyboardInterrupt), Console(quiet).status("reading a file ..."):
+            assert ("\rreading a file ..." in stream.getvalue()) == (stream.isatty() and not quiet)
+            raise KeyboardInterrupt
+        assert not stream.getvalue().split("\r")[-1].strip() and "\n" not in stream.getvalue()
+
+
 @pytest.mark.parametrize("stream", [Terminal, Closed])
 def test_quiet_and_closed(stream: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is written, and nothing is lost when it cannot be."""
     monkeypatch.setattr(sys, "stderr", first := stream())
     console = Console(quiet=stream is Terminal)
     console.say("a line")
-    with console.meter("training") as meter:
+    with console.status("reading"), console.meter("training") as meter:
         meter.update(0.5)
     console.say("another")
     assert first.getvalue() == ""
-
-
-def test_compiling_is_announced_once(capsys: pytest.CaptureFixture[str]) -> None:
-    function = numba.njit(lambda x: x + 1)
-    with announced_compiling(Console()):
-        function(1)
-        function(1.0)
-    assert capsys.readouterr().err.count("compiling kernels (first run only") == 1
 
 
 @pytest.mark.parametrize(

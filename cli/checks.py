@@ -1,0 +1,58 @@
+"""What can be seen to be wrong without torch, which takes a second or two to import; refused before that."""
+
+from __future__ import annotations
+
+import math
+from argparse import Namespace
+from collections.abc import Callable
+from pathlib import Path
+
+from clod_adapter.cli.files import Outputs, check_output, check_ply_name
+from clod_adapter.cli.settings import make_config
+from clod_adapter.errors import ClodError
+from clod_adapter.io.colmap_folder import find_model
+from clod_adapter.io.ply_columns import sh_degree_of
+from clod_adapter.io.ply_header import read_header
+
+
+def check_adapt(args: Namespace) -> None:
+    make_config(args)
+    Outputs.of(args.ply, args.out).check([args.ply])
+    check_checkpoint(args.ply)
+    check_scene(args.images)
+
+
+def check_evaluate(args: Namespace) -> None:
+    for virtual_scale in args.sv or ():
+        if not 1 <= virtual_scale < math.inf:
+            raise ClodError(f"--sv has {virtual_scale:g}, dial values must be at least 1 (1 is full quality)")
+    check_checkpoint(args.model)
+    check_scene(args.images)
+
+
+def check_apply(args: Namespace) -> None:
+    out = Path(args.out)
+    check_ply_name(out, "--out")
+    check_output(out, [args.base, args.adapter])
+    check_checkpoint(args.base)
+
+
+def check_checkpoint(path: str) -> None:
+    """Refuses what by its header is no checkpoint."""
+    sh_degree_of(Path(path), read_header(Path(path)))
+
+
+def check_scene(folder: str) -> None:
+    """Refuses what is no folder with a COLMAP model."""
+    if not Path(folder).is_dir():
+        raise ClodError(f"{folder}: is not a folder; give the one that holds images/ and sparse/0")
+    find_model(Path(folder))
+
+
+# By the command's module; the demo's only input is its --out, which it makes itself.
+CHECKS: dict[str, Callable[[Namespace], None]] = {
+    "adapt": check_adapt,
+    "evaluate": check_evaluate,
+    "apply": check_apply,
+    "demo": lambda args: None,
+}

@@ -1,0 +1,155 @@
+"""The command lines: texts and options of each command. What a command does is in its module, imported to run it."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from clod_adapter.cli.settings import add_settings
+
+
+@dataclass(frozen=True)
+class Command:
+    """What ``--help`` says of a command, and its options.
+
+    Attributes:
+        module: of ``clod_adapter.cli``; its ``run(args)`` returns the object that --json prints. It may import torch.
+        add_arguments: adds the options to a parser.
+    """
+
+    module: str
+    summary: str
+    description: str
+    usage: str
+    epilog: str
+    add_arguments: Callable[[ArgumentParser], None]
+
+
+def _adapt(parser: ArgumentParser) -> None:
+    parser.add_argument("ply", metavar="PLY", help="the checkpoint, in Inria's 3DGS layout; it is never modified")
+    parser.add_argument(
+        "--images", metavar="DIR", required=True,
+        help="the scene: photographs in DIR/images and their COLMAP model in DIR/sparse/0",
+    )  # fmt: skip
+    add_settings(parser)
+    parser.add_argument("--out", metavar="OUT.ply", help="output (default: PLY's name with _clod, in this folder)")
+    parser.add_argument("--device", choices=["auto", "cpu"], default="auto", help="where to train (default: auto)")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
+
+
+def _evaluate(parser: ArgumentParser) -> None:
+    parser.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one as the baseline")
+    parser.add_argument("--images", metavar="DIR", required=True, help="the scene: photographs and their COLMAP model")
+    parser.add_argument(
+        "--sv", metavar="S", type=float, nargs="+",
+        help="dial values, 1 (full quality) and up (default: 1 2 3 5 as far as trained, and the last one trained)",
+    )  # fmt: skip
+    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
+
+
+def _apply(parser: ArgumentParser) -> None:
+    parser.add_argument("base", metavar="BASE.ply", help="the checkpoint that was adapted")
+    parser.add_argument("adapter", metavar="ADAPTER.safetensors", help="what clod-adapt wrote beside its PLY")
+    parser.add_argument("-o", "--out", metavar="OUT.ply", required=True, help="what to write; replaced if it exists")
+    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
+
+
+def _demo(parser: ArgumentParser) -> None:
+    parser.add_argument("--out", metavar="DIR", default="demo", help="where everything goes (default: demo)")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
+
+
+ADAPT = Command(
+    module="adapt",
+    summary="Give a trained 3D Gaussian splat a quality dial.",
+    description="""\
+Give a trained 3D Gaussian splat a quality dial: one file for every budget.
+
+Learns one number per Gaussian, sigma_d, with which a renderer fades detail out
+smoothly with distance, and tunes the rest lightly. The dial s is set when
+rendering: 1 is full quality, at s roughly s^-1.5 of the Gaussians are drawn.
+""",
+    usage="PLY --images DIR [--max-sv S] [--out OUT.ply] [options]",
+    epilog="""\
+outputs, side by side; a file of that name is replaced:
+  OUT.ply          the splat with one more property, sigma_d
+  OUT.safetensors  the adapter: only what changed; "clod-adapt apply" makes
+                   OUT.ply again from it and the checkpoint
+  OUT.json         the report: settings, machine, times, and per dial value the
+                   quality on held-out photographs (every 8th by name)
+
+Ctrl-C while training stops after the step under way and writes what was learned
+so far (exit code 0, "interrupted": true in the report); once more aborts. While
+the result is written it is finished first, while it is measured the rest is
+skipped. Before training nothing is written.
+
+exit codes: 0 written; 2 bad input, one line on stderr and nothing written;
+130 interrupted with nothing to write, or aborted
+
+examples:
+  clod-adapt garden.ply --images garden --max-sv 5
+  clod-adapt garden.ply --images garden --time-budget 120 --out out/dial.ply
+  clod-adapt garden.ply --images garden --quiet --json > report.json
+""",
+    add_arguments=_adapt,
+)
+EVALUATE = Command(
+    module="evaluate",
+    summary="Measure quality, count and time at some dial values.",
+    description="Measure quality, Gaussians kept and frame time at several dial values.",
+    usage="MODEL.ply --images DIR [--sv S [S ...]] [options]",
+    epilog="""\
+All numbers are over the held-out photographs (every 8th by name):
+  PSNR, SSIM  means against the photographs
+  kept        Gaussians that the dial leaves in, and their share of all
+  in view     those of them that have their centre in the picture
+  frame ms    median time to render a picture
+A checkpoint without a dial shows the same at every value: the baseline.
+
+Ctrl-C skips the dial values that are not finished (exit code 0, "interrupted":
+true); before the first one is, there is nothing to print (exit code 130).
+
+examples:
+  clod-adapt eval garden_clod.ply --images garden
+  clod-adapt eval garden.ply --images garden --sv 1
+  clod-adapt eval garden_clod.ply --images garden --sv 1 4 --json > eval.json
+""",
+    add_arguments=_evaluate,
+)
+APPLY = Command(
+    module="apply",
+    summary="Make the adapted PLY from checkpoint and adapter.",
+    description="Make the adapted PLY again from the checkpoint and the small adapter file.",
+    usage="BASE.ply ADAPTER.safetensors -o OUT.ply [--json]",
+    epilog="""\
+OUT.ply is bit for bit what clod-adapt wrote. BASE.ply must be the very file
+that was adapted: its SHA-256 is compared with the one in the adapter.
+
+example:
+  clod-adapt apply garden.ply garden_clod.safetensors -o again.ply
+""",
+    add_arguments=_apply,
+)
+DEMO = Command(
+    module="demo",
+    summary="Run everything on a built-in scene; nothing to download.",
+    description="""\
+Run the whole job on a scene that comes with the package.
+
+Ray-traces a small gallery (its ground truth owes nothing to splatting), trains
+a plain checkpoint on it, gives that a dial, measures it on held-out views and
+draws two pictures. A few minutes on two cores without a GPU, the first time;
+the gallery and the checkpoint are kept and used again.
+""",
+    usage="[--out DIR] [options]",
+    epilog="""\
+in DIR afterwards:
+  capture/          64 images and their COLMAP model
+  base.ply          the checkpoint, as any 3DGS trainer would leave it
+  gallery.ply       the same with a dial; gallery.safetensors, gallery.json
+  dial.png          one held-out view at several dial values
+  curve.png         quality against the number of Gaussians
+""",
+    add_arguments=_demo,
+)

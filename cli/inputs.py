@@ -1,0 +1,35 @@
+"""Checkpoints and scenes as the commands read them: with a word to the user on what is in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from clod_adapter.cameras import Scene
+from clod_adapter.cli.console import Console
+from clod_adapter.cli.files import size
+from clod_adapter.io.colmap import load_scene
+from clod_adapter.io.ply import Checkpoint, load
+
+
+def read_checkpoint(path: str, console: Console) -> Checkpoint:
+    """Reads a PLY and says what is in it."""
+    with console.status(f"reading {path} ({size(Path(path))}) ..."):
+        checkpoint = load(path)
+    gaussians = checkpoint.gaussians
+    dial = ", with sigma_d" if gaussians.sigma_d is not None else ""
+    console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{dial}")
+    for note in checkpoint.notes:
+        console.say(f"  note: {note}")
+    return checkpoint
+
+
+def read_scene(folder: str, console: Console) -> Scene:
+    """Reads the photographs and says how they are used."""
+    with console.meter("photographs") as meter:
+        scene = load_scene(folder, progress=lambda done, total: meter.update(done / total, f"{done}/{total}"))
+    camera = scene.train[0].camera
+    size = f"{camera.width}x{camera.height}"
+    console.say(f"{folder}: {len(scene.train)} photographs to train on, {len(scene.test)} held out, {size}")
+    for note in scene.notes:
+        console.say(f"  note: {note}")
+    return scene

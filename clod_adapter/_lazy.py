@@ -1,0 +1,34 @@
+"""A package whose names are imported on first use."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+
+def on_first_use(package: str, names: Mapping[str, Sequence[str]]) -> None:
+    """Makes the names of each submodule attributes of the package that is being imported."""
+    module = sys.modules[package]
+    module.__dict__["_homes"] = {name: home for home, group in names.items() for name in group}
+    module.__class__ = _Lazy
+
+
+class _Lazy(ModuleType):
+    _homes: dict[str, str]
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in self._homes:
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+        value = self.__dict__[name] = getattr(import_module(f"{self.__name__}.{self._homes[name]}"), name)
+        return value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # Importing a submodule binds its name in the package, where the function of that name (render) stands.
+        if not (name in self._homes and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*self.__dict__, *self._homes})
