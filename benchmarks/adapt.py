@@ -3,6 +3,7 @@
     python benchmarks/adapt.py plush_half bonsai146 ci_banana plush_half/pretrained_mask
     python benchmarks/adapt.py plush_half --set lr_sigma=0.05 --set full_share=0 --label "slow sigma"
     python benchmarks/adapt.py plush_half --ablations      # one row for each choice in docs/method.md
+    python benchmarks/adapt.py plush_half bonsai146 --leave-out    # one for each in docs/performance.md
     python benchmarks/adapt.py --table                     # the rows as a Markdown table
 
 A scene is a folder of the shared data, with a checkpoint's name where it is not ``pretrained``. Each run
@@ -47,10 +48,20 @@ ABLATIONS: dict[str, dict[str, object]] = {
 }  # fmt: skip
 
 
+# What a step can leave out, at three lengths each: held-out error against time.
+GEOMETRY = {"lr_means": 0.0, "lr_quats": 0.0, "lr_scales": 0.0}
+LEAVE_OUT: dict[str, dict[str, object]] = {
+    f"{label}, {iters} steps": {"iters": iters, **changed}
+    for label, changed in (("default", {}), ("geometry frozen", GEOMETRY), ("higher bands tuned", {"lr_shN": 1e-4}))
+    for iters in (500, 1000, 1500)
+}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--ablations", action="store_true", help=f"every choice by itself, {ABLATION_STEPS} steps each")
+    parser.add_argument("--leave-out", action="store_true", help="what a step can leave out, at three lengths each")
     parser.add_argument("--table", action="store_true", help="print the rows there are")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a field of AdaptConfig")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
@@ -61,6 +72,8 @@ def main() -> None:
     runs = {args.label: dict(_setting(text) for text in args.set)}
     if args.ablations:
         runs = {label: {"iters": ABLATION_STEPS, **changed} for label, changed in ABLATIONS.items()}
+    if args.leave_out:
+        runs = LEAVE_OUT
     for scene in args.scenes:
         for label, changed in runs.items():
             for seed in args.seeds:

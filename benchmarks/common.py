@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import clod_adapter
 from clod_adapter.cli.report import jsonable, machine
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -25,10 +26,13 @@ def capture(name: str) -> Path:
 
 
 def commit() -> str:
-    """The checkout's commit, with a + where the package or the benchmarks differ from it."""
+    """The commit of the package that is measured, with a + where it or the benchmarks differ from it."""
+    checkout = Path(clod_adapter.__file__).parents[1]
 
     def git(*arguments: str) -> str:
-        return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(
+            ["git", *arguments], cwd=checkout, capture_output=True, text=True, check=True
+        ).stdout.strip()
 
     changed = git("status", "--porcelain", "--", "clod_adapter", "cli", "benchmarks/*.py")
     return git("rev-parse", "--short", "HEAD") + ("+" if changed else "")

@@ -73,7 +73,7 @@ def removal_error(
         opacities = gaussians.opacities.detach().requires_grad_()
         image, _ = splat(gaussians, opacities, view.camera)
         signs = torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
-        (gradient,) = torch.autograd.grad(image, opacities, signs)
+        (gradient,) = torch.autograd.grad((image * signs).sum(), opacities)  # as grad_outputs they would import sympy
         total += (gradient * opacities.detach()).square()
         if progress:
             progress(done, len(views))

@@ -45,7 +45,8 @@ class RowAdam:
             self._step_plain(gradients, rows, rates)
 
     def _step_fused(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
-        from clod_adapter._kernels import adam, threads
+        from clod_adapter._kernels import threads
+        from clod_adapter._kernels.adam import adam_rows
 
         jobs = []
         for name, gradient in gradients.items():
@@ -53,11 +54,11 @@ class RowAdam:
             flat = [x.view(len(x), math.prod(x.shape[1:])).numpy() for x in tensors]
             jobs.append((*flat, rows.numpy(), self._steps[name].numpy(), self._corrections, rates[name]))
 
-        def work(worker: int, workers: int) -> None:
+        def adam(worker: int, workers: int) -> None:
             for job in jobs:
-                adam.adam_rows(worker, workers, *job, self.beta1, self.beta2, self.epsilon)
+                adam_rows(worker, workers, *job, self.beta1, self.beta2, self.epsilon)
 
-        threads.run(work, threads.worker_count())
+        threads.run(adam, threads.worker_count())
 
     def _step_plain(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
         """The plain twin of the fused step."""

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.extending import intrinsic
 
-# Numba's cache notices a change of the file a function stands in, but not of the constants and
-# functions it took from other files. The stamp is therefore of all kernels' sources.
+# A kernel takes constants and functions from other files, so the stamp is of all kernels' sources.
 _STAMP = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(Path(__file__).parent.glob("*.py")))).hexdigest()
 
 
@@ -23,16 +24,44 @@ OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"
 
 def kernel(function: Callable[..., Any]) -> Any:
     """A compiled function that Python calls, usually on several threads."""
-    try:
-        dispatcher: Any = njit(cache=True, **OPTIONS)(function)
-    except RuntimeError:  # nowhere to write a cache: neither beside the package nor in the user's cache folder
-        return njit(**OPTIONS)(function)
-    dispatcher._cache._cache_file._source_stamp = _STAMP
+    dispatcher: Any = njit(**OPTIONS)(function)
+    with suppress(RuntimeError):  # nowhere to write a cache: neither beside the package nor in the user's cache folder
+        dispatcher._cache = _Cache(function)
     return dispatcher
 
 
-# Inlined before compilation: a call would pass seven words on the stack for each array argument.
-part = njit(inline="always", **OPTIONS)
+class _CacheFile(IndexDataCacheFile):  # type: ignore[misc]
+    """Compiled variants, each in a file named by all that its code depends on, which appears whole or not at all.
+
+    Numba's own form is an index beside numbered files, which are used again once the sources have changed, and writes
+    the index first. A process that runs between the two writes, or after one that died there, gets the older version's
+    code; two that add a variant at once give both the same number; and a file that was cut stays an error for good.
+    """
+
+    def _name(self, key: Any) -> str:
+        digest = hashlib.sha256(repr((self._version, self._source_stamp, key)).encode()).hexdigest()
+        return self._data_name_pattern.format(number=int(digest[:16], 16))
+
+    def load(self, key: Any) -> Any:
+        with suppress(Exception):  # absent, or damaged: unpickling raises many kinds
+            return self._load_data(self._name(key))
+
+    def save(self, key: Any, data: Any) -> None:
+        self._save_data(self._name(key), data)
+
+
+class _Cache(FunctionCache):  # type: ignore[misc]
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file = _CacheFile(self._cache_path, self._impl.filename_base, _STAMP)
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with suppress(OSError):  # a full disk costs the cache, not the run
+            super().save_overload(sig, data)
+
+
+# Always inlined: a call would pass seven words on the stack for each array argument.
+part = njit(forceinline=True, **OPTIONS)
 
 
 @intrinsic

@@ -369,34 +369,24 @@ def load_rows(typingctx, source, rows, width, first, count, lanes, at):  # type:
     return types.none(source, types.CPointer(i64), i64, i64, i64, types.CPointer(f32x16), i64), codegen
 
 
-@intrinsic(prefer_literal=True)
+@intrinsic
 def store_rows(typingctx, destination, rows, width, first, count, lanes, at):  # type: ignore[no-untyped-def]
     """The reverse of ``load_rows``; of rows that are named twice the last counts."""
-    known = count.literal_value if isinstance(count, types.IntegerLiteral) else None
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        destination, rows, width, first, count, lanes, at = (
-            context.cast(builder, value, kind, i64) if isinstance(kind, types.Integer) else value
-            for value, kind in zip(args, signature.args, strict=True)
-        )
+        destination, rows, width, first, count, lanes, at = args
         addresses, mask = _row_access(builder, destination, rows, width, first, count)
         found = [
             builder.load(builder.gep(lanes, [builder.add(at, ir.Constant(ir.IntType(64), k))]), align=4)
             for k in range(LANES)
         ]
         for address, row in zip(addresses, _transposed(builder, found), strict=True):
-            if known:  # a masked store is slow on some processors
-                short = builder.shuffle_vector(
-                    row, row, ir.Constant(ir.VectorType(ir.IntType(32), known), [*range(known)])
-                )
-                builder.store(short, builder.bitcast(address, short.type.as_pointer()), align=4)
-            else:
-                arguments = [row, address, ir.Constant(ir.IntType(32), 4), mask]
-                _call(builder, "llvm.masked.store.v16f32.p0v16f32", ir.VoidType(), arguments)
+            arguments = [row, address, ir.Constant(ir.IntType(32), 4), mask]
+            _call(builder, "llvm.masked.store.v16f32.p0v16f32", ir.VoidType(), arguments)
         return context.get_dummy_value()
 
     i64 = types.int64
-    return types.none(destination, rows, width, first, count, lanes, at), codegen
+    return types.none(destination, types.CPointer(i64), i64, i64, i64, types.CPointer(f32x16), i64), codegen
 
 
 @intrinsic

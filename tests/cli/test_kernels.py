@@ -23,7 +23,7 @@ def kernels() -> dict[str, Dispatcher]:
         importlib.import_module(f"{_kernels.__name__}.{m.name}") for m in pkgutil.iter_modules(_kernels.__path__)
     ]
     found = [value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)]
-    return {d.py_func.__name__: d for d in found if d.targetoptions.get("inline") != "always"}
+    return {d.py_func.__name__: d for d in found if not d.targetoptions.get("forceinline")}
 
 
 def test_all_that_a_job_needs_is_ready(capture: Any) -> None:
