@@ -30,7 +30,8 @@ from common import append
 from numba import float32
 
 from clod_adapter._kernels import threads
-from clod_adapter._kernels.compiling import kernel, scratch
+from clod_adapter._kernels.compiling import kernel
+from clod_adapter._kernels.pointers import scratch
 from clod_adapter._kernels.simd import f32x16, fma, splat, store
 
 FILE = "floor.jsonl"

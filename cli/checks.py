@@ -34,6 +34,8 @@ def check_apply(args: Namespace) -> None:
     out = Path(args.out)
     check_ply_name(out, "--out")
     check_output(out, [args.base, args.adapter])
+    if not Path(args.adapter).is_file():
+        raise ClodError(f"{args.adapter}: No such file; give the .safetensors that clod-adapt wrote")
     check_checkpoint(args.base)
 
 

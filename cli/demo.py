@@ -12,7 +12,7 @@ import torch
 from clod_adapter.cli import adapt
 from clod_adapter.cli.commands import ADAPT
 from clod_adapter.cli.console import Console, duration
-from clod_adapter.cli.files import check_output
+from clod_adapter.cli.files import Outputs, check_output
 from clod_adapter.cli.kernels import announced_compiling, prepare_kernels
 from clod_adapter.cli.parser import make_parser
 from clod_adapter.cli.report import Stopwatch
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     make_folder(folder)
     capture, base, model = folder / "capture", folder / "base.ply", folder / "gallery.ply"
     pictures = {"dial": folder / "dial.png", "curve": folder / "curve.png"}
-    for path in (base, model, *pictures.values()):
+    for path in (base, *vars(Outputs.of(str(base), str(model))).values(), *pictures.values()):
         check_output(path, [])
     prepare_kernels(console)
     with announced_compiling(console):

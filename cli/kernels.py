@@ -33,7 +33,9 @@ def prepare_kernels(console: Console, *, training: bool = True) -> None:
     with announced_compiling(console, SHARES), _one_thread():
         evaluate(one, [view], [1.0])
         if training:
-            adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0))
+            adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0))
+            if adapted.interrupted:  # it keeps what it has, and that is nothing here
+                raise KeyboardInterrupt
 
 
 @contextmanager

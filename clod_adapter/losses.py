@@ -81,7 +81,7 @@ class _Fused:
 
     def gradient(self, l1: float, dssim: float) -> tuple[Tensor, float]:
         """Of ``l1 sum |x - y| - dssim sum SSIM`` to the image; and ``sum |x - y|``."""
-        out, sums = torch.empty(self.height, self.width, 3), np.zeros(self.workers)
+        out, sums = torch.empty(self.height, self.width, 3, dtype=torch.float32, device="cpu"), np.zeros(self.workers)
         self.threads.run(
             self.kernels.loss_gradient, self.workers, self.x, self.y, self.width, *self.slopes, l1, dssim, out.numpy(),
             sums,

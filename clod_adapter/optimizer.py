@@ -8,9 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# After so many steps of its own a row's bias corrections are 1 in float32, for the default betas.
-CORRECTED = 20_000
-
 
 class RowAdam:
     """Adam (Kingma and Ba 2015) over named ``[N, ...]`` parameters, a subset of rows a step.
@@ -29,7 +26,9 @@ class RowAdam:
         self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
         self._moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in parameters.items()}
         self._steps = {name: torch.zeros(len(p), dtype=torch.int32, device=p.device) for name, p in parameters.items()}
-        count = np.arange(1, CORRECTED)
+        # After so many steps of its own a row's bias corrections are 1 in float32.
+        last = math.ceil(-25 * math.log(2) / math.log(max(beta1, beta2)))
+        count = np.arange(1, last + 2)
         corrections = 1 / (1 - beta1**count), 1 / np.sqrt(1 - beta2**count)
         self._corrections = np.pad(np.stack(corrections), ((0, 0), (1, 0))).astype(np.float32)
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
@@ -97,8 +98,9 @@ def adapt(
     # Where the higher bands are not tuned, empty ones stay empty.
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
     gaussians = start(lean, scene.train, config, report)
-    adapted = _Run(gaussians, scene.train, config, progress).run(time.perf_counter() - began)
-    return replace(adapted, gaussians=adapted.gaussians.replace(shN=base.shN)) if lean is not base else adapted
+    run = _Run(gaussians, scene.train, config, progress)
+    run.empty_bands = None if lean is base else base.shN.clone()
+    return run.run(time.perf_counter() - began)
 
 
 def camera_extent(views: tuple[View, ...]) -> float:
@@ -124,6 +126,7 @@ class _Run:
         self.parameters = {name: getattr(start, name).detach().to(**own) for name in ATTRIBUTES}
         self.parameters["log_sigma"] = start.sigma_d.detach().float().clamp(min=1e-30).log().clamp(*LOG_SIGMA_RANGE)
         self.optimizer = RowAdam(self.parameters)
+        self.empty_bands: Tensor | None = None  # the base's whole shN, where what was left out of it comes back
         self.all_rows = torch.ones(len(start), dtype=torch.bool)
         self.rates = {
             "means": config.lr_means * camera_extent(views), "quats": config.lr_quats, "log_scales": config.lr_scales,
@@ -158,6 +161,8 @@ class _Run:
 
     def gaussians(self) -> Gaussians:
         values = {name: self.parameters[name] for name in ATTRIBUTES}
+        if self.empty_bands is not None:
+            values["shN"] = self.empty_bands
         return Gaussians(**values, sigma_d=self.parameters["log_sigma"].exp(), attenuation=self.attenuation)
 
     def _draw(self) -> tuple[View, float]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from numba import float32, int64
 
-from clod_adapter._kernels.compiling import kernel, part, pointer, scratch
-from clod_adapter._kernels.simd import f32x16, load, load_rows, store_rows, vsqrt
+from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.pointers import pointer, scratch
+from clod_adapter._kernels.rows import load_rows, store_rows
+from clod_adapter._kernels.simd import f32x16, load, vsqrt
 
 ONE = float32(1)
 

@@ -8,11 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from llvmlite import ir
-from numba import njit, types
-from numba.core import cgutils
+from numba import njit
 from numba.core.caching import FunctionCache, IndexDataCacheFile
-from numba.extending import intrinsic
 
 # A kernel takes constants and functions from other files, so the stamp is of all kernels' sources.
 _STAMP = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(Path(__file__).parent.glob("*.py")))).hexdigest()
@@ -62,30 +59,3 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
 # Always inlined: a call would pass seven words on the stack for each array argument.
 part = njit(forceinline=True, **OPTIONS)
-
-
-@intrinsic
-def pointer(typingctx, array):  # type: ignore[no-untyped-def]
-    """Where a contiguous array's elements lie; ``p[i]`` is the i-th of all of them.
-
-    Kernels turn their arguments into pointers first: passing an array on counts references atomically,
-    and indexing one looks for negative indices. Nothing checks the bounds.
-    """
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return context.make_array(signature.args[0])(context, builder, args[0]).data
-
-    return types.CPointer(array.dtype)(array), codegen
-
-
-@intrinsic(prefer_literal=True)
-def scratch(typingctx, kind, size):  # type: ignore[no-untyped-def]
-    """A pointer to a constant number of ``kind`` on the stack: LLVM keeps a few in registers where it can."""
-    element = kind.instance_type
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        value = context.get_data_type(element)
-        room = cgutils.alloca_once(builder, ir.ArrayType(value, size.literal_value))
-        return builder.bitcast(room, value.as_pointer())
-
-    return types.CPointer(element)(kind, size), codegen

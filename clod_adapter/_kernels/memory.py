@@ -30,7 +30,7 @@ def recycled(shape: torch.Size | tuple[int, ...]) -> Tensor:
     """An uninitialised float32 tensor, in memory that an earlier one no longer uses."""
     size = int(np.prod(shape))
     if size < _SMALL:
-        return torch.empty(shape)
+        return torch.empty(shape, dtype=torch.float32, device="cpu")
     step = 1 << max(size.bit_length() - 4, 0)
     room = -(-size // step) * step  # at most an eighth too large, so that nearly equal sizes share
     try:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from numba import float32, float64, int64, uint64
 
-from clod_adapter._kernels.compiling import kernel, part, pointer, scratch
+from clod_adapter._kernels.bits import bits_of
+from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.conventions import (
     ALPHA_MIN,
     BLUE,
@@ -64,19 +65,18 @@ from clod_adapter._kernels.conventions import (
     Y1,
     ZERO,
 )
+from clod_adapter._kernels.pointers import pointer, scratch
+from clod_adapter._kernels.rows import load_rows, store_rows
 from clod_adapter._kernels.sh import sh_basis
 from clod_adapter._kernels.simd import (
-    bits_of,
     both,
     f32x16,
     fma,
     ge,
     gt,
     load,
-    load_rows,
     log2,
     splat,
-    store_rows,
     vabs,
     vceil,
     vfloor,
@@ -225,6 +225,7 @@ def find_visible(first, last, spare, means, quats, scales, opacities, cam, recor
             rows[lane], opacity[lane] = rows[0], ONE
         valid = covariance(means, quats, scales, rows, cam, w)
         centres(means, rows, cam, centre)
+        valid = both(valid, ge(load(centre, 32), splat(NEAR)))  # as float32 sees it, and as the centre was found
         bits = bits_of(both(valid, make_records(w, centre, load(opacity, 0), cam, record)))
         bits &= (uint64(1) << uint64(filled)) - uint64(1)
         if bits == uint64(0):

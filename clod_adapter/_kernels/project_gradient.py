@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from numba import float32, int64
 
-from clod_adapter._kernels.compiling import kernel, part, pointer, scratch
+from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.conventions import (
     BLUR,
     COV,
@@ -31,9 +31,11 @@ from clod_adapter._kernels.conventions import (
     WORKSPACE,
     ZERO,
 )
+from clod_adapter._kernels.pointers import pointer, scratch
 from clod_adapter._kernels.project import covariance, load_sh, view_direction
+from clod_adapter._kernels.rows import load_rows, store_rows
 from clod_adapter._kernels.sh import C0, sh_basis, sh_basis_gradient
-from clod_adapter._kernels.simd import eq, f32x16, gt, load, load_rows, select, splat, store, store_rows, vmax, vmin
+from clod_adapter._kernels.simd import eq, f32x16, gt, load, select, splat, store, vmax, vmin
 
 # Sixteen Gaussians' gradients, a vector each: sums over pixels (9), P (6), rotation matrix (9), then what is stored:
 # scales (3), quaternion (4), mean (3), SH degree 0 (3).

@@ -7,8 +7,9 @@ threads avoid a second OpenMP runtime beside torch's, which would spin against i
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
@@ -25,12 +26,13 @@ if hasattr(os, "register_at_fork"):  # a forked child has the pool's bookkeeping
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
-_held: list[int] = []  # how many workers there are while torch is kept on one thread
+_lock = threading.Lock()
+_alone, _before = 0, 0  # how many want torch on one thread now, and how many threads it had
 
 
 def worker_count() -> int:
     """As many workers as torch uses threads (``torch.set_num_threads``, ``OMP_NUM_THREADS``)."""
-    return _held[-1] if _held else torch.get_num_threads()
+    return _before if _alone else torch.get_num_threads()
 
 
 @contextmanager
@@ -39,14 +41,19 @@ def torch_on_one_thread() -> Iterator[None]:
 
     For work on a hundred thousand numbers at a time, which costs less than waking other threads for it.
     """
-    before = torch.get_num_threads()
-    _held.append(worker_count())
-    torch.set_num_threads(1)
+    global _alone, _before
+    with _lock:
+        if _alone == 0:
+            _before = torch.get_num_threads()
+        _alone += 1
     try:
+        torch.set_num_threads(1)
         yield
     finally:
-        torch.set_num_threads(before)
-        _held.pop()
+        with _lock:
+            _alone -= 1
+            if _alone == 0:
+                torch.set_num_threads(_before)
 
 
 def run(kernel: Callable[..., Any], workers: int, *arguments: Any) -> None:
@@ -54,8 +61,10 @@ def run(kernel: Callable[..., Any], workers: int, *arguments: Any) -> None:
     if workers == 1:
         kernel(0, 1, *arguments)
         return
-    others = [_pool(workers - 1).submit(kernel, worker, workers, *arguments) for worker in range(1, workers)]
+    others: list[Future[Any]] = []
     try:
+        for worker in range(1, workers):
+            others.append(_pool(workers - 1).submit(kernel, worker, workers, *arguments))
         kernel(0, workers, *arguments)
     finally:
         wait(others)  # also when interrupted: nobody may still write into arrays that are handed back

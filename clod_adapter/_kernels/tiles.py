@@ -7,13 +7,14 @@ import math
 import numpy as np
 from numba import float32
 
-from clod_adapter._kernels.compiling import kernel, part, pointer
+from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.conventions import (
     AHEAD,
     DET,
     HALF,
     MX,
     MY,
+    ONE,
     QA,
     QB,
     QC,
@@ -27,7 +28,13 @@ from clod_adapter._kernels.conventions import (
     Y0,
     Y1,
 )
-from clod_adapter._kernels.simd import prefetch
+from clod_adapter._kernels.pointers import pointer, prefetch
+
+
+@part
+def within(value, otherwise, low, high):  # type: ignore[no-untyped-def]
+    """A whole number between the bounds, before it is cast: an ellipse may reach 1e10 pixels, or none that is known."""
+    return np.int32(otherwise if value != value else min(max(value, low), high))
 
 
 @part
@@ -47,9 +54,10 @@ def extent(records, r, first, last):  # type: ignore[no-untyped-def]
     x1 = rx if right == tip else (-b * right + math.sqrt(max(float32(0), reach - det * right * right))) * half
     x0 = -rx if left == -tip else (-b * left - math.sqrt(max(float32(0), reach - det * left * left))) * half
     mx = records[r + MX]
-    low = max(records[r + X0], math.ceil(mx + x0 - HALF - SLACK))
-    high = min(records[r + X1], math.floor(mx + x1 - HALF + SLACK))
-    return np.int32(low), np.int32(high)
+    return (
+        within(np.ceil(mx + x0 - HALF - SLACK), records[r + X0], records[r + X0], records[r + X1] + ONE),
+        within(np.floor(mx + x1 - HALF + SLACK), records[r + X1], records[r + X0] - ONE, records[r + X1]),
+    )
 
 
 @kernel

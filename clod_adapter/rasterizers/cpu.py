@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from clod_adapter._kernels import blend, conventions, project, project_gradient, threads, tiles
+from clod_adapter._kernels import blend, blocks, conventions, project, project_gradient, threads, tiles
 from clod_adapter._kernels.memory import aligned, recycled
 from clod_adapter.cameras import Camera
+from clod_adapter.errors import ClodError
 
 
 class _Buffers:
@@ -119,7 +120,7 @@ def _prepare(arrays: list[np.ndarray], degree: int, camera: Camera, workers: int
     longest_first = np.argsort(-np.diff(offsets), kind="stable")
     return _Frame(
         buffers, cam, camera.width, camera.height, across, records, packed_ids, counts, slots, entries,
-        entry_slots, buffers.get("masks", (total * blend.WORDS,), np.uint64), offsets, longest_first, workers,
+        entry_slots, buffers.get("masks", (total * blocks.WORDS,), np.uint64), offsets, longest_first, workers,
     )  # fmt: skip
 
 
@@ -137,7 +138,7 @@ class _Splat(torch.autograd.Function):
         threads.run(
             blend.blend, frame.workers, frame.records, frame.entries, frame.offsets, frame.across, frame.width,
             frame.height, background.detach().contiguous().numpy(), frame.tiles, np.zeros(1, np.int64),
-            frame.room(blend.FORWARD_STATE), frame.masks, image.numpy(), alpha.numpy(),
+            frame.room(blocks.FORWARD_STATE), frame.masks, image.numpy(), alpha.numpy(),
         )  # fmt: skip
         ctx.frame, ctx.degree = frame, degree
         ctx.save_for_backward(means, quats, scales, opacities, sh0, shN, background, image, alpha)
@@ -159,7 +160,7 @@ class _Splat(torch.autograd.Function):
         threads.run(
             blend.blend_gradient, frame.workers, frame.records, frame.entries, frame.entry_slots, frame.offsets,
             frame.across, frame.width, frame.height, image.numpy(), alpha.numpy(), v_image, v_alpha, frame.tiles,
-            np.zeros(1, np.int64), frame.room(blend.BACKWARD_STATE), frame.masks, shaped, colored, pair_sums,
+            np.zeros(1, np.int64), frame.room(blocks.BACKWARD_STATE), frame.masks, shaped, colored, pair_sums,
         )  # fmt: skip
         wanted = [shaped] * 3 + [True, ctx.needs_input_grad[4], ctx.needs_input_grad[5]]
         grads = [recycled(x.shape if want else (0, *x.shape[1:])) for x, want in zip(inputs, wanted, strict=True)]
@@ -176,6 +177,13 @@ def rasterize(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor, camera: Camera,
     background: Tensor,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """See ``clod_adapter.rasterizers.Rasterizer``."""
+    """See ``clod_adapter.rasterizers.Rasterizer``.
+
+    Raises:
+        ClodError: a tensor is not float32.
+    """
+    for name, tensor in locals().items():
+        if isinstance(tensor, Tensor) and tensor.dtype != torch.float32:
+            raise ClodError(f"the CPU rasterizer takes float32 only, and {name} is {tensor.dtype}: use .float()")
     degree = round((shN.shape[1] + 1) ** 0.5) - 1
     return _Splat.apply(means, quats, scales, opacities, sh0, shN, background, camera, degree)  # type: ignore[no-any-return, no-untyped-call]

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from numba import int64, njit
 
-from clod_adapter._kernels.compiling import pointer, scratch
-from clod_adapter._kernels.simd import f32x16, load, load_rows, store, store_rows
+from clod_adapter._kernels.pointers import pointer, scratch
+from clod_adapter._kernels.rows import load_rows, store_rows
+from clod_adapter._kernels.simd import f32x16, load, store
 
 LANES, VECTORS = 16, 40
 WIDTHS = [3, 4, 9, 16, 45, 72]

@@ -9,27 +9,23 @@ import pytest
 from numba import float32, njit
 
 from clod_adapter._kernels import simd
-from clod_adapter._kernels.compiling import pointer
+from clod_adapter._kernels.bits import bits_of, lowest, set_spans
+from clod_adapter._kernels.pointers import fetch_add, pointer, prefetch
+from clod_adapter._kernels.rows import store_sums
 from clod_adapter._kernels.simd import (
     anywhere,
-    bits_of,
     both,
     but_not,
     eq,
     exp2,
-    fetch_add,
     fma,
     ge,
     gt,
     load,
     log2,
-    lowest,
-    prefetch,
     select,
-    set_spans,
     splat,
     store,
-    store_sums,
     vabs,
     vceil,
     vfloor,

@@ -7,8 +7,9 @@ import math
 import pytest
 import torch
 
+from clod_adapter.cameras import Camera
 from clod_adapter.rasterizers import Rasterizer
-from oracle import IMAGE, assert_agrees
+from oracle import BACKGROUND, IMAGE, assert_agrees
 from scenes import camera, in_front, scene
 
 # Neither multiples of 4 nor of a tile, but one; principal points on either side.
@@ -147,3 +148,17 @@ def test_thousands_in_one_tile(rasterize: Rasterizer) -> None:
     some["opacities"] = some["opacities"] * 0.02 + 1 / 255
     # So many alphas per pixel that a cut is nearby in most: look closer.
     assert_agrees(rasterize, some, camera(5, 4), cut=0.1, nudge=1e-5)
+
+
+@pytest.mark.parametrize("far", [1e4, 1e6, 1e8])
+def test_an_ellipse_that_reaches_beyond_all_whole_numbers(rasterize: Rasterizer, far: float) -> None:
+    """Its centre up to 1e12 pixels away, its long axis through the picture: neither a crash nor a wild pixel."""
+    view = Camera(torch.eye(4), torch.tensor([[100.0, 0, 64], [0, 100.0, 64], [0, 0, 1]]), 128, 128)
+    some = scene(20, 0, 0)
+    some["means"][:, 2] += 4
+    some["means"][7] = torch.tensor([far, 0.0, 0.01])
+    some["scales"][7] = torch.tensor([far, 1e-3, 1e-3])
+    some["quats"][7] = torch.tensor([math.cos(math.pi / 8), 0.0, 0.0, math.sin(math.pi / 8)])
+    some["opacities"][7] = 0.9
+    image, alpha = rasterize(**some, camera=view, background=BACKGROUND)
+    assert image.isfinite().all() and alpha.isfinite().all() and (alpha >= 0).all() and (alpha <= 1).all()

@@ -1,0 +1,66 @@
+"""Memory as kernels address it."""
+
+from __future__ import annotations
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+
+def data_of(context, builder, kind, value):  # type: ignore[no-untyped-def]
+    """The address of an array's elements, or the pointer that was given."""
+    return value if isinstance(kind, types.CPointer) else context.make_array(kind)(context, builder, value).data
+
+
+@intrinsic
+def pointer(typingctx, array):  # type: ignore[no-untyped-def]
+    """Where a contiguous array's elements lie; ``p[i]`` is the i-th of all of them.
+
+    Kernels turn their arguments into pointers first: passing an array on counts references atomically,
+    and indexing one looks for negative indices. Nothing checks the bounds.
+    """
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return context.make_array(signature.args[0])(context, builder, args[0]).data
+
+    return types.CPointer(array.dtype)(array), codegen
+
+
+@intrinsic(prefer_literal=True)
+def scratch(typingctx, kind, size):  # type: ignore[no-untyped-def]
+    """A pointer to a constant number of ``kind`` on the stack: LLVM keeps a few in registers where it can."""
+    element = kind.instance_type
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        value = context.get_data_type(element)
+        room = cgutils.alloca_once(builder, ir.ArrayType(value, size.literal_value))
+        return builder.bitcast(room, value.as_pointer())
+
+    return types.CPointer(element)(kind, size), codegen
+
+
+@intrinsic
+def prefetch(typingctx, array, index):  # type: ignore[no-untyped-def]
+    """Asks for the cache line of ``array[index]``, which will be read soon."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        data = builder.gep(data_of(context, builder, signature.args[0], args[0]), [args[1]])
+        byte, i32 = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, i32, i32, i32])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        builder.call(function, [builder.bitcast(data, byte), *(ir.Constant(i32, v) for v in (0, 3, 1))])
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp), codegen
+
+
+@intrinsic
+def fetch_add(typingctx, array, amount):  # type: ignore[no-untyped-def]
+    """Atomically adds to ``array[0]`` (int64) and returns what it was."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        data = data_of(context, builder, signature.args[0], args[0])
+        return builder.atomic_rmw("add", data, args[1], "monotonic")
+
+    return types.int64(array, types.int64), codegen

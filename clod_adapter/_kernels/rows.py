@@ -1,0 +1,105 @@
+"""Sixteen rows of a table as vectors, a lane a row, and back."""
+
+from __future__ import annotations
+
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from clod_adapter._kernels.pointers import data_of
+from clod_adapter._kernels.simd import INTEGERS, LANES, VECTOR, call_llvm, f32x16
+
+
+def _transposed(builder, rows):  # type: ignore[no-untyped-def]
+    """Sixteen vectors whose i-th lane of the j-th is the j-th lane of the i-th given."""
+    half = LANES // 2
+    low = ir.Constant(INTEGERS, [lane for k in range(half) for lane in (k, LANES + k)])
+    high = ir.Constant(INTEGERS, [lane for k in range(half, LANES) for lane in (k, LANES + k)])
+    for _ in range(4):
+        pairs = [(rows[i], rows[i + half]) for i in range(half)]
+        rows = [builder.shuffle_vector(*pair, order) for pair in pairs for order in (low, high)]
+    return rows
+
+
+def _row_access(builder, source, rows, width, first, count):  # type: ignore[no-untyped-def]
+    """Addresses of sixteen rows' ``[first : first + count]`` and the mask of so many lanes."""
+    i64, i32 = ir.IntType(64), ir.IntType(32)
+    addresses = []
+    for lane in range(LANES):
+        row = builder.load(builder.gep(rows, [ir.Constant(i32, lane)]))
+        index = builder.add(builder.mul(row, width), first)
+        addresses.append(builder.bitcast(builder.gep(source, [index]), VECTOR.as_pointer()))
+    numbers = ir.Constant(ir.VectorType(i64, LANES), list(range(LANES)))
+    one = builder.insert_element(ir.Constant(numbers.type, ir.Undefined), count, ir.Constant(i32, 0))
+    many = builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
+    return addresses, builder.icmp_signed("<", numbers, many)
+
+
+@intrinsic
+def load_rows(typingctx, source, rows, width, first, count, lanes, at):  # type: ignore[no-untyped-def]
+    """``lanes[at + k]`` = column ``first + k`` of sixteen rows of ``source [*, width]``, for k < count <= 16.
+
+    ``rows`` points to their sixteen numbers (int64), ``lanes`` to vectors; those up to at + 15 are overwritten.
+    """
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        source, rows, width, first, count, lanes, at = args
+        addresses, mask = _row_access(builder, source, rows, width, first, count)
+        empty = ir.Constant(VECTOR, [0.0] * LANES)
+        arguments = [ir.Constant(ir.IntType(32), 4), mask, empty]
+        found = [call_llvm(builder, "llvm.masked.load.v16f32.p0v16f32", VECTOR, [a, *arguments]) for a in addresses]
+        for k, vector in enumerate(_transposed(builder, found)):
+            builder.store(vector, builder.gep(lanes, [builder.add(at, ir.Constant(ir.IntType(64), k))]), align=4)
+        return context.get_dummy_value()
+
+    i64 = types.int64
+    return types.none(source, types.CPointer(i64), i64, i64, i64, types.CPointer(f32x16), i64), codegen
+
+
+@intrinsic
+def store_rows(typingctx, destination, rows, width, first, count, lanes, at):  # type: ignore[no-untyped-def]
+    """The reverse of ``load_rows``; of rows that are named twice the last counts."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        destination, rows, width, first, count, lanes, at = args
+        addresses, mask = _row_access(builder, destination, rows, width, first, count)
+        found = [
+            builder.load(builder.gep(lanes, [builder.add(at, ir.Constant(ir.IntType(64), k))]), align=4)
+            for k in range(LANES)
+        ]
+        for address, row in zip(addresses, _transposed(builder, found), strict=True):
+            arguments = [row, address, ir.Constant(ir.IntType(32), 4), mask]
+            call_llvm(builder, "llvm.masked.store.v16f32.p0v16f32", ir.VoidType(), arguments)
+        return context.get_dummy_value()
+
+    i64 = types.int64
+    return types.none(destination, types.CPointer(i64), i64, i64, i64, types.CPointer(f32x16), i64), codegen
+
+
+def _pairwise(builder, vectors):  # type: ignore[no-untyped-def]
+    """Adds neighbouring lanes of up to 16 vectors until one vector holds all their sums, in order."""
+    even, odd = range(0, 2 * LANES, 2), range(1, 2 * LANES, 2)
+    while len(vectors) > 1:
+        vectors = [*vectors, vectors[-1]] if len(vectors) % 2 else vectors
+        vectors = [
+            builder.fadd(*(builder.shuffle_vector(a, b, ir.Constant(INTEGERS, list(half))) for half in (even, odd)))
+            for a, b in zip(vectors[::2], vectors[1::2], strict=True)
+        ]
+    return vectors[0]
+
+
+@intrinsic
+def store_sums(typingctx, array, index, a, b, c, d, e, f, g, h, i):  # type: ignore[no-untyped-def]
+    """``array[index : index + 9]`` = the sums over the lanes of the nine vectors."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        sums = _pairwise(builder, list(args[2:]))
+        data = data_of(context, builder, signature.args[0], args[0])
+        pointer = builder.gep(data, [args[1]])
+        eight = builder.shuffle_vector(sums, sums, ir.Constant(ir.VectorType(ir.IntType(32), 8), list(range(8))))
+        builder.store(eight, builder.bitcast(pointer, eight.type.as_pointer()), align=4)
+        ninth = builder.extract_element(sums, ir.Constant(ir.IntType(32), 8))
+        builder.store(ninth, builder.gep(pointer, [ir.Constant(ir.IntType(64), 8)]))
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp, *([f32x16] * 9)), codegen
