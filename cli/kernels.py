@@ -54,7 +54,8 @@ def announced_compiling(console: Console, shares: Mapping[str, float] | None = N
     """Says so when something has to be compiled within the block; it takes a while.
 
     Args:
-        shares: of the time, by kernel and for ``OTHER`` ones: with them, how far it is is shown too.
+        shares: of the time, by kernel and for ``OTHER`` ones: with them, how far it is is shown too, and that it will
+            happen again where what is compiled cannot be kept.
     """
     listener = _Compiling(console, shares)
     try:
@@ -76,7 +77,8 @@ class _Compiling(Listener):  # type: ignore[misc]
         self.depth += 1
         if not self.said:
             self.said = True
-            cached = not isinstance(event.data["dispatcher"]._cache, NullCache)
+            # What the demo's ray tracer compiles is never kept: its pictures are.
+            cached = not self.shares or not isinstance(event.data["dispatcher"]._cache, NullCache)
             nowhere = "on every run, as no folder to keep them in can be written: set NUMBA_CACHE_DIR"
             self.console.say(f"compiling kernels ({'first run only, well under a minute' if cached else nowhere}) ...")
             self.meter = Meter(self.console, "compiling", slow=True) if self.shares else None
