@@ -87,7 +87,7 @@ def print_next(folder: Path, pictures: dict[str, Path], watch: Stopwatch) -> Non
 
 def prepare(capture: Path, base: Path, console: Console) -> None:
     """Makes the capture and the base checkpoint, or says that those there are used."""
-    # Here and not above: the ray tracer brings scikit-image and Numba, which the other commands start without.
+    # Here and not above: the ray tracer brings scikit-image, whose absence check_extra is to report first.
     from clod_adapter.demo.fit import fit_base
     from clod_adapter.demo.gallery import make_gallery, write_gallery
 
