@@ -17,7 +17,7 @@ from clod_adapter.render import splat
 # A start beyond this many times the normalised distance at the largest dial value would fade by less than a
 # thousandth there, and its gradient with it: such a sigma would never move again.
 WIDEST = 22.0
-# Views that are looked at, at most: twice as many changed the trained result by 0.01 to 0.04 dB (docs/method.md).
+# Views that are looked at, at most: twice as many changed the trained result by 0.01 to 0.04 dB (docs/performance.md).
 MOST_VIEWS = 64
 
 
