@@ -8,6 +8,10 @@ is its Eq. 2 (section 3.2), the cut is the mask M_i of the same section. For act
     a'' = a exp(-(d s)^2 / (2 v))                   attenuated opacity
     kept iff a'' > tau s                            compared as logarithms, which do not underflow
 
+A kept Gaussian is drawn with opacity a'' under the paper's cut, named ``hard``: it leaves with opacity
+``tau s``, which pops. Under the cut named ``soft`` it is drawn with ``(a'' - tau s) / (1 - tau s)``, which is 0
+where it leaves and 1 where a'' is: the same Gaussians are kept, and the picture is continuous in dial and camera.
+
 Throughout: tensors are ``[N]``, one entry per Gaussian, on one device. ``opacity_logits`` may be +-inf,
 ``sigma_d`` and the distances are finite, distances are >= 0. Half-precision inputs are computed, and their
 results returned, in float32; otherwise the result has the inputs' common dtype.
@@ -43,11 +47,13 @@ class Attenuated(NamedTuple):
         opacities: ``[N]`` a'', in [0, 1].
         log_opacities: ``[N]`` log a'', in [-inf, 0]; meaningful where a'' underflows.
         keep: ``[N]`` bool, ``log a'' > log(tau s)``.
+        drawn: ``[N]`` what a rasterizer is given, in [0, 1]: a'' after the cut, 0 for those that leave.
     """
 
     opacities: Tensor
     log_opacities: Tensor
     keep: Tensor
+    drawn: Tensor
 
 
 @torch.no_grad()
@@ -124,10 +130,11 @@ def attenuate(
 ) -> Attenuated:
     """The opacities at one dial value, and which Gaussians stay.
 
-    ``a'' = sigmoid(logit) exp(log_attenuation)`` and ``log a'' = logsigmoid(logit) + log_attenuation``,
-    both differentiable, once, in ``opacity_logits`` and ``sigma_d``. Where the factor is exactly 1, a'' is
-    ``sigmoid(logit)`` bit for bit: a dial that does nothing changes nothing. At a logit of +inf the opacity
-    is 1 and its gradient 0. Kept sets are nested: what is kept at s is kept at every smaller dial.
+    ``a'' = sigmoid(logit) exp(log_attenuation)``, then the cut, and ``log a'' = logsigmoid(logit) +
+    log_attenuation``, both differentiable, once, in ``opacity_logits`` and ``sigma_d``. Where the factor is
+    exactly 1, a'' is ``sigmoid(logit)`` bit for bit: under the hard cut a dial that does nothing changes only
+    what is fainter than tau. At a logit of +inf the opacity is 1 and its gradient 0. Kept sets are nested:
+    what is kept at s is kept at every smaller dial.
 
     Args:
         d: ``[N]`` from ``normalized_distances``.
@@ -139,7 +146,33 @@ def attenuate(
     opacity_logits, sigma_d, d = _common(opacity_logits=opacity_logits, sigma_d=sigma_d, d=d)
     factor = log_attenuation(sigma_d, d, virtual_scale, config.eps)
     opacities, log_opacities = _Attenuate.apply(opacity_logits, factor)
-    return Attenuated(opacities, log_opacities, log_opacities.detach() > _log_threshold(config.tau, virtual_scale))
+    keep = log_opacities.detach() > _log_threshold(config.tau, virtual_scale)
+    if config.cut == "hard":
+        drawn = torch.where(keep, opacities, 0)
+    else:
+        threshold = config.tau * virtual_scale
+        drawn = ((opacities - threshold) / max(1 - threshold, 1e-6)).clamp(0, 1)  # from tau s = 1 on nothing is left
+    return Attenuated(opacities, log_opacities, keep, drawn)
+
+
+@torch.no_grad()
+def count_slope(
+    opacity_logits: Tensor, log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float
+) -> Tensor:
+    """``[N]`` by how much each Gaussian's ``log sigma_d`` moves the share that is kept, softened.
+
+    ``q (1 - q) / (temperature N) max(2 u, 1)`` with ``q = sigmoid((log a'' - log(tau s)) / temperature)`` and
+    ``u = log a - log a''``: the slope of ``soft_count`` by ``log sigma_d``, whose own ``2 u`` would be nothing
+    for Gaussians that the dial does not touch yet, and keep them out of its reach for good.
+
+    Args:
+        log_opacities: ``[N]`` log a'' from ``attenuate``.
+        temperature: > 0, in units of log opacity.
+    """
+    q = (log_opacities - _log_threshold(tau, virtual_scale)).div_(temperature).sigmoid_()
+    touched = (F.logsigmoid(opacity_logits) - log_opacities).mul_(2).clamp_(min=1)
+    # Where log a'' is -inf q is 0 and touched inf.
+    return (1 - q).mul_(q).mul_(touched).nan_to_num_(0.0, 0.0).div_(temperature * max(len(q), 1))
 
 
 def soft_count(log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float) -> Tensor:

@@ -9,6 +9,11 @@ from typing import Any
 from clod_adapter.errors import ClodError
 
 NORMALIZERS = ("max", "quantile", "scene")
+CUTS = ("hard", "soft")
+STARTS = ("importance", "constant", "identity")
+PARAMETERS = ("log", "linear")
+SAMPLINGS = ("pair", "log", "uniform")
+COUNT_TERMS = ("relative", "paper")
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
 
 
@@ -21,7 +26,8 @@ def option(default: Any, help: str) -> Any:
 class AttenuationConfig:
     """How a stored ``sigma_d`` is to be read. Travels with the file.
 
-    The cut keeps a Gaussian iff its attenuated opacity exceeds ``tau * virtual_scale``. The
+    The cut keeps a Gaussian iff its attenuated opacity exceeds ``tau * virtual_scale``, and draws it with that
+    opacity (``hard``, the paper's) or with what is above the threshold (``soft``; ``attenuation.attenuate``). The
     normaliser D turns a distance into the ``d'`` of the equation:
 
     - ``scene``: one constant, ``scene_distance``, for every view;
@@ -30,6 +36,7 @@ class AttenuationConfig:
     """
 
     tau: float = option(1 / 255, "base opacity threshold of the cut; 1/255 is what rasterizers drop anyway")
+    cut: str = option("hard", "how a Gaussian leaves: hard (at opacity tau s, the paper's) or soft (at 0)")
     eps: float = option(1e-8, "the paper's epsilon under sigma_d squared; keeps sigma_d = 0 defined")
     normalizer: str = option("scene", "what distances are divided by: scene, quantile or max")
     quantile: float = option(0.95, "share of the frustum's Gaussians nearer than D (normalizer quantile)")
@@ -38,6 +45,7 @@ class AttenuationConfig:
 
     def __post_init__(self) -> None:
         require(0 < self.tau < 1, "tau", self.tau, "between 0 and 1")
+        require(self.cut in CUTS, "cut", self.cut, f"one of {', '.join(CUTS)}")
         require(0 <= self.eps < 1, "eps", self.eps, "at least 0 and below 1")
         require(self.normalizer in NORMALIZERS, "normalizer", self.normalizer, f"one of {', '.join(NORMALIZERS)}")
         require(0 < self.quantile <= 1, "quantile", self.quantile, "above 0 and at most 1")
@@ -61,16 +69,21 @@ class AdaptConfig:
         None, "stop training after this many seconds, schedule included (default: no limit)"
     )
     seed: int = option(0, "seed of view order, dial values and the importance estimate")
-    tau: float = option(1 / 255, "base opacity threshold of the cut")
+    tau: float = option(0.02, "base opacity threshold of the cut")
+    cut: str = option("soft", "how a Gaussian leaves: hard (at opacity tau s, the paper's) or soft (at 0)")
     eps: float = option(1e-8, "the paper's epsilon")
     normalizer: str = option("scene", "what distances are divided by: scene, quantile or max (the paper's)")
     quantile: float = option(0.95, "quantile of distances that becomes D (normalizers scene and quantile)")
-    start_share: float = option(0.6, "share of Gaussians the start keeps at s = 1")
-    full_share: float = option(0.3, "share of steps at s = 1; the others draw s log-uniform in [1, max_sv]")
+    start: str = option("importance", "first sigma_d: importance (by rank), constant (1) or identity (no fading)")
+    start_share: float = option(0.6, "share of Gaussians to keep at s = 1")
+    parameter: str = option("log", "what is trained: log (of sigma_d) or linear (sigma_d, the paper's)")
+    sampling: str = option("pair", "dial values of a step: pair (1 and one log-uniform), log, or uniform (the paper's)")
+    full_share: float = option(0.0, "share of steps at s = 1 (samplings log and uniform)")
     exponent: float = option(1.5, "the count law: the share to keep at s is s^-exponent")
-    reg_weight: float = option(1.0, "weight of the count term (the paper's lambda_reg)")
+    count_term: str = option("relative", "what moves the count: relative (to the law, both ways) or paper (L_reg)")
+    reg_weight: float = option(0.02, "weight of the count term (the paper's lambda_reg)")
     weight_slope: float = option(
-        0.5, "k of w_s = (1 - k s/max_sv)^2; the paper has 0.5, 0 weighs all dial values alike"
+        0.0, "k of w_s = (1 - k s/max_sv)^2; the paper has 0.5, 0 weighs all dial values alike"
     )
     temperature: float = option(0.5, "width of the straight-through count's sigmoid, in log opacity")
     ssim_weight: float = option(0.2, "weight of 1 - SSIM against L1")
@@ -91,6 +104,9 @@ class AdaptConfig:
         require(0 <= self.seed < 2**63, "seed", self.seed, "at least 0 and below 2^63")
         require(self.time_budget is None or self.time_budget > 0, "time_budget", self.time_budget, "positive seconds")
         require(0.5 < self.start_share <= 1, "start_share", self.start_share, "above 0.5 and at most 1")
+        choices = {"start": STARTS, "parameter": PARAMETERS, "sampling": SAMPLINGS, "count_term": COUNT_TERMS}
+        for name, allowed in choices.items():
+            require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
         require(0 <= self.full_share <= 1, "full_share", self.full_share, "between 0 and 1")
         require(0 < self.exponent < math.inf, "exponent", self.exponent, "positive and finite")
         require(0 <= self.reg_weight < math.inf, "reg_weight", self.reg_weight, "at least 0 and finite")
@@ -102,10 +118,24 @@ class AdaptConfig:
             require(getattr(self, f"lr_{name}") >= 0, f"lr_{name}", getattr(self, f"lr_{name}"), "at least 0")
         self.attenuation(1.0)  # checks the rest
 
+    @classmethod
+    def paper(cls, **changes: Any) -> AdaptConfig:
+        """The paper's own form, where it says; the rest, and ``changes``, as in ours.
+
+        CLoD-GS section 3.3: one s ~ U(1, max_sv) a step, w_s with k = 0.5, its L_reg with lambda 1, distances divided
+        by the frustum's largest, a hard cut, sigma_d itself trained at 1e-2. It does not give tau, the start,
+        and the gradient of its count: 1/255 (what rasterizers drop anyway), constant 1, straight through.
+        """
+        own: dict[str, Any] = {
+            "tau": 1 / 255, "cut": "hard", "normalizer": "max", "start": "constant", "parameter": "linear",
+            "sampling": "uniform", "count_term": "paper", "reg_weight": 1.0, "weight_slope": 0.5, "lr_sigma": 1e-2,
+        }  # fmt: skip
+        return cls(**{**own, **changes})
+
     def attenuation(self, scene_distance: float) -> AttenuationConfig:
         """What travels with the file."""
         return AttenuationConfig(
-            tau=self.tau, eps=self.eps, normalizer=self.normalizer, quantile=self.quantile,
+            tau=self.tau, cut=self.cut, eps=self.eps, normalizer=self.normalizer, quantile=self.quantile,
             scene_distance=scene_distance, max_sv=self.max_sv,
         )  # fmt: skip
 

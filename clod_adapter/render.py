@@ -42,7 +42,7 @@ def dial(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Attenuat
         require(1 <= virtual_scale < float("inf"), "virtual_scale", virtual_scale, "at least 1 and finite")
         log_opacities = torch.nn.functional.logsigmoid(gaussians.opacity_logits)
         keep = torch.ones(len(gaussians), dtype=torch.bool, device=log_opacities.device)
-        return Attenuated(gaussians.opacities, log_opacities, keep)
+        return Attenuated(gaussians.opacities, log_opacities, keep, gaussians.opacities)
     distances = normalized_distances(gaussians.means, camera, gaussians.attenuation)
     return attenuate(
         gaussians.opacity_logits, gaussians.sigma_d, distances, virtual_scale, gaussians.attenuation
@@ -95,6 +95,5 @@ def render(
         ClodError: the dial is below 1 or not finite.
     """
     attenuated = dial(gaussians, camera, virtual_scale)
-    opacities = torch.where(attenuated.keep, attenuated.opacities, 0)
-    image, alpha = splat(gaussians, opacities, camera, background=background, rasterizer=rasterizer)
+    image, alpha = splat(gaussians, attenuated.drawn, camera, background=background, rasterizer=rasterizer)
     return Rendering(image, alpha, attenuated.keep)

@@ -13,18 +13,18 @@ from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances, soft_count
+from clod_adapter.attenuation import SIGMA_MAX, Attenuated, attenuate, count_slope, normalized_distances, soft_count
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.importance import start
+from clod_adapter.importance import count_law, start
 from clod_adapter.losses import photometric_loss
 from clod_adapter.optimizer import RowAdam
 from clod_adapter.render import splat
 
-# Log sigma stays where the equation still tells values apart; below, a Gaussian would be gone for good.
-LOG_SIGMA_RANGE = (math.log(1e-4), math.log(SIGMA_MAX))
+# Sigma stays where the equation still tells values apart; below, a Gaussian would be gone for good.
+SIGMA_RANGE = (1e-4, SIGMA_MAX)
 
 
 @dataclass(frozen=True)
@@ -73,10 +73,12 @@ def adapt(
 ) -> Adapted:
     """Learns sigma_d for ``base`` on the training views of ``scene``, and updates the rest lightly.
 
-    Each step draws a view and a dial value s and minimises ``w_s (L_render + reg_weight L_reg)``
-    (CLoD-GS section 3.3): L_render is ``losses.photometric_loss``,
-    ``L_reg = (s - 1)^2 relu(eta - s^-exponent)^2`` with eta the share of all Gaussians kept,
-    ``w_s = (1 - 0.5 s / max_sv)^2``. A base that already has a sigma_d is continued from.
+    Each step draws a view, renders it at full detail and at one log-uniform dial value s in [1, max_sv], and
+    minimises the sum over the two of ``L_render + reg_weight (eta / law(s) - 1)^2``: L_render is
+    ``losses.photometric_loss``, eta the share of all Gaussians kept, law ``importance.count_law``. The count term
+    moves sigma_d only. ``AdaptConfig.paper`` gives CLoD-GS's own objective instead (section 3.3):
+    ``w_s (L_render + reg_weight L_reg)`` with ``L_reg = (s - 1)^2 relu(eta - s^-exponent)^2`` and
+    ``w_s = (1 - weight_slope s / max_sv)^2``. A base that already has a sigma_d is continued from.
 
     A KeyboardInterrupt ends training and returns what there is.
 
@@ -124,14 +126,17 @@ class _Run:
         self.attenuation = start.attenuation
         own = {"dtype": torch.float32, "copy": True, "memory_format": torch.contiguous_format}
         self.parameters = {name: getattr(start, name).detach().to(**own) for name in ATTRIBUTES}
-        self.parameters["log_sigma"] = start.sigma_d.detach().float().clamp(min=1e-30).log().clamp(*LOG_SIGMA_RANGE)
+        sigma = start.sigma_d.detach().float().clamp(*SIGMA_RANGE)
+        linear = config.parameter == "linear"
+        self.decay, self.range = ("sigma", SIGMA_RANGE) if linear else ("log_sigma", tuple(map(math.log, SIGMA_RANGE)))
+        self.parameters[self.decay] = sigma if linear else sigma.log()
         self.optimizer = RowAdam(self.parameters)
         self.empty_bands: Tensor | None = None  # the base's whole shN, where what was left out of it comes back
         self.all_rows = torch.ones(len(start), dtype=torch.bool)
         self.rates = {
             "means": config.lr_means * camera_extent(views), "quats": config.lr_quats, "log_scales": config.lr_scales,
             "opacity_logits": config.lr_opacities, "sh0": config.lr_sh0, "shN": config.lr_shN,
-            "log_sigma": config.lr_sigma,
+            self.decay: config.lr_sigma,
         }  # fmt: skip
         self.random = np.random.default_rng(config.seed)
         self.order: list[int] = []
@@ -163,38 +168,68 @@ class _Run:
         values = {name: self.parameters[name] for name in ATTRIBUTES}
         if self.empty_bands is not None:
             values["shN"] = self.empty_bands
-        return Gaussians(**values, sigma_d=self.parameters["log_sigma"].exp(), attenuation=self.attenuation)
+        decay = self.parameters[self.decay]
+        sigma = decay.clone() if self.config.parameter == "linear" else decay.exp()
+        return Gaussians(**values, sigma_d=sigma, attenuation=self.attenuation)
 
-    def _draw(self) -> tuple[View, float]:
-        """A view (each once per round, in random order) and a dial value."""
+    def _draw(self) -> tuple[View, list[float]]:
+        """A view (each once per round, in random order) and the dial values it is rendered at."""
         if not self.order:
             self.order = self.random.permutation(len(self.views)).tolist()
-        view = self.views[self.order.pop()]
-        uniform, full = self.random.random(), self.random.random() < self.config.full_share
-        return view, 1.0 if full else self.config.max_sv**uniform
+        view, config = self.views[self.order.pop()], self.config
+        uniform, full = self.random.random(), self.random.random() < config.full_share
+        drawn = 1 + (config.max_sv - 1) * uniform if config.sampling == "uniform" else config.max_sv**uniform
+        if config.sampling == "pair":
+            return view, [1.0, drawn] if config.max_sv > 1 else [1.0]
+        return view, [1.0 if full else drawn]
 
     @torch_on_one_thread()
     def step(self, share_done: float) -> None:
-        """One view, one dial value, one update."""
-        view, s = self._draw()
-        config, p = self.config, self.parameters
-        logits, log_sigma = p["opacity_logits"].detach().requires_grad_(), p["log_sigma"].detach().requires_grad_()
-        distances = normalized_distances(p["means"], view.camera, self.attenuation)
-        dialled = attenuate(logits, log_sigma.exp(), distances, s, self.attenuation)
-        # Dropped rows have opacity 0: the rasterizer leaves them out before anything else, and they get no gradient.
+        """One view, its dial values, one update."""
+        view, dials = self._draw()
+        p = self.parameters
+        logits, decay = p["opacity_logits"].detach().requires_grad_(), p[self.decay].detach().requires_grad_()
         leaves = {name: p[name].detach().requires_grad_(name in self.tuned) for name in ATTRIBUTES}
-        opacities = torch.where(dialled.keep, dialled.opacities, 0)
-        image, _ = splat(Gaussians(**leaves), opacities, view.camera)
-        loss = photometric_loss(image, view.image, config.ssim_weight)
-        self.loss = float(loss.detach()) if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * float(loss.detach())
-        count = soft_count(dialled.log_opacities, s, self.attenuation.tau, config.temperature)
-        excess = (count - s**-config.exponent).clamp(min=0)
-        weight = (1 - config.weight_slope * s / config.max_sv) ** 2
-        total = weight * (loss + config.reg_weight * (s - 1) ** 2 * excess**2)
+        sigma = decay.exp() if self.config.parameter == "log" else decay
+        distances = normalized_distances(p["means"], view.camera, self.attenuation)
+        total, pull, kept = torch.zeros(()), torch.zeros_like(decay), torch.zeros(len(decay), dtype=torch.bool)
+        for s in dials:
+            dialled = attenuate(logits, sigma, distances, s, self.attenuation)
+            # Dropped rows have opacity 0: the rasterizer leaves them out, and they get no gradient.
+            image, _ = splat(Gaussians(**leaves), dialled.drawn, view.camera)
+            loss = photometric_loss(image, view.image, self.config.ssim_weight)
+            weight = (1 - self.config.weight_slope * s / self.config.max_sv) ** 2
+            total = total + weight * (loss + self._paper_count(dialled, s))
+            pull += self._pull(dialled, logits.detach(), s)
+            kept |= dialled.keep
+            if s == dials[0]:
+                now = float(loss.detach())
+                self.loss = now if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * now
         leaves = {name: leaves[name] for name in self.tuned}
-        of_logits, of_sigma, *of_leaves = torch.autograd.grad(total, [logits, log_sigma, *leaves.values()])
-        rates = {name: rate * config.lr_final**share_done for name, rate in self.rates.items()}
-        self.optimizer.step(dict(zip(leaves, of_leaves, strict=True)), dialled.keep, rates)
-        # The count term reaches the dropped ones too.
-        self.optimizer.step({"opacity_logits": of_logits, "log_sigma": of_sigma}, self.all_rows, rates)
-        self.parameters["log_sigma"].clamp_(*LOG_SIGMA_RANGE)
+        of_logits, of_decay, *of_leaves = torch.autograd.grad(total, [logits, decay, *leaves.values()])
+        pull = pull if self.config.parameter == "log" else pull / decay.detach()
+        rates = {name: rate * self.config.lr_final**share_done for name, rate in self.rates.items()}
+        self.optimizer.step(dict(zip(leaves, of_leaves, strict=True)), kept, rates)
+        # The paper's count term moves opacities too, of those that have left as well.
+        rows = self.all_rows if self.config.count_term == "paper" else kept
+        self.optimizer.step({"opacity_logits": of_logits}, rows, rates)
+        self.optimizer.step({self.decay: of_decay + pull}, self.all_rows, rates)
+        p[self.decay].clamp_(*self.range)
+
+    def _paper_count(self, dialled: Attenuated, s: float) -> Tensor | float:
+        """The paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2``."""
+        config = self.config
+        if config.count_term != "paper" or config.reg_weight == 0:
+            return 0.0
+        count = soft_count(dialled.log_opacities, s, self.attenuation.tau, config.temperature)
+        return config.reg_weight * (s - 1) ** 2 * (count - s**-config.exponent).clamp(min=0) ** 2
+
+    def _pull(self, dialled: Attenuated, logits: Tensor, s: float) -> Tensor | float:
+        """``[N]`` the gradient of ``reg_weight (eta / law(s) - 1)^2`` by log sigma, opacities held."""
+        config = self.config
+        if config.count_term != "relative" or config.reg_weight == 0 or config.max_sv == 1:
+            return 0.0  # a range of one dial value asks for no law
+        law = count_law(s, config.start_share, config.exponent)
+        excess = float(dialled.keep.sum()) / len(logits) / law - 1
+        slope = count_slope(logits, dialled.log_opacities.detach(), s, self.attenuation.tau, config.temperature)
+        return slope.mul_(2 * config.reg_weight * excess / law)

@@ -12,13 +12,14 @@ from clod_adapter.errors import ClodError
 
 BOTH = {
     "tau": [0.0, -0.1, 1.0, 0.2, math.nan], "eps": [-1e-9, 1.0, math.nan], "normalizer": ["mean", ""],
-    "quantile": [0.0, 1.01, math.nan], "max_sv": [0.99, math.inf, math.nan],
+    "quantile": [0.0, 1.01, math.nan], "cut": ["none", ""], "max_sv": [0.99, math.inf, math.nan],
 }  # fmt: skip
 ADAPT = BOTH | {
     "iters": [-1], "time_budget": [0.0, -1.0, math.nan], "start_share": [0.5, 1.01, math.nan],
     "full_share": [-0.1, 1.1, math.nan], "exponent": [0.0, -1.5, math.inf, math.nan], "reg_weight": [-1.0, math.nan],
     "weight_slope": [-0.1, 1.1], "temperature": [0.0, math.nan], "ssim_weight": [-0.1, 1.1],
-    "lr_final": [0.0, 1.1, math.nan],
+    "lr_final": [0.0, 1.1, math.nan], "start": ["random"], "parameter": ["sqrt"], "sampling": ["normal"],
+    "count_term": ["none"],
     **{f"lr_{name}": [-1e-9, math.nan] for name in ("sigma", "means", "quats", "scales", "opacities", "sh0", "shN")},
 }  # fmt: skip
 ATTENUATION = BOTH | {"scene_distance": [0.0, -1.0, math.inf, math.nan]}
@@ -66,10 +67,19 @@ def test_frozen_and_by_keyword(kind: type) -> None:
 
 def test_what_travels_with_the_file() -> None:
     chosen = AdaptConfig(tau=0.01, eps=1e-6, normalizer="quantile", quantile=0.7, max_sv=7.0)
-    want = AttenuationConfig(tau=0.01, eps=1e-6, normalizer="quantile", quantile=0.7, scene_distance=2.5, max_sv=7.0)
+    want = AttenuationConfig(
+        tau=0.01, cut="soft", eps=1e-6, normalizer="quantile", quantile=0.7, scene_distance=2.5, max_sv=7.0
+    )
     assert chosen.attenuation(2.5) == want
     with pytest.raises(ClodError, match="scene_distance is 0"):
         chosen.attenuation(0.0)
+
+
+def test_the_papers_form() -> None:
+    paper = AdaptConfig.paper(max_sv=7, iters=10)
+    assert (paper.max_sv, paper.iters, paper.lr_sigma, paper.reg_weight) == (7, 10, 1e-2, 1.0)
+    assert paper.attenuation(1.0).cut == "hard" and paper.attenuation(1.0).normalizer == "max"
+    assert AdaptConfig.paper(reg_weight=0.0).reg_weight == 0  # its own ablation
 
 
 def test_something_survives_the_cut() -> None:
