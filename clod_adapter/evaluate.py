@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import torch
@@ -16,6 +16,7 @@ from clod_adapter.config import require
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.metrics import psnr_ssim
+from clod_adapter.perceptual import Metric
 from clod_adapter.render import Rendering, render
 
 
@@ -29,6 +30,7 @@ class Row:
         kept: Gaussians the dial leaves in, of all; kept_share: that divided by all.
         in_view: kept Gaussians that also take part in the picture (their centre is in the image).
         frame_ms: median time of a frame, milliseconds.
+        lpips, flip: where they were asked for (``perceptual.available_metrics``), else None.
     """
 
     virtual_scale: float
@@ -38,9 +40,12 @@ class Row:
     kept_share: float
     in_view: float
     frame_ms: float
+    lpips: float | None = None
+    flip: float | None = None
 
     def as_dict(self) -> dict[str, float]:
-        return asdict(self)
+        """By name, without what was not measured."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 @torch.no_grad()
@@ -50,6 +55,7 @@ def evaluate(
     virtual_scales: Sequence[float],
     *,
     repeats: int = 1,
+    metrics: Mapping[str, Metric] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
     """Renders ``views`` at each dial value and compares with the photographs.
@@ -57,6 +63,7 @@ def evaluate(
     Args:
         gaussians: adapted or not; without ``sigma_d`` every dial value shows the base.
         repeats: frames timed per view and dial value; all renders of one view are the same.
+        metrics: more to measure, from ``perceptual.available_metrics``: any of ``lpips`` and ``flip``.
         progress: called with (frames done, frames in all).
 
     Raises:
@@ -74,17 +81,22 @@ def evaluate(
     rows = []
     for i, virtual_scale in enumerate(virtual_scales):
         results, times = [], []
+        more: dict[str, list[float]] = {name: [] for name in metrics or {}}
         for j, view in enumerate(views):
             for _ in range(repeats):
                 began = time.perf_counter()
                 rendering = render(gaussians, view.camera, virtual_scale)
                 times.append((time.perf_counter() - began) * 1e3)
             results.append((*psnr_ssim(rendering.image, view.image), *_counts(gaussians, view, rendering)))
+            for name, metric in (metrics or {}).items():
+                more[name].append(metric(rendering.image, view.image))
             if progress:
                 progress(i * len(views) + j + 1, len(virtual_scales) * len(views))
         psnr, ssim, kept, in_view = (statistics.fmean(column) for column in zip(*results, strict=True))
         share = kept / max(len(gaussians), 1)
-        rows.append(Row(float(virtual_scale), psnr, ssim, kept, share, in_view, statistics.median(times)))
+        frame_ms = statistics.median(times)
+        perceived = {name: statistics.fmean(values) for name, values in more.items()}
+        rows.append(Row(float(virtual_scale), psnr, ssim, kept, share, in_view, frame_ms, **perceived))
     return rows
 
 

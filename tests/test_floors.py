@@ -19,11 +19,11 @@ PACKAGE = "clod_adapter"
 FLOORS = [
     {"errors", "_lazy"},
     {"_kernels"},
-    {"config", "gaussians", "cameras", "attenuation", "losses", "metrics", "optimizer"},
+    {"config", "gaussians", "cameras", "attenuation", "losses", "metrics", "optimizer", "perceptual"},
     {"io", "rasterizers", "adapter"},
     {"render"},
-    {"importance"},
-    {"train", "evaluate", "export", "viewer"},
+    {"importance", "popping"},
+    {"train", "evaluate", "export", "viewer", "compare"},
     {"demo"},
     {""},  # the package itself, whose __init__ re-exports from all of the above
     {"cli"},

@@ -1,0 +1,80 @@
+"""LPIPS and FLIP, from the packages that define them, where these are installed; never from the network."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+INSTALL = "pip install 'clod-adapter[eval]'"
+WEIGHTS = """python -c "import torchvision; torchvision.models.alexnet(weights='DEFAULT')\""""
+
+Metric = Callable[[Tensor, Tensor], float]
+"""Of a ``[H, W, 3]`` float render, which it clamps to [0, 1], against a uint8 photograph."""
+
+
+class Unavailable(Exception):
+    """A metric cannot be computed here; says why, and what to run."""
+
+
+def available_metrics() -> tuple[dict[str, Metric], list[str]]:
+    """The metrics that are there, by name in the reports, and at most one note on those that are not.
+
+    ``lpips``: LPIPS 0.1 with AlexNet, its authors' choice for evaluation, inputs scaled to [-1, 1]; 0 for equal
+    pictures. Papers that use Inria's evaluation report VGG on inputs in [0, 1], which are other numbers.
+    ``flip``: the mean over pixels of LDR-FLIP at 67 pixels per degree (FLIP's default viewing distance), in [0, 1].
+    """
+    found: dict[str, Metric] = {}
+    missing: dict[str, list[str]] = {}
+    for name, make in (("lpips", _make_lpips), ("flip", _make_flip)):
+        try:
+            found[name] = make()
+        except Unavailable as reason:
+            missing.setdefault(str(reason), []).append(name.upper())
+    notes = [f"without {' and '.join(names)} ({reason})" for reason, names in missing.items()]
+    return found, ["; ".join(notes)] if notes else []
+
+
+def _make_lpips() -> Metric:
+    try:
+        import lpips
+        from torchvision.models import AlexNet_Weights
+    except ImportError as error:
+        raise Unavailable(INSTALL) from error
+    except RuntimeError as error:  # torchvision's, where it was built for another torch
+        raise Unavailable(f"torchvision does not fit this torch: {error}") from error
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(AlexNet_Weights.IMAGENET1K_V1.url).name
+    if not weights.is_file():  # lpips would download it
+        raise Unavailable(f"its network's weights are not at {weights}; once, online: {WEIGHTS}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # lpips calls torchvision in a way that is deprecated
+        return partial(_lpips, lpips.LPIPS(net="alex", verbose=False))
+
+
+def _make_flip() -> Metric:
+    try:
+        import flip_evaluator
+    except ImportError as error:
+        raise Unavailable(INSTALL) from error
+    return partial(_flip, flip_evaluator.evaluate)
+
+
+@torch.no_grad()
+def _lpips(network: Any, image: Tensor, target: Tensor) -> float:
+    ours, theirs = (x.permute(2, 0, 1)[None].contiguous() for x in _unit(image, target))
+    return float(network.to(ours.device)(ours, theirs, normalize=True))
+
+
+def _flip(evaluate: Any, image: Tensor, target: Tensor) -> float:
+    ours, theirs = (x.cpu().numpy() for x in _unit(image, target))
+    return float(evaluate(theirs, ours, "LDR", applyMagma=False)[1])
+
+
+def _unit(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    image = image.detach().float().clamp(0, 1).contiguous()
+    return image, target.to(image) / 255

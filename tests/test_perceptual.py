@@ -1,0 +1,64 @@
+"""LPIPS and FLIP: offline without their packages or weights, and what they give where these are there."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from clod_adapter.evaluate import evaluate
+from clod_adapter.perceptual import available_metrics
+from scenes import gaussians, photograph, ring
+
+
+@pytest.fixture(autouse=True)
+def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "create_connection", lambda *_, **__: pytest.fail("asked the network"))
+
+
+def test_without_the_packages_one_note_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("lpips", "flip_evaluator"):
+        monkeypatch.setitem(sys.modules, name, None)
+    found, notes = available_metrics()
+    assert found == {} and notes == ["without LPIPS and FLIP (pip install 'clod-adapter[eval]')"]
+
+
+def test_flip() -> None:
+    """0 for what is equal to the byte, about 1 for black against white, the mean over the views in a row."""
+    pytest.importorskip("flip_evaluator")
+    flip = available_metrics()[0]["flip"]
+    photo = torch.randint(0, 256, (40, 60, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    assert flip(photo / 255, photo) == 0
+    assert flip(photo / 255 + 2, torch.full_like(photo, 255)) == 0  # clamped
+    black = torch.zeros(40, 60, 3)
+    assert 0.9 < flip(black, torch.full_like(photo, 255)) <= 1
+    assert 0 < flip((photo / 255).clamp(0.1, 0.9), photo) < 0.5
+    some = gaussians(50, 0, 0)
+    views = photograph(gaussians(50, 0, 1), ring(2, 32, 24))
+    rows = [evaluate(some, [view], [1.0], metrics={"flip": flip})[0] for view in views]
+    (both,) = evaluate(some, views, [1.0], metrics={"flip": flip})
+    assert both.flip == pytest.approx(sum(row.flip or 0 for row in rows) / 2) and both.lpips is None
+    assert "flip" in both.as_dict() and "lpips" not in both.as_dict()
+
+
+def test_lpips_is_left_out_without_weights(tmp_path: Path) -> None:
+    """It would download them; with them (here random ones) it measures."""
+    pytest.importorskip("lpips", exc_type=(ImportError, RuntimeError))
+    import torchvision
+
+    before = torch.hub.get_dir()
+    torch.hub.set_dir(str(tmp_path))
+    try:
+        found, notes = available_metrics()
+        assert "lpips" not in found and "weights are not at" in notes[0] and "alexnet" in notes[0]
+        (tmp_path / "checkpoints").mkdir()
+        name = Path(torchvision.models.AlexNet_Weights.IMAGENET1K_V1.url).name
+        torch.save(torchvision.models.alexnet().state_dict(), tmp_path / "checkpoints" / name)
+        lpips = available_metrics()[0]["lpips"]
+    finally:
+        torch.hub.set_dir(before)
+    photo = torch.randint(0, 256, (64, 80, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    assert lpips(photo / 255, photo) == 0 < lpips(1 - photo / 255, photo)
