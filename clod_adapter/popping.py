@@ -1,0 +1,182 @@
+"""Popping: does the picture change evenly as the dial turns or the camera moves, or does it jump?
+
+Neighbouring steps k, k+1 of a sweep are compared *from one camera*, so that only what the level of detail does is
+counted and not the camera's own motion: with ``I_c(k)`` the picture, clamped to [0, 1], that camera c sees of the
+Gaussians as they are opaque at step k, step k changes it by
+
+    delta_k = I_c(k+1) - I_c(k)      c the camera of step k+1
+    change_k = 255 rms(delta_k)      root mean square over pixels and channels, in levels of 255
+
+A fade changes the picture in proportion to the step's length, a jump by the same amount however short the step. Two
+numbers tell them apart: the largest change against the mean one (1 where all is even; a single switch within n steps
+gives n, without bound as steps get finer), and the largest change against the largest over two steps at once,
+``I_c(k+1) - I_c(k-1)`` (1/2 for a fade, 1 for a jump, about 0.7 where many small jumps at different places add up).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from clod_adapter.cameras import Camera
+from clod_adapter.config import require
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.render import dial, render, splat
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Popping:
+    """How a picture changes over a sweep; changes are in levels of 255.
+
+    Attributes:
+        steps: how many, of equal length.
+        mean: change of the picture in a step, mean over the steps.
+        largest: the largest of them; at: where it ends, as a dial value or a share of the camera path.
+        ratio: largest / mean, in [1, steps]; NaN where nothing changes at all.
+        persistence: largest / the largest over two steps at once: 0.5 a fade, 1 a jump; NaN as above.
+        pixel: the largest change of one channel of one pixel in one step; pixel_at: where.
+        pixel_persistence: the same as persistence, of the largest changes of one pixel.
+        changes: of every step.
+    """
+
+    steps: int
+    mean: float
+    largest: float
+    at: float
+    ratio: float
+    persistence: float
+    pixel: float
+    pixel_at: float
+    pixel_persistence: float
+    changes: tuple[float, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@torch.no_grad()
+def sweep(show: Callable[[int, int], Tensor], positions: Sequence[float], progress: Progress | None = None) -> Popping:
+    """The measure itself, of anything that can be shown.
+
+    Args:
+        show: ``show(k, j)`` is the picture ``[H, W, 3]`` from the camera of step k of the Gaussians as at step j.
+        positions: where the steps are, at least three.
+        progress: called with (steps done, steps in all).
+    """
+    require(len(positions) >= 3, "number of positions", len(positions), "at least 3")
+    once, twice = [], []
+    for k in range(1, len(positions)):
+        new = show(k, k).clamp(0, 1)
+        once.append(_change(new - show(k, k - 1).clamp(0, 1)))
+        if k >= 2:
+            twice.append(_change(new - show(k, k - 2).clamp(0, 1)))
+        if progress:
+            progress(k, len(positions) - 1)
+    changes, pixels = zip(*once, strict=True)
+    wide_changes, wide_pixels = zip(*twice, strict=True)
+    largest, pixel, mean = max(changes), max(pixels), math.fsum(changes) / len(changes)
+    return Popping(
+        steps=len(changes), mean=mean, largest=largest, at=float(positions[changes.index(largest) + 1]),
+        ratio=_ratio(largest, mean), persistence=_ratio(largest, max(wide_changes)), pixel=pixel,
+        pixel_at=float(positions[pixels.index(pixel) + 1]), pixel_persistence=_ratio(pixel, max(wide_pixels)),
+        changes=changes,
+    )  # fmt: skip
+
+
+def dial_popping(
+    gaussians: Gaussians, camera: Camera, max_sv: float, *, steps: int = 200, progress: Progress | None = None
+) -> Popping:
+    """Turns the dial from 1 to ``max_sv`` before a camera that stands still, in steps of equal ratio.
+
+    Raises:
+        ClodError: ``max_sv`` is not above 1 or not finite, or there are fewer than two steps.
+    """
+    require(1 < max_sv < math.inf, "max_sv", max_sv, "above 1 and finite")
+    positions = [max_sv ** (k / steps) for k in range(steps + 1)]
+    gaussians = gaussians.without_empty_bands()
+    # Each picture is wanted three times: as the newest, one and two steps later.
+    picture = lru_cache(maxsize=3)(lambda j: render(gaussians, camera, positions[j]).image)
+    return sweep(lambda _, j: picture(j), positions, progress)
+
+
+def path_popping(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    virtual_scale: float,
+    *,
+    steps: int = 200,
+    progress: Progress | None = None,
+) -> Popping:
+    """Moves through the ``cameras`` at a fixed dial value, in steps of equal length (``path``).
+
+    Raises:
+        ClodError: fewer than two cameras or two steps, or the dial is below 1 or not finite.
+    """
+    gaussians, shown = gaussians.without_empty_bands(), path(cameras, steps)
+
+    @lru_cache(maxsize=3)
+    def opacities(j: int) -> Tensor:
+        attenuated = dial(gaussians, shown[j], virtual_scale)
+        return torch.where(attenuated.keep, attenuated.opacities, 0)
+
+    positions = [k / steps for k in range(steps + 1)]
+    return sweep(lambda k, j: splat(gaussians, opacities(j), shown[k])[0], positions, progress)
+
+
+def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
+    """``steps + 1`` cameras from the first to the last through all of them, equally far apart along the way.
+
+    Between neighbours the centre moves straight and the rotation turns evenly about one axis; where no centre moves,
+    each turn takes as many steps as the next. Size and intrinsics are the first camera's.
+
+    Raises:
+        ClodError: fewer than two cameras or two steps.
+    """
+    require(steps >= 2, "steps", steps, "at least 2")
+    if len(cameras) < 2:
+        raise ClodError(f"a camera path needs at least two cameras, not {len(cameras)}")
+    centres = torch.stack([camera.position for camera in cameras]).double()
+    lengths = (centres[1:] - centres[:-1]).norm(dim=1)
+    lengths = lengths if lengths.sum() > 0 else torch.ones_like(lengths)
+    ends = lengths.cumsum(0)
+    found = []
+    for distance in torch.linspace(0, float(ends[-1]), steps + 1, dtype=torch.float64).clamp(max=ends[-1]):
+        i = int(torch.searchsorted(ends, distance))
+        share = float(1 - (ends[i] - distance) / lengths[i]) if lengths[i] > 0 else 0.0
+        rotation = _turned(cameras[i].viewmat[:3, :3], cameras[i + 1].viewmat[:3, :3], share)
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, :3] = rotation
+        viewmat[:3, 3] = -rotation @ torch.lerp(centres[i], centres[i + 1], share)
+        first = cameras[0]
+        found.append(Camera(viewmat.to(first.viewmat), first.K, first.width, first.height))
+    return found
+
+
+def _turned(start: Tensor, end: Tensor, share: float) -> Tensor:
+    """The rotation ``share`` of the way from one to the other (slerp): ``exp(share log(end start^T)) start``."""
+    turn = end.double() @ start.double().T
+    angle = math.acos(min(max((float(turn.trace()) - 1) / 2, -1.0), 1.0))
+    axis = torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    if float(axis.norm()) < 1e-9:  # no turn, or half a turn, which no neighbours of a capture are apart
+        return start.double()
+    cross = torch.linalg.cross(torch.eye(3, dtype=torch.float64), F.normalize(axis, dim=0).expand(3, 3))
+    return torch.linalg.matrix_exp(share * angle * cross) @ start.double()
+
+
+def _change(delta: Tensor) -> tuple[float, float]:
+    """Root mean square, and largest absolute value, in levels of 255."""
+    return 255 * float(delta.square().mean().sqrt()), 255 * float(delta.abs().max())
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole > 0 else math.nan
