@@ -1,0 +1,58 @@
+"""What an adapted file is compared with: other files at the same counts, and its base cut down by rank."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from clod_adapter.cameras import Camera, View
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.importance import MOST_VIEWS, removal_error
+from clod_adapter.render import dial
+
+CLOSE = 0.001  # relative distance of two counts that count as the same
+
+
+@torch.no_grad()
+def mean_kept(gaussians: Gaussians, cameras: Sequence[Camera], virtual_scale: float) -> float:
+    """Gaussians that the dial leaves in, mean over the cameras; nothing is rendered."""
+    return fmean(int(dial(gaussians, camera, virtual_scale).keep.sum()) for camera in cameras)
+
+
+def matching_dial(gaussians: Gaussians, cameras: Sequence[Camera], count: float) -> float:
+    """The dial value at which ``mean_kept`` is ``count``, within 0.1 % where counts go that finely.
+
+    1 where even that keeps no more, and without a dial: there is nothing to turn.
+    """
+    if gaussians.attenuation is None or mean_kept(gaussians, cameras, 1.0) <= count * (1 + CLOSE):
+        return 1.0
+    # Bisection of the logarithm until clod_adapter.budget solves it. At 1/tau nothing is left.
+    low, high = 1.0, 1 / gaussians.attenuation.tau
+    for _ in range(24):
+        middle = math.sqrt(low * high)
+        kept = mean_kept(gaussians, cameras, middle)
+        if abs(kept - count) <= CLOSE * count:
+            return middle
+        low, high = (middle, high) if kept > count else (low, middle)
+    return high
+
+
+def rankings(
+    base: Gaussians, views: Sequence[View], progress: Callable[[int, int], None] | None = None
+) -> dict[str, Tensor]:
+    """``[N]`` indices of the Gaussians of an unadapted base, the ones to keep longest first, by two rules.
+
+    ``opacity``: the stored one. ``contribution``: the error that removing it alone would cause in up to 64 of the
+    training views, evenly spread (``importance.removal_error``). ``base.select(order[:n])`` is the base at n Gaussians.
+
+    Args:
+        progress: called with (views done, views in all).
+    """
+    if len(views) > MOST_VIEWS:
+        views = [views[k * len(views) // MOST_VIEWS] for k in range(MOST_VIEWS)]
+    by = {"opacity": base.opacity_logits, "contribution": removal_error(base, views, progress=progress)}
+    return {name: values.argsort(descending=True, stable=True) for name, values in by.items()}
