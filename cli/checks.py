@@ -26,7 +26,12 @@ def check_evaluate(args: Namespace) -> None:
     for virtual_scale in args.sv or ():
         if not 1 <= virtual_scale < math.inf:
             raise ClodError(f"--sv has {virtual_scale:g}, dial values must be at least 1 (1 is full quality)")
-    check_checkpoint(args.model)
+    for path in (args.model, *args.against):
+        check_checkpoint(path)
+    if args.base:
+        check_checkpoint(args.base)
+        if "sigma_d" in read_header(Path(args.base))["vertex"]:
+            raise ClodError(f"{args.base}: has a dial (sigma_d); give --base the checkpoint that was adapted")
     check_scene(args.images)
 
 

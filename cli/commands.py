@@ -45,6 +45,16 @@ def _evaluate(parser: ArgumentParser) -> None:
         "--sv", metavar="S", type=float, nargs="+",
         help="dial values, 1 (full quality) and up (default: 1 2 3 5 as far as trained, and the last one trained)",
     )  # fmt: skip
+    parser.add_argument(
+        "--base", metavar="BASE.ply", help="also the unadapted checkpoint, cut by rank to as many Gaussians as each row"
+    )
+    parser.add_argument(
+        "--against", metavar="FILE.ply", nargs="+", default=[],
+        help="also other files, and beside each MODEL.ply at the dial value that keeps as many Gaussians",
+    )  # fmt: skip
+    parser.add_argument(
+        "--popping", action="store_true", help="also how evenly the picture changes with the dial and with the camera"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
@@ -105,7 +115,23 @@ All numbers are over the held-out photographs (every 8th by name):
   kept        Gaussians that the dial leaves in, and their share of all
   in view     those of them that have their centre in the picture
   frame ms    median time to render a picture
+  LPIPS, FLIP the picture's distance as seen: LPIPS with AlexNet, the mean of
+              FLIP; where pip install 'clod-adapter[eval]' put their packages,
+              and LPIPS its network's weights, which are not downloaded here
 A checkpoint without a dial shows the same at every value: the baseline.
+
+With --base each row is followed by the base, untouched, at the same count: the
+Gaussians of highest opacity, and those that contribute most to the photographs
+trained on. With --against a file that has a dial itself is measured at every
+dial value; the model keeps as many as a mean over the held-out views, at most
+what it keeps at s = 1.
+
+--popping turns the dial from 1 to the largest S in 200 equal ratios before two
+held-out cameras, and moves through five neighbouring cameras in 200 steps at
+that S; of a moving camera only what the dial does is counted, not the motion.
+Per step: the change of the picture (root mean square, levels of 255), the
+largest against the mean (1 is even, 200 a single switch), and how much of the
+largest is left when the step is halved: 0.5 of a fade, 1.0 of a jump.
 
 Ctrl-C skips the dial values that are not finished (exit code 0, "interrupted":
 true); before the first one is, there is nothing to print (exit code 130).
@@ -114,6 +140,8 @@ examples:
   clod-adapt eval garden_clod.ply --images garden
   clod-adapt eval garden.ply --images garden --sv 1
   clod-adapt eval garden_clod.ply --images garden --sv 1 4 --json > eval.json
+  clod-adapt eval garden_clod.ply --images garden --base garden.ply --popping
+  clod-adapt eval garden_clod.ply --images garden --against merged.ply cut.ply
 """,
     add_arguments=_evaluate,
 )

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 from clod_adapter.cameras import View
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.inputs import read_checkpoint, read_scene
+from clod_adapter.cli.instruments import Instruments
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.report import Stopwatch, machine, table
 from clod_adapter.config import AttenuationConfig
@@ -17,6 +18,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import Row, evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.version import package_version
+from clod_adapter.perceptual import Metric, available_metrics
 
 DIALS = (1.0, 2.0, 3.0, 5.0)
 
@@ -25,6 +27,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch = Console(args.quiet), Stopwatch()
     with watch.time("load"):
         model = read_checkpoint(args.model, console)
+        base = read_checkpoint(args.base, console).gaussians if args.base else None
+        others = {path: read_checkpoint(path, console).gaussians for path in args.against}
         scene = read_scene(args.images, console)
     if not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
@@ -32,21 +36,28 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         console.say(f"{args.model} has no sigma_d: every dial value shows it in full")
     attenuation = model.gaussians.attenuation
     dials, notes = choose_dials(args.sv, attenuation)
+    perceptual, missing = available_metrics()
+    notes += missing
     for note in notes:
         console.say(note)
     with watch.time("kernels"):
-        prepare_kernels(console, training=False)
+        prepare_kernels(console, training=base is not None)
     with watch.time("evaluate"):
-        rows, interrupted = measure(model.gaussians, scene.test, dials, console)
+        rows, interrupted = measure(model.gaussians, scene.test, dials, console, metrics=perceptual)
     if interrupted and not rows:
         raise KeyboardInterrupt
     print(table(rows))
+    instruments = Instruments(model.gaussians, scene, perceptual, console)
+    if not interrupted:
+        with watch.time("instruments"):
+            interrupted = instruments.run(rows, base, others, args.popping)
+    print(instruments.text(), end="")
     return {
         "command": "eval", "version": package_version(), "model": args.model, "scene": args.images,
         "base_count": len(model.gaussians), "sh_degree": model.gaussians.sh_degree, "views": len(scene.test),
-        "rows": [row.as_dict() for row in rows], "interrupted": interrupted,
-        "attenuation": asdict(attenuation) if attenuation else None,
-        "notes": [*model.notes, *scene.notes, *notes], "machine": machine(),
+        "rows": [row.as_dict() for row in rows], "base": args.base, **instruments.report(),
+        "interrupted": interrupted, "attenuation": asdict(attenuation) if attenuation else None,
+        "notes": [*model.notes, *scene.notes, *notes, *instruments.notes], "machine": machine(),
         "device": str(model.gaussians.means.device), "seconds": watch.report(),
     }  # fmt: skip
 
@@ -67,6 +78,7 @@ def measure(
     virtual_scales: Sequence[float],
     console: Console,
     label: str = "measure",
+    metrics: Mapping[str, Metric] | None = None,
 ) -> tuple[list[Row], bool]:
     """The rows of the dial values, none where there are no views, and whether Ctrl-C cut them short."""
     rows: list[Row] = []
@@ -77,7 +89,7 @@ def measure(
                 def report(done: int, total: int, before: int = i, s: float = virtual_scale) -> None:
                     meter.update((before + done / total) / len(virtual_scales), f"s={s:g}")
 
-                rows += evaluate(gaussians, views, [virtual_scale], progress=report)
+                rows += evaluate(gaussians, views, [virtual_scale], metrics=metrics, progress=report)
         except KeyboardInterrupt:
             return rows, True
     return rows, False

@@ -16,6 +16,7 @@ from clod_adapter.io.atomic import atomic_path
 
 if TYPE_CHECKING:
     from clod_adapter.evaluate import Row
+    from clod_adapter.popping import Popping
 
 
 class Stopwatch:
@@ -92,9 +93,34 @@ def report_dials(max_sv: float) -> list[float]:
 
 def table(rows: Sequence[Row], base_rows: Sequence[Row] = (), plain_rows: Sequence[Row] = ()) -> str:
     """The rows under each other, those of the base first and those without the dial last, both marked."""
-    lines = ["  dial  PSNR dB    SSIM        kept              in view  frame ms"]
     marked = [("base", row) for row in base_rows] + [(f"{row.virtual_scale:g}", row) for row in rows]
-    for dial, row in marked + [("plain", row) for row in plain_rows]:
-        kept = f"{row.kept:10,.0f}  {row.kept_share:7.1%}"
-        lines.append(f"{dial:>6}  {row.psnr:7.2f}  {row.ssim:.4f}  {kept}  {row.in_view:10,.0f}  {row.frame_ms:8.1f}")
+    return rows_table(marked + [("plain", row) for row in plain_rows])
+
+
+def rows_table(marked: Sequence[tuple[str, Row]]) -> str:
+    """The rows under each other, each behind its label; LPIPS and FLIP where they were measured."""
+    width = max(6, *(len(label) for label, _ in marked))
+    more = [name for name in ("lpips", "flip") if any(getattr(row, name) is not None for _, row in marked)]
+    heads = "".join(f"  {name.upper():>6}" for name in more)
+    lines = [f"{'dial':>{width}}  PSNR dB    SSIM{heads}        kept              in view  frame ms"]
+    for label, row in marked:
+        extra = "".join(f"  {getattr(row, name):6.4f}" for name in more)
+        kept = f"{row.kept:10,.0f}  {row.kept_share:7.1%}  {row.in_view:10,.0f}  {row.frame_ms:8.1f}"
+        lines.append(f"{label:>{width}}  {row.psnr:7.2f}  {row.ssim:.4f}{extra}  {kept}")
+    return "\n".join(lines)
+
+
+def popping_table(results: Sequence[tuple[str, Popping]]) -> str:
+    """How the picture changes over each sweep, and how to read it."""
+    width = max(len(moved) for moved, _ in results)
+    lines = [
+        "popping: how much a step changes the picture, in levels of 255 (RMS over the picture, largest pixel). Halving",
+        "the step leaves 0.5 of a fade's largest change, and 1.0 of a jump's:",
+        f"{'what moves':>{width}}  steps     mean  largest     at  / mean  halved   pixel  halved",
+    ]
+    for moved, p in results:
+        lines.append(
+            f"{moved:>{width}}  {p.steps:5}  {p.mean:7.4f}  {p.largest:7.4f}  {p.at:5.2f}  {p.ratio:6.1f}"
+            f"  {p.persistence:6.2f}  {p.pixel:6.1f}  {p.pixel_persistence:6.2f}"
+        )
     return "\n".join(lines)

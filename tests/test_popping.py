@@ -36,6 +36,12 @@ def test_an_even_fade_and_a_switch_by_hand() -> None:
     assert list(switch.changes) == [0, 0, 0, 127.5, *[0] * 6]
 
 
+def test_a_flicker_is_a_jump() -> None:
+    """There and back again at every step: over two steps nothing is left, which must not make it a fade."""
+    flicker = sweep(lambda _, j: torch.full((1, 1, 3), 0.2 * (j % 2)), [0, 1, 2, 3])
+    assert flicker.ratio == pytest.approx(1) and flicker.persistence == flicker.pixel_persistence == 1
+
+
 def test_what_cannot_be_seen_is_no_change() -> None:
     """Beyond white nothing is brighter; and with no change at all there is no ratio."""
     result = sweep(lambda _, j: torch.full((1, 1, 3), 1.0 + j), [0, 1, 2])

@@ -19,6 +19,11 @@ ROW = {"virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_
 TINY = ("--iters", 3, "--quiet", "--out", "dial.ply")
 
 
+def notes_of(report: Any) -> list[str]:
+    """Without the one on LPIPS and FLIP, which depends on what is installed."""
+    return [note for note in report["notes"] if not note.startswith("without ")]
+
+
 def test_eval_prints_one_object(spawn: Any, clod: Any, capture: Any, tmp_path: Path) -> None:
     clod(capture.ply, "--images", capture.scene, *TINY)
     process = spawn("eval", "dial.ply", "--images", capture.scene, "--sv", "1", "2.5", "--json", cwd=tmp_path)
@@ -28,8 +33,9 @@ def test_eval_prints_one_object(spawn: Any, clod: Any, capture: Any, tmp_path: P
     assert (report["model"], report["scene"], report["base_count"]) == ("dial.ply", str(capture.scene), 300)
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 2.5]
     for row in report["rows"]:
-        assert set(row) == ROW and row["kept_share"] == row["kept"] / 300 and row["in_view"] <= row["kept"]
-        assert row["frame_ms"] > 0 and 0 < row["psnr"] < 100 and 0 < row["ssim"] <= 1
+        assert set(row) - {"lpips", "flip"} == ROW and row["in_view"] <= row["kept"]
+        assert row["kept_share"] == row["kept"] / 300 and row["frame_ms"] > 0
+        assert 0 < row["psnr"] < 100 and 0 < row["ssim"] <= 1
     assert "PSNR dB" in err and "PSNR dB" not in out
 
 
@@ -47,9 +53,9 @@ def test_eval_stays_within_what_was_trained(clod: Any, capture: Any) -> None:
     for max_sv, dials in ((2.5, [1, 2, 2.5]), (1, [1]), (7, [1, 2, 3, 5, 7])):
         clod(capture.ply, "--images", capture.scene, *TINY, "--max-sv", max_sv)
         report = json.loads(clod("eval", "dial.ply", "--images", capture.scene, "--json").out)
-        assert [row["virtual_scale"] for row in report["rows"]] == dials and report["notes"] == []
+        assert [row["virtual_scale"] for row in report["rows"]] == dials and notes_of(report) == []
     done = clod("eval", "dial.ply", "--images", capture.scene, "--sv", 8, "--json")
-    (note,) = json.loads(done.out)["notes"]
+    (note,) = notes_of(json.loads(done.out))
     assert note.startswith("trained up to s = 7") and note in done.err
 
 
@@ -105,6 +111,8 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("mine.ply --images SCENE --out mine.ply", "mine.ply: is an input file.*choose another"),
         ("mine.ply --images SCENE --out ./empty/../mine.ply", "mine.ply: is an input file"),
         ("eval missing.ply --images SCENE", "missing.ply: .*check the path"),
+        ("eval PLY --images SCENE --against PLY text.ply", "text.ply: is not a PLY"),
+        ("eval PLY --images SCENE --base missing.ply", "missing.ply: .*check the path"),
         ("eval PLY --images SCENE --sv 1 0.5", "--sv has 0.5, dial values must be at least 1"),
         ("eval PLY --images SCENE --sv", "--sv: expected at least one argument.*clod-adapt eval --help"),
         ("apply PLY missing.safetensors -o x.ply", "missing.safetensors: .*No such file"),

@@ -1,0 +1,115 @@
+"""The instruments of ``clod-adapt eval``: the base by rank, other files at matched counts, popping, more metrics."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import clod_adapter
+from clod_adapter.cli import instruments
+
+TINY = ("--iters", 3, "--quiet", "--max-sv", 4, "--out", "dial.ply")
+
+
+@pytest.fixture
+def adapted(clod: Any, capture: Any, tmp_path: Path) -> Path:
+    assert clod(capture.ply, "--images", capture.scene, *TINY).code == 0
+    return tmp_path / "dial.ply"
+
+
+def test_base_by_rank(clod: Any, capture: Any, adapted: Path) -> None:
+    done = clod("eval", adapted, "--images", capture.scene, "--sv", 1, 4, "--base", capture.ply, "--json")
+    report = json.loads(done.out)
+    assert report["base"] == str(capture.ply) and report["base_row"]["kept"] == 300 and report["interrupted"] is False
+    assert [(entry["virtual_scale"], entry["by"]) for entry in report["ranked"]] == [
+        (s, by) for s in (1, 4) for by in ("opacity", "contribution")
+    ]
+    kept = {row["virtual_scale"]: row["kept"] for row in report["rows"]}
+    assert [entry["row"]["kept"] for entry in report["ranked"]] == [round(kept[s]) for s in (1, 1, 4, 4)]
+    base, views = clod_adapter.load(capture.ply).gaussians, clod_adapter.load_scene(capture.scene).test
+    top = base.opacity_logits.argsort(descending=True)[: round(kept[4])]
+    (want,) = clod_adapter.evaluate(base.select(top), views, [1.0])
+    assert report["ranked"][2]["row"]["psnr"] == pytest.approx(want.psnr, abs=1e-4)
+    block = done.err[done.err.index("cut to the same counts by rank") :].splitlines()[2:]
+    by = ["opacity", "contribution"]
+    assert [line.split()[0] for line in block[:7]] == ["base", "s=1", *by, "s=4", *by]
+    assert report["against"] == [] and report["popping"] == []
+
+
+def test_against_at_matched_counts(clod: Any, capture: Any, adapted: Path, tmp_path: Path) -> None:
+    few = capture.write(tmp_path / "few.ply", capture.gaussians.select(torch.arange(60)))
+    words = ("eval", adapted, "--images", capture.scene, "--sv", 1, 2, "--json", "--against", few, capture.ply, adapted)
+    done = clod(*words)
+    report = json.loads(done.out)
+    pairs = [(Path(e["model"]).name, e["theirs"]["kept"], e["ours"]["kept"]) for e in report["against"]]
+    assert [name for name, *_ in pairs] == ["few.ply", capture.ply.name, "dial.ply", "dial.ply"]
+    assert pairs[0][1] == 60 == pytest.approx(pairs[0][2], abs=1)
+    assert pairs[1][1] == 300 > pairs[1][2] == report["rows"][0]["kept"]
+    (note,) = [note for note in report["notes"] if "keeps 300 Gaussians" in note]
+    assert note in done.err and "at most" in note
+    for own, row in zip(report["against"][2:], report["rows"], strict=True):  # with itself: the same rows again
+        assert own["theirs"]["psnr"] == row["psnr"] and own["ours"]["kept"] == pytest.approx(row["kept"], rel=2e-3)
+    assert "the dial value that keeps as many" in done.err
+
+
+def test_popping(clod: Any, capture: Any, adapted: Path) -> None:
+    done = clod("eval", adapted, "--images", capture.scene, "--sv", 1, 3, "--popping", "--json")
+    dial, other, walk = json.loads(done.out)["popping"]
+    assert (dial["moved"], other["moved"]) == ("dial, 000.png", "dial, 008.png")
+    assert walk["moved"] == "camera, 002.png to 006.png, s = 3"
+    for entry in (dial, other, walk):
+        assert entry["steps"] == len(entry["changes"]) == 200
+        assert entry["largest"] == max(entry["changes"]) and 1 < entry["ratio"] < 200
+        assert 0.3 < entry["persistence"] <= 1 and entry["largest"] < entry["pixel"] < 255
+    assert 1 < dial["at"] <= 3 and 0 < walk["at"] <= 1
+    assert re.search(r"^ +what moves +steps +mean", done.err, re.M) and "camera, 002.png to 006.png" in done.err
+
+
+def test_no_dial_does_not_pop(clod: Any, capture: Any) -> None:
+    done = clod("eval", capture.ply, "--images", capture.scene, "--sv", 1, 2, "--popping", "--json")
+    report = json.loads(done.out)
+    assert done.code == 0 and report["popping"] == [] and any("no popping" in note for note in report["notes"])
+
+
+def test_interrupt_keeps_what_is_measured(
+    clod: Any, capture: Any, adapted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, calls = instruments.evaluate, []
+
+    def evaluate(*args: Any, **rest: Any) -> Any:
+        calls.append(args)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(*args, **rest)
+
+    monkeypatch.setattr(instruments, "evaluate", evaluate)
+    words = ("eval", adapted, "--images", capture.scene, "--sv", 1, 2, "--base", capture.ply, "--popping", "--json")
+    done = clod(*words)
+    report = json.loads(done.out)
+    assert done.code == 0 and report["interrupted"] is True and len(report["rows"]) == 2
+    assert report["base_row"] and [entry["by"] for entry in report["ranked"]] == ["opacity"]
+    assert report["popping"] == []
+
+
+def test_more_metrics_are_columns(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever metrics there are, they are means over the views in the rows and columns of the table."""
+    found = {"flip": lambda image, target: float(image.mean())}
+    monkeypatch.setattr("clod_adapter.cli.evaluate.available_metrics", lambda: (found, ["without LPIPS (why)"]))
+    done = clod("eval", capture.ply, "--images", capture.scene, "--sv", 1, "--json")
+    report = json.loads(done.out)
+    assert report["notes"] == ["without LPIPS (why)"] and "without LPIPS (why)" in done.err
+    assert 0 < report["rows"][0]["flip"] < 1 and "lpips" not in report["rows"][0]
+    table = done.err[done.err.index("  dial") :].splitlines()
+    assert "FLIP" in table[0] and "LPIPS" not in table[0] and f"{report['rows'][0]['flip']:.4f}" in table[1]
+
+
+def test_base_must_be_unadapted(clod: Any, capture: Any, adapted: Path) -> None:
+    done = clod("eval", adapted, "--images", capture.scene, "--base", adapted)
+    assert (done.code, done.out) == (2, "")
+    assert done.err.startswith(f"clod-adapt: error: {adapted}: has a dial (sigma_d); give --base the checkpoint")
+    assert len(done.err.splitlines()) == 1
