@@ -8,9 +8,16 @@ Gaussians as they are opaque at step k, step k changes it by
     change_k = 255 rms(delta_k)      root mean square over pixels and channels, in levels of 255
 
 A fade changes the picture in proportion to the step's length, a jump by the same amount however short the step. Two
-numbers tell them apart: the largest change against the mean one (1 where all is even; a single switch within n steps
-gives n, without bound as steps get finer), and the largest change against the largest over two steps at once,
-``I_c(k+1) - I_c(k-1)`` (1/2 for a fade, 1 for a jump, about 0.7 where many small jumps at different places add up).
+numbers tell them apart:
+
+    ratio       = max change / mean change              1 where all is even; a single switch within n steps gives n,
+                                                        without bound as the steps get finer
+    persistence = max change / max change over 2 steps  1/2 for a fade, 1 for a jump or a flicker, about 0.7 where many
+                  (I_c(k+1) - I_c(k-1))                 small jumps at different places add up in every step
+
+so ``max change (2 - 1 / persistence)`` is about what would be left of the largest change at the shortest of steps. What
+a Gaussian leaves behind when it is cut hardly shows in the root mean square; it does in the largest change of a pixel,
+which is therefore given as well.
 """
 
 from __future__ import annotations
@@ -43,7 +50,7 @@ class Popping:
         mean: change of the picture in a step, mean over the steps.
         largest: the largest of them; at: where it ends, as a dial value or a share of the camera path.
         ratio: largest / mean, in [1, steps]; NaN where nothing changes at all.
-        persistence: largest / the largest over two steps at once: 0.5 a fade, 1 a jump; NaN as above.
+        persistence: largest / the largest over two steps at once: 0.5 a fade, 1 a jump, at most 1; NaN as above.
         pixel: the largest change of one channel of one pixel in one step; pixel_at: where.
         pixel_persistence: the same as persistence, of the largest changes of one pixel.
         changes: of every step.
@@ -87,8 +94,8 @@ def sweep(show: Callable[[int, int], Tensor], positions: Sequence[float], progre
     largest, pixel, mean = max(changes), max(pixels), math.fsum(changes) / len(changes)
     return Popping(
         steps=len(changes), mean=mean, largest=largest, at=float(positions[changes.index(largest) + 1]),
-        ratio=_ratio(largest, mean), persistence=_ratio(largest, max(wide_changes)), pixel=pixel,
-        pixel_at=float(positions[pixels.index(pixel) + 1]), pixel_persistence=_ratio(pixel, max(wide_pixels)),
+        ratio=_ratio(largest, mean), persistence=_ratio(largest, max(largest, *wide_changes)), pixel=pixel,
+        pixel_at=float(positions[pixels.index(pixel) + 1]), pixel_persistence=_ratio(pixel, max(pixel, *wide_pixels)),
         changes=changes,
     )  # fmt: skip
 
