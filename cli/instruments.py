@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -108,7 +108,7 @@ class Instruments:
         found = self._measured(jobs)
         self.base_row = next(found)
         for (ours, by, _), row in zip(wanted, found, strict=True):
-            self.ranked.append((ours, by, row))
+            self.ranked.append((ours, by, replace(row, kept_share=row.kept / len(base))))  # not of what was selected
 
     def _match(self, rows: Sequence[Row], others: Mapping[str, Gaussians]) -> None:
         cameras = [view.camera for view in self.scene.test]

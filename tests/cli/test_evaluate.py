@@ -31,6 +31,7 @@ def test_base_by_rank(clod: Any, capture: Any, adapted: Path) -> None:
     ]
     kept = {row["virtual_scale"]: row["kept"] for row in report["rows"]}
     assert [entry["row"]["kept"] for entry in report["ranked"]] == [round(kept[s]) for s in (1, 1, 4, 4)]
+    assert all(entry["row"]["kept_share"] == entry["row"]["kept"] / 300 for entry in report["ranked"])
     base, views = clod_adapter.load(capture.ply).gaussians, clod_adapter.load_scene(capture.scene).test
     top = base.opacity_logits.argsort(descending=True)[: round(kept[4])]
     (want,) = clod_adapter.evaluate(base.select(top), views, [1.0])
