@@ -134,7 +134,7 @@ def path_popping(
     @lru_cache(maxsize=3)
     def opacities(j: int) -> Tensor:
         attenuated = dial(gaussians, shown[j], virtual_scale)
-        return torch.where(attenuated.keep, attenuated.opacities, 0)
+        return attenuated.drawn
 
     positions = [k / steps for k in range(steps + 1)]
     return sweep(lambda k, j: splat(gaussians, opacities(j), shown[k])[0], positions, progress)
