@@ -9,8 +9,9 @@ is its Eq. 2 (section 3.2), the cut is the mask M_i of the same section. For act
     kept iff a'' > tau s                            compared as logarithms, which do not underflow
 
 A kept Gaussian is drawn with opacity a'' under the paper's cut, named ``hard``: it leaves with opacity
-``tau s``, which pops. Under the cut named ``soft`` it is drawn with ``(a'' - tau s) / (1 - tau s)``, which is 0
-where it leaves and 1 where a'' is: the same Gaussians are kept, and the picture is continuous in dial and camera.
+``tau s``, which pops. Under the cut named ``soft`` it is drawn with ``a'' min(1, 2 (a'' / (tau s) - 1))``: nothing
+changes above 1.5 tau s, and from there it fades to 0 where it leaves. The same Gaussians are kept, and the picture is
+continuous in dial and camera.
 
 Throughout: tensors are ``[N]``, one entry per Gaussian, on one device. ``opacity_logits`` may be +-inf,
 ``sigma_d`` and the distances are finite, distances are >= 0. Half-precision inputs are computed, and their
@@ -150,8 +151,7 @@ def attenuate(
     if config.cut == "hard":
         drawn = torch.where(keep, opacities, 0)
     else:
-        threshold = config.tau * virtual_scale
-        drawn = ((opacities - threshold) / max(1 - threshold, 1e-6)).clamp(0, 1)  # from tau s = 1 on nothing is left
+        drawn = opacities * (opacities * (2 / (config.tau * virtual_scale)) - 2).clamp(0, 1)
     return Attenuated(opacities, log_opacities, keep, drawn)
 
 
