@@ -1,0 +1,211 @@
+"""What else could be done with a checkpoint and its photographs, at the counts the dial is judged at.
+
+    python benchmarks/rivals.py plush_half bonsai146 --only merging ranking
+    python benchmarks/rivals.py plush_half bonsai146 --iters 1500 --seed 0 1 2
+    python benchmarks/rivals.py plush_half --only specialist --shares 0.12 --seconds 100
+    python benchmarks/rivals.py --table                    # the rows as a Markdown table
+
+The rivals, each on the same base and photographs, at shares of the base's Gaussians:
+
+- ``merging``: ``splat-transform --decimate``, training-free; a file a count;
+- ``specialist``: the merged file, then tuned for that count alone; a file a count;
+- ``tuned``: the untouched base tuned as long, all of it;
+- ``prefix``: one file whose prefixes are the counts, tuned with random prefixes (tuning.tune);
+- ``ranking``: the same without any tuning, ordered by opacity, by contribution and by removal error.
+
+A scene is named as for adapt.py. Each run adds a row to ``results/rivals.jsonl``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from common import RESULTS, ROOT, append, capture
+from merging import Merger
+from torch import Tensor
+from tuning import RATES, Tuning, tune
+
+import clod_adapter as clod
+from clod_adapter.cli.console import Console
+from clod_adapter.importance import removal_error
+from clod_adapter.render import splat
+
+FILE = "rivals.jsonl"
+RIVALS = ("merging", "specialist", "tuned", "prefix", "ranking")
+SHARES = (0.62, 0.35, 0.12, 0.05, 0.02)
+ORDERS = ("opacity", "contribution", "removal error")
+SH0 = 0.28209479177387814  # the degree-0 harmonic: what a unit of sh0 adds to a colour
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*")
+    parser.add_argument("--only", nargs="+", choices=RIVALS, default=RIVALS, help="some of the rivals")
+    parser.add_argument("--shares", nargs="+", type=float, default=SHARES, help="of the base's Gaussians")
+    parser.add_argument("--iters", type=int, help="steps of tuning (default: 1500, without --seconds)")
+    parser.add_argument("--seconds", type=float, help="seconds of tuning, the rates' fall included")
+    parser.add_argument("--seed", nargs="+", type=int, default=[0])
+    parser.add_argument("--draw", choices=("uniform", "log"), default="log", help="how prefixes' shares are drawn")
+    parser.add_argument("--order", choices=ORDERS, default="removal error", help="of the prefixes")
+    parser.add_argument("--set", nargs="+", default=[], metavar="RATE=VALUE", help=f"a rate: {', '.join(RATES)}, final")
+    parser.add_argument("--cache", type=Path, default=ROOT / "benchmarks" / "cache", help="keeps the merged files")
+    parser.add_argument("--table", action="store_true", help="print the rows there are")
+    args = parser.parse_args()
+    if args.table:
+        print_table()
+    if args.iters is None and args.seconds is None:
+        args.iters = 1500
+    for scene in args.scenes:
+        contest = Contest(scene, args)
+        for rival in args.only:
+            getattr(contest, rival)()
+
+
+class Contest:
+    """One scene and its rivals; each method adds its rows."""
+
+    def __init__(self, scene: str, args: argparse.Namespace) -> None:
+        folder, _, checkpoint = scene.partition("/")
+        self.scene, self.args, self.console = scene, args, Console()
+        self.base = clod.load(capture(folder) / f"{checkpoint or 'pretrained'}.ply")
+        self.photographs = clod.load_scene(capture(folder))
+        self.counts = {share: max(round(share * len(self.base.gaussians)), 1) for share in args.shares}
+        self.base_row = self.measure(self.base.gaussians, 1.0)
+
+    def measure(self, gaussians: clod.Gaussians, share: float) -> dict[str, float]:
+        row = clod.evaluate(gaussians, self.photographs.test, [1.0])[0]
+        self.console.say(f"{self.scene}: {row.psnr:.2f} dB, {row.ssim:.4f} with {len(gaussians)} ({share:.0%})")
+        return {
+            "share": share, "count": len(gaussians), "psnr": row.psnr, "ssim": row.ssim, "in_view": row.in_view,
+            "frame_ms": row.frame_ms,
+        }  # fmt: skip
+
+    def record(self, rival: str, label: str, rows: list[dict[str, float]], **more: Any) -> None:
+        append(FILE, {
+            "benchmark": "rivals", "scene": self.scene, "rival": rival, "label": label,
+            "base_count": len(self.base.gaussians), "base": self.base_row, "rows": rows, **more,
+        })  # fmt: skip
+
+    def merging(self) -> None:
+        merger, rows = Merger.find(self.args.cache), []
+        for share, count in self.counts.items():
+            merged, seconds = merger.merge(self.base, count)
+            rows.append({**self.measure(merged, share), "seconds": seconds})
+        self.record("merging", f"splat-transform {merger.version} --decimate", rows)
+
+    def specialist(self) -> None:
+        merger = Merger.find(self.args.cache)
+        for share, count in self.counts.items():
+            merged, seconds = merger.merge(self.base, count)
+            self.tune_all("specialist", merged, share, merge_seconds=seconds)
+
+    def tuned(self) -> None:
+        self.tune_all("tuned", self.base.gaussians, 1.0)
+
+    def tune_all(self, rival: str, start: clod.Gaussians, share: float, **more: Any) -> None:
+        for seed in self.args.seed:
+            config = self.config(seed)
+            self.tune(rival, "merged, then tuned" if share < 1 else "tuned base", start, config, [share], **more)
+
+    def prefix(self) -> None:
+        for seed in self.args.seed:
+            config, order = self.config(seed, draw=self.args.draw), self.args.order
+            start = self.base.gaussians.select(self.ranked(order, seed))
+            label = f"prefixes by {order}, lengths {config.draw}"
+            self.tune("prefix", label, start, config, [1.0, *self.counts], order=order)
+
+    def ranking(self) -> None:
+        for order in ORDERS:
+            ranked = self.base.gaussians.select(self.ranked(order, self.args.seed[0]))
+            rows = [self.measure(head(ranked, count), share) for share, count in self.counts.items()]
+            self.record("ranking", f"untouched, by {order}", rows)
+
+    def config(self, seed: int, **more: Any) -> Tuning:
+        values = {name: float(value) for name, _, value in (text.partition("=") for text in self.args.set)}
+        if not values.keys() <= RATES.keys() | {"final"}:
+            raise SystemExit(f"--set knows {', '.join(RATES)} and final, not {', '.join(values.keys() - RATES.keys())}")
+        final = {"final": values.pop("final")} if "final" in values else {}
+        limits = {"iters": self.args.iters, "seconds": self.args.seconds}
+        return Tuning(**limits, seed=seed, rates=RATES | values, **final, **more)
+
+    def tune(
+        self, rival: str, label: str, start: clod.Gaussians, config: Tuning, shares: list[float], **more: Any
+    ) -> None:
+        with self.console.meter(f"{self.scene}, {label}, seed {config.seed}") as meter:
+            done = tune(start, self.photographs.train, config, meter.update)
+        rows = [
+            self.measure(
+                head(done.gaussians, self.counts[share]) if len(shares) > 1 and share < 1 else done.gaussians, share
+            )
+            for share in shares
+        ]
+        self.record(
+            rival, label, rows, config=asdict(config), steps=done.steps, train_seconds=round(done.seconds, 2), **more
+        )
+
+    def ranked(self, order: str, seed: int) -> Tensor:
+        """``[N]`` rows of the base, the most important first."""
+        gaussians, views = self.base.gaussians, self.photographs.train
+        if order == "opacity":
+            worth = gaussians.opacity_logits
+        elif order == "contribution":
+            worth = contribution(gaussians, views)
+        else:
+            worth = removal_error(gaussians, views, seed=seed)
+        return worth.argsort(descending=True, stable=True)
+
+
+def head(gaussians: clod.Gaussians, count: int) -> clod.Gaussians:
+    return gaussians.select(torch.arange(count))
+
+
+def contribution(gaussians: clod.Gaussians, views: tuple[clod.View, ...]) -> Tensor:
+    """``[N]`` sum of a Gaussian's blending weights over all pixels of the views.
+
+    The picture is linear in the colours, so this is the slope of its sum to a colour; a channel that is clamped at 0
+    has none, and the largest of the three is taken.
+    """
+    total = torch.zeros(len(gaussians))
+    for view in views:
+        sh0 = gaussians.sh0.detach().requires_grad_()
+        image, _ = splat(gaussians.replace(sh0=sh0), gaussians.opacities, view.camera)
+        (slope,) = torch.autograd.grad(image.sum(), sh0)
+        total += slope.amax((1, 2)) / SH0
+    return total
+
+
+def print_table() -> None:
+    """PSNR per share, a line for a rival at one length of tuning: the mean over seeds, of a seed the last row."""
+    shares = (1.0, *SHARES)
+    groups: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
+    for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
+        row = json.loads(line)
+        config = row.get("config", {"seed": 0})
+        key = (row["scene"], row["rival"], row["label"], json.dumps({**config, "seed": 0, "shares": row_shares(row)}))
+        groups.setdefault(key, {})[config["seed"]] = row
+    print("| scene | what | seeds | steps | seconds | base | " + " | ".join(f"{share:.0%}" for share in shares) + " |")
+    print("|---" * (6 + len(shares)) + "|")
+    for (scene, rival, label, _), seeds in groups.items():
+        rows = list(seeds.values())
+        trained = "steps" in rows[0]
+        steps = f"{statistics.fmean(row['steps'] for row in rows):.0f}" if trained else "-"
+        seconds = f"{statistics.fmean(row['train_seconds'] for row in rows):.0f}" if trained else "-"
+        cells = [scene, f"{rival}: {label}", str(len(rows)), steps, seconds, f"{rows[0]['base']['psnr']:.2f}"]
+        for share in shares:
+            values = [point["psnr"] for row in rows for point in row["rows"] if point["share"] == share]
+            cells.append(f"{statistics.fmean(values):.2f}" if values else "")
+        print("| " + " | ".join(cells) + " |")
+
+
+def row_shares(row: dict[str, Any]) -> list[float]:
+    return [point["share"] for point in row["rows"]]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,107 @@
+"""Plain tuning of a splat on photographs, without a dial: of all Gaussians, with or without random prefixes."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import clod_adapter as clod
+from clod_adapter._kernels.threads import torch_on_one_thread
+from clod_adapter.adapter import ATTRIBUTES
+from clod_adapter.losses import photometric_loss
+from clod_adapter.optimizer import RowAdam
+from clod_adapter.render import splat
+from clod_adapter.train import camera_extent
+
+# 3DGS's rates of training; means times the cameras' extent.
+RATES = {"means": 1.6e-4, "quats": 1e-3, "log_scales": 5e-3, "opacity_logits": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tuning:
+    """How a tuning is run.
+
+    Attributes:
+        iters, seconds: its end, the first that comes; one of them may be None. The rates fall over it.
+        seed: of the order of the views, and of the prefixes' lengths.
+        rates: step size by attribute at the start; they fall exponentially to ``final`` of it.
+        draw: how a prefix's share of all is drawn from [shortest, 1]: "uniform" or "log"; None trains no prefixes.
+    """
+
+    iters: int | None = None
+    seconds: float | None = None
+    seed: int = 0
+    rates: dict[str, float] = field(default_factory=lambda: dict(RATES))
+    final: float = 0.05
+    draw: str | None = None
+    shortest: float = 0.01
+
+    def share_done(self, steps: int, seconds: float) -> float:
+        if self.iters is None and self.seconds is None:
+            raise ValueError("Tuning needs iters or seconds")
+        by_steps = 0.0 if self.iters is None else steps / max(self.iters, 1)
+        return max(by_steps, seconds / self.seconds) if self.seconds else by_steps
+
+    def prefix(self, random: np.random.Generator, count: int) -> int:
+        """The length of a prefix of ``count`` Gaussians."""
+        uniform = random.random()
+        share = self.shortest + (1 - self.shortest) * uniform if self.draw == "uniform" else self.shortest**uniform
+        return max(round(share * count), 1)
+
+
+@dataclass(frozen=True)
+class Tuned:
+    gaussians: clod.Gaussians
+    steps: int
+    seconds: float
+
+
+def tune(
+    start: clod.Gaussians,
+    views: tuple[clod.View, ...],
+    config: Tuning,
+    progress: Callable[[float, str], None],
+) -> Tuned:
+    """Minimises 0.8 L1 + 0.2 (1 - SSIM), a view a step, with Adam over all attributes of all Gaussians.
+
+    With ``draw`` each step's loss is that of all Gaussians plus that of a random prefix of them, after Matryoshka
+    Gaussian Splatting (arXiv 2603.19234): two renders a step, no weights. ``start`` is then in the order of importance.
+    """
+    own = {"dtype": torch.float32, "copy": True, "memory_format": torch.contiguous_format}
+    parameters = {name: getattr(start, name).detach().to(**own) for name in ATTRIBUTES}
+    rates = config.rates | {"means": config.rates["means"] * camera_extent(views)}
+    tuned = [name for name in ATTRIBUTES if rates[name] > 0 and parameters[name].numel()]
+    optimizer, random = RowAdam(parameters), np.random.default_rng(config.seed)
+    everyone, order = torch.ones(len(start), dtype=torch.bool), []
+    began, steps, mean = time.perf_counter(), 0, math.nan
+    while (share := config.share_done(steps, time.perf_counter() - began)) < 1:
+        order = order or random.permutation(len(views)).tolist()
+        prefix = config.prefix(random, len(start)) if config.draw else None
+        loss, gradients = _gradients(parameters, tuned, views[order.pop()], prefix)
+        optimizer.step(gradients, everyone, {name: rate * config.final**share for name, rate in rates.items()})
+        mean = loss if math.isnan(mean) else 0.98 * mean + 0.02 * loss
+        steps += 1
+        progress(share, f"step {steps}, loss {mean:.4f}")
+    return Tuned(clod.Gaussians(**parameters), steps, time.perf_counter() - began)
+
+
+@torch_on_one_thread()
+def _gradients(
+    parameters: dict[str, Tensor], tuned: list[str], view: clod.View, prefix: int | None
+) -> tuple[float, dict[str, Tensor]]:
+    leaves = {name: value.detach().requires_grad_(name in tuned) for name, value in parameters.items()}
+    gaussians = clod.Gaussians(**leaves)
+    loss = photometric_loss(splat(gaussians, gaussians.opacities, view.camera)[0], view.image)
+    if prefix is not None:
+        # The rasterizer leaves out what has opacity 0 before anything else.
+        inside = torch.arange(len(gaussians)) < prefix
+        image, _ = splat(gaussians, torch.where(inside, gaussians.opacities, 0), view.camera)
+        loss = loss + photometric_loss(image, view.image)
+    found = torch.autograd.grad(loss, [leaves[name] for name in tuned])
+    return float(loss.detach()), dict(zip(tuned, found, strict=True))
