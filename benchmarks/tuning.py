@@ -79,6 +79,7 @@ def tune(
     tuned = [name for name in ATTRIBUTES if rates[name] > 0 and parameters[name].numel()]
     optimizer, random = RowAdam(parameters), np.random.default_rng(config.seed)
     everyone, order = torch.ones(len(start), dtype=torch.bool), []
+    _gradients(parameters, tuned, views[0], len(start) if config.draw else None)  # compiled before the clock starts
     began, steps, mean = time.perf_counter(), 0, math.nan
     while (share := config.share_done(steps, time.perf_counter() - began)) < 1:
         order = order or random.permutation(len(views)).tolist()
@@ -87,7 +88,7 @@ def tune(
         optimizer.step(gradients, everyone, {name: rate * config.final**share for name, rate in rates.items()})
         mean = loss if math.isnan(mean) else 0.98 * mean + 0.02 * loss
         steps += 1
-        progress(share, f"step {steps}, loss {mean:.4f}")
+        progress(config.share_done(steps, time.perf_counter() - began), f"step {steps}, loss {mean:.4f}")
     return Tuned(clod.Gaussians(**parameters), steps, time.perf_counter() - began)
 
 
