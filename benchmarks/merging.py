@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,17 +56,23 @@ class Merger:
         out = self.cache / f"{base.fingerprint[:12]}-{self.version}-{count}.ply"
         clock = out.with_suffix(".seconds")
         if not (out.exists() and clock.exists()):
-            source, partial = out.with_suffix(".source.ply"), out.with_suffix(".partial.ply")
-            _write_plain(source, base)
-            began = time.perf_counter()
-            command = [*self.command, "-q", "-w", "-g", "cpu", str(source), "--decimate", str(count), str(partial)]
-            done = subprocess.run(command, capture_output=True, text=True)
-            source.unlink()
-            if done.returncode:
-                sys.exit(f"{shlex.join(command)} failed: {(done.stderr or done.stdout).strip()}")
-            clock.write_text(f"{time.perf_counter() - began:.2f}\n", encoding="utf-8")
-            partial.replace(out)
+            # In a folder of its own: another benchmark may want the same file now.
+            with tempfile.TemporaryDirectory(dir=self.cache) as folder:
+                seconds = self._run(base, count, Path(folder))
+                clock.write_text(f"{seconds:.2f}\n", encoding="utf-8")
+                (Path(folder) / "merged.ply").replace(out)
         return clod.load(out).gaussians, float(clock.read_text(encoding="utf-8"))
+
+    def _run(self, base: clod.Checkpoint, count: int, folder: Path) -> float:
+        """Writes ``merged.ply`` into the folder; the seconds it took."""
+        source, merged = folder / "base.ply", folder / "merged.ply"
+        _write_plain(source, base)
+        began = time.perf_counter()
+        command = [*self.command, "-q", "-w", "-g", "cpu", str(source), "--decimate", str(count), str(merged)]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode or not merged.exists():
+            sys.exit(f"{shlex.join(command)} failed: {(done.stderr or done.stdout).strip()}")
+        return time.perf_counter() - began
 
 
 def _write_plain(path: Path, base: clod.Checkpoint) -> None:
