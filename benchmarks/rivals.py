@@ -168,15 +168,15 @@ def head(gaussians: clod.Gaussians, count: int) -> clod.Gaussians:
 def contribution(gaussians: clod.Gaussians, views: tuple[clod.View, ...]) -> Tensor:
     """``[N]`` sum of a Gaussian's blending weights over all pixels of the views.
 
-    The picture is linear in the colours, so this is the slope of its sum to a colour; a channel that is clamped at 0
-    has none, and the largest of the three is taken.
+    The picture is linear in the colours, so this is the slope of its sum to a colour, with all of them grey: a dark
+    one would be clamped at 0 and have none.
     """
-    total = torch.zeros(len(gaussians))
+    grey, total = gaussians.replace(shN=gaussians.shN[:, :0]), torch.zeros(len(gaussians))
     for view in views:
-        sh0 = gaussians.sh0.detach().requires_grad_()
-        image, _ = splat(gaussians.replace(sh0=sh0), gaussians.opacities, view.camera)
+        sh0 = torch.zeros_like(gaussians.sh0, requires_grad=True)
+        image, _ = splat(grey.replace(sh0=sh0), gaussians.opacities, view.camera)
         (slope,) = torch.autograd.grad(image.sum(), sh0)
-        total += slope.amax((1, 2)) / SH0
+        total += slope[:, 0, 0] / SH0
     return total
 
 
