@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.attenuation import SIGMA_MAX
+from clod_adapter.calibration import Calibration
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
@@ -33,6 +34,7 @@ class Adapter:
         base_fingerprint: SHA-256 of the checkpoint file it was trained on, hex.
         config: the training config, JSON-able, for the record.
         version: of the package that made it; it stands in the header of the PLY, which is so the same again.
+        calibration: what the result's dial values keep, cost and take, where that was measured; in the header too.
 
     Raises:
         ClodError: a tensor has the wrong type or shape, sigma_d is not finite, or version is no plain text.
@@ -44,6 +46,7 @@ class Adapter:
     base_fingerprint: str
     config: dict[str, Any]
     version: str = field(default_factory=package_version)
+    calibration: Calibration | None = None
 
     def __post_init__(self) -> None:
         if self.sigma_d.dim() != 1 or self.sigma_d.dtype != torch.float32:

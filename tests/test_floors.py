@@ -19,10 +19,10 @@ PACKAGE = "clod_adapter"
 FLOORS = [
     {"errors", "_lazy"},
     {"_kernels"},
-    {"config", "gaussians", "cameras", "attenuation", "losses", "metrics", "optimizer", "perceptual"},
+    {"config", "calibration", "gaussians", "cameras", "attenuation", "losses", "metrics", "optimizer", "perceptual"},
     {"io", "rasterizers", "adapter"},
     {"render"},
-    {"importance", "popping"},
+    {"importance", "popping", "budget"},
     {"train", "evaluate", "export", "viewer", "compare"},
     {"demo"},
     {""},  # the package itself, whose __init__ re-exports from all of the above

@@ -17,6 +17,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from clod_adapter.adapter import Adapter
+from clod_adapter.calibration import Calibration
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
@@ -40,6 +41,8 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
         "attenuation": asdict(adapter.attenuation),
         "config": adapter.config,
     }
+    if adapter.calibration is not None:
+        about["calibration"] = adapter.calibration.as_dict()
     check_config(adapter.config)
     metadata = {KEY: json.dumps(about, sort_keys=True, allow_nan=False)}
     tensors = {"sigma_d": adapter.sigma_d, **adapter.updates}
@@ -81,8 +84,9 @@ def load_adapter(path: str | Path) -> Adapter:
             base_fingerprint=about["base_sha256"],
             config=about["config"],
             version=about["package_version"],
+            calibration=Calibration.from_dict(about["calibration"]) if "calibration" in about else None,
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ClodError(f"{path}: its description is damaged ({error!r}); copy or export the adapter again") from error
     except ClodError as error:
         raise ClodError(f"{path}: {error}") from error

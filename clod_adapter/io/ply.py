@@ -11,11 +11,12 @@ import numpy as np
 import torch
 from plyfile import PlyData, PlyElement
 
+from clod_adapter.calibration import Calibration
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, read_table, sh_degree_of
-from clod_adapter.io.ply_header import all_comments, read_attenuation, read_header, write_comments
+from clod_adapter.io.ply_header import all_comments, read_attenuation, read_calibration, read_header, write_comments
 
 NORMALS = ("nx", "ny", "nz")
 
@@ -32,6 +33,7 @@ class Checkpoint:
         notes: what was dropped or noticed, one line each, for the report.
         fingerprint: SHA-256 of the file's bytes, hex.
         path: where it was read from.
+        calibration: what its dial values keep, cost and take, if the file says so.
     """
 
     gaussians: Gaussians
@@ -40,6 +42,7 @@ class Checkpoint:
     notes: tuple[str, ...]
     fingerprint: str
     path: Path
+    calibration: Calibration | None = None
 
 
 def load(path: str | Path) -> Checkpoint:
@@ -64,16 +67,24 @@ def load(path: str | Path) -> Checkpoint:
     if not keep.all():
         vertex, table = vertex[keep], table[keep]
     gaussians = _gaussians(table, columns)
-    comments = all_comments(header)
+    comments, calibration = all_comments(header), None
     if SIGMA in extras:
         attenuation, remarks = read_attenuation(path, comments)
         sigma_d = torch.from_numpy(table[:, len(names)].copy())
         gaussians = gaussians.replace(sigma_d=sigma_d, attenuation=attenuation)
-        notes += remarks
-    return Checkpoint(gaussians, vertex, comments, (*notes, *_not_kept(header)), _sha256(path), path)
+        calibration, doubts = read_calibration(comments, len(gaussians))
+        notes += remarks + doubts
+    return Checkpoint(gaussians, vertex, comments, (*notes, *_not_kept(header)), _sha256(path), path, calibration)
 
 
-def save(path: str | Path, gaussians: Gaussians, base: Checkpoint | None = None, *, version: str | None = None) -> None:
+def save(
+    path: str | Path,
+    gaussians: Gaussians,
+    base: Checkpoint | None = None,
+    *,
+    version: str | None = None,
+    calibration: Calibration | None = None,
+) -> None:
     """Writes ``gaussians`` as an extended file: the base's columns, then ``sigma_d``.
 
     Without a base the columns are those of Inria's layout.
@@ -84,6 +95,7 @@ def save(path: str | Path, gaussians: Gaussians, base: Checkpoint | None = None,
 
     Args:
         version: of the package that made the values, for the header (``Adapter.version``); by default the running one.
+        calibration: of these Gaussians, for the header. The base's is not passed on, which is of the base.
 
     Raises:
         ClodError: there are no Gaussians, they do not match the base, a new value is not finite, the target is the
@@ -100,7 +112,7 @@ def save(path: str | Path, gaussians: Gaussians, base: Checkpoint | None = None,
             f"{path}: {len(gaussians)} Gaussians of SH degree {gaussians.sh_degree} do not fit their base {base.path} "
             f"({len(base.vertex)} of degree {base.gaussians.sh_degree}); save with the checkpoint they came from"
         )
-    comments = write_comments(gaussians.attenuation, base.comments, version)
+    comments = write_comments(gaussians.attenuation, base.comments, version, calibration)
     element = PlyElement.describe(_merged(path, gaussians, base.vertex), "vertex", comments=comments)
     with atomic_path(path) as temporary:
         PlyData([element], byte_order="<").write(str(temporary))

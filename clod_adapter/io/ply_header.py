@@ -1,21 +1,24 @@
-"""PLY headers: a look before the data is read, and the comments that carry the dial's settings."""
+"""PLY headers: a look before the data is read, and the comments that carry the dial's settings and calibration."""
 
 from __future__ import annotations
 
 import io
 import re
 from collections.abc import Iterable
-from dataclasses import fields
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
 
 from plyfile import PlyData
 
+from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.version import package_version
 
 PREFIX = "clod_adapter "
+# Comments about the calibration: the machine; total, views, width and height; and the rows, one comment each.
+MACHINE, EXTENT, ROW = "calibrated_on", "calibrated_with", "calibrated"
 _HEADER_LIMIT = 1 << 20  # bytes; a longer header is no header
 
 
@@ -52,11 +55,17 @@ def all_comments(ply: PlyData) -> tuple[str, ...]:
     return (*ply.comments, *(comment for element in ply for comment in element.comments))
 
 
-def write_comments(config: AttenuationConfig | None, inherited: Iterable[str], version: str | None = None) -> list[str]:
+def write_comments(
+    config: AttenuationConfig | None,
+    inherited: Iterable[str],
+    version: str | None = None,
+    calibration: Calibration | None = None,
+) -> list[str]:
     """The comments of an output: the base's, then ours, which replace any the base had.
 
     One comment per field of ``config``, as ``clod_adapter tau 0.00392156862745098``: the shortest
-    decimal that gives back the same double. Before them the ``version`` that made the values, by default this one.
+    decimal that gives back the same double. Before them the ``version`` that made the values, by default this one;
+    after them the calibration, one short line for each row, as some readers do not take long ones.
     """
     comments = [comment for comment in inherited if not comment.startswith(PREFIX)]
     comments.append(f"{PREFIX}version {version or package_version()}")
@@ -64,7 +73,37 @@ def write_comments(config: AttenuationConfig | None, inherited: Iterable[str], v
         value = getattr(config, field.name)
         kind: Any = type(field.default)
         comments.append(f"{PREFIX}{field.name} {value if value is None else kind(value)}")
+    if calibration is not None:
+        c = calibration
+        comments.append(f"{PREFIX}{MACHINE} {c.machine}")
+        comments.append(f"{PREFIX}{EXTENT} {c.total} {c.views} {c.width} {c.height}")
+        comments += [f"{PREFIX}{ROW} {' '.join(map(repr, astuple(row)))}" for row in c.rows]
     return comments
+
+
+def read_calibration(comments: Iterable[str], total: int) -> tuple[Calibration | None, list[str]]:
+    """The calibration table in the header's comments, if it is one of ``total`` Gaussians, and a note if it is not.
+
+    A table that is damaged or of other rows is no reason to refuse the file: the picture does not need it.
+    """
+    found: dict[str, list[list[str]]] = {MACHINE: [], EXTENT: [], ROW: []}
+    for words in (comment[len(PREFIX) :].split() for comment in comments if comment.startswith(PREFIX)):
+        if words and words[0] in found:
+            found[words[0]].append(words[1:])
+    if not any(found.values()):
+        return None, []
+    try:
+        (machine,), (extent,) = found[MACHINE], found[EXTENT]
+        counts = dict(zip(("total", "views", "width", "height"), map(int, extent), strict=True))
+        rows = tuple(CalibrationRow(*map(float, row)) for row in found[ROW])
+        calibration = Calibration(rows, **counts, machine=" ".join(machine))
+    except (TypeError, ValueError, ClodError) as error:
+        return None, [f"the calibration in the header is unusable and ignored ({error})"]
+    if calibration.total != total:
+        return None, [
+            f"the calibration in the header is of {calibration.total} Gaussians and ignored, these are {total}"
+        ]
+    return calibration, []
 
 
 def read_attenuation(path: Path, comments: Iterable[str]) -> tuple[AttenuationConfig, list[str]]:
@@ -75,7 +114,8 @@ def read_attenuation(path: Path, comments: Iterable[str]) -> tuple[AttenuationCo
     """
     ours = [comment[len(PREFIX) :].split(maxsplit=1) for comment in comments if comment.startswith(PREFIX)]
     stored = {words[0]: words[1].strip() for words in ours if len(words) == 2}
-    stored.pop("version", None)
+    for other in ("version", MACHINE, EXTENT, ROW):
+        stored.pop(other, None)
     kinds = {field.name: type(field.default) for field in fields(AttenuationConfig)}
     missing = [name for name in kinds if name not in stored]
     notes = []

@@ -1,0 +1,136 @@
+"""The calibration table: what each dial value of an adapted file keeps, costs and takes. It travels with the file.
+
+Counts, PSNR and SSIM are of the file; frame times are of the machine and the picture size that the table names.
+Between its rows the table is read by linear interpolation in log s.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple, dataclass
+from typing import Any, Protocol
+
+from clod_adapter.errors import ClodError
+
+
+class Measured(Protocol):
+    """What a table takes of a row of ``evaluate``."""
+
+    @property
+    def virtual_scale(self) -> float: ...
+    @property
+    def kept(self) -> float: ...
+    @property
+    def psnr(self) -> float: ...
+    @property
+    def ssim(self) -> float: ...
+    @property
+    def frame_ms(self) -> float: ...
+
+
+@dataclass(frozen=True)
+class CalibrationRow:
+    """One dial value, means over the held-out views.
+
+    Attributes:
+        virtual_scale: the dial s.
+        kept: Gaussians the dial leaves in.
+        psnr: dB; ssim: in [-1, 1]; both against the photographs.
+        frame_ms: median time of a frame, milliseconds.
+    """
+
+    virtual_scale: float
+    kept: float
+    psnr: float
+    ssim: float
+    frame_ms: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Rows of ascending dial values, the first at s = 1, and what they were measured on.
+
+    Attributes:
+        rows: at least one.
+        total: Gaussians of the file; a file with another number is not the one that was measured.
+        views: held-out views that the rows are means over.
+        width, height: of the pictures, pixels.
+        machine: what the frame times were taken on: one line of printable ASCII.
+
+    Raises:
+        ClodError: no rows, dial values that do not ascend from 1, a value that is not finite, or an unusable machine.
+    """
+
+    rows: tuple[CalibrationRow, ...]
+    total: int
+    views: int
+    width: int
+    height: int
+    machine: str
+
+    def __post_init__(self) -> None:
+        dials = [row.virtual_scale for row in self.rows]
+        if not dials or dials[0] != 1 or any(b <= a for a, b in zip(dials, dials[1:], strict=False)):
+            raise ClodError(f"calibration has dial values {dials}, they must ascend from 1")
+        if not all(math.isfinite(value) for row in self.rows for value in astuple(row)):
+            raise ClodError("calibration has a value that is not finite")
+        if min(self.total, self.views, self.width, self.height) < 1 or min(row.frame_ms for row in self.rows) <= 0:
+            raise ClodError("calibration has a count, size or frame time that is not positive")
+        if not self.machine or not self.machine.isascii() or self.machine != _plain(self.machine):
+            raise ClodError(f"calibration has the machine {self.machine!r}, it must be one line of printable ASCII")
+
+    @classmethod
+    def of(
+        cls, rows: Iterable[Measured], *, total: int, views: int, size: tuple[int, int], machine: str
+    ) -> Calibration:
+        """The table of an evaluation's rows, in any order, for pictures of ``size`` (width, height).
+
+        Raises:
+            ClodError: no row at s = 1, or a value that is not finite (the PSNR of a picture equal to its photograph).
+        """
+        found = {
+            r.virtual_scale: CalibrationRow(*map(float, (r.virtual_scale, r.kept, r.psnr, r.ssim, r.frame_ms)))
+            for r in rows
+        }
+        ascending = tuple(found[s] for s in sorted(found))
+        return cls(ascending, total, views, *size, _plain(machine.encode("ascii", "replace").decode()) or "unknown")
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Calibration:
+        """The inverse of ``as_dict``.
+
+        Raises:
+            ClodError, KeyError, TypeError or ValueError: it is something else.
+        """
+        rows = tuple(CalibrationRow(**{name: float(value) for name, value in row.items()}) for row in values["rows"])
+        counts = {name: int(values[name]) for name in ("total", "views", "width", "height")}
+        return cls(rows, machine=str(values["machine"]), **counts)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain JSON."""
+        return {**vars(self), "rows": [dict(vars(row)) for row in self.rows]}
+
+
+def crossing(dials: Sequence[float], values: Sequence[float], target: float) -> float | None:
+    """The smallest dial value from which on ``values`` stay at most ``target``; None where the last one is above it.
+
+    Piecewise linear in log s. A measured curve need not be monotone: where it dips below the target and rises again,
+    the dip does not count.
+
+    Args:
+        dials: ascending, positive.
+        values: one for each.
+    """
+    above = [k for k, value in enumerate(values) if value > target]
+    if not above:
+        return dials[0]
+    last = above[-1]
+    if last == len(values) - 1:
+        return None
+    share = (values[last] - target) / (values[last] - values[last + 1])
+    return dials[last] * (dials[last + 1] / dials[last]) ** share
+
+
+def _plain(text: str) -> str:
+    return " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())

@@ -1,0 +1,131 @@
+"""The calibration table: what it refuses, and that JSON, adapter and PLY give it back exactly."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from clod_adapter.adapter import attach, extract
+from clod_adapter.calibration import Calibration, CalibrationRow
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluate import Row
+from clod_adapter.io.adapter_file import load_adapter, save_adapter
+from clod_adapter.io.ply import load, save
+from scenes import gaussians
+
+number = st.floats(-1e6, 1e6, allow_nan=False)
+rows = st.lists(
+    st.tuples(st.floats(1, 300, exclude_min=True), number, number, number, st.floats(1e-9, 1e6)), max_size=9
+)
+
+
+@st.composite
+def tables(draw: st.DrawFn, total: int = 4) -> Calibration:
+    found = {values[0]: values for values in [(1.0, *draw(st.tuples(number, number, number)), 2.5), *draw(rows)]}
+    machine = draw(st.text(min_size=1, max_size=40))
+    some = [Row(s, psnr, ssim, kept, 0.5, 1.0, ms) for s, kept, psnr, ssim, ms in found.values()]
+    return Calibration.of(some, total=total, views=13, size=(640, 480), machine=machine)
+
+
+@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(tables())
+def test_round_trips(tmp_path: Path, calibration: Calibration) -> None:
+    assert Calibration.from_dict(json.loads(json.dumps(calibration.as_dict(), allow_nan=False))) == calibration
+    base = gaussians(4, 0, 0)
+    dialled = attach(base, torch.ones(4))
+    save(tmp_path / "a.ply", dialled, calibration=calibration)
+    assert load(tmp_path / "a.ply").calibration == calibration and load(tmp_path / "a.ply").notes == ()
+    adapter = replace(extract(base, dialled, fingerprint="", config={}), calibration=calibration)
+    save_adapter(tmp_path / "a.safetensors", adapter)
+    assert load_adapter(tmp_path / "a.safetensors").calibration == calibration
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0]
+    assert header.isascii() and max(map(len, header.splitlines())) < 200
+
+
+def test_rows_of_an_evaluation() -> None:
+    some = [Row(s, 30 - s, 0.9, 100 / s, 1 / s, 50 / s, 10 / s) for s in (2.0, 1.0)]
+    found = Calibration.of(some, total=100, views=3, size=(64, 48), machine=" AMD\tRyzen\u2122  9\n")
+    assert found.rows == (CalibrationRow(1.0, 100.0, 29.0, 0.9, 10.0), CalibrationRow(2.0, 50.0, 28.0, 0.9, 5.0))
+    assert (found.machine, found.width, found.height) == ("AMD Ryzen? 9", 64, 48)
+
+
+ROW = CalibrationRow(1.0, 10.0, 30.0, 0.9, 5.0)
+GOOD: dict[str, Any] = {"rows": (ROW,), "total": 10, "views": 1, "width": 8, "height": 8, "machine": "m"}
+
+
+@pytest.mark.parametrize(
+    ("bad", "said"),
+    [
+        ({"rows": ()}, "ascend from 1"),
+        ({"rows": (CalibrationRow(2.0, 1.0, 1.0, 1.0, 1.0),)}, "ascend from 1"),
+        ({"rows": (ROW, ROW)}, "ascend from 1"),
+        ({"rows": (CalibrationRow(1.0, 1.0, float("inf"), 1.0, 1.0),)}, "not finite"),
+        ({"rows": (CalibrationRow(1.0, 1.0, 1.0, 1.0, 0.0),)}, "not positive"),
+        ({"total": 0}, "not positive"),
+        ({"machine": ""}, "machine"),
+        ({"machine": "two  spaces"}, "machine"),
+        ({"machine": "caf\u00e9"}, "machine"),
+    ],
+)
+def test_refused(bad: dict[str, Any], said: str) -> None:
+    Calibration(**GOOD)
+    with pytest.raises(ClodError, match=said):
+        Calibration(**{**GOOD, **bad})
+
+
+def edited(path: Path, old: bytes, new: bytes) -> Path:
+    data = path.read_bytes()
+    assert old in data
+    path.write_bytes(data.replace(old, new))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (b"calibrated 1.0", b"calibrated one", "unusable and ignored"),
+        (b"calibrated 1.0", b"calibrated 3.0", "unusable and ignored.*ascend"),
+        (b"calibrated_with 4 1 8 8", b"calibrated_with 4 1 8", "unusable and ignored"),
+        (b"calibrated_with", b"calibrated_what", "unusable and ignored"),
+        (b"calibrated_with 4", b"calibrated_with 5", "of 5 Gaussians and ignored, these are 4"),
+    ],
+)
+def test_a_damaged_table_does_not_cost_the_file(tmp_path: Path, old: bytes, new: bytes, said: str) -> None:
+    path = tmp_path / "a.ply"
+    save(path, attach(gaussians(4, 0, 0), torch.ones(4)), calibration=Calibration(**{**GOOD, "total": 4}))
+    loaded = load(edited(path, old, new))
+    assert loaded.calibration is None and loaded.gaussians.sigma_d is not None
+    assert any(re.search(said, note) for note in loaded.notes), loaded.notes
+
+
+def test_a_damaged_adapter_is_named(tmp_path: Path) -> None:
+    base = gaussians(4, 0, 0)
+    adapter = replace(
+        extract(base, attach(base, torch.ones(4)), fingerprint="", config={}),
+        calibration=Calibration(**{**GOOD, "total": 4}),
+    )
+    path = tmp_path / "a.safetensors"
+    for old, new in ((b'\\"rows\\": [{', b'\\"rows\\": [2,'), (b'\\"total\\": 4', b'\\"total\\": 0')):
+        save_adapter(path, adapter)
+        data = path.read_bytes()
+        if old not in data:
+            pytest.fail(f"{old!r} is not in {data[:2000]!r}")
+        path.write_bytes(data.replace(old, new))
+        with pytest.raises(ClodError, match="a.safetensors: "):
+            load_adapter(path)
+
+
+def test_a_base_s_table_is_not_passed_on(tmp_path: Path) -> None:
+    save(tmp_path / "a.ply", attach(gaussians(4, 0, 0), torch.ones(4)), calibration=Calibration(**{**GOOD, "total": 4}))
+    base = load(tmp_path / "a.ply")
+    save(tmp_path / "b.ply", base.gaussians, base)
+    assert load(tmp_path / "b.ply").calibration is None
+    assert b"calibrated" not in (tmp_path / "b.ply").read_bytes()
