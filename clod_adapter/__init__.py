@@ -23,10 +23,13 @@ if "torch" not in sys.modules:
 
 if TYPE_CHECKING:
     from clod_adapter.adapter import Adapter, attach, detach, extract
+    from clod_adapter.budget import DialValue, dial_for
+    from clod_adapter.calibration import Calibration
     from clod_adapter.cameras import Camera, Scene, View
     from clod_adapter.config import AdaptConfig, AttenuationConfig
     from clod_adapter.errors import ClodError
     from clod_adapter.evaluate import evaluate
+    from clod_adapter.export import bake
     from clod_adapter.gaussians import Gaussians
     from clod_adapter.io.adapter_file import load_adapter, save_adapter
     from clod_adapter.io.colmap import load_scene
@@ -37,10 +40,13 @@ if TYPE_CHECKING:
 # Imported on first use: torch takes a second or two, which the command's --help and most of its errors do without.
 on_first_use(__name__, {
     "adapter": ("Adapter", "attach", "detach", "extract"),
+    "budget": ("DialValue", "dial_for"),
+    "calibration": ("Calibration",),
     "cameras": ("Camera", "Scene", "View"),
     "config": ("AdaptConfig", "AttenuationConfig"),
     "errors": ("ClodError",),
     "evaluate": ("evaluate",),
+    "export": ("bake",),
     "gaussians": ("Gaussians",),
     "io.adapter_file": ("load_adapter", "save_adapter"),
     "io.colmap": ("load_scene",),
@@ -50,7 +56,7 @@ on_first_use(__name__, {
 })  # fmt: skip
 
 __all__ = [
-    "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Camera", "Checkpoint", "ClodError", "Gaussians",
-    "Rendering", "Scene", "View", "adapt", "attach", "detach", "evaluate", "extract", "load", "load_adapter",
-    "load_scene", "render", "save", "save_adapter",
+    "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
+    "DialValue", "Gaussians", "Rendering", "Scene", "View", "adapt", "attach", "bake", "detach", "dial_for", "evaluate",
+    "extract", "load", "load_adapter", "load_scene", "render", "save", "save_adapter",
 ]  # fmt: skip

@@ -1,0 +1,226 @@
+"""Budgets: the dial value that keeps so many Gaussians, gives up so many decibels, or draws so many frames a second.
+
+- A count needs no measuring. For one camera, Gaussian i is kept iff s is below its extinction scale
+  ``s*_i`` (``attenuation.extinction_scale``) and kept sets are nested, so the dial that keeps n lies between the n-th
+  and the (n+1)-th largest ``s*``. For a mean over V cameras the same holds of the ``s*`` of all of them pooled,
+  and of n V. Exact up to ties: Gaussians whose ``s*`` cannot be told apart in float32 leave together.
+- PSNR is read off the calibration table that is stored with the file (``calibration.py``).
+- Frames a second are of a machine, a picture size, and what else runs there. Where there are cameras some frames are
+  timed (``frame_times``, a second or two): under load the times of one machine differ by a factor of ten. The
+  table's own times are taken only where they are handed over, or (``clod-adapt bake``) where nothing can be timed.
+
+A budget that already s = 1 keeps within is no error: the dial is 1, and a note says so. s = 1 keeps fewer Gaussians
+than the file has. No budget is met beyond ``max_sv``: the equation goes on, but nothing was trained there.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from clod_adapter.attenuation import attenuate, extinction_scale, normalized_distances
+from clod_adapter.calibration import Calibration, crossing
+from clod_adapter.cameras import Camera
+from clod_adapter.config import AttenuationConfig, require
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.render import render
+
+TIMED_VIEWS, TIMED_DIALS, TIMED_REPEATS = 4, 6, 2
+
+
+@dataclass(frozen=True)
+class DialValue:
+    """The dial value that meets a budget.
+
+    Attributes:
+        virtual_scale: the dial s, in [1, max_sv].
+        note: one line where the budget does not bind, else empty.
+    """
+
+    virtual_scale: float
+    note: str = ""
+
+
+def dial_for(
+    gaussians: Gaussians,
+    *,
+    keep: float | None = None,
+    psnr_drop: float | None = None,
+    fps: float | None = None,
+    cameras: Sequence[Camera] = (),
+    calibration: Calibration | None = None,
+) -> DialValue:
+    """The smallest dial value that keeps within one budget, so the best picture that it allows.
+
+    Args:
+        gaussians: with a dial.
+        keep: Gaussians, at most: in the view of the one camera, the mean over several, without any camera at the
+            normalised distance 1, where ``export.bake`` looks from.
+        psnr_drop: dB below what the calibration has at s = 1. Here alone it is the largest dial value: from the first
+            point on where the interpolated PSNR falls below, the budget counts as spent.
+        fps: frames a second. With a calibration its times are taken as they stand, whatever they were measured on
+            (``calibration.machine``, ``width``, ``height``); without one, some frames of ``cameras`` are timed here.
+        cameras: for ``keep`` and ``fps``.
+        calibration: for ``psnr_drop`` and ``fps``; ``load(path).calibration``.
+
+    Raises:
+        ClodError: not exactly one budget, a budget that is not positive, no dial, nothing to judge the budget by, or
+            one that is beyond what the largest trained dial value reaches; the message says what that is.
+    """
+    budgets = {"keep": keep, "psnr_drop": psnr_drop, "fps": fps}
+    given = {name: value for name, value in budgets.items() if value is not None}
+    if len(given) != 1:
+        raise ClodError(f"dial_for needs exactly one of keep, psnr_drop and fps, {len(given)} are given")
+    ((name, value),) = given.items()
+    require(0 < value < math.inf, name, value, "positive and finite")
+    if gaussians.sigma_d is None or gaussians.attenuation is None:
+        raise ClodError("the Gaussians have no sigma_d, so no dial value meets a budget; adapt them first")
+    if name == "keep":
+        return _for_count(gaussians, cameras, value)
+    if name == "psnr_drop":
+        return _for_psnr_drop(calibration, value)
+    stored = [(row.virtual_scale, row.frame_ms) for row in calibration.rows] if calibration else None
+    return dial_for_times(stored or frame_times(gaussians, cameras), value)
+
+
+def dial_for_times(times: Sequence[tuple[float, float]], fps: float) -> DialValue:
+    """The smallest dial value from which on frames take at most ``1000 / fps`` ms, linear in log s between the times.
+
+    Args:
+        times: dial values, ascending from 1, each with its milliseconds a frame.
+
+    Raises:
+        ClodError: a frame takes longer than that even at the last dial value.
+    """
+    dials, taken = [s for s, _ in times], [ms for _, ms in times]
+    found = crossing(dials, taken, 1e3 / fps)
+    if found is None:
+        raise ClodError(
+            f"{fps:g} frames a second are out of reach: at s = {dials[-1]:g}, the largest dial value it was trained "
+            f"for, a frame takes {taken[-1]:.1f} ms, {1e3 / taken[-1]:.0f} a second"
+        )
+    if found == dials[0]:
+        return DialValue(1.0, f"s = 1 draws {1e3 / taken[0]:.0f} frames a second already")
+    return DialValue(found)
+
+
+@torch.no_grad()
+def frame_times(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[tuple[float, float]]:
+    """Milliseconds a frame takes here and now, at six dial values from 1 to max_sv, in even steps of log s.
+
+    Medians over at most four of the cameras, evenly spread.
+
+    Args:
+        progress: called with (frames timed, frames in all).
+
+    Returns: the dial values, each with its milliseconds.
+
+    Raises:
+        ClodError: there are no cameras, or the Gaussians have no dial.
+    """
+    if gaussians.attenuation is None:
+        raise ClodError("the Gaussians have no sigma_d, so there are no dial values to time")
+    if not cameras:
+        raise ClodError("frames a second need a calibration or cameras to time frames from")
+    seen = cameras[:: -(-len(cameras) // TIMED_VIEWS)]
+    max_sv, gaussians = gaussians.attenuation.max_sv, gaussians.without_empty_bands()
+    virtual_scales = [max_sv ** (k / (TIMED_DIALS - 1)) for k in range(TIMED_DIALS)] if max_sv > 1 else [1.0]
+    times: list[list[float]] = [[] for _ in virtual_scales]
+    render(gaussians, seen[0], max_sv)  # compiled and warm before the clock starts
+    for done in range(TIMED_REPEATS * len(seen)):
+        for taken, virtual_scale in zip(times, virtual_scales, strict=True):  # in turn: a machine's pace drifts
+            began = time.perf_counter()
+            render(gaussians, seen[done % len(seen)], virtual_scale)
+            taken.append((time.perf_counter() - began) * 1e3)
+        if progress:
+            progress((done + 1) * len(times), TIMED_REPEATS * len(seen) * len(times))
+    return [(s, statistics.median(taken)) for s, taken in zip(virtual_scales, times, strict=True)]
+
+
+def _for_psnr_drop(calibration: Calibration | None, drop: float) -> DialValue:
+    if calibration is None:
+        raise ClodError("a PSNR drop needs the calibration table that adapting stores with the file")
+    best, last = calibration.rows[0].psnr, calibration.rows[-1]
+    # From the far end, where 1/s ascends: the point from which on, down to s = 1, no more is lost than that.
+    nearness = [1 / row.virtual_scale for row in reversed(calibration.rows)]
+    losses = [best - row.psnr for row in reversed(calibration.rows)]
+    found = crossing(nearness, losses, drop)
+    assert found is not None  # s = 1 loses nothing
+    if found > nearness[0]:
+        return DialValue(1 / found)
+    note = f"only {losses[0]:.2f} dB are lost at s = {last.virtual_scale:g}, the largest dial value measured"
+    return DialValue(last.virtual_scale, note)
+
+
+@torch.no_grad()
+def _for_count(gaussians: Gaussians, cameras: Sequence[Camera], keep: float) -> DialValue:
+    views = _Views(gaussians, cameras)
+    largest, wanted = views.config.max_sv, math.floor(keep * len(views))
+    # What a picture really keeps, and not the roots, is what a count is held against: they differ by rounding.
+    most, fewest = views.count(1.0), views.count(largest)
+    if wanted >= most:
+        note = f"s = 1 keeps {most / len(views):,.0f} of {len(gaussians):,} already" if wanted > most else ""
+        return DialValue(1.0, note)
+    if wanted < fewest:
+        raise ClodError(
+            f"{keep:,.0f} Gaussians are out of reach: at s = {largest:g}, the largest dial value it was trained for, "
+            f"{fewest / len(views):,.0f} are kept"
+        )
+    pooled = torch.cat([scales[(scales > 1) & (scales <= largest)] for scales in views.extinction_scales()])
+    staying = min(max(wanted - fewest, 0), len(pooled))  # of those that leave within the dial's range
+    upper = float(pooled.kthvalue(len(pooled) - staying + 1).values) if staying > 0 else largest
+    lower = float(pooled.kthvalue(len(pooled) - staying).values) if staying < len(pooled) else 1.0
+    return DialValue(_polished(math.sqrt(lower * upper), views, wanted))
+
+
+def _polished(guess: float, views: _Views, wanted: int) -> float:
+    """The dial value near ``guess`` that keeps ``wanted``, or where ties allow none the smallest that keeps fewer."""
+    if views.count(guess) == wanted:
+        return guess
+    low, high = max(guess * (1 - 1e-4), 1.0), min(guess * (1 + 1e-4), views.config.max_sv)
+    if views.count(low) <= wanted:
+        low = 1.0
+    if views.count(high) > wanted:
+        high = views.config.max_sv
+    while high / low > 1 + 1e-9:
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if views.count(middle) <= wanted else (middle, high)
+    return high
+
+
+class _Views:
+    """The Gaussians as some cameras see them; without a camera, all at the normalised distance 1."""
+
+    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
+        assert gaussians.sigma_d is not None and gaussians.attenuation is not None
+        self.config: AttenuationConfig = gaussians.attenuation
+        self.means, self.logits, self.sigma_d = gaussians.means, gaussians.opacity_logits, gaussians.sigma_d
+        self.cameras: Sequence[Camera | None] = cameras or (None,)
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def _distances(self) -> Iterator[Tensor]:
+        for camera in self.cameras:
+            far = torch.ones_like(self.logits)
+            yield far if camera is None else normalized_distances(self.means, camera, self.config)
+
+    def extinction_scales(self) -> list[Tensor]:
+        return [extinction_scale(self.logits, self.sigma_d, d, self.config) for d in self._distances()]
+
+    def count(self, virtual_scale: float) -> int:
+        """Gaussians kept, summed over the views."""
+        kept = (attenuate(self.logits, self.sigma_d, d, virtual_scale, self.config).keep for d in self._distances())
+        return sum(int(keep.sum()) for keep in kept)
