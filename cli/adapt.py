@@ -6,13 +6,14 @@ import argparse
 import shlex
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
 
 from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.cameras import Scene
+from clod_adapter.cli.budgets import calibrate
 from clod_adapter.cli.console import Console, duration
 from clod_adapter.cli.evaluate import measure
 from clod_adapter.cli.files import Outputs, size
@@ -22,9 +23,11 @@ from clod_adapter.cli.report import Stopwatch, machine, report_dials, table, wri
 from clod_adapter.cli.settings import make_config
 from clod_adapter.cli.training import Follower, GracefulStop
 from clod_adapter.config import AdaptConfig
+from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import Row
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import check_config, save_adapter
+from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.ply import Checkpoint, save
 from clod_adapter.io.version import package_version
 from clod_adapter.train import Adapted, adapt
@@ -60,12 +63,15 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     skip = stop.requests > 0 and not adapted.interrupted
     with watch.time("evaluate"):
         rows, plain, cut_short = ([], [], True) if skip else measure_result(result, scene, config, console)
+        if rows and not cut_short:
+            adapter = store_calibration(base, adapter, result, rows, scene, outputs, console)
     if cut_short:
         notes.append("the measurements were interrupted: only the dial values that were finished are reported")
         console.say(notes[-1])
     report |= {
         "rows": [row.as_dict() for row in rows], "detached_row": plain[0].as_dict() if plain else None,
         "notes": [*base.notes, *scene.notes, *notes], "seconds": watch.report(),
+        "calibration": adapter.calibration and adapter.calibration.as_dict(), **outputs.sizes(),
     }  # fmt: skip
     write_report(outputs.report, report)
     print_summary(outputs, table(rows, base_rows, plain) if rows else "", args, watch)
@@ -78,8 +84,7 @@ def describe_run(args: argparse.Namespace, outputs: Outputs, adapter: Adapter, a
         "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
         "base_count": len(adapter.sigma_d), "config": adapter.config, "attenuation": asdict(adapter.attenuation),
         "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
-        "adapter_bytes": outputs.adapter.stat().st_size, "ply_bytes": outputs.ply.stat().st_size,
-        "outputs": outputs.names(),
+        "outputs": outputs.names(), "calibration": None, **outputs.sizes(),
     }  # fmt: skip
 
 
@@ -139,6 +144,27 @@ def write(base: Checkpoint, adapter: Adapter, result: Gaussians, outputs: Output
         save_adapter(outputs.adapter, adapter)
         save(outputs.ply, result, base, version=adapter.version)
     console.say(f"wrote {outputs.adapter} and {outputs.ply}")
+
+
+def store_calibration(
+    base: Checkpoint, adapter: Adapter, result: Gaussians, rows: Sequence[Row], scene: Scene, outputs: Outputs,
+    console: Console,
+) -> Adapter:  # fmt: skip
+    """The adapter with the calibration that ``rows`` are; adapter and PLY are written again with it.
+
+    Until then those written before the measurements are there. The new ones are complete, beside them, before the
+    first takes its place, so that nothing but a kill between two renames leaves a pair of which one has the table.
+    Where they cannot be written, or a PSNR is infinite, the earlier ones stay, and the console says so.
+    """
+    try:
+        calibrated = replace(adapter, calibration=calibrate(rows, len(result), scene.test))
+        with GracefulStop().listening(), atomic_path(outputs.adapter) as small, atomic_path(outputs.ply) as large:
+            save_adapter(small, calibrated)
+            save(large, result, base, version=adapter.version, calibration=calibrated.calibration)
+    except ClodError as error:
+        console.say(f"the files are without the calibration, so --fps and --psnr-drop will not know it: {error}")
+        return adapter
+    return calibrated
 
 
 def measure_result(

@@ -22,7 +22,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         adapted = adapter.apply(base.gaussians, base.fingerprint)
     except ClodError as error:
         raise ClodError(f"{args.base}: {error}") from error
-    save(args.out, adapted, base, version=adapter.version)
+    save(args.out, adapted, base, version=adapter.version, calibration=adapter.calibration)
     print(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with their dial")
     return {
         "command": "apply", "version": package_version(), "base": args.base, "adapter": args.adapter,

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
+import os
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 
+from clod_adapter.cli.dials import check_dials, has_dial
 from clod_adapter.cli.files import Outputs, check_output, check_ply_name
 from clod_adapter.cli.settings import make_config
 from clod_adapter.errors import ClodError
@@ -23,9 +24,7 @@ def check_adapt(args: Namespace) -> None:
 
 
 def check_evaluate(args: Namespace) -> None:
-    for virtual_scale in args.sv or ():
-        if not 1 <= virtual_scale < math.inf:
-            raise ClodError(f"--sv has {virtual_scale:g}, dial values must be at least 1 (1 is full quality)")
+    check_dials(args, args.model)
     for path in (args.model, *args.against):
         check_checkpoint(path)
     if args.base:
@@ -33,6 +32,23 @@ def check_evaluate(args: Namespace) -> None:
         if "sigma_d" in read_header(Path(args.base))["vertex"]:
             raise ClodError(f"{args.base}: has a dial (sigma_d); give --base the checkpoint that was adapted")
     check_scene(args.images)
+
+
+def check_render(args: Namespace) -> None:
+    check_dials(args, args.model)
+    check_checkpoint(args.model)
+    check_scene(args.images)
+    check_folder(Path(args.out), Path(args.images))
+
+
+def check_bake(args: Namespace) -> None:
+    out = Path(args.out)
+    check_ply_name(out, "--out")
+    check_output(out, [args.model])
+    check_dials(args, args.model, measured=False)
+    check_checkpoint(args.model)
+    if not has_dial(args.model):
+        raise ClodError(f"{args.model}: has no sigma_d, so there is no dial value to bake; it is plain already")
 
 
 def check_apply(args: Namespace) -> None:
@@ -56,10 +72,28 @@ def check_scene(folder: str) -> None:
     find_model(Path(folder))
 
 
+def check_folder(out: Path, scene: Path) -> None:
+    """Refuses a folder for pictures that cannot be made, or where they could replace photographs of the scene."""
+    parent = next(folder for folder in (out, *out.parents) if folder.exists())
+    if not parent.is_dir():
+        raise ClodError(f"{out}: {parent} is a file; choose another --out")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise ClodError(f"{out}: folder {parent} is not writable; choose another --out")
+    model = find_model(scene)
+    places = [scene, model.parent, model.parent.parent]  # where load_scene looks for photographs
+    images = [(place / "images").resolve() for place in places]
+    if out.resolve() in [place.resolve() for place in places] or any(
+        out.resolve().is_relative_to(folder) for folder in images
+    ):
+        raise ClodError(f"{out}: the scene's own photographs may be there; choose another --out")
+
+
 # By the command's module; the demo's only input is its --out, which it makes itself.
 CHECKS: dict[str, Callable[[Namespace], None]] = {
     "adapt": check_adapt,
     "evaluate": check_evaluate,
     "apply": check_apply,
+    "render": check_render,
+    "bake": check_bake,
     "demo": lambda args: None,
 }

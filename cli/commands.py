@@ -6,6 +6,7 @@ from argparse import ArgumentParser
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from clod_adapter.cli.dials import BUDGETS, add_dial_options
 from clod_adapter.cli.settings import add_settings
 
 
@@ -41,10 +42,8 @@ def _adapt(parser: ArgumentParser) -> None:
 def _evaluate(parser: ArgumentParser) -> None:
     parser.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one as the baseline")
     parser.add_argument("--images", metavar="DIR", required=True, help="the scene: photographs and their COLMAP model")
-    parser.add_argument(
-        "--sv", metavar="S", type=float, nargs="+",
-        help="dial values, 1 (full quality) and up (default: 1 2 3 5 as far as trained, and the last one trained)",
-    )  # fmt: skip
+    default = "dial values, 1 (full quality) and up (default: 1 2 3 5 as far as trained, and the last one trained)"
+    add_dial_options(parser, default, "(mean over the held-out views)", several=True, required=False)
     parser.add_argument(
         "--base", metavar="BASE.ply", help="also the unadapted checkpoint, cut by rank to as many Gaussians as each row"
     )
@@ -56,6 +55,29 @@ def _evaluate(parser: ArgumentParser) -> None:
         "--popping", action="store_true", help="also how evenly the picture changes with the dial and with the camera"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
+
+
+def _render(parser: ArgumentParser) -> None:
+    parser.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one")
+    parser.add_argument("--images", metavar="DIR", required=True, help="the scene: photographs and their COLMAP model")
+    parser.add_argument("-o", "--out", metavar="FOLDER", required=True, help="where the pictures go; made if missing")
+    add_dial_options(
+        parser, "dial values (default: 1); several are put side by side", "(mean over the pictures)", several=True,
+        required=False,
+    )  # fmt: skip
+    parser.add_argument(
+        "--views", metavar="NAME", nargs="+", default=["held-out"],
+        help="photographs whose cameras to render, by name, or all, or held-out (default)",
+    )  # fmt: skip
+    parser.add_argument("--beside", action="store_true", help="put the photograph left of the renderings")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
+
+
+def _bake(parser: ArgumentParser) -> None:
+    parser.add_argument("model", metavar="MODEL.ply", help="an adapted file")
+    parser.add_argument("-o", "--out", metavar="PLAIN.ply", required=True, help="what to write; replaced if it exists")
+    add_dial_options(parser, "the dial value", "(in the file written)", several=False, required=True)
+    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
 
 
 def _apply(parser: ArgumentParser) -> None:
@@ -88,6 +110,10 @@ outputs, side by side; a file of that name is replaced:
                    OUT.ply again from it and the checkpoint
   OUT.json         the report: settings, machine, times, and per dial value the
                    quality on held-out photographs (every 8th by name)
+The PLY's header and the adapter hold that calibration too: dial value, count,
+PSNR, SSIM and frame time, from which --psnr-drop and --fps find a dial value
+elsewhere. The same seed gives the same Gaussians, bit for bit; the frame times
+in the calibration are those of the run.
 
 Ctrl-C while training stops after the step under way and writes what was learned
 so far (exit code 0, "interrupted": true in the report); once more aborts. While
@@ -109,7 +135,8 @@ EVALUATE = Command(
     summary="Measure quality, count and time at some dial values.",
     description="Measure quality, Gaussians kept and frame time at several dial values.",
     usage="MODEL.ply --images DIR [--sv S [S ...]] [options]",
-    epilog="""\
+    epilog=f"""\
+{BUDGETS}
 All numbers are over the held-out photographs (every 8th by name):
   PSNR, SSIM  means against the photographs
   kept        Gaussians that the dial leaves in, and their share of all
@@ -142,8 +169,55 @@ examples:
   clod-adapt eval garden_clod.ply --images garden --sv 1 4 --json > eval.json
   clod-adapt eval garden_clod.ply --images garden --base garden.ply --popping
   clod-adapt eval garden_clod.ply --images garden --against merged.ply cut.ply
+  clod-adapt eval garden_clod.ply --images garden --keep 500000 200000
 """,
     add_arguments=_evaluate,
+)
+RENDER = Command(
+    module="render",
+    summary="Render a scene's cameras at some dial values to PNG.",
+    description="""\
+Render the cameras of a scene's photographs at some dial values, to PNG files.
+
+One picture for each photograph, named like it; several dial values are side by
+side in it, from left to right as given.
+""",
+    usage="MODEL.ply --images DIR -o FOLDER [options]",
+    epilog=f"""\
+{BUDGETS}
+Ctrl-C leaves the pictures that are finished (exit code 0, "interrupted": true).
+
+examples:
+  clod-adapt render garden_clod.ply --images garden -o out --sv 3
+  clod-adapt render garden_clod.ply --images garden -o out --sv 1 2 5 --beside
+  clod-adapt render garden_clod.ply --images garden -o out --views a.jpg --sv 2
+""",
+    add_arguments=_render,
+)
+BAKE = Command(
+    module="bake",
+    summary="Write one dial value as a plain PLY; lossy.",
+    description="""\
+Write one dial value of an adapted file as a plain PLY in Inria's layout, for
+viewers that do not know the dial: the Gaussians it keeps, faded for good.
+""",
+    usage="MODEL.ply (--sv S | --keep N | ...) -o PLAIN.ply",
+    epilog="""\
+Lossy, and exact at one distance only. The dial fades a Gaussian by its distance
+from the camera, and a plain file has no camera: what is written is how it looks
+from the normalised distance 1 (the far end of the scene as the training cameras
+saw it), so that what is nearer comes out fainter than it should. Other columns
+of the file are left out. Keep the adapted file: this cannot be undone.
+
+--keep is exact: PLAIN.ply has N Gaussians. --fps and --psnr-drop find the dial
+value in the calibration stored in MODEL.ply, which is of the adapted file and,
+for frame times, of the machine that a note names: here they are estimates.
+
+examples:
+  clod-adapt bake garden_clod.ply --sv 2 -o garden_s2.ply
+  clod-adapt bake garden_clod.ply --keep 200000 -o garden_200k.ply
+""",
+    add_arguments=_bake,
 )
 APPLY = Command(
     module="apply",

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from clod_adapter.cameras import View
+from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.inputs import read_checkpoint, read_scene
 from clod_adapter.cli.instruments import Instruments
@@ -35,9 +36,10 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     if model.gaussians.sigma_d is None:
         console.say(f"{args.model} has no sigma_d: every dial value shows it in full")
     attenuation = model.gaussians.attenuation
-    dials, notes = choose_dials(args.sv, attenuation)
+    given, solved = solve_dials(args, model, [view.camera for view in scene.test], console)
+    dials, notes = choose_dials(given, attenuation)
     perceptual, missing = available_metrics()
-    notes += missing
+    notes = [*solved, *notes, *missing]
     for note in notes:
         console.say(note)
     with watch.time("kernels"):

@@ -30,6 +30,9 @@ class Outputs:
         for path in vars(self).values():
             check_output(path, inputs)
 
+    def sizes(self) -> dict[str, int]:
+        return {"adapter_bytes": self.adapter.stat().st_size, "ply_bytes": self.ply.stat().st_size}
+
     def names(self) -> dict[str, str]:
         return {name: str(path) for name, path in vars(self).items()}
 

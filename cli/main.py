@@ -12,7 +12,7 @@ from contextlib import nullcontext, redirect_stdout
 from importlib import import_module
 from typing import Any
 
-from clod_adapter.cli.commands import ADAPT, APPLY, DEMO, EVALUATE, Command
+from clod_adapter.cli.commands import ADAPT, APPLY, BAKE, DEMO, EVALUATE, RENDER, Command
 from clod_adapter.cli.parser import Parser, make_parser
 from clod_adapter.errors import ClodError
 from clod_adapter.io.version import package_version
@@ -20,7 +20,9 @@ from clod_adapter.io.version import package_version
 PROG = "clod-adapt"
 
 # Adapting is the main job and needs no word.
-COMMANDS: dict[str, Command] = {"eval": EVALUATE, "apply": APPLY, "demo": DEMO}
+COMMANDS: dict[str, Command] = {
+    "eval": EVALUATE, "render": RENDER, "bake": BAKE, "apply": APPLY, "demo": DEMO,
+}  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from clod_adapter.evaluate import Row
     from clod_adapter.popping import Popping
 
+# Round values, each about 1.4 times the last, closer below 3 where most Gaussians leave.
+DIALS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0, 56.0, 80.0, 112.0, 160.0, 224.0)
+
 
 class Stopwatch:
     """Named wall times, for the report."""
@@ -57,6 +60,12 @@ def machine() -> dict[str, Any]:
     }
 
 
+def machine_name() -> str:
+    """The machine in a line: what frame times depend on most."""
+    about = machine()
+    return f"{about['cpu']}, {about['threads']} threads"
+
+
 def _cpu_name() -> str:
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
@@ -84,16 +93,13 @@ def write_report(path: Path, report: dict[str, Any]) -> None:
 
 
 def report_dials(max_sv: float) -> list[float]:
-    """Dial values worth a row: few, dense where most is lost, the last is ``max_sv``."""
-    if max_sv > 8:
-        inner = [float(f"{max_sv ** (i / 6):.2g}") for i in range(1, 6)]
-        return [1.0, *inner, max_sv]
-    return [float(s) for s in (1, 1.5, *range(2, 9)) if s < max_sv] + [max_sv]
+    """Dial values worth a row, in even steps of their logarithm, dense enough to read between; last ``max_sv``."""
+    return [s for s in DIALS if s < max_sv] + [max_sv]
 
 
 def table(rows: Sequence[Row], base_rows: Sequence[Row] = (), plain_rows: Sequence[Row] = ()) -> str:
     """The rows under each other, those of the base first and those without the dial last, both marked."""
-    marked = [("base", row) for row in base_rows] + [(f"{row.virtual_scale:g}", row) for row in rows]
+    marked = [("base", row) for row in base_rows] + [(f"{row.virtual_scale:.5g}", row) for row in rows]
     return rows_table(marked + [("plain", row) for row in plain_rows])
 
 

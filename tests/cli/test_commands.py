@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+import clod_adapter
 from clod_adapter.cli.main import COMMANDS
 from clod_adapter.io.version import package_version
 
@@ -82,7 +83,9 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
     (tmp_path / "cut.ply").write_bytes(capture.ply.read_bytes()[:-100])
     (tmp_path / "mine.ply").write_bytes(capture.ply.read_bytes())
     (tmp_path / "folder.ply").mkdir()
-    return {"PLY": capture.ply, "SCENE": capture.scene}
+    clod_adapter.save(tmp_path / "dialled.ply", clod_adapter.attach(capture.gaussians))
+    scene = capture.scene
+    return {"PLY": capture.ply, "SCENE": scene, "SCENE/images": scene / "images", "DIALLED": Path("dialled.ply")}
 
 
 @pytest.mark.parametrize(
@@ -115,6 +118,26 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("eval PLY --images SCENE --base missing.ply", "missing.ply: .*check the path"),
         ("eval PLY --images SCENE --sv 1 0.5", "--sv has 0.5, dial values must be at least 1"),
         ("eval PLY --images SCENE --sv", "--sv: expected at least one argument.*clod-adapt eval --help"),
+        ("eval PLY --images SCENE --keep 10", "base.ply: has no sigma_d, so no dial for --keep; give it one"),
+        ("eval PLY --images SCENE --keep 0", "--keep has 0, it must be positive"),
+        ("eval PLY --images SCENE --keep 1.5", "--keep: invalid int value"),
+        ("eval PLY --images SCENE --fps nan", "--fps has nan, it must be positive"),
+        ("eval PLY --images SCENE --psnr-drop -1", "--psnr-drop has -1, it must be positive"),
+        ("eval PLY --images SCENE --sv 2 --keep 10", "--keep: not allowed with argument --sv"),
+        ("eval DIALLED --images SCENE --psnr-drop 1", "dialled.ply: has no calibration .* --psnr-drop needs; adapt it"),
+        ("render PLY --images SCENE", "required: -o/--out"),
+        ("render PLY --images SCENE -o pictures --sv 0", "--sv has 0"),
+        ("render PLY --images nowhere -o pictures", "nowhere: is not a folder"),
+        ("render PLY --images SCENE -o text.ply", "text.ply: text.ply is a file; choose another --out"),
+        ("render PLY --images SCENE -o SCENE", "the scene's own photographs may be there"),
+        ("render PLY --images SCENE -o SCENE/images", "the scene's own photographs may be there"),
+        ("render PLY --images SCENE -o pictures --views banana", "--views has 'banana', .* like 000.png, 001.png"),
+        ("bake DIALLED -o x.ply", "one of the arguments --sv --keep --fps --psnr-drop is required"),
+        ("bake DIALLED -o x.splat --sv 2", "x.splat: .*must end in .ply"),
+        ("bake DIALLED -o dialled.ply --sv 2", "dialled.ply: is an input file"),
+        ("bake DIALLED -o x.ply --fps 60", "dialled.ply: has no calibration .* --fps needs"),
+        ("bake DIALLED -o x.ply --sv 2 3", "unrecognized arguments: 3"),
+        ("bake PLY -o x.ply --sv 2", "base.ply: has no sigma_d, so there is no dial value to bake"),
         ("apply PLY missing.safetensors -o x.ply", "missing.safetensors: .*No such file"),
         ("apply PLY text.ply -o x.ply", "text.ply: is no safetensors file"),
         ("apply mine.ply text.ply -o mine.ply", "mine.ply: is an input file"),
@@ -177,6 +200,12 @@ def test_help(clod: Any, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
         ("PLY --images SCENE --max-sv 0", 2),
         ("PLY --images SCENE --out nowhere/dial.ply", 2),
         ("eval PLY --images SCENE --sv 0", 2),
+        ("eval PLY --images SCENE --keep 10", 2),
+        ("render --help", 0),
+        ("render PLY --images SCENE -o SCENE", 2),
+        ("bake --help", 0),
+        ("bake PLY --sv 2 -o x.ply", 2),
+        ("bake DIALLED --psnr-drop 2 -o x.ply", 2),
         ("apply text.ply dial.safetensors -o dial.ply", 2),
     ],
 )

@@ -1,0 +1,70 @@
+"""Budgets of the command line, solved for a model and the cameras that a command has; and the calibration they use."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+from clod_adapter.budget import dial_for, dial_for_times, frame_times
+from clod_adapter.calibration import Calibration
+from clod_adapter.cameras import Camera, View
+from clod_adapter.cli.console import Console
+from clod_adapter.cli.dials import given_budget
+from clod_adapter.cli.kernels import prepare_kernels
+from clod_adapter.cli.report import machine_name
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluate import Row
+from clod_adapter.io.ply import Checkpoint
+
+
+def solve_dials(
+    args: argparse.Namespace, model: Checkpoint, cameras: Sequence[Camera], console: Console
+) -> tuple[list[float] | None, list[str]]:
+    """The dial values of --sv or of a budget, None where neither is given; and notes on how they were found.
+
+    Args:
+        cameras: those that the command renders; none for one that does not, which judges counts at the normalised
+            distance 1 and frame times by what is stored.
+    """
+    budget = given_budget(args)
+    if budget is None:
+        return args.sv, []
+    name, option, values = budget
+    times, notes = time_frames(model, cameras, console) if name == "fps" and cameras else (None, [])
+    stored = model.calibration
+    if stored is None and times is None and name != "keep":  # what the header has, the reader has found unusable
+        raise ClodError(f"{model.path}: {option}: {model.notes[-1]}; adapt it again, or give --sv or --keep")
+    origin = ""
+    if name == "fps" and stored is not None and times is None:
+        origin = f" (frame times of {stored.machine} at {stored.width}x{stored.height})"
+    dials = []
+    for value in values:
+        try:
+            if times:
+                solved = dial_for_times(times, value)
+            else:
+                solved = dial_for(model.gaussians, **{name: value}, cameras=cameras, calibration=stored)
+        except ClodError as error:
+            raise ClodError(f"{option} {value:g}: {error}{origin}") from error
+        dials.append(solved.virtual_scale)
+        notes.append(f"{option} {value:g}: s = {solved.virtual_scale:.5g}{solved.note and f' ({solved.note})'}{origin}")
+    return dials, notes
+
+
+def time_frames(
+    model: Checkpoint, cameras: Sequence[Camera], console: Console
+) -> tuple[list[tuple[float, float]], list[str]]:
+    """``budget.frame_times``, with its progress, and a note on how long frames take."""
+    prepare_kernels(console, training=False)
+    with console.meter("timing") as meter:
+        times = frame_times(
+            model.gaussians, cameras, progress=lambda done, total: meter.update(done / total, f"{done}/{total}")
+        )
+    (first, slow), (last, fast) = times[0], times[-1]
+    return times, [f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}"]
+
+
+def calibrate(rows: Sequence[Row], total: int, views: Sequence[View]) -> Calibration:
+    """The table of the rows just measured on this machine; a ClodError where a PSNR is infinite."""
+    size = (views[0].camera.width, views[0].camera.height)
+    return Calibration.of(rows, total=total, views=len(views), size=size, machine=machine_name())

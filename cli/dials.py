@@ -1,0 +1,82 @@
+"""The ways to give a dial value: ``--sv``, or a budget that it is solved from."""
+
+from __future__ import annotations
+
+import math
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import Any
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.ply_columns import SIGMA
+from clod_adapter.io.ply_header import PREFIX, ROW, all_comments, read_header
+
+# Option, metavar, type, help. All but the first are budgets, under the names that budget.dial_for has for them.
+OPTIONS: tuple[tuple[str, str, type, str], ...] = (
+    ("keep", "N", int, "the dial value that keeps N Gaussians {where}"),
+    ("fps", "F", float, "the dial value that draws F frames a second, by the frame times {times}"),
+    ("psnr_drop", "DB", float, "the dial value that gives up DB decibels against s = 1, by the stored calibration"),
+)  # fmt: skip
+BUDGETS = """\
+budgets, each solved to the dial value that just keeps within it:
+  --keep       exact, from the dial values at which Gaussians leave; s = 1 keeps
+               fewer than the file has
+  --psnr-drop  read off the calibration in the file's header, measured by
+               clod-adapt on its held-out photographs
+  --fps        some frames are timed first, here and now: times depend on the
+               machine, the size of the pictures, and what else is running
+A count or frame rate that s = 1 meets gives s = 1 and a note, and a drop larger
+than there is the largest trained dial value; a count or frame rate that this
+does not reach is an error that says what is reachable.
+"""
+
+
+def add_dial_options(parser: ArgumentParser, sv_help: str, where: str, *, several: bool, required: bool) -> None:
+    """Adds --sv and the budgets, of which one may be given; ``several`` allows more than one value of it."""
+    times = "measured here first" if several else "stored in the file, of the machine that a note names"
+    group: Any = parser.add_mutually_exclusive_group(required=required)
+    count = "+" if several else 1
+    group.add_argument("--sv", metavar="S", type=float, nargs=count, help=sv_help)
+    for name, metavar, kind, text in OPTIONS:
+        option = f"--{name.replace('_', '-')}"
+        group.add_argument(option, metavar=metavar, type=kind, nargs=count, help=text.format(where=where, times=times))
+
+
+def given_budget(args: Namespace) -> tuple[str, str, list[float]] | None:
+    """The budget's name, its option and its values, if one is given."""
+    for name, *_ in OPTIONS:
+        if getattr(args, name) is not None:
+            return name, f"--{name.replace('_', '-')}", getattr(args, name)
+    return None
+
+
+def check_dials(args: Namespace, model: str, *, measured: bool = True) -> None:
+    """Refuses values that are none, and budgets that the file's header says nothing can be solved for.
+
+    Args:
+        measured: whether the command can time frames where the file has no times.
+    """
+    for virtual_scale in args.sv or ():
+        if not 1 <= virtual_scale < math.inf:
+            raise ClodError(f"--sv has {virtual_scale:g}, dial values must be at least 1 (1 is full quality)")
+    budget = given_budget(args)
+    if budget is None:
+        return
+    name, option, values = budget
+    for value in values:
+        if not 0 < value < math.inf:
+            raise ClodError(f"{option} has {value:g}, it must be positive and finite")
+    if not has_dial(model):
+        raise ClodError(f"{model}: has no sigma_d, so no dial for {option}; give it one first: clod-adapt {model} ...")
+    needed = name == "psnr_drop" or (name == "fps" and not measured)
+    if needed and not any(comment.startswith(f"{PREFIX}{ROW} ") for comment in all_comments(read_header(Path(model)))):
+        raise ClodError(
+            f"{model}: has no calibration in its header, which {option} needs; adapt it again, and let it measure to "
+            "the end, or give --sv or --keep"
+        )
+
+
+def has_dial(model: str) -> bool:
+    """Whether the file's header has a sigma_d."""
+    header = read_header(Path(model))
+    return "vertex" in header and SIGMA in {column.name for column in header["vertex"].properties}

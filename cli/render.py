@@ -1,0 +1,123 @@
+"""``clod-adapt render``: the scene's cameras at some dial values, as PNG files."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PureWindowsPath
+from statistics import fmean
+from typing import Any
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from clod_adapter.cameras import Scene, View
+from clod_adapter.cli.budgets import solve_dials
+from clod_adapter.cli.console import Console
+from clod_adapter.cli.inputs import read_checkpoint, read_scene
+from clod_adapter.cli.kernels import prepare_kernels
+from clod_adapter.cli.report import Stopwatch
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.version import package_version
+from clod_adapter.metrics import psnr
+from clod_adapter.render import render
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What was written for a view: per dial value the Gaussians kept, and dB against the photograph."""
+
+    view: str
+    file: str
+    kept: list[int]
+    psnr: list[float]
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
+    model = read_checkpoint(args.model, console)
+    views = pick_views(read_scene(args.images, console), args.views)
+    solved, notes = solve_dials(args, model, [view.camera for view in views], console)
+    dials = solved or [1.0]
+    for note in notes:
+        console.say(note)
+    prepare_kernels(console, training=False)
+    gaussians, pictures, interrupted = model.gaussians.without_empty_bands(), [], False
+    try:
+        with console.meter("render") as meter:
+            for picture in draw(gaussians, views, dials, out, args.beside):
+                pictures.append(picture)
+                meter.update(len(pictures) / len(views), f"{len(pictures)}/{len(views)}")
+    except KeyboardInterrupt:
+        if not pictures:
+            raise
+        interrupted = True
+    print(summary(pictures, dials, len(gaussians), out))
+    return {
+        "command": "render", "version": package_version(), "model": args.model, "scene": args.images,
+        "base_count": len(gaussians), "virtual_scales": dials, "pictures": [vars(picture) for picture in pictures],
+        "interrupted": interrupted, "notes": [*model.notes, *notes], "seconds": watch.report(),
+        "outputs": {"folder": args.out},
+    }  # fmt: skip
+
+
+def pick_views(scene: Scene, wanted: Sequence[str]) -> list[View]:
+    """The held-out views, all, or those named, in the scene's order."""
+    views = sorted([*scene.train, *scene.test], key=lambda view: view.camera.name)
+    if list(wanted) == ["all"]:
+        return views
+    if list(wanted) == ["held-out"]:
+        return list(scene.test or scene.train)  # of a single photograph none is held out
+    for name in wanted:
+        if not any(named(view, name) for view in views):
+            some = ", ".join(view.camera.name for view in views[:3])
+            raise ClodError(f"--views has {name!r}, and no photograph is called that; names here are like {some}")
+    return [view for view in views if any(named(view, name) for name in wanted)]
+
+
+def named(view: View, name: str) -> bool:
+    """By the photograph's whole name, or without its suffix."""
+    return name in (view.camera.name, str(Path(view.camera.name).with_suffix("")))
+
+
+def files(views: Sequence[View]) -> list[Path]:
+    """For each view the PNG's name: that of its photograph, whose suffix stays where names would else collide."""
+    paths = [Path(*PureWindowsPath(view.camera.name).parts) for view in views]
+    short = [path.with_suffix(".png") for path in paths]
+    return short if len(set(short)) == len(short) else [path.with_name(f"{path.name}.png") for path in paths]
+
+
+@torch.no_grad()
+def draw(
+    gaussians: Gaussians, views: Sequence[View], dials: Sequence[float], out: Path, beside: bool
+) -> Iterator[Picture]:
+    """Writes a picture for each view: the dial values from left to right, behind the photograph with ``beside``."""
+    for view, name in zip(views, files(views), strict=True):
+        shown = [render(gaussians, view.camera, dial) for dial in dials]
+        panels = [(picture.image.clamp(0, 1) * 255).round().to(torch.uint8) for picture in shown]
+        write_png(out / name, torch.cat([view.image, *panels] if beside else panels, dim=1))
+        kept = [int(picture.kept.sum()) for picture in shown]
+        yield Picture(view.camera.name, str(out / name), kept, [psnr(p.image, view.image) for p in shown])
+
+
+def write_png(path: Path, pixels: Tensor) -> None:
+    """Writes ``[H, W, 3]`` uint8, in a folder that is made where it is missing."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ClodError(f"{path.parent}: cannot be made ({error.strerror or error}); choose another --out") from error
+    with atomic_path(path) as temporary:
+        Image.fromarray(pixels.cpu().numpy()).save(temporary)
+
+
+def summary(pictures: Sequence[Picture], dials: Sequence[float], total: int, out: Path) -> str:
+    lines = [f"wrote {len(pictures)} picture{'s' * (len(pictures) != 1)} to {out}"]
+    for k, dial in enumerate(dials):
+        kept = fmean(picture.kept[k] for picture in pictures)
+        error = fmean(picture.psnr[k] for picture in pictures)
+        lines.append(f"  s = {dial:.5g}: {kept:,.0f} of {total:,} Gaussians, {error:.2f} dB, means over the pictures")
+    return "\n".join(lines)
