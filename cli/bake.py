@@ -9,6 +9,7 @@ from typing import Any
 
 from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console
+from clod_adapter.cli.evaluate import choose_dials
 from clod_adapter.cli.files import size
 from clod_adapter.cli.inputs import read_checkpoint
 from clod_adapter.config import AttenuationConfig
@@ -22,11 +23,10 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     model = read_checkpoint(args.model, console)
     attenuation = model.gaussians.attenuation
     assert attenuation is not None  # check_bake has seen to it
-    dials, notes = solve_dials(args, model, (), console)
-    assert dials is not None  # one option is required
-    (virtual_scale,) = dials
-    if virtual_scale > attenuation.max_sv:
-        notes.append(f"trained up to s = {attenuation.max_sv:g}; beyond that nothing was learned")
+    solved, notes = solve_dials(args, model, (), console)
+    assert solved is not None  # one option is required
+    (virtual_scale,), beyond = choose_dials(solved, attenuation)
+    notes += beyond
     for note in notes:
         console.say(note)
     baked = bake(model.gaussians, virtual_scale)

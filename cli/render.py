@@ -16,6 +16,7 @@ from torch import Tensor
 from clod_adapter.cameras import Scene, View
 from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console
+from clod_adapter.cli.evaluate import choose_dials
 from clod_adapter.cli.inputs import read_checkpoint, read_scene
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.report import Stopwatch
@@ -42,7 +43,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     model = read_checkpoint(args.model, console)
     views = pick_views(read_scene(args.images, console), args.views)
     solved, notes = solve_dials(args, model, [view.camera for view in views], console)
-    dials = solved or [1.0]
+    dials, beyond = choose_dials(solved or [1.0], model.gaussians.attenuation)
+    notes += beyond
     for note in notes:
         console.say(note)
     prepare_kernels(console, training=False)

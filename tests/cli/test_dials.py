@@ -160,6 +160,12 @@ def test_bake(clod: Any, dialled: Path, tmp_path: Path) -> None:
     assert any(comment.startswith("baked at s = 2 and d' = 1") for comment in baked.comments)
 
 
+def test_dial_values_beyond_the_trained_ones_are_noted(clod: Any, capture: Any, dialled: Path) -> None:
+    for words in (("render", dialled, "--images", capture.scene, "-o", "out"), ("bake", dialled, "-o", "plain.ply")):
+        (note,) = json.loads(clod(*words, "--sv", 4.5, "--json").out)["notes"]
+        assert note == "trained up to s = 4; beyond that nothing was learned"
+
+
 def test_bake_to_a_budget(clod: Any, dialled: Path, tmp_path: Path) -> None:
     gaussians = load(dialled).gaussians
     n = (len(clod_adapter.bake(gaussians, 1.0)) + len(clod_adapter.bake(gaussians, 4.0))) // 2
