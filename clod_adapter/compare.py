@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from statistics import fmean
 
 import torch
 from torch import Tensor
 
+from clod_adapter.budget import dial_for
 from clod_adapter.cameras import Camera, View
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import MOST_VIEWS, removal_error
 from clod_adapter.render import dial
@@ -24,21 +25,13 @@ def mean_kept(gaussians: Gaussians, cameras: Sequence[Camera], virtual_scale: fl
 
 
 def matching_dial(gaussians: Gaussians, cameras: Sequence[Camera], count: float) -> float:
-    """The dial value at which ``mean_kept`` is ``count``, within 0.1 % where counts go that finely.
-
-    1 where even that keeps no more, and without a dial: there is nothing to turn.
-    """
-    if gaussians.attenuation is None or mean_kept(gaussians, cameras, 1.0) <= count * (1 + CLOSE):
+    """The dial value that keeps ``count`` on average: 1 without a dial or where that keeps no more, max_sv at most."""
+    if gaussians.attenuation is None:
         return 1.0
-    # Bisection of the logarithm until clod_adapter.budget solves it. At 1/tau nothing is left.
-    low, high = 1.0, 1 / gaussians.attenuation.tau
-    for _ in range(24):
-        middle = math.sqrt(low * high)
-        kept = mean_kept(gaussians, cameras, middle)
-        if abs(kept - count) <= CLOSE * count:
-            return middle
-        low, high = (middle, high) if kept > count else (low, middle)
-    return high
+    try:
+        return dial_for(gaussians, keep=max(count, 1), cameras=cameras).virtual_scale
+    except ClodError:  # out of reach
+        return gaussians.attenuation.max_sv
 
 
 def rankings(

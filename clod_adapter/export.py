@@ -17,7 +17,7 @@ OPAQUE = 20.0
 def bake(gaussians: Gaussians, virtual_scale: float) -> Gaussians:
     """The Gaussians that one dial value keeps at the normalised distance 1, faded as they are there, without a dial.
 
-    ``logit' = log a'' - log(1 - a'')`` with the attenuated opacity ``a''`` (``attenuation.attenuate``) at d' = 1.
+    ``logit' = log o - log(1 - o)`` with ``o`` the opacity that is drawn (``attenuation.attenuate``) at d' = 1.
     Lossy: the result has neither the dial nor the other Gaussians, and is what a renderer of the adapted file shows
     only for what is at that distance, ``scene_distance`` with the default normaliser. Nearer Gaussians come out
     fainter than they should be, or are missing; farther ones stronger. Where the dial does nothing the logits are as
@@ -36,8 +36,9 @@ def bake(gaussians: Gaussians, virtual_scale: float) -> Gaussians:
     faded = attenuate(logits, gaussians.sigma_d, torch.ones_like(logits), virtual_scale, gaussians.attenuation)
     if not faded.keep.any():
         raise ClodError(f"no Gaussian is kept at s = {virtual_scale:g} and the normalised distance 1; bake a smaller s")
-    # log(1 - a'') from log a'', and not by 1 - a'', which cancels where a'' is near 1.
-    baked = faded.log_opacities - torch.log(-torch.expm1(faded.log_opacities))
-    baked = torch.where(faded.log_opacities == torch.nn.functional.logsigmoid(logits), logits, baked)
+    # From log a'', and by expm1 and not 1 - o, which cancels where o is near 1; the cut's part of it is 1 for most.
+    drawn = faded.log_opacities + (faded.drawn / faded.opacities).log()
+    baked = drawn - torch.log(-torch.expm1(drawn))
+    baked = torch.where(drawn == torch.nn.functional.logsigmoid(logits), logits, baked)
     plain = detach(gaussians.replace(opacity_logits=baked.to(logits).clamp(max=OPAQUE)))
     return plain.select(faded.keep)
