@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from clod_adapter.io.adapter_file import load_adapter, save_adapter
     from clod_adapter.io.colmap import load_scene
     from clod_adapter.io.ply import Checkpoint, load, save
+    from clod_adapter.placement import imagine, place
     from clod_adapter.render import Rendering, render
     from clod_adapter.train import Adapted, adapt
 
@@ -51,6 +52,7 @@ on_first_use(__name__, {
     "io.adapter_file": ("load_adapter", "save_adapter"),
     "io.colmap": ("load_scene",),
     "io.ply": ("Checkpoint", "load", "save"),
+    "placement": ("imagine", "place"),
     "render": ("Rendering", "render"),
     "train": ("Adapted", "adapt"),
 })  # fmt: skip
@@ -58,5 +60,5 @@ on_first_use(__name__, {
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
     "DialValue", "Gaussians", "Rendering", "Scene", "View", "adapt", "attach", "bake", "detach", "dial_for", "evaluate",
-    "extract", "load", "load_adapter", "load_scene", "render", "save", "save_adapter",
+    "extract", "imagine", "load", "load_adapter", "load_scene", "place", "render", "save", "save_adapter",
 ]  # fmt: skip

@@ -22,7 +22,7 @@ FLOORS = [
     {"config", "calibration", "gaussians", "cameras", "attenuation", "losses", "metrics", "optimizer", "perceptual"},
     {"io", "rasterizers", "adapter"},
     {"render"},
-    {"importance", "popping", "budget"},
+    {"importance", "popping", "budget", "placement"},
     {"train", "evaluate", "export", "viewer", "compare"},
     {"demo"},
     {""},  # the package itself, whose __init__ re-exports from all of the above
