@@ -17,7 +17,7 @@ from clod_adapter.cli.budgets import calibrate
 from clod_adapter.cli.console import Console, duration
 from clod_adapter.cli.evaluate import measure
 from clod_adapter.cli.files import Outputs, size
-from clod_adapter.cli.inputs import read_checkpoint, read_scene
+from clod_adapter.cli.inputs import place_scene, read_checkpoint, read_scene
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, table, write_report
 from clod_adapter.cli.settings import make_config
@@ -42,10 +42,12 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     check_config(asdict(config))
     with watch.time("load"):
         base = read_checkpoint(args.ply, console)
-        scene = read_scene(args.images, console)
+        photographs = read_scene(args.images, console) if args.images is not None else None
     gaussians = base.gaussians.to(pick_device(args.device))
     with watch.time("kernels"):
         prepare_kernels(console)
+    with watch.time("load" if photographs else "place"):
+        scene = photographs or place_scene(gaussians, config.seed, console)
     with watch.time("evaluate"):
         base_rows, notes = look_at_base(gaussians, scene, args, console)
     with stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
@@ -82,6 +84,7 @@ def describe_run(args: argparse.Namespace, outputs: Outputs, adapter: Adapter, a
     """The part of the report that is known before anything is measured."""
     return {
         "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
+        "teacher": "checkpoint" if args.images is None else "photographs",
         "base_count": len(adapter.sigma_d), "config": adapter.config, "attenuation": asdict(adapter.attenuation),
         "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
         "outputs": outputs.names(), "calibration": None, **outputs.sizes(),
@@ -105,8 +108,9 @@ def look_at_base(
         rows, interrupted = measure(base, scene.test, [1.0], console, "base")
         if interrupted:
             raise KeyboardInterrupt
-        console.say(f"base: {rows[0].psnr:.2f} dB on the held-out photographs")
-        if rows[0].psnr < MISALIGNED_PSNR:
+        if args.images is not None:  # of the checkpoint's own pictures only their rounding is worth knowing
+            console.say(f"base: {rows[0].psnr:.2f} dB on the held-out photographs")
+        if args.images is not None and rows[0].psnr < MISALIGNED_PSNR:
             notes.append(
                 f"warning: {args.ply} is {rows[0].psnr:.1f} dB from the photographs in {args.images}: it is probably "
                 "of another scene, in other coordinates (some trainers normalise them) or on another background than "
@@ -185,6 +189,8 @@ def print_summary(outputs: Outputs, measured: str, args: argparse.Namespace, wat
             print(f"plain: what a viewer that does not know the dial makes of {outputs.ply}\n")
     for path in vars(outputs).values():
         print(f"{size(path):>9}  {path}")
-    print(f"\n{duration(watch.total())} in all; next, other dial values:")
+    following = "other dial values:" if args.images is not None else "against photographs, where there are any:"
+    print(f"\n{duration(watch.total())} in all; next, {following}")
     sv = " ".join(f"{s:g}" for s in sorted({1.0, args.max_sv}))
-    print(f"  clod-adapt eval {shlex.quote(str(outputs.ply))} --images {shlex.quote(args.images)} --sv {sv}")
+    images = "DIR" if args.images is None else shlex.quote(args.images)
+    print(f"  clod-adapt eval {shlex.quote(str(outputs.ply))} --images {images} --sv {sv}")

@@ -20,7 +20,8 @@ def check_adapt(args: Namespace) -> None:
     make_config(args)
     Outputs.of(args.ply, args.out).check([args.ply])
     check_checkpoint(args.ply)
-    check_scene(args.images)
+    if args.images is not None:
+        check_scene(args.images)
 
 
 def check_evaluate(args: Namespace) -> None:

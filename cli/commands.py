@@ -30,8 +30,8 @@ class Command:
 def _adapt(parser: ArgumentParser) -> None:
     parser.add_argument("ply", metavar="PLY", help="the checkpoint, in Inria's 3DGS layout; it is never modified")
     parser.add_argument(
-        "--images", metavar="DIR", required=True,
-        help="the scene: photographs in DIR/images and their COLMAP model in DIR/sparse/0",
+        "--images", metavar="DIR",
+        help="the scene: photographs in DIR/images and their COLMAP model in DIR/sparse/0 (default: none, see below)",
     )  # fmt: skip
     add_settings(parser)
     parser.add_argument("--out", metavar="OUT.ply", help="output (default: PLY's name with _clod, in this folder)")
@@ -102,7 +102,7 @@ Learns one number per Gaussian, sigma_d, with which a renderer fades detail out
 smoothly with distance, and tunes the rest lightly. The dial s is set when
 rendering: 1 is full quality, at s roughly s^-1.5 of the Gaussians are drawn.
 """,
-    usage="PLY --images DIR [--max-sv S] [--out OUT.ply] [options]",
+    usage="PLY [--images DIR] [--max-sv S] [--out OUT.ply] [options]",
     epilog="""\
 outputs, side by side; a file of that name is replaced:
   OUT.ply          the splat with one more property, sigma_d
@@ -114,6 +114,11 @@ The PLY's header and the adapter hold that calibration too: dial value, count,
 PSNR, SSIM and frame time, from which --psnr-drop and --fps find a dial value
 elsewhere. The same seed gives the same Gaussians, bit for bit; the frame times
 in the calibration are those of the run.
+
+without --images cameras are placed where the checkpoint looks photographed, and
+the pictures are its own, at full detail: it is its own teacher. The numbers are
+then against the checkpoint, on placed views held out. With the photographs the
+result is better; take them where you have them.
 
 Ctrl-C while training stops after the step under way and writes what was learned
 so far (exit code 0, "interrupted": true in the report); once more aborts. While
@@ -127,6 +132,7 @@ examples:
   clod-adapt garden.ply --images garden --max-sv 5
   clod-adapt garden.ply --images garden --time-budget 120 --out out/dial.ply
   clod-adapt garden.ply --images garden --quiet --json > report.json
+  clod-adapt garden.ply --max-sv 5
 """,
     add_arguments=_adapt,
 )

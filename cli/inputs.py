@@ -7,8 +7,10 @@ from pathlib import Path
 from clod_adapter.cameras import Scene
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.files import size
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.colmap import load_scene
 from clod_adapter.io.ply import Checkpoint, load
+from clod_adapter.placement import imagine, place
 
 
 def read_checkpoint(path: str, console: Console) -> Checkpoint:
@@ -32,4 +34,17 @@ def read_scene(folder: str, console: Console) -> Scene:
     console.say(f"{folder}: {len(scene.train)} photographs to train on, {len(scene.test)} held out, {size}")
     for note in scene.notes:
         console.say(f"  note: {note}")
+    return scene
+
+
+def place_scene(gaussians: Gaussians, seed: int, console: Console) -> Scene:
+    """Without photographs: places cameras, takes the checkpoint's own pictures, and says so."""
+    with console.meter("placing cameras") as meter:
+        cameras = place(
+            gaussians, seed=seed, progress=lambda done, total: meter.update(done / total, f"{done}/{total}")
+        )
+    with console.meter("pictures") as meter:
+        scene = imagine(gaussians, cameras, progress=lambda done, total: meter.update(done / total, f"{done}/{total}"))
+    for note in scene.notes:
+        console.say(note)
     return scene

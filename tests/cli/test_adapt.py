@@ -311,6 +311,34 @@ def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -
     assert clod("eval", "dial.ply", "--images", "one").code == 2
 
 
+def test_without_photographs(clod: Any, capture: Any, tmp_path: Path) -> None:
+    done = clod(capture.ply, *TINY, "--json")
+    report = json.loads(done.out)
+    assert done.code == 0 and names(tmp_path) == THREE, done
+    assert report["scene"] is None and report["teacher"] == "checkpoint" and report["seconds"]["place"] > 0
+    assert len(report["notes"]) == 1 and report["notes"][0] in done.err
+    assert re.match(r"no photographs: 84 placed cameras to train on, 12 held out, 496x368, ", report["notes"][0])
+    assert "held-out photographs" not in done.err and "other coordinates" not in done.err
+    # The teacher is the base itself, but for the rounding to bytes.
+    assert report["base_rows"][0]["psnr"] > 50 > report["rows"][-1]["psnr"] and len(report["rows"]) == 5
+    assert clod("apply", capture.ply, "dial.safetensors", "-o", "same.ply").code == 0
+    assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
+    photographs = json.loads(clod("eval", "dial.ply", "--images", capture.scene, "--sv", 1, 4, "--json").out)["rows"]
+    assert photographs[0]["psnr"] > 20 and photographs[0]["psnr"] > photographs[1]["psnr"]
+
+
+def test_the_summary_without_photographs(clod: Any, capture: Any) -> None:
+    done = clod(capture.ply, "--iters", 0, "--out", "dial.ply")
+    assert "clod-adapt eval dial.ply --images DIR --sv 1 5" in done.out and "where there are any" in done.out
+
+
+def test_a_checkpoint_that_shows_nothing_cannot_be_its_own_teacher(clod: Any, capture: Any, tmp_path: Path) -> None:
+    unseen = capture.gaussians.replace(opacity_logits=capture.gaussians.opacity_logits - 20)
+    done = clod(capture.write(tmp_path / "unseen.ply", unseen), "--out", "dial.ply", "--quiet")
+    assert (done.code, done.err.count("\n"), names(tmp_path)) == (2, 1, ["unseen.ply"])
+    assert "no camera can be placed" in done.err
+
+
 @pytest.mark.parametrize(
     ("max_sv", "dials"),
     [

@@ -91,8 +91,8 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("", "arguments are required: PLY, --images .*--help"),
-        ("PLY", "required: --images"),
+        ("", "arguments are required: PLY .*--help"),
+        ("PLY --images", "--images: expected one argument"),
         ("missing.ply --images SCENE", "missing.ply: .*No such file.*check the path"),
         ("text.ply --images SCENE", "text.ply: is not a PLY.*convert"),
         ("cut.ply --images SCENE", "cut.ply: .*truncated.*again"),
