@@ -1,0 +1,105 @@
+"""What training without photographs costs: one checkpoint adapted on three kinds of views, judged on photographs.
+
+    python benchmarks/nophoto.py plush_half bonsai146 ci_banana
+    python benchmarks/nophoto.py plush_half --iters 600 --kinds photographs placed
+    python benchmarks/nophoto.py --table                  # the rows as a Markdown table
+
+The kinds: ``photographs`` (real cameras, real pictures), ``teacher`` (real cameras, the checkpoint's own pictures:
+what is lost with the photographs alone) and ``placed`` (placed cameras, its own pictures: what is lost with the
+cameras too). The judges are always the real held-out photographs. Each run adds one row to ``results/nophoto.jsonl``,
+with how far the placed cameras stand from the real ones, which the method never sees.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import asdict
+
+import torch
+from common import RESULTS, append, capture
+
+import clod_adapter as clod
+from clod_adapter.placement import imagine, place, typical_reach
+
+FILE = "nophoto.jsonl"
+KINDS = ("photographs", "teacher", "placed")
+DIALS = (1.0, 2.0, 3.0, 5.0)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*")
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--iters", type=int, default=clod.AdaptConfig().iters)
+    parser.add_argument("--seed", type=int, default=0, help="of the training and of the placement")
+    parser.add_argument("--table", action="store_true", help="print the rows there are")
+    args = parser.parse_args()
+    if args.table:
+        print_table()
+    for scene in args.scenes:
+        for kind in args.kinds:
+            run(scene, kind, clod.AdaptConfig(iters=args.iters, seed=args.seed))
+
+
+def run(scene: str, kind: str, config: clod.AdaptConfig) -> None:
+    base = clod.load(capture(scene) / "pretrained.ply").gaussians
+    photographs = clod.load_scene(capture(scene))
+    base_row = clod.evaluate(base, photographs.test, [1.0])[0]
+    began = time.perf_counter()
+    views, placement = photographs, None
+    if kind == "teacher":
+        # Of the views to train on alone; none is held out of them.
+        views = clod.Scene(tuple(_own(base, view.camera) for view in photographs.train), ())
+    if kind == "placed":
+        cameras = place(base, seed=config.seed)
+        views = imagine(base, cameras)
+        placement = distances(cameras, [view.camera for view in photographs.train], typical_reach(base))
+    seconds = time.perf_counter() - began
+    adapted = clod.adapt(base, views, config)
+    rows = clod.evaluate(adapted.gaussians, photographs.test, DIALS)
+    append(FILE, {
+        "benchmark": "nophoto", "scene": scene, "kind": kind, "config": asdict(config), "views": len(views.train),
+        "placement": placement, "base": base_row.as_dict(), "rows": [row.as_dict() for row in rows],
+        "steps": adapted.steps, "views_seconds": round(seconds, 2), "start_seconds": round(adapted.start_seconds, 2),
+        "train_seconds": round(adapted.seconds, 2),
+    })  # fmt: skip
+
+
+def _own(base: clod.Gaussians, camera: clod.Camera) -> clod.View:
+    return imagine(base, [camera]).train[0]
+
+
+def distances(placed: list[clod.Camera], real: list[clod.Camera], reach: float) -> dict[str, list[float]]:
+    """10, 50 and 90 % quantiles, to the nearest of the others: in units of ``reach``, an angle of 30 degrees
+    counting as one."""
+
+    def parts(cameras: list[clod.Camera]) -> tuple[torch.Tensor, torch.Tensor]:
+        return torch.stack([c.position for c in cameras]), torch.stack([c.viewmat[2, :3] for c in cameras])
+
+    (at, forward), (at_real, forward_real) = parts(placed), parts(real)
+    angles = torch.rad2deg((forward @ forward_real.T).clamp(-1, 1).acos())
+    apart = ((torch.cdist(at, at_real) / reach).square() + (angles / 30).square()).sqrt()
+    shares = torch.tensor([0.1, 0.5, 0.9])
+    return {
+        "placed_to_real": apart.amin(1).quantile(shares).tolist(),
+        "real_to_placed": apart.amin(0).quantile(shares).tolist(),
+    }
+
+
+def print_table() -> None:
+    print("| scene | steps | views | base | " + " | ".join(f"s = {s:g}" for s in DIALS) + " |")
+    print("|---" * (4 + len(DIALS)) + "|")
+    for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
+        row = json.loads(line)
+        cells = [f"{r['psnr']:.2f} @ {r['kept_share']:.1%}" for r in row["rows"]]
+        print(
+            "| "
+            + " | ".join([row["scene"], str(row["steps"]), row["kind"], f"{row['base']['psnr']:.2f}", *cells])
+            + " |"
+        )
+
+
+if __name__ == "__main__":
+    main()
