@@ -118,7 +118,7 @@ in the calibration are those of the run.
 without --images cameras are placed where the checkpoint looks photographed, and
 the pictures are its own, at full detail: it is its own teacher. The numbers are
 then against the checkpoint, on placed views held out. With the photographs the
-result is better; take them where you have them.
+result is better; give them where there are any.
 
 Ctrl-C while training stops after the step under way and writes what was learned
 so far (exit code 0, "interrupted": true in the report); once more aborts. While
