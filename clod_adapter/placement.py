@@ -31,15 +31,13 @@ from clod_adapter.render import render, splat
 
 VIEWS = 96
 WIDTH, HEIGHT = 496, 368
-FIELD = 55.0  # horizontal, degrees, from which the reach is told
-FIELDS = (35.0, 65.0)  # of the cameras, from a portrait lens to a phone's: which it was does not show
+FIELD = 55.0  # horizontal, degrees: between a phone's 65 and the 35 of a portrait lens
 TRIES = 3  # candidates for each view, first anywhere, then as many beside the best of those
 BEST = 0.2  # share of the first ones that see what was photographed; later ones must be as good
 STEP = 0.2  # how far beside, in units of the distance, and of the direction's length
 LOOK = (80, 60)  # size of the picture that a candidate is judged by
 TEST_EVERY = 8  # as with photographs
 SMALL, SMALL_PIXELS = 0.1, 2.0  # a tenth of the Gaussians is this small or smaller, as their nearest cameras saw them
-NEARER_FARTHER = 1.5  # the most that a first candidate stands from the reach, as a factor
 FAR = 4.0  # cameras stand at most this many times as far away as the scene is large
 VISIBLE = 0.05  # less opaque ones say nothing about where cameras stood
 C0 = 0.28209479177387814  # of the SH band 0: colour = 0.5 + C0 sh0
@@ -65,8 +63,8 @@ def place(
         progress: called with the number of candidates judged, and of all of them.
 
     Returns:
-        ``views`` cameras (fewer only where fewer see anything) of 496x368 pixels, 35 to 65 degrees wide, in an
-        order in which every beginning is spread out.
+        ``views`` cameras (fewer only where fewer see anything) of 496x368 pixels, 55 degrees wide, in an order in
+        which every beginning is spread out.
 
     Raises:
         ClodError: no Gaussian is visible and finite, or no camera sees anything.
@@ -119,12 +117,12 @@ def imagine(
 
 
 def typical_reach(gaussians: Gaussians) -> float:
-    """World units between a camera of FIELD degrees and what it looks at.
+    """World units between the cameras and what they look at.
 
     From there the smallest tenth of the visible Gaussians is at most SMALL_PIXELS pixels large; but never more than
     FAR times the median distance of the Gaussians from their centre, for a splat of few large ones.
     """
-    footprint = _quantile(_size(gaussians), SMALL) * _focal(FIELD) * WIDTH / SMALL_PIXELS
+    footprint = _quantile(_size(gaussians), SMALL) * _focal(WIDTH) / SMALL_PIXELS
     from_centre = (gaussians.means - gaussians.means.median(0).values).norm(dim=1)
     return min(footprint, FAR * _quantile(from_centre, 0.5)) or footprint
 
@@ -142,19 +140,15 @@ def _judgeable(gaussians: Gaussians) -> Gaussians:
 
 
 def _anywhere(gaussians: Gaussians, count: int, reach: float, generator: torch.Generator) -> list[Camera]:
-    """Looking at Gaussians drawn by opacity over size, from uniform directions, from about the reach."""
+    """Looking at Gaussians drawn by opacity over size, from uniform directions, at half to twice the reach."""
     interest = gaussians.opacities / _size(gaussians).clamp(min=1e-12)
     # Drawn by hand, as torch.multinomial has a limit of 2^24 weights.
     ends = interest.double().cumsum(0)
     drawn = torch.searchsorted(ends, torch.rand(count, generator=generator, dtype=torch.float64) * ends[-1])
     targets = gaussians.means[drawn.clamp(max=len(gaussians) - 1)]
     sides = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
-    away = reach * NEARER_FARTHER ** (2 * torch.rand(count, 1, generator=generator) - 1)
-    low, high = FIELDS
-    focals = [_focal(low + (high - low) * x) for x in torch.rand(count, generator=generator).tolist()]
-    # A narrow camera stands as much farther away as it takes to see the same.
-    eyes = targets + away * sides * torch.tensor(focals)[:, None] / _focal(FIELD)
-    return [_looking(eye, target, focal) for eye, target, focal in zip(eyes, targets, focals, strict=True)]
+    away = reach * 2 ** (2 * torch.rand(count, 1, generator=generator) - 1)
+    return [_looking(eye, target) for eye, target in zip(targets + away * sides, targets, strict=True)]
 
 
 def _beside(candidates: list[Candidate], count: int, reach: float, generator: torch.Generator) -> list[Camera]:
@@ -165,7 +159,7 @@ def _beside(candidates: list[Candidate], count: int, reach: float, generator: to
         camera = candidates[k % len(candidates)].camera
         forward = camera.viewmat[2, :3] + steps[k, 0]
         eye = camera.position + reach * steps[k, 1]
-        cameras.append(_looking(eye, eye + forward, float(camera.K[0, 0]) / camera.width))
+        cameras.append(_looking(eye, eye + forward))
     return cameras
 
 
@@ -187,7 +181,7 @@ def _score(gaussians: Gaussians, camera: Camera) -> float:
     if covered < 0.1 * alpha.numel():
         return -math.inf
     depths = gaussians.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
-    pixels = _size(gaussians) * (camera.K[0, 0] * WIDTH / camera.width) / depths.clamp(min=1e-6)
+    pixels = _size(gaussians) * _focal(WIDTH) / depths.clamp(min=1e-6)
     shade = (pixels.clamp(1e-3, 1e4).log() + 7)[:, None, None].expand(-1, 1, 3)  # positive, as colours are
     sizes, _ = splat(gaussians.replace(sh0=(shade - 0.5) / C0, shN=gaussians.shN[:, :0]), gaussians.opacities, camera)
     size = float(sizes[..., 0].sum()) / covered - 7
@@ -197,21 +191,17 @@ def _score(gaussians: Gaussians, camera: Camera) -> float:
 
 
 def _spread(candidates: list[Candidate], count: int, reach: float) -> list[Candidate]:
-    """``count`` of them, first the best, then each time the one farthest from those taken, in place and direction.
-
-    A score that is lower by 2 counts like a distance that is smaller by a factor e.
-    """
+    """``count`` of them, first the best, then each time the one farthest from those taken, in place and direction."""
     places = torch.stack([torch.cat([c.camera.position / reach, c.camera.viewmat[2, :3]]) for c in candidates])
-    worth = torch.tensor([0.5 * c.score for c in candidates]).exp()
     taken = [0]
     gap = (places - places[0]).norm(dim=1)
     while len(taken) < min(count, len(candidates)):
-        taken.append(int((gap * worth).argmax()))
+        taken.append(int(gap.argmax()))
         gap = gap.minimum((places - places[taken[-1]]).norm(dim=1))
     return [candidates[k] for k in taken]
 
 
-def _looking(eye: Tensor, target: Tensor, focal: float) -> Camera:
+def _looking(eye: Tensor, target: Tensor) -> Camera:
     """A camera for a look; which way is up is unknown, and COLMAP's y axis points down more often than not."""
     forward = torch.nn.functional.normalize(target - eye, dim=0)
     down = torch.tensor([0.0, 1.0, 0.0]) if abs(float(forward[1])) < 0.99 else torch.tensor([0.0, 0.0, 1.0])
@@ -219,27 +209,25 @@ def _looking(eye: Tensor, target: Tensor, focal: float) -> Camera:
     viewmat = torch.eye(4)
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    K = torch.diag(torch.tensor([focal, focal, 1.0]))  # for a width of 1
-    return _resized(Camera(viewmat, K, 1, 1), *LOOK)
+    return _resized(Camera(viewmat, torch.eye(3), *LOOK), *LOOK)
 
 
 def _resized(camera: Camera, width: int, height: int, number: int = 0) -> Camera:
-    focal = float(camera.K[0, 0]) * width / camera.width
+    focal = _focal(width)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     return Camera(camera.viewmat, K, width, height, f"placed_{number:03}")
 
 
 def _describe(cameras: list[Camera]) -> str:
-    """Size and horizontal field of view."""
     if not cameras:
         return "no pictures"
-    fields = [2 * math.degrees(math.atan(c.width / 2 / float(c.K[0, 0]))) for c in cameras]
-    return f"{cameras[0].width}x{cameras[0].height}, {min(fields):.0f} to {max(fields):.0f} degrees wide"
+    width, focal = cameras[0].width, float(cameras[0].K[0, 0])
+    return f"{width}x{cameras[0].height}, {2 * math.degrees(math.atan(width / 2 / focal)):.0f} degrees wide"
 
 
-def _focal(field: float) -> float:
-    """For a horizontal field in degrees, in widths of the picture."""
-    return 0.5 / math.tan(math.radians(field) / 2)
+def _focal(width: int) -> float:
+    """In pixels."""
+    return 0.5 * width / math.tan(math.radians(FIELD) / 2)
 
 
 def _size(gaussians: Gaussians) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 import clod_adapter as clod
 import scenes
-from clod_adapter.placement import FIELDS, HEIGHT, WIDTH, imagine, place, typical_reach
+from clod_adapter.placement import FIELD, HEIGHT, WIDTH, imagine, place, typical_reach
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def test_cameras_are_proper_and_see_the_scene(blob: clod.Gaussians) -> None:
         assert camera.viewmat.isfinite().all() and torch.det(rotation) == pytest.approx(1, abs=1e-5)
         assert torch.allclose(rotation @ rotation.T, torch.eye(3), atol=1e-5)
         assert (camera.width, camera.height) == (WIDTH, HEIGHT)
-        assert FIELDS[0] < 2 * math.degrees(math.atan(WIDTH / 2 / float(camera.K[0, 0]))) < FIELDS[1]
+        assert 2 * math.degrees(math.atan(WIDTH / 2 / float(camera.K[0, 0]))) == pytest.approx(FIELD)
         assert clod.render(blob, camera).alpha.mean() > 0.02
     forward = torch.stack([c.viewmat[2, :3] for c in cameras])
     assert (forward @ forward.T).min() < 0  # from all around
