@@ -24,6 +24,7 @@ FLOORS = [
     {"render"},
     {"importance", "popping", "budget", "placement"},
     {"train", "evaluate", "export", "viewer", "compare"},
+    {"report", "robustness"},
     {"demo"},
     {""},  # the package itself, whose __init__ re-exports from all of the above
     {"cli"},

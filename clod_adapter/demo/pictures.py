@@ -1,34 +1,15 @@
-"""The demo's two pictures: one view at several dial values, and quality against the number of Gaussians kept.
-
-matplotlib is an optional dependency and is imported when a picture is drawn.
-"""
+"""The demo's two pictures: one view at several dial values, and quality against the number of Gaussians kept."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from clod_adapter.errors import ClodError
-from clod_adapter.io.atomic import atomic_path
-
-INK, QUIET, GRID = "#1c1c1e", "#6b6b70", "#e4e4e7"
-PSNR_COLOUR, SSIM_COLOUR = "#1f5fa8", "#c2571a"
-DPI = 200
-STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",  # matplotlib brings it, so captions fit everywhere
-    "text.color": INK,
-    "axes.edgecolor": QUIET,
-    "axes.labelcolor": INK,
-    "axes.linewidth": 0.8,
-    "xtick.color": QUIET,
-    "ytick.color": QUIET,
-    "font.size": 9,
-}
+from clod_adapter.report.style import BLUE, INK, ORANGE, QUIET, label_log, new_figure, save, tidy
 
 
 @dataclass(frozen=True)
@@ -126,12 +107,13 @@ def quality_curve(
     with new_figure((6.4, 5.6), layout="constrained") as figure:
         figure.suptitle(title, fontsize=11, weight="bold", x=0.02, ha="left")
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1.5, 1])
-        draw_curve(above, ordered, base_row, "psnr", PSNR_COLOUR)
-        draw_curve(below, ordered, base_row, "ssim", SSIM_COLOUR)
+        draw_curve(above, ordered, base_row, "psnr", BLUE)
+        draw_curve(below, ordered, base_row, "ssim", ORANGE)
         above.set_ylabel("PSNR (dB)")
         above.legend(loc="lower right", frameon=False, fontsize=8.5)
         below.set_ylabel("SSIM")
-        label_counts(below)
+        below.set_xlabel("Gaussians kept (log scale)")
+        label_log(below.xaxis)
         save(figure, path)
 
 
@@ -149,38 +131,4 @@ def draw_curve(
     if base_row:
         style = {"color": "white", "markeredgecolor": INK, "markersize": 7, "zorder": 2}
         axes.plot(base_row["kept"], base_row[key], "D", label="base", **style)
-    axes.grid(color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def label_counts(axes: Any) -> None:
-    """Round numbers on the log axis, 1-2-5 in each decade that is shown, written out."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axes.set_xlabel("Gaussians kept (log scale)")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda count, _: f"{count:,.0f}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-
-
-@contextmanager
-def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
-    """A matplotlib figure in the house style; without pyplot, so a notebook's own figures are left alone.
-
-    Raises:
-        ClodError: matplotlib is not installed.
-    """
-    try:
-        import matplotlib
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ClodError("pictures need matplotlib: pip install 'clod-adapter[demo]'") from error
-    with matplotlib.rc_context(STYLE):
-        yield Figure(figsize=inches, dpi=DPI, facecolor="white", **options)
-
-
-def save(figure: Any, path: str | Path) -> None:
-    """Writes the figure; the file appears whole or not at all."""
-    with atomic_path(path) as part:
-        figure.savefig(part, facecolor="white")
+    tidy(axes)

@@ -1,0 +1,88 @@
+"""The one drawing style: colours, fonts, figures, files.
+
+matplotlib is an optional dependency and is imported when a picture is drawn.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.atomic import atomic_path
+
+INK, QUIET, GRID, PAPER = "#1c1c1e", "#6b6b70", "#e4e4e7", "#ffffff"
+BLUE, ORANGE, GREEN, PURPLE = "#1f5fa8", "#c2571a", "#2d7d5a", "#7a4fa3"
+SERIES = (BLUE, ORANGE, GREEN, PURPLE, QUIET)  # in the order that lines are drawn
+DPI = 200
+INSTALL = "pip install 'clod-adapter[plots]'"
+STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",  # matplotlib brings it, so captions fit everywhere
+    "text.color": INK,
+    "axes.edgecolor": QUIET,
+    "axes.labelcolor": INK,
+    "axes.linewidth": 0.8,
+    "xtick.color": QUIET,
+    "ytick.color": QUIET,
+    "font.size": 9,
+    "svg.fonttype": "none",  # text stays text in a page
+}
+
+
+def check_matplotlib() -> None:
+    """Raises the ClodError that drawing would without matplotlib, before work is spent on what is to be drawn."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ClodError(f"pictures need matplotlib: {INSTALL}")
+
+
+@contextmanager
+def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
+    """A matplotlib figure in the house style; without pyplot, so a notebook's own figures are left alone.
+
+    Raises:
+        ClodError: matplotlib is not installed.
+    """
+    try:
+        import matplotlib
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ClodError(f"pictures need matplotlib: {INSTALL}") from error
+    with matplotlib.rc_context(STYLE):
+        yield Figure(figsize=inches, dpi=DPI, facecolor=PAPER, **options)
+
+
+def save(figure: Any, path: str | Path) -> None:
+    """Writes the figure; the file appears whole or not at all."""
+    with atomic_path(path) as part:
+        figure.savefig(part, facecolor=PAPER)
+
+
+def shades(count: int) -> list[str]:
+    """``count`` colours of one family from light to dark, for an ordered quantity."""
+    stops = ((0x9E, 0xC3, 0xE6), (0x1F, 0x5F, 0xA8), (0x10, 0x22, 0x4A))
+    colours = []
+    for k in range(count):
+        at = 2 * k / (count - 1) if count > 1 else 1.0
+        low = min(int(at), 1)
+        mixed = (a + (at - low) * (b - a) for a, b in zip(stops[low], stops[low + 1], strict=True))
+        colours.append("#" + "".join(f"{round(value):02x}" for value in mixed))
+    return colours
+
+
+def tidy(axes: Any) -> None:
+    """Grid behind, no box."""
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def label_log(axis: Any, text: str = "{:,.0f}", subs: Sequence[float] = (1, 2, 5)) -> None:
+    """Round numbers on a log axis, 1-2-5 in each decade that is shown, written out."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=subs))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: text.format(value)))
+    axis.set_minor_formatter(NullFormatter())
