@@ -8,12 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from clod_adapter.cli.dials import check_dials, has_dial
-from clod_adapter.cli.files import Outputs, check_output, check_ply_name
-from clod_adapter.cli.settings import make_config
+from clod_adapter.cli.files import Outputs, check_output, check_ply_name, labels
+from clod_adapter.cli.settings import make_config, make_configs
 from clod_adapter.errors import ClodError
 from clod_adapter.io.colmap_folder import find_model
 from clod_adapter.io.ply_columns import sh_degree_of
 from clod_adapter.io.ply_header import read_header
+from clod_adapter.report.style import check_matplotlib
 
 
 def check_adapt(args: Namespace) -> None:
@@ -61,6 +62,17 @@ def check_apply(args: Namespace) -> None:
     check_checkpoint(args.base)
 
 
+def check_robustness(args: Namespace) -> None:
+    check_matplotlib()
+    make_configs(args)
+    labels(args.ply)
+    if Path(args.out).exists() and not Path(args.out).is_dir():
+        raise ClodError(f"{args.out}: is a file; give --out the name of a folder")
+    for path in args.ply:
+        check_checkpoint(path)
+    check_scene(args.images)
+
+
 def check_checkpoint(path: str) -> None:
     """Refuses what by its header is no checkpoint."""
     sh_degree_of(Path(path), read_header(Path(path)))
@@ -96,5 +108,6 @@ CHECKS: dict[str, Callable[[Namespace], None]] = {
     "apply": check_apply,
     "render": check_render,
     "bake": check_bake,
+    "robustness": check_robustness,
     "demo": lambda args: None,
 }

@@ -12,7 +12,7 @@ import torch
 from clod_adapter.cli import adapt
 from clod_adapter.cli.commands import ADAPT
 from clod_adapter.cli.console import Console, duration
-from clod_adapter.cli.files import Outputs, check_output
+from clod_adapter.cli.files import Outputs, check_output, make_folder
 from clod_adapter.cli.kernels import announced_compiling, prepare_kernels
 from clod_adapter.cli.parser import make_parser
 from clod_adapter.cli.report import Stopwatch
@@ -58,15 +58,6 @@ def check_extra() -> None:
     for module, package in EXTRA.items():
         if importlib.util.find_spec(module) is None:
             raise ClodError(f"the demo needs {package}: pip install 'clod-adapter[demo]'")
-
-
-def make_folder(folder: Path) -> None:
-    if folder.exists() and not folder.is_dir():
-        raise ClodError(f"{folder}: is a file; give --out the name of a folder")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ClodError(f"{folder}: cannot be made ({error.strerror or error}); choose another --out") from error
 
 
 def adapt_arguments(args: argparse.Namespace, base: Path, capture: Path, model: Path) -> argparse.Namespace:

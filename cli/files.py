@@ -52,6 +52,33 @@ def check_ply_name(path: Path, option: str) -> None:
         raise ClodError(f"{path}: {option} names the PLY to write, so it must end in .ply")
 
 
+def make_folder(folder: Path) -> None:
+    """Makes ``--out`` a folder, where it is none yet."""
+    if folder.exists() and not folder.is_dir():
+        raise ClodError(f"{folder}: is a file; give --out the name of a folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ClodError(f"{folder}: cannot be made ({error.strerror or error}); choose another --out") from error
+
+
+def labels(paths: Sequence[str]) -> list[str]:
+    """Names of files that tell them apart: the stem, with its folder where two stems are the same.
+
+    Raises:
+        ClodError: a file is given twice, or two have the same name all the same.
+    """
+    resolved = [Path(path).resolve() for path in paths]
+    if len(set(resolved)) < len(resolved):
+        raise ClodError(f"{next(p for k, p in enumerate(paths) if resolved[k] in resolved[:k])}: is given twice")
+    stems = [path.stem for path in resolved]
+    names = [f"{p.parent.name}_{p.stem}" if stems.count(p.stem) > 1 else p.stem for p in resolved]
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise ClodError(f"{paths[k]}: has the same name as {paths[names.index(name)]}; rename one of them")
+    return names
+
+
 def size(path: Path) -> str:
     """Of a file: ``4 kB``, ``12.3 MB``."""
     count = path.stat().st_size

@@ -12,7 +12,7 @@ from contextlib import nullcontext, redirect_stdout
 from importlib import import_module
 from typing import Any
 
-from clod_adapter.cli.commands import ADAPT, APPLY, BAKE, DEMO, EVALUATE, RENDER, Command
+from clod_adapter.cli.commands import ADAPT, APPLY, BAKE, DEMO, EVALUATE, RENDER, ROBUSTNESS, Command
 from clod_adapter.cli.parser import Parser, make_parser
 from clod_adapter.errors import ClodError
 from clod_adapter.io.version import package_version
@@ -21,7 +21,7 @@ PROG = "clod-adapt"
 
 # Adapting is the main job and needs no word.
 COMMANDS: dict[str, Command] = {
-    "eval": EVALUATE, "render": RENDER, "bake": BAKE, "apply": APPLY, "demo": DEMO,
+    "eval": EVALUATE, "render": RENDER, "bake": BAKE, "apply": APPLY, "robustness": ROBUSTNESS, "demo": DEMO,
 }  # fmt: skip
 
 
@@ -85,7 +85,7 @@ def build_parser(name: str) -> Parser:
     command = COMMANDS.get(name, ADAPT)
     parser = make_parser(command, f"{PROG} {name}".strip())
     if not name:
-        others = "\n".join(f"  {PROG} {word:<6} {other.summary}" for word, other in COMMANDS.items())
+        others = "\n".join(f"  {PROG} {word:<10} {other.summary}" for word, other in COMMANDS.items())
         parser.epilog = f"other commands, each with its own --help:\n{others}\n\n{command.epilog}"
         parser.add_argument("--version", action="version", version=f"{PROG} {package_version()}")
     return parser

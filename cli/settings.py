@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import Any
 
 from clod_adapter.config import AdaptConfig, describe
@@ -13,9 +14,12 @@ OPTIONS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def add_settings(parser: argparse.ArgumentParser) -> None:
+def add_settings(parser: argparse.ArgumentParser, without: Sequence[str] = ()) -> None:
+    """Adds the options but those of the fields in ``without``, which a command has in another form."""
     helps, defaults = describe(AdaptConfig), AdaptConfig()
     for name, (metavar, kind) in OPTIONS.items():
+        if name in without:
+            continue
         default = getattr(defaults, name)
         shown = "" if default is None else f" (default: {default:g})"
         parser.add_argument(
@@ -35,6 +39,11 @@ def make_config(args: argparse.Namespace) -> AdaptConfig:
         except ClodError as error:
             raise ClodError(f"--{name.replace('_', '-')}{_without_name(str(error), name)}") from error
     return AdaptConfig(**given)
+
+
+def make_configs(args: argparse.Namespace) -> list[AdaptConfig]:
+    """One a range, ascending, where ``--max-sv`` takes several."""
+    return [make_config(argparse.Namespace(**vars(args) | {"max_sv": value})) for value in sorted(set(args.max_sv))]
 
 
 def _without_name(message: str, name: str) -> str:

@@ -1,0 +1,174 @@
+"""``clod-adapt robustness``: checkpoints adapted at several ranges of the dial; one figure, one CSV, one JSON."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from clod_adapter.cameras import Scene
+from clod_adapter.cli.cells import Cell, cells_of
+from clod_adapter.cli.console import Console, Meter, duration
+from clod_adapter.cli.files import check_output, labels, make_folder
+from clod_adapter.cli.inputs import read_checkpoint, read_scene
+from clod_adapter.cli.kernels import prepare_kernels
+from clod_adapter.cli.report import Stopwatch, machine, report_dials, write_report
+from clod_adapter.cli.settings import make_configs
+from clod_adapter.cli.training import GracefulStop
+from clod_adapter.errors import ClodError
+from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.version import package_version
+from clod_adapter.report.robustness_figure import robustness_figure
+from clod_adapter.robustness import Outcome, adapt_at_range, baseline, scene_fingerprint
+from clod_adapter.train import Progress
+
+COLUMNS = (
+    "checkpoint", "max_sv", "within_range", "virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"
+)  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    console, watch, stop = Console(args.quiet), Stopwatch(), GracefulStop()
+    folder = Path(args.out)
+    outputs = {kind: folder / f"robustness.{kind}" for kind in ("png", "csv", "json")}
+    make_folder(folder)
+    make_folder(folder / "cells")
+    for path in outputs.values():
+        check_output(path, args.ply)
+    with watch.time("load"):
+        scene = read_scene(args.images, console)
+        cells = plan(args, scene, console)
+    if not scene.test:
+        raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
+    found = {cell.name: read for cell in cells if (read := cell.read())}
+    missing = [cell for cell in cells if cell.name not in found]
+    if found:
+        console.say(f"{len(found)} of {len(cells)} cells are there already: {', '.join(found)}")
+    if missing:
+        with watch.time("kernels"):
+            prepare_kernels(console)
+    with stop.listening():
+        with watch.time("cells"):
+            interrupted = run_cells(missing, scene, found, console, stop)
+        if not found:
+            raise KeyboardInterrupt
+        report = describe(args, cells, found, interrupted, scene) | {
+            "machine": machine(), "seconds": watch.report(), "outputs": {k: str(v) for k, v in outputs.items()}
+        }  # fmt: skip
+        write_outputs(report, outputs, Path(args.images).resolve().name)
+    print_summary(report, outputs, watch)
+    return report
+
+
+def plan(args: argparse.Namespace, scene: Scene, console: Console) -> list[Cell]:
+    """All cells; every range is measured at the dial values of the widest, and at the end of its own."""
+    configs = make_configs(args)
+    dials = sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)})
+    cells: list[Cell] = []
+    for path, label in zip(args.ply, labels(args.ply), strict=True):
+        checkpoint = read_checkpoint(path, console)
+        if checkpoint.gaussians.sigma_d is not None:
+            console.say(f"  note: the dial of {path} plays no part: it is taken as a checkpoint without one")
+        cells += cells_of(label, checkpoint, configs, dials, scene_fingerprint(scene), Path(args.out) / "cells")
+    return cells
+
+
+def run_cells(
+    cells: Sequence[Cell], scene: Scene, found: dict[str, dict[str, Any]], console: Console, stop: GracefulStop
+) -> bool:
+    """Runs the cells and adds them to ``found``; says whether Ctrl-C cut that short."""
+    costs = [cell.cost(len(scene.train), len(scene.test)) for cell in cells]
+    with closing(Meter(console, "robustness", slow=True)) as meter:
+        for k, cell in enumerate(cells):
+            run_of = CellRun(meter, stop, sum(costs[:k]) / sum(costs), costs[k] / sum(costs), f"{k + 1}/{len(cells)}")
+            try:
+                outcome = run_of(cell, scene)
+            except KeyboardInterrupt:
+                if stop.requests > 1:
+                    raise
+                console.say(f"stopping: {cell.name} was not finished and is dropped; the same command goes on with it")
+                return True
+            found[cell.name] = cell.write(outcome)
+    return False
+
+
+class CellRun:
+    """Runs one cell as the part ``[before, before + weight]`` of all that is to be done."""
+
+    def __init__(self, meter: Meter, stop: GracefulStop, before: float, weight: float, count: str):
+        self.meter, self.stop, self.before, self.weight, self.count = meter, stop, before, weight, count
+
+    def __call__(self, cell: Cell, scene: Scene) -> Outcome:
+        base, self.name = cell.checkpoint.gaussians, cell.name
+        self.show(0.0, "")
+        if cell.config is None:
+            return baseline(base, scene.test, cell.points, measured=lambda d, n: self.show(d / n, "baseline"))
+        # The shares that cell.cost has them at.
+        measuring = len(cell.points) * len(scene.test) / cell.cost(len(scene.train), len(scene.test))
+
+        def follow(progress: Progress) -> None:
+            of_it = 0.05 * progress.share if progress.phase == "start" else 0.05 + 0.95 * progress.share
+            self.show((1 - measuring) * of_it, f"step {progress.done}" if progress.phase == "train" else "importance")
+
+        return adapt_at_range(
+            base, scene, cell.config, cell.points, fingerprint=cell.checkpoint.fingerprint, follow=follow,
+            measured=lambda done, total: self.show(1 - measuring * (1 - done / total), "measuring"),
+        )  # fmt: skip
+
+    def show(self, share: float, text: str) -> None:
+        self.meter.update(self.before + self.weight * share, f"{self.name} ({self.count}) {text}".rstrip())
+        if self.stop.requests:
+            raise KeyboardInterrupt
+
+
+def describe(
+    args: argparse.Namespace,
+    cells: Sequence[Cell],
+    found: dict[str, dict[str, Any]],
+    interrupted: bool,
+    scene: Scene,
+) -> dict[str, Any]:
+    checkpoints = {cell.label: cell.checkpoint for cell in cells}
+    return {
+        "command": "robustness", "version": package_version(), "scene": args.images, "views": len(scene.test),
+        "checkpoints": [
+            {"checkpoint": label, "model": path, "count": len(c.gaussians), "sha256": c.fingerprint, "notes": c.notes}
+            for path, (label, c) in zip(args.ply, checkpoints.items(), strict=True)
+        ],
+        "cells": [found[cell.name] for cell in cells if cell.name in found],
+        "missing": [cell.name for cell in cells if cell.name not in found],
+        "interrupted": interrupted, "notes": list(scene.notes),
+    }  # fmt: skip
+
+
+def write_outputs(report: dict[str, Any], outputs: dict[str, Path], scene: str) -> None:
+    title = f"{scene}: the dial after the fact, by range; mean of {report['views']} held-out photographs"
+    robustness_figure(outputs["png"], report["cells"], title)
+    with atomic_path(outputs["csv"]) as part, open(part, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        for cell in report["cells"]:
+            name, limit = cell["checkpoint"], cell["max_sv"]
+            for row in cell["rows"]:
+                inside = "" if limit is None else row["virtual_scale"] <= limit
+                writer.writerow({"checkpoint": name, "max_sv": limit or "base", "within_range": inside, **row})
+    write_report(outputs["json"], report)
+
+
+def print_summary(report: dict[str, Any], outputs: dict[str, Path], watch: Stopwatch) -> None:
+    """A line a cell: at s = 1 and at the end of the widest range; of a baseline its counts' ends."""
+    width = max(len(cell["checkpoint"]) for cell in report["cells"])
+    print(f"\n{'checkpoint':<{max(width, 10)}}  range     at the first              at the last")
+    for cell in report["cells"]:
+        ends = [f"{row['psnr'] or 0:6.2f} dB @ {row['kept']:9,.0f}" for row in (cell["rows"][0], cell["rows"][-1])]
+        name = "base" if cell["max_sv"] is None else f"[1, {cell['max_sv']:g}]"
+        print(f"{cell['checkpoint']:<{max(width, 10)}}  {name:<8}  {ends[0]}    {ends[1]}")
+    if report["missing"]:
+        print(f"\nmissing: {', '.join(report['missing'])}; the same command goes on from here")
+    print()
+    for path in outputs.values():
+        print(path)
+    print(f"\n{duration(watch.total())} in all")

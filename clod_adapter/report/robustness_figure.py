@@ -1,0 +1,97 @@
+"""The figure of the robustness experiment: quality against Gaussians, and what opacity and sigma_d became."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from clod_adapter.report.style import INK, ORANGE, QUIET, label_log, new_figure, save, shades, tidy
+
+PANELS = ("PSNR (dB)", "SSIM", "opacity", "decay sigma_d")
+
+
+def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], title: str) -> None:
+    """Draws a row of four panels a checkpoint: PSNR and SSIM against Gaussians kept, opacity, sigma_d.
+
+    Args:
+        path: the picture to write; its suffix chooses the format.
+        cells: each with ``checkpoint``, ``max_sv`` (None of the baseline), ``rows`` and ``distribution``, as the
+            experiment's JSON has them; any of them may be missing.
+        title: one line above.
+
+    Raises:
+        ClodError: matplotlib is missing, or the file cannot be written.
+    """
+    names = list(dict.fromkeys(cell["checkpoint"] for cell in cells))
+    ranges = sorted({cell["max_sv"] for cell in cells if cell["max_sv"] is not None})
+    colours = dict(zip(ranges, shades(len(ranges)), strict=True))
+    with new_figure((13.2, 0.95 + 3.0 * len(names)), layout="constrained") as figure:
+        figure.suptitle(title, fontsize=11.5, weight="bold", x=0.008, ha="left")
+        grid = figure.subplots(len(names), 4, squeeze=False, width_ratios=[1.35, 1.35, 1, 1])
+        for axes, name in zip(grid, names, strict=True):
+            group = [cell for cell in cells if cell["checkpoint"] == name]
+            _quality(axes[0], group, "psnr", colours)
+            _quality(axes[1], group, "ssim", colours)
+            _distribution(axes[2], group, "opacity", colours)
+            _distribution(axes[3], group, "log10_sigma_d", colours)
+            axes[0].set_title(name, loc="left", fontsize=10, weight="bold")
+            for panel, label in zip(axes[:2], PANELS, strict=False):
+                panel.set_ylabel(label)
+        for panel, label in zip(grid[-1], ("Gaussians kept (log scale)",) * 2 + PANELS[2:], strict=True):
+            panel.set_xlabel(label)
+        _legend(figure, colours)
+        save(figure, path)
+
+
+def _quality(
+    axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, str], ground: float = 0.12
+) -> None:
+    axes.set_xscale("log")
+    for cell in cells:
+        points = sorted((row["kept"], row["virtual_scale"], row[key]) for row in cell["rows"] if row[key] is not None)
+        if cell["max_sv"] is None:
+            axes.plot(*_xy(points), "--", color=ORANGE, linewidth=1.4, marker="D", markersize=3, zorder=2)
+            continue
+        inside = [point for point in points if point[1] <= cell["max_sv"]]
+        beyond = [point for point in points if point[1] >= cell["max_sv"]]
+        colour = colours[cell["max_sv"]]
+        axes.plot(*_xy(beyond), ":", color=colour, linewidth=1.2, marker="o", markersize=3.4, mfc="white", zorder=3)
+        axes.plot(*_xy(inside), "-", color=colour, linewidth=1.8, marker="o", markersize=4.2, zorder=4)
+    axes.margins(x=0.06, y=ground)
+    label_log(axes.xaxis)
+    tidy(axes)
+
+
+def _xy(points: Sequence[tuple[float, float, float]]) -> tuple[list[float], list[float]]:
+    return [point[0] for point in points], [point[2] for point in points]
+
+
+def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, str]) -> None:
+    """Outlines of the histograms, in percent of the Gaussians a bin."""
+    for cell in cells:
+        histogram = cell["distribution"].get(key)
+        if histogram is None:
+            continue
+        heights = [100 * share for share in histogram["shares"]]
+        base = cell["max_sv"] is None
+        style = {"color": ORANGE, "linestyle": "--"} if base else {"color": colours[cell["max_sv"]]}
+        axes.stairs(heights, histogram["edges"], linewidth=1.4, **style)
+    axes.set_ylim(bottom=0)
+    axes.set_ylabel("% of Gaussians a bin", color=QUIET, fontsize=8)
+    if key == "log10_sigma_d":
+        axes.set_xticks(range(-3, 4), ["≤0.001", "0.01", "0.1", "1", "10", "100", "≥1000"], fontsize=8)
+    tidy(axes)
+
+
+def _legend(figure: Any, colours: Mapping[float, str]) -> None:
+    from matplotlib.lines import Line2D
+
+    lines = [Line2D([], [], color=ORANGE, linestyle="--", marker="D", markersize=3)]
+    names = ["unadapted, most opaque kept"]
+    for max_sv, colour in colours.items():
+        lines.append(Line2D([], [], color=colour, linewidth=1.8, marker="o", markersize=4.2))
+        names.append("adapted at s = 1 only" if max_sv == 1 else f"adapted, s in [1, {max_sv:g}]")
+    lines.append(Line2D([], [], color=INK, linestyle=":", marker="o", markersize=3.4, mfc="white"))
+    names.append("beyond the range trained")
+    figure.legend(lines, names, loc="outside lower left", ncols=len(names), frameon=False, fontsize=8.5)

@@ -1,0 +1,162 @@
+"""``clod-adapt robustness``: the experiment as a user runs it, interrupts it and takes it up again."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+import clod_adapter
+from clod_adapter.cli import robustness as command
+from clod_adapter.robustness import BASELINE_SHARES
+
+pytest.importorskip("matplotlib")
+OUTPUTS = ["robustness.csv", "robustness.json", "robustness.png"]
+
+
+@pytest.fixture
+def run(clod: Any, capture: Any, tmp_path: Path) -> Callable[..., Any]:
+    """The command on two checkpoints, the second without its faintest Gaussians."""
+    few = capture.gaussians.select(capture.gaussians.opacities > 0.5)
+    paths = (capture.write(tmp_path / "plain.ply", capture.gaussians), capture.write(tmp_path / "masked.ply", few))
+
+    def start(*words: object) -> Any:
+        return clod("robustness", *paths, "--images", capture.scene, "--max-sv", 3, 1, "--iters", 6, *words)
+
+    return start
+
+
+def stamps(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
+
+
+def test_every_checkpoint_at_every_range(run: Any, clod: Any, tmp_path: Path) -> None:
+    done = run("--json")
+    assert done.code == 0, done
+    folder = tmp_path / "robustness"
+    assert sorted(p.name for p in folder.iterdir()) == ["cells", *OUTPUTS]
+    report = json.loads(done.out)
+    assert report == json.loads((folder / "robustness.json").read_text())
+    cells = [(cell["checkpoint"], cell["max_sv"]) for cell in report["cells"]]
+    assert cells == [(name, max_sv) for name in ("plain", "masked") for max_sv in (None, 1, 3)]
+    assert report["missing"] == [] and not report["interrupted"]
+    for cell in report["cells"]:
+        dials = [row["virtual_scale"] for row in cell["rows"]]
+        assert dials == ([1.0] * len(BASELINE_SHARES) if cell["max_sv"] is None else [1, 1.5, 2, 3])
+        assert ("log10_sigma_d" in cell["distribution"]) == (cell["max_sv"] is not None)
+    with open(folder / "robustness.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * (len(BASELINE_SHARES) + 8)
+    (row,) = [r for r in rows if (r["checkpoint"], r["max_sv"], r["virtual_scale"]) == ("masked", "1.0", "2.0")]
+    assert float(row["psnr"]) == report["cells"][4]["rows"][2]["psnr"] and row["within_range"] == "False"
+    assert Image.open(folder / "robustness.png").size[0] > 2000
+    # A cell's adapter gives the model that was measured.
+    assert clod("apply", "plain.ply", "robustness/cells/plain_sv3.safetensors", "-o", "x.ply").code == 0
+    scene = clod_adapter.load_scene(report["scene"])
+    (again,) = clod_adapter.evaluate(clod_adapter.load("x.ply").gaussians, scene.test, [3.0])
+    assert again.psnr == report["cells"][2]["rows"][3]["psnr"]
+
+
+def test_resumes_what_is_unfinished_or_changed(run: Any, tmp_path: Path) -> None:
+    first = run()
+    assert first.code == 0 and "there already" not in first.err, first
+    folder = tmp_path / "robustness"
+    before = stamps(folder)
+    assert len(before) == 10
+    (folder / "cells" / "masked_sv1.safetensors").unlink()
+    (folder / "robustness.png").unlink()
+    again = run()
+    assert again.code == 0 and "5 of 6 cells are there already" in again.err
+    changed = {name for name, stamp in stamps(folder).items() if stamp != before.get(name)}
+    assert changed == {"masked_sv1.safetensors", "masked_sv1.json"} and (folder / "robustness.png").exists()
+    other = run("--seed", 1)  # the baselines do not depend on it
+    assert "2 of 6 cells are there already: plain_base, masked_base" in other.err
+    before = stamps(folder)
+    Path("masked.ply").write_bytes(Path("plain.ply").read_bytes())
+    assert "3 of 6 cells are there already: plain_base, plain_sv1, plain_sv3" in run("--seed", 1).err
+    assert {name for name, stamp in stamps(folder).items() if stamp != before[name]} == {
+        f"masked_{what}" for what in ("base.json", "sv1.json", "sv1.safetensors", "sv3.json", "sv3.safetensors")
+    }
+
+
+def test_ctrl_c_leaves_what_there_is(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls, real = [], command.adapt_at_range
+
+    def interrupted(*args: Any, **options: Any) -> Any:
+        calls.append(args)
+        if len(calls) == 2:
+            signal.raise_signal(signal.SIGINT)
+        return real(*args, **options)
+
+    monkeypatch.setattr(command, "adapt_at_range", interrupted)
+    done = run("--json")
+    report, folder = json.loads(done.out), tmp_path / "robustness"
+    assert done.code == 0 and report["interrupted"] and "plain_sv3 was not finished" in done.err
+    assert [cell["max_sv"] for cell in report["cells"]] == [None, 1]
+    assert report["missing"] == ["plain_sv3", "masked_base", "masked_sv1", "masked_sv3"]
+    assert all((folder / name).exists() for name in OUTPUTS)
+    finished = json.loads(run("--json").out)
+    assert finished["missing"] == [] and finished["cells"][:2] == report["cells"] and len(calls) == 5
+
+
+def test_ctrl_c_before_the_first_cell(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = command.baseline
+
+    def interrupted(*args: Any, **options: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return real(*args, **options)
+
+    monkeypatch.setattr(command, "baseline", interrupted)
+    assert run().code == 130
+    assert [p.name for p in (tmp_path / "robustness").rglob("*")] == ["cells"]
+
+
+def test_progress_is_over_all_cells(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("clod_adapter.cli.console.LINE_EVERY", 0)
+    done = run()
+    lines = re.findall(r"^robustness +(\d+)%, .* left, (\w+) \((\d)/6\)", done.err, re.M)
+    shares = [int(share) for share, *_ in lines]
+    assert shares == sorted(shares) and shares[-1] == 100 and len(set(shares)) > 20
+    assert list(dict.fromkeys(k for *_, k in lines)) == list("123456")
+    assert run("--quiet", "--out", "other").err == ""
+
+
+def test_checkpoints_of_one_name(clod: Any, capture: Any, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        capture.write(tmp_path / name / "point_cloud.ply", capture.gaussians)
+    words = ("--images", capture.scene, "--max-sv", 1, "--iters", 1, "--json")
+    report = json.loads(clod("robustness", "a/point_cloud.ply", "b/point_cloud.ply", *words).out)
+    assert [c["checkpoint"] for c in report["checkpoints"]] == ["a_point_cloud", "b_point_cloud"]
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("PLY PLY --images SCENE", "base.ply: is given twice"),
+        ("PLY --images SCENE --max-sv 1 0.5", "--max-sv is 0.5, it must be at least 1"),
+        ("PLY missing.ply --images SCENE", "missing.ply: .*check the path"),
+        ("PLY --images SCENE --out file", "file: is a file; give --out"),
+        ("PLY --images nowhere", "nowhere: is not a folder"),
+    ],
+)
+def test_bad_input(clod: Any, capture: Any, tmp_path: Path, line: str, said: str) -> None:
+    (tmp_path / "file").write_text("mine")
+    given = {"PLY": capture.ply, "SCENE": capture.scene}
+    done = clod("robustness", *[given.get(word, word) for word in line.split()])
+    assert done.code == 2 and re.search(said, done.err) and [p.name for p in tmp_path.iterdir()] == ["file"], done
+
+
+def test_without_matplotlib_nothing_is_started(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    done = run()
+    assert done.code == 2 and "pip install 'clod-adapter[plots]'" in done.err
+    assert not (tmp_path / "robustness").exists()
