@@ -19,6 +19,7 @@ from clod_adapter.cli.evaluate import measure
 from clod_adapter.cli.files import Outputs, size
 from clod_adapter.cli.inputs import place_scene, read_checkpoint, read_scene
 from clod_adapter.cli.kernels import prepare_kernels
+from clod_adapter.cli.pages import AdaptPage
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, table, write_report
 from clod_adapter.cli.settings import make_config
 from clod_adapter.cli.training import Follower, GracefulStop
@@ -51,7 +52,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     with watch.time("evaluate"):
         base_rows, notes = look_at_base(gaussians, scene, args, console)
     with stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
-        adapted = train(gaussians, scene, config, console, stop, base_rows)
+        page = AdaptPage(gaussians, scene, config, console) if args.report else None
+        adapted = train(gaussians, scene, config, console, stop, base_rows, page)
         watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
         adapter = extract(gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config))
         result = adapter.apply(gaussians)
@@ -75,6 +77,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         "notes": [*base.notes, *scene.notes, *notes], "seconds": watch.report(),
         "calibration": adapter.calibration and adapter.calibration.as_dict(), **outputs.sizes(),
     }  # fmt: skip
+    if page and not cut_short:
+        report["outputs"] |= page.write(outputs.ply.with_suffix(".html"), report, result, adapted.start_seconds)
     write_report(outputs.report, report)
     print_summary(outputs, table(rows, base_rows, plain) if rows else "", args, watch)
     return report
@@ -124,12 +128,18 @@ def look_at_base(
 
 
 def train(
-    base: Gaussians, scene: Scene, config: AdaptConfig, console: Console, stop: GracefulStop, base_rows: Sequence[Row]
+    base: Gaussians,
+    scene: Scene,
+    config: AdaptConfig,
+    console: Console,
+    stop: GracefulStop,
+    base_rows: Sequence[Row],
+    page: AdaptPage | None = None,
 ) -> Adapted:
     """Adapts while the user watches. Raises KeyboardInterrupt when there is nothing worth writing."""
     base_row = base_rows[0] if base_rows else None
     with closing(Follower(console, stop, base, scene.test, config.max_sv, base_row)) as follower:
-        adapted = adapt(base, scene, config, follower)
+        adapted = adapt(base, scene, config, page.watching(follower) if page else follower)
     if stop.requests > 1:
         raise KeyboardInterrupt
     how = "interrupted after" if adapted.interrupted else "trained"

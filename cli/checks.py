@@ -20,6 +20,8 @@ from clod_adapter.report.style import check_matplotlib
 def check_adapt(args: Namespace) -> None:
     make_config(args)
     Outputs.of(args.ply, args.out).check([args.ply])
+    if args.report:
+        check_page(Outputs.of(args.ply, args.out).ply.with_suffix(".html"), [args.ply])
     check_checkpoint(args.ply)
     if args.images is not None:
         check_scene(args.images)
@@ -27,6 +29,8 @@ def check_adapt(args: Namespace) -> None:
 
 def check_evaluate(args: Namespace) -> None:
     check_dials(args, args.model)
+    if args.report:
+        check_page(Path(args.report), [args.model])
     for path in (args.model, *args.against):
         check_checkpoint(path)
     if args.base:
@@ -71,6 +75,14 @@ def check_robustness(args: Namespace) -> None:
     for path in args.ply:
         check_checkpoint(path)
     check_scene(args.images)
+
+
+def check_page(path: Path, inputs: list[str]) -> None:
+    """Refuses a page that could not be drawn or written."""
+    check_matplotlib()
+    if path.suffix.lower() != ".html":
+        raise ClodError(f"{path}: --report names the page to write, so it must end in .html")
+    check_output(path, inputs)
 
 
 def check_checkpoint(path: str) -> None:

@@ -36,6 +36,7 @@ def _adapt(parser: ArgumentParser) -> None:
     add_settings(parser)
     parser.add_argument("--out", metavar="OUT.ply", help="output (default: PLY's name with _clod, in this folder)")
     parser.add_argument("--device", choices=["auto", "cpu"], default="auto", help="where to train (default: auto)")
+    parser.add_argument("--report", action="store_true", help="also a page to look at, OUT.html, and its charts")
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
@@ -54,6 +55,7 @@ def _evaluate(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--popping", action="store_true", help="also how evenly the picture changes with the dial and with the camera"
     )
+    parser.add_argument("--report", metavar="OUT.html", help="also a page to look at, and beside it its charts")
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
@@ -122,6 +124,10 @@ outputs, side by side; a file of that name is replaced:
                    OUT.ply again from it and the checkpoint
   OUT.json         the report: settings, machine, times, and per dial value the
                    quality on held-out photographs (every 8th by name)
+with --report, which needs pip install 'clod-adapter[plots]':
+  OUT.html         one self-contained page: a view under a slider, error against
+                   the time of a frame and against seconds of training, all rows
+  OUT_rendering.png, OUT_adapting.png  its charts
 The PLY's header and the adapter hold that calibration too: dial value, count,
 PSNR, SSIM and frame time, from which --psnr-drop and --fps find a dial value
 elsewhere. The same seed gives the same Gaussians, bit for bit; the frame times
@@ -178,6 +184,9 @@ Per step: the change of the picture (root mean square, levels of 255), the
 largest against the mean (1 is even, 200 a single switch), and how much of the
 largest is left when the step is halved: 0.5 of a fade, 1.0 of a jump.
 
+--report writes one self-contained page: a held-out view under a slider, error
+against milliseconds a frame, all rows, settings, machine; and OUT_rendering.png.
+
 Ctrl-C skips the dial values that are not finished (exit code 0, "interrupted":
 true); before the first one is, there is nothing to print (exit code 130).
 
@@ -188,6 +197,7 @@ examples:
   clod-adapt eval garden_clod.ply --images garden --base garden.ply --popping
   clod-adapt eval garden_clod.ply --images garden --against merged.ply cut.ply
   clod-adapt eval garden_clod.ply --images garden --keep 500000 200000
+  clod-adapt eval garden_clod.ply --images garden --report garden.html
 """,
     add_arguments=_evaluate,
 )

@@ -13,6 +13,7 @@ from clod_adapter.cli.console import Console
 from clod_adapter.cli.inputs import read_checkpoint, read_scene
 from clod_adapter.cli.instruments import Instruments
 from clod_adapter.cli.kernels import prepare_kernels
+from clod_adapter.cli.pages import write_eval_page
 from clod_adapter.cli.report import Stopwatch, machine, table
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
@@ -54,7 +55,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         with watch.time("instruments"):
             interrupted = instruments.run(rows, base, others, args.popping)
     print(instruments.text(), end="")
-    return {
+    report: dict[str, Any] = {
         "command": "eval", "version": package_version(), "model": args.model, "scene": args.images,
         "base_count": len(model.gaussians), "sh_degree": model.gaussians.sh_degree, "views": len(scene.test),
         "rows": [row.as_dict() for row in rows], "base": args.base, **instruments.report(),
@@ -62,6 +63,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         "notes": [*model.notes, *scene.notes, *notes, *instruments.notes], "machine": machine(),
         "device": str(model.gaussians.means.device), "seconds": watch.report(),
     }  # fmt: skip
+    return report | write_eval_page(args, report, model.gaussians, scene, console)
 
 
 def choose_dials(given: list[float] | None, attenuation: AttenuationConfig | None) -> tuple[list[float], list[str]]:

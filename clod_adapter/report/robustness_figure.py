@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from clod_adapter.report.style import INK, ORANGE, QUIET, label_log, new_figure, save, shades, tidy
 
-PANELS = ("PSNR (dB)", "SSIM", "opacity", "decay sigma_d")
+PANELS = ("PSNR (dB)", "SSIM", "opacity", "decay sigma_d (log scale)")
 
 
 def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], title: str) -> None:
@@ -77,11 +78,24 @@ def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colou
         base = cell["max_sv"] is None
         style = {"color": ORANGE, "linestyle": "--"} if base else {"color": colours[cell["max_sv"]]}
         axes.stairs(heights, histogram["edges"], linewidth=1.4, **style)
-    axes.set_ylim(bottom=0)
     axes.set_ylabel("% of Gaussians a bin", color=QUIET, fontsize=8)
-    if key == "log10_sigma_d":
-        axes.set_xticks(range(-3, 4), ["≤0.001", "0.01", "0.1", "1", "10", "100", "≥1000"], fontsize=8)
+    if key == "opacity":
+        axes.set_yscale("log")  # most are nearly transparent
+        label_log(axes.yaxis, "{:g}")
+    else:
+        axes.set_ylim(bottom=0)
+        _trim(axes, [cell["distribution"][key] for cell in cells if key in cell["distribution"]])
     tidy(axes)
+
+
+def _trim(axes: Any, histograms: Sequence[Mapping[str, Any]]) -> None:
+    """Shows the decades of sigma_d that hold at least a thousandth of the Gaussians a bin."""
+    used = [k for h in histograms for k, share in enumerate(h["shares"]) if share > 1e-3]
+    if used:
+        edges = histograms[0]["edges"]
+        low, high = math.floor(edges[min(used)]), math.ceil(edges[max(used) + 1])
+        axes.set_xlim(low, high)
+        axes.set_xticks(range(low, high + 1), [f"{10.0**k:g}" for k in range(low, high + 1)])
 
 
 def _legend(figure: Any, colours: Mapping[float, str]) -> None:

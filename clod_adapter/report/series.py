@@ -1,0 +1,46 @@
+"""Lines of a chart, taken from the rows that ``clod-adapt --json`` and ``clod-adapt eval --json`` print."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import PurePath
+from typing import Any
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Series:
+    """Measurements that belong together.
+
+    Attributes:
+        rows: each with psnr, ssim, kept, frame_ms, and for a dial virtual_scale.
+        dial: they are one file at several dial values.
+    """
+
+    label: str
+    rows: Sequence[Row]
+    dial: bool = False
+
+
+def series_of(report: Mapping[str, Any]) -> list[Series]:
+    """The model over its dial first, then what it is compared with, as far as it was measured.
+
+    Read are ``rows``; the unadapted base as ``base_row`` or ``base_rows``; the file without its dial as
+    ``detached_row``; the base cut by rank as ``ranked``, ``[{by, row}]``; other files as ``against``,
+    ``[{model, theirs}]``. A row without a PSNR (an infinite one, in JSON) is left out.
+    """
+    base: list[Any] = report.get("base_rows") or [report.get("base_row")]
+    found = [Series("dial, one file", report.get("rows", []), dial=True), Series("base, unadapted", base)]
+    ranked = report.get("ranked") or []
+    for by in dict.fromkeys(entry["by"] for entry in ranked):
+        found.append(Series(f"base cut by {by}", [entry["row"] for entry in ranked if entry["by"] == by]))
+    against = report.get("against") or []
+    for model in dict.fromkeys(entry["model"] for entry in against):
+        rows = [entry["theirs"] for entry in against if entry["model"] == model]
+        found.append(Series(PurePath(model).name, rows, dial=len(rows) > 1))
+    plain: list[Any] = [report.get("detached_row")]
+    found.append(Series("plain viewer, no dial", plain))
+    complete = [Series(s.label, [r for r in s.rows if r and r["psnr"] is not None], s.dial) for s in found]
+    return [series for series in complete if series.rows]
