@@ -60,7 +60,7 @@ def rendering_chart(series: Sequence[Series]) -> Draw:
                 _note(axes, f"s = {row['virtual_scale']:g}", point)
         axes.set_xscale("log")
         axes.set_xlabel("milliseconds a frame (log scale)")
-        _finish(axes)
+        finish(axes)
 
     return draw
 
@@ -83,7 +83,7 @@ def training_chart(curves: Sequence[Mapping[str, Any]], base_psnr: float | None)
             axes.axhline(error(base_psnr), color=INK, linestyle="--", linewidth=1.1, label="base, unadapted")
         axes.set_xscale("log")
         axes.set_xlabel("seconds of adapting (log scale)")
-        _finish(axes)
+        finish(axes)
 
     return draw
 
@@ -97,7 +97,7 @@ def _note(axes: Any, text: str, at: tuple[float, float]) -> None:
     axes.annotate(text, at, (-5, -11), textcoords="offset points", ha="right", fontsize=8, color=QUIET)
 
 
-def _finish(axes: Any) -> None:
+def finish(axes: Any) -> None:
     """Log error on the left, at round PSNR values, which stand on the right."""
     axes.set_yscale("log")
     axes.margins(x=0.09, y=0.12)

@@ -1,0 +1,161 @@
+"""Held-out error against seconds of training: ours, the paper's form, and a specialist for each dial value.
+
+    python benchmarks/tradeoff.py plush_half                  # all methods at all budgets, an hour or so
+    python benchmarks/tradeoff.py plush_half --methods ours paper --iters 150 300 --seeds 0 1 2
+    python benchmarks/tradeoff.py plush_half --plot           # the rows there are: docs/images/error_vs_time.png
+
+A budget is a number of steps, each a run of its own with its own schedule. A specialist is made for one count, which
+is what ours keeps at that dial value in its longest run (so run ours first): the base merged to it, then tuned as
+many steps; at s = 1 it is the whole base, tuned. Each run adds a row to ``results/tradeoff.jsonl``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from statistics import fmean
+from typing import Any
+
+from common import RESULTS, ROOT, append, capture
+
+import clod_adapter as clod
+from clod_adapter.cli.console import Console
+from clod_adapter.report.charts import error, finish
+from clod_adapter.report.style import INK, SERIES, new_figure, save
+
+FILE = "tradeoff.jsonl"
+PICTURE = ROOT / "docs" / "images" / "error_vs_time.png"
+ITERS = (150, 300, 600, 1500, 4000)
+LABELS = {"ours": "ours, one file", "paper": "the paper's form, one file", "specialist": "specialists, a file each"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", help="a folder of the shared data")
+    parser.add_argument("--methods", nargs="+", choices=LABELS, default=list(LABELS))
+    parser.add_argument("--iters", nargs="+", type=int, default=list(ITERS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--max-sv", type=float, default=5.0)
+    parser.add_argument("--plot", action="store_true", help="only draw the rows there are")
+    args = parser.parse_args()
+    if args.plot:
+        plot(args.scene, args.max_sv)
+        return
+    contest = Contest(args.scene, args.max_sv)
+    for method in args.methods:
+        for iters in args.iters:
+            for seed in args.seeds:
+                contest.run(method, iters, seed)
+
+
+class Contest:
+    """One scene, and what is run on it."""
+
+    def __init__(self, scene: str, max_sv: float) -> None:
+        self.scene, self.max_sv, self.console = scene, max_sv, Console()
+        self.base = clod.load(capture(scene) / "pretrained.ply")
+        self.photographs = clod.load_scene(capture(scene))
+        self.dials = sorted({1.0, min(3.0, max_sv), max_sv})
+        self.base_row = clod.evaluate(self.base.gaussians, self.photographs.test, [1.0])[0]
+
+    def run(self, method: str, iters: int, seed: int) -> None:
+        if method == "specialist":
+            seconds, rows = self.specialists(iters, seed)
+        else:
+            seconds, rows = self.dial(method, iters, seed)
+        append(FILE, {
+            "benchmark": "tradeoff", "scene": self.scene, "method": method, "iters": iters, "seed": seed,
+            "max_sv": self.max_sv, "seconds": seconds, "base": self.base_row.as_dict(), "rows": rows,
+        })  # fmt: skip
+
+    def dial(self, method: str, iters: int, seed: int) -> tuple[list[float], list[dict[str, float]]]:
+        """Seconds (of the one run that serves every dial value) and the row of each dial value."""
+        make = clod.AdaptConfig if method == "ours" else clod.AdaptConfig.paper
+        config = make(max_sv=self.max_sv, iters=iters, seed=seed)
+        done = self.watched(f"{method}, {iters} steps", lambda follow: clod.adapt(
+            self.base.gaussians, self.photographs, config, lambda p: follow(p.share if p.phase == "train" else 0.0)
+        ))  # fmt: skip
+        rows = clod.evaluate(done.gaussians, self.photographs.test, self.dials)
+        return [done.start_seconds + done.seconds] * len(rows), [row.as_dict() for row in rows]
+
+    def specialists(self, iters: int, seed: int) -> tuple[list[float], list[dict[str, float]]]:
+        """Seconds and row of the specialist for each dial value; merging is within its time."""
+        from merging import Merger  # only here: it needs splat-transform
+        from tuning import Tuning, tune
+
+        seconds, rows = [], []
+        for s, count in zip(self.dials, self.counts(), strict=True):
+            start, merging = self.base.gaussians, 0.0
+            if s > 1:
+                start, merging = Merger.find(ROOT / "benchmarks" / "cache").merge(self.base, count)
+            tuned = self.watched(
+                f"specialist for {len(start):,}, {iters} steps",
+                lambda follow, start=start: tune(
+                    start, self.photographs.train, Tuning(iters=iters, seed=seed), lambda share, text: follow(share)
+                ),
+            )
+            row = clod.evaluate(tuned.gaussians, self.photographs.test, [1.0])[0].as_dict()
+            rows.append(row | {"virtual_scale": s, "kept_share": row["kept"] / len(self.base.gaussians)})
+            seconds.append(merging + tuned.seconds)
+        return seconds, rows
+
+    def counts(self) -> list[int]:
+        """What ours keeps at each dial value in its longest run."""
+        ours = [r for r in stored(self.scene, self.max_sv) if r["method"] == "ours"]
+        if not ours:
+            sys.exit(f"the specialists need to know what ours keeps: run --methods ours on {self.scene} first")
+        longest = max(ours, key=lambda r: r["iters"])
+        return [round(row["kept"]) for row in longest["rows"]]
+
+    def watched(self, label: str, work: Callable[[Callable[[float], None]], Any]) -> Any:
+        with self.console.meter(f"{self.scene}, {label}") as meter:
+            return work(meter.update)
+
+
+def stored(scene: str, max_sv: float) -> list[dict[str, Any]]:
+    path = RESULTS / FILE
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    return [row for row in map(json.loads, lines) if (row["scene"], row["max_sv"]) == (scene, max_sv)]
+
+
+def plot(scene: str, max_sv: float) -> None:
+    """A panel a dial value: error against seconds of training, the mean over seeds of the last row of each."""
+    rows = stored(scene, max_sv)
+    if not rows:
+        sys.exit(f"there are no rows of {scene} with max_sv {max_sv:g} in {RESULTS / FILE}")
+    dials = [row["virtual_scale"] for row in rows[-1]["rows"]]
+    PICTURE.parent.mkdir(parents=True, exist_ok=True)
+    with new_figure((4.6 * len(dials), 4.3), layout="constrained") as figure:
+        title = f"{scene}: held-out error against time of training, {rows[-1]['base']['kept']:,.0f} Gaussians"
+        figure.suptitle(title, fontsize=11.5, weight="bold", x=0.008, ha="left")
+        for k, (axes, s) in enumerate(zip(figure.subplots(1, len(dials), squeeze=False)[0], dials, strict=True)):
+            for method, colour, marker in zip(LABELS, SERIES, "oDs", strict=False):
+                points = curve([row for row in rows if row["method"] == method], k)
+                if points:
+                    xy = [(seconds, error(psnr)) for seconds, psnr, _ in points]
+                    label = f"{LABELS[method]} ({points[-1][2]:.0%} kept)"
+                    axes.plot(*zip(*xy, strict=True), color=colour, marker=marker, linewidth=1.8, label=label)
+            axes.axhline(error(rows[-1]["base"]["psnr"]), color=INK, linestyle="--", linewidth=1.1, label="base, whole")
+            axes.set_xscale("log")
+            axes.set_title(f"s = {s:g}", loc="left", fontsize=10, weight="bold")
+            axes.set_xlabel("seconds of training (log scale)")
+            finish(axes)
+        save(figure, PICTURE)
+    print(PICTURE)
+
+
+def curve(rows: Sequence[dict[str, Any]], k: int) -> list[tuple[float, float, float]]:
+    """(seconds, PSNR, share kept) a budget, at the k-th dial value."""
+    last = {(row["iters"], row["seed"]): row for row in rows}  # later rows replace earlier ones
+    found = []
+    for iters in sorted({iters for iters, _ in last}):
+        runs = [row for (steps, _), row in last.items() if steps == iters]
+        each = [(run["seconds"][k], run["rows"][k]["psnr"], run["rows"][k]["kept_share"]) for run in runs]
+        found.append(tuple(fmean(column) for column in zip(*each, strict=True)))
+    return found
+
+
+if __name__ == "__main__":
+    main()
