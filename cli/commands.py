@@ -272,7 +272,7 @@ each range of the dial, and measures all of them at the same dial values on the
 held-out photographs, beyond their own range too. The baseline of each is the
 untouched checkpoint with only its most opaque Gaussians kept, nothing tuned.
 """,
-    usage="PLY [PLY ...] --images DIR [--max-sv S [S ...]] [options]",
+    usage="PLY [PLY ...] --images DIR [--max-sv S ...] [options]",
     epilog="""\
 in DIR afterwards (default: robustness):
   robustness.png   a row a checkpoint: PSNR and SSIM against Gaussians kept,

@@ -1,0 +1,162 @@
+"""Discrete against continuous: two levels and a hard switch against one file and its dial, and the jump measured.
+
+    clod-adapt demo                                      # makes demo/gallery.ply and demo/capture
+    python benchmarks/discrete.py demo/gallery.ply demo/capture     # writes docs/images/discrete_vs_continuous.png
+
+The picture is as the paper's (CLoD-GS, Figure 6): one held-out view in four strips, from least detail to most, of two
+levels and of one file. Below it a sweep from most to least: PSNR, and the change from frame to frame. The two levels
+are the file itself at its dial's ends, written out as two files would be: nothing but the switch differs. A row with
+the numbers is added to ``results/discrete.jsonl``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from common import ROOT, append
+from torch import Tensor
+
+import clod_adapter as clod
+from clod_adapter.cli.console import Console
+from clod_adapter.metrics import psnr
+from clod_adapter.report.style import BLUE, ORANGE, QUIET, new_figure, save, tidy
+
+PICTURE = ROOT / "docs" / "images" / "discrete_vs_continuous.png"
+STRIPS = 4
+NAMES = ("two levels, a hard switch", "one file, its dial")
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Frames from most to least detail.
+
+    Attributes:
+        dials: the dial value of each frame.
+        images: ``[F, H, W, 3]`` clamped to [0, 1].
+        kept: Gaussians of each frame.
+        psnr: against the photograph, dB.
+    """
+
+    dials: list[float]
+    images: Tensor
+    kept: list[int]
+    psnr: list[float]
+
+    def changes(self) -> list[float]:
+        """Root mean square change from each frame to the next, in levels of 255."""
+        steps = (self.images[1:] - self.images[:-1]).square().mean(dim=(1, 2, 3)).sqrt() * 255
+        return [float(step) for step in steps]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", help="an adapted PLY")
+    parser.add_argument("images", help="its scene: photographs and COLMAP model")
+    parser.add_argument("--view", type=int, default=0, help="which of the held-out views (default: the first)")
+    parser.add_argument("--frames", type=int, default=120, help="of the sweep")
+    parser.add_argument("--out", type=Path, default=PICTURE)
+    args = parser.parse_args()
+    gaussians, view = clod.load(args.model).gaussians, clod.load_scene(args.images).test[args.view]
+    dial = sweep(gaussians, view, args.frames)
+    levels = hard_switch(dial)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    draw(args.out, view, levels, dial)
+    append("discrete.jsonl", {
+        "benchmark": "discrete", "model": Path(args.model).name, "gaussians": len(gaussians), "frames": args.frames,
+        "view": view.camera.name, "max_sv": dial.dials[-1], "switch": summary(levels), "dial": summary(dial),
+    })  # fmt: skip
+
+
+@torch.no_grad()
+def sweep(gaussians: clod.Gaussians, view: clod.View, frames: int) -> Sweep:
+    """The dial from 1 to the largest value trained, in equal ratios."""
+    widest = gaussians.attenuation.max_sv if gaussians.attenuation else 1.0
+    dials = [widest ** (k / (frames - 1)) for k in range(frames)]
+    images, kept = [], []
+    with Console().meter("sweep") as meter:
+        for k, s in enumerate(dials):
+            rendering = clod.render(gaussians, view.camera, s)
+            images.append(rendering.image.clamp(0, 1))
+            kept.append(int(rendering.kept.sum()))
+            meter.update((k + 1) / frames)
+    return Sweep(dials, torch.stack(images), kept, [psnr(image, view.image) for image in images])
+
+
+def hard_switch(dial: Sweep) -> Sweep:
+    """The same way with the two levels at its ends only, changed half way."""
+    half = len(dial.dials) // 2
+    at = [0] * half + [len(dial.dials) - 1] * (len(dial.dials) - half)
+    return Sweep(dial.dials, dial.images[at], [dial.kept[k] for k in at], [dial.psnr[k] for k in at])
+
+
+def summary(frames: Sweep) -> dict[str, Any]:
+    """The largest change between frames against the mean of all: 1 is even, the number of steps a single jump."""
+    changes = frames.changes()
+    mean = sum(changes) / len(changes)
+    return {
+        "largest_change": max(changes), "mean_change": mean, "largest_over_mean": max(changes) / mean if mean else 1.0,
+        "kept": [frames.kept[0], frames.kept[-1]], "psnr": [frames.psnr[0], frames.psnr[-1]],
+    }  # fmt: skip
+
+
+def strips(frames: Sweep) -> tuple[np.ndarray, list[int]]:
+    """One picture in vertical strips, from least detail on the left to most, and the frame of each."""
+    last = len(frames.dials) - 1
+    picked = [round(last * (1 - k / (STRIPS - 1))) for k in range(STRIPS)]
+    width = frames.images.shape[2]
+    edges = [round(width * k / STRIPS) for k in range(STRIPS + 1)]
+    parts = [frames.images[f][:, a:b] for f, a, b in zip(picked, edges[:-1], edges[1:], strict=True)]
+    return torch.cat(parts, dim=1).numpy(), picked
+
+
+def draw(path: Path, view: clod.View, levels: Sweep, dial: Sweep) -> None:
+    aspect = view.camera.height / view.camera.width
+    with new_figure((12.4, 6.1 * aspect + 3.6), layout="constrained") as figure:
+        above, below = figure.subfigures(2, 1, height_ratios=[6.1 * aspect + 0.75, 2.85])
+        for axes, name, frames in zip(above.subplots(1, 2), NAMES, (levels, dial), strict=True):
+            draw_strips(axes, name, frames)
+        left, right = below.subplots(1, 2)
+        for axes, label in ((left, "PSNR on this view (dB)"), (right, "change in one frame (of 255)")):
+            axes.set_xlabel("from most detail to least: the dial s (log scale)")
+            axes.set_ylabel(label)
+            axes.set_xscale("log")
+            tidy(axes)
+        for name, frames, colour in zip(NAMES, (levels, dial), (ORANGE, BLUE), strict=True):
+            changes = frames.changes()
+            left.plot(frames.dials, frames.psnr, color=colour, linewidth=1.8, label=name)
+            label = f"{name}: largest {max(changes):.2g}"
+            right.plot(frames.dials[1:], changes, color=colour, linewidth=1.8, label=label)
+        right.set_ylim(bottom=0)
+        for axes in (left, right):
+            ticks = [s for s in (1, 1.5, 2, 3, 4, 5, 7, 10, 15, 20) if s <= dial.dials[-1]]
+            axes.set_xticks(ticks, [f"{s:g}" for s in ticks])
+            axes.set_xticks([], minor=True)
+            axes.legend(frameon=False, fontsize=8.5)
+        save(figure, path)
+
+
+def draw_strips(axes: Any, name: str, frames: Sweep) -> None:
+    picture, picked = strips(frames)
+    height, width = picture.shape[:2]
+    axes.imshow(picture, interpolation="antialiased")
+    axes.set_title(name, loc="left", fontsize=11, weight="bold")
+    axes.set_xticks([width * (k + 0.5) / STRIPS for k in range(STRIPS)], [
+        f"{frames.kept[f]:,} Gaussians\n{frames.psnr[f]:.2f} dB" for f in picked
+    ])  # fmt: skip
+    axes.set_yticks([])
+    axes.tick_params(length=0, labelcolor=QUIET)
+    axes.spines[:].set_visible(False)
+    for k in range(1, STRIPS):
+        jump = frames.kept[picked[k]] != frames.kept[picked[k - 1]] and len(set(frames.kept)) == 2
+        style = {"color": "#e0262e", "linewidth": 1.6} if jump else {"color": "white", "linewidth": 0.8, "alpha": 0.7}
+        axes.axvline(width * k / STRIPS - 0.5, linestyle="--", **style)
+    axes.set_ylim(height - 0.5, -0.5)
+
+
+if __name__ == "__main__":
+    main()
