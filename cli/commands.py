@@ -185,7 +185,7 @@ largest against the mean (1 is even, 200 a single switch), and how much of the
 largest is left when the step is halved: 0.5 of a fade, 1.0 of a jump.
 
 --report writes one self-contained page: a held-out view under a slider, error
-against milliseconds a frame, all rows, settings, machine; and OUT_rendering.png.
+against milliseconds a frame, all rows, the settings; and OUT_rendering.png.
 
 Ctrl-C skips the dial values that are not finished (exit code 0, "interrupted":
 true); before the first one is, there is nothing to print (exit code 130).
@@ -272,7 +272,7 @@ each range of the dial, and measures all of them at the same dial values on the
 held-out photographs, beyond their own range too. The baseline of each is the
 untouched checkpoint with only its most opaque Gaussians kept, nothing tuned.
 """,
-    usage="PLY [PLY ...] --images DIR [--max-sv S ...] [options]",
+    usage="PLY [PLY ...] --images DIR [options]",
     epilog="""\
 in DIR afterwards (default: robustness):
   robustness.png   a row a checkpoint: PSNR and SSIM against Gaussians kept,
