@@ -45,9 +45,7 @@ def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], titl
         save(figure, path)
 
 
-def _quality(
-    axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, str], ground: float = 0.12
-) -> None:
+def _quality(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, str]) -> None:
     axes.set_xscale("log")
     for cell in cells:
         points = sorted((row["kept"], row["virtual_scale"], row[key]) for row in cell["rows"] if row[key] is not None)
@@ -59,7 +57,7 @@ def _quality(
         colour = colours[cell["max_sv"]]
         axes.plot(*_xy(beyond), ":", color=colour, linewidth=1.2, marker="o", markersize=3.4, mfc="white", zorder=3)
         axes.plot(*_xy(inside), "-", color=colour, linewidth=1.8, marker="o", markersize=4.2, zorder=4)
-    axes.margins(x=0.06, y=ground)
+    axes.margins(x=0.06, y=0.12)
     label_log(axes.xaxis)
     tidy(axes)
 
