@@ -128,7 +128,7 @@ with --report, which needs pip install 'clod-adapter[plots]':
   OUT.html         one self-contained page: a view under a slider, error against
                    the time of a frame and against seconds of training, all rows
   OUT_rendering.png, OUT_adapting.png  its charts
-The PLY's header and the adapter hold that calibration too: dial value, count,
+The PLY's header and the adapter hold the report's rows too: dial value, count,
 PSNR, SSIM and frame time, from which --psnr-drop and --fps find a dial value
 elsewhere. The same seed gives the same Gaussians, bit for bit; the frame times
 in the calibration are those of the run.
