@@ -75,13 +75,17 @@ class AdaptConfig:
     normalizer: str = option("scene", "what distances are divided by: scene, quantile or max (the paper's)")
     quantile: float = option(0.95, "quantile of distances that becomes D (normalizers scene and quantile)")
     start: str = option("importance", "first sigma_d: importance (by rank), constant (1) or identity (no fading)")
-    start_share: float = option(0.6, "share of Gaussians to keep at s = 1")
+    start_share: float = option(0.62, "share of Gaussians to keep at s = 1")
     parameter: str = option("log", "what is trained: log (of sigma_d) or linear (sigma_d, the paper's)")
     sampling: str = option("pair", "dial values of a step: pair (1 and one log-uniform), log, or uniform (the paper's)")
+    full_weight: float = option(
+        3.0, "weight of the picture at s = 1 beside that at the other dial value (sampling pair)"
+    )
     full_share: float = option(0.0, "share of steps at s = 1 (samplings log and uniform)")
     exponent: float = option(1.5, "the count law: the share to keep at s is s^-exponent")
     count_term: str = option("relative", "what moves the count: relative (to the law, both ways) or paper (L_reg)")
     reg_weight: float = option(0.02, "weight of the count term (the paper's lambda_reg)")
+    count_gain: float = option(0.003, "growth a step of the price of being kept (count_term relative)")
     weight_slope: float = option(
         0.0, "k of w_s = (1 - k s/max_sv)^2; the paper has 0.5, 0 weighs all dial values alike"
     )
@@ -108,6 +112,8 @@ class AdaptConfig:
         for name, allowed in choices.items():
             require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
         require(0 <= self.full_share <= 1, "full_share", self.full_share, "between 0 and 1")
+        require(0 <= self.full_weight < math.inf, "full_weight", self.full_weight, "at least 0 and finite")
+        require(0 <= self.count_gain < math.inf, "count_gain", self.count_gain, "at least 0 and finite")
         require(0 < self.exponent < math.inf, "exponent", self.exponent, "positive and finite")
         require(0 <= self.reg_weight < math.inf, "reg_weight", self.reg_weight, "at least 0 and finite")
         require(0 <= self.weight_slope <= 1, "weight_slope", self.weight_slope, "between 0 and 1")

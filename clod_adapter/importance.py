@@ -47,16 +47,6 @@ def start(
     return base.replace(sigma_d=sigma.minimum(WIDEST * config.max_sv * distances), attenuation=attenuation)
 
 
-def count_law(virtual_scale: float, share: float, exponent: float) -> float:
-    """The share of all Gaussians to keep at a dial value s: ``1 / (s^p + (1/share - 1) s^-p)``.
-
-    ``share`` at s = 1, and soon the paper's target ``s^-p`` (section 3.3, p = 1.5): with a share of 0.6, 8 % below it
-    at s = 2 and 2 % at s = 3.
-    """
-    power = virtual_scale**exponent
-    return 1 / (power + (1 / share - 1) / power)
-
-
 def scene_distance(base: Gaussians, views: Sequence[View], quantile: float) -> float:
     """D of the scene normaliser: mean over views of the ``quantile`` distance in the frustum, world units."""
     probe = AttenuationConfig(normalizer="quantile", quantile=quantile)
@@ -113,7 +103,7 @@ def sigma_from_importance(
     """``[N]`` sigma_d with which the share kept follows the count law from the start, before any training.
 
     Gaussians are ranked by importance. The one at rank fraction r (0 the most important) leaves
-    where ``count_law`` falls to r. Ranks beyond ``share`` leave before s = 1.
+    where ``counting.count_law`` falls to r. Ranks beyond ``share`` leave before s = 1.
 
     Args:
         importance: ``[N]``, larger stays longer.

@@ -13,12 +13,13 @@ from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.attenuation import SIGMA_MAX, Attenuated, attenuate, count_slope, normalized_distances, soft_count
+from clod_adapter.attenuation import SIGMA_MAX, Attenuated, attenuate, normalized_distances, soft_count
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
+from clod_adapter.counting import CountPressure
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.importance import count_law, start
+from clod_adapter.importance import start
 from clod_adapter.losses import photometric_loss
 from clod_adapter.optimizer import RowAdam
 from clod_adapter.render import splat
@@ -74,11 +75,13 @@ def adapt(
     """Learns sigma_d for ``base`` on the training views of ``scene``, and updates the rest lightly.
 
     Each step draws a view, renders it at full detail and at one log-uniform dial value s in [1, max_sv], and
-    minimises the sum over the two of ``L_render + reg_weight (eta / law(s) - 1)^2``: L_render is
-    ``losses.photometric_loss``, eta the share of all Gaussians kept, law ``importance.count_law``. The count term
-    moves sigma_d only. ``AdaptConfig.paper`` gives CLoD-GS's own objective instead (section 3.3):
-    ``w_s (L_render + reg_weight L_reg)`` with ``L_reg = (s - 1)^2 relu(eta - s^-exponent)^2`` and
-    ``w_s = (1 - weight_slope s / max_sv)^2``. A base that already has a sigma_d is continued from.
+    minimises ``full_weight L_render(1) + L_render(s)``, L_render being ``losses.photometric_loss``, while the share of
+    Gaussians kept is pressed towards ``counting.count_law`` at both, which moves sigma_d only. A base that already
+    has a sigma_d is continued from.
+
+    ``AdaptConfig.paper`` gives CLoD-GS's own objective instead (section 3.3): one s a step and
+    ``w_s (L_render + reg_weight L_reg)`` with ``L_reg = (s - 1)^2 relu(eta - s^-exponent)^2``, eta the share kept,
+    and ``w_s = (1 - weight_slope s / max_sv)^2``.
 
     A KeyboardInterrupt ends training and returns what there is.
 
@@ -131,6 +134,7 @@ class _Run:
         self.decay, self.range = ("sigma", SIGMA_RANGE) if linear else ("log_sigma", tuple(map(math.log, SIGMA_RANGE)))
         self.parameters[self.decay] = sigma if linear else sigma.log()
         self.optimizer = RowAdam(self.parameters)
+        self.pressure = CountPressure(config, self.attenuation.tau)
         self.empty_bands: Tensor | None = None  # the base's whole shN, where what was left out of it comes back
         self.all_rows = torch.ones(len(start), dtype=torch.bool)
         self.rates = {
@@ -199,8 +203,10 @@ class _Run:
             image, _ = splat(Gaussians(**leaves), dialled.drawn, view.camera)
             loss = photometric_loss(image, view.image, self.config.ssim_weight)
             weight = (1 - self.config.weight_slope * s / self.config.max_sv) ** 2
+            if len(dials) > 1 and s == 1:
+                weight *= self.config.full_weight
             total = total + weight * (loss + self._paper_count(dialled, s))
-            pull += self._pull(dialled, logits.detach(), s)
+            pull += self.pressure.gradient(dialled, logits.detach(), s)
             kept |= dialled.keep
             if s == dials[0]:
                 now = float(loss.detach())
@@ -223,13 +229,3 @@ class _Run:
             return 0.0
         count = soft_count(dialled.log_opacities, s, self.attenuation.tau, config.temperature)
         return config.reg_weight * (s - 1) ** 2 * (count - s**-config.exponent).clamp(min=0) ** 2
-
-    def _pull(self, dialled: Attenuated, logits: Tensor, s: float) -> Tensor | float:
-        """``[N]`` the gradient of ``reg_weight (eta / law(s) - 1)^2`` by log sigma, opacities held."""
-        config = self.config
-        if config.count_term != "relative" or config.reg_weight == 0 or config.max_sv == 1:
-            return 0.0  # a range of one dial value asks for no law
-        law = count_law(s, config.start_share, config.exponent)
-        excess = float(dialled.keep.sum()) / len(logits) / law - 1
-        slope = count_slope(logits, dialled.log_opacities.detach(), s, self.attenuation.tau, config.temperature)
-        return slope.mul_(2 * config.reg_weight * excess / law)
