@@ -1,12 +1,12 @@
 """Discrete against continuous: two levels and a hard switch against one file and its dial, and the jump measured.
 
     clod-adapt demo                                      # makes demo/gallery.ply and demo/capture
-    python benchmarks/discrete.py demo/gallery.ply demo/capture     # writes docs/images/discrete_vs_continuous.png
+    python benchmarks/discrete.py demo/gallery.ply demo/capture --view 6
 
-The picture is as the paper's (CLoD-GS, Figure 6): one held-out view in four strips, from least detail to most, of two
-levels and of one file. Below it a sweep from most to least: PSNR, and the change from frame to frame. The two levels
-are the file itself at its dial's ends, written out as two files would be: nothing but the switch differs. A row with
-the numbers is added to ``results/discrete.jsonl``.
+The picture, docs/images/discrete_vs_continuous.png, is as the paper's: one held-out view in four strips, from least
+detail to most, of two levels and of one file. Below it a sweep from most to least: PSNR, and the change from frame to
+frame. The two levels are the file itself at its dial's ends, written out as two files would be: nothing but the switch
+differs. A row with the numbers is added to ``results/discrete.jsonl``.
 """
 
 from __future__ import annotations
