@@ -59,7 +59,7 @@ def test_pictures_get_better(captured: tuple[Gaussians, Scene], trained: tuple[A
         for old, new in rows:
             assert new.psnr > old.psnr + 0.5, f"s {new.virtual_scale}"
     losses = [p.loss for p in trained[1] if p.phase == "train"]
-    assert losses[-1] < 0.6 * losses[0]
+    assert losses[-1] < 0.7 * losses[0]
 
 
 def test_the_defaults_do_that_too(captured: tuple[Gaussians, Scene]) -> None:
