@@ -1,7 +1,7 @@
 """Adapts real checkpoints and writes what came of it: quality, count and time per dial value.
 
     python benchmarks/adapt.py plush_half bonsai146 ci_banana plush_half/pretrained_mask
-    python benchmarks/adapt.py plush_half --set lr_sigma=0.05 --set full_share=0 --label "slow sigma"
+    python benchmarks/adapt.py plush_half bonsai146 --set max_sv=14.0 --label "max_sv 14" --seeds 0 1 2
     python benchmarks/adapt.py plush_half --ablations      # one row for each choice in docs/method.md
     python benchmarks/adapt.py plush_half bonsai146 --leave-out    # one for each in docs/performance.md
     python benchmarks/adapt.py --table                     # the rows as a Markdown table
@@ -15,37 +15,48 @@ from __future__ import annotations
 import argparse
 import ast
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
+from statistics import fmean
+from typing import Any
 
 from common import RESULTS, append, capture
 
 import clod_adapter as clod
+from clod_adapter.popping import dial_popping, path_popping
 
 FILE = "adapt.jsonl"
-DIALS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
-ABLATION_STEPS = 600
-# The default is an entry too: the others are compared with it at the same number of steps.
-ABLATIONS: dict[str, dict[str, object]] = {
-    "default, 600 steps": {},
-    "never s = 1 on purpose": {"full_share": 0.0},
-    "half the steps at s = 1": {"full_share": 0.5},
-    "sigma ten times slower": {"lr_sigma": 0.01},
-    "sigma three times faster": {"lr_sigma": 0.3},
-    "other attributes half as fast": {
-        "lr_means": 6.5e-5, "lr_quats": 4e-4, "lr_scales": 2e-3, "lr_opacities": 2.5e-2, "lr_sh0": 1e-3,
+DIALS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 14.0)
+SHARES = (0.35, 0.12, 0.05, 0.02)  # of the base's Gaussians, where the file is also measured
+ABLATION = {"iters": 500, "max_sv": 14.0}
+PATH_STEPS, DIAL_STEPS = 60, 100  # of the popping measures; max_sv 14 in 100 steps: 2.7 % each
+
+FROZEN = {"lr_means": 0.0, "lr_quats": 0.0, "lr_scales": 0.0, "lr_opacities": 0.0, "lr_sh0": 0.0}
+HALF = {name: getattr(clod.AdaptConfig(), name) / 2 for name in FROZEN}
+# By question; each changes one thing of ours, or, where it says so, of the paper's form.
+QUESTIONS: dict[str, dict[str, dict[str, object]]] = {
+    "form": {"ours": {}, "paper": {"paper": True}},
+    "ablations of the paper": {
+        "paper, without w_s": {"paper": True, "weight_slope": 0.0},
+        "paper, without L_reg": {"paper": True, "reg_weight": 0.0},
     },
-    "other attributes frozen": {
-        "lr_means": 0.0, "lr_quats": 0.0, "lr_scales": 0.0, "lr_opacities": 0.0, "lr_sh0": 0.0,
-    },
-    "higher bands tuned": {"lr_shN": 1e-4},
-    "all dial values weigh alike": {"weight_slope": 0.0},
-    "wider soft count": {"temperature": 1.0},
-    "no count term": {"reg_weight": 0.0},
-    "higher threshold": {"tau": 0.01},
-    "normaliser quantile": {"normalizer": "quantile"},
-    "normaliser max (the paper's)": {"normalizer": "max"},
-    "start keeps more at s = 1": {"start_share": 0.8},
+    "start": {"start constant": {"start": "constant"}, "start identity": {"start": "identity"}},
+    "parameter": {"linear sigma, 1e-2": {"parameter": "linear", "lr_sigma": 1e-2},
+                  "log sigma, 1e-2": {"lr_sigma": 1e-2}, "log sigma, 0.3": {"lr_sigma": 0.3}},
+    "normaliser": {"quantile": {"normalizer": "quantile"}, "max (the paper's)": {"normalizer": "max"}},
+    "cut": {"hard": {"cut": "hard"}, "tau 1/255": {"tau": 1 / 255}, "hard, tau 1/255": {"cut": "hard", "tau": 1 / 255},
+            "tau 0.05": {"tau": 0.05}},
+    "count": {"none": {"reg_weight": 0.0}, "price stays 0": {"count_gain": 0.0},
+              "the paper's L_reg, straight through": {"count_term": "paper", "reg_weight": 1.0},
+              "temperature 1": {"temperature": 1.0}},
+    "sampling": {"one, log-uniform": {"sampling": "log"}, "one, log-uniform, 30 % at 1": {"sampling": "log",
+                 "full_share": 0.3}, "one, uniform": {"sampling": "uniform"}},
+    "weights": {"s = 1 single": {"full_weight": 1.0}, "s = 1 fourfold": {"full_weight": 4.0},
+                "w_s of the paper": {"weight_slope": 0.5}},
+    "light update": {"frozen": FROZEN, "half as fast": HALF, "higher bands too": {"lr_shN": 1e-4}},
+    "schedule": {"steps stay long": {"lr_final": 1.0}, "steps fall to 0.5 %": {"lr_final": 0.005}},
 }  # fmt: skip
+ABLATIONS = {label: changed for rows in QUESTIONS.values() for label, changed in rows.items()}
 
 
 # What a step can leave out, at three lengths each: held-out error against time.
@@ -60,7 +71,7 @@ LEAVE_OUT: dict[str, dict[str, object]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*")
-    parser.add_argument("--ablations", action="store_true", help=f"every choice by itself, {ABLATION_STEPS} steps each")
+    parser.add_argument("--ablations", action="store_true", help=f"every choice by itself, {ABLATION}")
     parser.add_argument("--leave-out", action="store_true", help="what a step can leave out, at three lengths each")
     parser.add_argument("--table", action="store_true", help="print the rows there are")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a field of AdaptConfig")
@@ -71,26 +82,48 @@ def main() -> None:
         print_table()
     runs = {args.label: dict(_setting(text) for text in args.set)}
     if args.ablations:
-        runs = {label: {"iters": ABLATION_STEPS, **changed} for label, changed in ABLATIONS.items()}
+        runs = {label: {**ABLATION, **changed} for label, changed in ABLATIONS.items()}
     if args.leave_out:
         runs = LEAVE_OUT
     for scene in args.scenes:
         for label, changed in runs.items():
             for seed in args.seeds:
-                run(scene, label, clod.AdaptConfig(**{"seed": seed, **changed}), changed)
+                run(scene, label, make_config(changed, seed), changed, popping=args.ablations)
 
 
 def print_table() -> None:
-    """PSNR and share per dial value, a line a row of the results."""
-    dials = [f"s = {s:g}" for s in DIALS]
-    print("| scene | what | steps | seconds | base | " + " | ".join(dials) + " |")
-    print("|---" * (5 + len(dials)) + "|")
-    for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
-        row = json.loads(line)
-        seconds = row["start_seconds"] + row["train_seconds"]
-        cells = [f"{r['psnr']:.2f} @ {r['kept_share']:.1%}" for r in row["rows"] if r["virtual_scale"] in DIALS]
-        head = [row["scene"], row["label"], str(row["steps"]), f"{seconds:.0f}", f"{row['base']['psnr']:.2f}"]
+    """PSNR and share at s = 1 and at the matched shares, means over the seeds, a line a setting."""
+    lines = (RESULTS / FILE).read_text(encoding="utf-8").splitlines()
+    last = {}
+    for row in map(json.loads, lines):
+        if "at_shares" in row:  # rows of before have none
+            last[row["scene"], row["label"], row["steps"], row["config"]["seed"]] = row
+    groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    for (scene, label, steps, _), row in last.items():
+        groups.setdefault((scene, label, steps), []).append(row)
+    print(
+        "| scene | what | steps | seeds | seconds | base | s = 1 |" + "".join(f" {x:.0%} |" for x in SHARES) + " law |"
+    )
+    print("|---" * (8 + len(SHARES)) + "|")
+    for (scene, label, steps), rows in groups.items():
+        seconds = fmean(row["start_seconds"] + row["train_seconds"] for row in rows)
+        first = fmean(row["rows"][0]["psnr"] for row in rows), fmean(row["rows"][0]["kept_share"] for row in rows)
+        cells = [f"{first[0]:.2f} @ {first[1]:.0%}"]
+        for share in SHARES:
+            found = [r["psnr"] for row in rows for r in row["at_shares"] if r["share"] == share]
+            cells.append(f"{fmean(found):.2f}" if len(found) == len(rows) else "")
+        law = [
+            r["kept_share"] * r["virtual_scale"] ** 1.5 for row in rows for r in row["rows"] if r["virtual_scale"] >= 2
+        ]
+        cells.append(f"{min(law):.2f} to {max(law):.2f}" if law else "")
+        head = [scene, label, str(steps), str(len(rows)), f"{seconds:.0f}", f"{rows[0]['base']['psnr']:.2f}"]
         print("| " + " | ".join(head + cells) + " |")
+
+
+def make_config(changed: dict[str, Any], seed: int) -> clod.AdaptConfig:
+    """Ours, or the paper's form, with what is changed of it."""
+    changed = {"seed": seed, **changed}
+    return clod.AdaptConfig.paper(**changed) if changed.pop("paper", False) else clod.AdaptConfig(**changed)
 
 
 def _setting(text: str) -> tuple[str, object]:
@@ -101,21 +134,47 @@ def _setting(text: str) -> tuple[str, object]:
         return name, value
 
 
-def run(scene: str, label: str, config: clod.AdaptConfig, changed: dict[str, object]) -> None:
+def run(scene: str, label: str, config: clod.AdaptConfig, changed: dict[str, object], popping: bool) -> None:
     folder, _, checkpoint = scene.partition("/")
     base = clod.load(capture(folder) / f"{checkpoint or 'pretrained'}.ply")
     photographs = clod.load_scene(capture(folder))
-    dials = [s for s in DIALS if s <= config.max_sv] + ([config.max_sv] if config.max_sv > DIALS[-1] else [])
+    dials = sorted({s for s in DIALS if s < config.max_sv} | {config.max_sv})
     base_row = clod.evaluate(base.gaussians, photographs.test, [1.0])[0]
     adapted = clod.adapt(base.gaussians, photographs, config)
     adapter = clod.extract(base.gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config))
-    rows = clod.evaluate(adapter.apply(base.gaussians), photographs.test, dials)
+    result = adapter.apply(base.gaussians)
+    rows = clod.evaluate(result, photographs.test, dials)
     append(FILE, {
         "benchmark": "adapt", "scene": scene, "label": label, "changed": changed, "config": asdict(config),
         "base_count": len(base.gaussians), "base": base_row.as_dict(), "rows": [row.as_dict() for row in rows],
-        "steps": adapted.steps, "start_seconds": round(adapted.start_seconds, 2),
-        "train_seconds": round(adapted.seconds, 2),
+        "at_shares": at_shares(result, photographs.test), "steps": adapted.steps,
+        "start_seconds": round(adapted.start_seconds, 2), "train_seconds": round(adapted.seconds, 2),
+        "popping": jumps(result, photographs) if popping else None,
     })  # fmt: skip
+
+
+def at_shares(model: clod.Gaussians, views: Sequence[clod.View]) -> list[dict[str, float]]:
+    """Rows at the dial values that keep SHARES of the Gaussians, as far as the dial goes."""
+    found = []
+    for share in SHARES:
+        try:
+            solved = clod.dial_for(model, keep=share * len(model), cameras=[view.camera for view in views])
+        except clod.ClodError:
+            continue  # out of the dial's reach
+        if not solved.note:
+            found.append({"share": share, **clod.evaluate(model, views, [solved.virtual_scale])[0].as_dict()})
+    return found
+
+
+def jumps(model: clod.Gaussians, photographs: clod.Scene) -> dict[str, dict[str, float]]:
+    """How evenly the picture changes as the dial turns, and as the camera moves at a dial value of 3."""
+    assert model.attenuation is not None
+    cameras = [view.camera for view in photographs.test[:4]]
+    measured = {
+        "dial": dial_popping(model, cameras[0], model.attenuation.max_sv, steps=DIAL_STEPS),
+        "path": path_popping(model, cameras, 3.0, steps=PATH_STEPS),
+    }
+    return {name: {k: v for k, v in found.as_dict().items() if k != "changes"} for name, found in measured.items()}
 
 
 if __name__ == "__main__":
