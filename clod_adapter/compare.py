@@ -12,7 +12,7 @@ from clod_adapter.budget import dial_for
 from clod_adapter.cameras import Camera, View
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.importance import MOST_VIEWS, removal_error
+from clod_adapter.importance import removal_error, spread
 from clod_adapter.render import dial
 
 CLOSE = 0.001  # relative distance of two counts that count as the same
@@ -45,7 +45,5 @@ def rankings(
     Args:
         progress: called with (views done, views in all).
     """
-    if len(views) > MOST_VIEWS:
-        views = [views[k * len(views) // MOST_VIEWS] for k in range(MOST_VIEWS)]
-    by = {"opacity": base.opacity_logits, "contribution": removal_error(base, views, progress=progress)}
+    by = {"opacity": base.opacity_logits, "contribution": removal_error(base, spread(views), progress=progress)}
     return {name: values.argsort(descending=True, stable=True) for name, values in by.items()}

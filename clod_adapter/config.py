@@ -13,7 +13,7 @@ CUTS = ("hard", "soft")
 STARTS = ("importance", "constant", "identity")
 PARAMETERS = ("log", "linear")
 SAMPLINGS = ("pair", "log", "uniform")
-COUNT_TERMS = ("relative", "paper")
+COUNT_TERMS = ("law", "paper")
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
 
 
@@ -83,9 +83,8 @@ class AdaptConfig:
     )
     full_share: float = option(0.0, "share of steps at s = 1 (samplings log and uniform)")
     exponent: float = option(1.5, "the count law: the share to keep at s is s^-exponent")
-    count_term: str = option("relative", "what moves the count: relative (to the law, both ways) or paper (L_reg)")
-    reg_weight: float = option(0.02, "weight of the count term (the paper's lambda_reg)")
-    count_gain: float = option(0.003, "growth a step of the price of being kept (count_term relative)")
+    count_term: str = option("law", "what moves the count: law (a price, and corrections to the law) or paper (L_reg)")
+    reg_weight: float = option(0.005, "weight of the count term: the price, or the paper's lambda_reg")
     weight_slope: float = option(
         0.0, "k of w_s = (1 - k s/max_sv)^2; the paper has 0.5, 0 weighs all dial values alike"
     )
@@ -113,7 +112,6 @@ class AdaptConfig:
             require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
         require(0 <= self.full_share <= 1, "full_share", self.full_share, "between 0 and 1")
         require(0 <= self.full_weight < math.inf, "full_weight", self.full_weight, "at least 0 and finite")
-        require(0 <= self.count_gain < math.inf, "count_gain", self.count_gain, "at least 0 and finite")
         require(0 < self.exponent < math.inf, "exponent", self.exponent, "positive and finite")
         require(0 <= self.reg_weight < math.inf, "reg_weight", self.reg_weight, "at least 0 and finite")
         require(0 <= self.weight_slope <= 1, "weight_slope", self.weight_slope, "between 0 and 1")

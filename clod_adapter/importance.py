@@ -34,7 +34,7 @@ def start(
     """
     if base.sigma_d is not None and base.attenuation is not None and bool((base.sigma_d < SIGMA_MAX).any()):
         return base.replace(attenuation=dataclasses.replace(base.attenuation, max_sv=config.max_sv))
-    views = [views[k * len(views) // MOST_VIEWS] for k in range(MOST_VIEWS)] if len(views) > MOST_VIEWS else views
+    views = spread(views)
     attenuation = config.attenuation(scene_distance(base, views, config.quantile))
     if config.start != "importance":
         value = 1.0 if config.start == "constant" else WIDEST * config.max_sv
@@ -45,6 +45,11 @@ def start(
         base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent
     )
     return base.replace(sigma_d=sigma.minimum(WIDEST * config.max_sv * distances), attenuation=attenuation)
+
+
+def spread(views: Sequence[View]) -> Sequence[View]:
+    """At most MOST_VIEWS of the views, evenly spread."""
+    return [views[k * len(views) // MOST_VIEWS] for k in range(MOST_VIEWS)] if len(views) > MOST_VIEWS else views
 
 
 def scene_distance(base: Gaussians, views: Sequence[View], quantile: float) -> float:

@@ -16,10 +16,10 @@ from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.attenuation import SIGMA_MAX, Attenuated, attenuate, normalized_distances, soft_count
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
-from clod_adapter.counting import CountPressure
+from clod_adapter.counting import CountLaw
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.importance import start
+from clod_adapter.importance import spread, start, typical_distance
 from clod_adapter.losses import photometric_loss
 from clod_adapter.optimizer import RowAdam
 from clod_adapter.render import splat
@@ -75,8 +75,8 @@ def adapt(
     """Learns sigma_d for ``base`` on the training views of ``scene``, and updates the rest lightly.
 
     Each step draws a view, renders it at full detail and at one log-uniform dial value s in [1, max_sv], and
-    minimises ``full_weight L_render(1) + L_render(s)``, L_render being ``losses.photometric_loss``, while the share of
-    Gaussians kept is pressed towards ``counting.count_law`` at both, which moves sigma_d only. A base that already
+    minimises ``full_weight L_render(1) + L_render(s)``, L_render being ``losses.photometric_loss``, while
+    ``counting.CountLaw`` holds the share of Gaussians kept to its law by way of sigma_d. A base that already
     has a sigma_d is continued from.
 
     ``AdaptConfig.paper`` gives CLoD-GS's own objective instead (section 3.3): one s a step and
@@ -134,7 +134,10 @@ class _Run:
         self.decay, self.range = ("sigma", SIGMA_RANGE) if linear else ("log_sigma", tuple(map(math.log, SIGMA_RANGE)))
         self.parameters[self.decay] = sigma if linear else sigma.log()
         self.optimizer = RowAdam(self.parameters)
-        self.pressure = CountPressure(config, self.attenuation.tau)
+        # A range of one dial value asks for no law.
+        held = config.count_term == "law" and config.reg_weight > 0 and config.max_sv > 1
+        distances = typical_distance(start, spread(views), self.attenuation) if held else None
+        self.law = None if distances is None else CountLaw(config, self.attenuation, distances)
         self.empty_bands: Tensor | None = None  # the base's whole shN, where what was left out of it comes back
         self.all_rows = torch.ones(len(start), dtype=torch.bool)
         self.rates = {
@@ -172,9 +175,12 @@ class _Run:
         values = {name: self.parameters[name] for name in ATTRIBUTES}
         if self.empty_bands is not None:
             values["shN"] = self.empty_bands
+        return Gaussians(**values, sigma_d=self.sigma().clone(), attenuation=self.attenuation)
+
+    def sigma(self) -> Tensor:
+        """``[N]`` sigma_d now."""
         decay = self.parameters[self.decay]
-        sigma = decay.clone() if self.config.parameter == "linear" else decay.exp()
-        return Gaussians(**values, sigma_d=sigma, attenuation=self.attenuation)
+        return decay if self.config.parameter == "linear" else decay.exp()
 
     def _draw(self) -> tuple[View, list[float]]:
         """A view (each once per round, in random order) and the dial values it is rendered at."""
@@ -206,7 +212,8 @@ class _Run:
             if len(dials) > 1 and s == 1:
                 weight *= self.config.full_weight
             total = total + weight * (loss + self._paper_count(dialled, s))
-            pull += self.pressure.gradient(dialled, logits.detach(), s)
+            if self.law:
+                pull += self.law.gradient(dialled, logits.detach(), s)
             kept |= dialled.keep
             if s == dials[0]:
                 now = float(loss.detach())
@@ -220,6 +227,11 @@ class _Run:
         rows = self.all_rows if self.config.count_term == "paper" else kept
         self.optimizer.step({"opacity_logits": of_logits}, rows, rates)
         self.optimizer.step({self.decay: of_decay + pull}, self.all_rows, rates)
+        shift = self.law.correction(p["opacity_logits"], self.sigma()) if self.law else None
+        if shift is not None:
+            p[self.decay].copy_(
+                p[self.decay] + shift if self.config.parameter == "log" else p[self.decay] * shift.exp()
+            )
         p[self.decay].clamp_(*self.range)
 
     def _paper_count(self, dialled: Attenuated, s: float) -> Tensor | float:

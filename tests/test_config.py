@@ -19,8 +19,8 @@ ADAPT = BOTH | {
     "full_share": [-0.1, 1.1, math.nan], "exponent": [0.0, -1.5, math.inf, math.nan], "reg_weight": [-1.0, math.nan],
     "weight_slope": [-0.1, 1.1], "temperature": [0.0, math.nan], "ssim_weight": [-0.1, 1.1],
     "lr_final": [0.0, 1.1, math.nan], "full_weight": [-1.0, math.nan],
-    "count_gain": [-1.0, math.nan], "start": ["random"], "parameter": ["sqrt"], "sampling": ["normal"],
-    "count_term": ["none"],
+    "start": ["random"], "parameter": ["sqrt"], "sampling": ["normal"],
+    "count_term": ["none", "relative"],
     **{f"lr_{name}": [-1e-9, math.nan] for name in ("sigma", "means", "quats", "scales", "opacities", "sh0", "shN")},
 }  # fmt: skip
 ATTENUATION = BOTH | {"scene_distance": [0.0, -1.0, math.inf, math.nan]}
