@@ -16,10 +16,10 @@ from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.attenuation import SIGMA_MAX, Attenuated, attenuate, normalized_distances, soft_count
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
-from clod_adapter.counting import CountLaw
+from clod_adapter.counting import count_gradient
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.importance import spread, start, typical_distance
+from clod_adapter.importance import start
 from clod_adapter.losses import photometric_loss
 from clod_adapter.optimizer import RowAdam
 from clod_adapter.render import splat
@@ -76,8 +76,8 @@ def adapt(
 
     Each step draws a view, renders it at full detail and at one log-uniform dial value s in [1, max_sv], and
     minimises ``full_weight L_render(1) + L_render(s)``, L_render being ``losses.photometric_loss``, while
-    ``counting.CountLaw`` holds the share of Gaussians kept to its law by way of sigma_d. A base that already
-    has a sigma_d is continued from.
+    ``counting.count_gradient`` presses the share of Gaussians kept towards its law by way of sigma_d. A base that
+    already has a sigma_d is continued from.
 
     ``AdaptConfig.paper`` gives CLoD-GS's own objective instead (section 3.3): one s a step and
     ``w_s (L_render + reg_weight L_reg)`` with ``L_reg = (s - 1)^2 relu(eta - s^-exponent)^2``, eta the share kept,
@@ -134,10 +134,7 @@ class _Run:
         self.decay, self.range = ("sigma", SIGMA_RANGE) if linear else ("log_sigma", tuple(map(math.log, SIGMA_RANGE)))
         self.parameters[self.decay] = sigma if linear else sigma.log()
         self.optimizer = RowAdam(self.parameters)
-        # A range of one dial value asks for no law.
-        held = config.count_term == "law" and config.reg_weight > 0 and config.max_sv > 1
-        distances = typical_distance(start, spread(views), self.attenuation) if held else None
-        self.law = None if distances is None else CountLaw(config, self.attenuation, distances)
+        self.has_law = config.count_term == "law" and config.max_sv > 1  # a range of one dial value asks for none
         self.empty_bands: Tensor | None = None  # the base's whole shN, where what was left out of it comes back
         self.all_rows = torch.ones(len(start), dtype=torch.bool)
         self.rates = {
@@ -212,8 +209,10 @@ class _Run:
             if len(dials) > 1 and s == 1:
                 weight *= self.config.full_weight
             total = total + weight * (loss + self._paper_count(dialled, s))
-            if self.law:
-                pull += self.law.gradient(dialled, logits.detach(), s)
+            if self.has_law:
+                pull += count_gradient(
+                    dialled, logits.detach(), s, self.attenuation.tau, weight * float(loss.detach()), self.config
+                )
             kept |= dialled.keep
             if s == dials[0]:
                 now = float(loss.detach())
@@ -227,11 +226,6 @@ class _Run:
         rows = self.all_rows if self.config.count_term == "paper" else kept
         self.optimizer.step({"opacity_logits": of_logits}, rows, rates)
         self.optimizer.step({self.decay: of_decay + pull}, self.all_rows, rates)
-        shift = self.law.correction(p["opacity_logits"], self.sigma()) if self.law else None
-        if shift is not None:
-            p[self.decay].copy_(
-                p[self.decay] + shift if self.config.parameter == "log" else p[self.decay] * shift.exp()
-            )
         p[self.decay].clamp_(*self.range)
 
     def _paper_count(self, dialled: Attenuated, s: float) -> Tensor | float:
