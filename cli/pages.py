@@ -18,7 +18,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
 from clod_adapter.report.page import Picture
-from clod_adapter.report.tradeoff_page import write_tradeoff_report
+from clod_adapter.report.tradeoff_page import own_teacher, write_tradeoff_report
 from clod_adapter.train import Progress
 
 FRAMES = 13  # positions of the page's slider
@@ -104,7 +104,7 @@ def _write(
 ) -> dict[str, str]:
     try:
         with console.status(f"writing {path} ..."):
-            frames, others = pictures(model, base, scene.test)
+            frames, others = pictures(model, base, scene.test, own_teacher(report))
             written = write_tradeoff_report(path, jsonable(report), frames, others, jsonable(training))
     except KeyboardInterrupt:
         return _stopped(report, console)
@@ -120,15 +120,21 @@ def _stopped(report: dict[str, Any], console: Console) -> dict[str, str]:
 
 @torch.no_grad()
 def pictures(
-    model: Gaussians, base: Gaussians | None, views: Sequence[View]
+    model: Gaussians, base: Gaussians | None, views: Sequence[View], own: bool = False
 ) -> tuple[list[Picture], dict[str, Picture]]:
-    """The held-out view in the middle over the dial; and the photograph, and the base."""
+    """The held-out view in the middle over the dial; and the photograph, and the base.
+
+    Args:
+        own: the views are not photographs but the base's own pictures.
+    """
     if not views:
         return [], {}
     view = views[len(views) // 2]
-    others = {"photograph": Picture(view.image.numpy(), "photograph", "held out from training")}
-    if base is not None:
-        others["base"] = _rendered(base, view, 1.0, "base, unadapted")
+    if own:
+        others = {"base": Picture(view.image.numpy(), "base, unadapted", "its own picture, which errors are against")}
+    else:
+        others = {"photograph": Picture(view.image.numpy(), "photograph", "held out from training")}
+        others |= {"base": _rendered(base, view, 1.0, "base, unadapted")} if base is not None else {}
     widest = model.attenuation.max_sv if model.attenuation else 1.0
     dials = dict.fromkeys(float(f"{widest ** (k / (FRAMES - 1)):.2g}") for k in range(FRAMES))
     title = "s = {:g}" if model.sigma_d is not None else "the file"

@@ -14,11 +14,20 @@ from clod_adapter.report.series import Series, series_of
 READING = (
     "The dial s is set when rendering. At s = 1 the file is at its best; as s grows, Gaussians fade and leave, those "
     "that matter least first, so a frame takes less time. It is one file throughout: nothing is reloaded or swapped.",
-    "PSNR and SSIM are means over photographs that were held out: every 8th by name, never trained on. Higher is "
-    "better; 0.1 dB of PSNR is hardly seen, 1 dB is. The charts show the mean squared error that the mean PSNR stands "
-    "for.",
+    "PSNR and SSIM are means over {truth}, never trained on. Higher is better; 0.1 dB of PSNR is hardly seen, 1 dB is. "
+    "The charts show the mean squared error that the mean PSNR stands for.",
     "The time of a frame is the median over the held-out views, rendering alone, on the machine named below.",
 )
+PHOTOGRAPHS = "photographs that were held out: every 8th by name"
+OWN_PICTURES = (
+    "held-out views of cameras placed without photographs, against the checkpoint's own pictures: how well these are "
+    "kept, not how true they are"
+)
+
+
+def own_teacher(report: Mapping[str, Any]) -> bool:
+    """Whether the numbers are against the checkpoint's own pictures, for want of photographs."""
+    return report.get("teacher") == "checkpoint"
 
 
 def write_tradeoff_report(
@@ -33,37 +42,44 @@ def write_tradeoff_report(
     Args:
         report: what ``clod-adapt`` or ``clod-adapt eval`` prints with --json; see ``series_of`` for its rows.
         frames: one held-out view at dial values, ascending.
-        others: the same view otherwise: the photograph, the base; by the name it is to have.
+        others: the same view otherwise: the photograph where there are any, the base; by the name it is to have.
         training: ``curves`` and ``base_psnr`` as ``charts.training_chart`` has them, and the number of ``views``.
 
     Raises:
         ClodError: matplotlib is missing, or a file cannot be written.
     """
     path = Path(path)
-    series = series_of(report)
-    charts = {"rendering": rendering_chart(series)} if series else {}
+    series, own = series_of(report), own_teacher(report)
+    # Against its own pictures the base has only their rounding for an error, far below all that the charts are about.
+    drawn = [one for one in series if not (own and _is_base(one))]
+    charts = {"rendering": rendering_chart(drawn)} if drawn else {}
     if training:
-        charts["adapting"] = training_chart(training["curves"], training["base_psnr"])
+        charts["adapting"] = training_chart(training["curves"], None if own else training["base_psnr"])
     outputs = {name: path.with_name(f"{path.stem}_{name}.png") for name in charts}
     for name, draw in charts.items():
         write_png(outputs[name], draw)
     body = [page.paragraph(text, "lead") for text in _lead(report, series)]
-    body += [page.tiles(_tiles(series)), *_pictures(frames, others)]
-    if series:
+    body += [page.tiles(_tiles(drawn)), *_pictures(frames, others)]
+    if drawn:
         svg = inline_svg(charts["rendering"], "error against milliseconds a frame")
-        body.append(page.section("Error against the time of a frame", page.chart(svg, _rendering_caption(series))))
+        body.append(page.section("Error against the time of a frame", page.chart(svg, _rendering_caption(drawn))))
     if training:
-        svg = inline_svg(charts["adapting"], "error against seconds of adapting")
-        body.append(page.section("Error against the time of adapting", page.chart(svg, _training_caption(training))))
-    body += [_rows(series), page.section("How to read this", *map(page.paragraph, READING)), _settings(report)]
-    kicker = f"clod-adapter {report['version']}, {'adaptation' if training else 'evaluation'} report"
+        svg, caption = (
+            inline_svg(charts["adapting"], "error against seconds of adapting"),
+            _training_caption(training, own),
+        )
+        body.append(page.section("Error against the time of adapting", page.chart(svg, caption)))
+    reading = [text.format(truth=OWN_PICTURES if own else PHOTOGRAPHS) for text in READING]
+    body += [_rows(series), page.section("How to read this", *map(page.paragraph, reading)), _settings(report)]
+    kicker = f"clod-adapter {report['version']}, {'evaluation' if report['command'] == 'eval' else 'adaptation'} report"
     page.write_page(path, _title(report), kicker, body, {"report": report, "training": training})
     return {"page": path, **outputs}
 
 
-def _training_caption(training: Mapping[str, Any]) -> str:
+def _training_caption(training: Mapping[str, Any], own: bool) -> str:
+    seen = "placed views that were held out" if own else "held-out photographs"
     return (
-        f"One adaptation, looked at as it went, on {training['views']} held-out photographs. The state was copied at "
+        f"One adaptation, looked at as it went, on {training['views']} {seen}. The state was copied at "
         "points spaced evenly on this axis and measured after the end, so that measuring took no time from training. "
         "The clock includes the pass that finds the start."
     )
@@ -75,20 +91,22 @@ def _title(report: Mapping[str, Any]) -> str:
 
 def _lead(report: Mapping[str, Any], series: Sequence[Series]) -> list[str]:
     """What was run on what, and what came of it, in sentences."""
-    scene, count = Path(report["scene"]).resolve().name, report["base_count"]
+    own, count = own_teacher(report), report["base_count"]
+    scene = "" if own else Path(report["scene"]).resolve().name
     if report["command"] == "eval":
         first = f"{report['model']} holds {count:,} Gaussians. It was measured on held-out photographs of {scene}."
     else:
         seconds = report["seconds"].get("start", 0) + report["seconds"].get("train", 0)
+        seen = "its own pictures from placed cameras" if own else f"the photographs of {scene}"
         first = (
             f"{PurePath(report['model']).name}, a trained splat of {count:,} Gaussians, was given a quality dial: "
-            f"{report['steps']:,} steps on the photographs of {scene}, {seconds:.0f} seconds."
+            f"{report['steps']:,} steps on {seen}, {seconds:.0f} seconds."
         )
         first += " It was interrupted before its end." if report["interrupted"] else ""
     if not series:
         return [first, "Nothing was measured: " + " ".join(report["notes"])]
     rows = sorted(series[0].rows, key=lambda row: row.get("virtual_scale", 1))
-    base = next((one.rows[0] for one in series if one.label.startswith("base, ")), None)
+    base = next((one.rows[0] for one in series if _is_base(one)), None)
     if not series[0].dial or rows[0]["kept"] == rows[-1]["kept"]:
         return [first, f"It reaches {rows[0]['psnr']:.2f} dB at {rows[0]['frame_ms']:.1f} ms a frame."]
     best, last = rows[0], rows[-1]
@@ -97,15 +115,23 @@ def _lead(report: Mapping[str, Any], series: Sequence[Series]) -> list[str]:
         f"Gaussians, at {best['frame_ms']:.1f} ms a frame; at s = {last['virtual_scale']:g}, {last['psnr']:.2f} dB "
         f"with {last['kept_share']:.0%}, at {last['frame_ms']:.1f} ms."
     )
-    if base:
+    if base and own:
+        second += (
+            f" These are against the unadapted file's own pictures, of which a frame takes {base['frame_ms']:.1f} ms."
+        )
+    elif base:
         second += f" Unadapted it was {base['psnr']:.2f} dB at {base['frame_ms']:.1f} ms."
     return [first, second]
+
+
+def _is_base(series: Series) -> bool:
+    return series.label.startswith("base, ")
 
 
 def _tiles(series: Sequence[Series]) -> list[tuple[str, str, str]]:
     found = []
     for one in series:
-        if one.label.startswith("base, "):
+        if _is_base(one):
             found.append(("base, unadapted", f"{one.rows[0]['psnr']:.2f} dB", _beside(one.rows[0])))
     if series and series[0].dial:
         rows = sorted(series[0].rows, key=lambda row: row["virtual_scale"])
@@ -152,7 +178,8 @@ def _rows(series: Sequence[Series]) -> str:
 
 
 def _settings(report: Mapping[str, Any]) -> str:
-    flat = {"model": report["model"], "scene": report["scene"], "version": report["version"]}
+    scene = "none: its own pictures" if own_teacher(report) else report["scene"]
+    flat = {"model": report["model"], "scene": scene, "version": report["version"]}
     flat |= report["machine"] | {"device": report["device"]}
     flat |= {f"{name}, seconds": value for name, value in report["seconds"].items()}
     config = report.get("config") or report.get("attenuation") or {}

@@ -46,6 +46,22 @@ def test_adapt(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert text.count('data-name=""') == pages.FRAMES and text.count('data-name="base"') == 1
 
 
+def test_without_photographs_nothing_is_said_of_any(clod: Any, capture: Any, tmp_path: Path) -> None:
+    done = clod(capture.ply, *TINY, "--report", "--json")
+    assert done.code == 0, done
+    report, text = json.loads(done.out), (tmp_path / "dial.html").read_text(encoding="utf-8")
+    shown = re.sub(r"<script.*?</script>|<style.*?</style>|data:[^\"]*", "", text, flags=re.S)
+    assert report["scene"] is None and report["outputs"]["page"] == "dial.html"
+    assert "on its own pictures from placed cameras" in shown and "hold for base" in shown
+    before_the_notes = shown[: shown.index("What it was run with")]
+    assert re.findall(r"\S+ photograph", before_the_notes) == ["without photograph"]
+    assert text.count('data-name="photograph"') == 0 and text.count('data-name="base"') == 1
+    # The base, whose only error is the rounding, is a row and not a line or a point of the charts: the name stands
+    # with its two pictures, twice each, and in the table.
+    assert shown.count("base, unadapted") == 5
+    assert stored(tmp_path / "dial.html")["training"]["base_psnr"] > 50
+
+
 @pytest.mark.parametrize("lr", [0.0, 1e-3])
 def test_snapshots_do_not_change_with_the_training(lr: float) -> None:
     """A copy is what was there at the time, the higher bands included where they are trained."""
