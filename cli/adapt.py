@@ -77,9 +77,12 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         "notes": [*base.notes, *scene.notes, *notes], "seconds": watch.report(),
         "calibration": adapter.calibration and adapter.calibration.as_dict(), **outputs.sizes(),
     }  # fmt: skip
-    if page and not cut_short:
-        report["outputs"] |= page.write(outputs.ply.with_suffix(".html"), report, result, adapted.start_seconds)
     write_report(outputs.report, report)
+    if page and not cut_short:  # after the report, which no failure of the page is to cost
+        with watch.time("page"):
+            written = page.write(outputs.ply.with_suffix(".html"), report, result, adapted.start_seconds)
+        report |= {"outputs": report["outputs"] | written, "seconds": watch.report()}
+        write_report(outputs.report, report)
     print_summary(outputs, table(rows, base_rows, plain) if rows else "", args, watch)
     return report
 

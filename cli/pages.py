@@ -13,6 +13,7 @@ from clod_adapter.cameras import Scene, View
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.report import jsonable
 from clod_adapter.config import AdaptConfig
+from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.metrics import psnr
@@ -23,6 +24,7 @@ from clod_adapter.train import Progress
 
 FRAMES = 13  # positions of the page's slider
 SNAPSHOTS = tuple(2.0**-k for k in range(6, 0, -1))  # shares of the training at which its state is copied
+INTERRUPTED = "the page was interrupted and not written"
 SNAPSHOT_VIEWS = 12  # held-out views that these are measured on, at most
 
 
@@ -69,11 +71,11 @@ class AdaptPage:
         return state.replace(**changing)
 
     def write(self, path: Path, report: dict[str, Any], result: Gaussians, start_seconds: float) -> dict[str, str]:
-        """Writes the page; returns its files, none where Ctrl-C stopped it."""
+        """Writes the page; returns its files, none, and a note in the report, where Ctrl-C or the disk stopped it."""
         try:
             training = self._training(result, start_seconds) if self.scene.test and self.snapshots else None
         except KeyboardInterrupt:
-            return _stopped(report, self.console)
+            return _without(report, self.console, INTERRUPTED)
         return _write(path, report, result, self.base, self.scene, self.console, training)
 
     def _training(self, result: Gaussians, start_seconds: float) -> dict[str, Any]:
@@ -107,14 +109,17 @@ def _write(
             frames, others = pictures(model, base, scene.test, own_teacher(report))
             written = write_tradeoff_report(path, jsonable(report), frames, others, jsonable(training))
     except KeyboardInterrupt:
-        return _stopped(report, console)
+        return _without(report, console, INTERRUPTED)
+    except ClodError as error:
+        return _without(report, console, f"there is no page: {error}")
     console.say(f"wrote {path}: open it in a browser")
     return {name: str(file) for name, file in written.items()}
 
 
-def _stopped(report: dict[str, Any], console: Console) -> dict[str, str]:
-    report["notes"].append("the page was interrupted and not written")
-    console.say(report["notes"][-1])
+def _without(report: dict[str, Any], console: Console, why: str) -> dict[str, str]:
+    """No files, and a note: what was measured is worth reporting without its page."""
+    report["notes"].append(why)
+    console.say(why)
     return {}
 
 

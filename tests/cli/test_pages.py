@@ -13,6 +13,7 @@ import pytest
 
 from clod_adapter.cli import pages
 from clod_adapter.config import AdaptConfig
+from clod_adapter.errors import ClodError
 
 pytest.importorskip("matplotlib")
 TINY = ("--iters", 16, "--max-sv", 4, "--out", "dial.ply")
@@ -105,6 +106,25 @@ def test_ctrl_c_while_the_page_is_made_loses_nothing_else(
     report = json.loads(done.out)
     assert done.code == 0 and report["rows"] and "the page was interrupted and not written" in report["notes"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["dial.json", "dial.ply", "dial.safetensors"]
+
+
+@pytest.mark.parametrize("command", ["adapt", "eval"])
+def test_a_page_that_fails_costs_no_measured_rows(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    def full(*_: Any) -> Any:
+        if command == "adapt":  # its report is there already, whatever happens now
+            assert json.loads((tmp_path / "dial.json").read_text())["rows"]
+        raise ClodError("page.html: cannot be written (No space left on device)")
+
+    monkeypatch.setattr(pages, "write_tradeoff_report", full)
+    words = (*TINY, "--report") if command == "adapt" else ("--sv", 1, "--report", "page.html")
+    done = clod(*(["eval"] if command == "eval" else []), capture.ply, "--images", capture.scene, *words, "--json")
+    report = json.loads(done.out)
+    assert done.code == 0 and report["rows"] and "page" not in report.get("outputs", {})
+    assert any("No space left" in note and note in done.err for note in report["notes"])
+    if command == "adapt":
+        assert report == json.loads((tmp_path / "dial.json").read_text()) and report["seconds"]["page"] > 0
 
 
 def test_refused_before_anything_is_done(
