@@ -48,7 +48,8 @@ class Attenuated(NamedTuple):
         opacities: ``[N]`` a'', in [0, 1].
         log_opacities: ``[N]`` log a'', in [-inf, 0]; meaningful where a'' underflows.
         keep: ``[N]`` bool, ``log a'' > log(tau s)``.
-        drawn: ``[N]`` what a rasterizer is given, in [0, 1]: a'' after the cut, 0 for those that leave.
+        drawn: ``[N]`` what a rasterizer is given, in [0, 1]: a'' after the cut, above 0 for those kept and for no
+            others.
     """
 
     opacities: Tensor
@@ -147,11 +148,13 @@ def attenuate(
     opacity_logits, sigma_d, d = _common(opacity_logits=opacity_logits, sigma_d=sigma_d, d=d)
     factor = log_attenuation(sigma_d, d, virtual_scale, config.eps)
     opacities, log_opacities = _Attenuate.apply(opacity_logits, factor)
-    keep = log_opacities.detach() > _log_threshold(config.tau, virtual_scale)
+    threshold = _log_threshold(config.tau, virtual_scale)
+    keep = log_opacities.detach() > threshold
     if config.cut == "hard":
         drawn = torch.where(keep, opacities, 0)
-    else:
-        drawn = opacities * (opacities * (2 / (config.tau * virtual_scale)) - 2).clamp(0, 1)
+    else:  # from the same difference as keep, so that who is kept is drawn; clamped first, as infinity has no slope
+        excess = (log_opacities - threshold).clamp(max=1)
+        drawn = opacities * (2 * excess.expm1()).clamp(0, 1)
     return Attenuated(opacities, log_opacities, keep, drawn)
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from clod_adapter.attenuation import (
     SIGMA_MAX,
     attenuate,
+    count_slope,
     extinction_scale,
     log_attenuation,
     normalized_distances,
@@ -199,6 +200,82 @@ def test_gradcheck() -> None:
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("scale", SCALES[:3])
+def test_what_the_soft_cut_draws_matches_mpmath(dtype: torch.dtype, scale: float) -> None:
+    tau = 0.02
+    columns = grid([-3.7, -3.1, -1.6, *LOGITS], [*SIGMAS, 0.2, 0.6], [*DISTANCES, 0.15])
+    logits, sigma, d = (t.to(dtype) for t in columns)
+    logits.requires_grad_()
+    sigma.requires_grad_()
+    out = attenuate(logits, sigma, d, scale, config(tau, cut="soft"))
+    by_logit, by_sigma = torch.autograd.grad(out.drawn.sum(), (logits, sigma))
+    want, floors, slopes, transparency = [], [], [], []
+    for a, b, c in zip(*(x.tolist() for x in columns), strict=True):
+        factor = reference(b, c, scale, 1e-8)
+        log = log_opacity(a) + factor.log_factor
+        ratio = mpmath.exp(log) / (mpmath.mpf(tau) * scale)
+        want.append(mpmath.exp(log) * min(max(2 * (ratio - 1), ZERO), 1))
+        # By log a'', where there is a slope: below 1.5 tau s the fade's own part is added to that of a''.
+        inside = 1 < ratio < 1.5
+        slopes.append((factor.slope, mpmath.exp(log) * (4 * ratio - 2 if inside else ratio >= 1.5)))
+        transparency.append(ZERO if a == math.inf else 1 / (1 + mpmath.exp(mpmath.mpf(a))))
+        # The threshold's distance is a difference of logarithms, whose rounding the fade triples.
+        floors.append(float(mpmath.exp(log)) * 4 * (8 + float(min(abs(log), 1e4))) * torch.finfo(dtype).eps)
+    assert_close(out.drawn.detach(), want, 8, floors)
+    gained = [2 * floor for floor in floors]
+    assert_close(by_logit, [s * t for (_, s), t in zip(slopes, transparency, strict=True)], 12, gained)
+    by_slope = [f * float(k) for f, (k, _) in zip(gained, slopes, strict=True)]
+    assert_close(by_sigma, [k * s for k, s in slopes], 20, by_slope)
+    assert any(0 < g < 1 for g in (out.drawn / out.opacities).nan_to_num().tolist())
+
+
+@pytest.mark.parametrize("cut", ["hard", "soft"])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_what_is_kept_is_what_is_drawn(dtype: torch.dtype, cut: str) -> None:
+    """Of Gaussians that stand at the threshold, to rounding."""
+    generator = torch.Generator().manual_seed(0)
+    logits, d = (torch.rand(20_000, generator=generator, dtype=dtype) for _ in range(2))
+    for s in (1.0, 1.7, 3.3, 5.0):
+        chosen = config(0.02, cut=cut)
+        at = (8 * logits - 2, sigma_for_extinction(8 * logits - 2, d, torch.full_like(d, s), chosen), d)
+        out = attenuate(*at, s, chosen)
+        assert 0.1 < out.keep.float().mean() < 0.9
+        assert torch.equal(out.drawn > 0, out.keep)
+
+
+def test_gradcheck_of_the_soft_cut() -> None:
+    """Of Gaussians that fade; and finite gradients of those far above and below the cut, 0 of those that have left."""
+    chosen = config(0.02, 1e-8, cut="soft")
+    d = torch.linspace(0.2, 1, 9, dtype=torch.float64)
+    logits = torch.linspace(-1, 5, 9, dtype=torch.float64).requires_grad_()
+    share = torch.linspace(1.05, 1.45, 9, dtype=torch.float64)  # a'' / (tau s)
+    sigma = (d * 2.5 / (2 * (logits.detach().sigmoid() / (share * 0.02 * 2.5)).log()).sqrt()).requires_grad_()
+    faded = attenuate(logits, sigma, d, 2.5, chosen)
+    assert ((faded.drawn / faded.opacities - 2 * (share - 1)).abs() < 1e-6).all()
+    assert torch.autograd.gradcheck(lambda a, b: attenuate(a, b, d, 2.5, chosen).drawn, (logits, sigma))
+    edge = torch.tensor([-math.inf, -math.inf, math.inf, 9.0, -9.0, 2.0], dtype=torch.float64).requires_grad_()
+    wide = torch.tensor([1.0, 0.0, SIGMA_MAX, 1e9, 1.0, 1e-9], dtype=torch.float64).requires_grad_()
+    out = attenuate(edge, wide, torch.ones(6, dtype=torch.float64), 2.5, chosen)
+    slopes = torch.autograd.grad(out.drawn.sum(), (edge, wide))
+    assert all(slope.isfinite().all() for slope in slopes)
+    assert all((slope[[0, 1, 4, 5]] == 0).all() for slope in slopes) and slopes[0][3] > 0
+
+
+def test_the_soft_cut_is_continuous() -> None:
+    """The largest step of a sweep halves with its length; that of the hard cut stays tau s."""
+    d = torch.linspace(0.2, 1, 40, dtype=torch.float64)
+    logits, sigma = torch.linspace(-3, 6, 40, dtype=torch.float64), torch.linspace(0.3, 2, 40, dtype=torch.float64)
+
+    def largest(cut: str, steps: int) -> float:
+        dials = [1 + 9 * k / steps for k in range(steps + 1)]
+        drawn = torch.stack([attenuate(logits, sigma, d, s, config(0.02, cut=cut)).drawn for s in dials])
+        return float(drawn.diff(dim=0).abs().max())
+
+    assert largest("soft", 4000) < 0.55 * largest("soft", 2000)
+    assert largest("hard", 4000) > 0.02
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
 def test_identity_is_bit_exact(dtype: torch.dtype) -> None:
     logits = torch.cat([torch.linspace(-120, 60, 4001), torch.tensor([math.inf, -math.inf])]).to(dtype)
     d = torch.linspace(0, 1.5, len(logits)).to(dtype)
@@ -324,6 +401,25 @@ def test_soft_count_is_hard_forward_and_soft_backward() -> None:
     torch.testing.assert_close(grad[1:], want[1:])
     assert grad[0] == 0
     assert soft_count(torch.empty(0), scale, tau, temperature).item() == 0
+
+
+def test_count_slope_is_that_of_the_soft_count() -> None:
+    """Where 2 u > 1; below that it is as if 2 u were 1, so that who is not touched yet can be."""
+    tau, s, temperature = 0.02, 2.0, 0.5
+    logits = torch.linspace(-5, 5, 200, dtype=torch.float64)
+    d, log_sigma = torch.linspace(0.1, 1, 200, dtype=torch.float64), torch.linspace(-1, 2, 200, dtype=torch.float64)
+    log_sigma = log_sigma[torch.randperm(200, generator=torch.Generator().manual_seed(0))].requires_grad_()
+    out = attenuate(logits, log_sigma.exp(), d, s, config(tau, 0.0))
+    (want,) = torch.autograd.grad(soft_count(out.log_opacities, s, tau, temperature), log_sigma)
+    logs = out.log_opacities.detach()
+    got = count_slope(logits, logs, s, tau, temperature)
+    touched = 2 * (torch.nn.functional.logsigmoid(logits) - logs)
+    assert 20 < int((touched > 1).sum()) < 180
+    torch.testing.assert_close(got[touched > 1], want[touched > 1])
+    q = torch.sigmoid((logs - math.log(tau * s)) / temperature)
+    torch.testing.assert_close(got[touched <= 1], (q * (1 - q) / (temperature * 200))[touched <= 1])
+    gone = count_slope(torch.zeros(2), torch.tensor([-math.inf, -1e30]), s, tau, temperature)
+    assert gone.tolist() == [0, 0]
 
 
 def looking_down_z(fx: float = 100.0) -> Camera:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import attenuate
+from clod_adapter.attenuation import attenuate, sigma_for_extinction
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.export import bake
@@ -17,33 +18,50 @@ from clod_adapter.render import render
 from scenes import camera, gaussians
 
 CONFIG = AttenuationConfig(scene_distance=4.0)
+CUTS = pytest.mark.parametrize("cut", ["hard", "soft"])
 
 
-def sphere(n: int = 200) -> Gaussians:
+def sphere(n: int = 200, cut: str = "hard") -> Gaussians:
     """All at the reference distance from ``camera()``, the only place for which a bake is exact."""
     some, eye = gaussians(n, 1, 5), camera().position
     away = some.means - eye
     sigma = torch.rand(n, generator=torch.Generator().manual_seed(1)) * 2 + 0.1
-    return attach(some.replace(means=eye + 4.0 * away / away.norm(dim=1, keepdim=True)), sigma, CONFIG)
+    return attach(
+        some.replace(means=eye + 4.0 * away / away.norm(dim=1, keepdim=True)), sigma, replace(CONFIG, cut=cut)
+    )
 
 
+@CUTS
 @pytest.mark.parametrize("s", [1.0, 2.0, 4.5])
-def test_the_same_picture_at_the_reference_distance(s: float) -> None:
-    some = sphere()
+def test_the_same_picture_at_the_reference_distance(s: float, cut: str) -> None:
+    some = sphere(cut=cut)
     want, baked = render(some, camera(), s), bake(some, s)
     assert baked.sigma_d is None and baked.attenuation is None and 0 < len(baked) < 200
     assert len(baked) == want.kept.sum()
     torch.testing.assert_close(render(baked, camera()).image, want.image, atol=2e-5, rtol=0)
 
 
-def test_opacities_are_the_attenuated_ones() -> None:
-    logits = torch.tensor([-3.0, 0, 8, 30, math.inf, math.inf])
-    sigma = torch.tensor([2.0, 2, 2, 2, 2, 1e9])
-    some = attach(gaussians(6, 0, 0).replace(opacity_logits=logits), sigma, CONFIG)
-    want = attenuate(logits, sigma, torch.ones(6), 2.0, CONFIG)
+@CUTS
+def test_opacities_are_those_drawn(cut: str) -> None:
+    config = replace(CONFIG, cut=cut)
+    logits = torch.tensor([-3.0, 0, 8, 30, math.inf, math.inf, 2.0])
+    sigma = torch.tensor([2.0, 2, 2, 2, 2, 1e9, 0.6765])  # the last between tau s and 1.5 tau s
+    some = attach(gaussians(7, 0, 0).replace(opacity_logits=logits), sigma, config)
+    want = attenuate(logits, sigma, torch.ones(7), 2.0, config)
     baked = bake(some, 2.0)
-    assert len(baked) == 6 and baked.opacity_logits.isfinite().all()
-    torch.testing.assert_close(baked.opacities, want.opacities, atol=1e-7, rtol=2e-6)
+    assert len(baked) == 7 and baked.opacity_logits.isfinite().all()
+    torch.testing.assert_close(baked.opacities, want.drawn, atol=1e-7, rtol=2e-6)
+    assert (want.drawn[-1] < 0.9 * want.opacities[-1]) == (cut == "soft")
+
+
+@CUTS
+def test_a_gaussian_at_the_threshold_has_an_opacity_that_a_file_can_hold(cut: str) -> None:
+    config = AttenuationConfig(tau=0.02, cut=cut)
+    logits, ones = torch.linspace(-2, 6, 5000), torch.ones(5000)
+    for s in (1.0, 1.7, 3.3):
+        sigma = sigma_for_extinction(logits, ones, s * ones, config)
+        baked = bake(attach(gaussians(5000, 0, 0).replace(opacity_logits=logits), sigma, config), s)
+        assert 0 < len(baked) < 5000 and baked.opacity_logits.isfinite().all()
 
 
 def test_a_dial_that_does_nothing_changes_nothing() -> None:
