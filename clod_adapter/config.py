@@ -85,18 +85,18 @@ class AdaptConfig:
     exponent: float = option(1.5, "the count law: the share to keep at s is s^-exponent")
     count_term: str = option("law", "what moves the count: law (both ways, by sigma_d alone) or paper (its L_reg)")
     reg_weight: float = option(0.5, "weight of the count term (the paper's lambda_reg)")
-    price: float = option(0.07, "what being kept costs at any count (count_term law)")
+    price: float = option(0.03, "what being kept costs at any count (count_term law)")
     weight_slope: float = option(
         0.0, "k of w_s = (1 - k s/max_sv)^2; the paper has 0.5, 0 weighs all dial values alike"
     )
     temperature: float = option(0.5, "width of the straight-through count's sigmoid, in log opacity")
     ssim_weight: float = option(0.2, "weight of 1 - SSIM against L1")
     lr_sigma: float = option(0.1, "step size of log sigma_d: its largest relative change a step")
-    lr_means: float = option(4e-4, "step size of means, times the cameras' extent")
-    lr_quats: float = option(1.6e-3, "step size of quats")
-    lr_scales: float = option(1.4e-2, "step size of log_scales")
+    lr_means: float = option(2.6e-4, "step size of means, times the cameras' extent")
+    lr_quats: float = option(8e-4, "step size of quats")
+    lr_scales: float = option(8e-3, "step size of log_scales")
     lr_opacities: float = option(5e-2, "step size of opacity_logits")
-    lr_sh0: float = option(3e-3, "step size of sh0")
+    lr_sh0: float = option(2e-3, "step size of sh0")
     lr_shN: float = option(0.0, "step size of shN; 0 leaves the higher bands as they are: measured at 0.01 dB")
     lr_final: float = option(0.05, "step sizes fall exponentially to this share of their start")
 
