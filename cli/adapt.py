@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     with watch.time("evaluate"):
         rows, plain, cut_short = ([], [], True) if skip else measure_result(result, scene, config, console)
         if rows and not cut_short:
-            adapter = store_calibration(base, adapter, result, rows, scene, outputs, console)
+            adapter = store_calibration(base, adapter, result, rows, scene, report["teacher"], outputs, console)
     if cut_short:
         notes.append("the measurements were interrupted: only the dial values that were finished are reported")
         console.say(notes[-1])
@@ -164,8 +164,8 @@ def write(base: Checkpoint, adapter: Adapter, result: Gaussians, outputs: Output
 
 
 def store_calibration(
-    base: Checkpoint, adapter: Adapter, result: Gaussians, rows: Sequence[Row], scene: Scene, outputs: Outputs,
-    console: Console,
+    base: Checkpoint, adapter: Adapter, result: Gaussians, rows: Sequence[Row], scene: Scene, against: str,
+    outputs: Outputs, console: Console,
 ) -> Adapter:  # fmt: skip
     """The adapter with the calibration that ``rows`` are; adapter and PLY are written again with it.
 
@@ -174,7 +174,7 @@ def store_calibration(
     Where they cannot be written, or a PSNR is infinite, the earlier ones stay, and the console says so.
     """
     try:
-        calibrated = replace(adapter, calibration=calibrate(rows, len(result), scene.test))
+        calibrated = replace(adapter, calibration=calibrate(rows, len(result), scene.test, against))
         with GracefulStop().listening(), atomic_path(outputs.adapter) as small, atomic_path(outputs.ply) as large:
             save_adapter(small, calibrated)
             save(large, result, base, version=adapter.version, calibration=calibrated.calibration)

@@ -34,6 +34,11 @@ def solve_dials(
     stored = model.calibration
     if stored is None and times is None and name != "keep":  # what the header has, the reader has found unusable
         raise ClodError(f"{model.path}: {option}: {model.notes[-1]}; adapt it again, or give --sv or --keep")
+    if name == "psnr_drop" and stored is not None and stored.against == "checkpoint":
+        notes.append(
+            "--psnr-drop goes by the calibration, which no photographs were there for: it is against the checkpoint's "
+            "own pictures"
+        )
     origin = ""
     if name == "fps" and stored is not None and times is None:
         origin = f" (frame times of {stored.machine} at {stored.width}x{stored.height})"
@@ -64,7 +69,7 @@ def time_frames(
     return times, [f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}"]
 
 
-def calibrate(rows: Sequence[Row], total: int, views: Sequence[View]) -> Calibration:
+def calibrate(rows: Sequence[Row], total: int, views: Sequence[View], against: str) -> Calibration:
     """The table of the rows just measured on this machine; a ClodError where a PSNR is infinite."""
     size = (views[0].camera.width, views[0].camera.height)
-    return Calibration.of(rows, total=total, views=len(views), size=size, machine=machine_name())
+    return Calibration.of(rows, total=total, views=len(views), size=size, machine=machine_name(), against=against)

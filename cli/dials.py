@@ -22,7 +22,8 @@ budgets, each solved to the dial value that just keeps within it:
   --keep       exact, from the dial values at which Gaussians leave; s = 1 keeps
                fewer than the file has
   --psnr-drop  read off the calibration in the file's header, measured by
-               clod-adapt on its held-out photographs
+               clod-adapt on its held-out photographs; where it had none,
+               against the checkpoint's own pictures, as a note then says
   --fps        some frames are timed first, here and now: times depend on the
                machine, the size of the pictures, and what else is running
 A count or frame rate that s = 1 meets gives s = 1 and a note, and a drop larger

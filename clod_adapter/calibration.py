@@ -13,6 +13,8 @@ from typing import Any, Protocol
 
 from clod_adapter.errors import ClodError
 
+AGAINST = ("photographs", "checkpoint")
+
 
 class Measured(Protocol):
     """What a table takes of a row of ``evaluate``."""
@@ -36,7 +38,7 @@ class CalibrationRow:
     Attributes:
         virtual_scale: the dial s.
         kept: Gaussians the dial leaves in.
-        psnr: dB; ssim: in [-1, 1]; both against the photographs.
+        psnr: dB; ssim: in [-1, 1]; both against what ``Calibration.against`` says.
         frame_ms: median time of a frame, milliseconds.
     """
 
@@ -57,9 +59,12 @@ class Calibration:
         views: held-out views that the rows are means over.
         width, height: of the pictures, pixels.
         machine: what the frame times were taken on: one line of printable ASCII.
+        against: what PSNR and SSIM are against: ``photographs``, or, where there were none, the ``checkpoint``'s own
+            pictures.
 
     Raises:
-        ClodError: no rows, dial values that do not ascend from 1, a value that is not finite, or an unusable machine.
+        ClodError: no rows, dial values that do not ascend from 1, a value that is not finite, an unusable machine, or
+            another ``against``.
     """
 
     rows: tuple[CalibrationRow, ...]
@@ -68,6 +73,7 @@ class Calibration:
     width: int
     height: int
     machine: str
+    against: str = "photographs"
 
     def __post_init__(self) -> None:
         dials = [row.virtual_scale for row in self.rows]
@@ -79,22 +85,32 @@ class Calibration:
             raise ClodError("calibration has a count, size or frame time that is not positive")
         if not self.machine or not self.machine.isascii() or self.machine != _plain(self.machine):
             raise ClodError(f"calibration has the machine {self.machine!r}, it must be one line of printable ASCII")
+        if self.against not in AGAINST:
+            raise ClodError(f"calibration is against {self.against!r}, it must be one of {', '.join(AGAINST)}")
 
     @classmethod
     def of(
-        cls, rows: Iterable[Measured], *, total: int, views: int, size: tuple[int, int], machine: str
+        cls,
+        rows: Iterable[Measured],
+        *,
+        total: int,
+        views: int,
+        size: tuple[int, int],
+        machine: str,
+        against: str = "photographs",
     ) -> Calibration:
         """The table of an evaluation's rows, in any order, for pictures of ``size`` (width, height).
 
         Raises:
-            ClodError: no row at s = 1, or a value that is not finite (the PSNR of a picture equal to its photograph).
+            ClodError: no row at s = 1, or a value that is not finite (the PSNR of equal pictures).
         """
         found = {
             r.virtual_scale: CalibrationRow(*map(float, (r.virtual_scale, r.kept, r.psnr, r.ssim, r.frame_ms)))
             for r in rows
         }
         ascending = tuple(found[s] for s in sorted(found))
-        return cls(ascending, total, views, *size, _plain(machine.encode("ascii", "replace").decode()) or "unknown")
+        name = _plain(machine.encode("ascii", "replace").decode()) or "unknown"
+        return cls(ascending, total, views, *size, name, against)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Calibration:
@@ -105,7 +121,8 @@ class Calibration:
         """
         rows = tuple(CalibrationRow(**{name: float(value) for name, value in row.items()}) for row in values["rows"])
         counts = {name: int(values[name]) for name in ("total", "views", "width", "height")}
-        return cls(rows, machine=str(values["machine"]), **counts)
+        against = str(values.get("against", AGAINST[0]))  # files that do not say are of before there was another
+        return cls(rows, machine=str(values["machine"]), against=against, **counts)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain JSON."""

@@ -30,9 +30,9 @@ rows = st.lists(
 @st.composite
 def tables(draw: st.DrawFn, total: int = 4) -> Calibration:
     found = {values[0]: values for values in [(1.0, *draw(st.tuples(number, number, number)), 2.5), *draw(rows)]}
-    machine = draw(st.text(min_size=1, max_size=40))
+    machine, against = draw(st.text(min_size=1, max_size=40)), draw(st.sampled_from(["photographs", "checkpoint"]))
     some = [Row(s, psnr, ssim, kept, 0.5, 1.0, ms) for s, kept, psnr, ssim, ms in found.values()]
-    return Calibration.of(some, total=total, views=13, size=(640, 480), machine=machine)
+    return Calibration.of(some, total=total, views=13, size=(640, 480), machine=machine, against=against)
 
 
 @settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -70,6 +70,7 @@ GOOD: dict[str, Any] = {"rows": (ROW,), "total": 10, "views": 1, "width": 8, "he
         ({"rows": (CalibrationRow(1.0, 1.0, float("inf"), 1.0, 1.0),)}, "not finite"),
         ({"rows": (CalibrationRow(1.0, 1.0, 1.0, 1.0, 0.0),)}, "not positive"),
         ({"total": 0}, "not positive"),
+        ({"against": "thin air"}, "against 'thin air', it must be one of photographs, checkpoint"),
         ({"machine": ""}, "machine"),
         ({"machine": "two  spaces"}, "machine"),
         ({"machine": "caf\u00e9"}, "machine"),
@@ -95,6 +96,8 @@ def edited(path: Path, old: bytes, new: bytes) -> Path:
         (b"calibrated 1.0", b"calibrated 3.0", "unusable and ignored.*ascend"),
         (b"calibrated_with 4 1 8 8", b"calibrated_with 4 1 8", "unusable and ignored"),
         (b"calibrated_with", b"calibrated_what", "unusable and ignored"),
+        (b"8 photographs", b"8 paintings", "unusable and ignored.*against 'paintings'"),
+        (b"8 photographs", b"8 photographs 9", "unusable and ignored"),
         (b"calibrated_with 4", b"calibrated_with 5", "of 5 Gaussians and ignored, these are 4"),
     ],
 )
@@ -104,6 +107,14 @@ def test_a_damaged_table_does_not_cost_the_file(tmp_path: Path, old: bytes, new:
     loaded = load(edited(path, old, new))
     assert loaded.calibration is None and loaded.gaussians.sigma_d is not None
     assert any(re.search(said, note) for note in loaded.notes), loaded.notes
+
+
+def test_what_does_not_say_is_against_photographs(tmp_path: Path) -> None:
+    path, calibration = tmp_path / "a.ply", Calibration(**{**GOOD, "total": 4})
+    save(path, attach(gaussians(4, 0, 0), torch.ones(4)), calibration=calibration)
+    assert load(edited(path, b" 8 photographs", b" 8")).calibration == calibration
+    about = calibration.as_dict()
+    assert about.pop("against") == "photographs" and Calibration.from_dict(about) == calibration
 
 
 def test_a_damaged_adapter_is_named(tmp_path: Path) -> None:

@@ -11,13 +11,14 @@ from typing import Any
 
 from plyfile import PlyData
 
-from clod_adapter.calibration import Calibration, CalibrationRow
+from clod_adapter.calibration import AGAINST, Calibration, CalibrationRow
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.version import package_version
 
 PREFIX = "clod_adapter "
-# Comments about the calibration: the machine; total, views, width and height; and the rows, one comment each.
+# Comments about the calibration: the machine; total, views, width, height and what it is against; and the rows, one
+# comment each.
 MACHINE, EXTENT, ROW = "calibrated_on", "calibrated_with", "calibrated"
 _HEADER_LIMIT = 1 << 20  # bytes; a longer header is no header
 
@@ -76,7 +77,7 @@ def write_comments(
     if calibration is not None:
         c = calibration
         comments.append(f"{PREFIX}{MACHINE} {c.machine}")
-        comments.append(f"{PREFIX}{EXTENT} {c.total} {c.views} {c.width} {c.height}")
+        comments.append(f"{PREFIX}{EXTENT} {c.total} {c.views} {c.width} {c.height} {c.against}")
         comments += [f"{PREFIX}{ROW} {' '.join(map(repr, astuple(row)))}" for row in c.rows]
     return comments
 
@@ -94,9 +95,10 @@ def read_calibration(comments: Iterable[str], total: int) -> tuple[Calibration |
         return None, []
     try:
         (machine,), (extent,) = found[MACHINE], found[EXTENT]
-        counts = dict(zip(("total", "views", "width", "height"), map(int, extent), strict=True))
+        counts = dict(zip(("total", "views", "width", "height"), map(int, extent[:4]), strict=True))
         rows = tuple(CalibrationRow(*map(float, row)) for row in found[ROW])
-        calibration = Calibration(rows, **counts, machine=" ".join(machine))
+        against = " ".join(extent[4:]) or AGAINST[0]  # files that do not say are of before there was another
+        calibration = Calibration(rows, **counts, machine=" ".join(machine), against=against)
     except (TypeError, ValueError, ClodError) as error:
         return None, [f"the calibration in the header is unusable and ignored ({error})"]
     if calibration.total != total:

@@ -321,9 +321,12 @@ def test_without_photographs(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert "held-out photographs" not in done.err and "other coordinates" not in done.err
     assert re.search(r"where there are any:\n  clod-adapt eval dial.ply --images DIR --sv 1 4$", done.err, re.M)
     # The teacher is the base itself, but for the rounding to bytes.
-    assert report["base_rows"][0]["psnr"] > 50 > report["rows"][-1]["psnr"] and len(report["rows"]) == 5
+    assert report["base_rows"][0]["psnr"] > 50 > report["rows"][-1]["psnr"] and len(report["rows"]) == 7
     assert clod("apply", capture.ply, "dial.safetensors", "-o", "same.ply").code == 0
     assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
+    assert report["calibration"]["against"] == "checkpoint"
+    (note, _) = json.loads(clod("bake", "dial.ply", "--psnr-drop", 1, "-o", "plain.ply", "--json").out)["notes"]
+    assert "against the checkpoint's own pictures" in note
     photographs = json.loads(clod("eval", "dial.ply", "--images", capture.scene, "--sv", 1, 4, "--json").out)["rows"]
     assert photographs[0]["psnr"] > 20 and photographs[0]["psnr"] > photographs[1]["psnr"]
 

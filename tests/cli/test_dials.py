@@ -24,6 +24,11 @@ def stored(path: Path) -> clod_adapter.Calibration:
     return calibration
 
 
+def notes_of(report: Any) -> list[str]:
+    """Without the one on LPIPS and FLIP, which depends on what is installed."""
+    return [note for note in report["notes"] if not note.startswith("without ")]
+
+
 def with_times(source: Path, path: Path, **changes: Any) -> Path:
     """The same file with frame times of 8/s ms, taken as ``changes`` say."""
     model, table = load(source), stored(source)
