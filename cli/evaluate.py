@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         "notes": [*model.notes, *scene.notes, *notes, *instruments.notes], "machine": machine(),
         "device": str(model.gaussians.means.device), "seconds": watch.report(),
     }  # fmt: skip
-    return report | write_eval_page(args, report, model.gaussians, scene, console)
+    return report | write_eval_page(args, report, model.gaussians, base, scene, console)
 
 
 def choose_dials(given: list[float] | None, attenuation: AttenuationConfig | None) -> tuple[list[float], list[str]]:

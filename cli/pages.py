@@ -32,9 +32,9 @@ def write_eval_page(
     args: argparse.Namespace,
     report: dict[str, Any],
     model: Gaussians,
+    base: Gaussians | None,
     scene: Scene,
     console: Console,
-    base: Gaussians | None = None,
 ) -> dict[str, Any]:
     """The page where ``--report`` asks for it, with a picture of the base where there is one; adds to the report."""
     if not args.report:

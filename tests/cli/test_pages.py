@@ -90,6 +90,10 @@ def test_eval(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert done.code == 0 and report["outputs"] == {"page": "look.html", "rendering": "look_rendering.png"}, done
     page = stored(tmp_path / "look.html")
     assert page["report"]["rows"] == report["rows"] and page["training"] is None
+    words = ("eval", "dial.ply", "--images", capture.scene, "--sv", 1, 4, "--base", capture.ply)
+    assert clod(*words, "--report", "both.html").code == 0
+    text = (tmp_path / "both.html").read_text(encoding="utf-8")
+    assert 'data-name="base"' in text and "hold for base" in text
     plain = clod("eval", capture.ply, "--images", capture.scene, "--sv", 1, "--report", "plain.html")
     text = (tmp_path / "plain.html").read_text(encoding="utf-8")
     assert plain.code == 0 and "It reaches" in text and "<input" not in text  # no dial, no slider
