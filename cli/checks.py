@@ -31,6 +31,7 @@ def check_evaluate(args: Namespace) -> None:
     check_dials(args, args.model)
     if args.report:
         check_page(Path(args.report), [args.model])
+    labels(args.against)
     for path in (args.model, *args.against):
         check_checkpoint(path)
     if args.base:

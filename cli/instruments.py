@@ -11,6 +11,7 @@ from torch import Tensor
 
 from clod_adapter.cameras import Scene, View
 from clod_adapter.cli.console import Console
+from clod_adapter.cli.files import labels
 from clod_adapter.cli.report import popping_table, rows_table
 from clod_adapter.compare import CLOSE, matching_dial, mean_kept, rankings
 from clod_adapter.evaluate import Row, evaluate
@@ -67,13 +68,15 @@ class Instruments:
 
     def report(self) -> dict[str, Any]:
         """For --json."""
+        paths = list(dict.fromkeys(path for path, *_ in self.against))
+        names = dict(zip(paths, labels(paths), strict=True))
         return {
             "base_row": self.base_row.as_dict() if self.base_row else None,
             "ranked": [
                 {"virtual_scale": ours.virtual_scale, "by": by, "row": row.as_dict()} for ours, by, row in self.ranked
             ],
             "against": [
-                {"model": path, "theirs": theirs.as_dict(), "ours": ours.as_dict()}
+                {"model": path, "label": names[path], "theirs": theirs.as_dict(), "ours": ours.as_dict()}
                 for path, theirs, ours in self.against
             ],
             "popping": [{"moved": moved, **result.as_dict()} for moved, result in self.popping],

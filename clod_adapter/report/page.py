@@ -102,10 +102,10 @@ def chart(svg: str, caption: str) -> str:
     return f'<figure><div class="chart">{svg}</div><figcaption>{escape(caption)}</figcaption></figure>'
 
 
-def table(head: Sequence[str], groups: Mapping[str, Sequence[Sequence[str]]]) -> str:
+def table(head: Sequence[str], groups: Iterable[tuple[str, Sequence[Sequence[str]]]]) -> str:
     """Rows of cells under the name of their group."""
     lines = ["<tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
-    for name, rows in groups.items():
+    for name, rows in groups:
         lines.append(f'<tr class="group"><td colspan="{len(head)}">{escape(name)}</td></tr>')
         lines += ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
     return f'<div class="scroll"><table>{"".join(lines)}</table></div>'

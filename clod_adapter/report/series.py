@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import PurePath
 from typing import Any
 
 Row = Mapping[str, Any]
@@ -29,7 +28,7 @@ def series_of(report: Mapping[str, Any]) -> list[Series]:
 
     Read are ``rows``; the unadapted base as ``base_row`` or ``base_rows``; the file without its dial as
     ``detached_row``; the base cut by rank as ``ranked``, ``[{by, row}]``; other files as ``against``,
-    ``[{model, theirs}]``. A row without a PSNR (an infinite one, in JSON) is left out.
+    ``[{model, label, theirs}]``. A row without a PSNR (an infinite one, in JSON) is left out.
     """
     base: list[Any] = report.get("base_rows") or [report.get("base_row")]
     found = [Series("dial, one file", report.get("rows", []), dial=True), Series("base, unadapted", base)]
@@ -39,7 +38,8 @@ def series_of(report: Mapping[str, Any]) -> list[Series]:
     against = report.get("against") or []
     for model in dict.fromkeys(entry["model"] for entry in against):
         rows = [entry["theirs"] for entry in against if entry["model"] == model]
-        found.append(Series(PurePath(model).name, rows, dial=len(rows) > 1))
+        label = next(entry["label"] for entry in against if entry["model"] == model)
+        found.append(Series(label, rows, dial=len(rows) > 1))
     plain: list[Any] = [report.get("detached_row")]
     found.append(Series("plain viewer, no dial", plain))
     complete = [Series(s.label, [r for r in s.rows if r and r["psnr"] is not None], s.dial) for s in found]

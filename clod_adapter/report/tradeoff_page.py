@@ -165,15 +165,16 @@ def _rendering_caption(series: Sequence[Series]) -> str:
 
 def _rows(series: Sequence[Series]) -> str:
     head = ("dial", "PSNR dB", "SSIM", "Gaussians", "share", "in view", "ms a frame")
-    groups = {}
+    groups = []
     for one in series:
-        groups[one.label] = [
+        rows = [
             [
                 f"s = {row['virtual_scale']:g}" if one.dial else "", f"{row['psnr']:.2f}", f"{row['ssim']:.4f}",
                 f"{row['kept']:,.0f}", f"{row['kept_share']:.1%}", f"{row['in_view']:,.0f}", f"{row['frame_ms']:.1f}",
             ]
             for row in one.rows
         ]  # fmt: skip
+        groups.append((one.label, rows))
     return page.section("All rows", page.table(head, groups)) if groups else ""
 
 

@@ -58,6 +58,23 @@ def test_against_at_matched_counts(clod: Any, capture: Any, adapted: Path, tmp_p
     assert "the dial value that keeps as many" in done.err
 
 
+def test_against_files_of_one_name(clod: Any, capture: Any, adapted: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    paths = []
+    for name, count in (("a", 60), ("b", 90)):
+        (tmp_path / name).mkdir()
+        few = capture.gaussians.select(torch.arange(count))
+        paths.append(capture.write(tmp_path / name / "point_cloud.ply", few))
+    words = ("eval", adapted, "--images", capture.scene, "--sv", 1, "--json", "--against")
+    report = json.loads(clod(*words, *paths, "--report", "page.html").out)
+    assert [entry["label"] for entry in report["against"]] == ["a_point_cloud", "b_point_cloud"]
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    table = text[text.index("<table>") : text.index("</table>")]
+    assert [table.count(f"{name}_point_cloud") for name in "ab"] == [1, 1] and table.count("<td>60</td>") == 1
+    twice = clod(*words, paths[0], paths[1], paths[0])
+    assert twice.code == 2 and "point_cloud.ply: is given twice" in twice.err and "\n" not in twice.err.strip()
+
+
 def test_popping(clod: Any, capture: Any, adapted: Path) -> None:
     done = clod("eval", adapted, "--images", capture.scene, "--sv", 1, 3, "--popping", "--json")
     dial, other, walk = json.loads(done.out)["popping"]

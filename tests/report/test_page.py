@@ -47,7 +47,8 @@ def test_a_page(tmp_path: Path) -> None:
     body = [
         page.section(NASTY, page.paragraph(NASTY), page.tiles([(NASTY, "1", NASTY)]), page.facts({NASTY: NASTY})),
         page.dial([picture(0.0), picture(0.5), picture(1.0)], {"photograph": picture(0.2)}), page.bullets([NASTY]),
-        page.strip([picture(0.3)]), page.table(["x", NASTY], {NASTY: [["1", NASTY]]}), page.chart("<svg></svg>", NASTY),
+        page.strip([picture(0.3)]), page.table(["x", NASTY], [(NASTY, [["1", NASTY]])]),
+        page.chart("<svg></svg>", NASTY),
     ]  # fmt: skip
     data = {"rows": [{"note": NASTY, "psnr": None}]}
     page.write_page(tmp_path / "page.html", NASTY, NASTY, body, data)
