@@ -43,7 +43,7 @@ def test_eval_keeps_what_was_asked_for(clod: Any, capture: Any, dialled: Path) -
     done = clod("eval", dialled, "--images", capture.scene, "--keep", middle, 300, "--json")
     report = json.loads(done.out)
     assert report["rows"][0]["kept"] == middle and report["rows"][1]["virtual_scale"] == 1
-    first, second = report["notes"]
+    first, second = notes_of(report)
     s = report["rows"][0]["virtual_scale"]
     assert first == f"--keep {middle}: s = {s:.5g}" and 1 < s < 4 and first in done.err
     assert second == f"--keep 300: s = 1 (s = 1 keeps {rows[0].kept:,.0f} of 300 already)"
@@ -65,7 +65,9 @@ def test_eval_at_a_psnr_drop(clod: Any, capture: Any, dialled: Path) -> None:
     report = json.loads(clod("eval", dialled, "--images", capture.scene, "--psnr-drop", drop, 90, "--json").out)
     (found, last), psnr = report["rows"], rows[0].psnr
     assert found["virtual_scale"] == pytest.approx(rows[2].virtual_scale) and last["virtual_scale"] == 4
-    assert psnr - found["psnr"] == pytest.approx(drop, abs=0.02) and "largest dial value measured" in report["notes"][1]
+    assert (
+        psnr - found["psnr"] == pytest.approx(drop, abs=0.02) and "largest dial value measured" in notes_of(report)[1]
+    )
 
 
 def test_eval_times_frames_for_a_frame_rate(
@@ -80,7 +82,7 @@ def test_eval_times_frames_for_a_frame_rate(
     monkeypatch.setattr(budgets, "frame_times", times)
     report = json.loads(clod("eval", dialled, "--images", capture.scene, "--fps", 250, 10, "--json").out)
     assert [row["virtual_scale"] for row in report["rows"]] == [2, 1] and seen == [2]
-    assert report["notes"] == [
+    assert notes_of(report) == [
         "frames timed here: 8.0 ms at s = 1, 2.0 ms at s = 4",
         "--fps 250: s = 2",
         "--fps 10: s = 1 (s = 1 draws 125 frames a second already)",

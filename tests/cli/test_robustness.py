@@ -38,6 +38,12 @@ def stamps(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
 
 
+def at(cell: dict[str, Any], virtual_scale: float) -> dict[str, Any]:
+    """The cell's row at a dial value."""
+    (row,) = [row for row in cell["rows"] if row["virtual_scale"] == virtual_scale]
+    return row  # type: ignore[no-any-return]
+
+
 def test_every_checkpoint_at_every_range(run: Any, clod: Any, tmp_path: Path) -> None:
     done = run("--json")
     assert done.code == 0, done
@@ -50,19 +56,19 @@ def test_every_checkpoint_at_every_range(run: Any, clod: Any, tmp_path: Path) ->
     assert report["missing"] == [] and not report["interrupted"]
     for cell in report["cells"]:
         dials = [row["virtual_scale"] for row in cell["rows"]]
-        assert dials == ([1.0] * len(BASELINE_SHARES) if cell["max_sv"] is None else [1, 1.5, 2, 3])
+        assert dials == ([1.0] * len(BASELINE_SHARES) if cell["max_sv"] is None else [1, 1.25, 1.5, 2, 2.5, 3])
         assert ("log10_sigma_d" in cell["distribution"]) == (cell["max_sv"] is not None)
     with open(folder / "robustness.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * (len(BASELINE_SHARES) + 8)
+    assert len(rows) == 2 * (len(BASELINE_SHARES) + 12)
     (row,) = [r for r in rows if (r["checkpoint"], r["max_sv"], r["virtual_scale"]) == ("masked", "1.0", "2.0")]
-    assert float(row["psnr"]) == report["cells"][4]["rows"][2]["psnr"] and row["within_range"] == "False"
+    assert float(row["psnr"]) == at(report["cells"][4], 2)["psnr"] and row["within_range"] == "False"
     assert Image.open(folder / "robustness.png").size[0] > 2000
     # A cell's adapter gives the model that was measured.
     assert clod("apply", "plain.ply", "robustness/cells/plain_sv3.safetensors", "-o", "x.ply").code == 0
     scene = clod_adapter.load_scene(report["scene"])
     (again,) = clod_adapter.evaluate(clod_adapter.load("x.ply").gaussians, scene.test, [3.0])
-    assert again.psnr == report["cells"][2]["rows"][3]["psnr"]
+    assert again.psnr == at(report["cells"][2], 3)["psnr"]
 
 
 def test_resumes_what_is_unfinished_or_changed(run: Any, tmp_path: Path) -> None:
