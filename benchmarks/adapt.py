@@ -5,6 +5,7 @@
     python benchmarks/adapt.py plush_half --ablations      # one row for each choice in docs/method.md
     python benchmarks/adapt.py plush_half bonsai146 --leave-out    # one for each in docs/performance.md
     python benchmarks/adapt.py --table                     # the rows as a Markdown table
+    python benchmarks/adapt.py plush_half --questions      # the ablations' rows, a table a question
 
 A scene is a folder of the shared data, with a checkpoint's name where it is not ``pretrained``. Each run
 adds one row to ``results/adapt.jsonl``: the settings, the commit, the machine, the base and the dial.
@@ -89,12 +90,17 @@ def main() -> None:
     parser.add_argument("--ablations", action="store_true", help=f"every choice by itself, {ABLATION}")
     parser.add_argument("--leave-out", action="store_true", help="what a step can leave out, at three lengths each")
     parser.add_argument("--table", action="store_true", help="print the rows there are")
+    parser.add_argument("--questions", action="store_true", help="print a table for each question, of the scenes")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a field of AdaptConfig")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--label", default="default", help="what the row is for")
     args = parser.parse_args()
     if args.table:
         print_table()
+    if args.questions:
+        for scene in args.scenes:
+            print_questions(scene)
+        return
     runs = {args.label: dict(_setting(text) for text in args.set)}
     if args.ablations:
         runs = {label: {**ABLATION, **changed} for label, changed in ABLATIONS.items()}
@@ -106,33 +112,52 @@ def main() -> None:
                 run(scene, label, make_config(changed, seed), changed, popping=args.ablations)
 
 
-def print_table() -> None:
-    """PSNR and share at s = 1 and at the matched shares, means over the seeds, a line a setting."""
-    lines = (RESULTS / FILE).read_text(encoding="utf-8").splitlines()
+def stored() -> dict[tuple[str, str, int], list[dict[str, Any]]]:
+    """The last row of each seed, by scene, label and steps; rows of before the matched shares are left out."""
     last = {}
-    for row in map(json.loads, lines):
-        if "at_shares" in row:  # rows of before have none
+    for row in map(json.loads, (RESULTS / FILE).read_text(encoding="utf-8").splitlines()):
+        if "at_shares" in row:
             last[row["scene"], row["label"], row["steps"], row["config"]["seed"]] = row
     groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for (scene, label, steps, _), row in last.items():
         groups.setdefault((scene, label, steps), []).append(row)
-    print(
-        "| scene | what | steps | seeds | seconds | base | s = 1 |" + "".join(f" {x:.0%} |" for x in SHARES) + " law |"
-    )
-    print("|---" * (8 + len(SHARES)) + "|")
-    for (scene, label, steps), rows in groups.items():
+    return groups
+
+
+def cells_of(rows: list[dict[str, Any]]) -> list[str]:
+    """s = 1, the matched shares, and between what the counts lie, relative to s^-1.5, from s = 2 on."""
+    first = fmean(row["rows"][0]["psnr"] for row in rows), fmean(row["rows"][0]["kept_share"] for row in rows)
+    cells = [f"{first[0]:.2f} @ {first[1]:.0%}"]
+    for share in SHARES:
+        found = [r["psnr"] for row in rows for r in row["at_shares"] if r["share"] == share]
+        cells.append(f"{fmean(found):.2f}" if len(found) == len(rows) else "")
+    law = [r["kept_share"] * r["virtual_scale"] ** 1.5 for row in rows for r in row["rows"] if r["virtual_scale"] >= 2]
+    return [*cells, f"{min(law):.2f} to {max(law):.2f}" if law else ""]
+
+
+HEADS = ["s = 1", *(f"{share:.0%}" for share in SHARES), "counts / law"]
+
+
+def print_table() -> None:
+    """PSNR at s = 1 and at the matched shares, means over the seeds, a line a setting."""
+    heads = ["scene", "what", "steps", "seeds", "seconds", "base", *HEADS]
+    print(f"| {' | '.join(heads)} |\n{'|---' * len(heads)}|")
+    for (scene, label, steps), rows in stored().items():
         seconds = fmean(row["start_seconds"] + row["train_seconds"] for row in rows)
-        first = fmean(row["rows"][0]["psnr"] for row in rows), fmean(row["rows"][0]["kept_share"] for row in rows)
-        cells = [f"{first[0]:.2f} @ {first[1]:.0%}"]
-        for share in SHARES:
-            found = [r["psnr"] for row in rows for r in row["at_shares"] if r["share"] == share]
-            cells.append(f"{fmean(found):.2f}" if len(found) == len(rows) else "")
-        law = [
-            r["kept_share"] * r["virtual_scale"] ** 1.5 for row in rows for r in row["rows"] if r["virtual_scale"] >= 2
-        ]
-        cells.append(f"{min(law):.2f} to {max(law):.2f}" if law else "")
         head = [scene, label, str(steps), str(len(rows)), f"{seconds:.0f}", f"{rows[0]['base']['psnr']:.2f}"]
-        print("| " + " | ".join(head + cells) + " |")
+        print("| " + " | ".join(head + cells_of(rows)) + " |")
+
+
+def print_questions(scene: str) -> None:
+    """A table a question, ours and the paper's form above each, with the popping measures."""
+    groups, heads = stored(), ["what", *HEADS, "dial: jump", "path: jump"]
+    for question, settings in QUESTIONS.items():
+        print(f"\n### {question.capitalize()}\n\n| {' | '.join(heads)} |\n{'|---' * len(heads)}|")
+        for label in {**QUESTIONS["form"], **settings}:
+            rows = groups.get((scene, label, int(str(ABLATION["iters"]))))
+            if rows:
+                popping = [f"{rows[-1]['popping'][what]['largest']:.2f}" for what in ("dial", "path")]
+                print("| " + " | ".join([label, *cells_of(rows), *popping]) + " |")
 
 
 def make_config(changed: dict[str, Any], seed: int) -> clod.AdaptConfig:
