@@ -53,17 +53,16 @@ QUESTIONS: dict[str, dict[str, dict[str, object]]] = {
         "tau 0.05": {"tau": 0.05},
     },
     "count": {
-        "none": {"reg_weight": 0.0, "price": 0.0},
-        "no price": {"price": 0.0},
-        "price twice": {"price": 2 * clod.AdaptConfig().price},
-        "square four times": {"reg_weight": 4 * clod.AdaptConfig().reg_weight},
+        "none": {"reg_weight": 0.0},
+        "a quarter": {"reg_weight": clod.AdaptConfig().reg_weight / 4},
+        "four times": {"reg_weight": 4 * clod.AdaptConfig().reg_weight},
         "the paper's L_reg, straight through": {"count_term": "paper", "reg_weight": 1.0},
     },
     "sampling": {
         "one, log-uniform, 30 % at 1": {"sampling": "log", "full_share": 0.3},
         "one, uniform": {"sampling": "uniform"},
     },
-    "weights": {"s = 1 single": {"full_weight": 1.0}, "s = 1 fourfold": {"full_weight": 4.0}},
+    "weights": {"s = 1 half": {"full_weight": 0.5}, "s = 1 fourfold": {"full_weight": 4.0}},
     "light update": {
         "frozen": FROZEN,
         "half as fast": HALF,

@@ -85,7 +85,6 @@ class AdaptConfig:
     exponent: float = option(1.5, "the count law: the share to keep at s is s^-exponent")
     count_term: str = option("law", "what moves the count: law (both ways, by sigma_d alone) or paper (its L_reg)")
     reg_weight: float = option(0.5, "weight of the count term (the paper's lambda_reg)")
-    price: float = option(0.03, "what being kept costs at any count (count_term law)")
     weight_slope: float = option(
         0.0, "k of w_s = (1 - k s/max_sv)^2; the paper has 0.5, 0 weighs all dial values alike"
     )
@@ -115,7 +114,6 @@ class AdaptConfig:
         require(0 <= self.full_weight < math.inf, "full_weight", self.full_weight, "at least 0 and finite")
         require(0 < self.exponent < math.inf, "exponent", self.exponent, "positive and finite")
         require(0 <= self.reg_weight < math.inf, "reg_weight", self.reg_weight, "at least 0 and finite")
-        require(0 <= self.price < math.inf, "price", self.price, "at least 0 and finite")
         require(0 <= self.weight_slope <= 1, "weight_slope", self.weight_slope, "between 0 and 1")
         require(self.temperature > 0, "temperature", self.temperature, "positive")
         require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")

@@ -23,14 +23,13 @@ def count_gradient(
 ) -> Tensor:
     """``[N]`` what the count term adds to the gradient of log sigma_d at one dial value; opacities are held.
 
-    That of ``loss (price eta / law + reg_weight (eta / law - 1)^2)``, eta the share kept, through
-    ``attenuation.count_slope``. The first part is what being kept costs at any count: who is worth less to the picture
-    fades, who is worth more stays. The second moves the count towards the law, both ways. Both are relative: to the
+    That of ``loss reg_weight (eta / law - 1)^2``, eta the share kept, through ``attenuation.count_slope``. Who is worth
+    less to the picture than the pressure fades, who is worth more stays. It works both ways, and is relative: to the
     law, as the last percent of the Gaussians matters as much as the first, and to the picture's ``loss``, a constant
     here, so that the same settings suit scenes and dial values that are fitted well or badly.
     """
     law = count_law(virtual_scale, config.start_share, config.exponent)
     eta = float(dialled.keep.sum()) / len(opacity_logits)
-    pressure = loss * (config.price + 2 * config.reg_weight * (eta / law - 1)) / law
+    pressure = 2 * loss * config.reg_weight * (eta / law - 1) / law
     slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, config.temperature)
     return slope.mul_(pressure)

@@ -18,7 +18,7 @@ ADAPT = BOTH | {
     "iters": [-1], "time_budget": [0.0, -1.0, math.nan], "start_share": [0.5, 1.01, math.nan],
     "full_share": [-0.1, 1.1, math.nan], "exponent": [0.0, -1.5, math.inf, math.nan], "reg_weight": [-1.0, math.nan],
     "weight_slope": [-0.1, 1.1], "temperature": [0.0, math.nan], "ssim_weight": [-0.1, 1.1],
-    "lr_final": [0.0, 1.1, math.nan], "full_weight": [-1.0, math.nan], "price": [-1.0, math.nan],
+    "lr_final": [0.0, 1.1, math.nan], "full_weight": [-1.0, math.nan],
     "start": ["random"], "parameter": ["sqrt"], "sampling": ["normal"],
     "count_term": ["none", "relative"],
     **{f"lr_{name}": [-1e-9, math.nan] for name in ("sigma", "means", "quats", "scales", "opacities", "sh0", "shN")},

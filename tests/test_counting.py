@@ -1,4 +1,4 @@
-"""The count law: its values, the gradient of the price and the square, and that the square brings the counts to it."""
+"""The count law: its values, the gradient of the square, and that it brings the counts to it."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ def gradient(logits: Tensor, log_sigma: Tensor, d: Tensor, s: float, **changes: 
     return count_gradient(dialled, logits, s, ATTENUATION.tau, 0.1, dataclasses.replace(CONFIG, **changes))
 
 
-def test_the_gradient_is_that_of_price_and_square() -> None:
+def test_the_gradient_is_that_of_the_square() -> None:
     logits, log_sigma, d = some()
     for s in (1.0, 2.5, 6.0):
         dialled = attenuate(logits, log_sigma.exp(), d, s, ATTENUATION)
         slope = count_slope(logits, dialled.log_opacities, s, ATTENUATION.tau, CONFIG.temperature)
         law = count_law(s, CONFIG.start_share, CONFIG.exponent)
         excess = float(dialled.keep.float().mean()) / law - 1
-        want = 0.1 * (CONFIG.price + 2 * CONFIG.reg_weight * excess) / law * slope
+        want = 0.1 * 2 * CONFIG.reg_weight * excess / law * slope
         torch.testing.assert_close(gradient(logits, log_sigma, d, s), want)
 
 
@@ -57,9 +57,9 @@ def test_too_many_are_pressed_down_and_too_few_lifted() -> None:
     logits, log_sigma, d = some()
     many, few = log_sigma + 3, log_sigma - 2
     for s in (1.5, 6.0):
-        assert gradient(logits, many, d, s, price=0.0).max() > 0 >= -gradient(logits, many, d, s, price=0.0).min()
-        assert gradient(logits, few, d, s, price=0.0).min() < 0 and gradient(logits, few, d, s, price=0.0).max() <= 0
-        assert (gradient(logits, log_sigma, d, s, reg_weight=0.0) >= 0).all()
+        assert gradient(logits, many, d, s).max() > 0 >= -gradient(logits, many, d, s).min()
+        assert gradient(logits, few, d, s).min() < 0 and gradient(logits, few, d, s).max() <= 0
+        assert (gradient(logits, log_sigma, d, s, reg_weight=0.0) == 0).all()
 
 
 @pytest.mark.parametrize("start", [-1.0, 0.7])
@@ -80,5 +80,5 @@ def test_without_any_picture_and_price_the_counts_come_to_the_law(start: float) 
 
     assert worst(log_sigma) > 0.3
     for _ in range(5000):
-        log_sigma = log_sigma - 20 * gradient(logits, log_sigma, d, 6.0 ** random.random(), price=0.0)
+        log_sigma = log_sigma - 20 * gradient(logits, log_sigma, d, 6.0 ** random.random())
     assert worst(log_sigma) < 0.2

@@ -232,7 +232,7 @@ def test_one_step_by_hand(captured: tuple[Gaussians, Scene]) -> None:
     """At s = 1 on one view: the loss is the render's, kept rows move by their rates, dropped rows by nothing."""
     base, scene = captured
     alone = Scene(scene.train[:2], ())
-    config = config_of(iters=1, sampling="log", full_share=1.0, reg_weight=0.0, price=0.0, seed=3)
+    config = config_of(iters=1, sampling="log", full_share=1.0, reg_weight=0.0, seed=3)
     before, seen = start(base, alone.train, config), []
     after = adapt(before, alone, config, seen.append).gaussians
     losses = [photometric_loss(render(before, view.camera).image, view.image).item() for view in alone.train]
