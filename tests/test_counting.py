@@ -63,7 +63,7 @@ def test_too_many_are_pressed_down_and_too_few_lifted() -> None:
 
 
 @pytest.mark.parametrize("start", [-1.0, 0.7])
-def test_without_any_picture_and_price_the_counts_come_to_the_law(start: float) -> None:
+def test_without_any_picture_the_counts_come_to_the_law(start: float) -> None:
     """From too few, and from too many, in plain steps along the gradient."""
     logits, log_sigma, d = some()
     # Opaque enough that the law can be met: what is fainter than tau s stays nowhere.
