@@ -100,7 +100,7 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("PLY --images empty", "empty: no COLMAP model.*give the folder"),
         ("PLY --images SCENE --max-sv 0.5", "--max-sv is 0.5, it must be at least 1"),
         ("PLY --images SCENE --max-sv nan", "--max-sv is nan"),
-        ("PLY --images SCENE --max-sv 300", "--max-sv is 300, it must be below 255"),
+        ("PLY --images SCENE --max-sv 300", "--max-sv is 300, it must be below 50"),
         ("PLY --images SCENE --max-sv big", "--max-sv: invalid float value: 'big'"),
         ("PLY --images SCENE --iters -1", "--iters is -1, it must be at least 0"),
         ("PLY --images SCENE --seed -1", "--seed is -1, it must be at least 0"),

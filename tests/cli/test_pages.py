@@ -47,7 +47,11 @@ def test_adapt(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert text.count('data-name=""') == pages.FRAMES and text.count('data-name="base"') == 1
 
 
-def test_without_photographs_nothing_is_said_of_any(clod: Any, capture: Any, tmp_path: Path) -> None:
+def test_without_photographs_nothing_is_said_of_any(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clod_adapter.placement.WIDTH", 62)
+    monkeypatch.setattr("clod_adapter.placement.HEIGHT", 46)
     done = clod(capture.ply, *TINY, "--report", "--json")
     assert done.code == 0, done
     report, text = json.loads(done.out), (tmp_path / "dial.html").read_text(encoding="utf-8")
