@@ -33,7 +33,8 @@ def solve_dials(
     times, notes = time_frames(model, cameras, console) if name == "fps" and cameras else (None, [])
     stored = model.calibration
     if stored is None and times is None and name != "keep":  # what the header has, the reader has found unusable
-        raise ClodError(f"{model.path}: {option}: {model.notes[-1]}; adapt it again, or give --sv or --keep")
+        why = next((note for note in model.notes if "calibration" in note), "there is no calibration in the header")
+        raise ClodError(f"{model.path}: {option}: {why}; adapt it again, or give --sv or --keep")
     if name == "psnr_drop" and stored is not None and stored.against == "checkpoint":
         notes.append(
             "--psnr-drop goes by the calibration, which no photographs were there for: it is against the checkpoint's "

@@ -89,6 +89,15 @@ def test_eval_times_frames_for_a_frame_rate(
     ]
 
 
+def test_an_unusable_calibration_is_the_reason_given(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    data = dialled.read_bytes().replace(b"calibrated_with 300 ", b"calibrated_with 299 ")
+    extra = b"element face 0\nproperty list uchar int vertex_indices\nend_header"  # a note of its own, after it
+    (tmp_path / "other.ply").write_bytes(data.replace(b"end_header", extra, 1))
+    done = clod("bake", "other.ply", "--psnr-drop", 1, "-o", "x.ply")
+    said = "other.ply: --psnr-drop: the calibration in the header is of 299 Gaussians and ignored, these are 300; adapt"
+    assert done.code == 2 and said in done.err and "not carried over" in done.err
+
+
 def test_render_writes_a_picture_for_each_held_out_view(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     done = clod("render", dialled, "--images", capture.scene, "-o", "out/here", "--sv", 1, 3, "--beside", "--json")
     report = json.loads(done.out)
