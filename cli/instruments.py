@@ -13,12 +13,13 @@ from clod_adapter.cameras import Scene, View
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.files import labels
 from clod_adapter.cli.report import popping_table, rows_table
-from clod_adapter.compare import CLOSE, matching_dial, mean_kept, rankings
+from clod_adapter.compare import matching_dial, mean_kept, rankings
 from clod_adapter.evaluate import Row, evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.perceptual import Metric
 from clod_adapter.popping import Popping, dial_popping, path_popping
 
+CLOSE = 0.01  # relative distance of two counts that count as the same
 POPPING_VIEWS = 2  # held-out views before which the dial is turned
 PATH_CAMERAS = 5  # neighbours by name, which a capture takes one after the other
 
@@ -128,7 +129,7 @@ class Instruments:
             self.against.append((path, their_row, our_row))
 
     def _note_count(self, path: str, count: float, kept: float) -> None:
-        if abs(kept - count) > 10 * CLOSE * count:
+        if abs(kept - count) > CLOSE * count:
             more = "at most" if kept < count else "at least"
             self.notes.append(f"{path} keeps {count:,.0f} Gaussians; beside it is the model with {more} {kept:,.0f}")
             self.console.say(self.notes[-1])

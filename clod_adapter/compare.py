@@ -15,8 +15,6 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import removal_error, spread
 from clod_adapter.render import dial
 
-CLOSE = 0.001  # relative distance of two counts that count as the same
-
 
 @torch.no_grad()
 def mean_kept(gaussians: Gaussians, cameras: Sequence[Camera], virtual_scale: float) -> float:
