@@ -22,7 +22,7 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 import torch
 from common import append, capture
 
-from clod_adapter import counting, optimizer, train
+from clod_adapter import optimizer, train
 from clod_adapter._kernels import threads
 from clod_adapter.importance import start
 from clod_adapter.rasterizers import cpu
@@ -63,8 +63,7 @@ def main() -> None:
     clock = Clock()
     clock.wrap(threads, "run")
     clock.wrap(train, "attenuate", "attenuate")
-    clock.wrap(counting.CountLaw, "gradient", "count")
-    clock.wrap(counting.CountLaw, "correction", "count")
+    clock.wrap(train, "count_gradient", "count")
     clock.wrap(train, "splat", "splat forward")
     clock.wrap(train, "photometric_loss", "loss")
     clock.wrap(torch.autograd, "grad", "backward")
