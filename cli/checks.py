@@ -71,8 +71,8 @@ def check_robustness(args: Namespace) -> None:
     check_matplotlib()
     make_configs(args)
     labels(args.ply)
-    if Path(args.out).exists() and not Path(args.out).is_dir():
-        raise ClodError(f"{args.out}: is a file; give --out the name of a folder")
+    for folder in (Path(args.out), Path(args.out) / "cells"):
+        check_makeable(folder)
     for path in args.ply:
         check_checkpoint(path)
     check_scene(args.images)
@@ -98,13 +98,18 @@ def check_scene(folder: str) -> None:
     find_model(Path(folder))
 
 
-def check_folder(out: Path, scene: Path) -> None:
-    """Refuses a folder for pictures that cannot be made, or where they could replace photographs of the scene."""
+def check_makeable(out: Path) -> None:
+    """Refuses a folder that is no folder, or cannot be made or written to."""
     parent = next(folder for folder in (out, *out.parents) if folder.exists())
     if not parent.is_dir():
         raise ClodError(f"{out}: {parent} is a file; choose another --out")
     if not os.access(parent, os.W_OK | os.X_OK):
         raise ClodError(f"{out}: folder {parent} is not writable; choose another --out")
+
+
+def check_folder(out: Path, scene: Path) -> None:
+    """Refuses a folder for pictures that cannot be made, or where they could replace photographs of the scene."""
+    check_makeable(out)
     model = find_model(scene)
     places = [scene, model.parent, model.parent.parent]  # where load_scene looks for photographs
     images = [(place / "images").resolve() for place in places]

@@ -34,7 +34,9 @@ def _adapt(parser: ArgumentParser) -> None:
         help="the scene: photographs in DIR/images and their COLMAP model in DIR/sparse/0 (default: none, see below)",
     )  # fmt: skip
     add_settings(parser)
-    parser.add_argument("--out", metavar="OUT.ply", help="output (default: PLY's name with _clod, in this folder)")
+    parser.add_argument(
+        "-o", "--out", metavar="OUT.ply", help="output (default: PLY's name with _clod, in this folder)"
+    )
     parser.add_argument("--device", choices=["auto", "cpu"], default="auto", help="where to train (default: auto)")
     parser.add_argument("--report", action="store_true", help="also a page to look at, OUT.html, and its charts")
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
@@ -97,12 +99,17 @@ def _robustness(parser: ArgumentParser) -> None:
         help="the ranges: largest dial value of each adaptation; 1 adapts at full detail only (default: 1 3 5 7)",
     )  # fmt: skip
     add_settings(parser, without=["max_sv"])
-    parser.add_argument("--out", metavar="DIR", default="robustness", help="where everything goes and is resumed from")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        default="robustness",
+        help="where everything goes and is resumed from (default: robustness)",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
 def _demo(parser: ArgumentParser) -> None:
-    parser.add_argument("--out", metavar="DIR", default="demo", help="where everything goes (default: demo)")
+    parser.add_argument("-o", "--out", metavar="DIR", default="demo", help="where everything goes (default: demo)")
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 

@@ -34,15 +34,15 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, stop = Console(args.quiet), Stopwatch(), GracefulStop()
     folder = Path(args.out)
     outputs = {kind: folder / f"robustness.{kind}" for kind in ("png", "csv", "json")}
-    make_folder(folder)
-    make_folder(folder / "cells")
-    for path in outputs.values():
-        check_output(path, args.ply)
     with watch.time("load"):
         scene = read_scene(args.images, console)
         cells = plan(args, scene, console)
     if not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
+    make_folder(folder)  # only now: what cannot be read leaves none behind
+    make_folder(folder / "cells")
+    for path in outputs.values():
+        check_output(path, args.ply)
     found = {cell.name: read for cell in cells if (read := cell.read())}
     missing = [cell for cell in cells if cell.name not in found]
     if found:
@@ -67,12 +67,12 @@ def plan(args: argparse.Namespace, scene: Scene, console: Console) -> list[Cell]
     """All cells; every range is measured at the dial values of the widest, and at the end of its own."""
     configs = make_configs(args)
     dials = sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)})
-    cells: list[Cell] = []
+    seen, cells = scene_fingerprint(scene), list[Cell]()
     for path, label in zip(args.ply, labels(args.ply), strict=True):
         checkpoint = read_checkpoint(path, console)
         if checkpoint.gaussians.sigma_d is not None:
             console.say(f"  note: the dial of {path} plays no part: it is taken as a checkpoint without one")
-        cells += cells_of(label, checkpoint, configs, dials, scene_fingerprint(scene), Path(args.out) / "cells")
+        cells += cells_of(label, checkpoint, configs, dials, seen, Path(args.out) / "cells")
     return cells
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
+import shutil
 import signal
 import sys
 from collections.abc import Callable
@@ -150,7 +152,7 @@ def test_checkpoints_of_one_name(clod: Any, capture: Any, tmp_path: Path) -> Non
         ("PLY PLY --images SCENE", "base.ply: is given twice"),
         ("PLY --images SCENE --max-sv 1 0.5", "--max-sv is 0.5, it must be at least 1"),
         ("PLY missing.ply --images SCENE", "missing.ply: .*check the path"),
-        ("PLY --images SCENE --out file", "file: is a file; give --out"),
+        ("PLY --images SCENE --out file", "file: file is a file; choose another --out"),
         ("PLY --images nowhere", "nowhere: is not a folder"),
     ],
 )
@@ -159,6 +161,35 @@ def test_bad_input(clod: Any, capture: Any, tmp_path: Path, line: str, said: str
     given = {"PLY": capture.ply, "SCENE": capture.scene}
     done = clod("robustness", *[given.get(word, word) for word in line.split()])
     assert done.code == 2 and re.search(said, done.err) and [p.name for p in tmp_path.iterdir()] == ["file"], done
+
+
+def test_what_cannot_be_read_leaves_no_folder(clod: Any, capture: Any, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(capture.scene, scene)
+    (scene / "images" / "003.png").write_text("no picture")
+    done = clod("robustness", capture.ply, "--images", scene, "--iters", 1)
+    assert done.code == 2 and "003.png" in done.err and [p.name for p in tmp_path.iterdir()] == ["scene"], done
+
+
+def test_cells_must_be_a_folder_that_can_be_written(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cells = tmp_path / "robustness" / "cells"
+    cells.mkdir(parents=True)
+    real = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "cells" and real(path, mode))
+    for said in ("cells is not writable", "cells is a file"):
+        done = clod("robustness", capture.ply, "--images", capture.scene)
+        assert done.code == 2 and said in done.err and "photographs" not in done.err, done
+        cells.rmdir() if cells.is_dir() else cells.unlink()
+        cells.write_text("mine")
+
+
+def test_the_scene_is_looked_at_once(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls, real = [], command.scene_fingerprint
+    monkeypatch.setattr(command, "scene_fingerprint", lambda scene: calls.append(scene) or real(scene))
+    monkeypatch.setattr(command, "run_cells", lambda *_: True)
+    assert run().code == 130 and len(calls) == 1
 
 
 def test_without_matplotlib_nothing_is_started(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
