@@ -64,11 +64,11 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             "base_rows": [row.as_dict() for row in base_rows], "rows": [], "detached_row": None,
         }  # fmt: skip
         write_report(outputs.report, report)
-    skip = stop.requests > 0 and not adapted.interrupted
+    skip, late = stop.requests > 0 and not adapted.interrupted, GracefulStop()
     with watch.time("evaluate"):
         rows, plain, cut_short = ([], [], True) if skip else measure_result(result, scene, config, console)
         if rows and not cut_short:
-            adapter = store_calibration(base, adapter, result, rows, scene, report["teacher"], outputs, console)
+            adapter = store_calibration(base, adapter, result, rows, scene, report["teacher"], outputs, console, late)
     if cut_short:
         notes.append("the measurements were interrupted: only the dial values that were finished are reported")
         console.say(notes[-1])
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         "calibration": adapter.calibration and adapter.calibration.as_dict(), **outputs.sizes(),
     }  # fmt: skip
     write_report(outputs.report, report)
-    if page and not cut_short:  # after the report, which no failure of the page is to cost
+    if page and not cut_short and not late.requests:  # after the report, which no failure of the page is to cost
         with watch.time("page"):
             written = page.write(outputs.ply.with_suffix(".html"), report, result, adapted.start_seconds)
         report |= {"outputs": report["outputs"] | written, "seconds": watch.report()}
@@ -165,7 +165,7 @@ def write(base: Checkpoint, adapter: Adapter, result: Gaussians, outputs: Output
 
 def store_calibration(
     base: Checkpoint, adapter: Adapter, result: Gaussians, rows: Sequence[Row], scene: Scene, against: str,
-    outputs: Outputs, console: Console,
+    outputs: Outputs, console: Console, stop: GracefulStop,
 ) -> Adapter:  # fmt: skip
     """The adapter with the calibration that ``rows`` are; adapter and PLY are written again with it.
 
@@ -175,7 +175,7 @@ def store_calibration(
     """
     try:
         calibrated = replace(adapter, calibration=calibrate(rows, len(result), scene.test, against))
-        with GracefulStop().listening(), atomic_path(outputs.adapter) as small, atomic_path(outputs.ply) as large:
+        with stop.listening(), atomic_path(outputs.adapter) as small, atomic_path(outputs.ply) as large:
             save_adapter(small, calibrated)
             save(large, result, base, version=adapter.version, calibration=calibrated.calibration)
     except ClodError as error:
