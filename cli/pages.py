@@ -65,10 +65,9 @@ class AdaptPage:
         return call
 
     def _copy(self, state: Gaussians) -> Gaussians:
-        changing = {name: value.clone() for name, value in state.tensors().items()}
-        if self.config.lr_shN == 0:
-            changing["shN"] = self.base.shN  # the largest part, which is not trained
-        return state.replace(**changing)
+        fixed = {"shN": self.base.shN} if self.config.lr_shN == 0 else {}  # the largest part, where it is not trained
+        changing = {name: value.clone() for name, value in state.tensors().items() if name not in fixed}
+        return state.replace(**changing, **fixed)
 
     def write(self, path: Path, report: dict[str, Any], result: Gaussians, start_seconds: float) -> dict[str, str]:
         """Writes the page; returns its files, none, and a note in the report, where Ctrl-C or the disk stopped it."""

@@ -217,8 +217,9 @@ class _Views:
             far = torch.ones_like(self.logits)
             yield far if camera is None else normalized_distances(self.means, camera, self.config)
 
-    def extinction_scales(self) -> list[Tensor]:
-        return [extinction_scale(self.logits, self.sigma_d, d, self.config) for d in self._distances()]
+    def extinction_scales(self) -> Iterator[Tensor]:
+        """``[N]`` for each view, one at a time: all of them at once are views times Gaussians."""
+        return (extinction_scale(self.logits, self.sigma_d, d, self.config) for d in self._distances())
 
     def count(self, virtual_scale: float) -> int:
         """Gaussians kept, summed over the views."""
