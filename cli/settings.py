@@ -26,19 +26,27 @@ def add_settings(parser: argparse.ArgumentParser, without: Sequence[str] = ()) -
             f"--{name.replace('_', '-')}", metavar=metavar, type=kind, default=default, help=helps[name] + shown
         )
 
+    parser.add_argument(
+        "--form",
+        choices=["ours", "paper"],
+        default="ours",
+        help="of the training: ours, or the paper's own (default: ours)",
+    )
+
 
 def make_config(args: argparse.Namespace) -> AdaptConfig:
     """The settings; what is wrong with one is said in the words of the command line."""
-    limit = 1 / AdaptConfig().tau
+    make = AdaptConfig.paper if args.form == "paper" else AdaptConfig
+    limit = 1 / make().tau
     if args.max_sv >= limit:
         raise ClodError(f"--max-sv is {args.max_sv:g}, it must be below {limit:g}, where nothing survives the cut")
     given = {name: getattr(args, name) for name in OPTIONS}
     for name, value in given.items():  # one at a time, which tells the option to name
         try:
-            AdaptConfig(**{name: value})
+            make(**{name: value})
         except ClodError as error:
             raise ClodError(f"--{name.replace('_', '-')}{_without_name(str(error), name)}") from error
-    return AdaptConfig(**given)
+    return make(**given)
 
 
 def make_configs(args: argparse.Namespace) -> list[AdaptConfig]:
