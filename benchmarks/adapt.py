@@ -62,7 +62,7 @@ QUESTIONS: dict[str, dict[str, dict[str, object]]] = {
         "one, log-uniform, 30 % at 1": {"sampling": "log", "full_share": 0.3},
         "one, uniform": {"sampling": "uniform"},
     },
-    "weights": {"s = 1 half": {"full_weight": 0.5}, "s = 1 fourfold": {"full_weight": 4.0}},
+    "weights": {"s = 1 double": {"full_weight": 2.0}, "s = 1 fourfold": {"full_weight": 4.0}},
     "light update": {
         "frozen": FROZEN,
         "half as fast": HALF,

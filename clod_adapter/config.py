@@ -79,7 +79,7 @@ class AdaptConfig:
     parameter: str = option("log", "what is trained: log (of sigma_d) or linear (sigma_d, the paper's)")
     sampling: str = option("pair", "dial values of a step: pair (1 and one log-uniform), log, or uniform (the paper's)")
     full_weight: float = option(
-        3.0, "weight of the picture at s = 1 beside that at the other dial value (sampling pair)"
+        1.0, "weight of the picture at s = 1 beside that at the other dial value (sampling pair)"
     )
     full_share: float = option(0.0, "share of steps at s = 1 (samplings log and uniform)")
     exponent: float = option(1.5, "the count law: the share to keep at s is s^-exponent")
