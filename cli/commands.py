@@ -100,11 +100,9 @@ def _robustness(parser: ArgumentParser) -> None:
     )  # fmt: skip
     add_settings(parser, without=["max_sv"])
     parser.add_argument(
-        "--out",
-        metavar="DIR",
-        default="robustness",
+        "-o", "--out", metavar="DIR", default="robustness",
         help="where everything goes and is resumed from (default: robustness)",
-    )
+    )  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
