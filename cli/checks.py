@@ -14,6 +14,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.colmap_folder import find_model
 from clod_adapter.io.ply_columns import sh_degree_of
 from clod_adapter.io.ply_header import read_header
+from clod_adapter.report.charts import chart_file
 from clod_adapter.report.style import check_matplotlib
 
 
@@ -21,7 +22,7 @@ def check_adapt(args: Namespace) -> None:
     make_config(args)
     Outputs.of(args.ply, args.out).check([args.ply])
     if args.report:
-        check_page(Outputs.of(args.ply, args.out).ply.with_suffix(".html"), [args.ply])
+        check_page(Outputs.of(args.ply, args.out).ply.with_suffix(".html"), ["rendering", "adapting"], [args.ply])
     check_checkpoint(args.ply)
     if args.images is not None:
         check_scene(args.images)
@@ -30,14 +31,18 @@ def check_adapt(args: Namespace) -> None:
 def check_evaluate(args: Namespace) -> None:
     check_dials(args, args.model)
     if args.report:
-        check_page(Path(args.report), [args.model])
+        inputs = [args.model, *args.against, *([args.base] if args.base else [])]
+        check_page(Path(args.report), ["rendering"], inputs)
     labels(args.against)
     for path in (args.model, *args.against):
         check_checkpoint(path)
     if args.base:
         check_checkpoint(args.base)
-        if "sigma_d" in read_header(Path(args.base))["vertex"]:
-            raise ClodError(f"{args.base}: has a dial (sigma_d); give --base the checkpoint that was adapted")
+        if has_dial(args.base):
+            raise ClodError(
+                f"{args.base}: has a dial (sigma_d); give --base the checkpoint that was adapted, or give it to "
+                "--against"
+            )
     check_scene(args.images)
 
 
@@ -78,12 +83,13 @@ def check_robustness(args: Namespace) -> None:
     check_scene(args.images)
 
 
-def check_page(path: Path, inputs: list[str]) -> None:
-    """Refuses a page that could not be drawn or written."""
+def check_page(path: Path, charts: list[str], inputs: list[str]) -> None:
+    """Refuses a page that could not be drawn or written, or one of its charts."""
     check_matplotlib()
     if path.suffix.lower() != ".html":
         raise ClodError(f"{path}: --report names the page to write, so it must end in .html")
-    check_output(path, inputs)
+    for file in (path, *(chart_file(path, name) for name in charts)):
+        check_output(file, inputs)
 
 
 def check_checkpoint(path: str) -> None:

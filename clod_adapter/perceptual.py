@@ -47,7 +47,7 @@ def _make_lpips() -> Metric:
     except ImportError as error:
         raise Unavailable(INSTALL) from error
     except RuntimeError as error:  # torchvision's, where it was built for another torch
-        raise Unavailable(f"torchvision does not fit this torch: {error}") from error
+        raise Unavailable(f"torchvision does not fit this torch: {' '.join(str(error).split())}") from error
     weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(AlexNet_Weights.IMAGENET1K_V1.url).name
     if not weights.is_file():  # lpips would download it
         raise Unavailable(f"its network's weights are not at {weights}; once, online: {WEIGHTS}")

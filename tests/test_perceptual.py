@@ -44,6 +44,18 @@ def test_flip() -> None:
     assert "flip" in both.as_dict() and "lpips" not in both.as_dict()
 
 
+def test_a_torchvision_that_does_not_fit_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Finder:
+        def find_spec(self, name: str, *_: object) -> None:
+            if name == "lpips":
+                raise RuntimeError("operator torchvision::nms\n  does not exist\n")
+
+    monkeypatch.delitem(sys.modules, "lpips", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Finder(), *sys.meta_path])
+    found, (note,) = available_metrics()
+    assert "lpips" not in found and "does not fit this torch: operator torchvision::nms does not exist)" in note
+
+
 def test_lpips_is_left_out_without_weights(tmp_path: Path) -> None:
     """It would download them; with them (here random ones) it measures."""
     pytest.importorskip("lpips", exc_type=(ImportError, RuntimeError))

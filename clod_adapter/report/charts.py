@@ -29,6 +29,11 @@ def write_png(path: str | Path, draw: Draw) -> None:
         save(figure, path)
 
 
+def chart_file(page: Path, name: str) -> Path:
+    """Where a page's chart of this name goes: beside it."""
+    return page.with_name(f"{page.stem}_{name}.png")
+
+
 def inline_svg(draw: Draw, label: str) -> str:
     """The chart as an SVG element, its colours those of ``style.css`` (``--ink``, ``--series-1``, ...)."""
     with new_figure(SIZE, layout="constrained") as figure:

@@ -31,14 +31,16 @@ def series_of(report: Mapping[str, Any]) -> list[Series]:
     ``[{model, label, theirs}]``. A row without a PSNR (an infinite one, in JSON) is left out.
     """
     base: list[Any] = report.get("base_rows") or [report.get("base_row")]
-    found = [Series("dial, one file", report.get("rows", []), dial=True), Series("base, unadapted", base)]
+    plain_model = report.get("attenuation", {}) is None  # an evaluation's, of a file without a dial
+    model = Series("the file, no dial" if plain_model else "dial, one file", report.get("rows", []), not plain_model)
+    found = [model, Series("base, unadapted", base)]
     ranked = report.get("ranked") or []
     for by in dict.fromkeys(entry["by"] for entry in ranked):
         found.append(Series(f"base cut by {by}", [entry["row"] for entry in ranked if entry["by"] == by]))
     against = report.get("against") or []
-    for model in dict.fromkeys(entry["model"] for entry in against):
-        rows = [entry["theirs"] for entry in against if entry["model"] == model]
-        label = next(entry["label"] for entry in against if entry["model"] == model)
+    for path in dict.fromkeys(entry["model"] for entry in against):
+        rows = [entry["theirs"] for entry in against if entry["model"] == path]
+        label = next(entry["label"] for entry in against if entry["model"] == path)
         found.append(Series(label, rows, dial=len(rows) > 1))
     plain: list[Any] = [report.get("detached_row")]
     found.append(Series("plain viewer, no dial", plain))

@@ -7,7 +7,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from clod_adapter.report import page
-from clod_adapter.report.charts import inline_svg, rendering_chart, training_chart, write_png
+from clod_adapter.report.charts import chart_file, inline_svg, rendering_chart, training_chart, write_png
 from clod_adapter.report.page import Picture
 from clod_adapter.report.series import Series, series_of
 
@@ -55,7 +55,7 @@ def write_tradeoff_report(
     charts = {"rendering": rendering_chart(drawn)} if drawn else {}
     if training:
         charts["adapting"] = training_chart(training["curves"], None if own else training["base_psnr"])
-    outputs = {name: path.with_name(f"{path.stem}_{name}.png") for name in charts}
+    outputs = {name: chart_file(path, name) for name in charts}
     for name, draw in charts.items():
         write_png(outputs[name], draw)
     body = [page.paragraph(text, "lead") for text in _lead(report, series)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import signal
 import sys
 from pathlib import Path
@@ -145,6 +146,12 @@ def test_refused_before_anything_is_done(
     ):
         done = clod(*words)
         assert done.code == 2 and re.search(said, done.err), done
+    for name, words in (("dial_adapting.png", (capture.ply, *scene, *TINY, "--report")),
+                        ("page_rendering.png", ("eval", capture.ply, *scene, "--report", "page.html"))):  # fmt: skip
+        (tmp_path / name / "mine").mkdir(parents=True)
+        done = clod(*words)
+        assert done.code == 2 and f"{name}: is a folder" in done.err and done.err.count("\n") == 1, done
+        shutil.rmtree(tmp_path / name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     for words in ((capture.ply, *scene, *TINY, "--report"), ("eval", capture.ply, *scene, "--report", "page.html")):
         done = clod(*words)
