@@ -177,10 +177,10 @@ All numbers are over the held-out photographs (every 8th by name):
 A checkpoint without a dial shows the same at every value: the baseline.
 
 With --base each row is followed by the base, untouched, at the same count: the
-Gaussians of highest opacity, and those that contribute most to the photographs
-trained on. With --against a file that has a dial itself is measured at every
-dial value; the model keeps as many as a mean over the held-out views, at most
-what it keeps at s = 1.
+Gaussians of highest opacity, and those of highest removal error, the error that
+leaving one out alone makes in the photographs trained on. With --against a file
+that has a dial itself is measured at every dial value; the model keeps as many
+as a mean over the held-out views, at most what it keeps at s = 1.
 
 --popping turns the dial from 1 to the largest S in 200 equal ratios before two
 held-out cameras, and moves through five neighbouring cameras in 200 steps at

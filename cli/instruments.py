@@ -104,7 +104,7 @@ class Instruments:
         return "".join(f"\n{part}\n" for part in parts)
 
     def _rank(self, rows: Sequence[Row], base: Gaussians) -> None:
-        with self.console.meter("contribution") as meter:
+        with self.console.meter("removal error") as meter:
             orders = rankings(base, self.scene.train, lambda done, total: meter.update(done / total, f"{done}/{total}"))
         wanted = [(row, by, order) for row in rows for by, order in orders.items()]
         jobs: list[Job] = [("base", base, None, 1.0)]

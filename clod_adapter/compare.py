@@ -37,11 +37,16 @@ def rankings(
 ) -> dict[str, Tensor]:
     """``[N]`` indices of the Gaussians of an unadapted base, the ones to keep longest first, by two rules.
 
-    ``opacity``: the stored one. ``contribution``: the error that removing it alone would cause in up to 64 of the
+    ``opacity``: the stored one. ``removal error``: the error that removing it alone would cause in up to 64 of the
     training views, evenly spread (``importance.removal_error``). ``base.select(order[:n])`` is the base at n Gaussians.
 
     Args:
         progress: called with (views done, views in all).
     """
-    by = {"opacity": base.opacity_logits, "contribution": removal_error(base, spread(views), progress=progress)}
-    return {name: values.argsort(descending=True, stable=True) for name, values in by.items()}
+    removal = removal_error(base, spread(views), progress=progress)
+    return {"opacity": by_opacity(base), "removal error": removal.argsort(descending=True, stable=True)}
+
+
+def by_opacity(gaussians: Gaussians) -> Tensor:
+    """``[N]`` indices, the most opaque first; equals in their order."""
+    return gaussians.opacity_logits.argsort(descending=True, stable=True)

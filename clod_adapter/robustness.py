@@ -16,6 +16,7 @@ from torch import Tensor
 
 from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.cameras import Scene, View
+from clod_adapter.compare import by_opacity
 from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
@@ -98,7 +99,7 @@ def baseline(
 
 def most_opaque(gaussians: Gaussians, count: int) -> Gaussians:
     """The ``count`` Gaussians of highest opacity, in their order."""
-    return gaussians.select(gaussians.opacity_logits.topk(count).indices.sort().values)
+    return gaussians.select(by_opacity(gaussians)[:count].sort().values)
 
 
 def distribution(gaussians: Gaussians) -> dict[str, Any]:

@@ -35,7 +35,7 @@ def test_rankings() -> None:
     seen = []
     orders = rankings(base, scene.train, lambda *a: seen.append(a))
     assert seen[-1] == (len(scene.train), len(scene.train))
-    values = {"opacity": base.opacity_logits, "contribution": removal_error(base, scene.train)}
+    values = {"opacity": base.opacity_logits, "removal error": removal_error(base, scene.train)}
     assert list(orders) == list(values)
     for name, order in orders.items():
         assert torch.equal(order.sort().values, torch.arange(60))

@@ -27,7 +27,7 @@ def test_base_by_rank(clod: Any, capture: Any, adapted: Path) -> None:
     report = json.loads(done.out)
     assert report["base"] == str(capture.ply) and report["base_row"]["kept"] == 300 and report["interrupted"] is False
     assert [(entry["virtual_scale"], entry["by"]) for entry in report["ranked"]] == [
-        (s, by) for s in (1, 4) for by in ("opacity", "contribution")
+        (s, by) for s in (1, 4) for by in ("opacity", "removal error")
     ]
     kept = {row["virtual_scale"]: row["kept"] for row in report["rows"]}
     assert [entry["row"]["kept"] for entry in report["ranked"]] == [round(kept[s]) for s in (1, 1, 4, 4)]
@@ -37,7 +37,7 @@ def test_base_by_rank(clod: Any, capture: Any, adapted: Path) -> None:
     (want,) = clod_adapter.evaluate(base.select(top), views, [1.0])
     assert report["ranked"][2]["row"]["psnr"] == pytest.approx(want.psnr, abs=1e-4)
     block = done.err[done.err.index("cut to the same counts by rank") :].splitlines()[2:]
-    by = ["opacity", "contribution"]
+    by = ["opacity", "removal"]  # and error
     assert [line.split()[0] for line in block[:7]] == ["base", "s=1", *by, "s=4", *by]
     assert report["against"] == [] and report["popping"] == []
 

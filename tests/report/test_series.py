@@ -23,7 +23,7 @@ def test_an_evaluation_with_comparisons() -> None:
     report = {
         "rows": [row(1), row(3)],
         "base_row": row(1, 22),
-        "ranked": [{"by": by, "row": row(1, psnr)} for psnr in (21, 17) for by in ("opacity", "contribution")],
+        "ranked": [{"by": by, "row": row(1, psnr)} for psnr in (21, 17) for by in ("opacity", "removal error")],
         "against": [
             {"model": "x/a.ply", "label": "x_a", "theirs": row(1)},
             *({"model": "y/a.ply", "label": "y_a", "theirs": row(s)} for s in (1, 3)),
@@ -32,7 +32,7 @@ def test_an_evaluation_with_comparisons() -> None:
     found = {one.label: (one.dial, [r["psnr"] for r in one.rows]) for one in series_of(report)}
     assert found == {
         "dial, one file": (True, [20, 20]), "base, unadapted": (False, [22]), "base cut by opacity": (False, [21, 17]),
-        "base cut by contribution": (False, [21, 17]), "x_a": (False, [20]), "y_a": (True, [20, 20]),
+        "base cut by removal error": (False, [21, 17]), "x_a": (False, [20]), "y_a": (True, [20, 20]),
     }  # fmt: skip
 
 
