@@ -33,6 +33,7 @@ from tuning import RATES, Tuning, tune
 
 import clod_adapter as clod
 from clod_adapter.cli.console import Console
+from clod_adapter.gaussians import SH_C0
 from clod_adapter.importance import removal_error
 from clod_adapter.render import splat
 
@@ -40,7 +41,6 @@ FILE = "rivals.jsonl"
 RIVALS = ("merging", "specialist", "tuned", "prefix", "ranking")
 SHARES = (0.62, 0.35, 0.12, 0.05, 0.02)
 ORDERS = ("opacity", "contribution", "removal error")
-SH0 = 0.28209479177387814  # the degree-0 harmonic: what a unit of sh0 adds to a colour
 
 
 def main() -> None:
@@ -176,7 +176,7 @@ def contribution(gaussians: clod.Gaussians, views: tuple[clod.View, ...]) -> Ten
         sh0 = torch.zeros_like(gaussians.sh0, requires_grad=True)
         image, _ = splat(grey.replace(sh0=sh0), gaussians.opacities, view.camera)
         (slope,) = torch.autograd.grad(image.sum(), sh0)
-        total += slope[:, 0, 0] / SH0
+        total += slope[:, 0, 0] / SH_C0
     return total
 
 

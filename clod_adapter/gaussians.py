@@ -11,6 +11,9 @@ from torch import Tensor
 from clod_adapter.config import SH_COUNTS, AttenuationConfig
 from clod_adapter.errors import ClodError
 
+SH_C0 = 0.28209479177387814
+"""The degree-0 harmonic, ``1 / (2 sqrt(pi))``: seen without higher bands a colour is ``0.5 + SH_C0 sh0``."""
+
 
 @dataclass(frozen=True)
 class Gaussians:

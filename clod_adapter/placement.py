@@ -26,7 +26,7 @@ from torch import Tensor
 from clod_adapter.cameras import Camera, Scene, View
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.render import render, splat
 
 VIEWS = 96
@@ -40,7 +40,6 @@ TEST_EVERY = 8  # as with photographs
 SMALL, SMALL_PIXELS = 0.1, 2.0  # a tenth of the Gaussians is this small or smaller, as their nearest cameras saw them
 FAR = 4.0  # cameras stand at most this many times as far away as the scene is large
 VISIBLE = 0.05  # less opaque ones say nothing about where cameras stood
-C0 = 0.28209479177387814  # of the SH band 0: colour = 0.5 + C0 sh0
 
 
 @dataclass(frozen=True)
@@ -183,7 +182,9 @@ def _score(gaussians: Gaussians, camera: Camera) -> float:
     depths = gaussians.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
     pixels = _size(gaussians) * _focal(WIDTH) / depths.clamp(min=1e-6)
     shade = (pixels.clamp(1e-3, 1e4).log() + 7)[:, None, None].expand(-1, 1, 3)  # positive, as colours are
-    sizes, _ = splat(gaussians.replace(sh0=(shade - 0.5) / C0, shN=gaussians.shN[:, :0]), gaussians.opacities, camera)
+    sizes, _ = splat(
+        gaussians.replace(sh0=(shade - 0.5) / SH_C0, shN=gaussians.shN[:, :0]), gaussians.opacities, camera
+    )
     size = float(sizes[..., 0].sum()) / covered - 7
     empty = float((alpha < 0.9).float().mean())
     strength = float((bands - 0.5 * alpha[..., None]).abs().mean(2).sum()) / covered if gaussians.sh_degree else 1.0

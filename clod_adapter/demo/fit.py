@@ -12,10 +12,8 @@ from clod_adapter.adapter import attach, detach
 from clod_adapter.attenuation import SIGMA_MAX
 from clod_adapter.cameras import Scene
 from clod_adapter.config import SH_COUNTS, AdaptConfig
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.train import Progress, adapt
-
-SH_DC = 0.28209479177387814
 
 
 def fit_base(
@@ -52,7 +50,7 @@ def from_points(points: np.ndarray, colors: np.ndarray, *, sh_degree: int = 3) -
         quats=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
         log_scales=spacing.log()[:, None].repeat(1, 3),
         opacity_logits=torch.full((n,), 0.1).logit(),
-        sh0=((rgb - 0.5) / SH_DC)[:, None],
+        sh0=((rgb - 0.5) / SH_C0)[:, None],
         shN=torch.zeros(n, SH_COUNTS[sh_degree] - 1, 3),
     )
 
