@@ -24,7 +24,7 @@ from clod_adapter.io.ply import load, save
 from clod_adapter.render import render
 from clod_adapter.train import Progress
 
-POINTS, FIT_STEPS, MAX_SV = 60_000, 2000, 5.0
+POINTS, FIT_STEPS, ADAPT_STEPS, MAX_SV = 60_000, 2000, 1000, 5.0
 DIALS = (1.0, 2.0, 3.0, 5.0)
 EXTRA = {"matplotlib": "matplotlib", "skimage": "scikit-image"}  # module, and the package that brings it
 VIEW = 0  # the held-out view on the strip: across the whole room
@@ -62,7 +62,7 @@ def check_extra() -> None:
 
 def adapt_arguments(args: argparse.Namespace, base: Path, capture: Path, model: Path) -> argparse.Namespace:
     """What the main job's own parser makes of the command line for the demo's files."""
-    words = [f"--images={capture}", f"--max-sv={MAX_SV:g}", f"--out={model}"]
+    words = [f"--images={capture}", f"--max-sv={MAX_SV:g}", f"--iters={ADAPT_STEPS}", f"--out={model}"]
     words += [f"--{name}" for name in ("quiet", "json") if getattr(args, name)]
     return make_parser(ADAPT, "clod-adapt").parse_args([*words, "--", str(base)])
 
