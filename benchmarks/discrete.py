@@ -1,7 +1,7 @@
 """Discrete against continuous: two levels and a hard switch against one file and its dial, and the jump measured.
 
     clod-adapt demo                                      # makes demo/gallery.ply and demo/capture
-    python benchmarks/discrete.py demo/gallery.ply demo/capture --view 6
+    python benchmarks/discrete.py demo/gallery.ply demo/capture --view 0
 
 The picture, docs/images/discrete_vs_continuous.png, is as the paper's: one held-out view in four strips, from least
 detail to most, of two levels and of one file. Below it a sweep from most to least: PSNR, and the change from frame to
