@@ -84,5 +84,13 @@ def test_the_main_job_gets_its_own_defaults(flags: list[str]) -> None:
     args = build_parser("demo").parse_args(["--out=-odd", *flags])
     files = [Path("-odd") / name for name in ("base.ply", "capture", "gallery.ply")]
     given = demo.adapt_arguments(args, *files)
-    words = ["--images=-odd/capture", "--max-sv=5", "--iters=1000", "--out=-odd/gallery.ply", *flags, "--", "-odd/base.ply"]
+    words = [
+        "--images=-odd/capture",
+        "--max-sv=5",
+        "--iters=1000",
+        "--out=-odd/gallery.ply",
+        *flags,
+        "--",
+        "-odd/base.ply",
+    ]
     assert vars(given) == vars(build_parser("").parse_args(words))
