@@ -22,8 +22,10 @@ from common import ROOT, append
 from torch import Tensor
 
 import clod_adapter as clod
+from clod_adapter import popping
 from clod_adapter.cli.console import Console
 from clod_adapter.metrics import psnr
+from clod_adapter.popping import Popping
 from clod_adapter.report.style import BLUE, ORANGE, QUIET, new_figure, save, tidy
 
 PICTURE = ROOT / "docs" / "images" / "discrete_vs_continuous.png"
@@ -47,10 +49,9 @@ class Sweep:
     kept: list[int]
     psnr: list[float]
 
-    def changes(self) -> list[float]:
-        """Root mean square change from each frame to the next, in levels of 255."""
-        steps = (self.images[1:] - self.images[:-1]).square().mean(dim=(1, 2, 3)).sqrt() * 255
-        return [float(step) for step in steps]
+    def popping(self) -> Popping:
+        """How the picture changes from frame to frame."""
+        return popping.sweep(lambda _, j: self.images[j], self.dials)
 
 
 def main() -> None:
@@ -96,10 +97,9 @@ def hard_switch(dial: Sweep) -> Sweep:
 
 def summary(frames: Sweep) -> dict[str, Any]:
     """The largest change between frames against the mean of all: 1 is even, the number of steps a single jump."""
-    changes = frames.changes()
-    mean = sum(changes) / len(changes)
+    found = frames.popping()
     return {
-        "largest_change": max(changes), "mean_change": mean, "largest_over_mean": max(changes) / mean if mean else 1.0,
+        "largest_change": found.largest, "mean_change": found.mean, "largest_over_mean": found.ratio,
         "kept": [frames.kept[0], frames.kept[-1]], "psnr": [frames.psnr[0], frames.psnr[-1]],
     }  # fmt: skip
 
@@ -127,7 +127,7 @@ def draw(path: Path, view: clod.View, levels: Sweep, dial: Sweep) -> None:
             axes.set_xscale("log")
             tidy(axes)
         for name, frames, colour in zip(NAMES, (levels, dial), (ORANGE, BLUE), strict=True):
-            changes = frames.changes()
+            changes = frames.popping().changes
             left.plot(frames.dials, frames.psnr, color=colour, linewidth=1.8, label=name)
             label = f"{name}: largest {max(changes):.2g}"
             right.plot(frames.dials[1:], changes, color=colour, linewidth=1.8, label=label)
