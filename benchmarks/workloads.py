@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
+from clod_adapter.gaussians import SH_C0
 
 # Gaussians, width, height, seed.
 SIZES = {"W1": (50_000, 480, 320, 1), "W2": (300_000, 960, 640, 2)}
@@ -121,7 +122,7 @@ def _colors(draw: np.random.Generator, points: Array) -> Array:
     waves = 0.35 * np.sin(points @ draw.normal(size=(3, 3)) * 1.7 + 1.0)
     base = 0.5 + waves + 0.08 * draw.normal(size=points.shape)
     sh = np.empty((len(points), 16, 3))
-    sh[:, 0] = (base - 0.5) / 0.28209479177387814
+    sh[:, 0] = (base - 0.5) / SH_C0
     sh[:, 1:] = draw.normal(size=(len(points), 15, 3)) * np.repeat([0.10, 0.06, 0.04], [3, 5, 7])[None, :, None]
     return sh
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
+from clod_adapter.gaussians import SH_C0
 
 BLUR, NEAR, ALPHA_MIN, ALPHA_MAX, T_MIN = 0.3, 0.01, 1 / 255, 0.999, 1e-4
 
@@ -85,7 +86,7 @@ def sh_basis(directions: Tensor) -> Tensor:
     xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
     return torch.stack(
         [
-            torch.full_like(x, 0.28209479177387814),
+            torch.full_like(x, SH_C0),
             -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
             1.0925484305920792 * xy, -1.0925484305920792 * yz, 0.31539156525252005 * (2 * zz - xx - yy),
             -1.0925484305920792 * xz, 0.5462742152960396 * (xx - yy),
