@@ -100,7 +100,7 @@ def draw(
     """Writes a picture for each view: the dial values from left to right, behind the photograph with ``beside``."""
     for view, name in zip(views, files(views), strict=True):
         shown = [render(gaussians, view.camera, dial) for dial in dials]
-        panels = [(picture.image.clamp(0, 1) * 255).round().to(torch.uint8) for picture in shown]
+        panels = [picture.pixels for picture in shown]
         write_png(out / name, torch.cat([view.image, *panels] if beside else panels, dim=1))
         kept = [int(picture.kept.sum()) for picture in shown]
         yield Picture(view.camera.name, str(out / name), kept, [psnr(p.image, view.image) for p in shown])

@@ -101,8 +101,7 @@ def imagine(
     teacher = gaussians.without_empty_bands()
     views = []
     for camera in cameras:
-        image = (render(teacher, camera).image.clamp(0, 1) * 255).round().to(torch.uint8)
-        views.append(View(camera, image))
+        views.append(View(camera, render(teacher, camera).pixels))
         if progress:
             progress(len(views), len(cameras))
     held_out = range(0, len(views), TEST_EVERY) if len(views) > 1 else range(0)

@@ -29,6 +29,11 @@ class Rendering:
     alpha: Tensor
     kept: Tensor
 
+    @property
+    def pixels(self) -> Tensor:
+        """``[H, W, 3]`` uint8, the image as a file has it."""
+        return (self.image.clamp(0, 1) * 255).round().to(torch.uint8)
+
 
 def dial(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Attenuated:
     """Opacities of the Gaussians as ``camera`` sees them at one dial value (CLoD-GS Eq. 2 and its mask).

@@ -26,8 +26,7 @@ def main(model: str, folder: str | None = None) -> None:
     for virtual_scale in DIALS:
         rendering = clod.render(gaussians, camera, virtual_scale)
         name = f"{Path(model).stem}_sv{virtual_scale}.png"
-        pixels = (rendering.image.clamp(0, 1) * 255).round().to(torch.uint8)
-        Image.fromarray(pixels.numpy()).save(name)
+        Image.fromarray(rendering.pixels.numpy()).save(name)
         print(f"wrote {name}: {int(rendering.kept.sum()):,} of {len(gaussians):,} Gaussians")
 
 
