@@ -172,11 +172,10 @@ class _Run:
         values = {name: self.parameters[name] for name in ATTRIBUTES}
         if self.empty_bands is not None:
             values["shN"] = self.empty_bands
-        return Gaussians(**values, sigma_d=self.sigma().clone(), attenuation=self.attenuation)
+        return Gaussians(**values, sigma_d=self._sigma(self.parameters[self.decay]), attenuation=self.attenuation)
 
-    def sigma(self) -> Tensor:
-        """``[N]`` sigma_d now."""
-        decay = self.parameters[self.decay]
+    def _sigma(self, decay: Tensor) -> Tensor:
+        """``[N]`` sigma_d of the parameter that is trained for it."""
         return decay if self.config.parameter == "linear" else decay.exp()
 
     def _draw(self) -> tuple[View, list[float]]:
@@ -197,7 +196,7 @@ class _Run:
         p = self.parameters
         logits, decay = p["opacity_logits"].detach().requires_grad_(), p[self.decay].detach().requires_grad_()
         leaves = {name: p[name].detach().requires_grad_(name in self.tuned) for name in ATTRIBUTES}
-        sigma = decay.exp() if self.config.parameter == "log" else decay
+        sigma = self._sigma(decay)
         distances = normalized_distances(p["means"], view.camera, self.attenuation)
         total, pull, kept = torch.zeros(()), torch.zeros_like(decay), torch.zeros(len(decay), dtype=torch.bool)
         for s in dials:
@@ -205,17 +204,15 @@ class _Run:
             # Dropped rows have opacity 0: the rasterizer leaves them out, and they get no gradient.
             image, _ = splat(Gaussians(**leaves), dialled.drawn, view.camera)
             loss = photometric_loss(image, view.image, self.config.ssim_weight)
+            now = float(loss.detach())
             weight = (1 - self.config.weight_slope * s / self.config.max_sv) ** 2
             if len(dials) > 1 and s == 1:
                 weight *= self.config.full_weight
             total = total + weight * (loss + self._paper_count(dialled, s))
             if self.has_law:
-                pull += count_gradient(
-                    dialled, logits.detach(), s, self.attenuation.tau, weight * float(loss.detach()), self.config
-                )
+                pull += count_gradient(dialled, p["opacity_logits"], s, self.attenuation.tau, weight * now, self.config)
             kept |= dialled.keep
             if s == dials[0]:
-                now = float(loss.detach())
                 self.loss = now if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * now
         leaves = {name: leaves[name] for name in self.tuned}
         of_logits, of_decay, *of_leaves = torch.autograd.grad(total, [logits, decay, *leaves.values()])
