@@ -88,16 +88,17 @@ class AdaptConfig:
     weight_slope: float = option(
         0.0, "k of w_s = (1 - k s/max_sv)^2; the paper has 0.5, 0 weighs all dial values alike"
     )
-    temperature: float = option(0.5, "width of the straight-through count's sigmoid, in log opacity")
+    temperature: float = option(0.15, "width of the straight-through count's sigmoid, in log opacity")
     ssim_weight: float = option(0.2, "weight of 1 - SSIM against L1")
     lr_sigma: float = option(0.1, "step size of log sigma_d: its largest relative change a step")
-    lr_means: float = option(2.6e-4, "step size of means, times the cameras' extent")
-    lr_quats: float = option(8e-4, "step size of quats")
-    lr_scales: float = option(8e-3, "step size of log_scales")
-    lr_opacities: float = option(5e-2, "step size of opacity_logits")
-    lr_sh0: float = option(2e-3, "step size of sh0")
+    lr_means: float = option(5.2e-4, "step size of means, times the cameras' extent")
+    lr_quats: float = option(1.6e-3, "step size of quats")
+    lr_scales: float = option(1.6e-2, "step size of log_scales")
+    lr_opacities: float = option(0.1, "step size of opacity_logits")
+    lr_sh0: float = option(4e-3, "step size of sh0")
     lr_shN: float = option(0.0, "step size of shN; 0 leaves the higher bands as they are: measured at 0.01 dB")
-    lr_final: float = option(0.05, "step sizes fall exponentially to this share of their start")
+    lr_final: float = option(0.1, "step sizes fall exponentially to this share of their start")
+    average: float = option(0.2, "the last share of the steps, over which the mean of the parameters is the outcome")
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -118,6 +119,7 @@ class AdaptConfig:
         require(self.temperature > 0, "temperature", self.temperature, "positive")
         require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
         require(0 < self.lr_final <= 1, "lr_final", self.lr_final, "above 0 and at most 1")
+        require(0 <= self.average <= 1, "average", self.average, "between 0 and 1")
         for name in ("sigma", "means", "quats", "scales", "opacities", "sh0", "shN"):
             require(getattr(self, f"lr_{name}") >= 0, f"lr_{name}", getattr(self, f"lr_{name}"), "at least 0")
         self.attenuation(1.0)  # checks the rest

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from clod_adapter.attenuation import SIGMA_MAX, normalized_distances, normalizing_distance, sigma_for_extinction
 from clod_adapter.cameras import View
+from clod_adapter.collapse import leaving_order
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import splat
@@ -30,7 +31,7 @@ def start(
     that does nothing (``SIGMA_MAX`` throughout, as ``attach`` makes it) counts as none.
 
     Args:
-        progress: called with the number of views done, and of those that are looked at in all.
+        progress: called with how far it is, and how far it is to go; a view is a step.
     """
     if base.sigma_d is not None and base.attenuation is not None and bool((base.sigma_d < SIGMA_MAX).any()):
         return base.replace(attenuation=dataclasses.replace(base.attenuation, max_sv=config.max_sv))
@@ -39,7 +40,16 @@ def start(
     if config.start != "importance":
         value = 1.0 if config.start == "constant" else WIDEST * config.max_sv
         return base.replace(sigma_d=torch.full((len(base),), value), attenuation=attenuation)
-    importance = removal_error(base, views, seed=config.seed, progress=progress)
+
+    def report(done: float) -> None:
+        """Of the views and, as much as a fifth of them, of the order."""
+        if progress:
+            progress(round(done), len(views) + ordering)
+
+    ordering = -(-len(views) // 5)
+    error = removal_error(base, views, seed=config.seed, progress=lambda done, _: report(done))
+    worth = error.sqrt() * base.opacities
+    importance = leaving_order(base, worth, lambda share: report(len(views) + share * ordering))
     distances = typical_distance(base, views, attenuation)
     sigma = sigma_from_importance(
         base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent

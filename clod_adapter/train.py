@@ -76,8 +76,9 @@ def adapt(
 
     Each step draws a view, renders it at full detail and at one log-uniform dial value s in [1, max_sv], and
     minimises ``full_weight L_render(1) + L_render(s)``, L_render being ``losses.photometric_loss``, while
-    ``counting.count_gradient`` presses the share of Gaussians kept towards its law by way of sigma_d. A base that
-    already has a sigma_d is continued from.
+    ``counting.count_gradient`` presses the share of Gaussians kept towards its law by way of sigma_d. The outcome is
+    the mean of the parameters over the last ``average`` of the steps: step sizes can then stay long to the end. A base
+    that already has a sigma_d is continued from.
 
     ``AdaptConfig.paper`` gives CLoD-GS's own objective instead (section 3.3): one s a step and
     ``w_s (L_render + reg_weight L_reg)`` with ``L_reg = (s - 1)^2 relu(eta - s^-exponent)^2``, eta the share kept,
@@ -149,6 +150,8 @@ class _Run:
             n for n in ATTRIBUTES if n != "opacity_logits" and self.rates[n] > 0 and getattr(start, n).numel()
         ]
         self.loss = math.nan
+        self.mean: dict[str, Tensor] = {}  # of the parameters over the last ``average`` of the steps
+        self.averaged = 0
 
     def run(self, start_seconds: float) -> Adapted:
         began, done, interrupted = time.perf_counter(), 0, False
@@ -169,10 +172,20 @@ class _Run:
         return max(by_steps, seconds / self.config.time_budget) if self.config.time_budget else by_steps
 
     def gaussians(self) -> Gaussians:
-        values = {name: self.parameters[name] for name in ATTRIBUTES}
+        parameters = self.parameters | self.mean
+        values = {name: parameters[name] for name in ATTRIBUTES}
         if self.empty_bands is not None:
             values["shN"] = self.empty_bands
-        return Gaussians(**values, sigma_d=self._sigma(self.parameters[self.decay]), attenuation=self.attenuation)
+        return Gaussians(**values, sigma_d=self._sigma(parameters[self.decay]), attenuation=self.attenuation)
+
+    def _average(self) -> None:
+        """Takes the parameters as they stand into their mean; the optimiser goes on from where it is."""
+        self.averaged += 1
+        for name in [*self.tuned, "opacity_logits", self.decay]:
+            if name in self.mean:
+                self.mean[name].lerp_(self.parameters[name], 1 / self.averaged)
+            else:
+                self.mean[name] = self.parameters[name].clone()
 
     def _sigma(self, decay: Tensor) -> Tensor:
         """``[N]`` sigma_d of the parameter that is trained for it."""
@@ -224,6 +237,8 @@ class _Run:
         self.optimizer.step({"opacity_logits": of_logits}, rows, rates)
         self.optimizer.step({self.decay: of_decay + pull}, self.all_rows, rates)
         p[self.decay].clamp_(*self.range)
+        if share_done > 1 - self.config.average:
+            self._average()
 
     def _paper_count(self, dialled: Attenuated, s: float) -> Tensor | float:
         """The paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2``."""

@@ -25,6 +25,7 @@ FLOORS = [
         "gaussians",
         "cameras",
         "attenuation",
+        "collapse",
         "counting",
         "losses",
         "metrics",
