@@ -41,7 +41,11 @@ QUESTIONS: dict[str, dict[str, dict[str, object]]] = {
         "paper, without w_s": {"paper": True, "weight_slope": 0.0},
         "paper, without L_reg": {"paper": True, "reg_weight": 0.0},
     },
-    "start": {"start constant": {"start": "constant"}, "start identity": {"start": "identity"}},
+    "start": {
+        "by removal error alone": {"start": "error"},
+        "start constant": {"start": "constant"},
+        "start identity": {"start": "identity"},
+    },
     "parameter": {
         "linear sigma, 1e-2": {"parameter": "linear", "lr_sigma": 1e-2},
         "log sigma, 1e-2": {"lr_sigma": 1e-2},
@@ -56,6 +60,8 @@ QUESTIONS: dict[str, dict[str, dict[str, object]]] = {
         "none": {"reg_weight": 0.0},
         "a quarter": {"reg_weight": clod.AdaptConfig().reg_weight / 4},
         "four times": {"reg_weight": 4 * clod.AdaptConfig().reg_weight},
+        "sigmoid 0.5 wide": {"temperature": 0.5},
+        "sigmoid 0.05 wide": {"temperature": 0.05},
         "the paper's L_reg, straight through": {"count_term": "paper", "reg_weight": 1.0},
     },
     "sampling": {
@@ -69,7 +75,12 @@ QUESTIONS: dict[str, dict[str, dict[str, object]]] = {
         "twice as fast": TWICE,
         "higher bands too": {"lr_shN": 1e-4},
     },
-    "schedule": {"steps stay long": {"lr_final": 1.0}},
+    "schedule and its end": {
+        "no mean": {"average": 0.0},
+        "no mean, steps fall to a twentieth": {"average": 0.0, "lr_final": 0.05},
+        "steps stay long": {"lr_final": 1.0},
+        "steps stay long, no mean": {"average": 0.0, "lr_final": 1.0},
+    },
 }
 ABLATIONS = {label: changed for rows in QUESTIONS.values() for label, changed in rows.items()}
 
@@ -86,7 +97,13 @@ LEAVE_OUT: dict[str, dict[str, object]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*")
-    parser.add_argument("--ablations", action="store_true", help=f"every choice by itself, {ABLATION}")
+    parser.add_argument(
+        "--ablations",
+        nargs="*",
+        metavar="LABEL",
+        choices=ABLATIONS,
+        help=f"every choice, or these, by itself, {ABLATION}",
+    )
     parser.add_argument("--leave-out", action="store_true", help="what a step can leave out, at three lengths each")
     parser.add_argument("--table", action="store_true", help="print the rows there are")
     parser.add_argument("--questions", action="store_true", help="print a table for each question, of the scenes")
@@ -101,14 +118,14 @@ def main() -> None:
             print_questions(scene)
         return
     runs = {args.label: dict(_setting(text) for text in args.set)}
-    if args.ablations:
-        runs = {label: {**ABLATION, **changed} for label, changed in ABLATIONS.items()}
+    if args.ablations is not None:
+        runs = {label: {**ABLATION, **ABLATIONS[label]} for label in args.ablations or ABLATIONS}
     if args.leave_out:
         runs = LEAVE_OUT
     for scene in args.scenes:
         for label, changed in runs.items():
             for seed in args.seeds:
-                run(scene, label, make_config(changed, seed), changed, popping=args.ablations)
+                run(scene, label, make_config(changed, seed), changed, popping=args.ablations is not None)
 
 
 def stored() -> dict[tuple[str, str, int], list[dict[str, Any]]]:

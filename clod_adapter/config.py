@@ -10,7 +10,7 @@ from clod_adapter.errors import ClodError
 
 NORMALIZERS = ("max", "quantile", "scene")
 CUTS = ("hard", "soft")
-STARTS = ("importance", "constant", "identity")
+STARTS = ("importance", "error", "constant", "identity")
 PARAMETERS = ("log", "linear")
 SAMPLINGS = ("pair", "log", "uniform")
 COUNT_TERMS = ("law", "paper")
@@ -74,7 +74,11 @@ class AdaptConfig:
     eps: float = option(1e-8, "the paper's epsilon")
     normalizer: str = option("scene", "what distances are divided by: scene, quantile or max (the paper's)")
     quantile: float = option(0.95, "quantile of distances that becomes D (normalizers scene and quantile)")
-    start: str = option("importance", "first sigma_d: importance (by rank), constant (1) or identity (no fading)")
+    start: str = option(
+        "importance",
+        "first sigma_d: importance (by rank; who has a neighbour to stand in for it leaves sooner), error (by rank of "
+        "removal error alone), constant (1) or identity (no fading)",
+    )
     start_share: float = option(0.62, "share of Gaussians to keep at s = 1")
     parameter: str = option("log", "what is trained: log (of sigma_d) or linear (sigma_d, the paper's)")
     sampling: str = option("pair", "dial values of a step: pair (1 and one log-uniform), log, or uniform (the paper's)")

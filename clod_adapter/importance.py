@@ -37,24 +37,33 @@ def start(
         return base.replace(attenuation=dataclasses.replace(base.attenuation, max_sv=config.max_sv))
     views = spread(views)
     attenuation = config.attenuation(scene_distance(base, views, config.quantile))
-    if config.start != "importance":
+    if config.start in ("constant", "identity"):
         value = 1.0 if config.start == "constant" else WIDEST * config.max_sv
         return base.replace(sigma_d=torch.full((len(base),), value), attenuation=attenuation)
+    importance = _importance(base, views, config, progress)
+    distances = typical_distance(base, views, attenuation)
+    sigma = sigma_from_importance(
+        base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent
+    )
+    return base.replace(sigma_d=sigma.minimum(WIDEST * config.max_sv * distances), attenuation=attenuation)
+
+
+def _importance(
+    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Callable[[int, int], None] | None
+) -> Tensor:
+    """``[N]``, the larger the longer a Gaussian is to stay, by ``config.start``."""
 
     def report(done: float) -> None:
         """Of the views and, as much as a fifth of them, of the order."""
         if progress:
             progress(round(done), len(views) + ordering)
 
-    ordering = -(-len(views) // 5)
+    ordering = 0 if config.start == "error" else -(-len(views) // 5)
     error = removal_error(base, views, seed=config.seed, progress=lambda done, _: report(done))
+    if config.start == "error":
+        return error
     worth = error.sqrt() * base.opacities
-    importance = leaving_order(base, worth, lambda share: report(len(views) + share * ordering))
-    distances = typical_distance(base, views, attenuation)
-    sigma = sigma_from_importance(
-        base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent
-    )
-    return base.replace(sigma_d=sigma.minimum(WIDEST * config.max_sv * distances), attenuation=attenuation)
+    return leaving_order(base, worth, lambda share: report(len(views) + share * ordering))
 
 
 def spread(views: Sequence[View]) -> Sequence[View]:

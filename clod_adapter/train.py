@@ -237,7 +237,7 @@ class _Run:
         self.optimizer.step({"opacity_logits": of_logits}, rows, rates)
         self.optimizer.step({self.decay: of_decay + pull}, self.all_rows, rates)
         p[self.decay].clamp_(*self.range)
-        if share_done > 1 - self.config.average:
+        if share_done >= 1 - self.config.average:
             self._average()
 
     def _paper_count(self, dialled: Attenuated, s: float) -> Tensor | float:

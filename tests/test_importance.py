@@ -142,3 +142,18 @@ def test_of_no_gaussians() -> None:
     none = gaussians(0, 0, 0)
     sigma = sigma_from_importance(none, torch.empty(0), torch.empty(0), CONFIG, share=0.6, exponent=1.5)
     assert sigma.shape == (0,)
+
+
+def test_the_orders_of_the_start() -> None:
+    """By removal error alone the most important leaves last; with neighbours it may leave sooner."""
+    some = gaussians(200, 0, 0)
+    views = photograph(some, ring(3, 20, 16))
+    error = removal_error(some, views, seed=0)
+    by_error, by_default = (importance.start(some, views, AdaptConfig(start=name)) for name in ("error", "importance"))
+
+    def leaving(dialled: Gaussians) -> Tensor:
+        d = typical_distance(some, views, dialled.attenuation)
+        return extinction_scale(dialled.opacity_logits, dialled.sigma_d, d, dialled.attenuation).argsort()
+
+    assert torch.equal(leaving(by_error)[100:180], error.argsort(stable=True)[100:180])
+    assert not torch.equal(leaving(by_default)[100:180], leaving(by_error)[100:180])

@@ -296,6 +296,26 @@ def test_one_dial_value_a_step(captured: tuple[Gaussians, Scene], monkeypatch: p
     assert_uniform((torch.tensor(scales) - 1) / 3)
 
 
+@pytest.mark.parametrize(("share", "steps"), [(1.0, [1, 2, 3, 4]), (0.5, [3, 4]), (0.0, [4])])
+def test_the_outcome_is_the_mean_of_the_last_steps(
+    captured: tuple[Gaussians, Scene], share: float, steps: list[int]
+) -> None:
+    """Of the parameters, so of log sigma_d; the steps themselves are as without."""
+    seen: list[Gaussians] = []
+
+    def keep(progress: Progress) -> None:
+        if progress.phase == "train":
+            now = progress.gaussians()
+            seen.append(now.replace(**{name: value.clone() for name, value in now.tensors().items()}))
+
+    adapt(*captured, config_of(iters=4, average=0.0), keep)
+    states = [seen[step - 1] for step in steps]
+    found = adapt(*captured, config_of(iters=4, average=share)).gaussians
+    for name in ATTRIBUTES:
+        torch.testing.assert_close(getattr(found, name), torch.stack([getattr(g, name) for g in states]).mean(0))
+    torch.testing.assert_close(found.sigma_d.log(), torch.stack([g.sigma_d.log() for g in states]).mean(0))
+
+
 def test_a_time_budget_ends_it(captured: tuple[Gaussians, Scene]) -> None:
     result = adapt(*captured, config_of(iters=10_000_000, time_budget=0.3))
     assert 0 < result.steps < 10_000 and 0.3 <= result.seconds < 5 and not result.interrupted
