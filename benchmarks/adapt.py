@@ -68,7 +68,12 @@ QUESTIONS: dict[str, dict[str, dict[str, object]]] = {
         "one, log-uniform, 30 % at 1": {"sampling": "log", "full_share": 0.3},
         "one, uniform": {"sampling": "uniform"},
     },
-    "weights": {"s = 1 double": {"full_weight": 2.0}, "s = 1 fourfold": {"full_weight": 4.0}},
+    "weights": {
+        "w_s = 1": {"weight_slope": 0.0},
+        "w_s as the paper's": {"weight_slope": 0.5},
+        "s = 1 double": {"full_weight": 2.0},
+        "s = 1 fourfold": {"full_weight": 4.0},
+    },
     "light update": {
         "frozen": FROZEN,
         "half as fast": HALF,

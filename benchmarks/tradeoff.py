@@ -2,7 +2,7 @@
 
     python benchmarks/tradeoff.py plush_half                  # all methods at all budgets, an hour or so
     python benchmarks/tradeoff.py plush_half --methods ours paper --iters 150 300 --seeds 0 1 2
-    python benchmarks/tradeoff.py plush_half --plot           # the rows there are: docs/images/error_vs_time.png
+    python benchmarks/tradeoff.py plush_half --plot           # the rows there are: docs/error_vs_time.html, and its PNG
 
 A budget is a number of steps, each a run of its own with its own schedule. A specialist is made for one count, which
 is what ours keeps at that dial value in its longest run (so run ours first): the base merged to it, then tuned as
@@ -22,12 +22,28 @@ from common import RESULTS, ROOT, append, capture
 
 import clod_adapter as clod
 from clod_adapter.cli.console import Console
-from clod_adapter.report.charts import error, finish
+from clod_adapter.report import page
+from clod_adapter.report.charts import error, finish, inline_svg, training_chart
 from clod_adapter.report.style import INK, SERIES, new_figure, save
 
 FILE = "tradeoff.jsonl"
+PAGE = ROOT / "docs" / "error_vs_time.html"
 PICTURE = ROOT / "docs" / "images" / "error_vs_time.png"
-ITERS = (150, 300, 600, 1500, 4000)
+ITERS = (150, 300, 600, 1500)
+CAPTION = (
+    "Each point is a run of its own, with its own schedule, measured after its end; the clock includes the start of "
+    "ours and a specialist's merging. The dashed line is the base, untouched and whole."
+)
+READING = (
+    (
+        "One checkpoint ({given}) was given to three methods, each for several lengths of training. Ours and the "
+        "paper's form make one file for all dial values, so their seconds are paid once. A specialist is a file for "
+        "one dial value alone, the base merged to the count that ours keeps there and then tuned: its seconds are paid "
+        "for each.",
+        "lead",
+    ),
+    ("Down and to the left is better: less error after less time. Both axes are logarithmic.", ""),
+)
 LABELS = {"ours": "ours, one file", "paper": "the paper's form, one file", "specialist": "specialists, a file each"}
 
 
@@ -143,7 +159,42 @@ def plot(scene: str, max_sv: float) -> None:
             axes.set_xlabel("seconds of training (log scale)")
             finish(axes)
         save(figure, PICTURE)
-    print(PICTURE)
+    write(scene, max_sv, rows, dials)
+    print(f"{PICTURE}\n{PAGE}")
+
+
+def write(scene: str, max_sv: float, rows: list[dict[str, Any]], dials: list[float]) -> None:
+    """The page: what was run on what, a chart a dial value, and every number in a table."""
+    base = rows[-1]["base"]
+    given = f"{scene}, {base['kept']:,.0f} Gaussians, {base['psnr']:.2f} dB on held-out photographs"
+    body = [page.paragraph(text.format(given=given), kind) for text, kind in READING]
+    cells = []
+    for k, s in enumerate(dials):
+        found = {label: curve([r for r in rows if r["method"] == method], k) for method, label in LABELS.items()}
+        found = {label: points for label, points in found.items() if points}
+        curves = [
+            {
+                "label": f"{label} ({points[-1][2]:.0%} kept)",
+                "points": [{"seconds": seconds, "psnr": psnr} for seconds, psnr, _ in points],
+            }
+            for label, points in found.items()
+        ]
+        svg = inline_svg(
+            training_chart(curves, base["psnr"]), f"held-out error at s = {s:g} against seconds of training"
+        )
+        title = "full quality" if s == 1 else "the end of the dial" if s == dials[-1] else "between"
+        body.append(page.section(f"s = {s:g}: {title}", page.chart(svg, CAPTION)))
+        cells += [(f"s = {s:g}, {label}", [row_of(*point) for point in points]) for label, points in found.items()]
+    head = ("seconds", "PSNR dB", "mean squared error, thousandths", "Gaussians kept")
+    body.append(page.section("All rows", page.table(head, cells)))
+    facts = rows[-1]["machine"] | {"max_sv": max_sv, "command": f"python benchmarks/tradeoff.py {scene}"}
+    facts["commits"] = ", ".join(sorted({row["commit"] for row in rows}))
+    body.append(page.section("What it was run with", page.facts(facts)))
+    page.write_page(PAGE, "Held-out error against seconds of training", "clod-adapter, benchmark", body, {"rows": rows})
+
+
+def row_of(seconds: float, psnr: float, share: float) -> list[str]:
+    return [f"{seconds:.0f}", f"{psnr:.2f}", f"{1e3 * error(psnr):.3f}", f"{share:.1%}"]
 
 
 def curve(rows: Sequence[dict[str, Any]], k: int) -> list[tuple[float, float, float]]:

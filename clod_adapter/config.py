@@ -64,7 +64,7 @@ class AdaptConfig:
     """How an adaptation is run. docs/method.md says which defaults were measured, and what the others stand on."""
 
     max_sv: float = option(5.0, "largest dial value to train for")
-    iters: int = option(2500, "training steps")
+    iters: int = option(1500, "training steps")
     time_budget: float | None = option(
         None, "stop training after this many seconds, schedule included (default: no limit)"
     )
@@ -90,7 +90,7 @@ class AdaptConfig:
     count_term: str = option("law", "what moves the count: law (both ways, by sigma_d alone) or paper (its L_reg)")
     reg_weight: float = option(0.5, "weight of the count term (the paper's lambda_reg)")
     weight_slope: float = option(
-        0.0, "k of w_s = (1 - k s/max_sv)^2; the paper has 0.5, 0 weighs all dial values alike"
+        0.25, "k of w_s = (1 - k s/max_sv)^2; the paper has 0.5, 0 weighs all dial values alike"
     )
     temperature: float = option(0.15, "width of the straight-through count's sigmoid, in log opacity")
     ssim_weight: float = option(0.2, "weight of 1 - SSIM against L1")

@@ -75,14 +75,13 @@ def adapt(
     """Learns sigma_d for ``base`` on the training views of ``scene``, and updates the rest lightly.
 
     Each step draws a view, renders it at full detail and at one log-uniform dial value s in [1, max_sv], and
-    minimises ``full_weight L_render(1) + L_render(s)``, L_render being ``losses.photometric_loss``, while
-    ``counting.count_gradient`` presses the share of Gaussians kept towards its law by way of sigma_d. The outcome is
-    the mean of the parameters over the last ``average`` of the steps: step sizes can then stay long to the end. A base
-    that already has a sigma_d is continued from.
+    minimises ``full_weight w_1 L_render(1) + w_s L_render(s)``, L_render being ``losses.photometric_loss`` and ``w_s =
+    (1 - weight_slope s / max_sv)^2``, while ``counting.count_gradient`` presses the share of Gaussians kept towards its
+    law by way of sigma_d. The outcome is the mean of the parameters over the last ``average`` of the steps: step sizes
+    can then stay long to the end. A base that already has a sigma_d is continued from.
 
     ``AdaptConfig.paper`` gives CLoD-GS's own objective instead (section 3.3): one s a step and
-    ``w_s (L_render + reg_weight L_reg)`` with ``L_reg = (s - 1)^2 relu(eta - s^-exponent)^2``, eta the share kept,
-    and ``w_s = (1 - weight_slope s / max_sv)^2``.
+    ``w_s (L_render + reg_weight L_reg)`` with ``L_reg = (s - 1)^2 relu(eta - s^-exponent)^2``, eta the share kept.
 
     A KeyboardInterrupt ends training and returns what there is.
 
