@@ -110,7 +110,8 @@ class CellRun:
         measuring = len(cell.points) * len(scene.test) / cell.cost(len(scene.train), len(scene.test))
 
         def follow(progress: Progress) -> None:
-            of_it = 0.05 * progress.share if progress.phase == "start" else 0.05 + 0.95 * progress.share
+            begin, end = {"start": (0.0, 0.04), "order": (0.04, 0.05), "train": (0.05, 1.0)}[progress.phase]
+            of_it = begin + (end - begin) * progress.share
             self.show((1 - measuring) * of_it, f"step {progress.done}" if progress.phase == "train" else "importance")
 
         return adapt_at_range(

@@ -23,7 +23,7 @@ from clod_adapter.train import Progress
 CHECK_EVERY = 10.0  # seconds between looks at the held-out views, at least
 CHECK_COST = 0.03  # share of the time that they may take, at most
 CHECK_VIEWS = 4
-LABELS = {"start": "importance", "train": "training"}
+LABELS = {"start": "importance", "order": "order of leaving", "train": "training"}
 
 
 class GracefulStop:

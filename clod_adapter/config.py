@@ -133,12 +133,15 @@ class AdaptConfig:
         """The paper's own form, where it says; the rest, and ``changes``, as in ours.
 
         CLoD-GS section 3.3: one s ~ U(1, max_sv) a step, w_s with k = 0.5, its L_reg with lambda 1, distances divided
-        by the frustum's largest, a hard cut, sigma_d itself trained at 1e-2. It does not give tau, the start,
-        and the gradient of its count: 1/255 (what rasterizers drop anyway), constant 1, straight through.
+        by the frustum's largest, a hard cut, sigma_d itself trained at 1e-2. It does not give tau, the start, the
+        gradient of its count and the other step sizes: 1/255 (what rasterizers drop anyway), constant 1, straight
+        through a sigmoid 0.5 wide, half of ours falling to a twentieth, without a mean at the end.
         """
         own: dict[str, Any] = {
             "tau": 1 / 255, "cut": "hard", "normalizer": "max", "start": "constant", "parameter": "linear",
             "sampling": "uniform", "count_term": "paper", "reg_weight": 1.0, "weight_slope": 0.5, "lr_sigma": 1e-2,
+            "temperature": 0.5, "average": 0.0, "lr_final": 0.05, "lr_means": 2.6e-4, "lr_quats": 8e-4,
+            "lr_scales": 8e-3, "lr_opacities": 5e-2, "lr_sh0": 2e-3,
         }  # fmt: skip
         return cls(**{**own, **changes})
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -23,7 +24,7 @@ MOST_VIEWS = 64
 
 
 def start(
-    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Callable[[int, int], None] | None = None
+    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Callable[[str, int, int], None] | None = None
 ) -> Gaussians:
     """The Gaussians with a sigma_d to train from, by what they do in up to MOST_VIEWS of the views, evenly spread.
 
@@ -31,7 +32,8 @@ def start(
     that does nothing (``SIGMA_MAX`` throughout, as ``attach`` makes it) counts as none.
 
     Args:
-        progress: called with how far it is, and how far it is to go; a view is a step.
+        progress: called with "start" and the number of views done, and of those that are looked at in all; then with
+            "order" and the number of Gaussians whose place is known, and of all of them.
     """
     if base.sigma_d is not None and base.attenuation is not None and bool((base.sigma_d < SIGMA_MAX).any()):
         return base.replace(attenuation=dataclasses.replace(base.attenuation, max_sv=config.max_sv))
@@ -49,21 +51,17 @@ def start(
 
 
 def _importance(
-    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Callable[[int, int], None] | None
+    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Callable[[str, int, int], None] | None
 ) -> Tensor:
     """``[N]``, the larger the longer a Gaussian is to stay, by ``config.start``."""
 
-    def report(done: float) -> None:
-        """Of the views and, as much as a fifth of them, of the order."""
-        if progress:
-            progress(round(done), len(views) + ordering)
+    def of(phase: str) -> Callable[[int, int], None] | None:
+        return partial(progress, phase) if progress else None
 
-    ordering = 0 if config.start == "error" else -(-len(views) // 5)
-    error = removal_error(base, views, seed=config.seed, progress=lambda done, _: report(done))
+    error = removal_error(base, views, seed=config.seed, progress=of("start"))
     if config.start == "error":
         return error
-    worth = error.sqrt() * base.opacities
-    return leaving_order(base, worth, lambda share: report(len(views) + share * ordering))
+    return leaving_order(base, error.sqrt() * base.opacities, of("order"))
 
 
 def spread(views: Sequence[View]) -> Sequence[View]:

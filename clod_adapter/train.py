@@ -33,13 +33,13 @@ class Progress:
     """Where an adaptation stands; handed to the progress callback.
 
     Attributes:
-        phase: "start" (importance pass) or "train".
+        phase: "start" (a view a step), "order" (a Gaussian a step: who leaves before whom) or "train".
         done, total: steps of the phase.
-        seconds: since the phase began.
+        seconds: since training began; before it, since the adaptation did.
         share: of the phase that is done, by steps or by time budget, whichever is further.
         loss: running mean of the photometric loss, NaN before the first step.
-        gaussians: gives the state now (in the start phase, the base); it shares memory with what is
-            being trained, so use it within the callback.
+        gaussians: gives the state now (before training, the base; within the last ``average`` of it, the mean so
+            far); it shares memory with what is being trained, so use it within the callback.
     """
 
     phase: str
@@ -58,7 +58,7 @@ class Adapted:
     Attributes:
         gaussians: with ``sigma_d`` and ``attenuation``.
         steps: training steps done.
-        seconds: wall time of the training loop; start_seconds: of the importance pass before it.
+        seconds: wall time of the training loop; start_seconds: of what comes before it.
         interrupted: a KeyboardInterrupt ended it early.
     """
 
@@ -83,7 +83,7 @@ def adapt(
     ``AdaptConfig.paper`` gives CLoD-GS's own objective instead (section 3.3): one s a step and
     ``w_s (L_render + reg_weight L_reg)`` with ``L_reg = (s - 1)^2 relu(eta - s^-exponent)^2``, eta the share kept.
 
-    A KeyboardInterrupt ends training and returns what there is.
+    A KeyboardInterrupt ends training and returns what there is: before the last ``average`` of the steps, no mean.
 
     Raises:
         ClodError: no training views, or no Gaussians.
@@ -95,10 +95,10 @@ def adapt(
         raise ClodError("the checkpoint has no Gaussians, so there is nothing to adapt")
     began = time.perf_counter()
 
-    def report(done: int, total: int) -> None:
+    def report(phase: str, done: int, total: int) -> None:
         if progress:
             seconds = time.perf_counter() - began
-            progress(Progress("start", done, total, seconds, done / total, math.nan, lambda: base))
+            progress(Progress(phase, done, total, seconds, done / total, math.nan, lambda: base))
 
     # Where the higher bands are not tuned, empty ones stay empty.
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
@@ -179,12 +179,12 @@ class _Run:
 
     def _average(self) -> None:
         """Takes the parameters as they stand into their mean; the optimiser goes on from where it is."""
+        now = {name: self.parameters[name] for name in [*self.tuned, "opacity_logits", self.decay]}
         self.averaged += 1
-        for name in [*self.tuned, "opacity_logits", self.decay]:
-            if name in self.mean:
-                self.mean[name].lerp_(self.parameters[name], 1 / self.averaged)
-            else:
-                self.mean[name] = self.parameters[name].clone()
+        if self.averaged == 1:
+            self.mean = {name: value.clone() for name, value in now.items()}
+        for name, mean in self.mean.items():
+            mean.lerp_(now[name], 1 / self.averaged)
 
     def _sigma(self, decay: Tensor) -> Tensor:
         """``[N]`` sigma_d of the parameter that is trained for it."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
 from clod_adapter.collapse import APART, COLOUR_FLOOR, LEAVING, NEIGHBOURS, leaving_order
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from scenes import gaussians
 
@@ -74,6 +77,23 @@ def test_all_in_one_place_and_of_no_worth() -> None:
 
 
 def test_reports_its_progress() -> None:
-    seen: list[float] = []
-    leaving_order(gaussians(100, 0, 0), torch.ones(100), seen.append)
-    assert seen == sorted(seen) and 0 < seen[0] < 0.5 and seen[-1] == 0.99
+    seen: list[tuple[int, int]] = []
+    leaving_order(gaussians(100, 0, 0), torch.ones(100), lambda *count: seen.append(count))
+    assert seen == sorted(seen) and 0 < seen[0][0] < 50 and seen[-1] == (100, 100)
+
+
+def test_many_in_one_place_take_few_rounds() -> None:
+    some, seen = gaussians(2000, 0, 0), []
+    some = some.replace(means=torch.zeros(2000, 3), sh0=torch.zeros(2000, 1, 3))
+    order = leaving_order(some, torch.zeros(2000), lambda *count: seen.append(count))
+    assert sorted(order.tolist()) == list(range(2000)) and len(seen) < 300
+
+
+def test_what_is_not_finite() -> None:
+    """Colours and sizes are then unlike all others; centres are refused."""
+    some = gaussians(20, 0, 0)
+    odd = some.replace(sh0=some.sh0.index_fill(0, torch.tensor([3, 4]), math.inf))
+    odd = odd.replace(log_scales=some.log_scales.index_fill(0, torch.tensor([5]), math.nan))
+    assert sorted(leaving_order(odd, torch.rand(20)).tolist()) == list(range(20))
+    with pytest.raises(ClodError, match="means are not all finite"):
+        leaving_order(some.replace(means=some.means.index_fill(0, torch.tensor([3]), math.nan)), torch.rand(20))

@@ -9,6 +9,7 @@ from torch import Tensor
 from clod_adapter import importance
 from clod_adapter.attenuation import attenuate, extinction_scale, normalized_distances
 from clod_adapter.cameras import View
+from clod_adapter.collapse import leaving_order
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import removal_error, sigma_from_importance, typical_distance
@@ -74,9 +75,8 @@ def test_start_looks_at_some_of_many_views(monkeypatch: pytest.MonkeyPatch) -> N
         monkeypatch.setattr(importance, "MOST_VIEWS", most)
         importance.start(some, views, AdaptConfig(), lambda *count: counts.append(count))
         assert looked == [views[k].camera.name for k in expected]
-        total = len(looked) + -(-len(looked) // 5)  # the last fifth is the order
-        assert counts[: len(looked)] == [(k + 1, total) for k in range(len(looked))]
-        assert counts == sorted(counts) and counts[-1] == (total, total)
+        assert counts[: len(looked)] == [("start", k + 1, len(looked)) for k in range(len(looked))]
+        assert {phase for phase, *_ in counts[len(looked) :]} == {"order"} and counts[-1] == ("order", 50, 50)
 
 
 def test_what_no_view_shows_counts_nothing() -> None:
@@ -156,4 +156,6 @@ def test_the_orders_of_the_start() -> None:
         return extinction_scale(dialled.opacity_logits, dialled.sigma_d, d, dialled.attenuation).argsort()
 
     assert torch.equal(leaving(by_error)[100:180], error.argsort(stable=True)[100:180])
-    assert not torch.equal(leaving(by_default)[100:180], leaving(by_error)[100:180])
+    order = leaving_order(some, error.sqrt() * some.opacities)
+    assert torch.equal(leaving(by_default)[100:180], order.argsort()[100:180])
+    assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
