@@ -21,7 +21,7 @@ from dataclasses import asdict
 from statistics import fmean
 from typing import Any
 
-from common import RESULTS, append, capture
+from common import RESULTS, append, capture, jsonable
 
 import clod_adapter as clod
 from clod_adapter.popping import dial_popping, path_popping
@@ -102,13 +102,8 @@ LEAVE_OUT: dict[str, dict[str, object]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*")
-    parser.add_argument(
-        "--ablations",
-        nargs="*",
-        metavar="LABEL",
-        choices=ABLATIONS,
-        help=f"every choice, or these, by itself, {ABLATION}",
-    )
+    parser.add_argument("--ablations", action="store_true", help=f"every choice by itself, {ABLATION}")
+    parser.add_argument("--only", nargs="+", metavar="LABEL", choices=ABLATIONS, default=ABLATIONS, help="of these")
     parser.add_argument("--leave-out", action="store_true", help="what a step can leave out, at three lengths each")
     parser.add_argument("--table", action="store_true", help="print the rows there are")
     parser.add_argument("--questions", action="store_true", help="print a table for each question, of the scenes")
@@ -123,14 +118,14 @@ def main() -> None:
             print_questions(scene)
         return
     runs = {args.label: dict(_setting(text) for text in args.set)}
-    if args.ablations is not None:
-        runs = {label: {**ABLATION, **ABLATIONS[label]} for label in args.ablations or ABLATIONS}
+    if args.ablations:
+        runs = {label: {**ABLATION, **ABLATIONS[label]} for label in args.only}
     if args.leave_out:
         runs = LEAVE_OUT
     for scene in args.scenes:
         for label, changed in runs.items():
             for seed in args.seeds:
-                run(scene, label, make_config(changed, seed), changed, popping=args.ablations is not None)
+                run(scene, label, make_config(changed, seed), changed, popping=args.ablations)
 
 
 def stored() -> dict[tuple[str, str, int], list[dict[str, Any]]]:
@@ -175,7 +170,9 @@ def print_questions(scene: str) -> None:
     for question, settings in QUESTIONS.items():
         print(f"\n### {question.capitalize()}\n\n| {' | '.join(heads)} |\n{'|---' * len(heads)}|")
         for label in {**QUESTIONS["form"], **settings}:
-            rows = groups.get((scene, label, int(str(ABLATION["iters"]))))
+            rows = groups.get((scene, label, int(str(ABLATION["iters"]))), [])
+            # Of other defaults than today's a row would be no neighbour of the rest.
+            rows = [r for r in rows if r["config"] == settled({**ABLATION, **ABLATIONS[label]}, r["config"]["seed"])]
             if rows:
                 popping = [f"{rows[-1]['popping'][what]['largest']:.2f}" for what in ("dial", "path")]
                 print("| " + " | ".join([label, *cells_of(rows), *popping]) + " |")
@@ -185,6 +182,11 @@ def make_config(changed: dict[str, Any], seed: int) -> clod.AdaptConfig:
     """Ours, or the paper's form, with what is changed of it."""
     changed = {"seed": seed, **changed}
     return clod.AdaptConfig.paper(**changed) if changed.pop("paper", False) else clod.AdaptConfig(**changed)
+
+
+def settled(changed: dict[str, Any], seed: int) -> dict[str, Any]:
+    """All settings, as a row has them."""
+    return json.loads(json.dumps(jsonable(asdict(make_config(changed, seed)))))
 
 
 def _setting(text: str) -> tuple[str, object]:

@@ -31,8 +31,8 @@ PAGE = ROOT / "docs" / "error_vs_time.html"
 PICTURE = ROOT / "docs" / "images" / "error_vs_time.png"
 ITERS = (150, 300, 600, 1500)
 CAPTION = (
-    "Each point is a run of its own, with its own schedule, measured after its end; the clock includes the start of "
-    "ours and a specialist's merging. The dashed line is the base, untouched and whole."
+    "Each point is the mean of runs with one length, each with its own schedule and measured after its end; the clock "
+    "includes the start of ours and a specialist's merging. The dashed line is the base, untouched and whole."
 )
 READING = (
     (
@@ -122,7 +122,7 @@ class Contest:
         ours = [r for r in stored(self.scene, self.max_sv) if r["method"] == "ours"]
         if not ours:
             sys.exit(f"the specialists need to know what ours keeps: run --methods ours on {self.scene} first")
-        longest = max(ours, key=lambda r: r["iters"])
+        longest = max(reversed(ours), key=lambda r: r["iters"])  # of equal ones the last
         return [round(row["kept"]) for row in longest["rows"]]
 
     def watched(self, label: str, work: Callable[[Callable[[float], None]], Any]) -> Any:
@@ -138,7 +138,7 @@ def stored(scene: str, max_sv: float) -> list[dict[str, Any]]:
 
 def plot(scene: str, max_sv: float) -> None:
     """A panel a dial value: error against seconds of training, the mean over seeds of the last row of each."""
-    rows = stored(scene, max_sv)
+    rows = list({(r["method"], r["iters"], r["seed"]): r for r in stored(scene, max_sv)}.values())  # the last of each
     if not rows:
         sys.exit(f"there are no rows of {scene} with max_sv {max_sv:g} in {RESULTS / FILE}")
     dials = [row["virtual_scale"] for row in rows[-1]["rows"]]
@@ -147,12 +147,10 @@ def plot(scene: str, max_sv: float) -> None:
         title = f"{scene}: held-out error against time of training, {rows[-1]['base']['kept']:,.0f} Gaussians"
         figure.suptitle(title, fontsize=11.5, weight="bold", x=0.008, ha="left")
         for k, (axes, s) in enumerate(zip(figure.subplots(1, len(dials), squeeze=False)[0], dials, strict=True)):
-            for method, colour, marker in zip(LABELS, SERIES, "oDs", strict=False):
-                points = curve([row for row in rows if row["method"] == method], k)
-                if points:
-                    xy = [(seconds, error(psnr)) for seconds, psnr, _ in points]
-                    label = f"{LABELS[method]} ({points[-1][2]:.0%} kept)"
-                    axes.plot(*zip(*xy, strict=True), color=colour, marker=marker, linewidth=1.8, label=label)
+            for (label, points), colour, marker in zip(curves(rows, k).items(), SERIES, "oDs", strict=False):
+                xy = [(seconds, error(psnr)) for seconds, psnr, _ in points]
+                named = f"{label} ({points[-1][2]:.0%} kept)"
+                axes.plot(*zip(*xy, strict=True), color=colour, marker=marker, linewidth=1.8, label=named)
             axes.axhline(error(rows[-1]["base"]["psnr"]), color=INK, linestyle="--", linewidth=1.1, label="base, whole")
             axes.set_xscale("log")
             axes.set_title(f"s = {s:g}", loc="left", fontsize=10, weight="bold")
@@ -170,9 +168,8 @@ def write(scene: str, max_sv: float, rows: list[dict[str, Any]], dials: list[flo
     body = [page.paragraph(text.format(given=given), kind) for text, kind in READING]
     cells = []
     for k, s in enumerate(dials):
-        found = {label: curve([r for r in rows if r["method"] == method], k) for method, label in LABELS.items()}
-        found = {label: points for label, points in found.items() if points}
-        curves = [
+        found = curves(rows, k)
+        lines = [
             {
                 "label": f"{label} ({points[-1][2]:.0%} kept)",
                 "points": [{"seconds": seconds, "psnr": psnr} for seconds, psnr, _ in points],
@@ -180,7 +177,7 @@ def write(scene: str, max_sv: float, rows: list[dict[str, Any]], dials: list[flo
             for label, points in found.items()
         ]
         svg = inline_svg(
-            training_chart(curves, base["psnr"]), f"held-out error at s = {s:g} against seconds of training"
+            training_chart(lines, base["psnr"]), f"held-out error at s = {s:g} against seconds of training"
         )
         title = "full quality" if s == 1 else "the end of the dial" if s == dials[-1] else "between"
         body.append(page.section(f"s = {s:g}: {title}", page.chart(svg, CAPTION)))
@@ -193,16 +190,21 @@ def write(scene: str, max_sv: float, rows: list[dict[str, Any]], dials: list[flo
     page.write_page(PAGE, "Held-out error against seconds of training", "clod-adapter, benchmark", body, {"rows": rows})
 
 
+def curves(rows: Sequence[dict[str, Any]], k: int) -> dict[str, list[tuple[float, float, float]]]:
+    """The curve of each method that has one, by its label."""
+    found = {label: curve([r for r in rows if r["method"] == method], k) for method, label in LABELS.items()}
+    return {label: points for label, points in found.items() if points}
+
+
 def row_of(seconds: float, psnr: float, share: float) -> list[str]:
     return [f"{seconds:.0f}", f"{psnr:.2f}", f"{1e3 * error(psnr):.3f}", f"{share:.1%}"]
 
 
 def curve(rows: Sequence[dict[str, Any]], k: int) -> list[tuple[float, float, float]]:
     """(seconds, PSNR, share kept) a budget, at the k-th dial value."""
-    last = {(row["iters"], row["seed"]): row for row in rows}  # later rows replace earlier ones
     found = []
-    for iters in sorted({iters for iters, _ in last}):
-        runs = [row for (steps, _), row in last.items() if steps == iters]
+    for iters in sorted({row["iters"] for row in rows}):
+        runs = [row for row in rows if row["iters"] == iters]
         each = [(run["seconds"][k], run["rows"][k]["psnr"], run["rows"][k]["kept_share"]) for run in runs]
         found.append(tuple(fmean(column) for column in zip(*each, strict=True)))
     return found
