@@ -25,7 +25,7 @@ def count_gradient(
 
     That of ``loss reg_weight (eta / law - 1)^2``, eta the share kept, through ``attenuation.count_slope``. Who is worth
     less to the picture than the pressure fades, who is worth more stays. It works both ways, and is relative: to the
-    law, as the last percent of the Gaussians matters as much as the first, and to the picture's ``loss``, a constant
+    law, as the last percent of the Gaussians matters as much as the first, and to the weighted ``loss``, a constant
     here, so that the same settings suit scenes and dial values that are fitted well or badly.
     """
     law = count_law(virtual_scale, config.start_share, config.exponent)
