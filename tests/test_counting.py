@@ -13,6 +13,7 @@ from torch import Tensor
 from clod_adapter.attenuation import attenuate, count_slope
 from clod_adapter.config import AdaptConfig
 from clod_adapter.counting import count_gradient, count_law
+from clod_adapter.optimizer import RowAdam
 
 CONFIG = AdaptConfig(max_sv=6.0)
 ATTENUATION = CONFIG.attenuation(1.0)
@@ -64,7 +65,7 @@ def test_too_many_are_pressed_down_and_too_few_lifted() -> None:
 
 @pytest.mark.parametrize("start", [-1.0, 0.7])
 def test_without_any_picture_the_counts_come_to_the_law(start: float) -> None:
-    """From too few, and from too many, in plain steps along the gradient."""
+    """From too few, and from too many, in the optimiser's steps: those who are far from the cut feel little."""
     logits, log_sigma, d = some()
     # Opaque enough that the law can be met: what is fainter than tau s stays nowhere.
     logits, log_sigma = logits.clamp(min=-1.5) + 1, log_sigma + start
@@ -79,6 +80,8 @@ def test_without_any_picture_the_counts_come_to_the_law(start: float) -> None:
         return max(found)
 
     assert worst(log_sigma) > 0.3
-    for _ in range(5000):
-        log_sigma = log_sigma - 20 * gradient(logits, log_sigma, d, 6.0 ** random.random())
+    optimizer, rows = RowAdam({"log_sigma": log_sigma}), torch.ones(N, dtype=torch.bool)
+    for _ in range(3000):
+        slope = gradient(logits, log_sigma, d, 6.0 ** random.random())
+        optimizer.step({"log_sigma": slope}, rows, {"log_sigma": 0.01})
     assert worst(log_sigma) < 0.2
