@@ -18,6 +18,7 @@ import time
 from dataclasses import asdict
 
 import torch
+from adapt import at_shares
 from common import RESULTS, append, capture
 
 import clod_adapter as clod
@@ -25,7 +26,7 @@ from clod_adapter.placement import imagine, place, typical_reach
 
 FILE = "nophoto.jsonl"
 KINDS = ("photographs", "teacher", "placed")
-DIALS = (1.0, 2.0, 3.0, 5.0)
+DIALS = (1.0, 2.0, 3.0, 5.0, 7.0)
 
 
 def main() -> None:
@@ -33,6 +34,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--iters", type=int, default=clod.AdaptConfig().iters)
+    parser.add_argument("--max-sv", type=float, default=7.0)
     parser.add_argument("--seed", type=int, default=0, help="of the training and of the placement")
     parser.add_argument("--table", action="store_true", help="print the rows there are")
     args = parser.parse_args()
@@ -40,7 +42,7 @@ def main() -> None:
         print_table()
     for scene in args.scenes:
         for kind in args.kinds:
-            run(scene, kind, clod.AdaptConfig(iters=args.iters, seed=args.seed))
+            run(scene, kind, clod.AdaptConfig(iters=args.iters, seed=args.seed, max_sv=args.max_sv))
 
 
 def run(scene: str, kind: str, config: clod.AdaptConfig) -> None:
@@ -58,10 +60,11 @@ def run(scene: str, kind: str, config: clod.AdaptConfig) -> None:
         placement = distances(cameras, [view.camera for view in photographs.train], typical_reach(base))
     seconds = time.perf_counter() - began
     adapted = clod.adapt(base, views, config)
-    rows = clod.evaluate(adapted.gaussians, photographs.test, DIALS)
+    rows = clod.evaluate(adapted.gaussians, photographs.test, [s for s in DIALS if s <= config.max_sv])
     append(FILE, {
         "benchmark": "nophoto", "scene": scene, "kind": kind, "config": asdict(config), "views": len(views.train),
         "placement": placement, "base": base_row.as_dict(), "rows": [row.as_dict() for row in rows],
+        "at_shares": at_shares(adapted.gaussians, photographs.test),
         "steps": adapted.steps, "views_seconds": round(seconds, 2), "start_seconds": round(adapted.start_seconds, 2),
         "train_seconds": round(adapted.seconds, 2),
     })  # fmt: skip
@@ -89,11 +92,13 @@ def distances(placed: list[clod.Camera], real: list[clod.Camera], reach: float) 
 
 
 def print_table() -> None:
-    print("| scene | steps | views | base | " + " | ".join(f"s = {s:g}" for s in DIALS) + " |")
-    print("|---" * (4 + len(DIALS)) + "|")
+    print("| scene | steps | views | base | " + " | ".join(f"s = {s:g}" for s in DIALS) + " | 12 % |")
+    print("|---" * (5 + len(DIALS)) + "|")
     for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
         row = json.loads(line)
         cells = [f"{r['psnr']:.2f} @ {r['kept_share']:.1%}" for r in row["rows"]]
+        cells += [""] * (len(DIALS) - len(cells))
+        cells.append(next((f"{r['psnr']:.2f}" for r in row.get("at_shares", []) if r["share"] == 0.12), ""))
         print(
             "| "
             + " | ".join([row["scene"], str(row["steps"]), row["kind"], f"{row['base']['psnr']:.2f}", *cells])
