@@ -21,7 +21,7 @@ from dataclasses import asdict
 from statistics import fmean
 from typing import Any
 
-from common import RESULTS, append, capture, jsonable
+from common import RESULTS, append, capture
 
 import clod_adapter as clod
 from clod_adapter.popping import dial_popping, path_popping
@@ -170,7 +170,8 @@ def print_questions(scene: str) -> None:
         for label in {**QUESTIONS["form"], **settings}:
             rows = groups.get((scene, label, int(str(ABLATION["iters"]))), [])
             # Of other defaults than today's a row would be no neighbour of the rest.
-            rows = [r for r in rows if r["config"] == settled({**ABLATION, **ABLATIONS[label]}, r["config"]["seed"])]
+            changed = {**ABLATION, **ABLATIONS[label]}
+            rows = [r for r in rows if r["config"] == asdict(make_config(changed, r["config"]["seed"]))]
             if rows:
                 popping = [f"{rows[-1]['popping'][what]['largest']:.2f}" for what in ("dial", "path")]
                 print("| " + " | ".join([label, *cells_of(rows), *popping]) + " |")
@@ -180,11 +181,6 @@ def make_config(changed: dict[str, Any], seed: int) -> clod.AdaptConfig:
     """Ours, or the paper's form, with what is changed of it."""
     changed = {"seed": seed, **changed}
     return clod.AdaptConfig.paper(**changed) if changed.pop("paper", False) else clod.AdaptConfig(**changed)
-
-
-def settled(changed: dict[str, Any], seed: int) -> dict[str, Any]:
-    """All settings, as a row has them."""
-    return json.loads(json.dumps(jsonable(asdict(make_config(changed, seed)))))
 
 
 def _setting(text: str) -> tuple[str, object]:

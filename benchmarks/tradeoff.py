@@ -23,8 +23,8 @@ from common import RESULTS, ROOT, append, capture
 import clod_adapter as clod
 from clod_adapter.cli.console import Console
 from clod_adapter.report import page
-from clod_adapter.report.charts import error, finish, inline_svg, training_chart
-from clod_adapter.report.style import INK, SERIES, new_figure, save
+from clod_adapter.report.charts import draw_training, error, inline_svg, training_chart
+from clod_adapter.report.style import new_figure, save
 
 FILE = "tradeoff.jsonl"
 PAGE = ROOT / "docs" / "error_vs_time.html"
@@ -147,15 +147,8 @@ def plot(scene: str, max_sv: float) -> None:
         title = f"{scene}: held-out error against time of training, {rows[-1]['base']['kept']:,.0f} Gaussians"
         figure.suptitle(title, fontsize=11.5, weight="bold", x=0.008, ha="left")
         for k, (axes, s) in enumerate(zip(figure.subplots(1, len(dials), squeeze=False)[0], dials, strict=True)):
-            for (label, points), colour, marker in zip(curves(rows, k).items(), SERIES, "oDs", strict=False):
-                xy = [(seconds, error(psnr)) for seconds, psnr, _ in points]
-                named = f"{label} ({points[-1][2]:.0%} kept)"
-                axes.plot(*zip(*xy, strict=True), color=colour, marker=marker, linewidth=1.8, label=named)
-            axes.axhline(error(rows[-1]["base"]["psnr"]), color=INK, linestyle="--", linewidth=1.1, label="base, whole")
-            axes.set_xscale("log")
+            draw_training(axes, lines(curves(rows, k)), rows[-1]["base"]["psnr"])
             axes.set_title(f"s = {s:g}", loc="left", fontsize=10, weight="bold")
-            axes.set_xlabel("seconds of training (log scale)")
-            finish(axes)
         save(figure, PICTURE)
     write(scene, max_sv, rows, dials)
     print(f"{PICTURE}\n{PAGE}")
@@ -169,16 +162,8 @@ def write(scene: str, max_sv: float, rows: list[dict[str, Any]], dials: list[flo
     cells = []
     for k, s in enumerate(dials):
         found = curves(rows, k)
-        lines = [
-            {
-                "label": f"{label} ({points[-1][2]:.0%} kept)",
-                "points": [{"seconds": seconds, "psnr": psnr} for seconds, psnr, _ in points],
-            }
-            for label, points in found.items()
-        ]
-        svg = inline_svg(
-            training_chart(lines, base["psnr"]), f"held-out error at s = {s:g} against seconds of training"
-        )
+        chart = training_chart(lines(found), base["psnr"])
+        svg = inline_svg(chart, f"held-out error at s = {s:g} against seconds of training")
         title = "full quality" if s == 1 else "the end of the dial" if s == dials[-1] else "between"
         body.append(page.section(f"s = {s:g}: {title}", page.chart(svg, CAPTION)))
         cells += [(f"s = {s:g}, {label}", [row_of(*point) for point in points]) for label, points in found.items()]
@@ -194,6 +179,17 @@ def curves(rows: Sequence[dict[str, Any]], k: int) -> dict[str, list[tuple[float
     """The curve of each method that has one, by its label."""
     found = {label: curve([r for r in rows if r["method"] == method], k) for method, label in LABELS.items()}
     return {label: points for label, points in found.items() if points}
+
+
+def lines(found: dict[str, list[tuple[float, float, float]]]) -> list[dict[str, Any]]:
+    """The curves as the charts take them."""
+    return [
+        {
+            "label": f"{label} ({points[-1][2]:.0%} kept)",
+            "points": [{"seconds": seconds, "psnr": psnr} for seconds, psnr, _ in points],
+        }
+        for label, points in found.items()
+    ]
 
 
 def row_of(seconds: float, psnr: float, share: float) -> list[str]:

@@ -78,19 +78,20 @@ def training_chart(curves: Sequence[Mapping[str, Any]], base_psnr: float | None)
         base_psnr: of the unadapted base, a line across.
     """
 
-    def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        for k, curve in enumerate(curves):
-            points = [(point["seconds"], error(point["psnr"])) for point in curve["points"]]
-            style = {"color": SERIES[k % len(SERIES)], "marker": MARKERS[k % len(MARKERS)], "label": curve["label"]}
-            axes.plot(*zip(*points, strict=True), linewidth=1.8, markersize=5, **style)
-        if base_psnr is not None:
-            axes.axhline(error(base_psnr), color=INK, linestyle="--", linewidth=1.1, label="base, unadapted")
-        axes.set_xscale("log")
-        axes.set_xlabel("seconds of adapting (log scale)")
-        finish(axes)
+    return lambda figure: draw_training(figure.subplots(), curves, base_psnr)
 
-    return draw
+
+def draw_training(axes: Any, curves: Sequence[Mapping[str, Any]], base_psnr: float | None) -> None:
+    """What ``training_chart`` shows, into one panel of a figure."""
+    for k, curve in enumerate(curves):
+        points = [(point["seconds"], error(point["psnr"])) for point in curve["points"]]
+        style = {"color": SERIES[k % len(SERIES)], "marker": MARKERS[k % len(MARKERS)], "label": curve["label"]}
+        axes.plot(*zip(*points, strict=True), linewidth=1.8, markersize=5, **style)
+    if base_psnr is not None:
+        axes.axhline(error(base_psnr), color=INK, linestyle="--", linewidth=1.1, label="base, unadapted")
+    axes.set_xscale("log")
+    axes.set_xlabel("seconds of adapting (log scale)")
+    finish(axes)
 
 
 def error(psnr: float) -> float:
