@@ -133,7 +133,7 @@ def project(leaves: Fields, camera: Camera) -> Drawn:
     means, opacities = leaves["means"], leaves["opacities"]
     viewmat, K = camera.viewmat.to(means), camera.K.to(means)
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    rows = ((points[:, 2] >= reference.NEAR) & (opacities >= reference.ALPHA_MIN)).nonzero()[:, 0]
+    rows = ((points[:, 2] >= camera.near) & (opacities >= reference.ALPHA_MIN)).nonzero()[:, 0]
     rows = rows[points[rows, 2].argsort(stable=True)]
     quats, scales = leaves["quats"][rows], leaves["scales"][rows]
     centres, covariance = reference.project(points[rows], quats, scales, viewmat, K, camera)

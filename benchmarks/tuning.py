@@ -14,10 +14,10 @@ from torch import Tensor
 import clod_adapter as clod
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
+from clod_adapter.cameras import camera_extent
 from clod_adapter.losses import photometric_loss
 from clod_adapter.optimizer import RowAdam
 from clod_adapter.render import splat
-from clod_adapter.train import camera_extent
 
 # 3DGS's rates of training; means times the cameras' extent.
 RATES = {"means": 1.6e-4, "quats": 1e-3, "log_scales": 5e-3, "opacity_logits": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
@@ -75,7 +75,7 @@ def tune(
     """
     own = {"dtype": torch.float32, "copy": True, "memory_format": torch.contiguous_format}
     parameters = {name: getattr(start, name).detach().to(**own) for name in ATTRIBUTES}
-    rates = config.rates | {"means": config.rates["means"] * camera_extent(views)}
+    rates = config.rates | {"means": config.rates["means"] * camera_extent([view.camera for view in views])}
     tuned = [name for name in ATTRIBUTES if rates[name] > 0 and parameters[name].numel()]
     optimizer, random = RowAdam(parameters), np.random.default_rng(config.seed)
     everyone, order = torch.ones(len(start), dtype=torch.bool), []

@@ -19,6 +19,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.version import package_version
 
+HALF_ERROR = 2e-3  # the rounding that a difference may suffer, as a share of the largest
 ATTRIBUTES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 
 
@@ -97,8 +98,8 @@ class Adapter:
 def extract(base: Gaussians, adapted: Gaussians, *, fingerprint: str, config: dict[str, Any]) -> Adapter:
     """What has to be added to ``base`` to get ``adapted``, rounded to float16 differences.
 
-    Attributes with identical values are left out. Where a difference does not fit float16 (it
-    overflows, or an infinite logit became finite) the attribute is kept as its float32 values. A
+    Attributes with identical values are left out. Where the differences do not fit float16 (one
+    overflows, all are tiny, or an infinite logit became finite) the attribute is kept as its float32 values. A
     dial that ``base`` may already have plays no part.
 
     Raises:
@@ -135,8 +136,11 @@ def _update(name: str, old: Tensor, new: Tensor) -> Tensor:
     same = old == new  # inf - inf would be NaN
     if not (new.isfinite() | same).all():
         raise ClodError(f"{name} holds a new value that is not finite; the training has diverged")
-    delta = torch.where(same, 0.0, new - old).half()
-    return delta if delta.isfinite().all() else new.clone()
+    exact = torch.where(same, 0.0, new - old)
+    delta = exact.half()
+    # float16 has 11 bits, but fewer below 6e-5: in a scene of small numbers that is all there is to a difference.
+    error, largest = (delta.float() - exact).abs().amax(), exact.abs().amax()
+    return delta if delta.isfinite().all() and error <= HALF_ERROR * largest else new.clone()
 
 
 def _kind(tensor: Tensor) -> str:

@@ -37,7 +37,6 @@ from clod_adapter.errors import ClodError
 SIGMA_MAX = 1e9
 """Stands for an infinite sigma_d. The factor is exactly 1 for d s < 2e5 in float32, d s < 10 in float64."""
 
-_NEAR = 0.01  # world units; nearer centres, and those behind the camera, are not in view
 _LOG_HUGE = 1e4  # above the logarithms that float64 products here can have
 
 
@@ -78,7 +77,7 @@ def normalizing_distance(distances: Tensor, means: Tensor, camera: Camera, confi
     """0-d, the D that distances are divided by, world units, > 0; ``config.normalizer`` says which.
 
     ``scene`` is ``config.scene_distance``. ``max`` (the paper's) and ``quantile`` look at the Gaussians
-    whose centre projects into the image from more than 0.01 in front of the camera, or at all of them where
+    whose centre projects into the image from beyond the near plane, or at all of them where
     there is none; the quantile is an element, the ``ceil(q n)``-th smallest, not an interpolation. Never
     below the smallest normal number, so that 0 / D is 0; 1 where there are no Gaussians at all.
 
@@ -101,10 +100,10 @@ def normalizing_distance(distances: Tensor, means: Tensor, camera: Camera, confi
 
 
 def in_frustum(means: Tensor, camera: Camera) -> Tensor:
-    """``[N]`` bool: the centre projects into the image, from more than 0.01 world units in front of the camera."""
+    """``[N]`` bool: the centre projects into the image, from beyond the near plane."""
     projection = (camera.K @ camera.viewmat[:3].to(camera.K)).to(means)
     x, y, z = projection[:, :3] @ means.T + projection[:, 3:]
-    return (z > _NEAR) & (x >= 0) & (x < camera.width * z) & (y >= 0) & (y < camera.height * z)
+    return (z > camera.near) & (x >= 0) & (x < camera.width * z) & (y >= 0) & (y < camera.height * z)
 
 
 def log_attenuation(sigma_d: Tensor, d: Tensor, virtual_scale: float, eps: float) -> Tensor:

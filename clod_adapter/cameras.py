@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from clod_adapter.errors import ClodError
+
+NEAR = 0.01
+"""The near plane, world units, as in gsplat."""
+SMALL_EXTENT = 1.0  # of the cameras, world units; below it the near plane comes nearer by as much
 
 
 @dataclass(frozen=True)
@@ -19,6 +24,7 @@ class Camera:
         K: ``[3, 3]`` intrinsics in pixels; pixel centres lie at +0.5.
         width, height: image size in pixels.
         name: the photograph's name, for messages.
+        near: distance of the near plane, world units; Gaussians with a nearer centre are not drawn.
 
     Raises:
         ClodError: a matrix has the wrong shape or the image has no pixels.
@@ -29,6 +35,7 @@ class Camera:
     width: int
     height: int
     name: str = ""
+    near: float = NEAR
 
     def __post_init__(self) -> None:
         if tuple(self.viewmat.shape) != (4, 4) or tuple(self.K.shape) != (3, 3):
@@ -73,3 +80,30 @@ class Scene:
     train: tuple[View, ...]
     test: tuple[View, ...]
     notes: tuple[str, ...] = ()
+
+
+def camera_extent(cameras: Sequence[Camera]) -> float:
+    """1.1 times the largest distance of a camera from their mean, world units (3DGS's unit for position steps).
+
+    At most 3.3 times the median of these distances, unless that is 0: one camera that stands far off makes no scene
+    larger. 0 for cameras that are all in one place.
+    """
+    centres = torch.stack([camera.position for camera in cameras])
+    distances = (centres - centres.mean(0)).norm(dim=1)
+    largest, middle = float(distances.max()), float(distances.median())
+    return 1.1 * (min(largest, 3 * middle) or largest)
+
+
+def in_its_unit(scene: Scene) -> Scene:
+    """The scene with a near plane that fits its unit: where the cameras' extent is below 1, by that much nearer.
+
+    A scene in kilometres would else be nearer than the near plane altogether. Larger scenes keep the usual 0.01.
+    """
+    extent = camera_extent([view.camera for view in (*scene.train, *scene.test)])
+    if not 0 < extent < SMALL_EXTENT:
+        return scene
+
+    def nearer(views: tuple[View, ...]) -> tuple[View, ...]:
+        return tuple(replace(view, camera=replace(view.camera, near=NEAR * extent / SMALL_EXTENT)) for view in views)
+
+    return replace(scene, train=nearer(scene.train), test=nearer(scene.test))

@@ -19,6 +19,8 @@ APART = 0.05  # what being far apart counts, beside a squared difference of colo
 UNLIKE = 1e12  # for colours or sizes that are not finite
 STUCK = 0.02  # of those left: if fewer leave in a round, the cheapest LEAVING do whoever their heirs are
 ROWS = 1 << 18  # whose neighbours are held at a time
+CROWD = 64  # Gaussians exactly in one place, from which on they are moved apart,
+JITTER = 1e-6  # by so much of their size: a k-d tree cannot part them, and compares each with all others
 
 
 def leaving_order(gaussians: Gaussians, worth: Tensor, progress: Callable[[int, int], None] | None = None) -> Tensor:
@@ -47,6 +49,7 @@ def leaving_order(gaussians: Gaussians, worth: Tensor, progress: Callable[[int, 
     colours = 0.5 + SH_C0 * gaussians.sh0.detach()[:, 0].double().cpu().numpy()
     sizes = gaussians.log_scales.detach().double().exp().amax(1).cpu().numpy() if count else np.empty(0)
     worths, order = worth.detach().double().cpu().numpy().copy(), np.empty(count, np.int64)
+    centres = _apart(centres, sizes)
     left, gone = np.arange(count), 0
     while len(left) > 1:
         heir, unlike = _heirs(centres[left], colours[left], sizes[left])
@@ -61,6 +64,15 @@ def leaving_order(gaussians: Gaussians, worth: Tensor, progress: Callable[[int, 
     if progress:
         progress(count, count)
     return torch.from_numpy(order).to(worth.device)
+
+
+def _apart(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """The centres, a millionth of a Gaussian's size elsewhere where too many may be in one place."""
+    x = np.sort(centres[:, 0])
+    if not (x[CROWD:] == x[:-CROWD]).any():
+        return centres
+    shifts = np.random.default_rng(0).uniform(-JITTER, JITTER, centres.shape)
+    return centres + np.nan_to_num(sizes, posinf=0.0)[:, None] * shifts
 
 
 def _leaving(cost: np.ndarray, heir: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from clod_adapter.errors import ClodError
@@ -69,7 +69,7 @@ class AdaptConfig:
         None, "stop training after this many seconds, schedule included (default: no limit)"
     )
     seed: int = option(0, "seed of view order, dial values and the importance estimate")
-    tau: float = option(0.02, "base opacity threshold of the cut")
+    tau: float = option(0.02, "base opacity threshold of the cut; lowered for a checkpoint that is too faint for it")
     cut: str = option("soft", "how a Gaussian leaves: hard (at opacity tau s, the paper's) or soft (at 0)")
     eps: float = option(1e-8, "the paper's epsilon")
     normalizer: str = option("scene", "what distances are divided by: scene, quantile or max (the paper's)")
@@ -144,6 +144,11 @@ class AdaptConfig:
             "lr_scales": 8e-3, "lr_opacities": 5e-2, "lr_sh0": 2e-3,
         }  # fmt: skip
         return cls(**{**own, **changes})
+
+    def lighter(self, share: float) -> AdaptConfig:
+        """The same with step sizes times ``share`` for everything but sigma_d."""
+        names = ("lr_means", "lr_quats", "lr_scales", "lr_opacities", "lr_sh0", "lr_shN")
+        return replace(self, **{name: share * getattr(self, name) for name in names})
 
     def attenuation(self, scene_distance: float) -> AttenuationConfig:
         """What travels with the file."""

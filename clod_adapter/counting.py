@@ -26,9 +26,10 @@ def count_gradient(
     That of ``loss reg_weight (eta / law - 1)^2``, eta the share kept, through ``attenuation.count_slope``. Who is worth
     less to the picture than the pressure fades, who is worth more stays. It works both ways, and is relative: to the
     law, as the last percent of the Gaussians matters as much as the first, and to the weighted ``loss``, a constant
-    here, so that the same settings suit scenes and dial values that are fitted well or badly.
+    here, so that the same settings suit scenes and dial values that are fitted well or badly. Nothing presses the last
+    Gaussian out.
     """
-    law = count_law(virtual_scale, config.start_share, config.exponent)
+    law = max(count_law(virtual_scale, config.start_share, config.exponent), 1 / len(opacity_logits))
     eta = float(dialled.keep.sum()) / len(opacity_logits)
     pressure = 2 * loss * config.reg_weight * (eta / law - 1) / law
     slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, config.temperature)

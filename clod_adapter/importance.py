@@ -13,6 +13,7 @@ from clod_adapter.attenuation import SIGMA_MAX, normalized_distances, normalizin
 from clod_adapter.cameras import View
 from clod_adapter.collapse import leaving_order
 from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import splat
 
@@ -21,6 +22,11 @@ from clod_adapter.render import splat
 WIDEST = 22.0
 # Views that are looked at, at most: twice as many changed the trained result by 0.01 to 0.04 dB (docs/performance.md).
 MOST_VIEWS = 64
+# A checkpoint may be so faint that the cut would take its picture. Tau is lowered until those that it fades by their
+# opacity alone are worth at most this share of the picture at s = 1.
+FAINT_SHARE = 0.05
+TAU_MIN = 1e-6
+FADING = 1.5  # times the threshold: fainter ones are drawn less than they are (attenuation's soft cut)
 
 
 def start(
@@ -42,7 +48,12 @@ def start(
     if config.start in ("constant", "identity"):
         value = 1.0 if config.start == "constant" else WIDEST * config.max_sv
         return base.replace(sigma_d=torch.full((len(base),), value), attenuation=attenuation)
-    importance = _importance(base, views, config, progress)
+    error = removal_error(base, views, seed=config.seed, progress=partial(progress, "start") if progress else None)
+    attenuation = dataclasses.replace(attenuation, tau=fitting_tau(base.opacities, error, config))
+    importance = error
+    if config.start == "importance":
+        order = partial(progress, "order") if progress else None
+        importance = leaving_order(base, error.sqrt() * base.opacities, order)
     distances = typical_distance(base, views, attenuation)
     sigma = sigma_from_importance(
         base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent
@@ -50,18 +61,42 @@ def start(
     return base.replace(sigma_d=sigma.minimum(WIDEST * config.max_sv * distances), attenuation=attenuation)
 
 
-def _importance(
-    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Callable[[str, int, int], None] | None
-) -> Tensor:
-    """``[N]``, the larger the longer a Gaussian is to stay, by ``config.start``."""
+def seeing(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
+    """The views that have a Gaussian's centre beyond their near plane: from the others nothing is drawn or learned.
 
-    def of(phase: str) -> Callable[[int, int], None] | None:
-        return partial(progress, phase) if progress else None
+    Raises:
+        ClodError: there is none.
+    """
+    found = []
+    for view in views:
+        depths = base.means @ view.camera.viewmat[2, :3].to(base.means) + view.camera.viewmat[2, 3].to(base.means)
+        if bool((depths >= view.camera.near).any()):
+            found.append(view)
+    if not found:
+        raise ClodError(
+            f"no Gaussian is in front of any of the {len(views)} training cameras: checkpoint and cameras are not of "
+            "one scene, or not in one coordinate frame; give the photographs and poses it was trained on"
+        )
+    return tuple(found)
 
-    error = removal_error(base, views, seed=config.seed, progress=of("start"))
-    if config.start == "error":
-        return error
-    return leaving_order(base, error.sqrt() * base.opacities, of("order"))
+
+def fitting_tau(opacities: Tensor, error: Tensor, config: AdaptConfig) -> float:
+    """``config.tau``, or less for a checkpoint that is too faint for it.
+
+    At most 1/FADING of the opacity below which there is FAINT_SHARE of all removal error; and low enough for as many
+    Gaussians as the count law wants at ``max_sv`` to be opaque enough to be there.
+
+    Args:
+        error: ``[N]`` from ``removal_error``.
+    """
+    ordered, order = opacities.sort()
+    lost = error[order].double().cumsum(0)
+    if not lost[-1] > 0:
+        return config.tau
+    faint = float(ordered[int((lost < FAINT_SHARE * lost[-1]).sum())])
+    wanted = max(round(len(ordered) * config.max_sv**-config.exponent), 1)
+    opaque = float(ordered[-wanted]) / config.max_sv
+    return max(min(config.tau, faint / FADING, opaque / FADING), TAU_MIN)
 
 
 def spread(views: Sequence[View]) -> Sequence[View]:

@@ -16,6 +16,7 @@ that nobody photographed fails the judgement.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -23,13 +24,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import Camera, Scene, View
-from clod_adapter.config import require
+from clod_adapter.cameras import NEAR, Camera, Scene, View
+from clod_adapter.config import AdaptConfig, require
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.render import render, splat
 
 VIEWS = 96
+FEW, OWN = 8, 16  # photographs to train on, and what is added where there are fewer
 WIDTH, HEIGHT = 496, 368
 FIELD = 55.0  # horizontal, degrees: between a phone's 65 and the 35 of a portrait lens
 TRIES = 3  # candidates for each view, first anywhere, then as many beside the best of those
@@ -112,6 +114,27 @@ def imagine(
         "checkpoint is its own teacher; the numbers are against the checkpoint, not photographs"
     )
     return Scene(train, test, (note,))
+
+
+def complement(gaussians: Gaussians, scene: Scene, config: AdaptConfig) -> tuple[Scene, AdaptConfig]:
+    """What to adapt with where there are fewer than FEW photographs to train on; otherwise what was given.
+
+    So few do not show all that the checkpoint knows, and what they do not show would be lost. They get OWN pictures of
+    the checkpoint's own beside them, from placed cameras, and everything but sigma_d steps half as far. With more than
+    FEW photographs this makes the result worse: the checkpoint's pictures have its errors.
+
+    Raises:
+        ClodError: see ``place``.
+    """
+    if not 0 < len(scene.train) < FEW:
+        return scene, config
+    placed = imagine(gaussians, place(gaussians, views=OWN, seed=config.seed))
+    own = (*placed.train, *placed.test)
+    note = (
+        f"only {len(scene.train)} photographs to train on: {len(own)} of the checkpoint's own pictures from "
+        "placed cameras are added, and everything but sigma_d steps half as far"
+    )
+    return dataclasses.replace(scene, train=(*scene.train, *own), notes=(*scene.notes, note)), config.lighter(0.5)
 
 
 def typical_reach(gaussians: Gaussians) -> float:
@@ -209,13 +232,15 @@ def _looking(eye: Tensor, target: Tensor) -> Camera:
     viewmat = torch.eye(4)
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    return _resized(Camera(viewmat, torch.eye(3), *LOOK), *LOOK)
+    # As cameras.in_its_unit has it for photographs.
+    near = NEAR * min(float((target - eye).norm()), 1.0)
+    return _resized(Camera(viewmat, torch.eye(3), *LOOK, near=near), *LOOK)
 
 
 def _resized(camera: Camera, width: int, height: int, number: int = 0) -> Camera:
     focal = _focal(width)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    return Camera(camera.viewmat, K, width, height, f"placed_{number:03}")
+    return Camera(camera.viewmat, K, width, height, f"placed_{number:03}", camera.near)
 
 
 def _describe(cameras: list[Camera]) -> str:

@@ -165,7 +165,7 @@ def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
         viewmat[:3, :3] = rotation
         viewmat[:3, 3] = -rotation @ torch.lerp(centres[i], centres[i + 1], share)
         first = cameras[0]
-        found.append(Camera(viewmat.to(first.viewmat), first.K, first.width, first.height))
+        found.append(Camera(viewmat.to(first.viewmat), first.K, first.width, first.height, near=first.near))
     return found
 
 

@@ -14,12 +14,12 @@ from torch import Tensor
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.attenuation import SIGMA_MAX, Attenuated, attenuate, normalized_distances, soft_count
-from clod_adapter.cameras import Scene, View
+from clod_adapter.cameras import Scene, View, camera_extent
 from clod_adapter.config import AdaptConfig
 from clod_adapter.counting import count_gradient
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.importance import start
+from clod_adapter.importance import seeing, start
 from clod_adapter.losses import photometric_loss
 from clod_adapter.optimizer import RowAdam
 from clod_adapter.render import splat
@@ -86,7 +86,7 @@ def adapt(
     A KeyboardInterrupt ends training and returns what there is: before the last ``average`` of the steps, no mean.
 
     Raises:
-        ClodError: no training views, or no Gaussians.
+        ClodError: no training views, none that has a Gaussian before it, or no Gaussians.
     """
     config = config or AdaptConfig()
     if not scene.train:
@@ -102,16 +102,11 @@ def adapt(
 
     # Where the higher bands are not tuned, empty ones stay empty.
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
-    gaussians = start(lean, scene.train, config, report)
-    run = _Run(gaussians, scene.train, config, progress)
+    views = seeing(base, scene.train)
+    gaussians = start(lean, views, config, report)
+    run = _Run(gaussians, views, config, progress)
     run.empty_bands = None if lean is base else base.shN.clone()
     return run.run(time.perf_counter() - began)
-
-
-def camera_extent(views: tuple[View, ...]) -> float:
-    """1.1 times the largest distance of a camera from their mean (3DGS's unit for position steps)."""
-    centres = torch.stack([view.camera.position for view in views])
-    return 1.1 * float((centres - centres.mean(0)).norm(dim=1).max()) or 1.0
 
 
 class _Run:
@@ -137,8 +132,10 @@ class _Run:
         self.has_law = config.count_term == "law" and config.max_sv > 1  # a range of one dial value asks for none
         self.empty_bands: Tensor | None = None  # the base's whole shN, where what was left out of it comes back
         self.all_rows = torch.ones(len(start), dtype=torch.bool)
+        # Cameras all in one place say nothing of the scene's unit; the distances in their pictures do.
+        extent = camera_extent([view.camera for view in views]) or self.attenuation.scene_distance
         self.rates = {
-            "means": config.lr_means * camera_extent(views), "quats": config.lr_quats, "log_scales": config.lr_scales,
+            "means": config.lr_means * extent, "quats": config.lr_quats, "log_scales": config.lr_scales,
             "opacity_logits": config.lr_opacities, "sh0": config.lr_sh0, "shN": config.lr_shN,
             self.decay: config.lr_sigma,
         }  # fmt: skip

@@ -73,6 +73,16 @@ def test_overflowing_differences_are_kept_as_values() -> None:
     assert bits(adapter.apply(base))["means"] == bits(adapted)["means"]
 
 
+def test_tiny_differences_keep_their_precision() -> None:
+    """Those of a scene in small units are below what float16 tells apart."""
+    base = gaussians(50, 0, 0)
+    step = 1e-7 * torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
+    adapted = attach(base.replace(means=1e-4 * base.means + step))
+    adapter = extract(base.replace(means=1e-4 * base.means), adapted, fingerprint="", config={})
+    assert adapter.updates["means"].dtype == torch.float32
+    assert torch.equal(adapter.apply(base.replace(means=1e-4 * base.means)).means, adapted.means)
+
+
 def test_infinite_logits() -> None:
     base = gaussians()
     base.opacity_logits[0] = torch.inf

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.cameras import NEAR, Camera, Scene, View, camera_extent, in_its_unit
 from clod_adapter.errors import ClodError
 from scenes import camera, in_front, ring
 
@@ -53,3 +53,25 @@ def test_all_three_are_frozen() -> None:
         with pytest.raises(dataclasses.FrozenInstanceError):
             setattr(thing, name, None)
     assert Scene((view,), ()).notes == ()
+
+
+def test_extent_of_cameras() -> None:
+    cameras = ring(8, 8, 6, radius=2.0)
+    centres = torch.stack([camera.position for camera in cameras])
+    assert camera_extent(cameras) == pytest.approx(1.1 * (centres - centres.mean(0)).norm(dim=1).max().item())
+    assert camera_extent(cameras[:1]) == 0
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 1e6
+    far = dataclasses.replace(cameras[0], viewmat=viewmat)
+    # The one far off moves the mean of nine by a ninth of its distance, from which all the others are then as far.
+    assert camera_extent([*cameras, far]) <= 3.3 * 1e6 / 9 * 1.01
+    assert camera_extent([*cameras[:1] * 5, *cameras[1:2]]) > 0
+
+
+@pytest.mark.parametrize(("radius", "near"), [(1e-4, 1e-6), (0.5, 5e-3), (2.0, NEAR), (1e4, NEAR)])
+def test_near_plane_of_small_scenes(radius: float, near: float) -> None:
+    views = tuple(View(c, torch.zeros(6, 8, 3, dtype=torch.uint8)) for c in ring(8, 8, 6, radius=radius))
+    scene = in_its_unit(Scene(views[1:], views[:1]))
+    found = {view.camera.near for view in (*scene.train, *scene.test)}
+    assert len(found) == 1 and found.pop() == pytest.approx(near, rel=0.25)
+    assert in_its_unit(Scene(views[:1], ())).train[0].camera.near == NEAR  # one camera says nothing

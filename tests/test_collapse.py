@@ -89,6 +89,13 @@ def test_many_in_one_place_take_few_rounds() -> None:
     assert sorted(order.tolist()) == list(range(2000)) and len(seen) < 300
 
 
+def test_many_in_one_place_are_found_their_neighbours_quickly() -> None:
+    """A k-d tree cannot part them, and would compare each with all: minutes for as many as here."""
+    some = gaussians(60_000, 0, 0)
+    order = leaving_order(some.replace(means=torch.full_like(some.means, 0.3)), torch.rand(60_000))
+    assert order.sort().values.equal(torch.arange(60_000))
+
+
 def test_what_is_not_finite() -> None:
     """Colours and sizes are then unlike all others; centres are refused."""
     some = gaussians(20, 0, 0)

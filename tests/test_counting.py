@@ -85,3 +85,12 @@ def test_without_any_picture_the_counts_come_to_the_law(start: float) -> None:
         slope = gradient(logits, log_sigma, d, 6.0 ** random.random())
         optimizer.step({"log_sigma": slope}, rows, {"log_sigma": 0.01})
     assert worst(log_sigma) < 0.2
+
+
+def test_the_last_gaussian_is_not_pressed_out() -> None:
+    """Of one Gaussian the law would keep a tenth; one that is left stays unpressed."""
+    config = AdaptConfig()
+    logits, sigma, d = torch.tensor([4.0]), torch.tensor([5.0]), torch.tensor([1.0])
+    dialled = attenuate(logits, sigma, d, 5.0, config.attenuation(1.0))
+    assert bool(dialled.keep.all())
+    assert count_gradient(dialled, logits, 5.0, config.tau, 1.0, config).item() == 0

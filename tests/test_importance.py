@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 from torch import Tensor
@@ -11,8 +13,9 @@ from clod_adapter.attenuation import attenuate, extinction_scale, normalized_dis
 from clod_adapter.cameras import View
 from clod_adapter.collapse import leaving_order
 from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.importance import removal_error, sigma_from_importance, typical_distance
+from clod_adapter.importance import fitting_tau, removal_error, seeing, sigma_from_importance, start, typical_distance
 from clod_adapter.render import splat
 from scenes import gaussians, photograph, ring
 
@@ -159,3 +162,37 @@ def test_the_orders_of_the_start() -> None:
     order = leaving_order(some, error.sqrt() * some.opacities)
     assert torch.equal(leaving(by_default)[100:180], order.argsort()[100:180])
     assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
+
+
+def test_tau_is_lowered_for_faint_checkpoints_only() -> None:
+    config, error = AdaptConfig(max_sv=5.0), torch.rand(1000, generator=torch.Generator().manual_seed(0))
+    mixed = torch.linspace(0.001, 0.99, 1000)
+    assert fitting_tau(mixed, error, config) == config.tau
+    faint = torch.full((1000,), 0.01)
+    assert fitting_tau(faint, error, config) == pytest.approx(0.01 / 5 / 1.5)
+    # Nearly all opacities below tau, a few far above: the dial's end is served, the picture at s = 1 would not be.
+    some = torch.where(torch.arange(1000) < 100, 0.9, 0.012)
+    assert fitting_tau(some, torch.ones(1000), config) == pytest.approx(0.012 / 1.5)
+    assert fitting_tau(some, (some > 0.1).float(), config) == config.tau  # unless the faint ones do nothing
+    assert fitting_tau(faint, torch.zeros(1000), config) == config.tau  # nothing is visible: nothing to go by
+    assert fitting_tau(torch.zeros(10), torch.ones(10), config) > 0
+
+
+def test_a_checkpoint_of_faint_gaussians_keeps_its_picture() -> None:
+    base = gaussians(200, 0, 0, size=0.3).replace(opacity_logits=torch.full((200,), -4.6))
+    views = photograph(base, ring(3, 24, 18))
+    dialled = start(base, views, AdaptConfig())
+    assert dialled.attenuation is not None and dialled.sigma_d is not None and dialled.attenuation.tau < 0.01 / 5
+    d = normalized_distances(base.means, views[0].camera, dialled.attenuation)
+    assert attenuate(base.opacity_logits, dialled.sigma_d, d, 1.0, dialled.attenuation).keep.float().mean() > 0.5
+
+
+def test_views_of_nothing_are_left_out() -> None:
+    some = gaussians(20, 0, 0)
+    views = photograph(some, ring(3, 24, 18))
+    back = torch.diag(torch.tensor([-1.0, 1, -1, 1]))
+    away = dataclasses.replace(views[0].camera, viewmat=back @ views[0].camera.viewmat)
+    blind = View(away, views[0].image)
+    assert seeing(some, [views[0], blind, views[1]]) == views[:2]
+    with pytest.raises(ClodError, match="in front of any of the 1 training cameras"):
+        seeing(some, [blind])

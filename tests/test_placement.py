@@ -12,7 +12,7 @@ from torch import Tensor
 import clod_adapter as clod
 import scenes
 from clod_adapter.compare import matching_dial
-from clod_adapter.placement import FIELD, HEIGHT, WIDTH, imagine, place, typical_reach
+from clod_adapter.placement import FEW, FIELD, HEIGHT, OWN, WIDTH, complement, imagine, place, typical_reach
 
 
 @pytest.fixture(scope="module")
@@ -138,3 +138,21 @@ def test_a_dial_learned_from_placed_views_serves_views_it_never_saw() -> None:
     same = matching_dial(untrained, [view.camera for view in scene.test], after.kept)
     (before,) = clod.evaluate(untrained, scene.test, [same])
     assert before.kept == pytest.approx(after.kept, abs=1) and after.psnr > before.psnr + 0.5
+
+
+def test_few_photographs_get_company(blob: clod.Gaussians) -> None:
+    views, config = scenes.photograph(blob, scenes.ring(FEW, 24, 18)), clod.AdaptConfig()
+    enough = clod.Scene(views, ())
+    assert complement(blob, enough, config) == (enough, config)
+    scene, lighter = complement(blob, clod.Scene(views[:1], views[1:]), config)
+    assert scene.train[0] is views[0] and len(scene.train) == 1 + OWN and scene.test == views[1:]
+    assert "only 1 photographs" in scene.notes[-1]
+    assert lighter.lr_means == config.lr_means / 2 and lighter.lr_sigma == config.lr_sigma
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
+def test_cameras_are_placed_in_any_unit(blob: clod.Gaussians, unit: float) -> None:
+    other = blob.replace(means=blob.means * unit, log_scales=blob.log_scales + math.log(unit))
+    here, there = (imagine(g, place(g, views=8)) for g in (blob, other))
+    light = [torch.stack([view.image for view in scene.train]).float().mean().item() for scene in (here, there)]
+    assert light[0] > 5 and light[1] == pytest.approx(light[0], rel=0.3)  # roundings choose other cameras

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from numba import float32
 
-# Blur added to the covariance (px^2), near plane, alpha below which nothing is drawn, largest alpha, and the
-# transmittance before which a pixel ends.
-BLUR, NEAR, ALPHA_MIN, ALPHA_MAX, T_MIN = (float32(v) for v in (0.3, 0.01, 1 / 255, 0.999, 1e-4))
+# Blur added to the covariance (px^2), alpha below which nothing is drawn, largest alpha, and the transmittance before
+# which a pixel ends.
+BLUR, ALPHA_MIN, ALPHA_MAX, T_MIN = (float32(v) for v in (0.3, 1 / 255, 0.999, 1e-4))
 LOG2E, LOG2_255, TWO_LN2 = float32(1.4426950408889634), float32(7.994353436858858), float32(1.3862943611198906)
 HALF, ZERO, ONE, TWO = float32(0.5), float32(0), float32(1), float32(2)
 HUGE = float32(3e38)  # what is not below it is dropped as not finite
@@ -17,9 +17,10 @@ MX, MY, QA, QB, QC, LOG, RED, GREEN, BLUE, REACH, RX, DET, X0, Y0, X1, Y1 = rang
 RECORD = 16
 
 # A camera: viewmat row-major (16), fx, fy, cx, cy, width, height, ray clamp low x, high x, low y, high y,
-# centre in world coordinates (3).
+# centre in world coordinates (3), near plane.
 FX, FY, CX, CY, WIDTH, HEIGHT, LOW_X, HIGH_X, LOW_Y, HIGH_Y, EYE = range(16, 27)
-CAMERA = 29
+NEAR = EYE + 3
+CAMERA = NEAR + 1
 
 # The workspace of sixteen Gaussians, a vector each, a lane a Gaussian. As stored: mean (3), quaternion (4), scales (3).
 # Then camera point (3), rotation (9), U = J R_view (6), P = U R S (6), covariance (3), its determinant, unit

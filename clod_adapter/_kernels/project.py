@@ -1,8 +1,8 @@
 """Projection of Gaussians to the image: the local affine approximation (EWA splatting).
 
 Conventions of gsplat: pixel centres at +0.5, a blur of 0.3 px^2 added to the covariance, the
-Jacobian's ray clamped to 1.3 times the field of view (0.3 beyond the image on either side), near
-plane 0.01, alpha below 1/255 dropped. Sixteen Gaussians at a time, a lane each.
+Jacobian's ray clamped to 1.3 times the field of view (0.3 beyond the image on either side), the
+camera's near plane, alpha below 1/255 dropped. Sixteen Gaussians at a time, a lane each.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def covariance(means, quats, scales, rows, cam, w):  # type: ignore[no-untyped-d
         w[POINT + d] = cam[row] * w[MEAN] + cam[row + 1] * w[MEAN + 1] + cam[row + 2] * w[MEAN + 2] + cam[row + 3]
     norm2 = w[STORED] * w[STORED] + w[STORED + 1] * w[STORED + 1]
     norm2 = norm2 + w[STORED + 2] * w[STORED + 2] + w[STORED + 3] * w[STORED + 3]
-    valid = both(ge(w[POINT + 2], splat(NEAR)), gt(norm2, splat(ZERO)))
+    valid = both(ge(w[POINT + 2], splat(cam[NEAR])), gt(norm2, splat(ZERO)))
     w[QINV] = ONE / vsqrt(norm2)
     for d in range(4):
         w[QUAT + d] = w[STORED + d] * w[QINV]
@@ -225,7 +225,7 @@ def find_visible(first, last, spare, means, quats, scales, opacities, cam, recor
             rows[lane], opacity[lane] = rows[0], ONE
         valid = covariance(means, quats, scales, rows, cam, w)
         centres(means, rows, cam, centre)
-        valid = both(valid, ge(load(centre, 32), splat(NEAR)))  # as float32 sees it, and as the centre was found
+        valid = both(valid, ge(load(centre, 32), splat(cam[NEAR])))  # as float32 sees it, and as the centre was found
         bits = bits_of(both(valid, make_records(w, centre, load(opacity, 0), cam, record)))
         bits &= (uint64(1) << uint64(filled)) - uint64(1)
         if bits == uint64(0):

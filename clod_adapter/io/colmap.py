@@ -12,7 +12,7 @@ import pycolmap
 import torch
 from PIL import Image
 
-from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.cameras import Camera, Scene, View, in_its_unit
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.colmap_folder import find_model
@@ -62,7 +62,7 @@ def load_scene(
         notes.append(f"{count} of {len(views)} images {note}")
     held_out = {i for i in range(len(views)) if i % test_every == 0} if len(views) > 1 else set()
     train = tuple(view for i, view in enumerate(views) if i not in held_out)
-    return Scene(train, tuple(views[i] for i in sorted(held_out)), tuple(notes))
+    return in_its_unit(Scene(train, tuple(views[i] for i in sorted(held_out)), tuple(notes)))
 
 
 def write_model(

@@ -83,6 +83,7 @@ def camera_vector(camera: Camera) -> np.ndarray:
     out[22:24] = -(cx / fx + margin_x), (camera.width - cx) / fx + margin_x
     out[24:26] = -(cy / fy + margin_y), (camera.height - cy) / fy + margin_y
     out[26:29] = camera.position.detach().cpu().numpy()
+    out[conventions.NEAR] = camera.near
     return out
 
 

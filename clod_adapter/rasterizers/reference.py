@@ -1,7 +1,7 @@
 """The oracle: plain torch splatting, every Gaussian at every pixel, gradients by autograd.
 
 Any device, any float type, no speed. Same conventions as the fast backends: pixel centres at +0.5,
-blur 0.3, near plane 0.01, alpha clamped to 0.999 and dropped below 1/255, a pixel ends before its
+blur 0.3, the camera's near plane, alpha clamped to 0.999 and dropped below 1/255, a pixel ends before its
 transmittance would fall to 1e-4.
 """
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import SH_C0
 
-BLUR, NEAR, ALPHA_MIN, ALPHA_MAX, T_MIN = 0.3, 0.01, 1 / 255, 0.999, 1e-4
+BLUR, ALPHA_MIN, ALPHA_MAX, T_MIN = 0.3, 1 / 255, 0.999, 1e-4
 
 
 def rasterize(
@@ -23,7 +23,7 @@ def rasterize(
     """See ``clod_adapter.rasterizers.Rasterizer``."""
     viewmat, K = camera.viewmat.to(means), camera.K.to(means)
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    rows = ((points[:, 2] >= NEAR) & (opacities >= ALPHA_MIN) & (quats.norm(dim=1) > 0)).nonzero()[:, 0]
+    rows = ((points[:, 2] >= camera.near) & (opacities >= ALPHA_MIN) & (quats.norm(dim=1) > 0)).nonzero()[:, 0]
     rows = rows[points[rows, 2].argsort(stable=True)]
     centres, covariance = project(points[rows], quats[rows], scales[rows], viewmat, K, camera)
     colors = shade(means[rows], sh0[rows], shN[rows], camera.position.to(means))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -40,17 +41,21 @@ def test_principal_point_outside_the_image(rasterize: Rasterizer) -> None:
     assert_agrees(rasterize, scene(150, 1, 8, size=0.2), camera(50, 40, off_centre=(1.3, -0.2)))
 
 
-def test_near_the_camera_plane(rasterize: Rasterizer) -> None:
+@pytest.mark.parametrize("near", [1e-6, 0.01, 3.0])
+def test_near_the_camera_plane(rasterize: Rasterizer, near: float) -> None:
     """Centres just before, on and just beyond the near plane: those before it are not drawn."""
-    view = camera(40, 30)
+    view, unit = camera(40, 30), near / 0.01
     some = scene(60, 2, 3)
     z = torch.cat([torch.linspace(-0.05, 0.0099, 30), torch.linspace(0.0101, 0.05, 30)])
     sideways = torch.linspace(-1, 1, 60).roll(17)
     some["means"] = in_front(view, torch.stack([sideways * z, 0.3 * sideways.flip(0) * z, z], 1))
+    view.viewmat[:3, 3] *= unit
+    view = dataclasses.replace(view, near=near)
+    some["means"] = some["means"] * unit
     depths = some["means"] @ view.viewmat[2, :3] + view.viewmat[2, 3]
-    assert 20 <= (depths < 0.01).sum() <= 40
-    some["scales"] = some["scales"] * 0.02
-    assert_agrees(rasterize, some, view, rows=depths >= 0.01)
+    assert 20 <= (depths < near).sum() <= 40
+    some["scales"] = some["scales"] * 0.02 * unit
+    assert_agrees(rasterize, some, view, rows=depths >= near)
 
 
 @pytest.mark.parametrize("opacity", [0.0, 1 / 255 * 0.999, 0.5, 0.9995, 1.0])
