@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import uuid
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -24,24 +25,48 @@ def atomic_path(final: str | Path) -> Iterator[Path]:
         ClodError: the folder is missing or not writable, ``final`` is a folder that is not empty, or
             the operating system refuses the write (a full disk, say).
     """
-    final = Path(final)
-    check_target(final)
-    # The suffix is kept because some writers choose their format by it.
-    temporary = final.parent / f".tmp-{uuid.uuid4().hex}{final.suffix}"
-    try:
+    with atomic_paths(final) as (temporary,):
         yield temporary
-        for path in [*temporary.rglob("*"), temporary]:
-            _flush(path)
-        os.replace(temporary, final)
-        with suppress(OSError):  # the file is in place; some file systems cannot flush a folder
-            _flush(final.parent)
+
+
+@contextmanager
+def atomic_paths(*finals: str | Path) -> Iterator[tuple[Path, ...]]:
+    """``atomic_path`` for files that appear together: all are complete and flushed before the first is renamed.
+
+    What the body says in a ClodError of a temporary name is said of the final one.
+    """
+    targets = [Path(final) for final in finals]
+    for target in targets:
+        check_target(target)
+    temporaries = tuple(_temporary(target) for target in targets)
+    try:
+        yield temporaries
+        for temporary in temporaries:
+            for path in [*temporary.rglob("*"), temporary]:
+                _flush(path)
+        # One call from C, so that no Ctrl-C comes between two of them.
+        list(map(os.replace, list(map(str, temporaries)), list(map(str, targets))))
+        with suppress(OSError):  # the files are in place; some file systems cannot flush a folder
+            for folder in {target.parent for target in targets}:
+                _flush(folder)
     except OSError as error:
-        raise ClodError(f"{final}: cannot be written: {error.strerror or error}") from error
+        names = ", ".join(map(str, targets))
+        raise ClodError(f"{names}: cannot be written: {error.strerror or error}") from error
+    except ClodError as error:
+        message = str(error)
+        for temporary, target in zip(temporaries, targets, strict=True):
+            message = message.replace(str(temporary), str(target))
+        raise ClodError(message) from error
     finally:
-        if temporary.is_dir():
-            shutil.rmtree(temporary, ignore_errors=True)
-        else:
-            temporary.unlink(missing_ok=True)
+        for temporary in temporaries:
+            _remove(temporary)
+
+
+def remove_leftovers(final: Path) -> None:
+    """Removes what killed processes left beside ``final`` of their attempts to write it; where it can, that is."""
+    for path in final.parent.glob(f"{_mark(final)}*"):
+        with suppress(OSError):
+            _remove(path)
 
 
 def check_target(final: Path) -> None:
@@ -53,6 +78,24 @@ def check_target(final: Path) -> None:
         raise ClodError(f"{final}: folder {folder} is not writable; choose another or change its permissions")
     if final.is_dir() and any(final.iterdir()):
         raise ClodError(f"{final}: is a folder that is not empty; choose another name")
+
+
+def _mark(final: Path) -> str:
+    """How its temporaries' names begin: short, however long its own is."""
+    return f".tmp-{zlib.crc32(final.name.encode()):08x}-"
+
+
+def _temporary(final: Path) -> Path:
+    # That of a temporary is one of its final. The suffix is kept because some writers choose their format by it.
+    mark = final.name[:14] if final.name.startswith(".tmp-") else _mark(final)
+    return final.parent / f"{mark}{uuid.uuid4().hex[:16]}{final.suffix}"
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _flush(path: Path) -> None:

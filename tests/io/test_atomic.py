@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.atomic import atomic_path, atomic_paths, remove_leftovers
 
 
 def test_appears_only_after_success(tmp_path: Path) -> None:
@@ -83,3 +83,47 @@ def test_unwritable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere, so chmod proves nothing
     with pytest.raises(ClodError, match="not writable"), atomic_path(tmp_path / "out"):
         raise AssertionError("the body must not run")
+
+
+def test_several_appear_together(tmp_path: Path) -> None:
+    finals = [tmp_path / name for name in ("a", "b", "c")]
+    with atomic_paths(*finals) as temporaries:
+        for temporary in temporaries:
+            assert os.listdir(tmp_path) == [] or not any(final.exists() for final in finals)
+            temporary.write_bytes(b"new")
+    assert sorted(os.listdir(tmp_path)) == ["a", "b", "c"]
+    with pytest.raises(ClodError, match="cannot be written"), atomic_paths(*finals) as temporaries:
+        temporaries[0].write_bytes(b"newer")  # and the others not at all
+    assert [final.read_bytes() for final in finals] == [b"new"] * 3
+
+
+def test_errors_name_the_final_file(tmp_path: Path) -> None:
+    with (
+        pytest.raises(ClodError, match=r"^\S*/b: cannot be written: No space left on device$"),
+        atomic_paths(tmp_path / "a", tmp_path / "b") as (_, second),
+        atomic_path(second),
+    ):
+        raise OSError(28, "No space left on device")
+    assert os.listdir(tmp_path) == []
+
+
+def test_leftovers_of_the_same_file_are_removed(tmp_path: Path) -> None:
+    """Of a temporary's temporary too; what belongs to another file stays."""
+    final, other = tmp_path / "out.ply", tmp_path / "other.ply"
+    final.write_bytes(b"final")
+    with atomic_path(final) as first, atomic_path(other) as theirs:
+        with atomic_path(first) as nested:
+            nested.write_bytes(b"half")
+            theirs.write_bytes(b"half")
+            remove_leftovers(final)
+            assert sorted(os.listdir(tmp_path)) == sorted(["out.ply", theirs.name])
+            nested.write_bytes(b"new")
+        first.write_bytes(b"new")
+    assert final.read_bytes() == b"new"
+
+
+def test_a_long_name(tmp_path: Path) -> None:
+    final = tmp_path / ("x" * 251 + ".ply")
+    with atomic_path(final) as temporary, atomic_path(temporary) as nested:
+        nested.write_bytes(b"new")
+    assert final.read_bytes() == b"new"
