@@ -32,6 +32,13 @@ class RowAdam:
         corrections = 1 / (1 - beta1**count), 1 / np.sqrt(1 - beta2**count)
         self._corrections = np.pad(np.stack(corrections), ((0, 0), (1, 0))).astype(np.float32)
 
+    def state(self) -> dict[str, dict[str, Tensor]]:
+        """The tensors themselves that it keeps of each parameter: ``first`` and ``second`` moment, ``steps`` by row."""
+        moments = {
+            kind: {n: both[k] for n, both in self._moments.items()} for k, kind in enumerate(("first", "second"))
+        }
+        return {**moments, "steps": self._steps}
+
     @torch.no_grad()
     def step(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
         """Steps the parameters named in ``gradients``, each at its rate, where ``rows`` (bool ``[N]``) is set.

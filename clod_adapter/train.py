@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -23,54 +22,20 @@ from clod_adapter.importance import seeing, start
 from clod_adapter.losses import photometric_loss
 from clod_adapter.optimizer import RowAdam
 from clod_adapter.render import splat
+from clod_adapter.training_state import Adapted, Progress, TrainingState
+
+__all__ = ["Adapted", "Progress", "TrainingState", "adapt", "camera_extent"]
 
 # Sigma stays where the equation still tells values apart; below, a Gaussian would be gone for good.
 SIGMA_RANGE = (1e-4, SIGMA_MAX)
 
 
-@dataclass(frozen=True)
-class Progress:
-    """Where an adaptation stands; handed to the progress callback.
-
-    Attributes:
-        phase: "start" (a view a step), "order" (a Gaussian a step: who leaves before whom) or "train".
-        done, total: steps of the phase.
-        seconds: since training began; before it, since the adaptation did.
-        share: of the phase that is done, by steps or by time budget, whichever is further.
-        loss: running mean of the photometric loss, NaN before the first step.
-        gaussians: gives the state now (before training, the base; within the last ``average`` of it, the mean so
-            far); it shares memory with what is being trained, so use it within the callback.
-    """
-
-    phase: str
-    done: int
-    total: int
-    seconds: float
-    share: float
-    loss: float
-    gaussians: Callable[[], Gaussians]
-
-
-@dataclass(frozen=True)
-class Adapted:
-    """The outcome of ``adapt``.
-
-    Attributes:
-        gaussians: with ``sigma_d`` and ``attenuation``.
-        steps: training steps done.
-        seconds: wall time of the training loop; start_seconds: of what comes before it.
-        interrupted: a KeyboardInterrupt ended it early.
-    """
-
-    gaussians: Gaussians
-    steps: int
-    seconds: float
-    start_seconds: float
-    interrupted: bool
-
-
 def adapt(
-    base: Gaussians, scene: Scene, config: AdaptConfig | None = None, progress: Callable[[Progress], None] | None = None
+    base: Gaussians,
+    scene: Scene,
+    config: AdaptConfig | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    resume: TrainingState | None = None,
 ) -> Adapted:
     """Learns sigma_d for ``base`` on the training views of ``scene``, and updates the rest lightly.
 
@@ -85,8 +50,14 @@ def adapt(
 
     A KeyboardInterrupt ends training and returns what there is: before the last ``average`` of the steps, no mean.
 
+    Args:
+        resume: goes on from here (``Progress.state`` of an earlier call with the same base, views and config) and
+            ends, on as many threads, with the same bits as an undisturbed run; a time budget counts from the first
+            beginning.
+
     Raises:
-        ClodError: no training views, none that has a Gaussian before it, or no Gaussians.
+        ClodError: no training views, none that has a Gaussian before it, no Gaussians, or ``resume`` is of something
+            else.
     """
     config = config or AdaptConfig()
     if not scene.train:
@@ -103,10 +74,16 @@ def adapt(
     # Where the higher bands are not tuned, empty ones stay empty.
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
     views = seeing(base, scene.train)
-    gaussians = start(lean, views, config, report)
-    run = _Run(gaussians, views, config, progress)
+    if resume is None:
+        begun = start(lean, views, config, report)
+    else:
+        begun = lean.replace(sigma_d=torch.ones(len(base)), attenuation=resume.attenuation)
+    run = _Run(begun, views, config, progress)
     run.empty_bands = None if lean is base else base.shN.clone()
-    return run.run(time.perf_counter() - began)
+    run.start_seconds = time.perf_counter() - began
+    if resume is not None:
+        run.restore(resume)
+    return run.run()
 
 
 class _Run:
@@ -145,23 +122,58 @@ class _Run:
         self.tuned = [
             n for n in ATTRIBUTES if n != "opacity_logits" and self.rates[n] > 0 and getattr(start, n).numel()
         ]
+        self.stepped = [*self.tuned, "opacity_logits", self.decay]
+        self.done, self.seconds, self.start_seconds = 0, 0.0, 0.0
         self.loss = math.nan
         self.mean: dict[str, Tensor] = {}  # of the parameters over the last ``average`` of the steps
         self.averaged = 0
 
-    def run(self, start_seconds: float) -> Adapted:
-        began, done, interrupted = time.perf_counter(), 0, False
+    def run(self) -> Adapted:
+        began, interrupted = time.perf_counter() - self.seconds, False
         try:
-            while (share := self._share_done(done, time.perf_counter() - began)) < 1:
+            while (share := self._share_done(self.done, time.perf_counter() - began)) < 1:
                 self.step(share)
-                done += 1
+                self.done += 1
+                self.seconds = time.perf_counter() - began
                 if self.progress:
-                    seconds = time.perf_counter() - began
-                    share = self._share_done(done, seconds)
-                    self.progress(Progress("train", done, self.config.iters, seconds, share, self.loss, self.gaussians))
+                    share = self._share_done(self.done, self.seconds)
+                    told = ("train", self.done, self.config.iters, self.seconds, share, self.loss)
+                    self.progress(Progress(*told, self.gaussians, self.state))
         except KeyboardInterrupt:
             interrupted = True
-        return Adapted(self.gaussians(), done, time.perf_counter() - began, start_seconds, interrupted)
+        self.seconds = time.perf_counter() - began
+        return Adapted(self.gaussians(), self.done, self.seconds, self.start_seconds, interrupted)
+
+    def state(self) -> TrainingState:
+        return TrainingState(
+            tensors=self._changing(), attenuation=self.attenuation, random=dict(self.random.bit_generator.state),
+            order=tuple(self.order), loss=self.loss, averaged=self.averaged, steps=self.done, seconds=self.seconds,
+            start_seconds=self.start_seconds,
+        )  # fmt: skip
+
+    def restore(self, state: TrainingState) -> None:
+        """The inverse of ``state``."""
+        if state.averaged:
+            self.mean = {name: torch.empty_like(self.parameters[name]) for name in self.stepped}
+        own = self._changing()
+        shapes = [{name: (t.shape, t.dtype) for name, t in tensors.items()} for tensors in (own, state.tensors)]
+        if shapes[0] != shapes[1] or not all(0 <= view < len(self.views) for view in state.order):
+            raise ClodError("the training state is of other Gaussians, views or settings; give those it was saved with")
+        for name, tensor in own.items():
+            tensor.copy_(state.tensors[name])
+        try:
+            self.random.bit_generator.state = state.random
+        except (KeyError, OverflowError, TypeError, ValueError) as error:
+            raise ClodError(f"the training state's random state is damaged ({error!r}); start afresh") from error
+        self.order, self.loss, self.averaged = list(state.order), state.loss, state.averaged
+        self.done, self.seconds, self.start_seconds = state.steps, state.seconds, state.start_seconds
+
+    def _changing(self) -> dict[str, Tensor]:
+        """The tensors themselves that steps change, named as in ``TrainingState``."""
+        kinds = {"parameter": self.parameters, **self.optimizer.state(), "mean": self.mean}
+        return {
+            f"{kind}.{name}": values[name] for kind, values in kinds.items() for name in self.stepped if name in values
+        }
 
     def _share_done(self, done: int, seconds: float) -> float:
         by_steps = done / self.config.iters if self.config.iters else 1.0
@@ -176,7 +188,7 @@ class _Run:
 
     def _average(self) -> None:
         """Takes the parameters as they stand into their mean; the optimiser goes on from where it is."""
-        now = {name: self.parameters[name] for name in [*self.tuned, "opacity_logits", self.decay]}
+        now = {name: self.parameters[name] for name in self.stepped}
         self.averaged += 1
         if self.averaged == 1:
             self.mean = {name: value.clone() for name, value in now.items()}

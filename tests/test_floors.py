@@ -31,6 +31,7 @@ FLOORS = [
         "metrics",
         "optimizer",
         "perceptual",
+        "training_state",
     },
     {"io", "rasterizers", "adapter"},
     {"render"},

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +21,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import scene_distance, start
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import render, splat
-from clod_adapter.train import Adapted, Progress, adapt
+from clod_adapter.train import Adapted, Progress, TrainingState, adapt
 from scenes import capture, gaussians, photograph, ring
 
 SCALES = (1.0, 1.5, 2.0, 3.0, 5.0)
@@ -338,6 +340,94 @@ def test_an_interrupt_returns_what_there_is(captured: tuple[Gaussians, Scene]) -
     assert result.interrupted and result.steps == 5
     for name, value in result.gaussians.tensors().items():
         assert torch.equal(value, states[-1][name]) and value.isfinite().all() and not value.requires_grad, name
+
+
+def states_of(steps: set[int], found: dict[int, TrainingState]) -> Callable[[Progress], None]:
+    """A progress callback that keeps the states after these steps."""
+
+    def keep(progress: Progress) -> None:
+        if progress.state and progress.done in steps:
+            found[progress.done] = copy.deepcopy(progress.state())
+
+    return keep
+
+
+RESUMED = {
+    "ours": {},
+    "paper": vars(AdaptConfig.paper(iters=12, max_sv=4.0)),
+    "linear": {"parameter": "linear", "lr_shN": 0.0},
+    "mean of all": {"average": 1.0, "max_sv": 1.0},
+    "few attributes": {"lr_means": 0.0, "lr_quats": 0.0, "average": 0.0},
+}
+
+
+@pytest.mark.parametrize(
+    ("form", "kind"),
+    [
+        ("ours", "fresh"),
+        ("paper", "fresh"),
+        ("paper", "with a dial"),
+        ("linear", "empty bands"),
+        ("mean of all", "with a dial"),
+        ("few attributes", "fresh"),
+    ],
+)
+def test_a_resumed_run_ends_with_the_same_bits(captured: tuple[Gaussians, Scene], form: str, kind: str) -> None:
+    """From within a round of views and at its end, before, at the beginning of and within the averaging, at the end."""
+    base, scene = captured
+    if kind == "empty bands":
+        base = base.replace(shN=torch.zeros_like(base.shN))
+    if kind == "with a dial":
+        base = attach(base, torch.full((len(base),), 1.5), AttenuationConfig(scene_distance=4.0, max_sv=3.0))
+    config, states = config_of(**{"iters": 12, **RESUMED[form]}), dict[int, TrainingState]()
+    whole = adapt(base, scene, config, states_of({1, 6, 10, 11, 12}, states))
+    seen: list[Progress] = []
+    for steps, state in states.items():
+        again = adapt(base, scene, config, seen.append, copy.deepcopy(state))
+        assert_equal(again.gaussians, whole.gaussians)
+        assert (again.steps, again.interrupted, again.start_seconds) == (12, False, whole.start_seconds), steps
+        assert again.seconds > state.seconds
+    assert {p.phase for p in seen} == {"train"} and [p.done for p in seen[:11]] == list(range(2, 13))
+    later: dict[int, TrainingState] = {}
+    adapt(base, scene, config, states_of({11}, later), copy.deepcopy(states[6]))
+    assert {name: later[11].tensors[name].equal(value) for name, value in states[11].tensors.items()} == dict.fromkeys(
+        states[11].tensors, True
+    )
+    unlike = {"tensors": {}, "seconds": 0.0}
+    assert replace(later[11], **unlike) == replace(states[11], **unlike)
+
+
+def test_a_state_holds_what_changes_and_no_more(captured: tuple[Gaussians, Scene]) -> None:
+    base, states = captured[0], dict[int, TrainingState]()
+    still = {"lr_shN": 0.0, "lr_means": 0.0, "average": 0.5}
+    adapt(*captured, config_of(iters=4, **still), states_of({1, 3}, states))
+    changing = {"quats", "log_scales", "opacity_logits", "sh0", "log_sigma"}
+    for step, kinds in ((1, {"parameter", "first", "second", "steps"}), (3, {"mean"})):
+        assert {name.split(".")[1] for name in states[step].tensors} == changing
+        assert kinds <= {name.split(".")[0] for name in states[step].tensors}
+    assert "mean.quats" not in states[1].tensors and len(states[1].tensors["first.sh0"]) == len(base)
+
+
+def test_a_time_budget_counts_what_was_spent(captured: tuple[Gaussians, Scene]) -> None:
+    config, states = config_of(iters=10_000_000, time_budget=0.5), dict[int, TrainingState]()
+    adapt(*captured, config, states_of({3}, states))
+    spent = replace(states[3], seconds=0.45)
+    result = adapt(*captured, config, None, spent)
+    assert 3 < result.steps < 10_000 and 0.5 <= result.seconds < 5
+
+
+def test_a_state_of_something_else_is_refused(captured: tuple[Gaussians, Scene]) -> None:
+    base, scene = captured
+    config, states = config_of(iters=2), dict[int, TrainingState]()
+    adapt(base, scene, config, states_of({1}, states))
+    state = states[1]
+    few, fewer = base.select(torch.arange(len(base)) < 9), Scene(scene.train[:1], ())
+    for other in ((few, scene, config), (base, fewer, config), (base, scene, config_of(iters=2, parameter="linear"))):
+        with pytest.raises(ClodError, match="of other Gaussians, views or settings"):
+            adapt(*other, None, state)
+    for broken in ({}, {**state.random, "state": {"state": -1, "inc": "x"}}):
+        with pytest.raises(ClodError, match="random state is damaged"):
+            adapt(base, scene, config, None, replace(state, random=broken))
 
 
 def test_max_sv_of_one(captured: tuple[Gaussians, Scene]) -> None:

@@ -1,0 +1,61 @@
+"""Training states as safetensors files: the tensors, and one JSON document with the rest, what it belongs to included.
+
+The JSON stands under the metadata key ``clod_adapter_state``.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+from safetensors import safe_open
+from safetensors.torch import save
+
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.io.atomic import atomic_path
+from clod_adapter.training_state import TrainingState
+
+KEY = "clod_adapter_state"
+
+
+def save_state(path: str | Path, state: TrainingState, belongs: dict[str, Any]) -> None:
+    """Writes a state; loading it gives the same bits.
+
+    Args:
+        belongs: plain JSON: which run it is of.
+
+    Raises:
+        ClodError: the file cannot be written.
+    """
+    # Not asdict of the whole, which would copy the tensors.
+    about = {f.name: getattr(state, f.name) for f in fields(state) if f.name != "tensors"}
+    metadata = {KEY: json.dumps({**about, "attenuation": asdict(state.attenuation), "belongs": belongs})}
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(
+            save({name: t.detach().cpu().contiguous() for name, t in state.tensors.items()}, metadata)
+        )
+
+
+def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
+    """Reads a state, and what it belongs to.
+
+    Raises:
+        ClodError: the file cannot be read, is damaged, or no training state.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            # Copies, since the file will change under a memory map.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+            about = json.loads((file.metadata() or {})[KEY])
+        belongs, attenuation = about.pop("belongs"), AttenuationConfig(**about.pop("attenuation"))
+        order, random = tuple(map(int, about.pop("order"))), dict(about.pop("random"))
+        counts = {name: int(about.pop(name)) for name in ("averaged", "steps")}
+        rest = {name: float(value) for name, value in about.items()}
+        return TrainingState(tensors, attenuation, random, order, **counts, **rest), dict(belongs)  # type: ignore
+    except OSError as error:
+        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    except Exception as error:  # SafetensorError, and whatever a crafted file provokes
+        raise ClodError(f"{path}: is no training state or damaged ({error}); remove it to start afresh") from error

@@ -1,0 +1,83 @@
+"""Where a training stands: as it is told while it runs, as it can be gone on from, and as it ended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class TrainingState:
+    """All that the steps to come depend on, besides the base, the views and the config.
+
+    ``adapt`` goes on from it and ends with the bits that it would have ended with undisturbed, on as many threads.
+
+    Attributes:
+        tensors: by kind and name, as in ``parameter.means``: of each attribute that changes (what does not is the
+            base's) its ``parameter``, Adam's ``first`` and ``second`` moment and a row's number of ``steps``, and,
+            where there is one by now, the ``mean`` that will be the outcome. float32 and, the steps, int32.
+        attenuation: how sigma_d is to be read.
+        random: the state of NumPy's generator; order: the views to come in this round, the next one last.
+        loss: its running mean; averaged: how many steps are in the mean.
+        steps, seconds: done and spent in training; start_seconds: spent before it.
+    """
+
+    tensors: dict[str, Tensor]
+    attenuation: AttenuationConfig
+    random: dict[str, Any]
+    order: tuple[int, ...]
+    loss: float
+    averaged: int
+    steps: int
+    seconds: float
+    start_seconds: float
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where an adaptation stands; handed to the progress callback.
+
+    Attributes:
+        phase: "start" (a view a step), "order" (a Gaussian a step: who leaves before whom) or "train".
+        done, total: steps of the phase.
+        seconds: since training began; before it, since the adaptation did.
+        share: of the phase that is done, by steps or by time budget, whichever is further.
+        loss: running mean of the photometric loss, NaN before the first step.
+        gaussians: gives the state now (before training, the base; within the last ``average`` of it, the mean so
+            far); it shares memory with what is being trained, so use it within the callback.
+        state: gives what training can be resumed from, likewise; None before training.
+    """
+
+    phase: str
+    done: int
+    total: int
+    seconds: float
+    share: float
+    loss: float
+    gaussians: Callable[[], Gaussians]
+    state: Callable[[], TrainingState] | None = None
+
+
+@dataclass(frozen=True)
+class Adapted:
+    """The outcome of ``adapt``.
+
+    Attributes:
+        gaussians: with ``sigma_d`` and ``attenuation``.
+        steps: training steps done.
+        seconds: wall time of the training loop; start_seconds: of what comes before it. Of a resumed training both
+            count from its first beginning.
+        interrupted: a KeyboardInterrupt ended it early.
+    """
+
+    gaussians: Gaussians
+    steps: int
+    seconds: float
+    start_seconds: float
+    interrupted: bool
