@@ -4,32 +4,31 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import torch
 
 from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.cameras import Scene
-from clod_adapter.cli.budgets import calibrate
 from clod_adapter.cli.console import Console, duration
 from clod_adapter.cli.evaluate import measure
 from clod_adapter.cli.files import Outputs, size
 from clod_adapter.cli.inputs import place_scene, read_checkpoint, read_scene
+from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.pages import AdaptPage
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, table, write_report
+from clod_adapter.cli.results import write, write_measured
+from clod_adapter.cli.resume import Saver
 from clod_adapter.cli.settings import make_config
-from clod_adapter.cli.training import Follower, GracefulStop
+from clod_adapter.cli.training import Follower
 from clod_adapter.config import AdaptConfig
-from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import Row
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.adapter_file import check_config, save_adapter
-from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.ply import Checkpoint, save
+from clod_adapter.io.adapter_file import check_config
+from clod_adapter.io.atomic import remove_leftovers
 from clod_adapter.io.version import package_version
 from clod_adapter.train import Adapted, adapt
 
@@ -41,6 +40,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, stop = Console(args.quiet), Stopwatch(), GracefulStop()
     config, outputs = make_config(args), Outputs.of(args.ply, args.out)
     check_config(asdict(config))
+    for path in vars(outputs).values():
+        remove_leftovers(path)
+    saver = Saver(outputs.state, args.resume, config, console, stop)
     with watch.time("load"):
         base = read_checkpoint(args.ply, console)
         photographs = read_scene(args.images, console) if args.images is not None else None
@@ -49,35 +51,40 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         prepare_kernels(console)
     with watch.time("load" if photographs else "place"):
         scene = photographs or place_scene(gaussians, config.seed, console)
+        saver.belong((args.ply, base.fingerprint), scene, args.images or "those placed for it")
     with watch.time("evaluate"):
         base_rows, notes = look_at_base(gaussians, scene, args, console)
     with stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
         page = AdaptPage(gaussians, scene, config, console) if args.report else None
-        adapted = train(gaussians, scene, config, console, stop, base_rows, page)
+        follower = Follower(console, stop, gaussians, scene.test, config.max_sv, base_rows[0] if base_rows else None)
+        adapted = train(gaussians, scene, config, follower, saver, page)
         watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
         adapter = extract(gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config))
         result = adapter.apply(gaussians)
-        write(base, adapter, result, outputs, console)
         report = describe_run(args, outputs, adapter, adapted) | {
             "sh_degree": result.sh_degree, "device": str(result.means.device), "seconds": watch.report(),
+            "resumed_from": saver.state and saver.state.steps,
             "notes": [*base.notes, *scene.notes, *notes, "the result was not measured"],
             "base_rows": [row.as_dict() for row in base_rows], "rows": [], "detached_row": None,
         }  # fmt: skip
-        write_report(outputs.report, report)
+        with console.status(f"writing {outputs.ply} ..."):
+            write(base, adapter, result, outputs, report)
+        console.say(f"wrote {outputs.adapter} and {outputs.ply}")
     skip, late = stop.requests > 0 and not adapted.interrupted, GracefulStop()
     with watch.time("evaluate"):
         rows, plain, cut_short = ([], [], True) if skip else measure_result(result, scene, config, console)
-        if rows and not cut_short:
-            adapter = store_calibration(base, adapter, result, rows, scene, report["teacher"], outputs, console, late)
     if cut_short:
         notes.append("the measurements were interrupted: only the dial values that were finished are reported")
         console.say(notes[-1])
     report |= {
         "rows": [row.as_dict() for row in rows], "detached_row": plain[0].as_dict() if plain else None,
         "notes": [*base.notes, *scene.notes, *notes], "seconds": watch.report(),
-        "calibration": adapter.calibration and adapter.calibration.as_dict(), **outputs.sizes(),
     }  # fmt: skip
-    write_report(outputs.report, report)
+    if rows and not cut_short:
+        write_measured(base, adapter, result, rows, scene, outputs, report, console, late)
+    else:
+        write_report(outputs.report, report)
+    saver.close(finished=not adapted.interrupted and not cut_short)
     if page and not cut_short and not late.requests:  # after the report, which no failure of the page is to cost
         with watch.time("page"):
             written = page.write(outputs.ply.with_suffix(".html"), report, result, adapted.start_seconds)
@@ -94,7 +101,7 @@ def describe_run(args: argparse.Namespace, outputs: Outputs, adapter: Adapter, a
         "teacher": "checkpoint" if args.images is None else "photographs",
         "base_count": len(adapter.sigma_d), "config": adapter.config, "attenuation": asdict(adapter.attenuation),
         "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
-        "outputs": outputs.names(), "calibration": None, **outputs.sizes(),
+        "outputs": outputs.names(),
     }  # fmt: skip
 
 
@@ -131,57 +138,17 @@ def look_at_base(
 
 
 def train(
-    base: Gaussians,
-    scene: Scene,
-    config: AdaptConfig,
-    console: Console,
-    stop: GracefulStop,
-    base_rows: Sequence[Row],
-    page: AdaptPage | None = None,
+    base: Gaussians, scene: Scene, config: AdaptConfig, follower: Follower, saver: Saver, page: AdaptPage | None = None
 ) -> Adapted:
     """Adapts while the user watches. Raises KeyboardInterrupt when there is nothing worth writing."""
-    base_row = base_rows[0] if base_rows else None
-    with closing(Follower(console, stop, base, scene.test, config.max_sv, base_row)) as follower:
-        adapted = adapt(base, scene, config, page.watching(follower) if page else follower)
-    if stop.requests > 1:
+    console, follow = follower.console, saver.watching(page.watching(follower) if page else follower)
+    with closing(follower):
+        adapted = adapt(base, scene, config, follow, resume=saver.state)
+    if follower.stop.requests > 1:
         raise KeyboardInterrupt
     how = "interrupted after" if adapted.interrupted else "trained"
     console.say(f"{how} {adapted.steps} steps, {duration(adapted.seconds)}")
     return adapted
-
-
-def write(base: Checkpoint, adapter: Adapter, result: Gaussians, outputs: Outputs, console: Console) -> None:
-    """Writes adapter and PLY, before the last measurements, which may be interrupted.
-
-    The adapter first: it is small, and from it ``apply`` makes the PLY should that not fit on the disk. An earlier
-    run's report goes, since it is of other files.
-    """
-    outputs.report.unlink(missing_ok=True)
-    with console.status(f"writing {outputs.ply} ..."):
-        save_adapter(outputs.adapter, adapter)
-        save(outputs.ply, result, base, version=adapter.version)
-    console.say(f"wrote {outputs.adapter} and {outputs.ply}")
-
-
-def store_calibration(
-    base: Checkpoint, adapter: Adapter, result: Gaussians, rows: Sequence[Row], scene: Scene, against: str,
-    outputs: Outputs, console: Console, stop: GracefulStop,
-) -> Adapter:  # fmt: skip
-    """The adapter with the calibration that ``rows`` are; adapter and PLY are written again with it.
-
-    Until then those written before the measurements are there. The new ones are complete, beside them, before the
-    first takes its place, so that nothing but a kill between two renames leaves a pair of which one has the table.
-    Where they cannot be written, or a PSNR is infinite, the earlier ones stay, and the console says so.
-    """
-    try:
-        calibrated = replace(adapter, calibration=calibrate(rows, len(result), scene.test, against))
-        with stop.listening(), atomic_path(outputs.adapter) as small, atomic_path(outputs.ply) as large:
-            save_adapter(small, calibrated)
-            save(large, result, base, version=adapter.version, calibration=calibrated.calibration)
-    except ClodError as error:
-        console.say(f"the files are without the calibration, so --fps and --psnr-drop will not know it: {error}")
-        return adapter
-    return calibrated
 
 
 def measure_result(

@@ -58,11 +58,13 @@ class Meter:
 
     Args:
         slow: of few and uneven steps: shown from the start, and judged by all of its time so far.
+        initial: the share that was done before.
     """
 
     console: Console
     label: str
     slow: bool = False
+    initial: float = 0.0
     bar: Any = None
     began: float = field(default_factory=time.perf_counter)
     printed: float = field(default_factory=time.perf_counter)
@@ -70,7 +72,7 @@ class Meter:
     def __post_init__(self) -> None:
         if not self.console.quiet and sys.stderr.isatty():
             self.bar = tqdm(
-                total=1.0, desc=self.label, bar_format=BAR_FORMAT, file=sys.stderr,
+                total=1.0, initial=self.initial, desc=self.label, bar_format=BAR_FORMAT, file=sys.stderr,
                 leave=False, delay=0 if self.slow else 0.5, smoothing=0 if self.slow else 0.3,
                 miniters=0, dynamic_ncols=True,
             )  # fmt: skip
@@ -84,7 +86,7 @@ class Meter:
                 self.bar.update(min(share, 1.0) - self.bar.n)
         elif now - self.printed >= LINE_EVERY:
             self.printed = now
-            left = (now - self.began) * (1 / max(share, 1e-9) - 1)
+            left = (now - self.began) * (1 - share) / max(share - self.initial, 1e-9)
             self.console.say(f"{self.label} {share:4.0%}, {duration(left)} left, {text}".removesuffix(", "))
 
     def close(self) -> None:

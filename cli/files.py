@@ -24,14 +24,16 @@ class Outputs:
         ply = Path(out or f"{Path(checkpoint).stem}_clod.ply")
         return cls(ply, ply.with_suffix(".safetensors"), ply.with_suffix(".json"))
 
+    @property
+    def state(self) -> Path:
+        """What ``--resume`` goes on from; there only while a run is not finished."""
+        return self.ply.with_suffix(".resume.safetensors")
+
     def check(self, inputs: Sequence[str]) -> None:
         """``check_output`` for each of them."""
         check_ply_name(self.ply, "--out")
-        for path in vars(self).values():
+        for path in (*vars(self).values(), self.state):
             check_output(path, inputs)
-
-    def sizes(self) -> dict[str, int]:
-        return {"adapter_bytes": self.adapter.stat().st_size, "ply_bytes": self.ply.stat().st_size}
 
     def names(self) -> dict[str, str]:
         return {name: str(path) for name, path in vars(self).items()}

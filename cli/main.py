@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import Any
 
 from clod_adapter.cli.commands import ADAPT, APPLY, BAKE, DEMO, EVALUATE, RENDER, ROBUSTNESS, Command
+from clod_adapter.cli.interrupts import sigterm_as_interrupt
 from clod_adapter.cli.parser import Parser, make_parser
 from clod_adapter.errors import ClodError
 from clod_adapter.io.version import package_version
@@ -58,7 +59,7 @@ def run(command: Command, args: argparse.Namespace) -> None:
     CHECKS[command.module](args)
     module = import_command(command, args)
     aside = io.StringIO() if args.quiet else sys.stderr
-    with redirect_stdout(aside) if args.json else nullcontext():
+    with redirect_stdout(aside) if args.json else nullcontext(), sigterm_as_interrupt():
         report = module.run(args)
     if args.json:
         print(json.dumps(jsonable(report), allow_nan=False))

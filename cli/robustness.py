@@ -14,10 +14,10 @@ from clod_adapter.cli.cells import Cell, cells_of
 from clod_adapter.cli.console import Console, Meter, duration
 from clod_adapter.cli.files import check_output, labels, make_folder
 from clod_adapter.cli.inputs import read_checkpoint, read_scene
+from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, write_report
 from clod_adapter.cli.settings import make_configs
-from clod_adapter.cli.training import GracefulStop
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.version import package_version

@@ -1,19 +1,15 @@
-"""Training as the user follows it: progress, the held-out error so far, and Ctrl-C."""
+"""Training as the user follows it: progress, and the held-out error so far."""
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from statistics import fmean
-from types import FrameType
 
 import torch
 
 from clod_adapter.cameras import View
 from clod_adapter.cli.console import Console, Meter
+from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.evaluate import Row
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.metrics import psnr
@@ -24,29 +20,6 @@ CHECK_EVERY = 10.0  # seconds between looks at the held-out views, at least
 CHECK_COST = 0.03  # share of the time that they may take, at most
 CHECK_VIEWS = 4
 LABELS = {"start": "importance", "order": "order of leaving", "train": "training"}
-
-
-class GracefulStop:
-    """Counts Ctrl-C. The first is a request, which the step under way outlives; a second one interrupts at once."""
-
-    def __init__(self) -> None:
-        self.requests = 0
-
-    @contextmanager
-    def listening(self) -> Iterator[None]:
-        if threading.current_thread() is not threading.main_thread():  # Python allows handlers only there
-            yield
-            return
-        before = signal.signal(signal.SIGINT, self._request)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, before)
-
-    def _request(self, number: int, frame: FrameType | None) -> None:
-        self.requests += 1
-        if self.requests > 1:
-            raise KeyboardInterrupt
 
 
 class Follower:
@@ -81,7 +54,8 @@ class Follower:
     def __call__(self, progress: Progress) -> None:
         if self.meter is None or progress.phase != self.phase:
             self.close()
-            self.phase, self.meter = progress.phase, Meter(self.console, LABELS[progress.phase])
+            before = progress.share if progress.done > 1 else 0.0  # a resumed training's
+            self.phase, self.meter = progress.phase, Meter(self.console, LABELS[progress.phase], initial=before)
         if progress.phase == "train" and progress.share < 1 and not self.stop.requests:
             self._check(progress)
         by_time = progress.share > progress.done / max(progress.total, 1)

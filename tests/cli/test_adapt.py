@@ -17,13 +17,16 @@ from plyfile import PlyData
 import clod_adapter
 from clod_adapter.cli import adapt as adapt_command
 from clod_adapter.cli import evaluate as eval_command
+from clod_adapter.cli import results
 from clod_adapter.cli.report import machine_name, report_dials
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
+from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.colmap import write_model
 from clod_adapter.train import Progress
 
 THREE = ["dial.json", "dial.ply", "dial.safetensors"]
+STATE = "dial.resume.safetensors"
 TINY = ("--iters", 12, "--max-sv", 4, "--out", "dial.ply")
 
 
@@ -187,7 +190,7 @@ def test_interrupt_leaves_a_usable_result(spawn: Any, capture: Any, tmp_path: Pa
     assert process.returncode == 0 and "interrupted after" in err, err
     report = json.loads(out)
     assert report["interrupted"] is True and 0 < report["steps"] < 10**6 and len(report["rows"]) > 3
-    assert names(tmp_path) == THREE
+    assert names(tmp_path) == sorted([*THREE, STATE])
     assert clod_adapter.load(tmp_path / "dial.ply").gaussians.sigma_d is not None
     assert clod("apply", capture.ply, "dial.safetensors", "-o", "same.ply").code == 0
     assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
@@ -199,7 +202,7 @@ def test_interrupt_with_nothing_to_write(
 ) -> None:
     """One press before training, or two while it runs."""
 
-    def adapt(base: Any, scene: Any, config: Any, progress: Any) -> Any:
+    def adapt(base: Any, scene: Any, config: Any, progress: Any, resume: Any) -> Any:
         for _ in range(presses):
             signal.raise_signal(signal.SIGINT)
         if presses == 1:
@@ -225,7 +228,7 @@ def test_interrupt_of_the_measuring(clod: Any, capture: Any, tmp_path: Path, mon
     report = json.loads(done.out)
     assert done.code == 0 and [row["virtual_scale"] for row in report["rows"]] == [1, 1.25, 1.5]
     assert "measurements were interrupted" in report["notes"][0] in done.err and report["interrupted"] is False
-    assert names(tmp_path) == THREE
+    assert names(tmp_path) == sorted([*THREE, STATE])
 
 
 @pytest.mark.parametrize("step", ["extract", "save_adapter", "save"])
@@ -235,7 +238,7 @@ def test_one_interrupt_after_training_loses_nothing(
     press_during(monkeypatch, step, 1)
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
     report = json.loads(done.out)
-    assert done.code == 0 and names(tmp_path) == THREE and report["steps"] == 12
+    assert done.code == 0 and names(tmp_path) == sorted([*THREE, STATE]) and report["steps"] == 12
     assert report["rows"] == [] and report["detached_row"] is None and report["interrupted"] is False
     assert "measurements were interrupted" in report["notes"][0] in done.err
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -250,41 +253,65 @@ def test_a_second_interrupt_aborts_the_writing(
 ) -> None:
     press_during(monkeypatch, "save_adapter", 2)
     done = clod(capture.ply, "--images", capture.scene, *TINY)
-    assert (done.code, names(tmp_path)) == (130, [])
+    assert (done.code, names(tmp_path)) == (130, [STATE])
 
 
 def press_during(monkeypatch: pytest.MonkeyPatch, step: str, presses: int) -> None:
     """Ctrl-C at the beginning of a step of the command."""
-    real = getattr(adapt_command, step)
+    module = adapt_command if step == "extract" else results
+    real = getattr(module, step)
 
     def interrupted(*args: Any, **rest: Any) -> Any:
         for _ in range(presses):
             signal.raise_signal(signal.SIGINT)
         return real(*args, **rest)
 
-    monkeypatch.setattr(adapt_command, step, interrupted)
+    monkeypatch.setattr(module, step, interrupted)
 
 
-def test_a_report_is_never_that_of_an_earlier_run(
+def test_a_report_is_of_the_files_beside_it(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where the run is killed while it measures."""
-    (tmp_path / "dial.json").write_text(EARLIER)
-    save, seen = adapt_command.save, []
+    """An earlier run's stays with its files until all three are replaced; a kill while measuring leaves the new."""
+    for name in THREE:
+        (tmp_path / name).write_text(EARLIER)
+    save, seen = results.save, []
 
     def watched(*args: Any, **rest: Any) -> None:
-        seen.append((tmp_path / "dial.json").exists())
         save(*args, **rest)
+        seen.append({(tmp_path / name).read_text() for name in THREE})
 
     def killed(*_: Any) -> None:
         raise SystemExit(9)
 
-    monkeypatch.setattr(adapt_command, "save", watched)
+    monkeypatch.setattr(results, "save", watched)
     monkeypatch.setattr(adapt_command, "measure_result", killed)
     assert clod(capture.ply, "--images", capture.scene, *TINY).code == 9
     report = json.loads((tmp_path / "dial.json").read_text())
-    assert seen == [False] and names(tmp_path) == THREE
+    assert seen == [{EARLIER}] and names(tmp_path) == sorted([*THREE, STATE])
     assert (report["rows"], report["steps"], report["notes"]) == ([], 12, ["the result was not measured"])
+    assert report["ply_bytes"] == (tmp_path / "dial.ply").stat().st_size
+
+
+@pytest.mark.parametrize("step", ["save_adapter", "save", "write_report"])
+def test_a_full_disk_leaves_the_earlier_files(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    """All three of them, whichever of the new ones does not fit; and the state, to go on from once there is space."""
+    for name in THREE:
+        (tmp_path / name).write_text(EARLIER)
+
+    def full(path: Path, *_: Any, **rest: Any) -> None:
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(b"half")
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(results, step, full)
+    done = clod(capture.ply, "--images", capture.scene, *TINY)
+    name = {"save_adapter": "dial.safetensors", "save": "dial.ply", "write_report": "dial.json"}[step]
+    assert done.code == 2 and f"error: {name}: cannot be written: No space left on device" in done.err
+    assert names(tmp_path) == sorted([*THREE, STATE])
+    assert all((tmp_path / name).read_text() == EARLIER for name in THREE)
 
 
 def test_an_unusable_config_fails_before_the_work(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -389,14 +416,14 @@ def test_without_measurements_there_is_no_calibration(
 def test_a_calibration_that_cannot_be_written_leaves_what_was_there(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = adapt_command.save
+    real = results.save
 
     def save(*args: Any, calibration: Any = None, **rest: Any) -> None:
         if calibration is not None:
             raise ClodError("dial.ply: cannot be written: No space left on device")
         real(*args, **rest)
 
-    monkeypatch.setattr(adapt_command, "save", save)
+    monkeypatch.setattr(results, "save", save)
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
     report = json.loads(done.out)
     assert done.code == 0 and "without the calibration" in done.err and len(report["rows"]) == 7
@@ -411,7 +438,7 @@ def test_interrupt_while_the_calibration_is_written(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, presses: int
 ) -> None:
     """One press lets it finish; two leave the pair without it. Either pair is whole."""
-    real = adapt_command.save
+    real = results.save
 
     def save(*args: Any, **rest: Any) -> None:
         for _ in range(presses if rest.get("calibration") else 0):
@@ -419,9 +446,10 @@ def test_interrupt_while_the_calibration_is_written(
         real(*args, **rest)
 
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr(adapt_command, "save", save)
+    monkeypatch.setattr(results, "save", save)
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--report")  # the page is not begun any more
-    assert done.code == (0 if presses == 1 else 130) and names(tmp_path) == THREE
+    assert done.code == (0 if presses == 1 else 130)
+    assert names(tmp_path) == (THREE if presses == 1 else sorted([*THREE, STATE]))
     stored = clod_adapter.load(tmp_path / "dial.ply").calibration
     assert (stored is not None) == (presses == 1)
     assert stored == clod_adapter.load_adapter(tmp_path / "dial.safetensors").calibration

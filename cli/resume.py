@@ -1,0 +1,129 @@
+"""``--resume``: the state of a training, saved beside its output now and then, and gone on from."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from clod_adapter.cameras import Scene
+from clod_adapter.cli.console import Console
+from clod_adapter.cli.interrupts import GracefulStop
+from clod_adapter.cli.settings import OPTIONS
+from clod_adapter.config import AdaptConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.io.atomic import remove_leftovers
+from clod_adapter.io.state_file import load_state, save_state
+from clod_adapter.io.version import package_version
+from clod_adapter.robustness import scene_fingerprint
+from clod_adapter.training_state import Progress, TrainingState
+
+SAVE_EVERY = 5.0  # seconds between saves, at least
+SAVE_COST = 0.015  # share of the time that they may take, at most
+
+
+class Saver:
+    """The state file of one run.
+
+    Attributes:
+        state: what to go on from, where ``--resume`` found it.
+        saved: the step that the file of this run is of; None where it has written none yet.
+        seconds, saves: spent in saving, and how often.
+
+    Raises:
+        ClodError: the file to resume from is damaged, or of other settings.
+    """
+
+    def __init__(self, path: Path, resume: bool, config: AdaptConfig, console: Console, stop: GracefulStop) -> None:
+        self.path, self.console, self.stop = path, console, stop
+        self.belongs: dict[str, Any] = {"version": package_version(), "config": asdict(config)}
+        self.found: dict[str, Any] = {}
+        self.state: TrainingState | None = None
+        self.saved: int | None = None
+        self.seconds, self.saves, self.due, self.warned = 0.0, 0, 0.0, False
+        remove_leftovers(path)
+        if resume and path.exists():
+            self.state, self.found = load_state(path)
+            self.saved = self.state.steps
+            self._refuse_other_settings()
+        elif resume:
+            console.say(f"there is no {path} to resume from: starting from the beginning")
+        elif path.exists():
+            console.say(
+                f"{path} is there, of a run that was interrupted: --resume would go on with it; this run begins anew, "
+                "and replaces it once training has begun"
+            )
+
+    def belong(self, checkpoint: tuple[str, str], scene: Scene, source: str) -> None:
+        """Says what the states to come belong to, and refuses the one found where it belongs to something else.
+
+        Args:
+            checkpoint: its path and fingerprint.
+            source: of the views, for the message.
+        """
+        path, fingerprint = checkpoint
+        self.belongs |= {"base_sha256": fingerprint, "views_sha256": scene_fingerprint(scene)}
+        if self.state is None:
+            return
+        for key, what in {
+            "base_sha256": f"checkpoint than {path}",
+            "views_sha256": f"photographs than {source}",
+        }.items():
+            if self.found.get(key) != self.belongs[key]:
+                raise ClodError(f"{self.path}: is of another {what}; give what it was begun with, or another --out")
+        self.console.say(f"resuming {self.path} from step {self.state.steps}")
+
+    def _refuse_other_settings(self) -> None:
+        now, then = self.belongs["config"], self.found.get("config")
+        begun = "give what it was begun with, or start without --resume"
+        if self.found.get("version") != self.belongs["version"]:
+            raise ClodError(f"{self.path}: is of version {self.found.get('version')} of this package; {begun}")
+        if not isinstance(then, dict) or then.keys() != now.keys():
+            raise ClodError(f"{self.path}: is of other settings; {begun}")
+        different = [name for name in now if now[name] != then[name]]
+        options = [f"--{name.replace('_', '-')} {then[name]}" for name in different if name in OPTIONS]
+        if options or different:
+            what = ", ".join(options) or f"another --form ({different[0]} {then[different[0]]})"
+            raise ClodError(f"{self.path}: is of a run with {what}; {begun}")
+
+    def watching(self, follow: Callable[[Progress], None]) -> Callable[[Progress], None]:
+        """The progress callback that also saves: after the first step, now and then, and when training is stopped."""
+
+        def call(progress: Progress) -> None:
+            try:
+                follow(progress)
+            except KeyboardInterrupt:
+                if self.stop.requests == 1:
+                    self._save(progress)
+                raise
+            if time.perf_counter() >= self.due and progress.share < 1:
+                self._save(progress)
+
+        return call
+
+    def _save(self, progress: Progress) -> None:
+        """Saves, if there is something to be saved. Where that fails training goes on, which matters more."""
+        if progress.state is None:
+            return
+        began = time.perf_counter()
+        try:
+            save_state(self.path, progress.state(), self.belongs)
+            self.saved = progress.done
+        except ClodError as error:
+            if not self.warned:
+                self.console.say(f"warning: training goes on, but --resume will not know of it: {error}")
+            self.warned = True
+        ended = time.perf_counter()
+        self.seconds, self.saves = self.seconds + ended - began, self.saves + 1
+        self.due = ended + max(SAVE_EVERY, (ended - began) / SAVE_COST)
+
+    def close(self, finished: bool) -> None:
+        """Removes this run's file, or says what it is for; one of another run that it has not replaced stays."""
+        if self.saved is None:
+            return
+        if finished:
+            self.path.unlink(missing_ok=True)
+        else:
+            self.console.say(f"--resume goes on from step {self.saved}, which is in {self.path}")
