@@ -11,9 +11,9 @@ from clod_adapter.cli.dials import check_dials, has_dial
 from clod_adapter.cli.files import Outputs, check_output, check_ply_name, labels
 from clod_adapter.cli.settings import make_config, make_configs
 from clod_adapter.errors import ClodError
-from clod_adapter.io.colmap_folder import find_model
 from clod_adapter.io.ply_columns import sh_degree_of
 from clod_adapter.io.ply_header import read_header
+from clod_adapter.io.scene_folder import find_cameras, photograph_folders
 from clod_adapter.report.charts import chart_file
 from clod_adapter.report.style import check_matplotlib
 
@@ -98,10 +98,10 @@ def check_checkpoint(path: str) -> None:
 
 
 def check_scene(folder: str) -> None:
-    """Refuses what is no folder with a COLMAP model."""
+    """Refuses what is no folder with a COLMAP model or a transforms.json."""
     if not Path(folder).is_dir():
         raise ClodError(f"{folder}: is not a folder; give the one that holds images/ and sparse/0")
-    find_model(Path(folder))
+    find_cameras(Path(folder))
 
 
 def check_makeable(out: Path) -> None:
@@ -116,12 +116,12 @@ def check_makeable(out: Path) -> None:
 def check_folder(out: Path, scene: Path) -> None:
     """Refuses a folder for pictures that cannot be made, or where they could replace photographs of the scene."""
     check_makeable(out)
-    model = find_model(scene)
-    places = [scene, model.parent, model.parent.parent]  # where load_scene looks for photographs
-    images = [(place / "images").resolve() for place in places]
-    if out.resolve() in [place.resolve() for place in places] or any(
-        out.resolve().is_relative_to(folder) for folder in images
-    ):
+    cameras = find_cameras(scene)
+    places = [folder.resolve() for folder in (scene, cameras.parent, cameras.parent.parent)]
+    folders = photograph_folders(scene, cameras)
+    if cameras.is_dir():  # beside a model's images/ there is room; a transforms.json may name any file below it
+        folders.remove(scene)
+    if out.resolve() in places or any(out.resolve().is_relative_to(folder.resolve()) for folder in folders):
         raise ClodError(f"{out}: the scene's own photographs may be there; choose another --out")
 
 

@@ -19,8 +19,8 @@ from clod_adapter.cli.report import Stopwatch
 from clod_adapter.demo.pictures import Panel, dial_strip, quality_curve
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import evaluate
-from clod_adapter.io.colmap import load_scene
 from clod_adapter.io.ply import load, save
+from clod_adapter.io.scene import load_scene
 from clod_adapter.render import render
 from clod_adapter.train import Progress
 

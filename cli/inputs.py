@@ -8,8 +8,8 @@ from clod_adapter.cameras import Scene
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.files import size
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.colmap import load_scene
 from clod_adapter.io.ply import Checkpoint, load
+from clod_adapter.io.scene import load_scene
 from clod_adapter.placement import imagine, place
 
 

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from clod_adapter.export import bake
     from clod_adapter.gaussians import Gaussians
     from clod_adapter.io.adapter_file import load_adapter, save_adapter
-    from clod_adapter.io.colmap import load_scene
     from clod_adapter.io.ply import Checkpoint, load, save
+    from clod_adapter.io.scene import load_scene
     from clod_adapter.placement import imagine, place
     from clod_adapter.render import Rendering, render
     from clod_adapter.train import Adapted, adapt
@@ -50,7 +50,7 @@ on_first_use(__name__, {
     "export": ("bake",),
     "gaussians": ("Gaussians",),
     "io.adapter_file": ("load_adapter", "save_adapter"),
-    "io.colmap": ("load_scene",),
+    "io.scene": ("load_scene",),
     "io.ply": ("Checkpoint", "load", "save"),
     "placement": ("imagine", "place"),
     "render": ("Rendering", "render"),

@@ -1,36 +1,23 @@
-"""COLMAP models: refusing damaged ones, and the posed pinhole cameras in the others."""
+"""COLMAP models: refusing damaged ones, and the posed images in the others."""
 
 from __future__ import annotations
 
-import math
 import struct
-from dataclasses import dataclass
+from copy import copy
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from clod_adapter.errors import ClodError
-
-PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE")
-
-
-@dataclass(frozen=True)
-class PosedImage:
-    """An image of a model: its name, ``[4, 4]`` world to camera, ``[3, 3]`` intrinsics (pixels), size."""
-
-    name: str
-    viewmat: np.ndarray
-    K: np.ndarray
-    width: int
-    height: int
+from clod_adapter.io.posed import PosedImage, check_posed
 
 
 def read_model(model: Path) -> tuple[list[PosedImage], list[str]]:
     """The registered images of a model, sorted by name, and notes.
 
     Raises:
-        ClodError: the model is damaged or empty, or a camera is not an undistorted pinhole.
+        ClodError: the model is damaged or empty, or a camera is not usable.
     """
     _check_complete(model)
     try:
@@ -47,20 +34,10 @@ def read_model(model: Path) -> tuple[list[PosedImage], list[str]]:
 
 
 def _posed_image(model: Path, image: pycolmap.Image) -> PosedImage:
-    camera = image.camera
-    assert camera is not None  # a Reconstruction gives every image its camera
-    if camera.model_name not in PINHOLE_MODELS:
-        raise ClodError(
-            f"{model}: image {image.name} has camera model {camera.model_name}, only {' and '.join(PINHOLE_MODELS)} "
-            "can be rendered; undistort first: colmap image_undistorter --image_path IMAGES --input_path SPARSE "
-            "--output_path OUT"
-        )
-    K = np.asarray(camera.calibration_matrix(), np.float64)
+    assert image.camera is not None  # a Reconstruction gives every image its camera
     viewmat = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-    finite = np.isfinite(K).all() and np.isfinite(viewmat).all()
-    if not finite or K[0, 0] <= 0 or K[1, 1] <= 0 or not 0 < camera.width * camera.height < math.inf:
-        raise ClodError(f"{model}: image {image.name} has a camera or pose that is not usable; copy the model again")
-    return PosedImage(image.name, viewmat, K, camera.width, camera.height)
+    # A copy, as the image's own is part of the whole reconstruction and keeps it in memory.
+    return check_posed(PosedImage(image.name, viewmat, copy(image.camera)), model)
 
 
 def _check_complete(model: Path) -> None:

@@ -12,63 +12,16 @@ import pytest
 import torch
 from PIL import Image
 
-from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
-from clod_adapter.io.colmap import load_scene, write_model
+from clod_adapter.io.colmap import write_model
 from clod_adapter.io.colmap_model import read_model
-
-
-def pose(seed: int) -> torch.Tensor:
-    rotation, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
-    rotation *= np.sign(np.linalg.det(rotation))
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, [seed, -1, 2]
-    return torch.from_numpy(viewmat).float()
-
-
-def camera(seed: int, width: int = 40, height: int = 30, focal: float = 35.5) -> Camera:
-    K = torch.tensor([[focal, 0, 19.25], [0, focal + 1, 15.5], [0, 0, 1]])
-    return Camera(pose(seed), K, width, height)
-
-
-def pixels(seed: int, width: int = 40, height: int = 30) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
-
-
-def scene(folder: Path, count: int = 10) -> tuple[list[Camera], list[str]]:
-    """A scene whose model lists its images in another order than their names."""
-    cameras = [camera(i, focal=30.0 + i % 2) for i in range(count)]
-    names = [f"sub/{count - i:03d}.png" for i in range(count)]
-    write_model(folder, cameras, names)
-    (folder / "images" / "sub").mkdir(parents=True)
-    for i, name in enumerate(names):
-        Image.fromarray(pixels(i)).save(folder / "images" / name)
-    return cameras, names
-
-
-def as_text(folder: Path) -> None:
-    model = folder / "sparse" / "0"
-    reconstruction = pycolmap.Reconstruction(str(model))
-    for file in model.iterdir():
-        file.unlink()
-    reconstruction.write_text(str(model))
-
-
-def model_of(folder: Path, kind: str, params: list[float], name: str = "a.png", cameras: int = 1, **size: int) -> None:
-    """A model of one image, through pycolmap alone."""
-    size = size or {"width": 40, "height": 30}
-    reconstruction = pycolmap.Reconstruction()
-    for i in range(1, cameras + 1):
-        reconstruction.add_camera_with_trivial_rig(pycolmap.Camera(model=kind, params=params, camera_id=i, **size))
-    image = pycolmap.Image(name=name, camera_id=1, image_id=1)
-    reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-    (folder / "sparse" / "0").mkdir(parents=True)
-    reconstruction.write_binary(str(folder / "sparse" / "0"))
+from clod_adapter.io.scene import load_scene
+from photographs import as_text, camera, model_of, pixels, pose, write_scene
 
 
 @pytest.mark.parametrize("form", ["binary", "text", "before rigs"])
 def test_round_trip(tmp_path: Path, form: str) -> None:
-    cameras, names = scene(tmp_path)
+    cameras, names = write_scene(tmp_path)
     if form == "text":
         as_text(tmp_path)
     if form == "before rigs":
@@ -88,28 +41,8 @@ def test_round_trip(tmp_path: Path, form: str) -> None:
         np.testing.assert_array_equal(view.image, pixels(i))
 
 
-def test_progress(tmp_path: Path) -> None:
-    scene(tmp_path, 3)
-    seen: list[tuple[int, int]] = []
-    load_scene(tmp_path, progress=lambda done, total: seen.append((done, total)))
-    assert seen == [(1, 3), (2, 3), (3, 3)]
-
-
-def test_split_and_single_image(tmp_path: Path) -> None:
-    (tmp_path / "ten").mkdir()
-    (tmp_path / "one").mkdir()
-    scene(tmp_path / "ten")
-    loaded = load_scene(tmp_path / "ten", test_every=3)
-    assert (len(loaded.train), len(loaded.test)) == (6, 4)
-    scene(tmp_path / "one", 1)
-    loaded = load_scene(tmp_path / "one")
-    assert (len(loaded.train), len(loaded.test)) == (1, 0)
-    with pytest.raises(ClodError, match="test_every is 1"):
-        load_scene(tmp_path / "one", test_every=1)
-
-
 def test_model_and_images_elsewhere(tmp_path: Path) -> None:
-    scene(tmp_path, 2)
+    write_scene(tmp_path, 2)
     model = tmp_path / "sparse" / "0"
     assert len(load_scene(model).train) == 1  # images beside the model's parent
     for file in model.iterdir():
@@ -146,82 +79,6 @@ def test_simple_pinhole(tmp_path: Path) -> None:
     Image.fromarray(pixels(0)).save(tmp_path / "a.png")
     K = load_scene(tmp_path).train[0].camera.K
     assert K.tolist() == [[33, 0, 20], [0, 33, 15], [0, 0, 1]]
-
-
-@pytest.mark.parametrize(
-    ("kind", "params"), [("SIMPLE_RADIAL", [33, 20, 15, 0]), ("OPENCV", [33, 33, 20, 15, 0, 0, 0, 0])]
-)
-def test_distorted_cameras_are_refused(tmp_path: Path, kind: str, params: list[float]) -> None:
-    model_of(tmp_path, kind, params, cameras=3)
-    with pytest.raises(ClodError, match=f"{kind}.*image_undistorter"):
-        load_scene(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["../a.png", "sub/../../a.png", "/etc/a.png", "..\\a.png", "C:\\a.png"])
-def test_names_that_leave_the_folder_are_refused(tmp_path: Path, name: str) -> None:
-    (tmp_path / "scene").mkdir()
-    model_of(tmp_path / "scene", "PINHOLE", [33, 33, 20, 15], name)
-    Image.fromarray(pixels(0)).save(tmp_path / "a.png")
-    with pytest.raises(ClodError, match="leaves the images folder"):
-        load_scene(tmp_path / "scene")
-
-
-def test_names_made_on_windows(tmp_path: Path) -> None:
-    model_of(tmp_path, "PINHOLE", [33, 33, 20, 15], "sub\\a.png")
-    (tmp_path / "images" / "sub").mkdir(parents=True)
-    Image.fromarray(pixels(0)).save(tmp_path / "images" / "sub" / "a.png")
-    assert len(load_scene(tmp_path).train) == 1
-
-
-def test_missing_images(tmp_path: Path) -> None:
-    _, names = scene(tmp_path)
-    for name in sorted(names)[2:7]:
-        (tmp_path / "images" / name).unlink()
-    with pytest.raises(ClodError, match=r"5 of 10 images .* missing \(sub/003.png, sub/004.png, sub/005.png, \.\.\.\)"):
-        load_scene(tmp_path)
-
-
-def test_wide_images_are_scaled_with_their_intrinsics(tmp_path: Path) -> None:
-    scene(tmp_path, 3)
-    loaded = load_scene(tmp_path, max_width=15)
-    assert loaded.notes == ("3 of 3 images scaled from 40x30 to 15x11 (Pillow bicubic, as in Inria's code)",)
-    view, names = loaded.train[0], [view.camera.name for view in loaded.train]
-    assert tuple(view.image.shape) == (11, 15, 3) and names == ["sub/002.png", "sub/003.png"]
-    original = camera(1, focal=31.0).K  # names count down: 002 is the model's second image
-    scale = torch.tensor([[15 / 40], [11 / 30], [1.0]])
-    torch.testing.assert_close(view.camera.K, original * scale)
-    expected = Image.fromarray(pixels(1)).resize((15, 11), Image.Resampling.BICUBIC)
-    np.testing.assert_array_equal(view.image, np.asarray(expected))
-    assert load_scene(tmp_path, max_width=40).notes == ()
-
-
-def test_images_of_another_size_than_the_camera(tmp_path: Path) -> None:
-    model_of(tmp_path, "PINHOLE", [330, 340, 200, 150], width=400, height=300)
-    Image.fromarray(pixels(0)).save(tmp_path / "a.png")
-    loaded = load_scene(tmp_path)
-    assert loaded.notes == ("1 of 1 images are 40x30 where the model says 400x300: intrinsics scaled",)
-    torch.testing.assert_close(loaded.train[0].camera.K, torch.tensor([[33.0, 0, 20], [0, 34, 15], [0, 0, 1]]))
-    Image.fromarray(pixels(0, 30, 40)).save(tmp_path / "a.png")
-    with pytest.raises(ClodError, match="a.png: is 30x40, its camera 400x300, another shape"):
-        load_scene(tmp_path)
-
-
-def test_image_modes(tmp_path: Path) -> None:
-    model_of(tmp_path, "PINHOLE", [33, 33, 20, 15])
-    path = tmp_path / "a.png"
-    grey = pixels(0)[..., 0]
-    Image.fromarray(grey).save(path)
-    np.testing.assert_array_equal(load_scene(tmp_path).train[0].image[..., 2], grey)
-    Image.fromarray(np.dstack([pixels(0), np.where(grey > 99, 255, 0).astype(np.uint8)])).save(path)
-    loaded = load_scene(tmp_path)
-    assert loaded.notes == ("1 of 1 images have transparency: laid over black",)
-    np.testing.assert_array_equal(loaded.train[0].image, pixels(0) * (grey > 99)[..., None])
-    Image.fromarray(grey.astype(np.uint16) * 257).save(path)
-    with pytest.raises(ClodError, match="more than 8 bits"):
-        load_scene(tmp_path)
-    path.write_bytes(b"no image")
-    with pytest.raises(ClodError, match="a.png: cannot be decoded"):
-        load_scene(tmp_path)
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin", "frames.bin", "rigs.bin"])

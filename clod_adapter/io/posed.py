@@ -1,0 +1,57 @@
+"""What a scene says of a photograph, whichever file says it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from clod_adapter.errors import ClodError
+
+HUGE = 1e9  # world units and pixels; what is beyond is damage, and may not fit float32
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """A photograph's name, pose and camera.
+
+    Attributes:
+        name: its path in the folder of photographs, parts joined by /.
+        viewmat: ``[4, 4]`` float64, world to camera, OpenCV axes.
+        camera: any of COLMAP's perspective models; pixel centres lie at +0.5.
+        held_out: whether the scene says it is for testing; None where it says nothing.
+    """
+
+    name: str
+    viewmat: np.ndarray
+    camera: pycolmap.Camera
+    held_out: bool | None = None
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether straight lines are straight in it: no distortion, or only coefficients of 0."""
+        return self.camera.is_perspective_pinhole() and self.camera.is_undistorted()
+
+
+def check_posed(image: PosedImage, source: Path) -> PosedImage:
+    """The image as it is.
+
+    Raises:
+        ClodError: its camera or pose is not finite, too large, or nothing that undistorting makes a pinhole.
+    """
+    camera = image.camera
+    if not camera.is_perspective_pinhole() and not camera.is_perspective_fisheye():
+        raise ClodError(
+            f"{source}: image {image.name!r} has camera model {camera.model_name}, no perspective camera; cut "
+            "perspective views from it first"
+        )
+    focals = [camera.focal_length_x, camera.focal_length_y]
+    numbers = np.concatenate([image.viewmat.ravel(), camera.params])
+    sized = 0 < camera.width < HUGE and 0 < camera.height < HUGE
+    if not sized or not (np.abs(numbers) < HUGE).all() or min(focals) <= 0:  # a comparison with NaN is false
+        raise ClodError(
+            f"{source}: image {image.name!r} has a camera or pose that is not usable; copy or export it again"
+        )
+    return image

@@ -1,0 +1,144 @@
+"""Posed photographs in, whichever way they come."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.errors import ClodError
+from clod_adapter.io.colmap_model import read_model
+from clod_adapter.io.images import Note, read_image
+from clod_adapter.io.posed import HUGE, PosedImage
+from clod_adapter.io.scene_folder import find_cameras, find_photographs
+from clod_adapter.io.undistort import Photograph, cache_folder, kept, undistort
+
+
+def load_scene(
+    folder: str | Path,
+    *,
+    test_every: int = 8,
+    max_width: int = 1600,
+    progress: Callable[[int, int], None] | None = None,
+) -> Scene:
+    """Reads posed photographs: a COLMAP model (binary or text, any version) and its images.
+
+    A model is looked for in ``sparse/0``, ``sparse`` and ``folder``. Its images are looked for in ``images`` and
+    ``folder``, then beside the model and its parent, then in ``images_2``, ``images_4``, ``images_8`` and, for
+    distorted cameras, ``input``. What was done to the photographs is in the scene's notes.
+
+    Views are sorted by image name; of those that the scene lists, present or not, the 0th, 8th, 16th... are held out,
+    as Inria's code does (``llffhold``). A single image is for training.
+
+    Photographs of a distorted camera are undistorted by COLMAP into the user's cache folder, where a later run finds
+    them. A photograph of another size than its camera has that camera's intrinsics, scaled.
+
+    Args:
+        folder: usually the one with ``images/`` and ``sparse/0/``.
+        test_every: one view in this many is held out; at least 2.
+        max_width: wider images are scaled down to this many pixels, with Pillow's bicubic filter as
+            in Inria's code; the intrinsics follow, and a note says so.
+        progress: called with (images loaded, images in all).
+
+    Raises:
+        ClodError: no usable cameras; images that are damaged, of another shape than their camera, or named outside
+            their folder; more than half of them missing, or all that are for training.
+    """
+    if test_every < 2 or max_width < 1:
+        raise ClodError(f"test_every is {test_every}, max_width {max_width}; they must be at least 2 and 1")
+    folder = Path(folder)
+    cameras = find_cameras(folder)
+    images, notes = read_model(cameras)
+    names = [image.name for image in images]
+    paths, more = find_photographs(folder, cameras, names, raw=not all(image.is_pinhole for image in images))
+    notes += more
+    present = [(image, path) for image, path in zip(images, paths, strict=True) if path is not None]
+    held_out = _held_out(images, test_every)
+    if not any(image.name not in held_out for image, _ in present):
+        raise ClodError(f"{folder}: has no photograph to train on, as all that are there are held out; add more")
+    views, more = _load(present, folder, max_width, progress)
+    train = tuple(view for view in views if view.camera.name not in held_out)
+    return Scene(train, tuple(view for view in views if view.camera.name in held_out), (*notes, *more))
+
+
+def _held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:
+    if any(image.held_out is not None for image in images):
+        return {image.name for image in images if image.held_out}
+    return {image.name for image in images[::test_every]} if len(images) > 1 else set()
+
+
+def _load(
+    present: Sequence[tuple[PosedImage, Path]],
+    folder: Path,
+    max_width: int,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[list[View], list[str]]:
+    """The views of the images, decoded two at a time, and notes."""
+    cache = None if all(image.is_pinhole for image, _ in present) else cache_folder(folder)
+    views, notes = [], []
+    pool = ThreadPoolExecutor(2)
+    with warnings.catch_warnings():
+        # Large, but below the size at which it is refused: photographs are no attack.
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        try:
+            for view, remarks in pool.map(lambda each: _load_view(each[0], each[1], cache, max_width), present):
+                views.append(view)
+                notes += remarks
+                if progress:
+                    progress(len(views), len(present))
+        finally:  # at Ctrl-C or an error the images in hand are finished, and no more
+            pool.shutdown(cancel_futures=True)
+    return views, _summary(notes, len(views))
+
+
+def _summary(notes: Sequence[Note], total: int) -> list[str]:
+    """One line for each thing done, however many sizes it was done to."""
+    lines = []
+    for what, count in Counter(what for what, _ in notes).items():
+        details = list(dict.fromkeys(detail for each, detail in notes if each == what))
+        others = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+        lines.append(f"{count} of {total} images {what.format(details[0] + others)}")
+    return lines
+
+
+def _load_view(image: PosedImage, path: Path, cache: Path | None, max_width: int) -> tuple[View, list[Note]]:
+    if cache is None or image.is_pinhole:
+        pixels, K, notes = _photograph(image, path, max_width)
+    else:
+        pixels, K, notes = kept(cache, image, path, max_width, lambda: _photograph(image, path, max_width))
+        lens = f"from {image.camera.model_name} into {cache}"
+        notes = [*notes, ("undistorted {}, which may be deleted; the sources are untouched", lens)]
+    viewmat = torch.from_numpy(image.viewmat).float()
+    camera = Camera(viewmat, torch.from_numpy(K).float(), pixels.width, pixels.height, image.name)
+    return View(camera, torch.from_numpy(np.array(pixels))), notes
+
+
+def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
+    """The photograph as a pinhole camera has it, no wider than ``max_width``."""
+    camera = copy(image.camera)
+    pixels, notes = read_image(path, camera.width, camera.height)
+    if pixels.size != (camera.width, camera.height):
+        sizes = f"{pixels.width}x{pixels.height} where the model says {camera.width}x{camera.height}"
+        notes.append(("are {}: intrinsics scaled", sizes))
+        # With pixel centres at +0.5, in COLMAP as here, the principal point scales like the focal length.
+        camera.rescale(*pixels.size)
+    if not image.is_pinhole:
+        pixels, camera = undistort(path, pixels, camera)
+    width, height = pixels.size
+    if width > max_width:
+        size = (max_width, max(1, int(height * max_width / width)))
+        pixels = pixels.resize(size, Image.Resampling.BICUBIC)
+        sizes = f"from {width}x{height} to {size[0]}x{size[1]}"
+        notes.append(("scaled {} (Pillow bicubic, as in Inria's code)", sizes))
+    K = np.array([[pixels.width / width], [pixels.height / height], [1.0]]) * camera.calibration_matrix()
+    if not 0 < min(K[0, 0], K[1, 1]) <= np.abs(K).max() < HUGE:
+        raise ClodError(f"{path}: its camera is not usable once undistorted; check the camera's parameters")
+    return Photograph(pixels, K, notes)

@@ -1,0 +1,73 @@
+"""Photographs and COLMAP models of them that the tests of readers share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import torch
+from PIL import Image
+
+from clod_adapter.cameras import Camera
+from clod_adapter.io.colmap import write_model
+
+
+def pose(seed: int) -> torch.Tensor:
+    rotation, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    rotation *= np.sign(np.linalg.det(rotation))
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, [seed, -1, 2]
+    return torch.from_numpy(viewmat).float()
+
+
+def camera(seed: int, width: int = 40, height: int = 30, focal: float = 35.5) -> Camera:
+    K = torch.tensor([[focal, 0, 19.25], [0, focal + 1, 15.5], [0, 0, 1]])
+    return Camera(pose(seed), K, width, height)
+
+
+def pixels(seed: int, width: int = 40, height: int = 30) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def write_scene(folder: Path, count: int = 10) -> tuple[list[Camera], list[str]]:
+    """A scene whose model lists its images in another order than their names."""
+    cameras = [camera(i, focal=30.0 + i % 2) for i in range(count)]
+    names = [f"sub/{count - i:03d}.png" for i in range(count)]
+    write_model(folder, cameras, names)
+    (folder / "images" / "sub").mkdir(parents=True)
+    for i, name in enumerate(names):
+        Image.fromarray(pixels(i)).save(folder / "images" / name)
+    return cameras, names
+
+
+def as_text(folder: Path) -> None:
+    model = folder / "sparse" / "0"
+    reconstruction = pycolmap.Reconstruction(str(model))
+    for file in model.iterdir():
+        file.unlink()
+    reconstruction.write_text(str(model))
+
+
+def model_of(folder: Path, kind: str, params: list[float], name: str = "a.png", cameras: int = 1, **size: int) -> None:
+    """A model of one image, through pycolmap alone."""
+    size = size or {"width": 40, "height": 30}
+    reconstruction = pycolmap.Reconstruction()
+    for i in range(1, cameras + 1):
+        reconstruction.add_camera_with_trivial_rig(pycolmap.Camera(model=kind, params=params, camera_id=i, **size))
+    image = pycolmap.Image(name=name, camera_id=1, image_id=1)
+    reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    (folder / "sparse" / "0").mkdir(parents=True)
+    reconstruction.write_binary(str(folder / "sparse" / "0"))
+
+
+def seen(camera: pycolmap.Camera) -> np.ndarray:
+    """``[H, W, 3]`` uint8: a smooth pattern on the plane z = 1, as a camera at the origin sees it, lens and all."""
+    across, down = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    u, v = camera.cam_from_img(np.stack([across.ravel(), down.ravel()], axis=1)).T
+    waves = [np.sin(5 * u + v), np.sin(5 * v - 2 * u), np.sin(4 * (u + v) + 1)]
+    return np.rint(127.5 + 120 * np.stack(waves, axis=1)).astype(np.uint8).reshape(camera.height, camera.width, 3)
+
+
+def psnr_of(picture: np.ndarray, other: np.ndarray) -> float:
+    return float(-10 * np.log10(np.square((picture.astype(float) - other) / 255).mean() + 1e-9))
