@@ -31,7 +31,8 @@ def _adapt(parser: ArgumentParser) -> None:
     parser.add_argument("ply", metavar="PLY", help="the checkpoint, in Inria's 3DGS layout; it is never modified")
     parser.add_argument(
         "--images", metavar="DIR",
-        help="the scene: photographs in DIR/images and their COLMAP model in DIR/sparse/0 (default: none, see below)",
+        help="the scene: photographs in DIR/images and their COLMAP model in DIR/sparse/0, or nerfstudio's or "
+        "instant-ngp's DIR/transforms.json (default: none, see below)",
     )  # fmt: skip
     add_settings(parser)
     parser.add_argument(
@@ -43,9 +44,14 @@ def _adapt(parser: ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
+def _add_images(parser: ArgumentParser) -> None:
+    scene = "the scene: photographs and their COLMAP model or transforms.json"
+    parser.add_argument("--images", metavar="DIR", required=True, help=scene)
+
+
 def _evaluate(parser: ArgumentParser) -> None:
     parser.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one as the baseline")
-    parser.add_argument("--images", metavar="DIR", required=True, help="the scene: photographs and their COLMAP model")
+    _add_images(parser)
     default = "dial values, 1 (full quality) and up (default: 1 2 3 5 as far as trained, and the last one trained)"
     add_dial_options(parser, default, "(mean over the held-out views)", several=True, required=False)
     parser.add_argument(
@@ -64,7 +70,7 @@ def _evaluate(parser: ArgumentParser) -> None:
 
 def _render(parser: ArgumentParser) -> None:
     parser.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one")
-    parser.add_argument("--images", metavar="DIR", required=True, help="the scene: photographs and their COLMAP model")
+    _add_images(parser)
     parser.add_argument("-o", "--out", metavar="FOLDER", required=True, help="where the pictures go; made if missing")
     add_dial_options(
         parser, "dial values (default: 1); several are put side by side", "(mean over the pictures)", several=True,
@@ -94,7 +100,7 @@ def _apply(parser: ArgumentParser) -> None:
 
 def _robustness(parser: ArgumentParser) -> None:
     parser.add_argument("ply", metavar="PLY", nargs="+", help="checkpoints of one scene; they are never modified")
-    parser.add_argument("--images", metavar="DIR", required=True, help="the scene: photographs and their COLMAP model")
+    _add_images(parser)
     parser.add_argument(
         "--max-sv", metavar="S", type=float, nargs="+", default=[1.0, 3.0, 5.0, 7.0],
         help="the ranges: largest dial value of each adaptation; 1 adapts at full detail only (default: 1 3 5 7)",

@@ -19,6 +19,7 @@ from clod_adapter.io.colmap_model import read_model
 from clod_adapter.io.images import Note, read_image
 from clod_adapter.io.posed import HUGE, PosedImage
 from clod_adapter.io.scene_folder import find_cameras, find_photographs
+from clod_adapter.io.transforms import read_transforms
 from clod_adapter.io.undistort import Photograph, cache_folder, kept, undistort
 
 
@@ -29,14 +30,16 @@ def load_scene(
     max_width: int = 1600,
     progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
-    """Reads posed photographs: a COLMAP model (binary or text, any version) and its images.
+    """Reads posed photographs: a COLMAP model (binary or text, any version) or a transforms.json, and its images.
 
-    A model is looked for in ``sparse/0``, ``sparse`` and ``folder``. Its images are looked for in ``images`` and
+    A model is looked for in ``sparse/0``, ``sparse`` and ``folder``, and is taken where there is a ``transforms.json``
+    (nerfstudio, instant-ngp, Blender's synthetic scenes) too. A model's images are looked for in ``images`` and
     ``folder``, then beside the model and its parent, then in ``images_2``, ``images_4``, ``images_8`` and, for
     distorted cameras, ``input``. What was done to the photographs is in the scene's notes.
 
     Views are sorted by image name; of those that the scene lists, present or not, the 0th, 8th, 16th... are held out,
-    as Inria's code does (``llffhold``). A single image is for training.
+    as Inria's code does (``llffhold``). A single image is for training. With ``transforms_train.json`` and
+    ``transforms_test.json`` those of the latter are held out instead.
 
     Photographs of a distorted camera are undistorted by COLMAP into the user's cache folder, where a later run finds
     them. A photograph of another size than its camera has that camera's intrinsics, scaled.
@@ -56,7 +59,9 @@ def load_scene(
         raise ClodError(f"test_every is {test_every}, max_width {max_width}; they must be at least 2 and 1")
     folder = Path(folder)
     cameras = find_cameras(folder)
-    images, notes = read_model(cameras)
+    images, notes = (read_transforms if cameras.is_file() else read_model)(cameras)
+    if not cameras.is_file() and (folder / "transforms.json").is_file():
+        notes.append("the cameras are the COLMAP model's, not those of transforms.json")
     names = [image.name for image in images]
     paths, more = find_photographs(folder, cameras, names, raw=not all(image.is_pinhole for image in images))
     notes += more

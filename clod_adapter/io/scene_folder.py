@@ -12,6 +12,7 @@ from pathlib import Path, PureWindowsPath
 
 from clod_adapter.errors import ClodError
 
+TRANSFORMS = ("transforms_train.json", "transforms.json")
 SMALLER = ("images_2", "images_4", "images_8")  # copies at a part of the size, as Mip-NeRF 360 and Inria's code have
 RAW = "input"  # Inria's name for the photographs before they are undistorted into images
 MISSING = 0.5  # the share of a scene's photographs that may be
@@ -30,12 +31,15 @@ def find_cameras(folder: Path) -> Path:
     for model in (folder / "sparse" / "0", folder / "sparse", folder):
         if _is_model(model):
             return model
+    for name in TRANSFORMS:
+        if (folder / name).is_file():
+            return folder / name
     for model in (beside / "0", beside):
         if _is_model(model):
             return model
     raise ClodError(
         f"{folder}: no COLMAP model (cameras, images, points3D as .bin or .txt) in sparse/0, sparse or the folder "
-        "itself; give the folder that holds images/ and sparse/0"
+        "itself, and no transforms.json; give the folder that holds images/ and sparse/0, or transforms.json"
     )
 
 
