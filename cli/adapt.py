@@ -12,6 +12,7 @@ import torch
 
 from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.cameras import Scene
+from clod_adapter.cli.alignment import require_alignment
 from clod_adapter.cli.console import Console, duration
 from clod_adapter.cli.evaluate import measure
 from clod_adapter.cli.files import Outputs, size
@@ -32,9 +33,6 @@ from clod_adapter.io.atomic import remove_leftovers
 from clod_adapter.io.version import package_version
 from clod_adapter.train import Adapted, adapt
 
-# A base this far off its photographs is not a poor one but one that stands elsewhere.
-MISALIGNED_PSNR = 15.0
-
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, stop = Console(args.quiet), Stopwatch(), GracefulStop()
@@ -51,9 +49,16 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         prepare_kernels(console)
     with watch.time("load" if photographs else "place"):
         scene = photographs or place_scene(gaussians, config.seed, console)
-        saver.belong((args.ply, base.fingerprint), scene, args.images or "those placed for it")
+    alignment, warnings = None, list[str]()
+    if photographs:
+        with watch.time("align"):
+            alignment, warnings = require_alignment(
+                gaussians, scene, args.ply, args.images, args.misaligned_ok, console
+            )
+    saver.belong((args.ply, base.fingerprint), scene, args.images or "those placed for it")
     with watch.time("evaluate"):
         base_rows, notes = look_at_base(gaussians, scene, args, console)
+    notes = [*warnings, *notes]
     with stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
         page = AdaptPage(gaussians, scene, config, console) if args.report else None
         follower = Follower(console, stop, gaussians, scene.test, config.max_sv, base_rows[0] if base_rows else None)
@@ -65,7 +70,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             "sh_degree": result.sh_degree, "device": str(result.means.device), "seconds": watch.report(),
             "resumed_from": saver.state and saver.state.steps,
             "notes": [*base.notes, *scene.notes, *notes, "the result was not measured"],
-            "base_rows": [row.as_dict() for row in base_rows], "rows": [], "detached_row": None,
+            "base_rows": [row.as_dict() for row in base_rows], "rows": [], "detached_row": None, "alignment": alignment,
         }  # fmt: skip
         with console.status(f"writing {outputs.ply} ..."):
             write(base, adapter, result, outputs, report)
@@ -113,7 +118,7 @@ def pick_device(name: str) -> torch.device:
 def look_at_base(
     base: Gaussians, scene: Scene, args: argparse.Namespace, console: Console
 ) -> tuple[list[Row], list[str]]:
-    """The base's row at dial 1, and notes: on a dial it has, on photographs it does not fit."""
+    """The base's row at dial 1, and notes: on a dial it has, on nothing held out."""
     notes = []
     if base.sigma_d is not None:
         notes.append(f"{args.ply} has a dial already: continuing from its sigma_d")
@@ -124,12 +129,6 @@ def look_at_base(
             raise KeyboardInterrupt
         if args.images is not None:  # of the checkpoint's own pictures only their rounding is worth knowing
             console.say(f"base: {rows[0].psnr:.2f} dB on the held-out photographs")
-        if args.images is not None and rows[0].psnr < MISALIGNED_PSNR:
-            notes.append(
-                f"warning: {args.ply} is {rows[0].psnr:.1f} dB from the photographs in {args.images}: it is probably "
-                "of another scene, in other coordinates (some trainers normalise them) or on another background than "
-                "black, and then the result is of no use"
-            )
     else:
         notes.append("no photographs are held out, so nothing is measured; at least two are needed")
     for note in notes:

@@ -40,6 +40,9 @@ def _adapt(parser: ArgumentParser) -> None:
     )
     parser.add_argument("--resume", action="store_true", help="go on with the same command where it was interrupted")
     parser.add_argument("--device", choices=["auto", "cpu"], default="auto", help="where to train (default: auto)")
+    parser.add_argument(
+        "--misaligned-ok", action="store_true", help="train even where a checkpoint does not fit the photographs"
+    )
     parser.add_argument("--report", action="store_true", help="also a page to look at, OUT.html, and its charts")
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
@@ -110,6 +113,9 @@ def _robustness(parser: ArgumentParser) -> None:
         "-o", "--out", metavar="DIR", default="robustness",
         help="where everything goes and is resumed from (default: robustness)",
     )  # fmt: skip
+    parser.add_argument(
+        "--misaligned-ok", action="store_true", help="train even where a checkpoint does not fit the photographs"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
@@ -149,6 +155,12 @@ without --images cameras are placed where the checkpoint looks photographed, and
 the pictures are its own, at full detail: it is its own teacher. The numbers are
 then against the checkpoint, on placed views held out. With the photographs the
 result is better; give them where there are any.
+
+Before training eight of the photographs are compared with what the checkpoint
+shows there. Where that is worse than their own mean colours, or another frame
+fits clearly better, it stops, with what was found: other axes, scale or offset,
+gsplat's or nerfstudio's normalised frame, a white background.
+--misaligned-ok goes on with a warning.
 
 While training its state is saved in OUT.resume.safetensors, after the first step
 and then now and then, for at most 2 % of the time. After a crash, a kill, a full

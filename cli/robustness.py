@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from clod_adapter.cameras import Scene
+from clod_adapter.cli.alignment import require_alignment
 from clod_adapter.cli.cells import Cell, cells_of
 from clod_adapter.cli.console import Console, Meter, duration
 from clod_adapter.cli.files import check_output, labels, make_folder
@@ -39,10 +40,6 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         cells = plan(args, scene, console)
     if not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
-    make_folder(folder)  # only now: what cannot be read leaves none behind
-    make_folder(folder / "cells")
-    for path in outputs.values():
-        check_output(path, args.ply)
     found = {cell.name: read for cell in cells if (read := cell.read())}
     missing = [cell for cell in cells if cell.name not in found]
     if found:
@@ -50,6 +47,15 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     if missing:
         with watch.time("kernels"):
             prepare_kernels(console)
+        with watch.time("align"):
+            for path, label in zip(args.ply, labels(args.ply), strict=True):
+                base = next((cell.checkpoint.gaussians for cell in missing if cell.label == label), None)
+                if base is not None:
+                    require_alignment(base, scene, path, args.images, args.misaligned_ok, console)
+    make_folder(folder)  # only now: what cannot be read, or does not fit, leaves none behind
+    make_folder(folder / "cells")
+    for path in outputs.values():
+        check_output(path, args.ply)
     with stop.listening():
         with watch.time("cells"):
             interrupted = run_cells(missing, scene, found, console, stop)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -16,6 +17,8 @@ from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import splat
+
+T = TypeVar("T")
 
 # A start beyond this many times the normalised distance at the largest dial value would fade by less than a
 # thousandth there, and its gradient with it: such a sigma would never move again.
@@ -99,9 +102,9 @@ def fitting_tau(opacities: Tensor, error: Tensor, config: AdaptConfig) -> float:
     return max(min(config.tau, faint / FADING, opaque / FADING), TAU_MIN)
 
 
-def spread(views: Sequence[View]) -> Sequence[View]:
-    """At most MOST_VIEWS of the views, evenly spread."""
-    return [views[k * len(views) // MOST_VIEWS] for k in range(MOST_VIEWS)] if len(views) > MOST_VIEWS else views
+def spread(views: Sequence[T], most: int = MOST_VIEWS) -> Sequence[T]:
+    """At most ``most`` of the views, evenly spread."""
+    return [views[k * len(views) // most] for k in range(most)] if len(views) > most else views
 
 
 def scene_distance(base: Gaussians, views: Sequence[View], quantile: float) -> float:

@@ -35,7 +35,7 @@ FLOORS = [
     },
     {"io", "rasterizers", "adapter"},
     {"render"},
-    {"importance", "popping", "budget", "placement"},
+    {"importance", "popping", "budget", "placement", "alignment", "alignment_frames", "alignment_guess"},
     {"train", "evaluate", "export", "viewer", "compare"},
     {"report", "robustness"},
     {"demo"},

@@ -13,6 +13,12 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 
 
+def load_points(folder: str | Path) -> torch.Tensor:
+    """``[M, 3]`` float64, the points of the scene's COLMAP model, world units; the model is one that loads."""
+    points = pycolmap.Reconstruction(str(find_model(Path(folder)))).points3D.values()
+    return torch.from_numpy(np.array([point.xyz for point in points], np.float64).reshape(-1, 3))
+
+
 def write_model(
     folder: str | Path,
     cameras: Sequence[Camera],

@@ -7,13 +7,14 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import Image
 
-from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.cameras import Camera, Scene, View, in_its_unit
 from clod_adapter.errors import ClodError
 from clod_adapter.io.colmap_model import read_model
 from clod_adapter.io.images import Note, read_image
@@ -28,6 +29,7 @@ def load_scene(
     *,
     test_every: int = 8,
     max_width: int = 1600,
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
     progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
     """Reads posed photographs: a COLMAP model (binary or text, any version) or a transforms.json, and its images.
@@ -49,6 +51,7 @@ def load_scene(
         test_every: one view in this many is held out; at least 2.
         max_width: wider images are scaled down to this many pixels, with Pillow's bicubic filter as
             in Inria's code; the intrinsics follow, and a note says so.
+        origin: ``[3]`` what the cameras' world is to be relative to, in its units: ``Checkpoint.origin``.
         progress: called with (images loaded, images in all).
 
     Raises:
@@ -69,9 +72,18 @@ def load_scene(
     held_out = _held_out(images, test_every)
     if not any(image.name not in held_out for image, _ in present):
         raise ClodError(f"{folder}: has no photograph to train on, as all that are there are held out; add more")
+    present = [(_relative(image, np.asarray(origin, np.float64)), path) for image, path in present]
     views, more = _load(present, folder, max_width, progress)
     train = tuple(view for view in views if view.camera.name not in held_out)
-    return Scene(train, tuple(view for view in views if view.camera.name in held_out), (*notes, *more))
+    test = tuple(view for view in views if view.camera.name in held_out)
+    return in_its_unit(Scene(train, test, (*notes, *more)))
+
+
+def _relative(image: PosedImage, origin: np.ndarray) -> PosedImage:
+    """The image in a world that begins at ``origin``; in float64, as far from 0 float32 has no digits left."""
+    viewmat = image.viewmat.copy()
+    viewmat[:3, 3] += viewmat[:3, :3] @ origin
+    return replace(image, viewmat=viewmat)
 
 
 def _held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:

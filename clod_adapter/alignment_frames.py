@@ -1,0 +1,164 @@
+"""Frames that checkpoints are found in instead of their cameras': other axes, poses and trainers' normalised worlds.
+
+A frame is a similarity ``x_cameras = s R x_file + t``. Cameras are brought into the file's frame, not the Gaussians
+into theirs: that is exact for the harmonics too and costs nothing. The picture does not depend on the unit of length,
+so ``[R_c | t_c]`` becomes ``[R_c R | (R_c t + t_c) / s]``.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+GSPLAT = (
+    "it is in the frame that gsplat's trainer normalises the world to: train it with --no-normalize-world-space, or "
+    "apply the inverse of its parser's transform to it"
+)
+NERFSTUDIO = (
+    "it is in the frame that nerfstudio normalises the world to: undo the transform and scale in its "
+    "dataparser_transforms.json, or train with its colmap dataparser and --orientation-method none --center-method "
+    "none --auto-scale-poses False --assume-colmap-world-coordinate-convention False"
+)
+# How nerfstudio's readers turn COLMAP's world before they normalise it: not, today's way, and the older one.
+NERFSTUDIO_TURNS = (
+    ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
+    ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame that the file may be in.
+
+    Attributes:
+        says: what it is, and what to do.
+        viewmats: ``[V, 4, 4]`` the cameras in it.
+    """
+
+    says: str
+    viewmats: Tensor
+
+
+def known_frames(viewmats: Tensor, points: Tensor | None = None) -> list[Frame]:
+    """Those that follow from the cameras, and the scene's points, alone.
+
+    Args:
+        viewmats: ``[V, 4, 4]`` float64, of all the cameras, by which trainers normalise.
+        points: ``[M, 3]`` of the COLMAP model, world units; gsplat's trainer normalises by them too.
+    """
+    return [*_poses(viewmats), *_axes(viewmats), *_nerfstudio(viewmats), *_gsplat(viewmats, points)]
+
+
+def into_file(viewmats: Tensor, rotation: Tensor, scale: float, offset: Tensor) -> Tensor:
+    """``[V, 4, 4]`` the cameras where ``x_cameras = scale rotation x_file + offset``."""
+    out = viewmats.clone()
+    out[:, :3, :3] = viewmats[:, :3, :3] @ rotation
+    out[:, :3, 3] = (viewmats[:, :3, :3] @ offset + viewmats[:, :3, 3]) / scale
+    return out
+
+
+def centres_of(viewmats: Tensor) -> Tensor:
+    """``[V, 3]`` the cameras' centres."""
+    return torch.linalg.inv(viewmats)[:, :3, 3]
+
+
+def focus_of(viewmats: Tensor) -> Tensor:
+    """``[3]`` the point closest to the optical axes, least squares; the mean of the centres where they are parallel."""
+    poses = torch.linalg.inv(viewmats.double())
+    centres, forward = poses[:, :3, 3], poses[:, :3, 2]
+    across = torch.eye(3, dtype=poses.dtype) - forward[:, :, None] * forward[:, None, :]
+    if float(torch.linalg.cond(across.mean(0))) > 1e4:
+        return centres.mean(0)
+    return torch.linalg.solve(across.mean(0), (across @ centres[:, :, None]).mean(0))[:, 0]
+
+
+def median(rows: Tensor) -> Tensor:
+    """Per column, the mean of the middle two, as numpy has it."""
+    return rows.quantile(0.5, dim=0)
+
+
+def _poses(viewmats: Tensor) -> Iterator[Frame]:
+    """The cameras' own mistakes, each camera for itself."""
+    backward = torch.diag(viewmats.new_tensor([1.0, -1, -1, 1]))
+    inverse = torch.linalg.inv(viewmats)
+    yield Frame(
+        "the cameras look along -z with y up (OpenGL), where COLMAP's look along z with y down: negate the y and z "
+        "axes of their poses",
+        backward @ viewmats,
+    )
+    yield Frame("the poses are camera to world, where COLMAP's are world to camera: invert them", inverse)
+    yield Frame(
+        "the poses are camera to world in OpenGL's axes, where COLMAP's are world to camera: negate their y and z axes "
+        "and invert them",
+        backward @ inverse,
+    )
+
+
+def _axes(viewmats: Tensor) -> Iterator[Frame]:
+    """The 47 other ways to name the axes, mirrored ones included."""
+    identity = torch.eye(3, dtype=viewmats.dtype)
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            rotation = torch.diag(viewmats.new_tensor(signs)) @ identity[list(order)]
+            if rotation.equal(identity):
+                continue
+            names = ", ".join(("-" if sign < 0 else "") + "xyz"[axis] for sign, axis in zip(signs, order, strict=True))
+            mirrored = " (mirrored)" if torch.linalg.det(rotation) < 0 else ""
+            says = f"the cameras' x, y, z are the file's {names}{mirrored}: export it without that turn"
+            yield Frame(says, into_file(viewmats, rotation, 1.0, viewmats.new_zeros(3)))
+
+
+def _nerfstudio(viewmats: Tensor) -> Iterator[Frame]:
+    """nerfstudio's default: the mean up to z, the mean centre to the origin, the farthest coordinate to 1."""
+    poses = torch.linalg.inv(viewmats)
+    for rows in NERFSTUDIO_TURNS:
+        turn = viewmats.new_tensor(rows)
+        centres, up = poses[:, :3, 3] @ turn.T, turn @ -poses[:, :3, 1].mean(0)
+        rotation = _turning(up, viewmats.new_tensor([0.0, 0, 1]))
+        farthest = float(((centres - centres.mean(0)) @ rotation.T).abs().max())
+        if farthest > 0:
+            yield Frame(NERFSTUDIO, _normalised(viewmats, rotation @ turn, 1 / farthest, -rotation @ centres.mean(0)))
+
+
+def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
+    """gsplat's ``normalize``: up, focus and median distance from the cameras, then the points' principal axes."""
+    poses = torch.linalg.inv(viewmats)
+    rotation = _turning(-poses[:, :3, 1].mean(0), viewmats.new_tensor([0.0, -1, 0]))
+    centres, forward = poses[:, :3, 3] @ rotation.T, poses[:, :3, 2] @ rotation.T
+    focus = median(centres - (forward * centres).sum(1, keepdim=True) * forward)
+    distance = float((centres - focus).norm(dim=1).quantile(0.5))
+    if distance == 0:
+        return
+    yield Frame(GSPLAT, _normalised(viewmats, rotation, 1 / distance, -focus))
+    if points is None or len(points) < 3:
+        return
+    turned = points.to(viewmats) @ rotation.T
+    middle = median(turned)
+    axes = torch.linalg.eigh((turned - middle).T.cov()).eigenvectors.flip(1).T
+    axes = axes * torch.linalg.det(axes).sign()
+    for signs in ((1.0, 1, 1), (1.0, -1, -1), (-1.0, 1, -1), (-1.0, -1, 1)):  # of eigenvectors anyone's choice
+        turn = torch.diag(viewmats.new_tensor(signs)) @ axes
+        yield Frame(GSPLAT, _normalised(viewmats, turn @ rotation, 1 / distance, -turn @ middle))
+
+
+def _normalised(viewmats: Tensor, rotation: Tensor, scale: float, offset: Tensor) -> Tensor:
+    """The cameras where ``x_file = scale (rotation x_cameras + offset)``."""
+    return into_file(viewmats, rotation.T, 1 / scale, -rotation.T @ offset)
+
+
+def _turning(source: Tensor, target: Tensor) -> Tensor:
+    """The smallest rotation from one direction to another (Rodrigues); of opposite ones, half a turn."""
+    a, b = F.normalize(source, dim=0), F.normalize(target, dim=0)
+    identity = torch.eye(3, dtype=a.dtype)
+    cosine = float(a @ b)
+    if cosine < -1 + 1e-8:
+        across = F.normalize(torch.linalg.cross(b, identity[int(b.abs().argmin())]), dim=0)
+        return 2 * torch.outer(across, across) - identity
+    skew = torch.linalg.cross(identity, torch.linalg.cross(a, b).expand(3, 3))
+    return identity + skew + skew @ skew / (1 + cosine)
