@@ -16,7 +16,7 @@ from clod_adapter.cli.alignment import require_alignment
 from clod_adapter.cli.console import Console, duration
 from clod_adapter.cli.evaluate import measure
 from clod_adapter.cli.files import Outputs, size
-from clod_adapter.cli.inputs import place_scene, read_checkpoint, read_scene
+from clod_adapter.cli.inputs import complement_scene, place_scene, read_checkpoint, read_scene
 from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.pages import AdaptPage
@@ -55,6 +55,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             alignment, warnings = require_alignment(
                 gaussians, scene, args.ply, args.images, args.misaligned_ok, console
             )
+        scene, config = complement_scene(gaussians, scene, config, console)
     saver.belong((args.ply, base.fingerprint), scene, args.images or "those placed for it")
     with watch.time("evaluate"):
         base_rows, notes = look_at_base(gaussians, scene, args, console)
@@ -65,6 +66,11 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         adapted = train(gaussians, scene, config, follower, saver, page)
         watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
         adapter = extract(gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config))
+        if gaussians.sigma_d is None and adapter.attenuation.tau < config.tau:
+            notes.append(
+                f"tau is lowered from {config.tau:g} to {adapter.attenuation.tau:.2g}: its Gaussians are faint"
+            )
+            console.say(notes[-1])
         result = adapter.apply(gaussians)
         report = describe_run(args, outputs, adapter, adapted) | {
             "sh_degree": result.sh_degree, "device": str(result.means.device), "seconds": watch.report(),

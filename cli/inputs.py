@@ -7,10 +7,11 @@ from pathlib import Path
 from clod_adapter.cameras import Scene
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.files import size
+from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.ply import Checkpoint, load
 from clod_adapter.io.scene import load_scene
-from clod_adapter.placement import imagine, place
+from clod_adapter.placement import complement, imagine, place
 
 
 def read_checkpoint(path: str, console: Console) -> Checkpoint:
@@ -35,6 +36,17 @@ def read_scene(folder: str, console: Console) -> Scene:
     for note in scene.notes:
         console.say(f"  note: {note}")
     return scene
+
+
+def complement_scene(
+    gaussians: Gaussians, scene: Scene, config: AdaptConfig, console: Console
+) -> tuple[Scene, AdaptConfig]:
+    """What ``placement.complement`` makes of few photographs, and says so."""
+    with console.status("looking for places of cameras ..."):
+        more, lighter = complement(gaussians, scene, config)
+    for note in more.notes[len(scene.notes) :]:
+        console.say(f"  note: {note}")
+    return more, lighter
 
 
 def place_scene(gaussians: Gaussians, seed: int, console: Console) -> Scene:

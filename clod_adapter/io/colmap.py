@@ -7,15 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+import torch
 
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.scene_folder import find_cameras
 
 
 def load_points(folder: str | Path) -> torch.Tensor:
-    """``[M, 3]`` float64, the points of the scene's COLMAP model, world units; the model is one that loads."""
-    points = pycolmap.Reconstruction(str(find_model(Path(folder)))).points3D.values()
+    """``[M, 3]`` float64, the points of the scene's COLMAP model, world units; none where it has no model.
+
+    The model is one that loads.
+    """
+    model = find_cameras(Path(folder))
+    points = pycolmap.Reconstruction(str(model)).points3D.values() if model.is_dir() else ()
     return torch.from_numpy(np.array([point.xyz for point in points], np.float64).reshape(-1, 3))
 
 
