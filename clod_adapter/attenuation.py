@@ -37,8 +37,6 @@ from clod_adapter.errors import ClodError
 SIGMA_MAX = 1e9
 """Stands for an infinite sigma_d. The factor is exactly 1 for d s < 2e5 in float32, d s < 10 in float64."""
 
-_LOG_HUGE = 1e4  # above the logarithms that float64 products here can have
-
 
 class Attenuated(NamedTuple):
     """What a dial value makes of the opacities.
@@ -122,7 +120,7 @@ def log_attenuation(sigma_d: Tensor, d: Tensor, virtual_scale: float, eps: float
         ClodError: the dial is below 1 or not finite, or the shapes differ.
     """
     require(1 <= virtual_scale < math.inf, "virtual_scale", virtual_scale, "at least 1 and finite")
-    sigma_d, d = _common(sigma_d=sigma_d, d=d)
+    sigma_d, d = conform(sigma_d=sigma_d, d=d)
     return _LogAttenuation.apply(sigma_d, d.detach(), float(virtual_scale), eps)
 
 
@@ -144,10 +142,10 @@ def attenuate(
     Raises:
         ClodError: the dial is below 1 or not finite, or the shapes differ.
     """
-    opacity_logits, sigma_d, d = _common(opacity_logits=opacity_logits, sigma_d=sigma_d, d=d)
+    opacity_logits, sigma_d, d = conform(opacity_logits=opacity_logits, sigma_d=sigma_d, d=d)
     factor = log_attenuation(sigma_d, d, virtual_scale, config.eps)
     opacities, log_opacities = _Attenuate.apply(opacity_logits, factor)
-    threshold = _log_threshold(config.tau, virtual_scale)
+    threshold = log_threshold(config.tau, virtual_scale)
     keep = log_opacities.detach() > threshold
     if config.cut == "hard":
         drawn = torch.where(keep, opacities, 0)
@@ -157,108 +155,24 @@ def attenuate(
     return Attenuated(opacities, log_opacities, keep, drawn)
 
 
-@torch.no_grad()
-def count_slope(
-    opacity_logits: Tensor, log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float
-) -> Tensor:
-    """``[N]`` by how much each Gaussian's ``log sigma_d`` moves the share that is kept, softened.
-
-    ``q (1 - q) / (temperature N) max(2 u, 1)`` with ``q = sigmoid((log a'' - log(tau s)) / temperature)`` and
-    ``u = log a - log a''``: the slope of ``soft_count`` by ``log sigma_d``, whose own ``2 u`` would be nothing
-    for Gaussians that the dial does not touch yet, and keep them out of its reach for good.
-
-    Args:
-        log_opacities: ``[N]`` log a'' from ``attenuate``.
-        temperature: > 0, in units of log opacity.
-    """
-    q = (log_opacities - _log_threshold(tau, virtual_scale)).div_(temperature).sigmoid_()
-    touched = (F.logsigmoid(opacity_logits) - log_opacities).mul_(2).clamp_(min=1)
-    # Where log a'' is -inf q is 0 and touched inf.
-    return (1 - q).mul_(q).mul_(touched).nan_to_num_(0.0, 0.0).div_(temperature * max(len(q), 1))
-
-
-def soft_count(log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float) -> Tensor:
-    """0-d, the share of Gaussians kept, in [0, 1]: exact on the way forward, soft on the way back.
-
-    Forward: mean of ``log a'' > log(tau s)``; 0 for no Gaussians. Backward, straight through: the gradient
-    of the mean of ``sigmoid((log a'' - log(tau s)) / temperature)``, which is 0 at log a'' = -inf.
-
-    Args:
-        log_opacities: ``[N]`` from ``attenuate``, in [-inf, 0].
-        temperature: > 0, in units of log opacity; the larger, the farther from the cut it is felt.
-    """
-    (log_opacities,) = _common(log_opacities=log_opacities)
-    return _SoftCount.apply(log_opacities, _log_threshold(tau, virtual_scale), temperature)
-
-
-@torch.no_grad()
-def extinction_scale(opacity_logits: Tensor, sigma_d: Tensor, d: Tensor, config: AttenuationConfig) -> Tensor:
-    """``[N]`` the dial value s* at which each Gaussian leaves: kept at s iff ``s < s*`` (up to rounding).
-
-    The unique root of ``a exp(-(d s)^2 / (2 v)) = tau s``, which is
-    ``s*^2 = (v / d^2) W(a^2 d^2 / (tau^2 v))`` with W the principal Lambert function. In [0, a/tau]; below
-    1 means kept at no dial value. ``a/tau`` where d = 0 (or d^2 / v is negligible); 0 where sigma <= 0,
-    eps = 0 and d > 0. No gradient.
-
-    Accuracy: relative error within ``(6 + |log a|) * finfo.eps`` where ``a`` is a normal number.
-
-    Raises:
-        ClodError: the shapes differ.
-    """
-    opacity_logits, sigma_d, d = _common(opacity_logits=opacity_logits, sigma_d=sigma_d, d=d)
-    ratio = (d / _radius(sigma_d, config.eps)).masked_fill_(d == 0, 0)
-    upper = opacity_logits.sigmoid().div_(config.tau)
-    log_ratio = ratio.log().clamp_(max=_LOG_HUGE)  # ratio is inf where the variance is 0
-    w = _lambert_w_of_exp((F.logsigmoid(opacity_logits) - math.log(config.tau) + log_ratio).mul_(2))
-    # The same value twice: e^{-W/2} = sqrt(W / z). The first does not cancel at small W, the second does not
-    # amplify W's error at large W.
-    return torch.where(w < 1, upper * torch.exp(-0.5 * w), w.sqrt().div_(ratio))
-
-
-@torch.no_grad()
-def sigma_for_extinction(opacity_logits: Tensor, d: Tensor, extinction: Tensor, config: AttenuationConfig) -> Tensor:
-    """``[N]`` the sigma_d with which a Gaussian at distance d leaves at s*; inverse of ``extinction_scale``.
-
-    ``v = (d s*)^2 / (2 log(a / (tau s*)))``, ``sigma = sqrt(max(v - eps/2, 0))``, in [0, SIGMA_MAX].
-    ``SIGMA_MAX`` where ``s* >= a/tau``, which no finite sigma reaches. 0 where the wish lies below what
-    eps alone allows, and at d = 0, where no sigma matters. No gradient.
-
-    Accuracy: relative error of v + eps/2 within ``(4 + (|log a| + |log(tau s*)|) / log(a / (tau s*))) *
-    finfo.eps``: the last step before ``a/tau`` is a steep one.
-
-    Args:
-        extinction: ``[N]`` wanted s*, >= 0.
-
-    Raises:
-        ClodError: the shapes differ.
-    """
-    opacity_logits, d, extinction = _common(opacity_logits=opacity_logits, d=d, extinction=extinction)
-    drop = F.logsigmoid(opacity_logits) - (extinction * config.tau).log_()
-    radius = d * extinction / (2 * drop).sqrt_()
-    floor = math.sqrt(config.eps / 2)
-    # sqrt(r - f) sqrt(r + f) and not sqrt(r^2 - f^2): squares underflow.
-    sigma = (radius - floor).clamp_(min=0).sqrt_() * (radius + floor).sqrt_()
-    return torch.where(drop > 0, sigma, SIGMA_MAX).clamp_(max=SIGMA_MAX)
-
-
 class _LogAttenuation(Function):
     """``log_attenuation`` with the slope in the form that gives 0, not NaN, where things overflow."""
 
     @staticmethod
     def forward(ctx: Any, sigma: Tensor, d: Tensor, virtual_scale: float, eps: float) -> Tensor:
-        radius = _radius(sigma, eps)
+        root = radius(sigma, eps)
         # Divided before it is squared: (d s)^2 and v both leave float32's range before their ratio does.
-        out = (d * virtual_scale).div_(radius).square_().mul_(-0.5)
+        out = (d * virtual_scale).div_(root).square_().mul_(-0.5)
         if math.sqrt(eps / 2) < torch.finfo(out.dtype).tiny:  # then the radius may be 0, and 0/0 is to be 0
             out.masked_fill_(d == 0, 0)
-        ctx.save_for_backward(sigma, radius, out)
+        ctx.save_for_backward(sigma, root, out)
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, None, None]:
-        sigma, radius, out = ctx.saved_tensors
-        slope = sigma.relu().div_(radius).div_(radius).mul_(out).mul_(-2)
+        sigma, root, out = ctx.saved_tensors
+        slope = sigma.relu().div_(root).div_(root).mul_(out).mul_(-2)
         return slope.nan_to_num_(0.0, 0.0, 0.0).mul_(grad), None, None, None
 
 
@@ -286,49 +200,17 @@ class _Attenuate(Function):
         return logits.neg().sigmoid_().mul_(total) if ctx.needs_input_grad[0] else None, total
 
 
-class _SoftCount(Function):
-    """``soft_count`` above a log threshold."""
-
-    @staticmethod
-    def forward(ctx: Any, log_opacities: Tensor, threshold: float, temperature: float) -> Tensor:
-        ctx.save_for_backward(log_opacities)
-        ctx.settings = threshold, temperature
-        return (log_opacities > threshold).sum() / log_opacities.new_full((), max(len(log_opacities), 1))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        (log_opacities,) = ctx.saved_tensors
-        threshold, temperature = ctx.settings
-        p = (log_opacities - threshold).div_(temperature).sigmoid_()
-        return (1 - p).mul_(p).mul_(grad / (temperature * max(len(p), 1))), None, None
-
-
-def _radius(sigma: Tensor, eps: float) -> Tensor:
+def radius(sigma: Tensor, eps: float) -> Tensor:
     """``sqrt(v) = sqrt(relu(sigma)^2 + eps/2)``, without squares that underflow."""
     return torch.hypot(sigma.relu(), sigma.new_full((), math.sqrt(eps / 2)))
 
 
-def _lambert_w_of_exp(x: Tensor) -> Tensor:
-    """W(e^x): the w > 0 with ``w + log w = x``, to rounding; x is clamped to [-80, 1e4].
-
-    Two steps of Fritsch, Shafer and Crowley (CACM 16(2), 1973, Algorithm 443), each of fourth order.
-    """
-    x = x.clamp(-80, _LOG_HUGE)  # e^-80 is nothing beside 1
-    w = torch.where(x > 1, x - x.clamp(min=1).log_(), x.sigmoid())
-    for _ in range(2):
-        r = x - w.log() - w
-        q = 2 * (1 + w) * (1 + w + r * (2 / 3))
-        w = w * (1 + r / (1 + w) * ((q - r) / (q - 2 * r)))
-    return w
-
-
-def _log_threshold(tau: float, virtual_scale: float) -> float:
+def log_threshold(tau: float, virtual_scale: float) -> float:
     """``log(tau s)``, what log a'' must exceed."""
     return math.log(tau * virtual_scale)
 
 
-def _common(**tensors: Tensor) -> list[Tensor]:
+def conform(**tensors: Tensor) -> list[Tensor]:
     """The tensors in their common dtype, at least float32; raises ClodError unless they share one [N]."""
     shapes = {name: tuple(t.shape) for name, t in tensors.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 1 for shape in shapes.values()):

@@ -1,7 +1,7 @@
 """Budgets: the dial value that keeps so many Gaussians, gives up so many decibels, or draws so many frames a second.
 
 - A count needs no measuring. For one camera, Gaussian i is kept iff s is below its extinction scale
-  ``s*_i`` (``attenuation.extinction_scale``) and kept sets are nested, so the dial that keeps n lies between the n-th
+  ``s*_i`` (``extinction.extinction_scale``) and kept sets are nested, so the dial that keeps n lies between the n-th
   and the (n+1)-th largest ``s*``. For a mean over V cameras the same holds of the ``s*`` of all of them pooled,
   and of n V. Exact up to ties: Gaussians whose ``s*`` cannot be told apart in float32 leave together.
 - PSNR is read off the calibration table that is stored with the file (``calibration.py``).
@@ -24,11 +24,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import attenuate, extinction_scale, normalized_distances
+from clod_adapter.attenuation import attenuate, normalized_distances
 from clod_adapter.calibration import Calibration, crossing
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, require
 from clod_adapter.errors import ClodError
+from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
 

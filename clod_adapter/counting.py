@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+from typing import Any
 
-from clod_adapter.attenuation import Attenuated, count_slope
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from clod_adapter.attenuation import Attenuated, conform, log_threshold
 from clod_adapter.config import AdaptConfig
 
 
@@ -23,7 +29,7 @@ def count_gradient(
 ) -> Tensor:
     """``[N]`` what the count term adds to the gradient of log sigma_d at one dial value; opacities are held.
 
-    That of ``loss reg_weight (eta / law - 1)^2``, eta the share kept, through ``attenuation.count_slope``. Who is worth
+    That of ``loss reg_weight (eta / law - 1)^2``, eta the share kept, through ``count_slope``. Who is worth
     less to the picture than the pressure fades, who is worth more stays. It works both ways, and is relative: to the
     law, as the last percent of the Gaussians matters as much as the first, and to the weighted ``loss``, a constant
     here, so that the same settings suit scenes and dial values that are fitted well or badly. Nothing presses the last
@@ -34,3 +40,55 @@ def count_gradient(
     pressure = 2 * loss * config.reg_weight * (eta / law - 1) / law
     slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, config.temperature)
     return slope.mul_(pressure)
+
+
+@torch.no_grad()
+def count_slope(
+    opacity_logits: Tensor, log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float
+) -> Tensor:
+    """``[N]`` by how much each Gaussian's ``log sigma_d`` moves the share that is kept, softened.
+
+    ``q (1 - q) / (temperature N) max(2 u, 1)`` with ``q = sigmoid((log a'' - log(tau s)) / temperature)`` and
+    ``u = log a - log a''``: the slope of ``soft_count`` by ``log sigma_d``, whose own ``2 u`` would be nothing
+    for Gaussians that the dial does not touch yet, and keep them out of its reach for good.
+
+    Args:
+        log_opacities: ``[N]`` log a'' from ``attenuate``.
+        temperature: > 0, in units of log opacity.
+    """
+    q = (log_opacities - log_threshold(tau, virtual_scale)).div_(temperature).sigmoid_()
+    touched = (F.logsigmoid(opacity_logits) - log_opacities).mul_(2).clamp_(min=1)
+    # Where log a'' is -inf q is 0 and touched inf.
+    return (1 - q).mul_(q).mul_(touched).nan_to_num_(0.0, 0.0).div_(temperature * max(len(q), 1))
+
+
+def soft_count(log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float) -> Tensor:
+    """0-d, the share of Gaussians kept, in [0, 1]: exact on the way forward, soft on the way back.
+
+    Forward: mean of ``log a'' > log(tau s)``; 0 for no Gaussians. Backward, straight through: the gradient
+    of the mean of ``sigmoid((log a'' - log(tau s)) / temperature)``, which is 0 at log a'' = -inf.
+
+    Args:
+        log_opacities: ``[N]`` from ``attenuate``, in [-inf, 0].
+        temperature: > 0, in units of log opacity; the larger, the farther from the cut it is felt.
+    """
+    (log_opacities,) = conform(log_opacities=log_opacities)
+    return _SoftCount.apply(log_opacities, log_threshold(tau, virtual_scale), temperature)
+
+
+class _SoftCount(Function):
+    """``soft_count`` above a log threshold."""
+
+    @staticmethod
+    def forward(ctx: Any, log_opacities: Tensor, threshold: float, temperature: float) -> Tensor:
+        ctx.save_for_backward(log_opacities)
+        ctx.settings = threshold, temperature
+        return (log_opacities > threshold).sum() / log_opacities.new_full((), max(len(log_opacities), 1))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        (log_opacities,) = ctx.saved_tensors
+        threshold, temperature = ctx.settings
+        p = (log_opacities - threshold).div_(temperature).sigmoid_()
+        return (1 - p).mul_(p).mul_(grad / (temperature * max(len(p), 1))), None, None

@@ -10,11 +10,12 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import SIGMA_MAX, normalized_distances, normalizing_distance, sigma_for_extinction
+from clod_adapter.attenuation import SIGMA_MAX, normalized_distances, normalizing_distance
 from clod_adapter.cameras import View
 from clod_adapter.collapse import leaving_order
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
+from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import splat
 

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.attenuation import SIGMA_MAX, Attenuated, attenuate, normalized_distances, soft_count
+from clod_adapter.attenuation import SIGMA_MAX, Attenuated, attenuate, normalized_distances
 from clod_adapter.cameras import Scene, View, camera_extent
 from clod_adapter.config import AdaptConfig
-from clod_adapter.counting import count_gradient
+from clod_adapter.counting import count_gradient, soft_count
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import seeing, start

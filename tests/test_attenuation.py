@@ -4,104 +4,47 @@ from __future__ import annotations
 
 import itertools
 import math
-from functools import cache
-from typing import NamedTuple
 
 import mpmath
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
 from clod_adapter.attenuation import (
     SIGMA_MAX,
     attenuate,
-    count_slope,
-    extinction_scale,
     log_attenuation,
     normalized_distances,
     normalizing_distance,
-    sigma_for_extinction,
-    soft_count,
 )
 from clod_adapter.cameras import Camera
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.counting import soft_count
 from clod_adapter.errors import ClodError
-
-DTYPES = [torch.float32, torch.float64]
-LOGITS = [-200.0, -40.0, -6.0, -1.0, 0.0, 2.0, 9.0, 200.0, math.inf]
-SIGMAS = [-1.0, 0.0, 1e-12, 1e-6, 1e-3, 0.05, 0.4, 1.0, 30.0, 1e6, 1e12]
-DISTANCES = [0.0, 1e-7, 1e-3, 0.1, 0.7, 1.5]
-SCALES = [1.0, 1.75, 7.0, 1e4]
-TAUS = [1e-6, 1 / 255, 0.5]
-EPSILONS = [0.0, 1e-8, 1e-2]
-
-mpmath.mp.dps = 50
-ZERO = mpmath.mpf(0)
-
-
-def grid(*axes: list[float]) -> list[Tensor]:
-    """Columns of the axes' product. Values are float32's, so both dtypes share one mpmath reference."""
-    return list(torch.tensor(list(itertools.product(*axes)), dtype=torch.float32).double().unbind(1))
-
-
-def assert_close(
-    got: Tensor, want: list[mpmath.mpf], ulps: float | list[float], floor: float | list[float] = 0.0
-) -> None:
-    """Relative error within ulps * finfo.eps, absolute within floor or the smallest normal; too large means inf."""
-    info = torch.finfo(got.dtype)
-    ulps = ulps if isinstance(ulps, list) else [ulps] * len(want)
-    floor = floor if isinstance(floor, list) else [floor] * len(want)
-    for i, (g, w) in enumerate(zip(got.tolist(), want, strict=True)):
-        if abs(w) > info.max:
-            assert g == math.copysign(math.inf, w), (i, g, w)
-        else:
-            error = abs(mpmath.mpf(g) - w)
-            assert error <= max(ulps[i] * info.eps * abs(w), info.tiny, floor[i]), (
-                i,
-                g,
-                w,
-                float(error / info.eps / abs(w)),
-            )
-
-
-class Reference(NamedTuple):
-    """log factor and its slope by sigma, at 50 digits."""
-
-    log_factor: mpmath.mpf
-    slope: mpmath.mpf
-
-
-@cache
-def reference(sigma: float, d: float, s: float, eps: float) -> Reference:
-    sigma_plus = max(mpmath.mpf(sigma), ZERO)
-    v = sigma_plus**2 + mpmath.mpf(eps) / 2
-    if d == 0:
-        return Reference(ZERO, ZERO)
-    if v == 0:
-        return Reference(-mpmath.inf, ZERO)
-    u = (mpmath.mpf(d) * s) ** 2 / (2 * v)
-    return Reference(-u, 2 * u * sigma_plus / v)
-
-
-def log_opacity(logit: float) -> mpmath.mpf:
-    return ZERO if logit == math.inf else -mpmath.log1p(mpmath.exp(-mpmath.mpf(logit)))
-
-
-@cache
-def reference_extinction(logit: float, sigma: float, d: float, tau: float, eps: float) -> mpmath.mpf:
-    upper = mpmath.exp(log_opacity(logit)) / mpmath.mpf(tau)
-    v = max(mpmath.mpf(sigma), ZERO) ** 2 + mpmath.mpf(eps) / 2
-    if d == 0:
-        return upper
-    if v == 0:
-        return ZERO
-    return upper * mpmath.exp(-mpmath.lambertw((upper * d) ** 2 / v).real / 2)
-
-
-def config(tau: float = 1 / 255, eps: float = 1e-8, **other: object) -> AttenuationConfig:
-    return AttenuationConfig(tau=tau, eps=eps, **{"max_sv": 1.0} | other)
+from clod_adapter.extinction import extinction_scale, sigma_for_extinction
+from exact import (
+    DISTANCES,
+    DTYPES,
+    EPSILONS,
+    LOGITS,
+    SCALES,
+    SIGMAS,
+    ZERO,
+    assert_close,
+    columns,
+    config,
+    decay,
+    dial,
+    epsilon,
+    grid,
+    log_opacity,
+    logit,
+    quick,
+    reference,
+    rows,
+    unit,
+)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -147,42 +90,6 @@ def test_opacities_and_their_gradients_match_mpmath(dtype: torch.dtype, eps: flo
     # Where a'' itself is denormal its product with a steep slope has that error and no other.
     floors = [float(4 * tiny * s) for s in slopes]
     assert_close(by_sigma, [a * s for a, s in zip(opacities, slopes, strict=True)], [x + 8 for x in soft], floors)
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("eps", EPSILONS)
-@pytest.mark.parametrize("tau", TAUS)
-def test_extinction_scale_matches_mpmath(dtype: torch.dtype, eps: float, tau: float) -> None:
-    columns = grid(LOGITS, SIGMAS, DISTANCES)
-    logits, sigma, d = (t.to(dtype) for t in columns)
-    got = extinction_scale(logits, sigma, d, config(tau, eps))
-    rows = list(zip(*(c.tolist() for c in columns), strict=True))
-    want = [reference_extinction(*row, tau, eps) for row in rows]
-    allowed = [6 + float(abs(log_opacity(row[0]))) for row in rows]
-    assert_close(got, want, allowed, floor=torch.finfo(dtype).tiny / tau)
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("eps", EPSILONS)
-@pytest.mark.parametrize("tau", TAUS)
-def test_sigma_for_extinction_matches_mpmath(dtype: torch.dtype, eps: float, tau: float) -> None:
-    columns = grid(LOGITS[2:], DISTANCES, [0.0, 1e-6, 0.3, 1.0, 1.75, 6.0, 100.0, 1e4])
-    got = sigma_for_extinction(*(t.to(dtype) for t in columns), config(tau, eps)).double()
-    info = torch.finfo(dtype)
-    for row, g in zip(zip(*(c.tolist() for c in columns), strict=True), got.tolist(), strict=True):
-        logit, d, s = row
-        drop = log_opacity(logit) - mpmath.log(tau * mpmath.mpf(s)) if s > 0 else mpmath.inf
-        if abs(drop) < 16 * info.eps:
-            continue  # s* is a/tau to rounding: both answers are right
-        if drop < 0:
-            assert g == float(torch.tensor(SIGMA_MAX, dtype=dtype)), row
-            continue
-        total = (mpmath.mpf(d) * s) ** 2 / (2 * drop)
-        want = min(mpmath.sqrt(max(total - mpmath.mpf(eps) / 2, ZERO)), mpmath.mpf(SIGMA_MAX))
-        condition = 4 + float((abs(log_opacity(logit)) + abs(mpmath.log(tau * mpmath.mpf(s)))) / drop) if s > 0 else 4
-        # Stated for v + eps/2 = r^2, of which sigma^2 is what lies above eps/2.
-        error = abs(mpmath.mpf(g) ** 2 - want**2)
-        assert error <= condition * info.eps * max(total, mpmath.mpf(eps) / 2) + info.tiny, (row, g, want)
 
 
 def test_gradcheck() -> None:
@@ -325,19 +232,6 @@ def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
     assert extinction_scale(logits, sigma, d, config()).dtype == torch.float32
 
 
-unit = st.floats(0, 1.5, width=32)
-decay = st.one_of(st.floats(-1, 2, width=32), st.floats(0.0009765625, 1e6, width=32))
-logit = st.floats(-30, 30, width=32)
-dial = st.floats(1, 100)
-rows = st.lists(st.tuples(logit, decay, unit), min_size=1, max_size=20)
-epsilon = st.sampled_from(EPSILONS)
-quick = settings(deadline=None, max_examples=50)
-
-
-def columns(data: list[tuple[float, ...]], dtype: torch.dtype = torch.float64) -> list[Tensor]:
-    return [torch.tensor(c, dtype=dtype) for c in zip(*data, strict=True)]
-
-
 @given(rows, dial, dial, epsilon, st.sampled_from(DTYPES))
 @quick
 def test_kept_sets_are_nested(
@@ -346,34 +240,6 @@ def test_kept_sets_are_nested(
     at = [attenuate(*columns(data, dtype), s, config(eps=eps)) for s in sorted((a, b))]
     assert (at[1].keep <= at[0].keep).all()
     assert (at[1].opacities <= at[0].opacities).all()
-
-
-@given(rows, epsilon, st.sampled_from(TAUS[1:]), dial)
-@quick
-def test_kept_until_the_extinction_scale(data: list[tuple[float, ...]], eps: float, tau: float, scale: float) -> None:
-    inputs = columns(data)
-    chosen = config(tau, eps)
-    leaves = extinction_scale(*inputs, chosen)
-    kept = attenuate(*inputs, scale, chosen).keep
-    clear = (leaves / scale - 1).abs() > 1e-12
-    assert torch.equal(kept[clear], (scale < leaves)[clear])
-    for row, s in zip(data, leaves.tolist(), strict=True):
-        one = columns([row])
-        if s * (1 - 1e-12) >= 1:
-            assert attenuate(*one, s * (1 - 1e-12), chosen).keep.all()
-            assert not attenuate(*one, s * (1 + 1e-12), chosen).keep.any()
-
-
-@given(rows, st.floats(0.01, 0.999), epsilon)
-@quick
-def test_sigma_for_extinction_round_trip(data: list[tuple[float, ...]], share: float, eps: float) -> None:
-    logits, _, d = columns(data)
-    wanted = share * logits.sigmoid() * 255
-    sigma = sigma_for_extinction(logits, d, wanted, config(eps=eps))
-    reached = extinction_scale(logits, sigma, d, config(eps=eps))
-    fits = (sigma > 1e-6) & (d > 0)
-    torch.testing.assert_close(reached[fits], wanted[fits], rtol=1e-9, atol=0)
-    assert (reached[d > 0] >= wanted[d > 0] * (1 - 1e-9)).all()  # eps may keep one longer, never shorter
 
 
 @given(logit, st.lists(decay, min_size=2, max_size=20), unit, dial, epsilon, st.sampled_from(DTYPES))
@@ -388,38 +254,6 @@ def test_monotone_in_sigma(
     assert (out.opacities.diff() >= -slack * out.opacities[1:]).all()
     leaves = extinction_scale(logits, sigma, distances, config(eps=eps))
     assert (leaves.diff() >= -8 * slack * leaves[1:]).all()
-
-
-def test_soft_count_is_hard_forward_and_soft_backward() -> None:
-    tau, scale, temperature = 1 / 255, 2.0, 0.5
-    logs = torch.tensor([-math.inf, -30.0, -5.0, -4.8, -1.0, 0.0], dtype=torch.float64, requires_grad=True)
-    count = soft_count(logs, scale, tau, temperature)
-    assert count.shape == () and count.item() == 3 / 6
-    (grad,) = torch.autograd.grad(3 * count, logs)
-    plain = torch.sigmoid((logs - math.log(tau * scale)) / temperature).mean()
-    (want,) = torch.autograd.grad(3 * plain, logs)
-    torch.testing.assert_close(grad[1:], want[1:])
-    assert grad[0] == 0
-    assert soft_count(torch.empty(0), scale, tau, temperature).item() == 0
-
-
-def test_count_slope_is_that_of_the_soft_count() -> None:
-    """Where 2 u > 1; below that it is as if 2 u were 1, so that who is not touched yet can be."""
-    tau, s, temperature = 0.02, 2.0, 0.5
-    logits = torch.linspace(-5, 5, 200, dtype=torch.float64)
-    d, log_sigma = torch.linspace(0.1, 1, 200, dtype=torch.float64), torch.linspace(-1, 2, 200, dtype=torch.float64)
-    log_sigma = log_sigma[torch.randperm(200, generator=torch.Generator().manual_seed(0))].requires_grad_()
-    out = attenuate(logits, log_sigma.exp(), d, s, config(tau, 0.0))
-    (want,) = torch.autograd.grad(soft_count(out.log_opacities, s, tau, temperature), log_sigma)
-    logs = out.log_opacities.detach()
-    got = count_slope(logits, logs, s, tau, temperature)
-    touched = 2 * (torch.nn.functional.logsigmoid(logits) - logs)
-    assert 20 < int((touched > 1).sum()) < 180
-    torch.testing.assert_close(got[touched > 1], want[touched > 1])
-    q = torch.sigmoid((logs - math.log(tau * s)) / temperature)
-    torch.testing.assert_close(got[touched <= 1], (q * (1 - q) / (temperature * 200))[touched <= 1])
-    gone = count_slope(torch.zeros(2), torch.tensor([-math.inf, -1e30]), s, tau, temperature)
-    assert gone.tolist() == [0, 0]
 
 
 def looking_down_z(fx: float = 100.0) -> Camera:

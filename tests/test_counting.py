@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import attenuate, count_slope
-from clod_adapter.config import AdaptConfig
-from clod_adapter.counting import count_gradient, count_law
+from clod_adapter.attenuation import attenuate
+from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.counting import count_gradient, count_law, count_slope, soft_count
 from clod_adapter.optimizer import RowAdam
 
 CONFIG = AdaptConfig(max_sv=6.0)
@@ -94,3 +94,35 @@ def test_the_last_gaussian_is_not_pressed_out() -> None:
     dialled = attenuate(logits, sigma, d, 5.0, config.attenuation(1.0))
     assert bool(dialled.keep.all())
     assert count_gradient(dialled, logits, 5.0, config.tau, 1.0, config).item() == 0
+
+
+def test_soft_count_is_hard_forward_and_soft_backward() -> None:
+    tau, scale, temperature = 1 / 255, 2.0, 0.5
+    logs = torch.tensor([-math.inf, -30.0, -5.0, -4.8, -1.0, 0.0], dtype=torch.float64, requires_grad=True)
+    count = soft_count(logs, scale, tau, temperature)
+    assert count.shape == () and count.item() == 3 / 6
+    (grad,) = torch.autograd.grad(3 * count, logs)
+    plain = torch.sigmoid((logs - math.log(tau * scale)) / temperature).mean()
+    (want,) = torch.autograd.grad(3 * plain, logs)
+    torch.testing.assert_close(grad[1:], want[1:])
+    assert grad[0] == 0
+    assert soft_count(torch.empty(0), scale, tau, temperature).item() == 0
+
+
+def test_count_slope_is_that_of_the_soft_count() -> None:
+    """Where 2 u > 1; below that it is as if 2 u were 1, so that who is not touched yet can be."""
+    tau, s, temperature = 0.02, 2.0, 0.5
+    logits = torch.linspace(-5, 5, 200, dtype=torch.float64)
+    d, log_sigma = torch.linspace(0.1, 1, 200, dtype=torch.float64), torch.linspace(-1, 2, 200, dtype=torch.float64)
+    log_sigma = log_sigma[torch.randperm(200, generator=torch.Generator().manual_seed(0))].requires_grad_()
+    out = attenuate(logits, log_sigma.exp(), d, s, AttenuationConfig(tau=tau, eps=0.0))
+    (want,) = torch.autograd.grad(soft_count(out.log_opacities, s, tau, temperature), log_sigma)
+    logs = out.log_opacities.detach()
+    got = count_slope(logits, logs, s, tau, temperature)
+    touched = 2 * (torch.nn.functional.logsigmoid(logits) - logs)
+    assert 20 < int((touched > 1).sum()) < 180
+    torch.testing.assert_close(got[touched > 1], want[touched > 1])
+    q = torch.sigmoid((logs - math.log(tau * s)) / temperature)
+    torch.testing.assert_close(got[touched <= 1], (q * (1 - q) / (temperature * 200))[touched <= 1])
+    gone = count_slope(torch.zeros(2), torch.tensor([-math.inf, -1e30]), s, tau, temperature)
+    assert gone.tolist() == [0, 0]

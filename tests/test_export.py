@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import attenuate, sigma_for_extinction
+from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.export import bake
+from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
 from scenes import camera, gaussians

@@ -27,6 +27,7 @@ FLOORS = [
         "attenuation",
         "collapse",
         "counting",
+        "extinction",
         "losses",
         "metrics",
         "optimizer",

@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from clod_adapter import importance
-from clod_adapter.attenuation import attenuate, extinction_scale, normalized_distances
+from clod_adapter.attenuation import attenuate, normalized_distances
 from clod_adapter.cameras import View
 from clod_adapter.collapse import leaving_order
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
+from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import fitting_tau, removal_error, seeing, sigma_from_importance, start, typical_distance
 from clod_adapter.render import splat

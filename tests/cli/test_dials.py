@@ -13,8 +13,9 @@ import pytest
 from PIL import Image
 
 import clod_adapter
-from clod_adapter.attenuation import extinction_scale, normalized_distances
+from clod_adapter.attenuation import normalized_distances
 from clod_adapter.cli import budgets
+from clod_adapter.extinction import extinction_scale
 from clod_adapter.io.ply import load, save
 
 

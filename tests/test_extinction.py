@@ -1,0 +1,95 @@
+"""The extinction scale and its inverse against mpmath, and against each other."""
+
+from __future__ import annotations
+
+import mpmath
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from clod_adapter.attenuation import SIGMA_MAX, attenuate
+from clod_adapter.extinction import extinction_scale, sigma_for_extinction
+from exact import (
+    DISTANCES,
+    DTYPES,
+    EPSILONS,
+    LOGITS,
+    SIGMAS,
+    TAUS,
+    ZERO,
+    assert_close,
+    columns,
+    config,
+    dial,
+    epsilon,
+    grid,
+    log_opacity,
+    quick,
+    reference_extinction,
+    rows,
+)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("eps", EPSILONS)
+@pytest.mark.parametrize("tau", TAUS)
+def test_extinction_scale_matches_mpmath(dtype: torch.dtype, eps: float, tau: float) -> None:
+    columns = grid(LOGITS, SIGMAS, DISTANCES)
+    logits, sigma, d = (t.to(dtype) for t in columns)
+    got = extinction_scale(logits, sigma, d, config(tau, eps))
+    rows = list(zip(*(c.tolist() for c in columns), strict=True))
+    want = [reference_extinction(*row, tau, eps) for row in rows]
+    allowed = [6 + float(abs(log_opacity(row[0]))) for row in rows]
+    assert_close(got, want, allowed, floor=torch.finfo(dtype).tiny / tau)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("eps", EPSILONS)
+@pytest.mark.parametrize("tau", TAUS)
+def test_sigma_for_extinction_matches_mpmath(dtype: torch.dtype, eps: float, tau: float) -> None:
+    columns = grid(LOGITS[2:], DISTANCES, [0.0, 1e-6, 0.3, 1.0, 1.75, 6.0, 100.0, 1e4])
+    got = sigma_for_extinction(*(t.to(dtype) for t in columns), config(tau, eps)).double()
+    info = torch.finfo(dtype)
+    for row, g in zip(zip(*(c.tolist() for c in columns), strict=True), got.tolist(), strict=True):
+        logit, d, s = row
+        drop = log_opacity(logit) - mpmath.log(tau * mpmath.mpf(s)) if s > 0 else mpmath.inf
+        if abs(drop) < 16 * info.eps:
+            continue  # s* is a/tau to rounding: both answers are right
+        if drop < 0:
+            assert g == float(torch.tensor(SIGMA_MAX, dtype=dtype)), row
+            continue
+        total = (mpmath.mpf(d) * s) ** 2 / (2 * drop)
+        want = min(mpmath.sqrt(max(total - mpmath.mpf(eps) / 2, ZERO)), mpmath.mpf(SIGMA_MAX))
+        condition = 4 + float((abs(log_opacity(logit)) + abs(mpmath.log(tau * mpmath.mpf(s)))) / drop) if s > 0 else 4
+        # Stated for v + eps/2 = r^2, of which sigma^2 is what lies above eps/2.
+        error = abs(mpmath.mpf(g) ** 2 - want**2)
+        assert error <= condition * info.eps * max(total, mpmath.mpf(eps) / 2) + info.tiny, (row, g, want)
+
+
+@given(rows, epsilon, st.sampled_from(TAUS[1:]), dial)
+@quick
+def test_kept_until_the_extinction_scale(data: list[tuple[float, ...]], eps: float, tau: float, scale: float) -> None:
+    inputs = columns(data)
+    chosen = config(tau, eps)
+    leaves = extinction_scale(*inputs, chosen)
+    kept = attenuate(*inputs, scale, chosen).keep
+    clear = (leaves / scale - 1).abs() > 1e-12
+    assert torch.equal(kept[clear], (scale < leaves)[clear])
+    for row, s in zip(data, leaves.tolist(), strict=True):
+        one = columns([row])
+        if s * (1 - 1e-12) >= 1:
+            assert attenuate(*one, s * (1 - 1e-12), chosen).keep.all()
+            assert not attenuate(*one, s * (1 + 1e-12), chosen).keep.any()
+
+
+@given(rows, st.floats(0.01, 0.999), epsilon)
+@quick
+def test_sigma_for_extinction_round_trip(data: list[tuple[float, ...]], share: float, eps: float) -> None:
+    logits, _, d = columns(data)
+    wanted = share * logits.sigmoid() * 255
+    sigma = sigma_for_extinction(logits, d, wanted, config(eps=eps))
+    reached = extinction_scale(logits, sigma, d, config(eps=eps))
+    fits = (sigma > 1e-6) & (d > 0)
+    torch.testing.assert_close(reached[fits], wanted[fits], rtol=1e-9, atol=0)
+    assert (reached[d > 0] >= wanted[d > 0] * (1 - 1e-9)).all()  # eps may keep one longer, never shorter
