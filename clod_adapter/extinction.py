@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from clod_adapter.attenuation import SIGMA_MAX, conform, radius
+from clod_adapter.attenuation import SIGMA_MAX, conform, twice_variance
 from clod_adapter.config import AttenuationConfig
 
 _LOG_HUGE = 1e4  # above the logarithms that float64 products here can have
@@ -32,7 +32,8 @@ def extinction_scale(opacity_logits: Tensor, sigma_d: Tensor, d: Tensor, config:
         ClodError: the shapes differ.
     """
     opacity_logits, sigma_d, d = conform(opacity_logits=opacity_logits, sigma_d=sigma_d, d=d)
-    ratio = (d / radius(sigma_d, config.eps)).masked_fill_(d == 0, 0)
+    radius = twice_variance(sigma_d, config.eps).div_(2).sqrt_()
+    ratio = (d.double() / radius).to(d.dtype).masked_fill_(d == 0, 0)
     upper = opacity_logits.sigmoid().div_(config.tau)
     log_ratio = ratio.log().clamp_(max=_LOG_HUGE)  # ratio is inf where the variance is 0
     w = _lambert_w_of_exp((F.logsigmoid(opacity_logits) - math.log(config.tau) + log_ratio).mul_(2))
@@ -49,8 +50,9 @@ def sigma_for_extinction(opacity_logits: Tensor, d: Tensor, extinction: Tensor, 
     ``SIGMA_MAX`` where ``s* >= a/tau``, which no finite sigma reaches. 0 where the wish lies below what
     eps alone allows, and at d = 0, where no sigma matters. No gradient.
 
-    Accuracy: relative error of v + eps/2 within ``(4 + (|log a| + |log(tau s*)|) / log(a / (tau s*))) *
-    finfo.eps``: the last step before ``a/tau`` is a steep one.
+    Computed in float64. Accuracy: sigma^2 is off by at most ``4 finfo.eps``, and ``(|log a| + |log(tau s*)| + 1) /
+    log(a / (tau s*))`` of float64's eps, times the larger of v and eps/2: the last step before ``a/tau`` is a steep
+    one.
 
     Args:
         extinction: ``[N]`` wanted s*, >= 0.
@@ -58,13 +60,12 @@ def sigma_for_extinction(opacity_logits: Tensor, d: Tensor, extinction: Tensor, 
     Raises:
         ClodError: the shapes differ.
     """
-    opacity_logits, d, extinction = conform(opacity_logits=opacity_logits, d=d, extinction=extinction)
+    given = conform(opacity_logits=opacity_logits, d=d, extinction=extinction)
+    opacity_logits, d, extinction = (t.double() for t in given)
     drop = F.logsigmoid(opacity_logits) - (extinction * config.tau).log_()
-    reach = d * extinction / (2 * drop).sqrt_()
-    floor = math.sqrt(config.eps / 2)
-    # sqrt(r - f) sqrt(r + f) and not sqrt(r^2 - f^2): squares underflow.
-    sigma = (reach - floor).clamp_(min=0).sqrt_() * (reach + floor).sqrt_()
-    return torch.where(drop > 0, sigma, SIGMA_MAX).clamp_(max=SIGMA_MAX)
+    variance = (d * extinction).square_().div_(2 * drop)
+    sigma = variance.sub_(config.eps / 2).clamp_(min=0).sqrt_()
+    return torch.where(drop > 0, sigma, SIGMA_MAX).clamp_(max=SIGMA_MAX).to(given[0].dtype)
 
 
 def _lambert_w_of_exp(x: Tensor) -> Tensor:

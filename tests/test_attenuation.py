@@ -58,38 +58,51 @@ def test_log_attenuation_and_its_slope_match_mpmath(dtype: torch.dtype, eps: flo
     want = [reference(a, b, scale, eps) for a, b in zip(sigma.tolist(), d.tolist(), strict=True)]
     assert_close(out.detach(), [w.log_factor for w in want], ulps=4)
     limit = torch.finfo(dtype).max
-    slopes = [ZERO if max(abs(w.slope), abs(w.log_factor)) > limit else w.slope for w in want]
+    slopes = [ZERO if w.slope > limit else w.slope for w in want]
     assert sigma.grad is not None
-    assert_close(sigma.grad, slopes, ulps=7)
+    assert_close(sigma.grad, slopes, ulps=4)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("eps", EPSILONS)
 @pytest.mark.parametrize("scale", SCALES)
 def test_opacities_and_their_gradients_match_mpmath(dtype: torch.dtype, eps: float, scale: float) -> None:
-    columns = grid(LOGITS, SIGMAS, DISTANCES)
-    logits, sigma, d = (t.to(dtype) for t in columns)
+    inputs = grid(LOGITS, SIGMAS, DISTANCES)
+    logits, sigma, d = (t.to(dtype) for t in inputs)
     logits.requires_grad_()
     sigma.requires_grad_()
     out = attenuate(logits, sigma, d, scale, config(eps=eps))
     by_logit, by_sigma = torch.autograd.grad(out.opacities.sum(), (logits, sigma), retain_graph=True)
     (log_by_logit,) = torch.autograd.grad(out.log_opacities.sum(), logits)
-    rows = list(zip(*(c.tolist() for c in columns), strict=True))
-    factors = [reference(a, b, scale, eps) for _, a, b in rows]
-    logs = [log_opacity(r[0]) + f.log_factor for r, f in zip(rows, factors, strict=True)]
+    logits = inputs[0].tolist()
+    factors = [reference(a, b, scale, eps) for a, b in zip(*(c.tolist() for c in inputs[1:]), strict=True)]
+    logs = [log_opacity(a) + f.log_factor for a, f in zip(logits, factors, strict=True)]
     opacities = [mpmath.exp(x) for x in logs]
-    transparency = [ZERO if r[0] == math.inf else 1 / (1 + mpmath.exp(mpmath.mpf(r[0]))) for r in rows]
-    # exp turns an absolute error into a relative one: what is allowed grows with |log a''|.
-    soft = [6 + 3 * float(min(abs(x), 1e4)) for x in logs]
+    transparency = [1 / (1 + mpmath.exp(mpmath.mpf(a))) for a in logits]
+    # exp turns u's error into a relative one; from float32's inputs u is float64's until after it.
+    soft = [4 + 3 * float(min(-f.log_factor, 1e4)) if dtype == torch.float64 else 4.0 for f in factors]
     tiny = torch.finfo(dtype).tiny
-    assert_close(out.log_opacities.detach(), logs, ulps=5)
+    assert_close(out.log_opacities.detach(), logs, ulps=4)
     assert_close(out.opacities.detach(), opacities, soft)
     assert_close(log_by_logit, transparency, ulps=4)
     assert_close(by_logit, [a * t for a, t in zip(opacities, transparency, strict=True)], soft)
-    slopes = [ZERO if f.slope > 1 / tiny else f.slope for f in factors]
+    slopes = [ZERO if f.slope > torch.finfo(dtype).max else f.slope for f in factors]
     # Where a'' itself is denormal its product with a steep slope has that error and no other.
     floors = [float(4 * tiny * s) for s in slopes]
-    assert_close(by_sigma, [a * s for a, s in zip(opacities, slopes, strict=True)], [x + 8 for x in soft], floors)
+    assert_close(by_sigma, [a * s for a, s in zip(opacities, slopes, strict=True)], soft, floors)
+
+
+@pytest.mark.parametrize("cut", ["hard", "soft"])
+@pytest.mark.parametrize("dtype", [*DTYPES, torch.float16, torch.bfloat16])
+def test_nothing_is_kept_once_the_threshold_passes_1(dtype: torch.dtype, cut: str) -> None:
+    """tau s from just above 1, where opacity 1 at no distance at all is too little, and no NaN in what it leaves."""
+    logits, sigma, d = (t.to(dtype) for t in grid([-math.inf, *LOGITS], [-1.0, 0.0, 1e-6, 1.0, 6e4], [0.0, 1.0, 1.002]))
+    logits.requires_grad_()
+    sigma.requires_grad_()
+    for s, tau in ((1.0 + 1e-6, 1 - 1e-7), (300.0, 1 / 255), (1e4, 0.999)):
+        out = attenuate(logits, sigma, d, s, config(tau, 0.0, cut=cut))
+        assert not out.keep.any() and (out.drawn == 0).all()
+        assert all((slope == 0).all() for slope in torch.autograd.grad(out.drawn.sum(), (logits, sigma)))
 
 
 def test_gradcheck() -> None:
@@ -110,14 +123,14 @@ def test_gradcheck() -> None:
 @pytest.mark.parametrize("scale", SCALES[:3])
 def test_what_the_soft_cut_draws_matches_mpmath(dtype: torch.dtype, scale: float) -> None:
     tau = 0.02
-    columns = grid([-3.7, -3.1, -1.6, *LOGITS], [*SIGMAS, 0.2, 0.6], [*DISTANCES, 0.15])
-    logits, sigma, d = (t.to(dtype) for t in columns)
+    inputs = grid([-3.7, -3.1, -1.6, *LOGITS], [*SIGMAS, 0.2, 0.6], [*DISTANCES, 0.15])
+    logits, sigma, d = (t.to(dtype) for t in inputs)
     logits.requires_grad_()
     sigma.requires_grad_()
     out = attenuate(logits, sigma, d, scale, config(tau, cut="soft"))
     by_logit, by_sigma = torch.autograd.grad(out.drawn.sum(), (logits, sigma))
     want, floors, slopes, transparency = [], [], [], []
-    for a, b, c in zip(*(x.tolist() for x in columns), strict=True):
+    for a, b, c in zip(*(x.tolist() for x in inputs), strict=True):
         factor = reference(b, c, scale, 1e-8)
         log = log_opacity(a) + factor.log_factor
         ratio = mpmath.exp(log) / (mpmath.mpf(tau) * scale)
@@ -125,7 +138,7 @@ def test_what_the_soft_cut_draws_matches_mpmath(dtype: torch.dtype, scale: float
         # By log a'', where there is a slope: below 1.5 tau s the fade's own part is added to that of a''.
         inside = 1 < ratio < 1.5
         slopes.append((factor.slope, mpmath.exp(log) * (4 * ratio - 2 if inside else ratio >= 1.5)))
-        transparency.append(ZERO if a == math.inf else 1 / (1 + mpmath.exp(mpmath.mpf(a))))
+        transparency.append(1 / (1 + mpmath.exp(mpmath.mpf(a))))
         # The threshold's distance is a difference of logarithms, whose rounding the fade triples.
         floors.append(float(mpmath.exp(log)) * 4 * (8 + float(min(abs(log), 1e4))) * torch.finfo(dtype).eps)
     assert_close(out.drawn.detach(), want, 8, floors)
@@ -146,7 +159,7 @@ def test_what_is_kept_is_what_is_drawn(dtype: torch.dtype, cut: str) -> None:
         chosen = config(0.02, cut=cut)
         at = (8 * logits - 2, sigma_for_extinction(8 * logits - 2, d, torch.full_like(d, s), chosen), d)
         out = attenuate(*at, s, chosen)
-        assert 0.1 < out.keep.float().mean() < 0.9
+        assert 0.05 < out.keep.float().mean() < 0.95
         assert torch.equal(out.drawn > 0, out.keep)
 
 
