@@ -50,16 +50,20 @@ def count_slope(
 
     ``q (1 - q) / (temperature N) max(2 u, 1)`` with ``q = sigmoid((log a'' - log(tau s)) / temperature)`` and
     ``u = log a - log a''``: the slope of ``soft_count`` by ``log sigma_d``, whose own ``2 u`` would be nothing
-    for Gaussians that the dial does not touch yet, and keep them out of its reach for good.
+    for Gaussians that the dial does not touch yet, and keep them out of its reach for good. 0 at log a'' = -inf.
 
     Args:
         log_opacities: ``[N]`` log a'' from ``attenuate``.
         temperature: > 0, in units of log opacity.
+
+    Raises:
+        ClodError: the shapes differ.
     """
-    q = (log_opacities - log_threshold(tau, virtual_scale)).div_(temperature).sigmoid_()
+    opacity_logits, log_opacities = conform(opacity_logits=opacity_logits, log_opacities=log_opacities)
     touched = (F.logsigmoid(opacity_logits) - log_opacities).mul_(2).clamp_(min=1)
-    # Where log a'' is -inf q is 0 and touched inf.
-    return (1 - q).mul_(q).mul_(touched).nan_to_num_(0.0, 0.0).div_(temperature * max(len(q), 1))
+    slope = _slope_of_sigmoid(log_opacities, log_threshold(tau, virtual_scale), temperature)
+    # Where log a'' is -inf the slope is 0 and touched inf.
+    return slope.mul_(touched).nan_to_num_(0.0, 0.0)
 
 
 def soft_count(log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float) -> Tensor:
@@ -88,7 +92,16 @@ class _SoftCount(Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        (log_opacities,) = ctx.saved_tensors
-        threshold, temperature = ctx.settings
-        p = (log_opacities - threshold).div_(temperature).sigmoid_()
-        return (1 - p).mul_(p).mul_(grad / (temperature * max(len(p), 1))), None, None
+        return _slope_of_sigmoid(ctx.saved_tensors[0], *ctx.settings).mul_(grad), None, None
+
+
+def _slope_of_sigmoid(log_opacities: Tensor, threshold: float, temperature: float) -> Tensor:
+    """``[N]`` the slope of the mean of ``sigmoid(z)``, ``z = (log a'' - threshold) / temperature``, by log a''.
+
+    ``sigmoid(z) sigmoid(-z) / (temperature N)``, as 1 - sigmoid(z) would cancel. A temperature that the numbers cannot
+    divide by counts as the nearest that they can: neither 0 / 0 nor inf / inf.
+    """
+    info = torch.finfo(log_opacities.dtype)
+    temperature = min(max(temperature, info.tiny), info.max)
+    z = (log_opacities - threshold).div_(temperature)
+    return z.sigmoid().mul_(z.neg_().sigmoid_()).div_(temperature * max(len(z), 1))
