@@ -13,6 +13,10 @@ from torch.autograd.function import once_differentiable
 from clod_adapter.attenuation import Attenuated, conform, log_threshold
 from clod_adapter.config import AdaptConfig
 
+# What the sigmoid's own slope, at most 1/4, does not fall below for who has left while too few are kept. Some widths
+# below the cut it is exactly 0, and so is the picture's: nothing would ever bring such a sigma back.
+LIFT = 1e-3
+
 
 def count_law(virtual_scale: float, share: float, exponent: float) -> float:
     """The share of all Gaussians to keep at a dial value s: ``1 / (s^p + (1/share - 1) s^-p)``.
@@ -33,12 +37,15 @@ def count_gradient(
     less to the picture than the pressure fades, who is worth more stays. It works both ways, and is relative: to the
     law, as the last percent of the Gaussians matters as much as the first, and to the weighted ``loss``, a constant
     here, so that the same settings suit scenes and dial values that are fitted well or badly. Nothing presses the last
-    Gaussian out.
+    Gaussian out. Where too few are kept, whoever has left is called back, however far below the cut: with a slope of
+    at least ``LIFT / (temperature N)``.
     """
     law = max(count_law(virtual_scale, config.start_share, config.exponent), 1 / len(opacity_logits))
     eta = float(dialled.keep.sum()) / len(opacity_logits)
     pressure = 2 * loss * config.reg_weight * (eta / law - 1) / law
     slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, config.temperature)
+    if pressure < 0:
+        slope = torch.where(dialled.keep, slope, slope.clamp(min=LIFT / (config.temperature * len(slope))))
     return slope.mul_(pressure)
 
 

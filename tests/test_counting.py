@@ -161,3 +161,29 @@ def test_counts_at_the_edges(dtype: torch.dtype) -> None:
     wide = count_slope(logits.to(slope.dtype), logs.detach().to(slope.dtype), s, tau, 0.15)
     assert slope.dtype == torch.promote_types(dtype, torch.float32)
     assert torch.equal(count_slope(logits, logs.detach(), s, tau, 0.15), wide)
+
+
+def test_whoever_has_left_is_called_back_from_any_depth() -> None:
+    """Only while too few are kept: where a'' is 0 at every dial value nothing else has a slope."""
+    logits, _, d = some()
+    for gone in (-9.2, -100.0):  # the floor that training has, and 0
+        assert (gradient(logits, torch.full((N,), gone), d, 2.0) < 0).all()
+    mixed = torch.where(torch.arange(N) % 2 == 0, 5.0, -9.2)  # half stay, where the law at s = 6 asks for 7 %
+    assert (gradient(logits, mixed, d, 6.0) >= 0).all() and (gradient(logits, mixed, d, 6.0)[1::2] == 0).all()
+
+
+def test_from_nobody_the_counts_come_to_the_law() -> None:
+    """Every sigma at the floor that training has: each of them comes back, and then they leave one by one."""
+    logits, _, d = some()
+    logits, log_sigma = logits.clamp(min=-1.5) + 1, torch.full((N,), math.log(1e-4))
+    optimizer, rows, random = (
+        RowAdam({"log_sigma": log_sigma}),
+        torch.ones(N, dtype=torch.bool),
+        np.random.default_rng(0),
+    )
+    for step in range(600):
+        slopes = gradient(logits, log_sigma, d, 1.0) + gradient(logits, log_sigma, d, 6.0 ** random.random())
+        optimizer.step({"log_sigma": slopes}, rows, {"log_sigma": 0.1 * 0.1 ** (step / 600)})
+    kept = float(attenuate(logits, log_sigma.exp(), d, 1.0, ATTENUATION).keep.float().mean())
+    assert kept == pytest.approx(CONFIG.start_share, rel=0.1)
+    assert (log_sigma > math.log(1e-4) + 2).all()
