@@ -11,7 +11,8 @@ is its Eq. 2 (section 3.2), the cut is the mask M_i of the same section. For act
 A kept Gaussian is drawn with opacity a'' under the paper's cut, named ``hard``: it leaves with opacity
 ``tau s``, which pops. Under the cut named ``soft`` it is drawn with ``a'' min(1, 2 (a'' / (tau s) - 1))``: nothing
 changes above 1.5 tau s, and from there it fades to 0 where it leaves. The same Gaussians are kept, and the picture is
-continuous in dial and camera.
+continuous in dial and camera: per unit of ``log s`` or ``log d`` what is drawn changes by at most 4.3, namely by
+``2 x (1.5 - 4 log x)`` with ``x = min(1.5 tau s, e^(-5/8))`` or, where that is less, by 2/e.
 
 Throughout: tensors are ``[N]``, one entry per Gaussian, on one device. ``opacity_logits`` may be +-inf,
 ``sigma_d`` and the distances are finite, distances are >= 0; in float64, which has no wider type to square them in,

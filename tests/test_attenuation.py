@@ -195,6 +195,28 @@ def test_the_soft_cut_is_continuous() -> None:
     assert largest("hard", 4000) > 0.02
 
 
+@pytest.mark.parametrize(
+    ("tau", "max_sv", "bound"), [(1e-4, 5.0, 0.736), (0.02, 5.0, 2.73), (0.02, 20.0, 4.29), (0.1, 9.0, 4.29)]
+)
+def test_the_soft_cut_has_a_steepest_slope(tau: float, max_sv: float, bound: float) -> None:
+    """Per unit of log s, whatever the opacity, sigma_d and distance; it is reached, and the hard cut knows none."""
+    a = torch.linspace(0.05, 0.9999, 30, dtype=torch.float64)[:, None].expand(30, 400).flatten()
+    sigma = torch.logspace(-1, 1.5, 400, dtype=torch.float64).repeat(30)
+    step, slopes = 1e-4, {}
+    for cut in ("soft", "hard"):
+        at = torch.linspace(0, math.log(max_sv) - step, 60).tolist()
+        drawn = [
+            [
+                attenuate(a.logit(), sigma, torch.ones_like(a), math.exp(x), config(tau, cut=cut)).drawn
+                for x in (s, s + step)
+            ]
+            for s in at
+        ]
+        slopes[cut] = max(float((after - before).abs().max()) for before, after in drawn) / step
+    assert 0.95 * bound < slopes["soft"] < bound
+    assert slopes["hard"] > 4 * bound
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_identity_is_bit_exact(dtype: torch.dtype) -> None:
     logits = torch.cat([torch.linspace(-120, 60, 4001), torch.tensor([math.inf, -math.inf])]).to(dtype)
