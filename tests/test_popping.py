@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from clod_adapter.adapter import attach
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.attenuation import normalized_distances, sigma_for_extinction
+from clod_adapter.cameras import Camera
+from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.popping import dial_popping, path, path_popping, sweep
@@ -138,3 +140,44 @@ def test_bad_calls_are_named() -> None:
         path_popping(some, cameras[:1], 2.0)
     with pytest.raises(ClodError, match="steps is 1"):
         path(cameras, 1)
+
+
+def adversary(normalizer: str, cut: str) -> tuple[Gaussians, list[Camera]]:
+    """Four opaque white Gaussians in one place that leave together at s = 2.2, with max_sv 5 and the default tau, two
+    black ones behind them, and one far away that a camera sees once it has turned."""
+    camera = ring(1, 32, 24)[0]
+    forward, right = camera.viewmat[2, :3], camera.viewmat[0, :3]
+    means = torch.cat([torch.zeros(4, 3), torch.stack([forward, 2 * forward, 60 * forward + 40 * right])])
+    some = gaussians(7, 0, 0).replace(
+        means=means, log_scales=torch.full((7, 3), math.log(0.4)), opacity_logits=torch.full((7,), 3.0),
+        sh0=torch.tensor([1.7] * 4 + [-1.7] * 3)[:, None, None].expand(7, 1, 3),
+    )  # fmt: skip
+    config = AdaptConfig(normalizer=normalizer, cut=cut).attenuation(4.0)
+    leave = torch.tensor([2.2] * 4 + [3.0, 4.0, 5.0])
+    sigma = sigma_for_extinction(some.opacity_logits, normalized_distances(means, camera, config), leave, config)
+    turn = torch.eye(4)
+    turn[[0, 0, 2, 2], [0, 2, 0, 2]] = torch.tensor([0.8, -0.6, 0.6, 0.8])
+    return attach(some, sigma, config), [camera, dataclasses.replace(camera, viewmat=turn @ camera.viewmat)]
+
+
+def test_the_default_holds_a_bound_in_the_dial_and_the_hard_cut_does_not() -> None:
+    """What is drawn changes by at most 2.73 per unit of log s within max_sv 5; a rasterizer drops one level each."""
+    pixels = {}
+    for cut in ("soft", "hard"):
+        some, cameras = adversary("scene", cut)
+        for steps in (60, 120):
+            pixels[cut, steps] = dial_popping(some, cameras[0], 5.0, steps=steps).pixel
+            bound = 6 * (255 * 2.73 * math.log(5) / steps + 1)  # six lie behind each other
+            assert cut == "hard" or pixels[cut, steps] < bound
+    assert pixels["soft", 120] < 0.7 * pixels["soft", 60]
+    assert pixels["hard", 120] > 0.9 * pixels["hard", 60] > 30
+
+
+def test_the_default_does_not_change_as_a_camera_turns_and_the_maximum_does() -> None:
+    for normalizer in ("scene", "quantile", "max"):
+        some, cameras = adversary(normalizer, "soft")
+        pixels = [path_popping(some, cameras, 2.0, steps=steps).pixel for steps in (10, 20)]
+        if normalizer == "scene":
+            assert max(pixels) < 0.05
+        else:
+            assert pixels[1] > 0.9 * pixels[0] > 20
