@@ -1,0 +1,281 @@
+"""Stiffness: which optimiser, parameter and step size find sigma_d where its values span eight decades.
+
+    python benchmarks/stability_stiffness.py
+
+The slope of the equation goes as 1/sigma. Three measurements, all with the package's own equation, count law, schedule
+and mean of the last steps:
+
+- ``equation``: Gaussians at distances over eight decades, whose right sigma_d is known and keeps the count law. The
+  picture is the opacity each is drawn with, its loss the mean square of what the right ones are drawn with less that.
+  Starts are wrong by up to four decades each way. Every optimiser gets the same gradient: the picture's and the law's.
+- ``stuck`` and ``training``: the same through the training step itself (``stability_stuck.py``).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import clod_adapter  # noqa: F401  # before torch: it sets how OpenMP's threads wait
+
+# isort: split
+import numpy as np
+import torch
+from common import ROOT
+from stability_stuck import CONFIG, DIALS, STUCK_STEPS, TRAINING_STEPS, scene, stuck_rows, training_rows
+from torch import Tensor
+
+from clod_adapter._kernels.threads import torch_on_one_thread
+from clod_adapter.attenuation import Attenuated, attenuate, normalized_distances
+from clod_adapter.counting import count_gradient
+from clod_adapter.optimizer import RowAdam
+from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, PURPLE, QUIET, label_log, new_figure, save, tidy
+from clod_adapter.train import SIGMA_RANGE
+
+PICTURE = "stability_stiffness.png"
+RATES = tuple(10 ** (k / 2) for k in range(-8, 1))  # 1e-4 to 1 in half decades
+WRONG = 4.0  # decades, each way
+STEPS, LENGTHS = 600, (30, 100, 300, 1000)
+CONVERGED = 0.25  # of the start's error
+Stepper = Callable[[list[Tensor], list[float]], None]
+
+
+def _torch_optimizer(kind: type[torch.optim.Optimizer], **settings: Any) -> Callable[[list[Tensor]], Stepper]:
+    def make(runs: list[Tensor]) -> Stepper:
+        optimizer = kind([{"params": [x]} for x in runs], lr=1.0, **settings)
+
+        def step(gradients: list[Tensor], rates: list[float]) -> None:
+            for group, gradient, rate in zip(optimizer.param_groups, gradients, rates, strict=True):
+                group["params"][0].grad, group["lr"] = gradient, rate
+            optimizer.step()
+
+        return step
+
+    return make
+
+
+def _row_adam(runs: list[Tensor]) -> Stepper:
+    names, rows = list(map(str, range(len(runs)))), torch.ones(len(runs[0]), dtype=torch.bool)
+    optimizer = RowAdam(dict(zip(names, runs, strict=True)))
+    return lambda gradients, rates: optimizer.step(
+        dict(zip(names, gradients, strict=True)), rows, dict(zip(names, rates, strict=True))
+    )
+
+
+# AdamW is left out: its decay pulls sigma_d towards 0 (log sigma_d: 1), which nothing about a dial asks for.
+OPTIMIZERS: dict[str, tuple[Callable[[list[Tensor]], Stepper], str]] = {
+    "RowAdam": (_row_adam, BLUE),
+    "Adam": (_torch_optimizer(torch.optim.Adam), GREEN),
+    "AMSGrad": (_torch_optimizer(torch.optim.Adam, amsgrad=True), "#3aa6a0"),
+    "NAdam": (_torch_optimizer(torch.optim.NAdam), "#8fb339"),
+    "RMSprop": (_torch_optimizer(torch.optim.RMSprop), PURPLE),
+    "Adagrad": (_torch_optimizer(torch.optim.Adagrad), ORANGE),
+    "SGD, momentum 0.9": (_torch_optimizer(torch.optim.SGD, momentum=0.9), QUIET),
+}
+
+
+def main() -> None:
+    rows = measure()
+    plot(rows, ROOT / "docs" / "images")
+    print(markdown(rows))
+
+
+def measure() -> list[dict[str, Any]]:
+    task, rows = problem(), []
+    for optimizer, parameter in product(OPTIMIZERS, ("log", "linear")):
+        own = {"part": "stiffness", "what": "equation", "optimizer": optimizer, "parameter": parameter}
+        fit(task, optimizer, parameter, (1e-4,), 2)  # compiled, and imported by torch, before the clock starts
+        errors = [task.error(sigma) for sigma in fit(task, optimizer, parameter, RATES, STEPS)[0]]
+        rows += [own | {"rate": rate, "steps": STEPS, "error": e} for rate, e in zip(RATES, errors, strict=True)]
+        best = RATES[int(np.nanargmin(errors))]
+        for steps in LENGTHS:
+            (sigma,), seconds = fit(task, optimizer, parameter, (best,), steps)
+            rows.append(own | {"rate": best, "steps": steps, "error": task.error(sigma), "seconds": seconds})
+    rows.append({"part": "stiffness", "what": "start", "error": task.error(task.start)})
+    near = problem(1.0)
+    for parameter in ("log", "linear"):  # for the default alone: how wide where the start is only a decade wrong
+        errors = [near.error(sigma) for sigma in fit(near, "RowAdam", parameter, RATES, STEPS)[0]]
+        good = [rate for rate, e in zip(RATES, errors, strict=True) if e <= CONVERGED * near.error(near.start)]
+        rows.append({"part": "stiffness", "what": "near", "parameter": parameter, "steps": STEPS, "rates": good})
+    return rows + stuck_rows() + training_rows()
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What the equation is to be fitted to: all ``[N]``, but ``wanted [dial values, N]``, the right ones as drawn."""
+
+    logits: Tensor
+    distances: Tensor
+    right: Tensor
+    start: Tensor
+    wanted: Tensor
+
+    def drawn(self, sigma: Tensor) -> Tensor:
+        return _drawn(self.logits, sigma, self.distances)
+
+    def error(self, sigma: Tensor) -> float:
+        """Root mean square over Gaussians and dial values of the opacity they are drawn with, less the right one."""
+        return float((self.drawn(sigma) - self.wanted).square().mean().sqrt())
+
+
+def _drawn(logits: Tensor, sigma: Tensor, distances: Tensor) -> Tensor:
+    settings = CONFIG.attenuation(1.0)
+    return torch.stack([attenuate(logits, sigma, distances, s, settings).drawn for s in DIALS])
+
+
+def problem(wrong: float = WRONG) -> Problem:
+    """The scene's equation; the start is wrong by up to ``wrong`` decades each way, log-uniform."""
+    some, camera = scene()
+    distances, right = normalized_distances(some.means, camera, some.attenuation), some.sigma_d
+    off = torch.empty(len(right)).uniform_(-wrong, wrong, generator=torch.Generator().manual_seed(1))
+    return Problem(
+        some.opacity_logits, distances, right, right * 10**off, _drawn(some.opacity_logits, right, distances)
+    )
+
+
+@torch_on_one_thread()
+def fit(
+    task: Problem, optimizer: str, parameter: str, rates: tuple[float, ...], steps: int
+) -> tuple[list[Tensor], float]:
+    """sigma_d after training as ``train._Run`` does it, at dial value 1 and another one a step; and seconds.
+
+    One run a step size, all of them at once; they know nothing of each other.
+    """
+    log, n = parameter == "log", len(task.start)
+    limits = tuple(map(math.log, SIGMA_RANGE)) if log else SIGMA_RANGE
+    x = task.start.clamp(*SIGMA_RANGE)
+    runs = [(x.log() if log else x).clone() for _ in rates]
+    step, means, random = OPTIMIZERS[optimizer][0](runs), torch.zeros(len(rates), n), np.random.default_rng(0)
+    began, averaged = time.perf_counter(), 0
+    for k in range(steps):
+        fall = CONFIG.lr_final ** (k / steps)
+        gradients = _gradients(task, torch.stack(runs), log, int(random.integers(1, len(DIALS))))
+        step(list(gradients), [rate * fall for rate in rates])
+        for x in runs:
+            x.clamp_(*limits)
+        if k >= (1 - CONFIG.average) * steps:
+            averaged += 1
+            means.lerp_(torch.stack(runs), 1 / averaged)
+    return list(means.exp() if log else means), time.perf_counter() - began
+
+
+def _gradients(task: Problem, x: Tensor, log: bool, other: int) -> Tensor:
+    """``[runs, N]``: of the picture at dial value 1 and another one, and what the count law adds, by ``x``."""
+    settings, n, total, pull = CONFIG.attenuation(1.0), len(task.start), torch.zeros(()), torch.zeros_like(x)
+    leaf = x.requires_grad_()
+    sigma = (leaf.exp() if log else leaf).flatten()
+    logits, distances = task.logits.repeat(len(x)), task.distances.repeat(len(x))
+    for k in (0, other):
+        s = DIALS[k]
+        dialled = attenuate(logits, sigma, distances, s, settings)
+        losses = (dialled.drawn.view(-1, n) - task.wanted[k]).square().mean(1)
+        weight = (1 - CONFIG.weight_slope * s / CONFIG.max_sv) ** 2
+        total = total + weight * losses.sum()
+        for run, loss in enumerate((weight * losses.detach()).tolist()):
+            own = Attenuated(*(value[run * n : (run + 1) * n] for value in dialled))
+            pull[run] += count_gradient(own, task.logits, s, settings.tau, loss, CONFIG)
+    (gradient,) = torch.autograd.grad(total, leaf)
+    return gradient + (pull if log else pull / x.detach())
+
+
+def _curves(rows: list[dict[str, Any]], timed: bool) -> dict[tuple[str, str], list[dict[str, Any]]]:
+    """By optimiser and parameter: errors by step size, or, timed, by seconds at the best of them."""
+    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        if row["what"] == "equation" and ("seconds" in row) == timed:
+            found.setdefault((row["optimizer"], row["parameter"]), []).append(row)
+    return found
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    (start,) = (row["error"] for row in rows if row["what"] == "start")
+    enough, timed = CONVERGED * start, _curves(rows, True)
+    lines = ["| optimiser | sigma_d | best error | at | step sizes that converge | seconds to it |"]
+    lines += ["|---|---|---|---|---|---|"]
+    for key, own in _curves(rows, False).items():
+        best = min(own, key=lambda row: row["error"])
+        good = [row["rate"] for row in own if row["error"] <= enough]
+        span = _span(good)
+        first = next((f"{row['seconds']:.2f}" for row in timed[key] if row["error"] <= enough), "")
+        lines.append(f"| {key[0]} | {key[1]} | {best['error']:.3f} | {best['rate']:.2g} | {span} | {first} |")
+    lines += ["", f"| who cannot come back | at the start | after {STUCK_STEPS} steps |", "|---|---|---|"]
+    for row in rows:
+        if row["what"] == "stuck":
+            lines.append(f"| {row['method']} | {row['start']} of {row['of']} | {row['end']} |")
+    ends = {row["from"]: row for row in rows if row["what"] == "training"}
+    low, right = ends["too small"], ends["right"]
+    near = {row["parameter"]: _span(row["rates"]) for row in rows if row["what"] == "near"}
+    table = "\n".join(lines)
+    return f"""### Stiffness
+
+Right values of `sigma_d` over eight decades, starts wrong by up to four each way, {STEPS} steps, the schedule of
+training. The error is the RMS of the opacity that is drawn, {start:.2f} at the start; converged is below a quarter of
+that. Seconds are of the shortest of {", ".join(map(str, LENGTHS))} steps that does, at the best step size
+(`benchmarks/stability_stiffness.py`).
+
+{table}
+
+![Error by step size, and by seconds](images/{PICTURE})
+
+The parameter decides, not the optimiser: a step that suits one linear sigma is eight decades off for another, so none
+converges. With the logarithm the default and Adam's kin do over the same, widest range; smaller steps cannot walk four
+decades in the time. Steps that scale with the gradient (SGD) or only shrink (Adagrad) fall behind. From starts at most
+one decade wrong the default converges at step sizes {near["log"]}, with a linear sigma: {near["linear"]}.
+
+Who has faded out at every dial value gets no gradient from any picture; the count law, which works both ways, calls
+them back. Started ten thousand times too small throughout, {TRAINING_STEPS} steps of the training itself with its
+defaults bring the objective from {low["before"]:.3f} to {low["after"]:.3f}; from the right start it comes to
+{right["after"]:.3f}."""
+
+
+def _span(rates: list[float]) -> str:
+    return "none" if not rates else f"{rates[0]:.2g}" if len(rates) == 1 else f"{rates[0]:.2g} to {rates[-1]:.2g}"
+
+
+def plot(rows: list[dict[str, Any]], folder: Path) -> None:
+    """Error by step size on the left, by seconds at the best step size on the right; dashes for linear sigma."""
+    (start,) = (row["error"] for row in rows if row["what"] == "start")
+    with new_figure((10.4, 4.6), layout="constrained") as figure:
+        panels = figure.subplots(1, 2, sharey=True)
+        for axes, timed, along in zip(panels, (False, True), ("rate", "seconds"), strict=True):
+            for (optimizer, parameter), own in _curves(rows, timed).items():
+                ours = (optimizer, parameter) == ("RowAdam", "log")
+                axes.plot(
+                    [row[along] for row in own], [row["error"] for row in own], color=OPTIMIZERS[optimizer][1],
+                    linestyle="-" if parameter == "log" else ":", linewidth=2.6 if ours else 1.3, marker="o",
+                    markersize=3.5 if parameter == "log" else 0, zorder=3 if ours else 2,
+                    label=optimizer + (" (default)" if ours else "") if parameter == "log" else None,
+                )  # fmt: skip
+            for y, text in ((start, "start"), (CONVERGED * start, "converged")):
+                axes.axhline(y, color=QUIET, linewidth=0.8, linestyle="--")
+                if not timed:
+                    axes.text(
+                        0.01, y * 0.97, text, transform=axes.get_yaxis_transform(), fontsize=8, color=QUIET, va="top"
+                    )
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            tidy(axes)
+        label_log(panels[0].yaxis, "{:g}")
+        label_log(panels[0].xaxis, "{:g}", subs=(1,))
+        label_log(panels[1].xaxis, "{:g}", subs=(1, 3))
+        panels[0].axvline(CONFIG.lr_sigma, color=BLUE, linewidth=0.8)
+        panels[0].text(CONFIG.lr_sigma * 0.9, 0.0125, "default\nstep size", fontsize=8, color=BLUE, ha="right")
+        panels[0].set_ylim(0.012, 0.6)
+        panels[0].set_ylabel("RMS error of the opacity that is drawn")
+        panels[0].set_xlabel(f"step size, {STEPS} steps")
+        panels[1].set_xlabel(f"seconds of training, {LENGTHS[0]} to {LENGTHS[-1]} steps at the best step size")
+        panels[0].plot([], [], color=INK, linestyle="-", marker="o", markersize=3.5, label="log sigma_d")
+        panels[0].plot([], [], color=INK, linestyle=":", label="linear sigma_d")
+        figure.legend(
+            *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False, fontsize=8.5
+        )
+        save(figure, folder / PICTURE)
+
+
+if __name__ == "__main__":
+    main()
