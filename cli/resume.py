@@ -67,19 +67,17 @@ class Saver:
         self.belongs |= {"base_sha256": fingerprint, "views_sha256": scene_fingerprint(scene)}
         if self.state is None:
             return
-        for key, what in {
-            "base_sha256": f"checkpoint than {path}",
-            "views_sha256": f"photographs than {source}",
-        }.items():
+        whats = {"base_sha256": f"another checkpoint than {path}", "views_sha256": f"other photographs than {source}"}
+        for key, what in whats.items():
             if self.found.get(key) != self.belongs[key]:
-                raise ClodError(f"{self.path}: is of another {what}; give what it was begun with, or another --out")
+                raise ClodError(f"{self.path}: is of {what}; give what it was begun with, or start without --resume")
         self.console.say(f"resuming {self.path} from step {self.state.steps}")
 
     def _refuse_other_settings(self) -> None:
-        now, then = self.belongs["config"], self.found.get("config")
         begun = "give what it was begun with, or start without --resume"
-        if self.found.get("version") != self.belongs["version"]:
-            raise ClodError(f"{self.path}: is of version {self.found.get('version')} of this package; {begun}")
+        if (then := self.found.get("version")) != (now := self.belongs["version"]):
+            raise ClodError(f"{self.path}: is of version {then} of this package, not {now}; start without --resume")
+        now, then = self.belongs["config"], self.found.get("config")
         if not isinstance(then, dict) or then.keys() != now.keys():
             raise ClodError(f"{self.path}: is of other settings; {begun}")
         different = [name for name in now if now[name] != then[name]]

@@ -24,6 +24,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.colmap import write_model
 from clod_adapter.train import Progress
+from scenes import stripped
 
 THREE = ["dial.json", "dial.ply", "dial.safetensors"]
 STATE = "dial.resume.safetensors"
@@ -147,14 +148,6 @@ def test_same_seed_same_files(clod: Any, capture: Any, tmp_path: Path) -> None:
         files.append([(tmp_path / name).read_bytes() for name in THREE[1:]])
     first, second, other = ([stripped(data) for data in pair] for pair in files)
     assert first == second and first[0] != other[0]
-
-
-def stripped(data: bytes) -> bytes:
-    """A file without its calibration's times, the one thing in it that a seed does not settle."""
-    if data.startswith(b"ply"):
-        return re.sub(rb"(?m)^(comment clod_adapter calibrated .*) \S+$", rb"\1", data)
-    text = re.sub(rb'\\"frame_ms\\": [0-9.e-]+', b"", data[8:])
-    return text.replace(b" ", b"")  # the header is padded with spaces to a whole number of words
 
 
 def test_reported_quality_is_that_of_the_file(clod: Any, capture: Any, tmp_path: Path) -> None:

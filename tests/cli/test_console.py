@@ -48,6 +48,14 @@ def test_lines_off_a_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: p
     ]
 
 
+def test_what_was_done_before_is_not_taken_for_speed(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clod_adapter.cli.console.time", SimpleNamespace(perf_counter=lambda: 10.0))
+    Meter(Console(), "training", began=0, printed=0, initial=0.5).update(0.6)
+    assert capsys.readouterr().err == "training  60%, 40 s left\n"
+
+
 def test_a_slow_meter_shows_from_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", terminal := Terminal())
     Meter(Console(), "compiling", slow=True).close()
