@@ -1,0 +1,65 @@
+"""What it costs to save the training's state now and then, and to resume from it.
+
+    python benchmarks/interruptions.py                       # plush_half, 300 steps
+    python benchmarks/interruptions.py bonsai146 --iters 1500
+
+An adaptation as ``clod-adapt`` runs it, with its saver: ``saving_share`` is the time spent in saving, of the time spent
+in training. The saves are flushed to the disk of ``--folder``. ``load_seconds`` is what reading the last state takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
+
+# isort: split
+import torch
+from common import append, capture
+
+from clod_adapter.cli.console import Console
+from clod_adapter.cli.interrupts import GracefulStop
+from clod_adapter.cli.resume import Saver
+from clod_adapter.io.state_file import load_state
+
+FILE = "resume.jsonl"
+THREADS = 2
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*", default=["plush_half"])
+    parser.add_argument("--iters", type=int, default=300)
+    parser.add_argument("--folder", help="where to save (default: a temporary folder)")
+    args = parser.parse_args()
+    torch.set_num_threads(THREADS)
+    for scene in args.scenes:
+        with tempfile.TemporaryDirectory(dir=args.folder) as folder:
+            measure(scene, clod.AdaptConfig(iters=args.iters), Path(folder) / "dial.resume.safetensors")
+
+
+def measure(scene: str, config: clod.AdaptConfig, path: Path) -> None:
+    base = clod.load(capture(scene) / "pretrained.ply")
+    photographs = clod.load_scene(capture(scene))
+    saver = Saver(path, False, config, Console(), GracefulStop())
+    began = time.perf_counter()
+    saver.belong((str(base.path), base.fingerprint), photographs, scene)
+    digest_seconds = time.perf_counter() - began
+    adapted = clod.adapt(base.gaussians, photographs, config, saver.watching(lambda progress: None))
+    began = time.perf_counter()
+    load_state(path)
+    append(FILE, {
+        "benchmark": "interruptions", "scene": scene, "threads": THREADS, "gaussians": len(base.gaussians),
+        "steps": adapted.steps, "start_seconds": round(adapted.start_seconds, 2),
+        "train_seconds": round(adapted.seconds, 2), "saves": saver.saves,
+        "saving_seconds": round(saver.seconds, 3), "saving_share": round(saver.seconds / adapted.seconds, 5),
+        "state_bytes": path.stat().st_size, "load_seconds": round(time.perf_counter() - began, 3),
+        "digest_seconds": round(digest_seconds, 3),
+    })  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
