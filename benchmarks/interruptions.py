@@ -46,7 +46,7 @@ def measure(scene: str, config: clod.AdaptConfig, path: Path) -> None:
     photographs = clod.load_scene(capture(scene))
     saver = Saver(path, False, config, Console(), GracefulStop())
     began = time.perf_counter()
-    saver.belong((str(base.path), base.fingerprint), photographs, scene)
+    saver.belong(base.gaussians, photographs, scene, scene)
     digest_seconds = time.perf_counter() - began
     adapted = clod.adapt(base.gaussians, photographs, config, saver.watching(lambda progress: None))
     began = time.perf_counter()

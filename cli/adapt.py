@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
                 gaussians, scene, args.ply, args.images, args.misaligned_ok, console
             )
         scene, config = complement_scene(gaussians, scene, config, console)
-    saver.belong((args.ply, base.fingerprint), scene, args.images or "those placed for it")
+    saver.belong(gaussians, scene, args.ply, args.images or "those placed for it")
     with watch.time("evaluate"):
         base_rows, notes = look_at_base(gaussians, scene, args, console)
     notes = [*warnings, *notes]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -14,6 +16,7 @@ from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.settings import OPTIONS
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import remove_leftovers
 from clod_adapter.io.state_file import load_state, save_state
 from clod_adapter.io.version import package_version
@@ -21,7 +24,7 @@ from clod_adapter.robustness import scene_fingerprint
 from clod_adapter.training_state import Progress, TrainingState
 
 SAVE_EVERY = 5.0  # seconds between saves, at least
-SAVE_COST = 0.015  # share of the time that they may take, at most
+SAVE_COST = 0.015  # share of the training that all of them may take; only the first is not asked
 
 
 class Saver:
@@ -42,33 +45,39 @@ class Saver:
         self.found: dict[str, Any] = {}
         self.state: TrainingState | None = None
         self.saved: int | None = None
-        self.seconds, self.saves, self.due, self.warned = 0.0, 0, 0.0, False
+        self.seconds, self.saves, self.warned = 0.0, 0, False
+        self.began, self.due = math.inf, 0.0
         remove_leftovers(path)
-        if resume and path.exists():
-            self.state, self.found = load_state(path)
-            self.saved = self.state.steps
-            self._refuse_other_settings()
+        if path.exists():
+            self._look(resume)
         elif resume:
             console.say(f"there is no {path} to resume from: starting from the beginning")
-        elif path.exists():
-            console.say(
-                f"{path} is there, of a run that was interrupted: --resume would go on with it; this run begins anew, "
-                "and replaces it once training has begun"
+
+    def _look(self, resume: bool) -> None:
+        """Reads the file that is there; also where it is only to be replaced, so that no other file ever is."""
+        state, found = load_state(self.path)
+        if resume:
+            self.state, self.found, self.saved = state, found, state.steps
+            self._refuse_other_settings()
+        else:
+            self.console.say(
+                f"{self.path} has step {state.steps} of a run that was interrupted, with which --resume would go on; "
+                "this run begins anew, and replaces it once its own training has begun"
             )
 
-    def belong(self, checkpoint: tuple[str, str], scene: Scene, source: str) -> None:
+    def belong(self, base: Gaussians, scene: Scene, checkpoint: str, source: str) -> None:
         """Says what the states to come belong to, and refuses the one found where it belongs to something else.
 
         Args:
-            checkpoint: its path and fingerprint.
-            source: of the views, for the message.
+            checkpoint, source: where ``base`` and the views are from, for the messages.
         """
-        path, fingerprint = checkpoint
-        self.belongs |= {"base_sha256": fingerprint, "views_sha256": scene_fingerprint(scene)}
+        self.belongs |= {"base_sha256": _fingerprint(base), "views_sha256": scene_fingerprint(scene)}
         if self.state is None:
             return
-        whats = {"base_sha256": f"another checkpoint than {path}", "views_sha256": f"other photographs than {source}"}
-        for key, what in whats.items():
+        for key, what in (
+            ("base_sha256", f"another checkpoint than {checkpoint}"),
+            ("views_sha256", f"other photographs than {source}"),
+        ):
             if self.found.get(key) != self.belongs[key]:
                 raise ClodError(f"{self.path}: is of {what}; give what it was begun with, or start without --resume")
         self.console.say(f"resuming {self.path} from step {self.state.steps}")
@@ -81,7 +90,7 @@ class Saver:
         if not isinstance(then, dict) or then.keys() != now.keys():
             raise ClodError(f"{self.path}: is of other settings; {begun}")
         different = [name for name in now if now[name] != then[name]]
-        options = [f"--{name.replace('_', '-')} {then[name]}" for name in different if name in OPTIONS]
+        options = [_as_option(name, then[name]) for name in different if name in OPTIONS]
         if options or different:
             what = ", ".join(options) or f"another --form ({different[0]} {then[different[0]]})"
             raise ClodError(f"{self.path}: is of a run with {what}; {begun}")
@@ -106,16 +115,18 @@ class Saver:
         if progress.state is None:
             return
         began = time.perf_counter()
+        self.began = min(self.began, began)
         try:
             save_state(self.path, progress.state(), self.belongs)
             self.saved = progress.done
-        except ClodError as error:
+        except (ClodError, MemoryError) as error:
             if not self.warned:
                 self.console.say(f"warning: training goes on, but --resume will not know of it: {error}")
             self.warned = True
-        ended = time.perf_counter()
-        self.seconds, self.saves = self.seconds + ended - began, self.saves + 1
-        self.due = ended + max(SAVE_EVERY, (ended - began) / SAVE_COST)
+        now = time.perf_counter()
+        cost = now - began
+        self.seconds, self.saves = self.seconds + cost, self.saves + 1
+        self.due = max(now + SAVE_EVERY, self.began + (self.seconds + cost) / SAVE_COST)
 
     def close(self, finished: bool) -> None:
         """Removes this run's file, or says what it is for; one of another run that it has not replaced stays."""
@@ -125,3 +136,17 @@ class Saver:
             self.path.unlink(missing_ok=True)
         else:
             self.console.say(f"--resume goes on from step {self.saved}, which is in {self.path}")
+
+
+def _as_option(name: str, value: object) -> str:
+    option = f"--{name.replace('_', '-')}"
+    return f"no {option}" if value is None else f"{option} {value}"
+
+
+def _fingerprint(gaussians: Gaussians) -> str:
+    """SHA-256, hex, of the Gaussians as they were read, which the options of reading have a part in."""
+    digest = hashlib.sha256(repr(gaussians.attenuation).encode())
+    for name, tensor in gaussians.tensors().items():
+        digest.update(f"{name} {tuple(tensor.shape)};".encode())
+        digest.update(tensor.detach().cpu().contiguous().flatten().numpy().data)
+    return digest.hexdigest()

@@ -49,6 +49,9 @@ from clod_adapter.cli.kernels import prepare_kernels
 prepare_kernels(Console(quiet=True))
 print("ready", flush=True)
 for line in sys.stdin:
+    if line == "ended\\n":
+        print(int(os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None), flush=True)
+        continue
     if line == "wait\\n":
         print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
         continue
@@ -61,7 +64,7 @@ for line in sys.stdin:
             os.dup2(log, stream)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         torch.set_num_threads(2)
-        resume.SAVE_EVERY, resume.SAVE_COST = 0.0, 1.0  # so that kills find states of many ages
+        resume.SAVE_EVERY, resume.SAVE_COST = 0.0, 1e9  # so that kills find states of many ages
         code = main.main(words)
         sys.stdout.flush()
         os._exit(code)
@@ -85,6 +88,9 @@ class Server:
     def wait(self) -> int:
         """The exit code; of a killed one the signal, negative."""
         return int(self._ask("wait"))
+
+    def ended(self) -> bool:
+        return self._ask("ended") == "1"
 
     def run(self, folder: Path, *words: object) -> tuple[int, str]:
         """Exit code and output."""
@@ -160,6 +166,7 @@ def assert_same(folder: Path, want: Path) -> None:
     assert found["steps"] == ITERS and not found["interrupted"]
 
 
+@pytest.mark.timeout(300)
 def test_kills_at_random_moments(
     server: Server, words: list[Any], capture: Any, undisturbed: tuple[Path, float], tmp_path: Path
 ) -> None:
@@ -175,7 +182,11 @@ def test_kills_at_random_moments(
         while code != 0:
             child = server.start(folder, *words, "--resume")
             if kills < KILLS:
-                time.sleep(draw.uniform(0, seconds))
+                began, after = time.monotonic(), draw.uniform(0, seconds)
+                while (lived := time.monotonic() - began) < after and not server.ended():
+                    time.sleep(0.002)
+                if server.ended():  # the machine is faster than it was when the run was timed
+                    seconds = (seconds + lived) / 2
                 os.kill(child, signal.SIGKILL)
             code = server.wait()
             assert code in (0, -signal.SIGKILL), log_of(folder)
@@ -277,7 +288,7 @@ def broken_off(clod: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None
     ("changes", "message"),
     [
         (("--iters", 13), "is of a run with --iters 12; give what it was begun with"),
-        (("--seed", 5, "--time-budget", 9), "is of a run with --time-budget None, --seed 0; give"),
+        (("--seed", 5, "--time-budget", 9), "is of a run with no --time-budget, --seed 0; give"),
         (("--form", "paper"), "is of a run with another --form"),
     ],
 )
@@ -319,8 +330,25 @@ def test_other_inputs_are_refused(
         done.code == 2 and f"error: {STATE}: is of version {package_version()} of this package, not 0.0.7" in done.err
     )
     (tmp_path / STATE).write_bytes(state[:-9])
+    for words in ([], ["--resume"]):  # what is no state, an adapter say, is not replaced either
+        done = clod(capture.ply, "--images", capture.scene, *TINY, *words)
+        assert done.code == 2 and f"error: {STATE}: is no training state or damaged" in done.err
+
+
+def test_the_same_gaussians_in_another_file(clod: Any, capture: Any, tmp_path: Path, broken_off: Any) -> None:
+    """And the same photographs in another folder: what they are counts, not where they are."""
+    broken_off(capture.ply, "--images", capture.scene, *TINY)
+    shutil.copy(capture.ply, tmp_path / "moved.ply")
+    shutil.copytree(capture.scene, tmp_path / "moved")
+    done = clod("moved.ply", "--images", "moved", *TINY, "--resume")
+    assert done.code == 0 and f"resuming {STATE} from step 1" in done.err, done
+
+
+def test_a_read_only_folder(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere, so chmod proves nothing
+    monkeypatch.setattr(adapt_command, "read_checkpoint", lambda *_: pytest.fail("read"))
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--resume")
-    assert done.code == 2 and f"error: {STATE}: is no training state or damaged" in done.err
+    assert done.code == 2 and "is not writable" in done.err and done.err.count("\n") == 1 and names(tmp_path) == []
 
 
 def test_nothing_to_resume_from(clod: Any, capture: Any, tmp_path: Path) -> None:
@@ -340,7 +368,7 @@ def test_without_resume_a_state_is_replaced_only_by_the_next(
         adapt_command, "look_at_base", lambda *a: seen.append((tmp_path / STATE).read_bytes()) or look(*a)
     )
     done = clod(*words, "--seed", 4)
-    assert done.code == 0 and "--resume would go on with it" in done.err and seen == [before]
+    assert done.code == 0 and f"{STATE} has step 1 of a run that was interrupted" in done.err and seen == [before]
     assert names(tmp_path) == OUTPUTS
 
 
@@ -377,7 +405,7 @@ def test_resuming_without_photographs(
 
 
 def test_saves_take_their_share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After the first step, then so rarely that saves of a tenth of a second take less than 2 % of the time."""
+    """After the first step, then as often as saves of a tenth of a second take no more than 1.5 % of the time."""
     clock, saved = [0.0], []
     monkeypatch.setattr(resume.time, "perf_counter", lambda: clock[0])
 
@@ -391,7 +419,7 @@ def test_saves_take_their_share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     for step in range(1, 601):
         clock[0] += 0.1
         follow(Progress("train", step, 600, clock[0], step / 600, 0.1, lambda: None, lambda step=step: step))
-    assert saved[0] == 1 and 0.01 < saver.seconds / clock[0] < 0.02 and saver.saves == len(saved) > 5
+    assert saved[0] == 1 and 0.012 < saver.seconds / clock[0] <= 0.015 and saver.saves == len(saved) > 5
 
 
 def test_sigterm_before_training(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
