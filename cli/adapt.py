@@ -51,15 +51,13 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         scene = photographs or place_scene(gaussians, config.seed, console)
     alignment, warnings = None, list[str]()
     if photographs:
-        with watch.time("align"):
-            alignment, warnings = require_alignment(
-                gaussians, scene, args.ply, args.images, args.misaligned_ok, console
-            )
+        with watch.time("evaluate"):
+            alignment, warnings = require_alignment(gaussians, scene, args.ply, args, console)
         scene, config = complement_scene(gaussians, scene, config, console)
     saver.belong(gaussians, scene, args.ply, args.images or "those placed for it")
     with watch.time("evaluate"):
         base_rows, notes = look_at_base(gaussians, scene, args, console)
-    notes = [*warnings, *notes]
+        notes = [*warnings, *notes]
     with stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
         page = AdaptPage(gaussians, scene, config, console) if args.report else None
         follower = Follower(console, stop, gaussians, scene.test, config.max_sv, base_rows[0] if base_rows else None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,16 +17,21 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.colmap import load_points
 
+OTHER_COLOURS = (
+    "warning: {ply} shows the photographs in {images}, but some are farther from it than from their own mean colours: "
+    "another exposure, views that it does not cover, or a poor checkpoint?"
+)
+
 
 def require_alignment(
-    base: Gaussians, scene: Scene, ply: str, images: str, allowed: bool, console: Console
+    base: Gaussians, scene: Scene, ply: str, args: argparse.Namespace, console: Console
 ) -> tuple[dict[str, Any], list[str]]:
     """The numbers of ``check_alignment`` and the ``guess``, for the report, and a note where the file does not fit.
 
     Where the file fits poorly, or not at all, other frames are tried on it, which takes some seconds.
 
     Raises:
-        ClodError: it does not fit, or clearly better in another frame; not where that is ``allowed``.
+        ClodError: it does not fit, or clearly better in another frame; not with --misaligned-ok.
     """
     views = [*scene.test, *scene.train]
     with console.status("comparing the checkpoint with the photographs ..."):
@@ -33,12 +39,15 @@ def require_alignment(
     guess = None
     if not found.on_white and (not found.fits or found.margin < DOUBTFUL):
         with console.status("the checkpoint fits poorly: trying other frames ..."):
-            guess = guess_frame(base, views, found, load_points(images))
+            guess = guess_frame(base, views, found, load_points(args.images))
     numbers = found.as_dict() | {"guess": guess and guess.says}
     if found.fits and guess is None:
-        return numbers, []
-    message = f"{ply}: does not fit {images}: {describe(base, views, found, guess)}"
-    if not allowed:
+        notes = [OTHER_COLOURS.format(ply=ply, images=args.images)] if found.margin < 0 else []
+        for note in notes:
+            console.say(note)
+        return numbers, notes
+    message = f"{ply}: does not fit {args.images}: {describe(base, views, found, guess)}"
+    if not args.misaligned_ok:
         raise ClodError(f"{message}; --misaligned-ok trains regardless")
     console.say(f"warning: {message}")
     return numbers, [f"warning: {message}"]

@@ -47,11 +47,11 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     if missing:
         with watch.time("kernels"):
             prepare_kernels(console)
-        with watch.time("align"):
+        with watch.time("evaluate"):
             for path, label in zip(args.ply, labels(args.ply), strict=True):
                 base = next((cell.checkpoint.gaussians for cell in missing if cell.label == label), None)
                 if base is not None:
-                    require_alignment(base, scene, path, args.images, args.misaligned_ok, console)
+                    require_alignment(base, scene, path, args, console)
     make_folder(folder)  # only now: what cannot be read, or does not fit, leaves none behind
     make_folder(folder / "cells")
     for path in outputs.values():

@@ -30,15 +30,16 @@ from clod_adapter.importance import spread
 from clod_adapter.render import render
 
 MOST_VIEWS = 8
-# Photographs that vary by less, root mean square, are one colour for all that can be said: half of 8-bit's noise.
+# Photographs that vary by less, root mean square, are one colour but for noise and rounding.
 FLAT = 2 / 255
-# Of a checkpoint that fits its photographs a third to all of it is in sight of eight of them; of a large capture given
-# a part of its cameras much less. Only decides where the photographs are flat.
+# Of a fitting file nine tenths and more are in sight of eight photographs, of a large one given a part of its cameras
+# much less; so this decides only where all photographs are flat.
 FEWEST_IN_VIEW = 0.01
-# Of misaligned files it was at most 0.49, of those that fit at least 0.87 (benchmarks/alignment.py).
-CORRELATED = 0.7
+# Of files that are far from their place at most 0.39, of those that a pixel or two are missing 0.43 and more: a guess
+# tells these. Of fitting ones 0.91 and more, with half of their Gaussians left out 0.67 (benchmarks/alignment.py).
+CORRELATED = 0.5
 CLEAR = 3.0  # dB by which another explanation must be better than the present one
-DOUBTFUL = 6.0  # dB over the mean colours below which another frame may be the reason; fitting files had 9 to 17
+DOUBTFUL = 6.0  # dB over the mean colours below which another frame may be the reason; fitting files had 8 to 18
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Alignment:
     Attributes:
         views: compared; those whose photograph is one colour are not.
         in_view: share of the Gaussians whose centre projects into any of the views, in [0, 1].
-        psnr: of the renders; NaN, like the next three, where no view was compared.
+        psnr: of the renders; NaN, like the next four, where no view was compared.
         mean_colour_psnr: of each photograph's own mean colour.
         white_psnr: of the renders over white.
         correlation: of renders and photographs, each less its own mean colour, in [-1, 1].
@@ -65,10 +66,15 @@ class Alignment:
 
     @property
     def fits(self) -> bool:
-        """Whether anything speaks for a common frame; of flat photographs, that some Gaussians are in sight."""
+        """Whether something speaks for a common frame, and nothing for a white background.
+
+        Of flat photographs, whether FEWEST_IN_VIEW are in sight; of others a black picture is never better than the
+        mean colour, so that a file with nothing in sight does not fit.
+        """
         if not self.views:
             return self.in_view >= FEWEST_IN_VIEW
-        return self.margin > 0 or self.explained >= 0.5 or self.correlation >= CORRELATED
+        shown = self.margin > 0 or self.explained >= 0.5 or self.correlation >= CORRELATED
+        return shown and not self.on_white
 
     @property
     def margin(self) -> float:
@@ -77,11 +83,11 @@ class Alignment:
 
     @property
     def on_white(self) -> bool:
-        """Whether they do not fit over black, and over white do."""
-        return not self.fits and self.white_psnr > self.mean_colour_psnr and self.white_psnr > self.psnr + CLEAR
+        """Whether the renders are worse than the mean colours over black, and better over white."""
+        return self.margin < 0 < self.white_psnr - self.mean_colour_psnr and self.white_psnr > self.psnr + CLEAR
 
     def as_dict(self) -> dict[str, float]:
-        """By name; what was not measured, or is infinite, is None in JSON."""
+        """By name."""
         return asdict(self)
 
 

@@ -12,7 +12,7 @@ from clod_adapter.budget import dial_for
 from clod_adapter.cameras import Camera, View
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.importance import removal_error, spread
+from clod_adapter.importance import MOST_VIEWS, removal_error, spread
 from clod_adapter.render import dial
 
 
@@ -43,7 +43,7 @@ def rankings(
     Args:
         progress: called with (views done, views in all).
     """
-    removal = removal_error(base, spread(views), progress=progress)
+    removal = removal_error(base, spread(views, MOST_VIEWS), progress=progress)
     return {"opacity": by_opacity(base), "removal error": removal.argsort(descending=True, stable=True)}
 
 

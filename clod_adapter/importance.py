@@ -47,7 +47,7 @@ def start(
     """
     if base.sigma_d is not None and base.attenuation is not None and bool((base.sigma_d < SIGMA_MAX).any()):
         return base.replace(attenuation=dataclasses.replace(base.attenuation, max_sv=config.max_sv))
-    views = spread(views)
+    views = spread(views, MOST_VIEWS)
     attenuation = config.attenuation(scene_distance(base, views, config.quantile))
     if config.start in ("constant", "identity"):
         value = 1.0 if config.start == "constant" else WIDEST * config.max_sv
@@ -103,7 +103,7 @@ def fitting_tau(opacities: Tensor, error: Tensor, config: AdaptConfig) -> float:
     return max(min(config.tau, faint / FADING, opaque / FADING), TAU_MIN)
 
 
-def spread(views: Sequence[T], most: int = MOST_VIEWS) -> Sequence[T]:
+def spread(views: Sequence[T], most: int) -> Sequence[T]:
     """At most ``most`` of the views, evenly spread."""
     return [views[k * len(views) // most] for k in range(most)] if len(views) > most else views
 

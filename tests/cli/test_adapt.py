@@ -314,12 +314,6 @@ def test_an_unusable_config_fails_before_the_work(clod: Any, capture: Any, monke
     assert done.code == 2 and "not plain JSON" in done.err
 
 
-def test_a_base_of_another_place_is_noticed(clod: Any, capture: Any, tmp_path: Path) -> None:
-    moved = capture.gaussians.replace(means=capture.gaussians.means + 100)
-    done = clod(capture.write(tmp_path / "moved.ply", moved), "--images", capture.scene, *TINY)
-    assert done.code == 0 and "in other coordinates" in done.err
-
-
 def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -> None:
     view = clod_adapter.load_scene(capture.scene).train[0]
     (tmp_path / "one" / "images").mkdir(parents=True)
