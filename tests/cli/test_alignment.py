@@ -10,6 +10,9 @@ import pytest
 import torch
 from PIL import Image, ImageOps
 
+from clod_adapter.io.colmap import load_scene
+from clod_adapter.render import render
+
 FAST = ("--iters", 1, "--max-sv", 4)
 
 
@@ -57,11 +60,6 @@ def test_a_base_that_fits_says_nothing(clod: Any, capture: Any) -> None:
     assert report["notes"] == [] and report["alignment"]["guess"] is None and report["alignment"]["explained"] == 1
 
 
-def test_without_photographs_there_is_nothing_to_compare(clod: Any, capture: Any) -> None:
-    done = clod(capture.ply, *FAST, "--json")
-    assert done.code == 0 and json.loads(done.out)["alignment"] is None, done
-
-
 def test_far_away_with_where_both_are(clod: Any, capture: Any, tmp_path: Path) -> None:
     random = torch.Generator().manual_seed(2)
     lost = capture.gaussians.replace(
@@ -75,9 +73,6 @@ def test_far_away_with_where_both_are(clod: Any, capture: Any, tmp_path: Path) -
 def test_a_white_background_is_named(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few = capture.gaussians.select(torch.arange(300) < 40)  # so that there is a background
     ply = capture.write(tmp_path / "few.ply", few)
-    from clod_adapter.io.colmap import load_scene
-    from clod_adapter.render import render
-
     scene = scene_of(capture, tmp_path, lambda image: image)
     loaded = load_scene(capture.scene)
     for view in (*loaded.train, *loaded.test):
