@@ -77,6 +77,8 @@ def load_adapter(path: str | Path) -> Adapter:
         for name in ("base_sha256", "package_version"):
             if not isinstance(about[name], str):
                 raise TypeError(f"{name} is {about[name]!r}, not a string")
+        if not isinstance(about["config"], dict):
+            raise TypeError(f"config is {about['config']!r:.40}, not an object")
         return Adapter(
             sigma_d=tensors.pop("sigma_d"),
             attenuation=AttenuationConfig(**about["attenuation"]),
@@ -86,7 +88,7 @@ def load_adapter(path: str | Path) -> Adapter:
             version=about["package_version"],
             calibration=Calibration.from_dict(about["calibration"]) if "calibration" in about else None,
         )
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ClodError(f"{path}: its description is damaged ({error!r}); copy or export the adapter again") from error
     except ClodError as error:
         raise ClodError(f"{path}: {error}") from error

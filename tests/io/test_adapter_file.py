@@ -119,6 +119,7 @@ def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject) 
         ({"attenuation": {"tau": 2.0}}, "tau is 2.0"),
         ({"attenuation": {"new_field": 1}}, "new_field"),
         ({"attenuation": 3}, "description is damaged"),
+        ({"config": [1]}, "config is .1., not an object"),
     ],
 )
 def test_other_descriptions(tmp_path: Path, change: dict[str, object], message: str) -> None:
@@ -150,3 +151,30 @@ def test_other_tensors(tmp_path: Path) -> None:
     save_file(tensors, tmp_path / "b", metadata)
     with pytest.raises(ClodError, match="sigma_d"):
         load_adapter(tmp_path / "b")
+
+
+def write_raw(path: Path, header: str, data: bytes = b"") -> Path:
+    path.write_bytes(len(header.encode()).to_bytes(8, "little") + header.encode() + data)
+    return path
+
+
+def test_descriptions_made_to_break_the_reader(tmp_path: Path) -> None:
+    for text in ("[" * 100_000, '{"format": ' * 50_000, "1" * 10_000, "nul", '"\\ud800"'):
+        path = write_raw(tmp_path / "a", json.dumps({"__metadata__": {"clod_adapter": text}}))
+        with pytest.raises(ClodError, match="description is damaged"):
+            load_adapter(path)
+    odd = {"sigma_d": {"dtype": "a\nb\x1b[2J", "shape": [1], "data_offsets": [0, 4]}}
+    with pytest.raises(ClodError) as caught:
+        load_adapter(write_raw(tmp_path / "a", json.dumps(odd), bytes(4)))
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize("count", [1 << 31, 1 << 62, -1])
+def test_tensors_that_are_not_there_take_no_memory(tmp_path: Path, count: int) -> None:
+    about = {"dtype": "F32", "shape": [count], "data_offsets": [0, 4 * count]}
+    path = write_raw(tmp_path / "a", json.dumps({"sigma_d": about}), bytes(64))
+    with pytest.raises(ClodError, match="damaged"):
+        load_adapter(path)
+    path.write_bytes(count.to_bytes(8, "little", signed=count < 0) + bytes(64))  # a header of that length
+    with pytest.raises(ClodError, match="damaged"):
+        load_adapter(path)
