@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.colmap_records import check_records
+from clod_adapter.io.colmap_records import check_name, check_records
 from clod_adapter.io.posed import PosedImage, check_posed
 
 
@@ -23,6 +23,8 @@ def read_model(model: Path) -> tuple[list[PosedImage], list[str]]:
     try:
         reconstruction = pycolmap.Reconstruction(str(model))
         images = sorted(reconstruction.images.values(), key=lambda image: image.name)
+        for image in images:
+            check_name(model, image.name)
         posed = [_posed_image(model, image) for image in images if image.has_pose]
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -34,6 +34,17 @@ def check_records(model: Path) -> None:
             raise ClodError(f"{path}: is truncated or damaged; copy or export the model again")
 
 
+def check_name(model: Path, name: str) -> None:
+    """Refuses an image name that no file can have, or that is not safe to print.
+
+    Raises:
+        ClodError: it holds control characters, or is longer than file systems allow.
+    """
+    parts = name.encode(errors="surrogatepass").replace(b"\\", b"/").split(b"/")
+    if not name.isprintable() or len(name) > 4000 or max(map(len, parts)) > 255:
+        raise ClodError(f"{model}: image name {name[:40]!r} ({len(name)} characters) is no file's name; rename it")
+
+
 def _count(data: bytes, at: int) -> int:
     return struct.unpack_from("<Q", data, at)[0]
 
