@@ -15,10 +15,15 @@ from clod_adapter.calibration import Calibration
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, read_table, sh_degree_of
-from clod_adapter.io.ply_header import all_comments, read_attenuation, read_calibration, read_header, write_comments
-
-NORMALS = ("nx", "ny", "nz")
+from clod_adapter.io.ply_body import read_vertex
+from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, inria_dtype, read_table, sh_degree_of
+from clod_adapter.io.ply_header import (
+    all_comments,
+    read_attenuation,
+    read_calibration,
+    read_head,
+    write_comments,
+)
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,7 @@ class Checkpoint:
 
 
 def load(path: str | Path) -> Checkpoint:
-    """Reads a checkpoint of plain Gaussians, in Inria's, MaskGaussian's or our extended layout.
+    """Reads a checkpoint of plain Gaussians, in Inria's, MaskGaussian or our extended layout.
 
     Any property order, byte order or ascii, with or without normals, SH degree 0 to 4. Rows with a
     value that is not finite in a used column, or with a zero rotation, are dropped and counted in
@@ -54,27 +59,25 @@ def load(path: str | Path) -> Checkpoint:
     (``masks_0, masks_1``) rows with existence probability sigmoid(masks_0 - masks_1) < 0.5 go too.
 
     Raises:
-        ClodError: not a PLY, damaged, another kind of PLY, or nothing usable in it.
+        ClodError: not a checkpoint, damaged, of another kind, or nothing usable in it.
     """
     path = Path(path)
-    header = read_header(path)
-    columns = column_map(sh_degree_of(path, header))
-    vertex = _read_vertex(path)
+    vertex, sh_degree, comments, others = _read_rows(path)
+    columns = column_map(sh_degree)
     names = [name for group in columns.values() for name in group]
     extras = [name for name in (SIGMA, *MASKS) if name in (vertex.dtype.names or ())]
     table = read_table(vertex, names + extras)
     keep, notes = _usable_rows(path, table, names + extras)
     if not keep.all():
         vertex, table = vertex[keep], table[keep]
-    gaussians = _gaussians(table, columns)
-    comments, calibration = all_comments(header), None
+    gaussians, calibration = _gaussians(table, columns), None
     if SIGMA in extras:
         attenuation, remarks = read_attenuation(path, comments)
         sigma_d = torch.from_numpy(table[:, len(names)].copy())
         gaussians = gaussians.replace(sigma_d=sigma_d, attenuation=attenuation)
         calibration, doubts = read_calibration(comments, len(gaussians))
         notes += remarks + doubts
-    return Checkpoint(gaussians, vertex, comments, (*notes, *_not_kept(header)), _sha256(path), path, calibration)
+    return Checkpoint(gaussians, vertex, comments, (*notes, *others), _sha256(path), path, calibration)
 
 
 def save(
@@ -121,24 +124,15 @@ def save(
 def blank(count: int, sh_degree: int) -> Checkpoint:
     """A base of zeros in Inria's layout (normals included), for Gaussians that come from no file."""
     groups = column_map(sh_degree)
-    order = ("means", None, "sh0", "shN", "opacity_logits", "log_scales", "quats")
-    names = [name for attribute in order for name in (_in_file_order(groups[attribute]) if attribute else NORMALS)]
-    vertex = np.zeros(count, [(name, "f4") for name in names])
+    vertex = np.zeros(count, inria_dtype(sh_degree))
     return Checkpoint(_gaussians(read_table(vertex, sum(groups.values(), ())), groups), vertex, (), (), "", Path())
 
 
-def _in_file_order(group: tuple[str, ...]) -> list[str]:
-    """f_rest_0, f_rest_1, ...: the column map lists them by coefficient."""
-    return sorted(group, key=lambda name: int(name.rsplit("_", 1)[1])) if group and "_" in group[0] else list(group)
-
-
-def _read_vertex(path: Path) -> np.ndarray:
-    try:
-        with np.errstate(over="ignore"):
-            data = PlyData.read(str(path), mmap="r")["vertex"].data
-            return np.array(data, dtype=data.dtype.newbyteorder("="))  # a copy, so that the file is let go
-    except Exception as error:  # plyfile lets ValueError and more through, besides its own errors
-        raise ClodError(f"{path}: damaged or truncated ({error}); copy or export it again") from error
+def _read_rows(path: Path) -> tuple[np.ndarray, int, tuple[str, ...], list[str]]:
+    """The rows, their SH degree, the comments, and notes."""
+    head = read_head(path)
+    degree = sh_degree_of(path, head.ply)
+    return read_vertex(path, head), degree, all_comments(head.ply), _not_kept(head.ply)
 
 
 def _usable_rows(path: Path, table: np.ndarray, names: list[str]) -> tuple[np.ndarray, list[str]]:

@@ -50,12 +50,21 @@ def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
     }
 
 
+def inria_dtype(sh_degree: int) -> np.dtype:
+    """The rows of the file that Inria's trainer writes, normals included."""
+    groups = column_map(sh_degree)
+    rest = sorted(groups["shN"], key=lambda name: int(name.rsplit("_", 1)[1]))  # the map lists them by coefficient
+    names = [*groups["means"], "nx", "ny", "nz", *groups["sh0"], *rest]
+    names += [*groups["opacity_logits"], *groups["log_scales"], *groups["quats"]]
+    return np.dtype([(name, "f4") for name in names])
+
+
 def read_table(vertex: np.ndarray, names: Iterable[str]) -> np.ndarray:
     """``[N, P]`` float32 copy of the named columns; values beyond float32's range become infinite."""
     names = list(names)
     table = np.empty((len(vertex), len(names)), np.float32)
     rows = 4096  # a block of rows stays in cache while its columns are picked out, which is 8 times faster
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # invalid: a NaN that signals
         for start in range(0, len(vertex), rows):
             block = vertex[start : start + rows]
             for column, name in enumerate(names):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterable
-from dataclasses import astuple, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from plyfile import PlyData
 from clod_adapter.calibration import AGAINST, Calibration, CalibrationRow
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
+from clod_adapter.io.foreign import refuse
 from clod_adapter.io.version import package_version
 
 PREFIX = "clod_adapter "
@@ -23,32 +24,64 @@ MACHINE, EXTENT, ROW = "calibrated_on", "calibrated_with", "calibrated"
 _HEADER_LIMIT = 1 << 20  # bytes; a longer header is no header
 
 
+@dataclass(frozen=True)
+class Head:
+    """What stands before the data of a PLY.
+
+    Attributes:
+        ply: the elements, properties and comments; every element has 0 rows.
+        counts: the rows that the elements are said to have, in their order.
+        size: bytes; the data starts there.
+    """
+
+    ply: PlyData
+    counts: tuple[int, ...]
+    size: int
+
+
+def read_head(path: Path) -> Head:
+    """A look at a PLY before its data is read, which allocates nothing for it whatever it claims to hold.
+
+    Raises:
+        ClodError: the file cannot be read, is not a PLY, or its header is damaged or longer than 1 MB.
+    """
+    try:
+        if path.exists() and not path.is_file():  # a pipe would be waited for
+            raise ClodError(f"{path}: cannot be read (it is not a regular file); give the name of a file")
+        with open(path, "rb") as file:
+            start = file.read(_HEADER_LIMIT)
+    except (OSError, ValueError) as error:  # ValueError: a name that holds a NUL
+        raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
+    if not re.match(rb"ply\r?\n|ply\r", start):
+        refuse(path, start)
+    end = re.search(rb"[\r\n]end_header(\r?\n|\r)", start)
+    if end is None:
+        raise ClodError(f"{path}: the PLY header has no end, so the file is truncated; copy or export it again")
+    header = re.sub(rb"\r\n?", b"\n", start[: end.end()])
+    if re.search(rb"[^\t\n\x20-\x7e]", header):
+        raise ClodError(
+            f"{path}: the PLY header holds a character that is not printable ASCII; remove it from the comments"
+        )
+    counts = re.findall(rb"(?m)^[ \t]*element[ \t]+\S+[ \t]+(\d{1,18})[ \t]*$", header)
+    header = re.sub(rb"(?m)^([ \t]*element[ \t]+\S+[ \t]+)\d{1,18}[ \t]*$", rb"\g<1>0", header)
+    try:
+        ply = PlyData.read(io.BytesIO(header), mmap=False)
+    except Exception as error:  # plyfile lets ValueError and more through, besides its own errors
+        raise ClodError(f"{path}: the PLY header is damaged ({error}); export the file again") from error
+    if len(counts) != len(ply.elements):
+        raise ClodError(f"{path}: the PLY header is damaged (a count of rows is no number); export the file again")
+    return Head(ply, tuple(map(int, counts)), end.end())
+
+
 def read_header(path: Path) -> PlyData:
     """The elements, properties and comments of a PLY without its data; every element has 0 rows.
 
     A large mesh given by mistake is so refused at once instead of after minutes of parsing faces.
 
     Raises:
-        ClodError: the file cannot be read or is not a PLY.
+        ClodError: as ``read_head``.
     """
-    try:
-        with open(path, "rb") as file:
-            start = file.read(_HEADER_LIMIT)
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    if not re.match(rb"ply\r?\n|ply\r", start):
-        raise ClodError(f"{path}: is not a PLY file; convert it to a .ply in Inria's 3DGS layout first")
-    end = re.search(rb"[\r\n]end_header(\r?\n|\r)", start)
-    if end is None:
-        raise ClodError(f"{path}: the PLY header has no end, so the file is truncated; copy or export it again")
-    header = re.sub(rb"\r\n?", b"\n", start[: end.end()])
-    if not header.isascii():
-        raise ClodError(f"{path}: the PLY header holds a character that is not ASCII; remove it from the comments")
-    header = re.sub(rb"(?m)^([ \t]*element[ \t]+\S+[ \t]+)\d+", rb"\g<1>0", header)
-    try:
-        return PlyData.read(io.BytesIO(header), mmap=False)
-    except Exception as error:  # plyfile lets ValueError and more through, besides its own errors
-        raise ClodError(f"{path}: the PLY header is damaged ({error}); export the file again") from error
+    return read_head(path).ply
 
 
 def all_comments(ply: PlyData) -> tuple[str, ...]:

@@ -1,0 +1,69 @@
+"""Files that are no PLY: what they are, by their first bytes and their name, and what to do about them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NoReturn
+
+from clod_adapter.errors import ClodError
+
+_CONVERT = "convert it: splat-transform IN{suffix} OUT.ply; better still, adapt the PLY that it was made from"
+
+# What a file begins with (white space aside), what it then is whatever its name, and what to do.
+CONTENTS = (
+    (b"version https://git-lfs", "a Git LFS pointer, not the file it stands for", "fetch that: git lfs pull"),
+    (b"<!doctype html", "a web page, so a download went wrong", "download the file itself"),
+    (b"<html", "a web page, so a download went wrong", "download the file itself"),
+    (b"<?xml", "an XML document, perhaps an error that a server sent", "download the file itself"),
+)
+# The same by suffix, for formats that no first bytes tell apart.
+SUFFIXES = {
+    ".splat": ("a .splat file: 8-bit colours and rotations, no view-dependent colour", _CONVERT),
+    ".ksplat": ("a .ksplat file, compressed for a web viewer", _CONVERT),
+    ".spz": ("an SPZ file, compressed for delivery", _CONVERT),
+    ".sog": ("a SOG file, compressed for delivery", _CONVERT),
+    ".hier": (
+        "a Hierarchical-3DGS tree, whose levels of detail are its own",
+        "use the chunk's point_cloud.ply that the tree was built from",
+    ),
+    ".ckpt": (
+        "a training checkpoint, as Nerfstudio writes it",
+        "export a PLY: ns-export gaussian-splat --load-config CONFIG.yml --output-dir OUT",
+    ),
+    ".pth": (
+        "a trainer's own checkpoint, as Inria's code writes it to resume from",
+        "use the point_cloud/iteration_N/point_cloud.ply beside it",
+    ),
+    ".safetensors": (
+        "an adapter or another safetensors file, no checkpoint",
+        "give the PLY; clod-adapt apply BASE.ply ADAPTER.safetensors makes one of an adapter",
+    ),
+    ".json": ("a JSON document; of an unbundled SOG it is the table of contents", _CONVERT),
+}
+# The same by first bytes, where neither of the two above knows better.
+ARCHIVES = (
+    (b"\x1f\x8b", "compressed with gzip", "unpack it first: gunzip"),
+    (b"PK\x03\x04", "a zip archive", "unpack it first; a gsplat checkpoint must be called .pt to be read as one"),
+    (b"\xfd7zXZ\x00", "compressed with xz", "unpack it first: unxz"),
+    (b"BZh", "compressed with bzip2", "unpack it first: bunzip2"),
+    (b"\x28\xb5\x2f\xfd", "compressed with Zstandard", "unpack it first: unzstd"),
+    (b"7z\xbc\xaf\x27\x1c", "a 7z archive", "unpack it first"),
+    (b"glTF", "a glTF model", "give the splat as a .ply in Inria's 3DGS layout"),
+)
+
+
+def refuse(path: Path, start: bytes) -> NoReturn:
+    """Raises the ClodError of a file that begins with ``start`` and so is no PLY."""
+    if not start:
+        raise ClodError(f"{path}: is empty; copy or export it again")
+    text, suffix = start.lstrip()[:64].lower(), path.suffix.lower()
+    for magic, what, remedy in CONTENTS:
+        if text.startswith(magic):
+            raise ClodError(f"{path}: is {what}; {remedy}")
+    if suffix in SUFFIXES:
+        what, remedy = SUFFIXES[suffix]
+        raise ClodError(f"{path}: is {what}; {remedy.format(suffix=path.suffix)}")
+    for magic, what, remedy in ARCHIVES:
+        if start.startswith(magic):
+            raise ClodError(f"{path}: is {what}; {remedy}")
+    raise ClodError(f"{path}: is not a PLY file; convert it to a .ply in Inria's 3DGS layout first")

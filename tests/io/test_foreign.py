@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import pytest
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.ply import load
+
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 248\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.ply", b"", "is empty"),
+        ("a.ply", LFS, "Git LFS pointer.*git lfs pull"),
+        ("a.splat", LFS, "Git LFS pointer.*git lfs pull"),
+        ("a.pt", LFS, "Git LFS pointer.*git lfs pull"),
+        ("a.ply", b"\r\n<!DOCTYPE html><html>", "web page.*download the file itself"),
+        ("a.ply", b"<html lang=en>", "web page"),
+        ("a.ply", b"<?xml version='1.0'?><Error>", "XML document"),
+        ("a.ply", gzip.compress(b"ply\n"), "gzip.*gunzip"),
+        ("a.ply.gz", gzip.compress(b"ply\n"), "gzip.*gunzip"),
+        ("a.spz", gzip.compress(b"NGSP"), "SPZ.*splat-transform IN.spz OUT.ply"),
+        ("a.ply", b"PK\x03\x04rest", "zip archive"),
+        ("a.sog", b"PK\x03\x04rest", "SOG.*splat-transform IN.sog OUT.ply"),
+        ("a.splat", bytes(64), "8-bit.*splat-transform IN.splat OUT.ply"),
+        ("a.KSPLAT", bytes(64), "splat-transform IN.KSPLAT OUT.ply"),
+        ("a.hier", bytes(64), "Hierarchical-3DGS.*point_cloud.ply"),
+        ("a.ckpt", b"PK\x03\x04rest", "Nerfstudio.*ns-export gaussian-splat"),
+        ("chkpnt30000.pth", b"PK\x03\x04rest", "Inria.*point_cloud.ply"),
+        ("a.safetensors", bytes(64), "clod-adapt apply"),
+        ("meta.json", b"{}", "SOG.*splat-transform"),
+        ("a.ply", b"solid teapot", "is not a PLY file"),
+        ("a.ply", b"plyx", "is not a PLY file"),
+    ],
+)  # fmt: skip
+def test_what_it_is_and_what_to_do(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ClodError, match=f"{name}: .*{message}"):
+        load(tmp_path / name)
