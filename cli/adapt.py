@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         remove_leftovers(path)
     saver = Saver(outputs.state, args.resume, config, console, stop)
     with watch.time("load"):
-        base = read_checkpoint(args.ply, console)
+        base = read_checkpoint(args.ply, console, args.activated)
         photographs = read_scene(args.images, console) if args.images is not None else None
     gaussians = base.gaussians.to(pick_device(args.device))
     with watch.time("kernels"):

@@ -20,7 +20,7 @@ from clod_adapter.io.version import package_version
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console = Console(args.quiet)
-    model = read_checkpoint(args.model, console)
+    model = read_checkpoint(args.model, console, args.activated)
     attenuation = model.gaussians.attenuation
     assert attenuation is not None  # check_bake has seen to it
     solved, notes = solve_dials(args, model, (), console)

@@ -27,8 +27,17 @@ class Command:
     add_arguments: Callable[[ArgumentParser], None]
 
 
+def _add_activated(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--activated", choices=["none", "opacity", "scales", "both"],
+        help="what a checkpoint stores activated: opacities as such, scales as lengths; asked for where it looks so",
+    )  # fmt: skip
+
+
 def _adapt(parser: ArgumentParser) -> None:
-    parser.add_argument("ply", metavar="PLY", help="the checkpoint, in Inria's 3DGS layout; it is never modified")
+    parser.add_argument(
+        "ply", metavar="PLY", help="the checkpoint: a PLY in Inria's 3DGS layout, or gsplat's .pt; never modified"
+    )
     parser.add_argument(
         "--images", metavar="DIR",
         help="the scene: photographs in DIR/images and their COLMAP model in DIR/sparse/0, or nerfstudio's or "
@@ -44,6 +53,7 @@ def _adapt(parser: ArgumentParser) -> None:
         "--misaligned-ok", action="store_true", help="train even where a checkpoint does not fit the photographs"
     )
     parser.add_argument("--report", action="store_true", help="also a page to look at, OUT.html, and its charts")
+    _add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
@@ -68,6 +78,7 @@ def _evaluate(parser: ArgumentParser) -> None:
         "--popping", action="store_true", help="also how evenly the picture changes with the dial and with the camera"
     )
     parser.add_argument("--report", metavar="OUT.html", help="also a page to look at, and beside it its charts")
+    _add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
@@ -84,6 +95,7 @@ def _render(parser: ArgumentParser) -> None:
         help="photographs whose cameras to render, by name, or all, or held-out (default)",
     )  # fmt: skip
     parser.add_argument("--beside", action="store_true", help="put the photograph left of the renderings")
+    _add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
@@ -91,6 +103,7 @@ def _bake(parser: ArgumentParser) -> None:
     parser.add_argument("model", metavar="MODEL.ply", help="an adapted file")
     parser.add_argument("-o", "--out", metavar="PLAIN.ply", required=True, help="what to write; replaced if it exists")
     add_dial_options(parser, "the dial value", "(in the file written)", several=False, required=True)
+    _add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
 
 
@@ -98,6 +111,7 @@ def _apply(parser: ArgumentParser) -> None:
     parser.add_argument("base", metavar="BASE.ply", help="the checkpoint that was adapted")
     parser.add_argument("adapter", metavar="ADAPTER.safetensors", help="what clod-adapt wrote beside its PLY")
     parser.add_argument("-o", "--out", metavar="OUT.ply", required=True, help="what to write; replaced if it exists")
+    _add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
 
 
@@ -116,6 +130,7 @@ def _robustness(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--misaligned-ok", action="store_true", help="train even where a checkpoint does not fit the photographs"
     )
+    _add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 

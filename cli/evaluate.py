@@ -28,9 +28,9 @@ DIALS = (1.0, 2.0, 3.0, 5.0)
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch = Console(args.quiet), Stopwatch()
     with watch.time("load"):
-        model = read_checkpoint(args.model, console)
-        base = read_checkpoint(args.base, console).gaussians if args.base else None
-        others = {path: read_checkpoint(path, console).gaussians for path in args.against}
+        model = read_checkpoint(args.model, console, args.activated)
+        base = read_checkpoint(args.base, console, args.activated).gaussians if args.base else None
+        others = {path: read_checkpoint(path, console, args.activated).gaussians for path in args.against}
         scene = read_scene(args.images, console)
     if not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")

@@ -10,14 +10,15 @@ from clod_adapter.cli.files import size
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.ply import Checkpoint, load
+from clod_adapter.io.ply_values import Activated
 from clod_adapter.io.scene import load_scene
 from clod_adapter.placement import complement, imagine, place
 
 
-def read_checkpoint(path: str, console: Console) -> Checkpoint:
-    """Reads a PLY and says what is in it."""
+def read_checkpoint(path: str, console: Console, activated: Activated | None = None) -> Checkpoint:
+    """Reads a PLY, or gsplat's .pt, and says what is in it; ``activated`` as ``load`` takes it."""
     with console.status(f"reading {path} ({size(Path(path))}) ..."):
-        checkpoint = load(path)
+        checkpoint = load(path, activated=activated)
     gaussians = checkpoint.gaussians
     dial = ", with sigma_d" if gaussians.sigma_d is not None else ""
     console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{dial}")

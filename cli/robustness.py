@@ -75,7 +75,7 @@ def plan(args: argparse.Namespace, scene: Scene, console: Console) -> list[Cell]
     dials = sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)})
     seen, cells = scene_fingerprint(scene), list[Cell]()
     for path, label in zip(args.ply, labels(args.ply), strict=True):
-        checkpoint = read_checkpoint(path, console)
+        checkpoint = read_checkpoint(path, console, args.activated)
         if checkpoint.gaussians.sigma_d is not None:
             console.say(f"  note: the dial of {path} plays no part: it is taken as a checkpoint without one")
         cells += cells_of(label, checkpoint, configs, dials, seen, Path(args.out) / "cells")

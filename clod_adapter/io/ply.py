@@ -18,12 +18,14 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.ply_body import read_vertex
 from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, inria_dtype, read_table, sh_degree_of
 from clod_adapter.io.ply_header import (
+    PREFIX,
     all_comments,
     read_attenuation,
     read_calibration,
     read_head,
     write_comments,
 )
+from clod_adapter.io.ply_values import Activated, as_stored_by_inria
 
 
 @dataclass(frozen=True)
@@ -33,10 +35,10 @@ class Checkpoint:
     Attributes:
         gaussians: the usable Gaussians, float32; with sigma_d and attenuation if the file is extended.
         vertex: ``[N]`` structured array, the same rows with every column of the file, in file order
-            and type, native byte order.
+            and type, native byte order; what was activated or filtered is not any more.
         comments: the header's comments.
         notes: what was dropped or noticed, one line each, for the report.
-        fingerprint: SHA-256 of the file's bytes, hex.
+        fingerprint: SHA-256 of the file's bytes, hex; before it and a colon, what was taken as activated.
         path: where it was read from.
         calibration: what its dial values keep, cost and take, if the file says so.
     """
@@ -50,19 +52,28 @@ class Checkpoint:
     calibration: Calibration | None = None
 
 
-def load(path: str | Path) -> Checkpoint:
-    """Reads a checkpoint of plain Gaussians, in Inria's, MaskGaussian or our extended layout.
+def load(path: str | Path, *, activated: Activated | None = None) -> Checkpoint:
+    """Reads a checkpoint of plain Gaussians, in Inria's, MaskGaussian's, Mip-Splatting's or our extended layout.
 
     Any property order, byte order or ascii, with or without normals, SH degree 0 to 4. Rows with a
     value that is not finite in a used column, or with a zero rotation, are dropped and counted in
     the notes; opacity = +inf stays and means fully opaque. In MaskGaussian's old layout
     (``masks_0, masks_1``) rows with existence probability sigmoid(masks_0 - masks_1) < 0.5 go too.
+    Mip-Splatting's ``filter_3D`` is fused into scale and opacity.
+
+    Args:
+        activated: which values to take as activated already, where no logit opacity is below -0.1 or no
+            logarithmic scale below 0, as in no usual file: "none", "opacity", "scales" or "both". Files
+            that this package wrote are not in question.
 
     Raises:
-        ClodError: not a checkpoint, damaged, of another kind, or nothing usable in it.
+        ClodError: not a checkpoint, damaged, of another kind, nothing usable in it, or values in question and
+            ``activated`` is None.
     """
     path = Path(path)
     vertex, sh_degree, comments, others = _read_rows(path)
+    ours = any(comment.startswith(PREFIX) for comment in comments)
+    vertex, was, changes = as_stored_by_inria(path, vertex, "none" if ours else activated)
     columns = column_map(sh_degree)
     names = [name for group in columns.values() for name in group]
     extras = [name for name in (SIGMA, *MASKS) if name in (vertex.dtype.names or ())]
@@ -77,7 +88,9 @@ def load(path: str | Path) -> Checkpoint:
         gaussians = gaussians.replace(sigma_d=sigma_d, attenuation=attenuation)
         calibration, doubts = read_calibration(comments, len(gaussians))
         notes += remarks + doubts
-    return Checkpoint(gaussians, vertex, comments, (*notes, *others), _sha256(path), path, calibration)
+    notes = [*changes, *notes, *others]
+    fingerprint = _sha256(path) if was == "none" else f"{was}:{_sha256(path)}"
+    return Checkpoint(gaussians, vertex, (*comments, *changes), tuple(notes), fingerprint, path, calibration)
 
 
 def save(

@@ -26,11 +26,6 @@ FOREIGN = (
         "a Scaffold-GS or Octree-GS file: anchors from which a network makes Gaussians per view",
         "use a checkpoint of 3DGS or of a method that keeps plain Gaussians",
     ),
-    (
-        r"filter_3D",
-        "a Mip-Splatting file whose 3D filter is not yet part of scale and opacity",
-        "fuse it first with Mip-Splatting's create_fused_ply.py",
-    ),
 )
 
 
