@@ -13,6 +13,7 @@ from clod_adapter.cli.settings import make_config, make_configs
 from clod_adapter.errors import ClodError
 from clod_adapter.io.ply_columns import sh_degree_of
 from clod_adapter.io.ply_header import read_header
+from clod_adapter.io.pt import check_pt, is_pt
 from clod_adapter.io.scene_folder import find_cameras, photograph_folders
 from clod_adapter.report.charts import chart_file
 from clod_adapter.report.style import check_matplotlib
@@ -93,8 +94,11 @@ def check_page(path: Path, charts: list[str], inputs: list[str]) -> None:
 
 
 def check_checkpoint(path: str) -> None:
-    """Refuses what by its header is no checkpoint."""
-    sh_degree_of(Path(path), read_header(Path(path)))
+    """Refuses what by its header is no checkpoint, and what is no .pt where it is called one."""
+    if is_pt(Path(path)):
+        check_pt(Path(path))
+    else:
+        sh_degree_of(Path(path), read_header(Path(path)))
 
 
 def check_scene(folder: str) -> None:

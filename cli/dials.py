@@ -10,6 +10,7 @@ from typing import Any
 from clod_adapter.errors import ClodError
 from clod_adapter.io.ply_columns import SIGMA
 from clod_adapter.io.ply_header import PREFIX, ROW, all_comments, read_header
+from clod_adapter.io.pt import is_pt
 
 # Option, metavar, type, help. All but the first are budgets, under the names that budget.dial_for has for them.
 OPTIONS: tuple[tuple[str, str, type, str], ...] = (
@@ -78,6 +79,8 @@ def check_dials(args: Namespace, model: str, *, measured: bool = True) -> None:
 
 
 def has_dial(model: str) -> bool:
-    """Whether the file's header has a sigma_d."""
+    """Whether the file's header has a sigma_d, which no .pt has."""
+    if is_pt(Path(model)):
+        return False
     header = read_header(Path(model))
     return "vertex" in header and SIGMA in {column.name for column in header["vertex"].properties}

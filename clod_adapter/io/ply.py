@@ -26,6 +26,7 @@ from clod_adapter.io.ply_header import (
     write_comments,
 )
 from clod_adapter.io.ply_values import Activated, as_stored_by_inria
+from clod_adapter.io.pt import is_pt, read_pt
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,8 @@ def load(path: str | Path, *, activated: Activated | None = None) -> Checkpoint:
     value that is not finite in a used column, or with a zero rotation, are dropped and counted in
     the notes; opacity = +inf stays and means fully opaque. In MaskGaussian's old layout
     (``masks_0, masks_1``) rows with existence probability sigmoid(masks_0 - masks_1) < 0.5 go too.
-    Mip-Splatting's ``filter_3D`` is fused into scale and opacity.
+    Mip-Splatting's ``filter_3D`` is fused into scale and opacity. A name that ends in ``.pt`` is read
+    as a checkpoint of gsplat's trainer.
 
     Args:
         activated: which values to take as activated already, where no logit opacity is below -0.1 or no
@@ -143,6 +145,9 @@ def blank(count: int, sh_degree: int) -> Checkpoint:
 
 def _read_rows(path: Path) -> tuple[np.ndarray, int, tuple[str, ...], list[str]]:
     """The rows, their SH degree, the comments, and notes."""
+    if is_pt(path):
+        vertex, degree, notes = read_pt(path)
+        return vertex, degree, (), notes
     head = read_head(path)
     degree = sh_degree_of(path, head.ply)
     return read_vertex(path, head), degree, all_comments(head.ply), _not_kept(head.ply)

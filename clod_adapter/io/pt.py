@@ -1,0 +1,151 @@
+"""Checkpoints of gsplat's trainer, ``.pt``: the one format here that is a pickle, of which only tensors are taken."""
+
+from __future__ import annotations
+
+import pickle
+import pickletools
+import re
+import struct
+import warnings
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clod_adapter.config import SH_COUNTS
+from clod_adapter.errors import ClodError
+from clod_adapter.io.foreign import refuse
+from clod_adapter.io.ply_columns import column_map, inria_dtype
+
+SUFFIX = ".pt"
+# As gsplat's trainer names its parameters, and as they are called here.
+_NAMES = {
+    "means": "means", "quats": "quats", "scales": "log_scales", "opacities": "opacity_logits",
+    "sh0": "sh0", "shN": "shN",
+}  # fmt: skip
+_PICKLE_LIMIT = 1 << 20  # bytes; of a few tensors it has a few hundred
+_PLAIN = r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|torch \w+Storage"
+
+
+def is_pt(path: Path) -> bool:
+    """Whether the file is to be read as one: by its name alone, so that no other is ever unpickled."""
+    return path.suffix.lower() == SUFFIX
+
+
+def check_pt(path: Path) -> None:
+    """Refuses, without torch, what is not a file of ``torch.save``, or would unpack to more than it is.
+
+    Raises:
+        ClodError: it is not, or cannot be read.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            raise ClodError(f"{path}: cannot be read (it is not a regular file); give the name of a file")
+        with open(path, "rb") as file:
+            start = file.read(64)
+        if start.startswith(b"\x80"):
+            raise ClodError(f"{path}: is a pickle in PyTorch's format before 1.6; load it and torch.save it again")
+        if not start.startswith(b"PK"):
+            refuse(path, start)
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+            pickles = [entry for entry in entries if entry.filename.endswith("/data.pkl")]
+            stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
+            whole = stored and sum(entry.file_size for entry in entries) <= path.stat().st_size
+            if not whole or len(pickles) != 1 or pickles[0].file_size > _PICKLE_LIMIT:
+                raise ClodError(f"{path}: is a zip archive that torch.save does not write; export a PLY instead")
+            with warnings.catch_warnings(action="ignore"):  # of odd escapes in it
+                _check_pickle(path, archive.read(pickles[0]))
+    except (OSError, ValueError) as error:
+        raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, struct.error) as error:
+        raise ClodError(f"{path}: is damaged or truncated ({error}); copy or export it again") from error
+
+
+def _check_pickle(path: Path, data: bytes) -> None:
+    """Refuses a pickle that names anything but what plain tensors need.
+
+    ``weights_only`` runs no code either, but lets a pickle of a hundred bytes ask for gigabytes.
+    """
+    try:
+        for opcode, argument, _ in pickletools.genops(data):
+            named = opcode.name in ("GLOBAL", "INST", "STACK_GLOBAL")
+            if named and not re.fullmatch(_PLAIN, str(argument)):
+                raise ClodError(
+                    f"{path}: holds {argument}, more than tensors, and is not unpickled; export it as a PLY"
+                )
+    except (ValueError, IndexError) as error:  # no such opcode, or it ends early
+        raise ClodError(f"{path}: is damaged ({error}); copy or export it again") from error
+
+
+def read_pt(path: Path) -> tuple[np.ndarray, int, list[str]]:
+    """``[N]`` rows in Inria's layout of a dictionary with ``splats``, their SH degree, and notes.
+
+    The values are as in that layout: scales are logarithms, opacities logits.
+
+    Read with ``weights_only``: a pickle that calls anything but what makes tensors is refused, and nothing is called.
+
+    Raises:
+        ClodError: not such a checkpoint, damaged, or more than tensors.
+    """
+    import torch  # here and not above, as check_pt does without
+
+    check_pt(path)
+    try:
+        # Mapped, so that what else a checkpoint holds (optimisers, networks) is not read.
+        with warnings.catch_warnings(action="ignore"):
+            checkpoint = torch.load(str(path), map_location="cpu", weights_only=True, mmap=True)
+    except pickle.UnpicklingError as error:
+        raise ClodError(
+            f"{path}: holds more than tensors, or is damaged, and was not unpickled; export the checkpoint as a PLY"
+        ) from error
+    except Exception as error:  # torch lets RuntimeError, KeyError, TypeError and more through
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ClodError(f"{path}: is damaged ({reason}); copy or export it again") from error
+    splats = checkpoint.get("splats") if isinstance(checkpoint, dict) else None
+    if not isinstance(splats, dict):
+        found = (
+            ", ".join(map(repr, list(checkpoint)[:5])) if isinstance(checkpoint, dict) else type(checkpoint).__name__
+        )
+        raise ClodError(
+            f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {found}); export it as a PLY"
+        )
+    vertex, degree = _rows(path, {name: _values(path, name, splats) for name in _NAMES})
+    return vertex, degree, ["gsplat's trainer may have normalised the coordinates; photographs must be in the same"]
+
+
+def _values(path: Path, name: str, splats: dict[str, Any]) -> np.ndarray:
+    """A parameter as float32, unless it is none or claims more values than the file has bytes."""
+    import torch
+
+    value = splats.get(name)
+    if value is None:
+        more = "; with appearance optimisation its trainer stores no colours" if "features" in splats else ""
+        raise ClodError(f"{path}: splats has no {name!r}{more}; export it as a PLY with spherical harmonics")
+    usable = isinstance(value, torch.Tensor) and value.device.type == "cpu" and value.layout == torch.strided
+    if not usable or not value.is_floating_point() or value.nbytes > path.stat().st_size:
+        raise ClodError(f"{path}: splats[{name!r}] is no plain tensor of numbers; export the checkpoint as a PLY")
+    return value.detach().float().numpy()
+
+
+def _rows(path: Path, values: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
+    count = len(values["means"]) if values["means"].ndim else 0
+    bands = values["shN"].shape[1] if values["shN"].ndim == 3 else -1
+    shapes = {
+        "means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,), "sh0": (count, 1, 3),
+        "shN": (count, bands, 3),
+    }  # fmt: skip
+    for name, shape in shapes.items():
+        if values[name].shape != shape:
+            raise ClodError(f"{path}: splats[{name!r}] has shape {values[name].shape}, not {shape}; export it again")
+    degrees = {bands: degree for degree, bands in SH_COUNTS.items()}
+    if bands + 1 not in degrees:
+        raise ClodError(f"{path}: splats['shN'] has {bands} coefficients, which fit no SH degree; export it again")
+    degree = degrees[bands + 1]
+    columns, vertex = column_map(degree), np.zeros(count, inria_dtype(degree))
+    for name, attribute in _NAMES.items():
+        flat = values[name].reshape(count, len(columns[attribute]))
+        for k, column in enumerate(columns[attribute]):
+            vertex[column] = flat[:, k]
+    return vertex, degree
