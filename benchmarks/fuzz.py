@@ -1,0 +1,240 @@
+"""Damaged files of every format that is read: each must be read, or refused with ClodError, soon and in little memory.
+
+    python benchmarks/fuzz.py                                # 200,000 cases over all formats, some minutes
+    python benchmarks/fuzz.py --cases 20000 --format colmap --seed 3 --record
+    python benchmarks/fuzz.py --format ply --seed 0 --case 4711 --keep /tmp/it    # one again, its files kept
+
+A case is an undamaged input (mutants.py), damaged at random from its seed and number. Anything else than those two
+outcomes is a failure: another exception, a process that dies (COLMAP is C++) or takes more than LIMIT_S, more than
+LIMIT_MB of memory beyond what reading an undamaged input takes, an allocation that was refused, a file opened outside
+of the case's folder, a program started, a connection made. Failures are printed, with the command that repeats them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import random
+import resource
+import signal
+import sys
+import tempfile
+import time
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
+
+# isort: split
+import torch
+from common import append
+from mutants import FORMATS, Input, make, mutate, write, write_images
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.adapter_file import load_adapter
+
+FILE = "fuzz.jsonl"
+LIMIT_S, LIMIT_MB = 10.0, 64
+BATCH = 5000  # cases a process
+SHARES = {"ply": 0.4, "safetensors": 0.2, "colmap": 0.35, "pt": 0.05}
+HARMFUL = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect", "ctypes.dlopen")
+# What a process tells the one that watches it, in shared memory.
+CASE, READ, REFUSED, SLOWEST_US, SLOWEST, EXTRA_KB = range(6)
+
+
+@dataclass
+class Tally:
+    """The outcome of a format."""
+
+    cases: int
+    read: int = 0
+    refused: int = 0
+    failures: dict[int, str] = field(default_factory=dict)
+    slowest_s: float = 0.0
+    slowest_case: int = 0
+    extra_mb: float = 0.0
+
+
+class Watch:
+    """What Python opens and starts while a case is read."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.on, self.seen = str(folder), False, [""][:0]
+        sys.addaudithook(self.hear)
+
+    def hear(self, event: str, args: tuple[Any, ...]) -> None:
+        if not self.on:
+            return
+        if event in HARMFUL:
+            self.seen.append(f"{event} {args[:1]}")
+        elif event == "open" and isinstance(args[0], str | bytes | os.PathLike):
+            path = os.path.realpath(os.fsdecode(args[0]))
+            if not path.startswith((self.folder, sys.prefix, sys.base_prefix, "/dev/", "/proc/", "/sys/")):
+                self.seen.append(f"opened {path}")
+
+
+def read(kind: str, folder: Path, case: Input, number: int) -> None:
+    if kind == "colmap":
+        clod.load_scene(folder)
+    elif kind == "safetensors":
+        load_adapter(folder / next(iter(case)))
+    else:
+        clod.load(folder / next(iter(case)), activated=None if number % 2 else "both")
+
+
+def damaged(kind: str, inputs: list[Input], seed: int, number: int) -> Input:
+    chance = random.Random(f"{kind} {seed} {number}")
+    return mutate(chance.choice(inputs), inputs, chance)
+
+
+def place(kind: str, folder: Path) -> Path:
+    """Where the files of a case go."""
+    target = folder / "sparse" / "0" if kind == "colmap" else folder
+    target.mkdir(parents=True, exist_ok=True)
+    return target
+
+
+def outcome(kind: str, folder: Path, case: Input, number: int, watch: Watch) -> str:
+    """ "read", "refused", or what went wrong."""
+    watch.seen.clear()
+    watch.on = True
+    try:
+        with warnings.catch_warnings(action="error"):
+            read(kind, folder, case, number)
+        result = "read"
+    except ClodError as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, MemoryError):
+            cause = cause.__cause__ or cause.__context__
+        result = "refused" if cause is None else f"was out of memory: {error}"
+        if "\n" in str(error) or str(folder) not in str(error):
+            result = f"message of many lines, or without the file's name: {error}"
+    except Exception as error:
+        result = f"{type(error).__name__}: {error}"
+    finally:
+        watch.on = False
+    return f"harm: {watch.seen[:3]}" if watch.seen else result
+
+
+def work(kind: str, inputs: list[Input], seed: int, cases: range, folder: Path, shared: Any, failures: Path) -> None:
+    """A batch of cases, in a process of its own with little memory; outcomes go to ``shared`` and ``failures``."""
+    watch, target = Watch(folder), place(kind, folder)
+    for case in inputs:
+        write(case, target)
+        read(kind, folder, case, 0)
+    virtual = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (virtual + (1 << 30), resource.RLIM_INFINITY))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for number in cases:
+        shared[CASE] = number
+        case = damaged(kind, inputs, seed, number)
+        write(case, target)
+        began = time.perf_counter()
+        result = outcome(kind, folder, case, number, watch)
+        microseconds = int((time.perf_counter() - began) * 1e6)
+        extra = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+        if extra - shared[EXTRA_KB] > LIMIT_MB * 1024:
+            result = f"took {extra // 1024} MB"
+        shared[EXTRA_KB] = max(shared[EXTRA_KB], extra)
+        if microseconds > shared[SLOWEST_US]:
+            shared[SLOWEST_US], shared[SLOWEST] = microseconds, number
+        if result in ("read", "refused"):
+            shared[READ if result == "read" else REFUSED] += 1
+        else:
+            with open(failures, "a", encoding="utf-8") as out:
+                out.write(json.dumps([number, result]) + "\n")
+
+
+def run(kind: str, seed: int, cases: int, folder: Path) -> Tally:
+    """All cases of a format, batch by batch; a process that dies or hangs costs the case it was at."""
+    tally, inputs = Tally(cases), make(kind, folder)
+    write_images(folder / "case" / "images")
+    failures, fork = folder / "failures.jsonl", multiprocessing.get_context("fork")
+    shared = fork.Array("q", 6, lock=False)
+    start = 0
+    while start < cases:
+        stop = min(start + BATCH, cases)
+        arguments = (kind, inputs, seed, range(start, stop), folder / "case", shared, failures)
+        shared[CASE] = start
+        process = fork.Process(target=work, args=arguments)
+        process.start()
+        died = wait(process, shared)
+        if died:
+            tally.failures[shared[CASE]] = died
+        start = shared[CASE] + 1 if died else stop
+        tally.extra_mb = max(tally.extra_mb, shared[EXTRA_KB] / 1024)
+        shared[EXTRA_KB] = 0
+        print(f"{kind}: {start} of {cases}", file=sys.stderr)
+    tally.read, tally.refused = shared[READ], shared[REFUSED]
+    tally.slowest_s, tally.slowest_case = shared[SLOWEST_US] / 1e6, shared[SLOWEST]
+    for line in failures.read_text(encoding="utf-8").splitlines() if failures.exists() else []:
+        number, result = json.loads(line)
+        tally.failures[number] = result
+    failures.unlink(missing_ok=True)
+    return tally
+
+
+def wait(process: Any, shared: Any) -> str:
+    """Until the process ends, or has been at one case for too long; says how it died, if it did."""
+    case, since = -1, time.monotonic()
+    while process.is_alive():
+        process.join(0.2)
+        if shared[CASE] != case:
+            case, since = shared[CASE], time.monotonic()
+        elif time.monotonic() - since > LIMIT_S:
+            process.kill()
+            process.join()
+            return f"took more than {LIMIT_S:g} s"
+    code = process.exitcode
+    return "" if code == 0 else signal.Signals(-code).name if code < 0 else f"the process ended with {code}"
+
+
+def again(kind: str, seed: int, number: int, folder: Path) -> None:
+    """One case in this process, its files left in ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        inputs = make(kind, Path(scratch))
+    case = damaged(kind, inputs, seed, number)
+    write_images(folder / "images")
+    write(case, place(kind, folder))
+    read(kind, folder, case, number)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", type=int, default=200_000, help="over all formats")
+    parser.add_argument("--format", choices=FORMATS, help="this one alone")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--case", type=int, help="this one alone, in this process")
+    parser.add_argument("--keep", type=Path, default=Path("case"), help="with --case: where its files go")
+    parser.add_argument("--record", action="store_true", help=f"add a row to results/{FILE}")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    if args.case is not None:
+        again(args.format, args.seed, args.case, args.keep)
+        return
+    shares, began, tallies = {args.format: 1.0} if args.format else SHARES, time.perf_counter(), {}
+    for kind, share in shares.items():
+        with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as folder:
+            tallies[kind] = run(kind, args.seed, round(args.cases * share), Path(folder).resolve())
+    row = {
+        "seed": args.seed, "cases": sum(tally.cases for tally in tallies.values()),
+        "failures": sum(len(tally.failures) for tally in tallies.values()),
+        "seconds": time.perf_counter() - began, "formats": {kind: vars(tally) for kind, tally in tallies.items()},
+    }  # fmt: skip
+    for kind, tally in tallies.items():
+        for number, failure in tally.failures.items():
+            print(f"{failure}\n  python benchmarks/fuzz.py --format {kind} --seed {args.seed} --case {number}")
+    if args.record:
+        append(FILE, row)
+    else:
+        print(json.dumps(row, indent=1))
+    sys.exit(1 if row["failures"] else 0)
+
+
+if __name__ == "__main__":
+    main()
