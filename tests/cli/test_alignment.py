@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image, ImageOps
 
-from clod_adapter.io.colmap import load_scene
+from clod_adapter.io.scene import load_scene
 from clod_adapter.render import render
 
 FAST = ("--iters", 1, "--max-sv", 4)

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.colmap import load_scene
 from clod_adapter.io.colmap_model import read_model
 from clod_adapter.io.colmap_records import check_name, check_records
+from clod_adapter.io.scene import load_scene
 
 FORMS = ("binary", "text")
 
