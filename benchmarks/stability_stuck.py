@@ -22,10 +22,10 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances, soft_count
+from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances
 from clod_adapter.cameras import Camera, View
 from clod_adapter.config import AdaptConfig
-from clod_adapter.counting import count_gradient, count_law
+from clod_adapter.counting import count_gradient, count_law, soft_count
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import sigma_from_importance
 from clod_adapter.losses import photometric_loss
