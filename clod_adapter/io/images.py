@@ -39,9 +39,10 @@ def read_image(path: Path, width: int, height: int) -> tuple[Image.Image, list[N
     """
     notes: list[Note] = []
     with _opened(path) as source:
-        turn = _TURNS.get(source.getexif().get(_ORIENTATION, 1))
+        turned = _same_shape(source.size, height, width) and not _same_shape(source.size, width, height)
+        turn = _TURNS.get(source.getexif().get(_ORIENTATION, 1)) if turned else None
         pixels = _rgb(path, source, notes)
-    if turn is not None and not _same_shape(pixels.size, width, height) and _same_shape(pixels.size, height, width):
+    if turn is not None:
         pixels = pixels.transpose(turn)
         notes.append(("turned as their EXIF says, as the cameras have the turned shape", ""))
     if not _same_shape(pixels.size, width, height):

@@ -101,18 +101,14 @@ def _load(
     """The views of the images, decoded two at a time, and notes."""
     cache = None if all(image.is_pinhole for image, _ in present) else cache_folder(folder)
     views, notes = [], []
-    pool = ThreadPoolExecutor(2)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), ThreadPoolExecutor(2) as pool:
         # Large, but below the size at which it is refused: photographs are no attack.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        try:
-            for view, remarks in pool.map(lambda each: _load_view(each[0], each[1], cache, max_width), present):
-                views.append(view)
-                notes += remarks
-                if progress:
-                    progress(len(views), len(present))
-        finally:  # at Ctrl-C or an error the images in hand are finished, and no more
-            pool.shutdown(cancel_futures=True)
+        for view, remarks in pool.map(lambda each: _load_view(each[0], each[1], cache, max_width), present):
+            views.append(view)
+            notes += remarks
+            if progress:
+                progress(len(views), len(present))
     return views, _summary(notes, len(views))
 
 

@@ -110,6 +110,13 @@ def test_exif_rotation_is_applied_where_the_camera_has_the_turned_shape(tmp_path
     assert turned.shape == (40, 30, 3) and notes == ["turned as their EXIF says, as the cameras have the turned shape"]
 
 
+def test_damaged_exif_is_not_looked_at_where_the_shape_fits(tmp_path: Path) -> None:
+    Image.fromarray(pixels(0)).save(tmp_path / "a.png", exif=b"Exif\0\0" + bytes(range(200)))
+    np.testing.assert_array_equal(read(tmp_path / "a.png")[0], pixels(0))
+    with pytest.raises(ClodError, match="a.png: "):
+        read(tmp_path / "a.png", 30, 40)
+
+
 def test_no_rotation_without_exif(tmp_path: Path) -> None:
     Image.fromarray(pixels(0)).save(tmp_path / "a.png")
     with pytest.raises(ClodError, match="a.png: is 40x30, its camera 30x40, another shape"):
