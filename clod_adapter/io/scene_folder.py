@@ -104,6 +104,7 @@ def inside(name: str, cameras: Path) -> tuple[str, ...]:
         ClodError: the name is empty, leads out of the folder it is looked for in, or is no name of a file.
     """
     path = PureWindowsPath(name)
-    if not path.parts or path.anchor or ".." in path.parts or any(sign < " " for sign in name):
+    controls = any(sign < " " or "\x7f" <= sign <= "\x9f" for sign in name)
+    if not path.parts or path.anchor or ".." in path.parts or controls:
         raise ClodError(f"{cameras}: image name {name[:80]!r} leaves the images folder or is no name; rename it there")
     return path.parts

@@ -178,6 +178,7 @@ def changed(row: int, column: int, value: float) -> dict[str, Any]:
         ({"file_path": ""}, "leaves the images folder"),
         ({"file_path": "a\nb.png"}, "is no name"),
         ({"file_path": "a\x1b[2J.png"}, "is no name"),
+        ({"file_path": "a\x9b2J.png"}, "is no name"),
         ({"file_path": "a" * 5000}, "1 of 1 images .* missing"),
         ({"file_path": 3}, "frame 0 has no file_path"),
         ({"transform_matrix": None}, "frame a.png: transform_matrix is no 4x4 matrix"),
