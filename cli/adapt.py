@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     saver = Saver(outputs.state, args.resume, config, console, stop)
     with watch.time("load"):
         base = read_checkpoint(args.ply, console, args.activated)
-        photographs = read_scene(args.images, console) if args.images is not None else None
+        photographs = read_scene(args.images, console, base.origin) if args.images is not None else None
     gaussians = base.gaussians.to(pick_device(args.device))
     with watch.time("kernels"):
         prepare_kernels(console)
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     alignment, warnings = None, list[str]()
     if photographs:
         with watch.time("evaluate"):
-            alignment, warnings = require_alignment(gaussians, scene, args.ply, args, console)
+            alignment, warnings = require_alignment(base, scene, args, console)
         scene, config = complement_scene(gaussians, scene, config, console)
     saver.belong(gaussians, scene, args.ply, args.images or "those placed for it")
     with watch.time("evaluate"):
@@ -63,7 +63,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         follower = Follower(console, stop, gaussians, scene.test, config.max_sv, base_rows[0] if base_rows else None)
         adapted = train(gaussians, scene, config, follower, saver, page)
         watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
-        adapter = extract(gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config))
+        about = {"fingerprint": base.fingerprint, "config": asdict(config), "origin": base.origin}
+        adapter = extract(gaussians, adapted.gaussians, **about)
         if gaussians.sigma_d is None and adapter.attenuation.tau < config.tau:
             notes.append(
                 f"tau is lowered from {config.tau:g} to {adapter.attenuation.tau:.2g}: its Gaussians are faint"

@@ -16,6 +16,7 @@ from clod_adapter.cli.console import Console
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.colmap import load_points
+from clod_adapter.io.ply import Checkpoint
 
 OTHER_COLOURS = (
     "warning: {ply} shows the photographs in {images}, but some are farther from it than from their own mean colours: "
@@ -24,7 +25,7 @@ OTHER_COLOURS = (
 
 
 def require_alignment(
-    base: Gaussians, scene: Scene, ply: str, args: argparse.Namespace, console: Console
+    checkpoint: Checkpoint, scene: Scene, args: argparse.Namespace, console: Console
 ) -> tuple[dict[str, Any], list[str]]:
     """The numbers of ``check_alignment`` and the ``guess``, for the report, and a note where the file does not fit.
 
@@ -33,13 +34,13 @@ def require_alignment(
     Raises:
         ClodError: it does not fit, or clearly better in another frame; not with --misaligned-ok.
     """
-    views = [*scene.test, *scene.train]
+    base, ply, views = checkpoint.gaussians, checkpoint.path, [*scene.test, *scene.train]
     with console.status("comparing the checkpoint with the photographs ..."):
         found = check_alignment(base, views)
     guess = None
     if not found.on_white and (not found.fits or found.margin < DOUBTFUL):
         with console.status("the checkpoint fits poorly: trying other frames ..."):
-            guess = guess_frame(base, views, found, load_points(args.images))
+            guess = guess_frame(base, views, found, load_points(args.images, checkpoint.origin))
     numbers = found.as_dict() | {"guess": guess and guess.says}
     if found.fits and guess is None:
         notes = [OTHER_COLOURS.format(ply=ply, images=args.images)] if found.margin < 0 else []

@@ -17,7 +17,7 @@ from clod_adapter.io.version import package_version
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     adapter = load_adapter(args.adapter)
-    base = read_checkpoint(args.base, Console(args.quiet), args.activated)
+    base = read_checkpoint(args.base, Console(args.quiet), args.activated, adapter.origin)
     try:
         adapted = adapter.apply(base.gaussians, base.fingerprint)
     except ClodError as error:

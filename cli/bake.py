@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         console.say(note)
     baked = bake(model.gaussians, virtual_scale)
     about = f"baked at s = {virtual_scale:.6g} and d' = 1 by clod-adapter: exact at one distance only"
-    base = replace(blank(len(baked), baked.sh_degree), comments=(about,))
+    base = replace(blank(len(baked), baked.sh_degree, model.origin), comments=(about,))
     save(args.out, baked, base)
     print(
         f"wrote {args.out} ({size(Path(args.out))}): {len(baked):,} of {len(model.gaussians):,} Gaussians, "

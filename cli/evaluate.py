@@ -29,9 +29,13 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch = Console(args.quiet), Stopwatch()
     with watch.time("load"):
         model = read_checkpoint(args.model, console, args.activated)
-        base = read_checkpoint(args.base, console, args.activated).gaussians if args.base else None
-        others = {path: read_checkpoint(path, console, args.activated).gaussians for path in args.against}
-        scene = read_scene(args.images, console)
+
+        def beside(path: str) -> Gaussians:
+            return read_checkpoint(path, console, args.activated, model.origin).gaussians
+
+        base = beside(args.base) if args.base else None
+        others = {path: beside(path) for path in args.against}
+        scene = read_scene(args.images, console, model.origin)
     if not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
     if model.gaussians.sigma_d is None:

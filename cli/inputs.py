@@ -9,16 +9,19 @@ from clod_adapter.cli.console import Console
 from clod_adapter.cli.files import size
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.origin import Origin
 from clod_adapter.io.ply import Checkpoint, load
 from clod_adapter.io.ply_values import Activated
 from clod_adapter.io.scene import load_scene
 from clod_adapter.placement import complement, imagine, place
 
 
-def read_checkpoint(path: str, console: Console, activated: Activated | None = None) -> Checkpoint:
-    """Reads a PLY, or gsplat's .pt, and says what is in it; ``activated`` as ``load`` takes it."""
+def read_checkpoint(
+    path: str, console: Console, activated: Activated | None = None, origin: Origin | None = None
+) -> Checkpoint:
+    """Reads a PLY, or gsplat's .pt, and says what is in it; the options as ``load`` takes them."""
     with console.status(f"reading {path} ({size(Path(path))}) ..."):
-        checkpoint = load(path, activated=activated)
+        checkpoint = load(path, activated=activated, origin=origin)
     gaussians = checkpoint.gaussians
     dial = ", with sigma_d" if gaussians.sigma_d is not None else ""
     console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{dial}")
@@ -27,10 +30,12 @@ def read_checkpoint(path: str, console: Console, activated: Activated | None = N
     return checkpoint
 
 
-def read_scene(folder: str, console: Console) -> Scene:
+def read_scene(folder: str, console: Console, origin: Origin) -> Scene:
     """Reads the photographs and says how they are used."""
     with console.meter("photographs") as meter:
-        scene = load_scene(folder, progress=lambda done, total: meter.update(done / total, f"{done}/{total}"))
+        scene = load_scene(
+            folder, origin=origin, progress=lambda done, total: meter.update(done / total, f"{done}/{total}")
+        )
     camera = scene.train[0].camera
     size = f"{camera.width}x{camera.height}"
     console.say(f"{folder}: {len(scene.train)} photographs to train on, {len(scene.test)} held out, {size}")

@@ -41,7 +41,7 @@ class Picture:
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
     model = read_checkpoint(args.model, console, args.activated)
-    views = pick_views(read_scene(args.images, console), args.views)
+    views = pick_views(read_scene(args.images, console, model.origin), args.views)
     solved, notes = solve_dials(args, model, [view.camera for view in views], console)
     dials, beyond = choose_dials(solved or [1.0], model.gaussians.attenuation)
     notes += beyond

@@ -21,6 +21,7 @@ from clod_adapter.cli.report import Stopwatch, machine, report_dials, write_repo
 from clod_adapter.cli.settings import make_configs
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.version import package_version
 from clod_adapter.report.robustness_figure import robustness_figure
 from clod_adapter.robustness import Outcome, adapt_at_range, baseline, scene_fingerprint
@@ -36,8 +37,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     folder = Path(args.out)
     outputs = {kind: folder / f"robustness.{kind}" for kind in ("png", "csv", "json")}
     with watch.time("load"):
-        scene = read_scene(args.images, console)
-        cells = plan(args, scene, console)
+        checkpoints = read_checkpoints(args, console)
+        scene = read_scene(args.images, console, checkpoints[0].origin)
+        cells = plan(args, checkpoints, scene)
     if not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
     found = {cell.name: read for cell in cells if (read := cell.read())}
@@ -48,10 +50,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         with watch.time("kernels"):
             prepare_kernels(console)
         with watch.time("evaluate"):
-            for path, label in zip(args.ply, labels(args.ply), strict=True):
-                base = next((cell.checkpoint.gaussians for cell in missing if cell.label == label), None)
-                if base is not None:
-                    require_alignment(base, scene, path, args, console)
+            for checkpoint in checkpoints:
+                if any(cell.checkpoint is checkpoint for cell in missing):
+                    require_alignment(checkpoint, scene, args, console)
     make_folder(folder)  # only now: what cannot be read, or does not fit, leaves none behind
     make_folder(folder / "cells")
     for path in outputs.values():
@@ -69,15 +70,23 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     return report
 
 
-def plan(args: argparse.Namespace, scene: Scene, console: Console) -> list[Cell]:
+def read_checkpoints(args: argparse.Namespace, console: Console) -> list[Checkpoint]:
+    """All of them, relative to one origin."""
+    found = list[Checkpoint]()
+    for path in args.ply:
+        origin = found[0].origin if found else None
+        found.append(read_checkpoint(path, console, args.activated, origin))
+        if found[-1].gaussians.sigma_d is not None:
+            console.say(f"  note: the dial of {path} plays no part: it is taken as a checkpoint without one")
+    return found
+
+
+def plan(args: argparse.Namespace, checkpoints: Sequence[Checkpoint], scene: Scene) -> list[Cell]:
     """All cells; every range is measured at the dial values of the widest, and at the end of its own."""
     configs = make_configs(args)
     dials = sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)})
     seen, cells = scene_fingerprint(scene), list[Cell]()
-    for path, label in zip(args.ply, labels(args.ply), strict=True):
-        checkpoint = read_checkpoint(path, console, args.activated)
-        if checkpoint.gaussians.sigma_d is not None:
-            console.say(f"  note: the dial of {path} plays no part: it is taken as a checkpoint without one")
+    for checkpoint, label in zip(checkpoints, labels(args.ply), strict=True):
         cells += cells_of(label, checkpoint, configs, dials, seen, Path(args.out) / "cells")
     return cells
 
@@ -121,7 +130,8 @@ class CellRun:
             self.show((1 - measuring) * of_it, f"step {progress.done}" if progress.phase == "train" else "importance")
 
         return adapt_at_range(
-            base, scene, cell.config, cell.points, fingerprint=cell.checkpoint.fingerprint, follow=follow,
+            base, scene, cell.config, cell.points, fingerprint=cell.checkpoint.fingerprint,
+            origin=cell.checkpoint.origin, follow=follow,
             measured=lambda done, total: self.show(1 - measuring * (1 - done / total), "measuring"),
         )  # fmt: skip
 

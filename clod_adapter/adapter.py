@@ -36,6 +36,7 @@ class Adapter:
         config: the training config, JSON-able, for the record.
         version: of the package that made it; it stands in the header of the PLY, which is so the same again.
         calibration: what the result's dial values keep, cost and take, where that was measured; in the header too.
+        origin: ``[3]`` what the base's means were relative to, world units (``Checkpoint.origin``).
 
     Raises:
         ClodError: a tensor has the wrong type or shape, sigma_d is not finite, or version is no plain text.
@@ -48,6 +49,7 @@ class Adapter:
     config: dict[str, Any]
     version: str = field(default_factory=package_version)
     calibration: Calibration | None = None
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if self.sigma_d.dim() != 1 or self.sigma_d.dtype != torch.float32:
@@ -67,7 +69,8 @@ class Adapter:
         """The adapted Gaussians: the base plus the differences in float32, and the dial.
 
         Args:
-            base: the Gaussians of the checkpoint the adapter was trained on, as the reader gives them.
+            base: the Gaussians of the checkpoint the adapter was trained on, as ``load(path, origin=adapter.origin)``
+                gives them.
             fingerprint: that checkpoint file's SHA-256; when given it must be the adapter's.
 
         Raises:
@@ -95,7 +98,14 @@ class Adapter:
         return base.replace(**changes, sigma_d=self.sigma_d.to(base.means.device), attenuation=self.attenuation)
 
 
-def extract(base: Gaussians, adapted: Gaussians, *, fingerprint: str, config: dict[str, Any]) -> Adapter:
+def extract(
+    base: Gaussians,
+    adapted: Gaussians,
+    *,
+    fingerprint: str,
+    config: dict[str, Any],
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Adapter:
     """What has to be added to ``base`` to get ``adapted``, rounded to float16 differences.
 
     Attributes with identical values are left out. Where the differences do not fit float16 (one
@@ -115,7 +125,7 @@ def extract(base: Gaussians, adapted: Gaussians, *, fingerprint: str, config: di
         if not torch.equal(old, new):
             updates[name] = _update(name, old, new).cpu()
     sigma_d = adapted.sigma_d.detach().float().cpu().clone()
-    return Adapter(sigma_d, adapted.attenuation, updates, fingerprint, dict(config))
+    return Adapter(sigma_d, adapted.attenuation, updates, fingerprint, dict(config), origin=origin)
 
 
 def attach(

@@ -52,6 +52,7 @@ def adapt_at_range(
     virtual_scales: Sequence[float],
     *,
     fingerprint: str,
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     follow: Callable[[Progress], None] | None = None,
     measured: Callable[[int, int], None] | None = None,
 ) -> Outcome:
@@ -60,7 +61,7 @@ def adapt_at_range(
     Args:
         base: the checkpoint; a dial it may have plays no part.
         virtual_scales: dial values to measure at; those above ``max_sv`` show how it goes on beyond the range.
-        fingerprint: of the checkpoint file, for the adapter.
+        fingerprint: of the checkpoint file; origin: what its means are relative to; both for the adapter.
         follow: progress of the adaptation; measured: of the measurement, as (frames done, frames in all).
 
     Raises:
@@ -70,7 +71,7 @@ def adapt_at_range(
     adapted = adapt(base, scene, config, follow)
     if adapted.interrupted:
         raise KeyboardInterrupt
-    adapter = extract(base, adapted.gaussians, fingerprint=fingerprint, config=asdict(config))
+    adapter = extract(base, adapted.gaussians, fingerprint=fingerprint, config=asdict(config), origin=origin)
     result = adapter.apply(base)
     rows = [row.as_dict() for row in evaluate(result, scene.test, virtual_scales, progress=measured)]
     return Outcome(rows, distribution(result), adapter, adapted.start_seconds + adapted.seconds)

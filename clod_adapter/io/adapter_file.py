@@ -12,6 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -21,6 +22,7 @@ from clod_adapter.calibration import Calibration
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.origin import NOWHERE, Origin
 
 KEY = "clod_adapter"
 FORMAT = "clod-adapter"
@@ -41,6 +43,8 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
         "attenuation": asdict(adapter.attenuation),
         "config": adapter.config,
     }
+    if any(adapter.origin):
+        about["origin"] = adapter.origin
     if adapter.calibration is not None:
         about["calibration"] = adapter.calibration.as_dict()
     check_config(adapter.config)
@@ -87,11 +91,19 @@ def load_adapter(path: str | Path) -> Adapter:
             config=about["config"],
             version=about["package_version"],
             calibration=Calibration.from_dict(about["calibration"]) if "calibration" in about else None,
+            origin=_origin(about.get("origin", NOWHERE)),
         )
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ClodError(f"{path}: its description is damaged ({error!r}); copy or export the adapter again") from error
     except ClodError as error:
         raise ClodError(f"{path}: {error}") from error
+
+
+def _origin(values: Any) -> Origin:
+    x, y, z = map(float, values)
+    if not np.isfinite((x, y, z)).all():
+        raise ValueError(f"origin is {values!r:.80}, not finite")
+    return x, y, z
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

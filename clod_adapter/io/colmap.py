@@ -15,14 +15,14 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.scene_folder import find_cameras
 
 
-def load_points(folder: str | Path) -> torch.Tensor:
-    """``[M, 3]`` float64, the points of the scene's COLMAP model, world units; none where it has no model.
+def load_points(folder: str | Path, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> torch.Tensor:
+    """``[M, 3]`` float64, the points of the scene's COLMAP model less ``origin``, world units; none without a model.
 
     The model is one that loads.
     """
     model = find_cameras(Path(folder))
     points = pycolmap.Reconstruction(str(model)).points3D.values() if model.is_dir() else ()
-    return torch.from_numpy(np.array([point.xyz for point in points], np.float64).reshape(-1, 3))
+    return torch.from_numpy(np.array([point.xyz for point in points], np.float64).reshape(-1, 3) - origin)
 
 
 def write_model(

@@ -15,6 +15,7 @@ from clod_adapter.calibration import Calibration
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.origin import AXES, NOWHERE, Origin, origin_of, relative
 from clod_adapter.io.ply_body import read_vertex
 from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, inria_dtype, read_table, sh_degree_of
 from clod_adapter.io.ply_header import (
@@ -42,6 +43,8 @@ class Checkpoint:
         fingerprint: SHA-256 of the file's bytes, hex; before it and a colon, what was taken as activated.
         path: where it was read from.
         calibration: what its dial values keep, cost and take, if the file says so.
+        origin: ``[3]`` what the means are relative to, world units: not 0 only for a scene far from 0, whose
+            photographs are to be read relative to it too (``load_scene``). Outputs are in the file's own coordinates.
     """
 
     gaussians: Gaussians
@@ -51,9 +54,10 @@ class Checkpoint:
     fingerprint: str
     path: Path
     calibration: Calibration | None = None
+    origin: Origin = NOWHERE
 
 
-def load(path: str | Path, *, activated: Activated | None = None) -> Checkpoint:
+def load(path: str | Path, *, activated: Activated | None = None, origin: Origin | None = None) -> Checkpoint:
     """Reads a checkpoint of plain Gaussians, in Inria's, MaskGaussian's, Mip-Splatting's or our extended layout.
 
     Any property order, byte order or ascii, with or without normals, SH degree 0 to 4. Rows with a
@@ -67,6 +71,7 @@ def load(path: str | Path, *, activated: Activated | None = None) -> Checkpoint:
         activated: which values to take as activated already, where no logit opacity is below -0.1 or no
             logarithmic scale below 0, as in no usual file: "none", "opacity", "scales" or "both". Files
             that this package wrote are not in question.
+        origin: what the means are to be relative to, as another checkpoint's are; by default what suits them.
 
     Raises:
         ClodError: not a checkpoint, damaged, of another kind, nothing usable in it, or values in question and
@@ -80,7 +85,13 @@ def load(path: str | Path, *, activated: Activated | None = None) -> Checkpoint:
     names = [name for group in columns.values() for name in group]
     extras = [name for name in (SIGMA, *MASKS) if name in (vertex.dtype.names or ())]
     table = read_table(vertex, names + extras)
+    origin = origin_of(vertex) if origin is None else origin
+    if any(origin):
+        table[:, :3] = relative(vertex, origin)
     keep, notes = _usable_rows(path, table, names + extras)
+    if any(origin):
+        where = ", ".join(f"{value:.10g}" for value in origin)
+        notes.append(f"far from 0: read relative to ({where}); outputs have x, y, z as double")
     if not keep.all():
         vertex, table = vertex[keep], table[keep]
     gaussians, calibration = _gaussians(table, columns), None
@@ -92,7 +103,7 @@ def load(path: str | Path, *, activated: Activated | None = None) -> Checkpoint:
         notes += remarks + doubts
     notes = [*changes, *notes, *others]
     fingerprint = _sha256(path) if was == "none" else f"{was}:{_sha256(path)}"
-    return Checkpoint(gaussians, vertex, (*comments, *changes), tuple(notes), fingerprint, path, calibration)
+    return Checkpoint(gaussians, vertex, (*comments, *changes), tuple(notes), fingerprint, path, calibration, origin)
 
 
 def save(
@@ -109,7 +120,8 @@ def save(
 
     Row ``i`` of ``gaussians`` is row ``i`` of ``base``. Columns keep name, order and type; a value is
     overwritten only where it differs from the base's float32 reading, so what was not tuned stays
-    byte-equal. The settings follow the element line as comments. Without a sigma_d a plain file results.
+    byte-equal. Where the base has an origin, x, y and z are written as double. The settings follow the element line
+    as comments. Without a sigma_d a plain file results.
 
     Args:
         version: of the package that made the values, for the header (``Adapter.version``); by default the running one.
@@ -131,16 +143,19 @@ def save(
             f"({len(base.vertex)} of degree {base.gaussians.sh_degree}); save with the checkpoint they came from"
         )
     comments = write_comments(gaussians.attenuation, base.comments, version, calibration)
-    element = PlyElement.describe(_merged(path, gaussians, base.vertex), "vertex", comments=comments)
+    element = PlyElement.describe(_merged(path, gaussians, base), "vertex", comments=comments)
     with atomic_path(path) as temporary:
         PlyData([element], byte_order="<").write(str(temporary))
 
 
-def blank(count: int, sh_degree: int) -> Checkpoint:
-    """A base of zeros in Inria's layout (normals included), for Gaussians that come from no file."""
+def blank(count: int, sh_degree: int, origin: Origin = NOWHERE) -> Checkpoint:
+    """A base of zeros in Inria's layout (normals included), for Gaussians that come from no file, or not as rows."""
     groups = column_map(sh_degree)
-    vertex = np.zeros(count, inria_dtype(sh_degree))
-    return Checkpoint(_gaussians(read_table(vertex, sum(groups.values(), ())), groups), vertex, (), (), "", Path())
+    vertex = _with_doubles(np.zeros(count, inria_dtype(sh_degree)), origin)
+    gaussians = _gaussians(np.zeros((count, sum(map(len, groups.values()))), np.float32), groups)
+    for axis, value in zip(AXES, origin, strict=True):
+        vertex[axis] = value
+    return Checkpoint(gaussians, vertex, (), (), "", Path(), origin=origin)
 
 
 def _read_rows(path: Path) -> tuple[np.ndarray, int, tuple[str, ...], list[str]]:
@@ -191,8 +206,9 @@ def _gaussians(table: np.ndarray, columns: dict[str, tuple[str, ...]]) -> Gaussi
     return Gaussians(**tensors)
 
 
-def _merged(path: Path, gaussians: Gaussians, vertex: np.ndarray) -> np.ndarray:
+def _merged(path: Path, gaussians: Gaussians, base: Checkpoint) -> np.ndarray:
     """The base's rows with changed values written in and sigma_d as the last column."""
+    vertex = _with_doubles(base.vertex, base.origin)
     names = [name for name in vertex.dtype.names or () if name != SIGMA]
     dtype = [(name, vertex.dtype[name]) for name in names]
     merged = np.empty(len(vertex), dtype + ([(SIGMA, np.dtype("f4"))] if gaussians.sigma_d is not None else []))
@@ -200,17 +216,26 @@ def _merged(path: Path, gaussians: Gaussians, vertex: np.ndarray) -> np.ndarray:
         merged[name] = vertex[name]
     for attribute, group in column_map(gaussians.sh_degree).items():
         new = _numpy(getattr(gaussians, attribute)).reshape(len(vertex), -1)
-        changed = new.view(np.uint32) != read_table(vertex, group).view(np.uint32)
+        old = relative(vertex, base.origin) if attribute == "means" else read_table(vertex, group)
+        changed = new.view(np.uint32) != old.view(np.uint32)
         if not np.isfinite(new[changed]).all():
             raise ClodError(f"{path}: {attribute} holds a new value that is not finite; the tuning has diverged")
         for column in np.flatnonzero(changed.any(0)):
             rows = changed[:, column]
-            merged[group[column]][rows] = new[rows, column]
+            shift = base.origin[column] if attribute == "means" else 0.0
+            merged[group[column]][rows] = new[rows, column].astype(np.float64) + shift if shift else new[rows, column]
     if gaussians.sigma_d is not None:
         merged[SIGMA] = _numpy(gaussians.sigma_d)
         if not np.isfinite(merged[SIGMA]).all():
             raise ClodError(f"{path}: {SIGMA} holds a value that is not finite; use a large number for no decay")
     return merged
+
+
+def _with_doubles(vertex: np.ndarray, origin: Origin) -> np.ndarray:
+    """The rows with coordinates that have digits for what is far from 0, where the origin is."""
+    names = vertex.dtype.names or ()
+    wider = [(name, np.dtype("f8") if name in AXES else vertex.dtype[name]) for name in names]
+    return vertex.astype(wider) if any(origin) else vertex
 
 
 def _numpy(tensor: torch.Tensor) -> np.ndarray:

@@ -1,0 +1,40 @@
+"""Scenes far from 0: read relative to an origin of their own, where float32 has digits for them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+Origin = tuple[float, float, float]
+NOWHERE: Origin = (0.0, 0.0, 0.0)
+AXES = ("x", "y", "z")
+# Times the spread of the bulk. Nearer, float32 places the Gaussians to 1e-5 of it and better, and nothing is done.
+FAR = 100.0
+
+
+def origin_of(vertex: np.ndarray) -> Origin:
+    """What the coordinates ``x, y, z`` of the rows are to be relative to, world units; 0 unless they are far from it.
+
+    The median, rounded to multiples of a power of two near the spread (the middle 80 % along the widest axis), so that
+    taking it from float32 coordinates is exact.
+    """
+    xyz = np.stack([vertex[axis].astype(np.float64) for axis in AXES], 1)
+    xyz = xyz[np.isfinite(xyz).all(1)]
+    if not len(xyz):
+        return NOWHERE
+    low, middle, high = np.quantile(xyz, (0.1, 0.5, 0.9), axis=0, method="nearest")
+    spread = float((high - low).max())
+    if not 0 < FAR * spread < float(np.abs(middle).max()):
+        return NOWHERE
+    unit = 2.0 ** math.ceil(math.log2(spread))
+    x, y, z = (float(value) for value in np.round(middle / unit) * unit)
+    return x, y, z
+
+
+def relative(vertex: np.ndarray, origin: Sequence[float]) -> np.ndarray:
+    """``[N, 3]`` float32 coordinates of the rows relative to ``origin``."""
+    columns = [vertex[axis].astype(np.float64) - by for axis, by in zip(AXES, origin, strict=True)]
+    with np.errstate(over="ignore"):
+        return np.stack(columns, 1).astype(np.float32)
