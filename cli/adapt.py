@@ -147,7 +147,7 @@ def train(
     """Adapts while the user watches. Raises KeyboardInterrupt when there is nothing worth writing."""
     console, follow = follower.console, saver.watching(page.watching(follower) if page else follower)
     with closing(follower):
-        adapted = adapt(base, scene, config, follow, resume=saver.state)
+        adapted = adapt(base, scene, config, follow, saver.state)
     if follower.stop.requests > 1:
         raise KeyboardInterrupt
     how = "interrupted after" if adapted.interrupted else "trained"

@@ -177,22 +177,22 @@ fits clearly better, it stops, with what was found: other axes, scale or offset,
 gsplat's or nerfstudio's normalised frame, a white background.
 --misaligned-ok goes on with a warning.
 
-While training its state is saved in OUT.resume.safetensors, after the first step
-and then now and then, for at most 2 % of the time. After a crash, a kill, a full
-disk or Ctrl-C the same command with --resume goes on from there, and ends with
-the very Gaussians, bit for bit, that it would have ended with undisturbed (on as
-many threads). Without such a file it starts from the beginning, and says so; the
-finished run removes it. Inputs are only read, and no file carries its final name
-before it is complete.
+While training its state is saved in OUT.resume.safetensors, after the first
+step and then now and then, for at most 2 % of the time. After a crash, a kill,
+a full disk or Ctrl-C the same command with --resume goes on from there, and
+ends with the very Gaussians, bit for bit, that it would have ended with
+undisturbed (on as many threads). Without such a file it starts from the
+beginning, and says so; the finished run removes it. No file has its final name
+before it is whole.
 
-Ctrl-C, or SIGTERM, while training stops after the step under way and writes what
-was learned so far (exit code 0, "interrupted": true in the report), and the state
-for --resume; once more aborts, with the state last saved. While the result is
-written it is finished first, while it is measured the rest is skipped. Before
-training nothing is written.
+Ctrl-C, or SIGTERM, while training stops after the step under way and writes the
+state for --resume and what was learned so far (exit code 0, "interrupted": true
+in the report); once more aborts, and the state last saved stays. While the
+result is written it is finished first; while it is measured the rest is
+skipped. Before training nothing is written.
 
-exit codes: 0 written; 2 bad input, one line on stderr and nothing written;
-130 interrupted with nothing to write, or aborted
+exit codes: 0 written; 2 bad input or a full disk, one line on stderr and no
+output written; 130 interrupted with nothing to write, or aborted
 
 examples:
   clod-adapt garden.ply --images garden --max-sv 5
