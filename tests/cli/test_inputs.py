@@ -1,0 +1,81 @@
+"""Checkpoints as other tools leave them, through the commands."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+
+from clod_adapter.cli.main import COMMANDS, build_parser
+
+TINY = ("--iters", 4, "--max-sv", 4, "--out", "dial.ply")
+
+
+def activated(source: Path, path: Path) -> Path:
+    """The same splat with opacities and scales as such."""
+    ply = PlyData.read(str(source), mmap=False)
+    vertex = ply["vertex"].data
+    vertex["opacity"] = 1 / (1 + np.exp(-vertex["opacity"].astype(np.float64)))
+    for name in ("scale_0", "scale_1", "scale_2"):
+        vertex[name] = np.exp(vertex[name].astype(np.float64))
+    ply.write(str(path))
+    return path
+
+
+def test_gsplats_checkpoint_gets_a_dial(clod: Any, capture: Any, tmp_path: Path) -> None:
+    g = capture.gaussians
+    values = {
+        "means": g.means, "quats": g.quats, "scales": g.log_scales, "opacities": g.opacity_logits, "sh0": g.sh0,
+        "shN": g.shN,
+    }  # fmt: skip
+    torch.save({"step": 6999, "splats": values}, tmp_path / "ckpt.pt")
+    done = clod("ckpt.pt", "--images", capture.scene, *TINY)
+    assert done.code == 0 and "note: gsplat's trainer may have normalised" in done.err, done
+    assert clod("apply", "ckpt.pt", "dial.safetensors", "--out", "again.ply").code == 0
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
+    done = clod("bake", "ckpt.pt", "--sv", 2, "--out", "b.ply")
+    assert done.code == 2 and "has no sigma_d" in done.err
+
+
+def test_values_that_look_activated_are_asked_about(clod: Any, capture: Any, tmp_path: Path) -> None:
+    path = activated(capture.ply, tmp_path / "in.ply")
+    images = ("--images", capture.scene)
+    for words in ((path, *images, *TINY), ("eval", path, *images), ("robustness", path, *images)):
+        done = clod(*words)
+        assert done.code == 2 and "--activated both" in done.err.splitlines()[-1], done
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["in.ply"]
+    done = clod(path, *images, *TINY, "--activated", "both")
+    assert done.code == 0 and "opacity taken as activated" in done.err, done
+    done = clod("apply", path, "dial.safetensors", "--out", "again.ply", "--activated", "both")
+    assert done.code == 0 and (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes(), done
+    done = clod("apply", path, "dial.safetensors", "--out", "again.ply", "--activated", "none")
+    assert done.code == 2 and "a different base was given" in done.err
+    # The answer is about the checkpoint, not about the adapted file beside it.
+    done = clod("eval", "dial.ply", *images, "--sv", 1, "--base", path, "--activated", "both", "--json")
+    assert done.code == 0, done
+    # And with it the picture is the right one.
+    errors = [
+        json.loads(clod("eval", *words, *images, "--sv", 1, "--json").out)["rows"][0]["psnr"]
+        for words in ((capture.ply,), (path, "--activated", "both"), (path, "--activated", "none"))
+    ]
+    assert errors[0] > 40 and abs(errors[1] - errors[0]) < 0.5 and errors[2] < 20
+
+
+def test_every_command_that_reads_a_checkpoint_takes_the_answer() -> None:
+    for name in ("", *COMMANDS):
+        options = {option for action in build_parser(name)._actions for option in action.option_strings}
+        assert ("--activated" in options) == (name != "demo"), name
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("a.hier", "Hierarchical-3DGS"), ("a.splat", "splat-transform"), ("a.ckpt", "ns-export")]
+)
+def test_other_formats_are_refused_before_the_work(clod: Any, tmp_path: Path, name: str, message: str) -> None:
+    (tmp_path / name).write_bytes(bytes(100))
+    done = clod(name, "--out", "dial.ply")
+    assert done.code == 2 and message in done.err and len(done.err.splitlines()) == 1, done
