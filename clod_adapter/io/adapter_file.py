@@ -107,6 +107,8 @@ def _origin(values: Any) -> Origin:
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    if path.exists() and not path.is_file():  # a pipe would be waited for
+        raise ClodError(f"{path}: cannot be read (it is not a regular file); give the name of a file")
     try:
         with safe_open(path, framework="pt") as file:
             # Copies, since the file may change under a memory map.

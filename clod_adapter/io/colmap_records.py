@@ -18,6 +18,9 @@ def check_records(model: Path) -> None:
     """
     for name, after in _RECORDS.items():
         path = model / name
+        for other in (path, path.with_suffix(".txt")):
+            if other.exists() and not other.is_file():  # a pipe would be waited for
+                raise ClodError(f"{other}: cannot be read (it is not a regular file); copy the model again")
         if not path.is_file():
             continue
         try:

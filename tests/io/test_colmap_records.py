@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -72,6 +73,15 @@ def test_counts_of_what_is_not_there(tmp_path: Path, file: str, count: int) -> N
     path.write_bytes(count.to_bytes(8, "little") + path.read_bytes()[8:])
     with pytest.raises(ClodError, match=f"{file}.bin: is truncated or damaged"):
         check_records(path.parent)
+
+
+@pytest.mark.parametrize("file", ["rigs.bin", "frames.txt"])
+def test_pipes_are_not_waited_for(tmp_path: Path, file: str) -> None:
+    target = model(tmp_path, "binary")
+    (target / file).unlink(missing_ok=True)
+    os.mkfifo(target / file)
+    with pytest.raises(ClodError, match=f"{file}: .*not a regular file"):
+        read_model(target)
 
 
 @pytest.mark.parametrize(
