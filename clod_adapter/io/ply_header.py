@@ -62,8 +62,8 @@ def read_head(path: Path) -> Head:
         raise ClodError(
             f"{path}: the PLY header holds a character that is not printable ASCII; remove it from the comments"
         )
-    counts = re.findall(rb"(?m)^[ \t]*element[ \t]+\S+[ \t]+(\d{1,18})[ \t]*$", header)
-    header = re.sub(rb"(?m)^([ \t]*element[ \t]+\S+[ \t]+)\d{1,18}[ \t]*$", rb"\g<1>0", header)
+    counts = re.findall(rb"(?m)^[ \t]*element[ \t]+\S+[ \t]+(\d{1,20})[ \t]*$", header)
+    header = re.sub(rb"(?m)^([ \t]*element[ \t]+\S+[ \t]+)\d{1,20}[ \t]*$", rb"\g<1>0", header)
     try:
         ply = PlyData.read(io.BytesIO(header), mmap=False)
     except Exception as error:  # plyfile lets ValueError and more through, besides its own errors

@@ -32,7 +32,7 @@ def header(form: str, count: object, before: str = "", after: str = "") -> bytes
 
 
 @pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize("count", [1 << 31, 1 << 32, (1 << 59) + 7, 10])
+@pytest.mark.parametrize("count", [1 << 31, 1 << 62, (1 << 64) - 1, 10])
 def test_a_header_that_claims_too_much_allocates_nothing(tmp_path: Path, form: str, count: int) -> None:
     path = tmp_path / "in.ply"
     path.write_bytes(header(form, count) + b"0 " * 30)
@@ -47,7 +47,7 @@ def test_a_header_that_claims_too_much_allocates_nothing(tmp_path: Path, form: s
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("count", [-1, -(1 << 31), "nan", "0x10", "1_0", "9" * 20, "9" * 5000, "2.0", "+3", ""])
+@pytest.mark.parametrize("count", [-1, -(1 << 31), "nan", "0x10", "1_0", "9" * 21, "9" * 5000, "2.0", "+3", ""])
 def test_counts_that_are_none(tmp_path: Path, count: object) -> None:
     (tmp_path / "in.ply").write_bytes(header("binary_little_endian", count) + bytes(300))
     with pytest.raises(ClodError, match="header is damaged"):
