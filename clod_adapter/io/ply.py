@@ -68,9 +68,9 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
     as a checkpoint of gsplat's trainer.
 
     Args:
-        activated: which values to take as activated already, where no logit opacity is below -0.1 or no
-            logarithmic scale below 0, as in no usual file: "none", "opacity", "scales" or "both". Files
-            that this package wrote are not in question.
+        activated: which values to take as activated already, where no opacity is below -0.1 and half are at
+            most 1, or no scale is below 0, as in no usual file of logits and logarithms: "none", "opacity",
+            "scales" or "both". Files that this package wrote are not in question.
         origin: what the means are to be relative to, as another checkpoint's are; by default what suits them.
 
     Raises:

@@ -17,7 +17,7 @@ from clod_adapter.io.ply_columns import column_map, read_table
 Activated = Literal["none", "opacity", "scales", "both"]
 FILTER = "filter_3D"
 _OPACITY, _SCALES = ("opacity",), column_map(0)["log_scales"]
-_FEW = 10  # so few values may have any range
+_FEW = 10  # fewer Gaussians may have any range
 _FAINTEST = -0.1  # logit of 0.475; trainers leave fainter Gaussians than that, and files of |a| dip just below 0
 _TINY = float(np.finfo(np.float32).tiny)
 _OPAQUE = 1 - 2.0**-24  # the largest float32 below 1
@@ -37,11 +37,13 @@ def as_stored_by_inria(
     """
     if activated is not None and activated not in get_args(Activated):
         raise ClodError(f"activated is {activated!r}, it must be one of {', '.join(get_args(Activated))}")
-    found = {
-        name: extent
-        for name, columns, least in (("opacity", _OPACITY, _FAINTEST), ("scales", _SCALES, 0.0))
-        if (extent := _suspicious(vertex, columns, least))
-    }
+    opacity, scales = _table(vertex, _OPACITY), _table(vertex, _SCALES)
+    found = {}
+    # Half of the values at most 1: not so of logits whose faint ones were pruned.
+    if (extent := _range(opacity, _FAINTEST)) and np.nanmedian(opacity) <= 1:
+        found["opacity"] = extent
+    if extent := _range(scales, 0.0):
+        found["scales"] = extent
     if found and activated is None:
         raise ClodError(f"{path}: {_question(found)}")
     taken = [name for name in found if activated in (name, "both")]
@@ -58,11 +60,10 @@ def as_stored_by_inria(
     return vertex, was, notes
 
 
-def _suspicious(vertex: np.ndarray, columns: tuple[str, ...], least: float) -> tuple[float, float] | None:
-    """The range of the values, if it is that of activated ones: none is below ``least``."""
-    values = _table(vertex, columns)
-    values = values[np.isfinite(values)]
-    if values.size < _FEW * len(columns):
+def _range(values: np.ndarray, least: float) -> tuple[float, float] | None:
+    """The smallest and the largest, if none is below ``least`` and they are enough to tell anything."""
+    values = values[np.isfinite(values).all(1)]
+    if len(values) < _FEW:
         return None
     low, high = float(values.min()), float(values.max())
     return (low, high) if low >= least and (low < high or high == 1) else None
