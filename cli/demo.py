@@ -64,6 +64,7 @@ def adapt_arguments(args: argparse.Namespace, base: Path, capture: Path, model: 
     """What the main job's own parser makes of the command line for the demo's files."""
     words = [f"--images={capture}", f"--max-sv={MAX_SV:g}", f"--iters={ADAPT_STEPS}", f"--out={model}"]
     words += [f"--{name}" for name in ("quiet", "json") if getattr(args, name)]
+    words += ["--resume"] if Outputs.of(str(base), str(model)).state.exists() else []
     return make_parser(ADAPT, "clod-adapt").parse_args([*words, "--", str(base)])
 
 
