@@ -125,7 +125,7 @@ def _camera(where: str, photograph: Path, values: Mapping[str, Any]) -> pycolmap
 
     width, height = (int(number(key, 0)) for key in ("w", "h"))
     if width < 1 or height < 1:  # that of a missing photograph does not matter
-        width, height = image_size(photograph) if photograph.is_file() else (1, 1)
+        width, height = image_size(photograph) if isfile(photograph) else (1, 1)
     fx = number("fl_x", 0) or _focal(width, number("camera_angle_x", 0))
     if fx <= 0:
         raise ClodError(f"{where}: has neither fl_x nor camera_angle_x above 0; export the file again")

@@ -237,3 +237,10 @@ def test_a_file_that_is_too_large(tmp_path: Path) -> None:
         file.truncate(300 * 2**20)
     with pytest.raises(ClodError, match="transforms.json: is larger than 256 MB"):
         load_scene(tmp_path)
+
+
+def test_names_longer_than_file_systems_allow(tmp_path: Path) -> None:
+    for name in ("images/" + "b" * 300, "[" * 100_000, "a/" * 3000 + "b.png"):
+        write(tmp_path, [frame(0) | {"file_path": name}], camera_angle_x=0.8)  # whose size would be looked for
+        with pytest.raises(ClodError):
+            load_scene(tmp_path)
