@@ -7,12 +7,14 @@ first records of its models are among them.
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import random
 import re
 import shutil
 import zipfile
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -29,15 +31,19 @@ from clod_adapter.io.ply_columns import inria_dtype
 from clod_adapter.io.ply_header import read_head
 
 Input = dict[str, bytes]
-FORMATS = ("ply", "safetensors", "colmap", "pt")
+FORMATS = ("ply", "safetensors", "colmap", "transforms", "pt")
 IMAGES = ("a.png", "b.png", "c.png")
 SIZE = (8, 6)
+CAMERAS = {
+    "SIMPLE_PINHOLE": (9.0, 4, 3), "PINHOLE": (9.0, 9, 4, 3), "SIMPLE_RADIAL": (9.0, 4, 3, 0.02),
+    "OPENCV": (9.0, 9, 4, 3, 0.01, 0, 0, 0.001),
+}  # fmt: skip
 
 
 def make(kind: str, folder: Path) -> list[Input]:
     """The undamaged inputs of a format; ``folder`` is for files on the way."""
     makers: dict[str, Callable[[Path], list[Input]]] = {
-        "ply": _plys, "safetensors": _adapters, "colmap": _models, "pt": _pts
+        "ply": _plys, "safetensors": _adapters, "colmap": _models, "transforms": _transforms, "pt": _pts
     }  # fmt: skip
     return makers[kind](folder)
 
@@ -108,11 +114,11 @@ def _adapters(folder: Path) -> list[Input]:
     return inputs
 
 
-def _model() -> pycolmap.Reconstruction:
-    """Three images of two cameras, one a rig of two, and points that they see."""
+def _model(*kinds: str) -> pycolmap.Reconstruction:
+    """Three images of two cameras of these kinds, and points that they see."""
     model = pycolmap.Reconstruction()
-    for number, params in enumerate(([9.0, 4, 3], [9.0, 9, 4, 3]), start=1):
-        kind = "SIMPLE_PINHOLE" if len(params) == 3 else "PINHOLE"
+    for number, kind in enumerate(kinds, start=1):
+        params = CAMERAS[kind]
         size = {"width": SIZE[0], "height": SIZE[1]}
         model.add_camera_with_trivial_rig(pycolmap.Camera(model=kind, params=params, camera_id=number, **size))
     for number, name in enumerate(IMAGES, start=1):
@@ -127,16 +133,32 @@ def _model() -> pycolmap.Reconstruction:
 
 
 def _models(folder: Path) -> list[Input]:
-    """Binary and text, each as of today and as of before there were rigs."""
+    """Binary and text, each as of today and as of before there were rigs; without and with distortion."""
     inputs = []
-    for form in ("binary", "text"):
+    pairs = (("SIMPLE_PINHOLE", "PINHOLE"), ("OPENCV", "SIMPLE_RADIAL"))
+    for form, kinds in itertools.product(("binary", "text"), pairs):
         target = folder / form
         target.mkdir()
-        getattr(_model(), f"write_{form}")(str(target))
+        getattr(_model(*kinds), f"write_{form}")(str(target))
         files = {path.name: path.read_bytes() for path in target.iterdir()}
         inputs += [files, {name: data for name, data in files.items() if name.split(".")[0] not in ("rigs", "frames")}]
         shutil.rmtree(target)
     return inputs
+
+
+def _transforms(folder: Path) -> list[Input]:
+    """Of nerfstudio with distortion, and of Blender's scenes, in two files."""
+    pose = np.diag([1.0, -1, -1, 1]).tolist()
+    frames = [{"file_path": f"images/{name}", "transform_matrix": pose} for name in IMAGES]
+    size = {"w": SIZE[0], "h": SIZE[1], "fl_x": 9.0, "fl_y": 9.0, "cx": 4.0, "cy": 3.0}
+    lens = {"camera_model": "OPENCV", "k1": 0.01, "k2": 0.0, "p1": 0.0, "p2": 0.001}
+    named = [{**frame, "file_path": frame["file_path"][:-4]} for frame in frames]
+    blender = [{"camera_angle_x": 0.8, "frames": part} for part in (named[:2], named[2:])]
+    documents = [
+        {"transforms.json": {**size, "frames": frames}}, {"transforms.json": {**size, **lens, "frames": frames[:1]}},
+{"transforms_train.json": blender[0], "transforms_test.json": blender[1]},
+    ]  # fmt: skip
+    return [{name: json.dumps(content).encode() for name, content in files.items()} for files in documents]
 
 
 def _pts(folder: Path) -> list[Input]:
@@ -155,7 +177,8 @@ def _pts(folder: Path) -> list[Input]:
 
 VALUES: tuple[Any, ...] = (
     None, True, -1, 0, 1 << 31, 1 << 63, 1 << 200, 1e308, float("nan"), float("inf"), "", "x", "nan", "a\nb", "\x1b",
-    [], {}, [1], {"a": 1}, [None, None], "[" * 100000, 0.5, "F64", [2**62, 2**62], [0, 2**63],
+    [], {}, [1], {"a": 1}, [None, None], "[" * 100000, 0.5, "F64", [2**62, 2**62], [0, 2**63], 1e-300, 1e9, -0.5,
+    "../a.png", "/etc/passwd", "images/a", "OPENCV_FISHEYE", "x" * 300,
 )  # fmt: skip
 NUMBERS = (0, 1, 2, 255, 1 << 15, 1 << 16, 1 << 24, (1 << 31) - 1, 1 << 31, (1 << 32) - 1, 1 << 40, 1 << 62)
 NUMBERS += ((1 << 63) - 1, 1 << 63, (1 << 64) - 1)
@@ -205,17 +228,29 @@ def _describe(data: bytes, chance: random.Random) -> bytearray:
         damage(text, chance)
         header["__metadata__"]["clod_adapter"] = text.decode("latin1")
     else:
-        where: Any = header if chance.random() < 0.2 else about
-        while True:
-            key = chance.choice(sorted(where) if isinstance(where, dict) else range(len(where)))
-            if not isinstance(where[key], dict | list) or not where[key] or chance.random() < 0.3:
-                break
-            where = where[key]
-        where[key] = chance.choice(VALUES)
+        _replace(header if chance.random() < 0.2 else about, chance)
         if isinstance(header.get("__metadata__"), dict):
             header["__metadata__"]["clod_adapter"] = json.dumps(about)
     changed = json.dumps(header).encode()
     return bytearray(len(changed).to_bytes(8, "little") + changed + data[8 + size :])
+
+
+def _document(data: bytes, chance: random.Random) -> bytearray:
+    """JSON with some of its values replaced."""
+    document = json.loads(data)
+    for _ in range(chance.choice((1, 1, 2, 4))):
+        _replace(document, chance)
+    return bytearray(json.dumps(document).encode())
+
+
+def _replace(where: Any, chance: random.Random) -> None:
+    """Puts another value somewhere into a JSON document."""
+    while True:
+        key = chance.choice(sorted(where) if isinstance(where, dict) else range(len(where)))
+        if not isinstance(where[key], dict | list) or not where[key] or chance.random() < 0.3:
+            break
+        where = where[key]
+    where[key] = deepcopy(chance.choice(VALUES))
 
 
 def _repack(data: bytes, chance: random.Random) -> bytearray:
@@ -296,5 +331,5 @@ def _place(data: bytearray, chance: random.Random) -> int:
     return chance.randrange(max(1, min(len(data), 200) if chance.random() < 0.33 else len(data)))
 
 
-INSIDE = {".safetensors": _describe, ".pt": _repack}
+INSIDE = {".safetensors": _describe, ".pt": _repack, ".json": _document}
 WAYS = (_flip, _truncate, _drop, _insert, _word, _number, _number, _chunk, _line, _line)
