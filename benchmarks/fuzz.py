@@ -6,8 +6,9 @@
 
 A case is an undamaged input (mutants.py), damaged at random from its seed and number. Anything else than those two
 outcomes is a failure: another exception, a process that dies (COLMAP is C++) or takes more than LIMIT_S, more than
-LIMIT_MB of memory beyond what reading an undamaged input takes, an allocation that was refused, a file opened outside
-of the case's folder, a program started, a connection made. Failures are printed, with the command that repeats them.
+LIMIT_MB of memory beyond what reading undamaged inputs takes, an allocation that was refused, a warning, a message of
+several lines or without the file's name, a file opened outside of the case's folder, a program started, a connection
+made. Failures are printed, with the command that repeats them.
 """
 
 from __future__ import annotations
