@@ -20,12 +20,14 @@ def origin_of(vertex: np.ndarray) -> Origin:
     The median, rounded to multiples of a power of two near the spread (the middle 80 % along the widest axis), so that
     taking it from float32 coordinates is exact.
     """
-    xyz = np.stack([vertex[axis].astype(np.float64) for axis in AXES], 1)
+    with np.errstate(invalid="ignore"):  # a NaN that signals
+        xyz = np.stack([vertex[axis].astype(np.float64) for axis in AXES], 1)
     xyz = xyz[np.isfinite(xyz).all(1)]
     if not len(xyz):
         return NOWHERE
     low, middle, high = np.quantile(xyz, (0.1, 0.5, 0.9), axis=0, method="nearest")
-    spread = float((high - low).max())
+    with np.errstate(over="ignore"):  # of doubles
+        spread = float((high - low).max())
     if not 0 < FAR * spread < float(np.abs(middle).max()):
         return NOWHERE
     unit = 2.0 ** math.ceil(math.log2(spread))
@@ -35,6 +37,6 @@ def origin_of(vertex: np.ndarray) -> Origin:
 
 def relative(vertex: np.ndarray, origin: Sequence[float]) -> np.ndarray:
     """``[N, 3]`` float32 coordinates of the rows relative to ``origin``."""
-    columns = [vertex[axis].astype(np.float64) - by for axis, by in zip(AXES, origin, strict=True)]
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
+        columns = [vertex[axis].astype(np.float64) - by for axis, by in zip(AXES, origin, strict=True)]
         return np.stack(columns, 1).astype(np.float32)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import time
 import tracemalloc
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -116,3 +117,16 @@ def test_ascii_rows_that_are_none(tmp_path: Path, bad: str) -> None:
     (tmp_path / "in.ply").write_bytes(header("ascii", 3) + (good + bad + "\n" + good).encode())
     with pytest.raises(ClodError, match="in.ply: damaged or truncated"):
         load(tmp_path / "in.ply")
+
+
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+def test_values_at_the_ends_warn_of_nothing(tmp_path: Path, kind: str) -> None:
+    vertex = np.zeros(20, [(name, kind) for name in inria_dtype(0).names or ()])
+    vertex["rot_0"], vertex["opacity"] = 1, np.linspace(-3, 3, 20)
+    vertex["x"] = np.linspace(-1, 1, 20) * np.finfo(kind).max
+    for name in ("x", "opacity", "scale_0"):  # NaNs that signal
+        vertex[name].view("u4" if kind == "f4" else "u8")[3] = 0x7F800001 if kind == "f4" else 0x7FF0000000000001
+    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(tmp_path / "in.ply"))
+    with warnings.catch_warnings(action="error"):
+        loaded = load(tmp_path / "in.ply", activated="none")
+    assert 0 < len(loaded.gaussians) < 20
