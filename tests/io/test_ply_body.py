@@ -123,7 +123,8 @@ def test_ascii_rows_that_are_none(tmp_path: Path, bad: str) -> None:
 def test_values_at_the_ends_warn_of_nothing(tmp_path: Path, kind: str) -> None:
     vertex = np.zeros(20, [(name, kind) for name in inria_dtype(0).names or ()])
     vertex["rot_0"], vertex["opacity"] = 1, np.linspace(-3, 3, 20)
-    vertex["x"] = np.linspace(-1, 1, 20) * np.finfo(kind).max
+    vertex["x"] = np.linspace(-1, 1, 20)
+    vertex["x"][:2] = -np.finfo(kind).max, np.finfo(kind).max
     for name in ("x", "opacity", "scale_0"):  # NaNs that signal
         vertex[name].view("u4" if kind == "f4" else "u8")[3] = 0x7F800001 if kind == "f4" else 0x7FF0000000000001
     PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(tmp_path / "in.ply"))
