@@ -63,8 +63,13 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         follower = Follower(console, stop, gaussians, scene.test, config.max_sv, base_rows[0] if base_rows else None)
         adapted = train(gaussians, scene, config, follower, saver, page)
         watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
-        about = {"fingerprint": base.fingerprint, "config": asdict(config), "origin": base.origin}
-        adapter = extract(gaussians, adapted.gaussians, **about)
+        adapter = extract(
+            gaussians,
+            adapted.gaussians,
+            fingerprint=base.fingerprint,
+            config=asdict(config),
+            origin=base.origin,
+        )
         if gaussians.sigma_d is None and adapter.attenuation.tau < config.tau:
             notes.append(
                 f"tau is lowered from {config.tau:g} to {adapter.attenuation.tau:.2g}: its Gaussians are faint"
