@@ -282,9 +282,9 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     return f"""\
 ## Extreme scenes
 
-`{CAPTURE}` (20,000 Gaussians, {rows[0]["base_psnr"]:.2f} dB) with one thing made extreme, adapted for {STEPS} steps; PSNR
-on the held-out views at the share that is kept. A scene holds when every picture and parameter is finite and the
-full-quality end is at most {ALLOWED} dB below the checkpoint itself: {held} of {len(rows)} do.
+`{CAPTURE}` (20,000 Gaussians, {rows[0]["base_psnr"]:.2f} dB) with one thing made extreme, adapted for {STEPS} steps;
+PSNR on the held-out views at the share that is kept. A scene holds when every picture and parameter is finite and
+the full-quality end is at most {ALLOWED} dB below the checkpoint itself: {held} of {len(rows)} do.
 
 {table(rows)}
 

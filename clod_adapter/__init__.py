@@ -2,7 +2,7 @@
 
 import clod_adapter as clod
 base = clod.load("pretrained.ply")
-scene = clod.load_scene("scene/")
+scene = clod.load_scene("scene/", origin=base.origin)
 result = clod.adapt(base.gaussians, scene, clod.AdaptConfig(max_sv=5))
 clod.save("model.ply", result.gaussians, base)
 image = clod.render(result.gaussians, scene.test[0].camera, virtual_scale=3).image

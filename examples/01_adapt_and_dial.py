@@ -18,7 +18,7 @@ ITERS = 200
 
 def main(checkpoint: str, folder: str, out: str = "adapted.ply") -> None:
     base = clod.load(checkpoint)
-    scene = clod.load_scene(folder)
+    scene = clod.load_scene(folder, origin=base.origin)
     config = clod.AdaptConfig(max_sv=5, iters=ITERS)
     result = clod.adapt(base.gaussians, scene, config)
 

@@ -20,8 +20,9 @@ DIALS = (1, 2, 3, 5)
 
 
 def main(model: str, folder: str | None = None) -> None:
-    gaussians = clod.load(model).gaussians
-    scene = clod.load_scene(folder) if folder else None
+    checkpoint = clod.load(model)
+    gaussians = checkpoint.gaussians
+    scene = clod.load_scene(folder, origin=checkpoint.origin) if folder else None
     camera = (scene.test or scene.train)[0].camera if scene else camera_facing(gaussians)
     for virtual_scale in DIALS:
         rendering = clod.render(gaussians, camera, virtual_scale)

@@ -46,7 +46,7 @@ def test_both(run: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_a_scene_without_held_out_views(run: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = clod_adapter.load_scene(capture.scene)
-    monkeypatch.setattr(clod_adapter, "load_scene", lambda folder: clod_adapter.Scene(scene.train, (), ()))
+    monkeypatch.setattr(clod_adapter, "load_scene", lambda folder, **_: clod_adapter.Scene(scene.train, (), ()))
     assert "of 300 Gaussians" in run(2, capture.ply, capture.scene)
 
 
