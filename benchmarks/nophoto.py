@@ -1,12 +1,13 @@
-"""What training without photographs costs: one checkpoint adapted on three kinds of views, judged on photographs.
+"""What training with few photographs, or none, costs: one checkpoint adapted on kinds of views, judged on photographs.
 
     python benchmarks/nophoto.py plush_half bonsai146 ci_banana
     python benchmarks/nophoto.py plush_half --iters 600 --kinds photographs placed
+    python benchmarks/nophoto.py plush_half --few 4 --iters 300 --max-sv 5 --kinds photographs complemented
     python benchmarks/nophoto.py --table                  # the rows as a Markdown table
 
 The kinds: ``photographs`` (real cameras, real pictures), ``teacher`` (real cameras, the checkpoint's own pictures:
-what is lost with the photographs alone) and ``placed`` (placed cameras, its own pictures: what is lost with the
-cameras too). The judges are always the real held-out photographs. Each run adds one row to ``results/nophoto.jsonl``,
+what is lost with the photographs alone), ``placed`` (placed cameras, its own pictures: what is lost with the
+cameras too) and ``complemented`` (few photographs, and placed cameras beside them, as clod-adapt does it). The judges are always the real held-out photographs. Each run adds one row to ``results/nophoto.jsonl``,
 with how far the placed cameras stand from the real ones, which the method never sees.
 """
 
@@ -22,17 +23,18 @@ from adapt import at_shares
 from common import RESULTS, append, capture
 
 import clod_adapter as clod
-from clod_adapter.placement import imagine, place, typical_reach
+from clod_adapter.placement import complement, imagine, place, typical_reach
 
 FILE = "nophoto.jsonl"
-KINDS = ("photographs", "teacher", "placed")
+KINDS = ("photographs", "teacher", "placed", "complemented")
 DIALS = (1.0, 2.0, 3.0, 5.0, 7.0)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*")
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS[:3])
+    parser.add_argument("--few", type=int, metavar="K", help="of the photographs to train on, only K, evenly spread")
     parser.add_argument("--iters", type=int, default=clod.AdaptConfig().iters)
     parser.add_argument("--max-sv", type=float, default=7.0)
     parser.add_argument("--seed", type=int, default=0, help="of the training and of the placement")
@@ -42,12 +44,15 @@ def main() -> None:
         print_table()
     for scene in args.scenes:
         for kind in args.kinds:
-            run(scene, kind, clod.AdaptConfig(iters=args.iters, seed=args.seed, max_sv=args.max_sv))
+            run(scene, kind, clod.AdaptConfig(iters=args.iters, seed=args.seed, max_sv=args.max_sv), args.few)
 
 
-def run(scene: str, kind: str, config: clod.AdaptConfig) -> None:
+def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> None:
     base = clod.load(capture(scene) / "pretrained.ply").gaussians
     photographs = clod.load_scene(capture(scene))
+    if few:
+        train = photographs.train[:: max(len(photographs.train) // few, 1)][:few]
+        photographs = clod.Scene(train, photographs.test)
     base_row = clod.evaluate(base, photographs.test, [1.0])[0]
     began = time.perf_counter()
     views, placement = photographs, None
@@ -58,11 +63,14 @@ def run(scene: str, kind: str, config: clod.AdaptConfig) -> None:
         cameras = place(base, seed=config.seed)
         views = imagine(base, cameras)
         placement = distances(cameras, [view.camera for view in photographs.train], typical_reach(base))
+    if kind == "complemented":
+        views, config = complement(base, photographs, config)
     seconds = time.perf_counter() - began
     adapted = clod.adapt(base, views, config)
     rows = clod.evaluate(adapted.gaussians, photographs.test, [s for s in DIALS if s <= config.max_sv])
     append(FILE, {
         "benchmark": "nophoto", "scene": scene, "kind": kind, "config": asdict(config), "views": len(views.train),
+        "photographs": len(photographs.train),
         "placement": placement, "base": base_row.as_dict(), "rows": [row.as_dict() for row in rows],
         "at_shares": at_shares(adapted.gaussians, photographs.test),
         "steps": adapted.steps, "views_seconds": round(seconds, 2), "start_seconds": round(adapted.start_seconds, 2),
@@ -92,8 +100,8 @@ def distances(placed: list[clod.Camera], real: list[clod.Camera], reach: float) 
 
 
 def print_table() -> None:
-    print("| scene | steps | views | base | " + " | ".join(f"s = {s:g}" for s in DIALS) + " | 12 % |")
-    print("|---" * (5 + len(DIALS)) + "|")
+    print("| scene | steps | photographs | views | base | " + " | ".join(f"s = {s:g}" for s in DIALS) + " | 12 % |")
+    print("|---" * (6 + len(DIALS)) + "|")
     for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
         row = json.loads(line)
         cells = [f"{r['psnr']:.2f} @ {r['kept_share']:.1%}" for r in row["rows"]]
@@ -101,7 +109,16 @@ def print_table() -> None:
         cells.append(next((f"{r['psnr']:.2f}" for r in row.get("at_shares", []) if r["share"] == 0.12), ""))
         print(
             "| "
-            + " | ".join([row["scene"], str(row["steps"]), row["kind"], f"{row['base']['psnr']:.2f}", *cells])
+            + " | ".join(
+                [
+                    row["scene"],
+                    str(row["steps"]),
+                    str(row.get("photographs", "all")),
+                    row["kind"],
+                    f"{row['base']['psnr']:.2f}",
+                    *cells,
+                ]
+            )
             + " |"
         )
 
