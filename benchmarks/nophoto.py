@@ -7,8 +7,9 @@
 
 The kinds: ``photographs`` (real cameras, real pictures), ``teacher`` (real cameras, the checkpoint's own pictures:
 what is lost with the photographs alone), ``placed`` (placed cameras, its own pictures: what is lost with the
-cameras too) and ``complemented`` (few photographs, and placed cameras beside them, as clod-adapt does it). The judges are always the real held-out photographs. Each run adds one row to ``results/nophoto.jsonl``,
-with how far the placed cameras stand from the real ones, which the method never sees.
+cameras too) and ``complemented`` (few photographs, and placed cameras beside them, as clod-adapt does it). The judges
+are always the real held-out photographs. Each run adds one row to ``results/nophoto.jsonl``, with how far the placed
+cameras stand from the real ones, which the method never sees.
 """
 
 from __future__ import annotations
@@ -107,20 +108,8 @@ def print_table() -> None:
         cells = [f"{r['psnr']:.2f} @ {r['kept_share']:.1%}" for r in row["rows"]]
         cells += [""] * (len(DIALS) - len(cells))
         cells.append(next((f"{r['psnr']:.2f}" for r in row.get("at_shares", []) if r["share"] == 0.12), ""))
-        print(
-            "| "
-            + " | ".join(
-                [
-                    row["scene"],
-                    str(row["steps"]),
-                    str(row.get("photographs", "all")),
-                    row["kind"],
-                    f"{row['base']['psnr']:.2f}",
-                    *cells,
-                ]
-            )
-            + " |"
-        )
+        head = [row["scene"], str(row["steps"]), str(row.get("photographs", "all")), row["kind"]]
+        print("| " + " | ".join([*head, f"{row['base']['psnr']:.2f}", *cells]) + " |")
 
 
 if __name__ == "__main__":
