@@ -13,6 +13,7 @@ from clod_adapter.errors import ClodError
 NEAR = 0.01
 """The near plane, world units, as in gsplat."""
 SMALL_EXTENT = 1.0  # of the cameras, world units; below it the near plane comes nearer by as much
+ROUNDING = 1e-6  # times their distance from 0: nearer to each other than that, float32 has cameras in one place
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,12 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
     """1.1 times the largest distance of a camera from their mean, world units (3DGS's unit for position steps).
 
     At most 3.3 times the median of these distances, unless that is 0: one camera that stands far off makes no scene
-    larger. 0 for cameras that are all in one place.
+    larger. 0 for cameras that are all in one place, as a turning one is on its tripod. What only the rounding of
+    float32 may have made counts as 0.
     """
     centres = torch.stack([camera.position for camera in cameras])
     distances = (centres - centres.mean(0)).norm(dim=1)
+    distances = distances * (distances > ROUNDING * centres.norm(dim=1).max())
     largest, middle = float(distances.max()), float(distances.median())
     return 1.1 * (min(largest, 3 * middle) or largest)
 

@@ -68,6 +68,24 @@ def test_extent_of_cameras() -> None:
     assert camera_extent([*cameras[:1] * 5, *cameras[1:2]]) > 0
 
 
+def test_what_rounding_puts_between_cameras_is_no_extent() -> None:
+    place = torch.tensor([3.0, -2.0, 1.5])
+    turning = []
+    for each in ring(10, 8, 6):
+        viewmat = each.viewmat.clone()
+        viewmat[:3, 3] = -viewmat[:3, :3] @ place
+        turning.append(dataclasses.replace(each, viewmat=viewmat))
+    assert len({tuple(each.position.tolist()) for each in turning}) > 1
+    assert camera_extent(turning) == 0
+    views = tuple(View(c, torch.zeros(6, 8, 3, dtype=torch.uint8)) for c in turning)
+    assert in_its_unit(Scene(views, ())).train[0].camera.near == NEAR
+    # Nor does a pair beside a tripod, one on either side, have a median of roundings.
+    sides = [dataclasses.replace(c, viewmat=c.viewmat.clone()) for c in turning[:2]]
+    for each, sign in zip(sides, (1, -1), strict=True):
+        each.viewmat[:3, 3] = -each.viewmat[:3, :3] @ (place + sign * torch.tensor([1.0, 0, 0]))
+    assert camera_extent([*turning, *sides]) == pytest.approx(1.1, rel=1e-4)
+
+
 @pytest.mark.parametrize(("radius", "near"), [(1e-4, 1e-6), (0.5, 5e-3), (2.0, NEAR), (1e4, NEAR)])
 def test_near_plane_of_small_scenes(radius: float, near: float) -> None:
     views = tuple(View(c, torch.zeros(6, 8, 3, dtype=torch.uint8)) for c in ring(8, 8, 6, radius=radius))
