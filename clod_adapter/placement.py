@@ -121,19 +121,18 @@ def complement(gaussians: Gaussians, scene: Scene, config: AdaptConfig) -> tuple
 
     So few do not show all that the checkpoint knows, and what they do not show would be lost. They get OWN pictures of
     the checkpoint's own beside them, from placed cameras, and everything but sigma_d steps half as far. With more than
-    FEW photographs this makes the result worse: the checkpoint's pictures have its errors.
-
-    Raises:
-        ClodError: see ``place``.
+    FEW photographs this makes the result worse: the checkpoint's pictures have its errors. Where no camera can be
+    placed, the photographs have to do, and a note says so.
     """
     if not 0 < len(scene.train) < FEW:
         return scene, config
-    placed = imagine(gaussians, place(gaussians, views=OWN, seed=config.seed))
-    own = (*placed.train, *placed.test)
-    note = (
-        f"only {len(scene.train)} photographs to train on: {len(own)} of the checkpoint's own pictures from "
-        "placed cameras are added, and everything but sigma_d steps half as far"
-    )
+    try:
+        placed = imagine(gaussians, place(gaussians, views=OWN, seed=config.seed))
+        own = (*placed.train, *placed.test)
+        added = f"{len(own)} of the checkpoint's own pictures from placed cameras are added"
+    except ClodError as error:
+        own, added = (), f"none of the checkpoint's own pictures can be added ({error})"
+    note = f"only {len(scene.train)} photographs to train on: {added}, and everything but sigma_d steps half as far"
     return dataclasses.replace(scene, train=(*scene.train, *own), notes=(*scene.notes, note)), config.lighter(0.5)
 
 

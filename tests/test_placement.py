@@ -150,6 +150,14 @@ def test_few_photographs_get_company(blob: clod.Gaussians) -> None:
     assert lighter.lr_means == config.lr_means / 2 and lighter.lr_sigma == config.lr_sigma
 
 
+def test_few_photographs_of_a_checkpoint_that_no_camera_can_be_placed_for(blob: clod.Gaussians) -> None:
+    faint = blob.replace(opacity_logits=torch.full((len(blob),), -4.6))  # fainter than what is looked for
+    views, config = scenes.photograph(faint, scenes.ring(2, 24, 18)), clod.AdaptConfig(iters=1)
+    scene, lighter = complement(faint, clod.Scene(views, ()), config)
+    assert scene.train == views and "none of the checkpoint's own pictures can be added" in scene.notes[-1]
+    assert clod.adapt(faint, scene, lighter).steps == 1
+
+
 @pytest.mark.parametrize("unit", [1e-4, 1e4])
 def test_cameras_are_placed_in_any_unit(blob: clod.Gaussians, unit: float) -> None:
     other = blob.replace(means=blob.means * unit, log_scales=blob.log_scales + math.log(unit))
