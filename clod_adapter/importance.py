@@ -85,7 +85,7 @@ def seeing(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
 
 
 def fitting_tau(opacities: Tensor, error: Tensor, config: AdaptConfig) -> float:
-    """``config.tau``, or less for a checkpoint that is too faint for it.
+    """``config.tau``, or less for a checkpoint that is too faint for it; by itself no less than TAU_MIN.
 
     At most 1/FADING of the opacity below which there is FAINT_SHARE of all removal error; and low enough for as many
     Gaussians as the count law wants at ``max_sv`` to be opaque enough to be there.
@@ -100,7 +100,7 @@ def fitting_tau(opacities: Tensor, error: Tensor, config: AdaptConfig) -> float:
     faint = float(ordered[int((lost < FAINT_SHARE * lost[-1]).sum())])
     wanted = max(round(len(ordered) * config.max_sv**-config.exponent), 1)
     opaque = float(ordered[-wanted]) / config.max_sv
-    return max(min(config.tau, faint / FADING, opaque / FADING), TAU_MIN)
+    return min(config.tau, max(faint / FADING, TAU_MIN), max(opaque / FADING, TAU_MIN))
 
 
 def spread(views: Sequence[T], most: int) -> Sequence[T]:

@@ -177,6 +177,8 @@ def test_tau_is_lowered_for_faint_checkpoints_only() -> None:
     assert fitting_tau(some, (some > 0.1).float(), config) == config.tau  # unless the faint ones do nothing
     assert fitting_tau(faint, torch.zeros(1000), config) == config.tau  # nothing is visible: nothing to go by
     assert fitting_tau(torch.zeros(10), torch.ones(10), config) > 0
+    for opacities in (mixed, faint, torch.zeros(1000)):  # never raised, however low it was asked for
+        assert fitting_tau(opacities, error, AdaptConfig(tau=1e-8)) == 1e-8
 
 
 def test_a_checkpoint_of_faint_gaussians_keeps_its_picture() -> None:
