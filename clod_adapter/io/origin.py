@@ -12,6 +12,7 @@ NOWHERE: Origin = (0.0, 0.0, 0.0)
 AXES = ("x", "y", "z")
 # Times the spread of the bulk. Nearer, float32 places the Gaussians to 1e-5 of it and better, and nothing is done.
 FAR = 100.0
+FINEST = 2.0**-40  # of the distance from 0: what an origin is rounded to at least
 
 
 def origin_of(vertex: np.ndarray) -> Origin:
@@ -30,7 +31,8 @@ def origin_of(vertex: np.ndarray) -> Origin:
         spread = float((high - low).max())
     if not 0 < FAR * spread < float(np.abs(middle).max()):
         return NOWHERE
-    unit = 2.0 ** math.ceil(math.log2(spread))
+    # Doubles may spread by less than their largest has digits for.
+    unit = 2.0 ** math.ceil(math.log2(max(spread, FINEST * float(np.abs(middle).max()))))
     x, y, z = (float(value) for value in np.round(middle / unit) * unit)
     return x, y, z
 

@@ -46,6 +46,14 @@ def test_only_what_is_far_has_an_origin() -> None:
     assert np.abs(np.array(origin_of(rows(with_floater + UTM))) - UTM).max() < 5
 
 
+def test_a_spread_of_next_to_nothing() -> None:
+    line = np.array([[1.0, 0.0, 0.0]] * 100)
+    line[:, 2] = np.linspace(0, 1e-320, 100)
+    assert origin_of(rows(line)) == (1.0, 0.0, 0.0)
+    line[:, 2] = np.linspace(0, 1e-9, 100)
+    assert origin_of(rows(line))[0] == 1.0
+
+
 @pytest.mark.parametrize("kind", ["f4", "f8"])
 def test_reading_loses_nothing_and_writing_leads_back(tmp_path: Path, kind: str) -> None:
     base = gaussians(200, 1, 0)
