@@ -159,6 +159,11 @@ class _Run:
         shapes = [{name: (t.shape, t.dtype) for name, t in tensors.items()} for tensors in (own, state.tensors)]
         if shapes[0] != shapes[1] or not all(0 <= view < len(self.views) for view in state.order):
             raise ClodError("the training state is of other Gaussians, views or settings; give those it was saved with")
+        # A row's steps are an index in compiled code, which checks none.
+        counts = [steps for name, steps in state.tensors.items() if name.startswith("steps.")]
+        possible = all(bool(((steps >= 0) & (steps <= state.steps)).all()) for steps in counts)
+        if not possible or not 0 <= state.averaged <= state.steps or not 0 <= state.seconds < math.inf:
+            raise ClodError("the training state counts steps or seconds that cannot be; start afresh")
         for name, tensor in own.items():
             tensor.copy_(state.tensors[name])
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -429,6 +430,12 @@ def test_a_state_of_something_else_is_refused(captured: tuple[Gaussians, Scene])
     for other in ((few, scene, config), (base, fewer, config), (base, scene, config_of(iters=2, parameter="linear"))):
         with pytest.raises(ClodError, match="of other Gaussians, views or settings"):
             adapt(*other, None, state)
+    damaged = dict(state.tensors) | {"steps.sh0": state.tensors["steps.sh0"] - 2}
+    for impossible in (
+        {"tensors": damaged}, {"steps": 0}, {"averaged": -1}, {"averaged": 9}, {"seconds": math.nan}, {"seconds": -1.0},
+    ):  # fmt: skip
+        with pytest.raises(ClodError, match="counts steps or seconds that cannot be|of other Gaussians"):
+            adapt(base, scene, config, None, replace(state, **impossible))
     for broken in ({}, {**state.random, "state": {"state": -1, "inc": "x"}}):
         with pytest.raises(ClodError, match="random state is damaged"):
             adapt(base, scene, config, None, replace(state, random=broken))
