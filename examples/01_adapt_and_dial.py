@@ -18,12 +18,13 @@ ITERS = 200
 
 def main(checkpoint: str, folder: str, out: str = "adapted.ply") -> None:
     base = clod.load(checkpoint)
-    scene = clod.load_scene(folder, origin=base.origin)
+    scene = clod.load_scene(folder, origin=base.origin)  # relative to what the checkpoint is, if it is far from 0
     config = clod.AdaptConfig(max_sv=5, iters=ITERS)
     result = clod.adapt(base.gaussians, scene, config)
 
     # What is worth keeping is the difference from the base; the file is made of the two.
-    adapter = clod.extract(base.gaussians, result.gaussians, fingerprint=base.fingerprint, config=asdict(config))
+    about = {"fingerprint": base.fingerprint, "config": asdict(config), "origin": base.origin}
+    adapter = clod.extract(base.gaussians, result.gaussians, **about)
     adapted = adapter.apply(base.gaussians)
     clod.save(out, adapted, base)
 

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import runpy
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 
 import clod_adapter
+from clod_adapter.io.ply import blank
 
 EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("[0-9]*.py"))
 
@@ -44,9 +48,32 @@ def test_both(run: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monkey
         assert len({picture.tobytes() for picture in pictures}) == 4
 
 
+def test_far_from_0_they_do_the_same(run: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    adapt = clod_adapter.adapt
+    monkeypatch.setattr(
+        clod_adapter, "adapt", lambda base, scene, config: adapt(base, scene, config.__class__(iters=5))
+    )
+    far, by = tmp_path / "far", np.array([437_123.0, -4_481_010.0, 1_000.0])
+    shutil.copytree(capture.scene, far)
+    model = pycolmap.Reconstruction(str(far / "sparse" / "0"))
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), by))
+    model.write_binary(str(far / "sparse" / "0"))
+    base = clod_adapter.load(capture.ply)
+    there = blank(len(base.gaussians), base.gaussians.sh_degree, tuple(by))
+    clod_adapter.save(far / "far.ply", base.gaussians, there)
+    decibels = []
+    for ply, scene in ((capture.ply, capture.scene), (far / "far.ply", far)):
+        printed = run(1, ply, scene, f"{ply.stem}_dial.ply")
+        decibels.append([float(row.split()[2]) for row in printed.splitlines() if row.startswith("dial")])
+        run(2, f"{ply.stem}_dial.ply", scene)
+    assert decibels[1] == pytest.approx(decibels[0], abs=0.1)
+    one, other = (Image.open(f"{ply}_dial_sv1.png") for ply in (capture.ply.stem, "far"))
+    assert np.abs(np.asarray(one, float) - np.asarray(other, float)).mean() < 1
+
+
 def test_a_scene_without_held_out_views(run: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = clod_adapter.load_scene(capture.scene)
-    monkeypatch.setattr(clod_adapter, "load_scene", lambda folder, **_: clod_adapter.Scene(scene.train, (), ()))
+    monkeypatch.setattr(clod_adapter, "load_scene", lambda folder, origin: clod_adapter.Scene(scene.train, (), ()))
     assert "of 300 Gaussians" in run(2, capture.ply, capture.scene)
 
 
