@@ -53,7 +53,12 @@ class Candidate:
 
 
 def place(
-    gaussians: Gaussians, *, views: int = VIEWS, seed: int = 0, progress: Callable[[int, int], None] | None = None
+    gaussians: Gaussians,
+    *,
+    views: int = VIEWS,
+    seed: int = 0,
+    field: float = FIELD,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[Camera]:
     """Cameras that see the scene from about where it was photographed.
 
@@ -61,18 +66,19 @@ def place(
         gaussians: a checkpoint without a dial; one it has is ignored.
         views: how many cameras, at least 1.
         seed: of the candidates; the same seed gives the same cameras.
+        field: of view, horizontal, degrees; best that of the cameras it was photographed with.
         progress: called with the number of candidates judged, and of all of them.
 
     Returns:
-        ``views`` cameras (fewer only where fewer see anything) of 496x368 pixels, 55 degrees wide, in an order in
-        which every beginning is spread out.
+        ``views`` cameras (fewer only where fewer see anything) of 496x368 pixels, in an order in which every
+        beginning is spread out.
 
     Raises:
         ClodError: no Gaussian is visible and finite, or no camera sees anything.
     """
     require(views >= 1, "views", views, "at least 1")
     seen, generator = _judgeable(gaussians), torch.Generator().manual_seed(seed)
-    reach, tries = typical_reach(seen), TRIES * views
+    reach, tries, zoom = typical_reach(seen, field), TRIES * views, _zoom(field)
     judged: list[Candidate] = []
 
     def judge(cameras: Iterable[Camera]) -> None:
@@ -81,11 +87,11 @@ def place(
             if progress:
                 progress(len(judged), 2 * tries)
 
-    judge(_anywhere(seen, tries, reach, generator))
+    judge(_anywhere(seen, tries, reach, zoom, generator))
     good = _best(judged, math.inf, max(round(BEST * tries), 1))
     if not good:
         raise ClodError("no camera can be placed: from everywhere that was tried the checkpoint shows nothing")
-    judge(_beside(good, tries, reach, generator))
+    judge(_beside(good, tries, reach, zoom, generator))
     good = _best(judged, good[-1].score, views)
     return [_resized(c.camera, WIDTH, HEIGHT, k) for k, c in enumerate(_spread(good, views, reach))]
 
@@ -120,14 +126,15 @@ def complement(gaussians: Gaussians, scene: Scene, config: AdaptConfig) -> tuple
     """What to adapt with where there are fewer than FEW photographs to train on; otherwise what was given.
 
     So few do not show all that the checkpoint knows, and what they do not show would be lost. They get OWN pictures of
-    the checkpoint's own beside them, from placed cameras, and everything but sigma_d steps half as far. With more than
-    FEW photographs this makes the result worse: the checkpoint's pictures have its errors. Where no camera can be
+    the checkpoint's own beside them, from placed cameras with the field of view of the first, and everything but
+    sigma_d steps half as far. Of more photographs the checkpoint's pictures take more than they add, as they have its
+    errors and other distances (docs/method.md). Where no camera can be
     placed, the photographs have to do, and a note says so.
     """
     if not 0 < len(scene.train) < FEW:
         return scene, config
     try:
-        placed = imagine(gaussians, place(gaussians, views=OWN, seed=config.seed))
+        placed = imagine(gaussians, place(gaussians, views=OWN, seed=config.seed, field=_field(scene.train[0].camera)))
         own = (*placed.train, *placed.test)
         added = f"{len(own)} of the checkpoint's own pictures from placed cameras are added"
     except ClodError as error:
@@ -136,13 +143,14 @@ def complement(gaussians: Gaussians, scene: Scene, config: AdaptConfig) -> tuple
     return dataclasses.replace(scene, train=(*scene.train, *own), notes=(*scene.notes, note)), config.lighter(0.5)
 
 
-def typical_reach(gaussians: Gaussians) -> float:
+def typical_reach(gaussians: Gaussians, field: float = FIELD) -> float:
     """World units between the cameras and what they look at.
 
     From there the smallest tenth of the visible Gaussians is at most SMALL_PIXELS pixels large; but never more than
-    FAR times the median distance of the Gaussians from their centre, for a splat of few large ones.
+    FAR times the median distance of the Gaussians from their centre, for a splat of few large ones. ``field`` is the
+    cameras' horizontal field of view, degrees.
     """
-    footprint = _quantile(_size(gaussians), SMALL) * _focal(WIDTH) / SMALL_PIXELS
+    footprint = _quantile(_size(gaussians), SMALL) * WIDTH * _zoom(field) / SMALL_PIXELS
     from_centre = (gaussians.means - gaussians.means.median(0).values).norm(dim=1)
     return min(footprint, FAR * _quantile(from_centre, 0.5)) or footprint
 
@@ -159,7 +167,7 @@ def _judgeable(gaussians: Gaussians) -> Gaussians:
     return plain.select(rows).without_empty_bands()
 
 
-def _anywhere(gaussians: Gaussians, count: int, reach: float, generator: torch.Generator) -> list[Camera]:
+def _anywhere(gaussians: Gaussians, count: int, reach: float, zoom: float, generator: torch.Generator) -> list[Camera]:
     """Looking at Gaussians drawn by opacity over size, from uniform directions, at half to twice the reach."""
     interest = gaussians.opacities / _size(gaussians).clamp(min=1e-12)
     # Drawn by hand, as torch.multinomial has a limit of 2^24 weights.
@@ -168,10 +176,12 @@ def _anywhere(gaussians: Gaussians, count: int, reach: float, generator: torch.G
     targets = gaussians.means[drawn.clamp(max=len(gaussians) - 1)]
     sides = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     away = reach * 2 ** (2 * torch.rand(count, 1, generator=generator) - 1)
-    return [_looking(eye, target) for eye, target in zip(targets + away * sides, targets, strict=True)]
+    return [_looking(eye, target, zoom) for eye, target in zip(targets + away * sides, targets, strict=True)]
 
 
-def _beside(candidates: list[Candidate], count: int, reach: float, generator: torch.Generator) -> list[Camera]:
+def _beside(
+    candidates: list[Candidate], count: int, reach: float, zoom: float, generator: torch.Generator
+) -> list[Camera]:
     """A step away from the candidates, each in turn, and looking a little elsewhere."""
     steps = STEP * torch.randn(count, 2, 3, generator=generator)
     cameras = []
@@ -179,7 +189,7 @@ def _beside(candidates: list[Candidate], count: int, reach: float, generator: to
         camera = candidates[k % len(candidates)].camera
         forward = camera.viewmat[2, :3] + steps[k, 0]
         eye = camera.position + reach * steps[k, 1]
-        cameras.append(_looking(eye, eye + forward))
+        cameras.append(_looking(eye, eye + reach * forward, zoom))
     return cameras
 
 
@@ -201,7 +211,7 @@ def _score(gaussians: Gaussians, camera: Camera) -> float:
     if covered < 0.1 * alpha.numel():
         return -math.inf
     depths = gaussians.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
-    pixels = _size(gaussians) * _focal(WIDTH) / depths.clamp(min=1e-6)
+    pixels = _size(gaussians) * WIDTH / camera.width * camera.K[0, 0] / depths.clamp(min=1e-6)
     shade = (pixels.clamp(1e-3, 1e4).log() + 7)[:, None, None].expand(-1, 1, 3)  # positive, as colours are
     sizes, _ = splat(
         gaussians.replace(sh0=(shade - 0.5) / SH_C0, shN=gaussians.shN[:, :0]), gaussians.opacities, camera
@@ -223,7 +233,7 @@ def _spread(candidates: list[Candidate], count: int, reach: float) -> list[Candi
     return [candidates[k] for k in taken]
 
 
-def _looking(eye: Tensor, target: Tensor) -> Camera:
+def _looking(eye: Tensor, target: Tensor, zoom: float) -> Camera:
     """A camera for a look; which way is up is unknown, and COLMAP's y axis points down more often than not."""
     forward = torch.nn.functional.normalize(target - eye, dim=0)
     down = torch.tensor([0.0, 1.0, 0.0]) if abs(float(forward[1])) < 0.99 else torch.tensor([0.0, 0.0, 1.0])
@@ -233,11 +243,13 @@ def _looking(eye: Tensor, target: Tensor) -> Camera:
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
     # As cameras.in_its_unit has it for photographs.
     near = NEAR * min(float((target - eye).norm()), 1.0)
-    return _resized(Camera(viewmat, torch.eye(3), *LOOK, near=near), *LOOK)
+    width, height = LOOK
+    K = torch.tensor([[zoom * width, 0, width / 2], [0, zoom * width, height / 2], [0, 0, 1.0]])
+    return Camera(viewmat, K, width, height, near=near)
 
 
-def _resized(camera: Camera, width: int, height: int, number: int = 0) -> Camera:
-    focal = _focal(width)
+def _resized(camera: Camera, width: int, height: int, number: int) -> Camera:
+    focal = float(camera.K[0, 0]) / camera.width * width
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     return Camera(camera.viewmat, K, width, height, f"placed_{number:03}", camera.near)
 
@@ -245,13 +257,16 @@ def _resized(camera: Camera, width: int, height: int, number: int = 0) -> Camera
 def _describe(cameras: list[Camera]) -> str:
     if not cameras:
         return "no pictures"
-    width, focal = cameras[0].width, float(cameras[0].K[0, 0])
-    return f"{width}x{cameras[0].height}, {2 * math.degrees(math.atan(width / 2 / focal)):.0f} degrees wide"
+    return f"{cameras[0].width}x{cameras[0].height}, {_field(cameras[0]):.0f} degrees wide"
 
 
-def _focal(width: int) -> float:
-    """In pixels."""
-    return 0.5 * width / math.tan(math.radians(FIELD) / 2)
+def _zoom(field: float) -> float:
+    """The focal length in widths of the picture, of a horizontal field of view in degrees."""
+    return 0.5 / math.tan(math.radians(field) / 2)
+
+
+def _field(camera: Camera) -> float:
+    return math.degrees(2 * math.atan(0.5 * camera.width / float(camera.K[0, 0])))
 
 
 def _size(gaussians: Gaussians) -> Tensor:
