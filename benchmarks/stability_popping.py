@@ -162,7 +162,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
             lines.append(f"| its bound | | {limit} |")
     held = all(row["pixel"] <= row["bound"] + 0.05 for row in rows if "bound" in row)
     table, sweeps = "\n".join(lines), "; ".join(SWEEPS.values())
-    return f"""### Popping
+    return f"""## Popping
 
 The largest change of any pixel in one step, levels of 255, in steps of 1/{longest} and 1/{shortest} of a sweep:
 {sweeps}. The scene is made to pop

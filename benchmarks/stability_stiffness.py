@@ -211,7 +211,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     low, right = ends["too small"], ends["right"]
     near = {row["parameter"]: _span(row["rates"]) for row in rows if row["what"] == "near"}
     table = "\n".join(lines)
-    return f"""### Stiffness
+    return f"""## Stiffness
 
 Right values of `sigma_d` over eight decades, starts wrong by up to four each way, {STEPS} steps, the schedule of
 training. The error is the RMS of the opacity that is drawn, {start:.2f} at the start; converged is below a quarter of
