@@ -33,7 +33,7 @@ def origin_of(vertex: np.ndarray) -> Origin:
         return NOWHERE
     # Doubles may spread by less than their largest has digits for.
     unit = 2.0 ** math.ceil(math.log2(max(spread, FINEST * float(np.abs(middle).max()))))
-    x, y, z = (float(value) for value in np.round(middle / unit) * unit)
+    x, y, z = (float(value) for value in np.round(middle / unit) * unit + 0.0)  # no -0
     return x, y, z
 
 

@@ -54,6 +54,11 @@ def test_a_spread_of_next_to_nothing() -> None:
     assert origin_of(rows(line))[0] == 1.0
 
 
+def test_no_origin_is_minus_nothing() -> None:
+    origin = origin_of(rows(np.random.default_rng(0).normal(size=(500, 3)) * [1, 1, 1e-3] + [1e6, -0.1, -1e-4]))
+    assert origin[0] > 9e5 and [str(value) for value in origin[1:]] == ["0.0", "0.0"]
+
+
 @pytest.mark.parametrize("kind", ["f4", "f8"])
 def test_reading_loses_nothing_and_writing_leads_back(tmp_path: Path, kind: str) -> None:
     base = gaussians(200, 1, 0)
