@@ -49,6 +49,13 @@ def count_gradient(
     return slope.mul_(pressure)
 
 
+def paper_count(dialled: Attenuated, virtual_scale: float, tau: float, config: AdaptConfig) -> Tensor:
+    """0-d, the paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2`` (section 3.3); eta is ``soft_count``."""
+    count = soft_count(dialled.log_opacities, virtual_scale, tau, config.temperature)
+    excess = (count - virtual_scale**-config.exponent).clamp(min=0)
+    return config.reg_weight * (virtual_scale - 1) ** 2 * excess**2
+
+
 @torch.no_grad()
 def count_slope(
     opacity_logits: Tensor, log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float

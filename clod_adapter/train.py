@@ -12,10 +12,10 @@ from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.attenuation import SIGMA_MAX, Attenuated, attenuate, normalized_distances
+from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances
 from clod_adapter.cameras import Scene, View, camera_extent
 from clod_adapter.config import AdaptConfig
-from clod_adapter.counting import count_gradient, soft_count
+from clod_adapter.counting import count_gradient, paper_count
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import seeing, start
@@ -234,7 +234,9 @@ class _Run:
             weight = (1 - self.config.weight_slope * s / self.config.max_sv) ** 2
             if len(dials) > 1 and s == 1:
                 weight *= self.config.full_weight
-            total = total + weight * (loss + self._paper_count(dialled, s))
+            if self.config.count_term == "paper" and self.config.reg_weight > 0:
+                loss = loss + paper_count(dialled, s, self.attenuation.tau, self.config)
+            total = total + weight * loss
             if self.has_law:
                 pull += count_gradient(dialled, p["opacity_logits"], s, self.attenuation.tau, weight * now, self.config)
             kept |= dialled.keep
@@ -252,11 +254,3 @@ class _Run:
         p[self.decay].clamp_(*self.range)
         if share_done >= 1 - self.config.average:
             self._average()
-
-    def _paper_count(self, dialled: Attenuated, s: float) -> Tensor | float:
-        """The paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2``."""
-        config = self.config
-        if config.count_term != "paper" or config.reg_weight == 0:
-            return 0.0
-        count = soft_count(dialled.log_opacities, s, self.attenuation.tau, config.temperature)
-        return config.reg_weight * (s - 1) ** 2 * (count - s**-config.exponent).clamp(min=0) ** 2
