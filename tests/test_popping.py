@@ -131,6 +131,11 @@ def test_path_of_a_camera_that_only_turns() -> None:
     assert all(torch.allclose(c.position, camera.position, atol=1e-5) for c in found)
 
 
+def test_a_path_keeps_the_near_plane() -> None:
+    cameras = [dataclasses.replace(camera, near=1e-4) for camera in ring(2, 32, 24)]
+    assert {camera.near for camera in path(cameras, 5)} == {1e-4}
+
+
 def test_bad_calls_are_named() -> None:
     some, cameras = dialled(), ring(3, 32, 24)
     with pytest.raises(ClodError, match="max_sv is 1"):

@@ -458,6 +458,13 @@ def test_one_gaussian_and_one_that_is_never_seen() -> None:
         assert all(value.isfinite().all() for value in found.tensors().values())
 
 
+def test_cameras_in_one_place_move_means_all_the_same(captured: tuple[Gaussians, Scene]) -> None:
+    """By the distances in their pictures, as their own are 0."""
+    base, scene = captured
+    found = adapt(base, Scene(scene.train[:1] * 2, ()), config_of(iters=3)).gaussians
+    assert camera_extent([scene.train[0].camera] * 2) == 0 and not found.means.equal(base.means)
+
+
 def test_what_cannot_be_adapted_is_named(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     with pytest.raises(ClodError, match="no training views"):

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +141,9 @@ def test_a_second_run_finds_the_first_ones(tmp_path: Path, cache: Path, monkeypa
     for file in files:
         file.write_bytes(file.read_bytes()[:-500])
     assert same(load_scene(scene, max_width=100), first) and len(made) == 3
+    model_of(tmp_path / "other", "OPENCV", [*LENSES["OPENCV"][:4], 0.01, 0, 0, 0], **SIZE)  # calibrated again
+    shutil.copytree(tmp_path / "other" / "sparse", scene / "sparse", dirs_exist_ok=True)
+    assert not same(load_scene(scene, max_width=100), first) and len(made) == 4
 
 
 def test_interrupted_nothing_half_made_is_left(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
