@@ -23,6 +23,8 @@ from clod_adapter.io.version import package_version
 from clod_adapter.robustness import scene_fingerprint
 from clod_adapter.training_state import Progress, TrainingState
 
+# Not "leave out --resume", which the demo gives by itself.
+BEGUN = "give what it was begun with, or remove it to start afresh"
 SAVE_EVERY = 5.0  # seconds between saves, at least
 SAVE_COST = 0.015  # share of the training that all of them may take; only the first is not asked
 
@@ -79,21 +81,20 @@ class Saver:
             ("views_sha256", f"other photographs than {source}"),
         ):
             if self.found.get(key) != self.belongs[key]:
-                raise ClodError(f"{self.path}: is of {what}; give what it was begun with, or start without --resume")
+                raise ClodError(f"{self.path}: is of {what}; {BEGUN}")
         self.console.say(f"resuming {self.path} from step {self.state.steps}")
 
     def _refuse_other_settings(self) -> None:
-        begun = "give what it was begun with, or start without --resume"
         if (then := self.found.get("version")) != (now := self.belongs["version"]):
-            raise ClodError(f"{self.path}: is of version {then} of this package, not {now}; start without --resume")
+            raise ClodError(f"{self.path}: is of version {then} of this package, not {now}; remove it to start afresh")
         now, then = self.belongs["config"], self.found.get("config")
         if not isinstance(then, dict) or then.keys() != now.keys():
-            raise ClodError(f"{self.path}: is of other settings; {begun}")
+            raise ClodError(f"{self.path}: is of other settings; {BEGUN}")
         different = [name for name in now if now[name] != then[name]]
         options = [_as_option(name, then[name]) for name in different if name in OPTIONS]
         if options or different:
             what = ", ".join(options) or f"another --form ({different[0]} {then[different[0]]})"
-            raise ClodError(f"{self.path}: is of a run with {what}; {begun}")
+            raise ClodError(f"{self.path}: is of a run with {what}; {BEGUN}")
 
     def watching(self, follow: Callable[[Progress], None]) -> Callable[[Progress], None]:
         """The progress callback that also saves: after the first step, now and then, and when training is stopped."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from clod_adapter.cli import adapt, demo
+from clod_adapter.cli import adapt, demo, resume
 from clod_adapter.cli.main import build_parser
 
 PICTURES = ("dial.png", "curve.png")
@@ -94,3 +94,25 @@ def test_the_main_job_gets_its_own_defaults(flags: list[str]) -> None:
         "-odd/base.ply",
     ]
     assert vars(given) == vars(build_parser("").parse_args(words))
+
+
+def test_goes_on_with_what_was_interrupted(
+    clod: Any, short: None, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what keeps it from doing so is said without the main job's --resume, which the demo has not."""
+    pytest.importorskip("matplotlib")
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(adapt, "write", stop)
+        assert clod("demo").code == 130
+    state = tmp_path / "demo" / "gallery.resume.safetensors"
+    with monkeypatch.context() as patch:
+        patch.setattr(resume, "package_version", lambda: "0.0.7")
+        done = clod("demo")
+    assert done.code == 2 and f"{state.relative_to(tmp_path)}: is of version" in done.err, done
+    assert "remove it to start afresh" in done.err and "--resume" not in done.err and state.exists()
+    done = clod("demo", "--json")
+    assert done.code == 0 and json.loads(done.out)["resumed_from"] == 1 and not state.exists(), done
