@@ -26,5 +26,6 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     print(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with their dial")
     return {
         "command": "apply", "version": package_version(), "base": args.base, "adapter": args.adapter,
-        "base_count": len(adapted), "changed": sorted(adapter.updates), "outputs": {"ply": args.out},
+        "base_count": len(adapted), "changed": sorted(adapter.updates), "notes": base.notes,
+        "outputs": {"ply": args.out},
     }  # fmt: skip

@@ -41,7 +41,8 @@ class Picture:
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
     model = read_checkpoint(args.model, console, args.activated)
-    views = pick_views(read_scene(args.images, console, model.origin), args.views)
+    scene = read_scene(args.images, console, model.origin)
+    views = pick_views(scene, args.views)
     solved, notes = solve_dials(args, model, [view.camera for view in views], console)
     dials, beyond = choose_dials(solved or [1.0], model.gaussians.attenuation)
     notes += beyond
@@ -62,7 +63,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     return {
         "command": "render", "version": package_version(), "model": args.model, "scene": args.images,
         "base_count": len(gaussians), "virtual_scales": dials, "pictures": [vars(picture) for picture in pictures],
-        "interrupted": interrupted, "notes": [*model.notes, *notes], "seconds": watch.report(),
+        "interrupted": interrupted, "notes": [*model.notes, *scene.notes, *notes], "seconds": watch.report(),
         "outputs": {"folder": args.out},
     }  # fmt: skip
 

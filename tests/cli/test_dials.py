@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -131,6 +132,13 @@ def test_render_picks_views_and_solves_for_them(clod: Any, capture: Any, dialled
     every = json.loads(clod("render", dialled, "--images", capture.scene, "-o", "all", "--views", "all", "--json").out)
     assert [p["view"] for p in every["pictures"]] == [f"{k:03}.png" for k in range(10)]
     assert every["virtual_scales"] == [1] and len(list((tmp_path / "all").iterdir())) == 10
+
+
+def test_render_reports_what_the_photographs_lack(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
+    shutil.copytree(capture.scene, tmp_path / "fewer")
+    (tmp_path / "fewer" / "images" / "003.png").unlink()
+    report = json.loads(clod("render", dialled, "--images", "fewer", "-o", "out", "--json").out)
+    assert any("missing and left out (003.png)" in note for note in report["notes"]), report
 
 
 def test_interrupted_rendering_leaves_what_is_finished(

@@ -51,7 +51,8 @@ def test_values_that_look_activated_are_asked_about(clod: Any, capture: Any, tmp
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.ply"]
     done = clod(path, *images, *TINY, "--activated", "both")
     assert done.code == 0 and "opacity taken as activated" in done.err, done
-    done = clod("apply", path, "dial.safetensors", "--out", "again.ply", "--activated", "both")
+    done = clod("apply", path, "dial.safetensors", "--out", "again.ply", "--activated", "both", "--json")
+    assert "opacity taken as activated" in json.loads(done.out)["notes"][0], done
     assert done.code == 0 and (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes(), done
     done = clod("apply", path, "dial.safetensors", "--out", "again.ply", "--activated", "none")
     assert done.code == 2 and "a different base was given" in done.err
