@@ -22,6 +22,7 @@ OTHER_COLOURS = (
     "warning: {ply} shows the photographs in {images}, but some are farther from it than from their own mean colours: "
     "another exposure, views that it does not cover, or a poor checkpoint?"
 )
+FLAT = "warning: the photographs in {images} show one colour each, which is what the checkpoint will be trained on"
 
 
 def require_alignment(
@@ -43,7 +44,8 @@ def require_alignment(
             guess = guess_frame(base, views, found, load_points(args.images, checkpoint.origin))
     numbers = found.as_dict() | {"guess": guess and guess.says}
     if found.fits and guess is None:
-        notes = [OTHER_COLOURS.format(ply=ply, images=args.images)] if found.margin < 0 else []
+        notes = [FLAT.format(images=args.images)] if not found.views else []
+        notes += [OTHER_COLOURS.format(ply=ply, images=args.images)] if found.margin < 0 else []
         for note in notes:
             console.say(note)
         return numbers, notes

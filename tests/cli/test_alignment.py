@@ -88,10 +88,11 @@ def test_another_exposure_is_noted(clod: Any, capture: Any, tmp_path: Path) -> N
     assert done.code == 0 and "another exposure" in done.err, done
 
 
-def test_black_photographs_do_not_stop(clod: Any, capture: Any, tmp_path: Path) -> None:
+def test_black_photographs_are_noted(clod: Any, capture: Any, tmp_path: Path) -> None:
     scene = scene_of(capture, tmp_path, lambda image: ImageOps.colorize(image.convert("L"), "black", "black"))
-    done = clod(capture.ply, "--images", scene, *FAST)
-    assert done.code == 0, done
+    done = clod(capture.ply, "--images", scene, *FAST, "--json")
+    assert done.code == 0 and "show one colour each" in done.err, done
+    assert "show one colour each" in json.loads(done.out)["notes"][0]
 
 
 def test_robustness_stops_too(clod: Any, capture: Any, turned: Path, tmp_path: Path) -> None:
