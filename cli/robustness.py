@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     if not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
     found = {cell.name: read for cell in cells if (read := cell.read())}
-    missing = [cell for cell in cells if cell.name not in found]
+    missing, notes = [cell for cell in cells if cell.name not in found], list[str]()
     if found:
         console.say(f"{len(found)} of {len(cells)} cells are there already: {', '.join(found)}")
     if missing:
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         with watch.time("evaluate"):
             for checkpoint in checkpoints:
                 if any(cell.checkpoint is checkpoint for cell in missing):
-                    require_alignment(checkpoint, scene, args, console)
+                    notes += require_alignment(checkpoint, scene, args, console)[1]
     make_folder(folder)  # only now: what cannot be read, or does not fit, leaves none behind
     make_folder(folder / "cells")
     for path in outputs.values():
@@ -62,8 +62,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             interrupted = run_cells(missing, scene, found, console, stop)
         if not found:
             raise KeyboardInterrupt
-        report = describe(args, cells, found, interrupted, scene) | {
-            "machine": machine(), "seconds": watch.report(), "outputs": {k: str(v) for k, v in outputs.items()}
+        report = describe(args, cells, found, interrupted, [*scene.notes, *notes]) | {
+            "views": len(scene.test), "machine": machine(), "seconds": watch.report(),
+            "outputs": {k: str(v) for k, v in outputs.items()},
         }  # fmt: skip
         write_outputs(report, outputs, Path(args.images).resolve().name)
     print_summary(report, outputs, watch)
@@ -146,18 +147,18 @@ def describe(
     cells: Sequence[Cell],
     found: dict[str, dict[str, Any]],
     interrupted: bool,
-    scene: Scene,
+    notes: list[str],
 ) -> dict[str, Any]:
     checkpoints = {cell.label: cell.checkpoint for cell in cells}
     return {
-        "command": "robustness", "version": package_version(), "scene": args.images, "views": len(scene.test),
+        "command": "robustness", "version": package_version(), "scene": args.images,
         "checkpoints": [
             {"checkpoint": label, "model": path, "count": len(c.gaussians), "sha256": c.fingerprint, "notes": c.notes}
             for path, (label, c) in zip(args.ply, checkpoints.items(), strict=True)
         ],
         "cells": [found[cell.name] for cell in cells if cell.name in found],
         "missing": [cell.name for cell in cells if cell.name not in found],
-        "interrupted": interrupted, "notes": list(scene.notes),
+        "interrupted": interrupted, "notes": notes,
     }  # fmt: skip
 
 

@@ -99,3 +99,6 @@ def test_robustness_stops_too(clod: Any, capture: Any, turned: Path, tmp_path: P
     done = clod("robustness", capture.ply, turned, "--images", capture.scene, "--max-sv", 2, "--iters", 1)
     assert done.code == 2 and f"{turned}: does not fit" in done.err and "--misaligned-ok" in done.err, done
     assert [path.name for path in tmp_path.iterdir()] == [turned.name]
+    words = ("--max-sv", 2, "--iters", 1, "--misaligned-ok", "--json")
+    done = clod("robustness", turned, "--images", capture.scene, *words)
+    assert done.code == 0 and "x, -y, -z" in json.loads(done.out)["notes"][0], done
