@@ -64,11 +64,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         adapted = train(gaussians, scene, config, follower, saver, page)
         watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
         adapter = extract(
-            gaussians,
-            adapted.gaussians,
-            fingerprint=base.fingerprint,
-            config=asdict(config),
-            origin=base.origin,
+            gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config), origin=base.origin
         )
         if gaussians.sigma_d is None and adapter.attenuation.tau < config.tau:
             notes.append(
