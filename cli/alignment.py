@@ -14,8 +14,8 @@ from clod_adapter.alignment_guess import Guess, guess_frame
 from clod_adapter.cameras import Scene, View
 from clod_adapter.cli.console import Console
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.colmap import load_points
+from clod_adapter.io.origin import Origin
 from clod_adapter.io.ply import Checkpoint
 
 OTHER_COLOURS = (
@@ -49,14 +49,14 @@ def require_alignment(
         for note in notes:
             console.say(note)
         return numbers, notes
-    message = f"{ply}: does not fit {args.images}: {describe(base, views, found, guess)}"
+    message = f"{ply}: does not fit {args.images}: {describe(checkpoint, views, found, guess)}"
     if not args.misaligned_ok:
         raise ClodError(f"{message}; --misaligned-ok trains regardless")
     console.say(f"warning: {message}")
     return numbers, [f"warning: {message}"]
 
 
-def describe(base: Gaussians, views: Sequence[View], found: Alignment, guess: Guess | None) -> str:
+def describe(checkpoint: Checkpoint, views: Sequence[View], found: Alignment, guess: Guess | None) -> str:
     """What was found, and what to do."""
     share = f"{found.in_view:.2g}" if 0 < found.in_view < 0.01 else f"{found.in_view:.0%}"
     facts = f"{share} of its Gaussians are in view"
@@ -73,11 +73,12 @@ def describe(base: Gaussians, views: Sequence[View], found: Alignment, guess: Gu
         )
     if guess:
         return f"{facts}; in another frame it is {guess.psnr:.1f} dB from them: {guess.says}"
-    return f"{facts}; {places(base, views)}; give the checkpoint of this scene, in the cameras' frame"
+    return f"{facts}; {places(checkpoint, views)}; give the checkpoint of this scene, in the cameras' frame"
 
 
-def places(base: Gaussians, views: Sequence[View]) -> str:
-    """Where the Gaussians are, and where the cameras."""
+def places(checkpoint: Checkpoint, views: Sequence[View]) -> str:
+    """Where the Gaussians are, and where the cameras, in the coordinates of their files."""
+    base, origin = checkpoint.gaussians, checkpoint.origin
     if not len(base):
         return "it is empty"
     middle = base.means.median(dim=0).values
@@ -86,10 +87,10 @@ def places(base: Gaussians, views: Sequence[View]) -> str:
     focus = focus_of(torch.stack([view.camera.viewmat for view in views])).to(centres)
     away = float((centres - focus).norm(dim=1).median())
     return (
-        f"half of it lies within {radius:.3g} of {_point(middle)}, the cameras look at about {_point(focus)} from "
+        f"half of it lies within {radius:.3g} of {_point(middle, origin)}, the cameras look at about {_point(focus, origin)} from "
         f"{away:.3g} away"
     )
 
 
-def _point(position: torch.Tensor) -> str:
-    return "(" + ", ".join(f"{value:.3g}" for value in position.tolist()) + ")"
+def _point(position: torch.Tensor, origin: Origin) -> str:
+    return "(" + ", ".join(f"{value + by:.3g}" for value, by in zip(position.tolist(), origin, strict=True)) + ")"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,7 @@ def test_far_away_with_where_both_are(clod: Any, capture: Any, tmp_path: Path) -
     done = clod(capture.write(tmp_path / "lost.ply", lost), "--images", capture.scene, *FAST)
     assert done.code == 2 and "half of it lies within" in done.err and "the cameras look at about" in done.err, done
     assert "0% of its Gaussians are in view" in done.err
+    assert re.search(r"of \(1e\+04, 1e\+04, 1e\+04\), .* at about \(-?[\d.]+, ", done.err), done  # as in the files
 
 
 def test_a_white_background_is_named(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
