@@ -45,8 +45,8 @@ def write_measured(
     Where that is not possible, or a PSNR is infinite, those without it stay, and the console says so.
     """
     try:
-        calibrated = replace(adapter, calibration=calibrate(rows, len(result), scene.test, report["teacher"]))
         with stop.listening():
+            calibrated = replace(adapter, calibration=calibrate(rows, len(result), scene.test, report["teacher"]))
             write(base, calibrated, result, outputs, report)
     except ClodError as error:
         console.say(f"the files are without the calibration, so --fps and --psnr-drop will not know it: {error}")

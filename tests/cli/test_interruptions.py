@@ -24,7 +24,7 @@ from PIL import Image
 
 import clod_adapter
 from clod_adapter.cli import adapt as adapt_command
-from clod_adapter.cli import inputs, resume
+from clod_adapter.cli import inputs, results, resume
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.config import AdaptConfig
@@ -420,6 +420,16 @@ def test_saves_take_their_share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         clock[0] += 0.1
         follow(Progress("train", step, 600, clock[0], step / 600, 0.1, lambda: None, lambda step=step: step))
     assert saved[0] == 1 and 0.012 < saver.seconds / clock[0] <= 0.015 and saver.saves == len(saved) > 5
+
+
+def test_an_interrupt_between_measuring_and_writing(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All was measured, so that nothing is left to skip: the run ends as if undisturbed."""
+    calibrate = results.calibrate
+    monkeypatch.setattr(results, "calibrate", lambda *a: signal.raise_signal(signal.SIGINT) or calibrate(*a))
+    done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
+    assert done.code == 0 and json.loads(done.out)["calibration"] and names(tmp_path) == OUTPUTS, done
 
 
 def test_sigterm_before_training(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
