@@ -87,8 +87,8 @@ def places(checkpoint: Checkpoint, views: Sequence[View]) -> str:
     focus = focus_of(torch.stack([view.camera.viewmat for view in views])).to(centres)
     away = float((centres - focus).norm(dim=1).median())
     return (
-        f"half of it lies within {radius:.3g} of {_point(middle, origin)}, the cameras look at about {_point(focus, origin)} from "
-        f"{away:.3g} away"
+        f"half of it lies within {radius:.3g} of {_point(middle, origin)}, the cameras look at about "
+        f"{_point(focus, origin)} from {away:.3g} away"
     )
 
 
