@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.collapse import APART, COLOUR_FLOOR, LEAVING, NEIGHBOURS, leaving_order
+from clod_adapter.collapse import APART, COLOUR_FLOOR, LEAVING, NEIGHBOURS, _apart, leaving_order
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from scenes import gaussians
@@ -89,11 +90,17 @@ def test_many_in_one_place_take_few_rounds() -> None:
     assert sorted(order.tolist()) == list(range(2000)) and len(seen) < 300
 
 
-def test_many_in_one_place_are_found_their_neighbours_quickly() -> None:
-    """A k-d tree cannot part them, and would compare each with all: minutes for as many as here."""
-    some = gaussians(60_000, 0, 0)
-    order = leaving_order(some.replace(means=torch.full_like(some.means, 0.3)), torch.rand(60_000))
-    assert order.sort().values.equal(torch.arange(60_000))
+def test_many_in_one_place_are_moved_apart() -> None:
+    """A k-d tree cannot part them, and would compare each with all: hours for some hundred thousand."""
+    sizes = np.full(200, 0.1)
+    sizes[3] = math.inf
+    crowd = _apart(np.full((200, 3), 0.3), sizes)
+    assert len(np.unique(np.delete(crowd, 3, 0), axis=0)) == 199 and np.abs(crowd - 0.3).max() <= 1e-7
+    spread = np.random.default_rng(0).normal(size=(200, 3))
+    assert _apart(spread, sizes) is spread
+    some = gaussians(300, 0, 0)
+    order = leaving_order(some.replace(means=torch.full_like(some.means, 0.3)), torch.rand(300))
+    assert order.sort().values.equal(torch.arange(300))
 
 
 def test_what_is_not_finite() -> None:
