@@ -12,6 +12,7 @@ from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.inputs import read_checkpoint, read_scene
 from clod_adapter.cli.instruments import Instruments
+from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.pages import write_eval_page
 from clod_adapter.cli.report import Stopwatch, machine, table
@@ -89,15 +90,17 @@ def measure(
     metrics: Mapping[str, Metric] | None = None,
 ) -> tuple[list[Row], bool]:
     """The rows of the dial values, none where there are no views, and whether Ctrl-C cut them short."""
-    rows: list[Row] = []
-    with console.meter(label) as meter:
+    rows, stop = list[Row](), GracefulStop()  # raised between frames: within a kernel it would be a SystemError
+    with console.meter(label) as meter, stop.listening():
         try:
             for i, virtual_scale in enumerate(virtual_scales if views else ()):
 
                 def report(done: int, total: int, before: int = i, s: float = virtual_scale) -> None:
                     meter.update((before + done / total) / len(virtual_scales), f"s={s:g}")
+                    if stop.requests:
+                        raise KeyboardInterrupt
 
                 rows += evaluate(gaussians, views, [virtual_scale], metrics=metrics, progress=report)
         except KeyboardInterrupt:
             return rows, True
-    return rows, False
+    return rows, stop.requests > 0

@@ -24,6 +24,7 @@ from PIL import Image
 
 import clod_adapter
 from clod_adapter.cli import adapt as adapt_command
+from clod_adapter.cli import evaluate as evaluate_command
 from clod_adapter.cli import inputs, results, resume
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.interrupts import GracefulStop
@@ -430,6 +431,21 @@ def test_an_interrupt_between_measuring_and_writing(
     monkeypatch.setattr(results, "calibrate", lambda *a: signal.raise_signal(signal.SIGINT) or calibrate(*a))
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
     assert done.code == 0 and json.loads(done.out)["calibration"] and names(tmp_path) == OUTPUTS, done
+
+
+def test_a_frame_outlives_an_interrupt(capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Raised within a compiled kernel it would end as a SystemError."""
+    frames: list[float] = []
+
+    def evaluate(*_: Any, progress: Any, **__: Any) -> list[Any]:
+        signal.raise_signal(signal.SIGINT)
+        frames.append(1.0)
+        progress(1, 2)
+        pytest.fail("not stopped")
+
+    monkeypatch.setattr(evaluate_command, "evaluate", evaluate)
+    assert evaluate_command.measure(capture.gaussians, [None], [1.0, 2.0], Console(quiet=True)) == ([], True)
+    assert frames == [1.0]
 
 
 def test_sigterm_before_training(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
