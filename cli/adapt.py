@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
@@ -30,8 +30,26 @@ from clod_adapter.evaluate import Row
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import check_config
 from clod_adapter.io.atomic import remove_leftovers
+from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.version import package_version
 from clod_adapter.train import Adapted, adapt
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What is adapted, on what, and how.
+
+    Attributes:
+        scene, config: with company, and lighter, where there are few photographs.
+        alignment: the numbers of the check against the photographs, for the report; None without photographs.
+        notes: on how the two fit.
+    """
+
+    base: Checkpoint
+    scene: Scene
+    config: AdaptConfig
+    alignment: dict[str, Any] | None
+    notes: list[str]
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
@@ -41,23 +59,13 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     for path in vars(outputs).values():
         remove_leftovers(path)
     saver = Saver(outputs.state, args.resume, config, console, stop)
-    with watch.time("load"):
-        base = read_checkpoint(args.ply, console, args.activated)
-        photographs = read_scene(args.images, console, base.origin) if args.images is not None else None
+    inputs = read_inputs(args, config, console, watch)
+    base, scene, config = inputs.base, inputs.scene, inputs.config
     gaussians = base.gaussians.to(pick_device(args.device))
-    with watch.time("kernels"):
-        prepare_kernels(console)
-    with watch.time("load" if photographs else "place"):
-        scene = photographs or place_scene(gaussians, config.seed, console)
-    alignment, warnings = None, list[str]()
-    if photographs:
-        with watch.time("evaluate"):
-            alignment, warnings = require_alignment(base, scene, args, console)
-        scene, config = complement_scene(gaussians, scene, config, console)
     saver.belong(gaussians, scene, args.ply, args.images or "those placed for it")
     with watch.time("evaluate"):
         base_rows, notes = look_at_base(gaussians, scene, args, console)
-        notes = [*warnings, *notes]
+    notes = [*inputs.notes, *notes]
     with stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
         page = AdaptPage(gaussians, scene, config, console) if args.report else None
         follower = Follower(console, stop, gaussians, scene.test, config.max_sv, base_rows[0] if base_rows else None)
@@ -67,16 +75,14 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config), origin=base.origin
         )
         if gaussians.sigma_d is None and adapter.attenuation.tau < config.tau:
-            notes.append(
-                f"tau is lowered from {config.tau:g} to {adapter.attenuation.tau:.2g}: its Gaussians are faint"
-            )
+            notes.append(f"tau is {adapter.attenuation.tau:.2g} and not {config.tau:g}: the Gaussians are faint")
             console.say(notes[-1])
         result = adapter.apply(gaussians)
         report = describe_run(args, outputs, adapter, adapted) | {
             "sh_degree": result.sh_degree, "device": str(result.means.device), "seconds": watch.report(),
-            "resumed_from": saver.state and saver.state.steps,
+            "resumed_from": saver.state and saver.state.steps, "alignment": inputs.alignment,
             "notes": [*base.notes, *scene.notes, *notes, "the result was not measured"],
-            "base_rows": [row.as_dict() for row in base_rows], "rows": [], "detached_row": None, "alignment": alignment,
+            "base_rows": [row.as_dict() for row in base_rows], "rows": [], "detached_row": None,
         }  # fmt: skip
         with console.status(f"writing {outputs.ply} ..."):
             write(base, adapter, result, outputs, report)
@@ -103,6 +109,26 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         write_report(outputs.report, report)
     print_summary(outputs, table(rows, base_rows, plain) if rows else "", args, watch)
     return report
+
+
+def read_inputs(args: argparse.Namespace, config: AdaptConfig, console: Console, watch: Stopwatch) -> Inputs:
+    """Reads checkpoint and photographs, or places cameras.
+
+    Raises:
+        ClodError: something cannot be read, or checkpoint and photographs do not fit.
+    """
+    with watch.time("load"):
+        base = read_checkpoint(args.ply, console, args.activated)
+        photographs = read_scene(args.images, console, base.origin) if args.images is not None else None
+    with watch.time("kernels"):
+        prepare_kernels(console)
+    if photographs is None:
+        with watch.time("place"):
+            return Inputs(base, place_scene(base.gaussians, config.seed, console), config, None, [])
+    with watch.time("evaluate"):
+        alignment, notes = require_alignment(base, photographs, args, console)
+        scene, config = complement_scene(base.gaussians, photographs, config, console)
+    return Inputs(base, scene, config, alignment, notes)
 
 
 def describe_run(args: argparse.Namespace, outputs: Outputs, adapter: Adapter, adapted: Adapted) -> dict[str, Any]:

@@ -37,7 +37,10 @@ def main(argv: list[str] | None = None) -> int:
     except ClodError as error:
         print(f"{PROG}: error: {' '.join(str(error).splitlines())}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        # A Ctrl-C within the dispatching of a compiled function comes as a SystemError.
+        if isinstance(error, SystemError) and not isinstance(error.__cause__, KeyboardInterrupt):
+            raise
         print(f"{PROG}: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:

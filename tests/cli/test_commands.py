@@ -259,3 +259,19 @@ def test_threads_do_not_spin() -> None:
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split()[0] == "PASSIVE"
+
+
+def test_ctrl_c_within_compiled_code(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numba's dispatcher hands it on as a SystemError; other SystemErrors are nobody's Ctrl-C."""
+    for cause, answer in ((KeyboardInterrupt(), 130), (None, None)):
+
+        def read(*_: object, cause: BaseException | None = cause) -> None:
+            raise SystemError("returned a result with an exception set") from cause
+
+        monkeypatch.setattr("clod_adapter.cli.evaluate.read_checkpoint", read)
+        if answer is None:
+            with pytest.raises(SystemError):
+                clod("eval", capture.ply, "--images", capture.scene)
+        else:
+            done = clod("eval", capture.ply, "--images", capture.scene)
+            assert done.code == answer and done.err.endswith("clod-adapt: interrupted\n")
