@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -440,3 +441,27 @@ def test_interrupt_while_the_calibration_is_written(
     stored = clod_adapter.load(tmp_path / "dial.ply").calibration
     assert (stored is not None) == (presses == 1)
     assert stored == clod_adapter.load_adapter(tmp_path / "dial.safetensors").calibration
+
+
+def test_few_photographs_get_company(clod: Any, capture: Any, tmp_path: Path) -> None:
+    shutil.copytree(capture.scene, tmp_path / "few")
+    names = sorted(path for path in (tmp_path / "few" / "images").iterdir())
+    for name in names[1:5]:
+        name.unlink()
+    done = clod(capture.ply, "--images", "few", "--iters", 2, "--out", "dial.ply", "--json")
+    assert done.code == 0, done
+    report = json.loads(done.out)
+    (note,) = [note for note in report["notes"] if "photographs to train on" in note]
+    assert note in done.err and "16 of the checkpoint's own pictures" in note
+    assert report["config"]["lr_means"] == AdaptConfig().lr_means / 2
+    assert report["config"]["lr_sigma"] == AdaptConfig().lr_sigma
+
+
+def test_faint_gaussians_lower_tau(clod: Any, capture: Any, tmp_path: Path) -> None:
+    logits = torch.full_like(capture.gaussians.opacity_logits, -4.6)
+    ply = capture.write(tmp_path / "faint.ply", capture.gaussians.replace(opacity_logits=logits))
+    done = clod(ply, "--images", capture.scene, "--iters", 2, "--out", "dial.ply", "--json", "--misaligned-ok")
+    assert done.code == 0, done
+    report = json.loads(done.out)
+    assert report["attenuation"]["tau"] < 0.003 and report["config"]["tau"] == 0.02
+    assert any("the Gaussians are faint" in note for note in report["notes"])
