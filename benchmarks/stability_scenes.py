@@ -295,8 +295,8 @@ checkpoint had lost its digits before it came here; the tuning finds some of the
 cameras' extent where that is below 1; tau is lowered for faint Gaussians; cameras that see nothing are left out; fewer
 than 8 photographs get pictures of the checkpoint's own beside them, from placed cameras; a k-d tree that cannot part
 Gaussians in one place is helped. Where a third of the cameras see nothing eight photographs are left, hardly enough for
-{STEPS} steps (the limit for company is fewer than eight). A dial up to 100 asks for pictures of a thousandth of the Gaussians in half of its
-steps, which {STEPS} steps do not recover from, but 1,500 do.
+{STEPS} steps (the limit for company is fewer than eight). A dial up to 100 asks for pictures of a thousandth of the
+Gaussians in half of its steps, which {STEPS} steps do not recover from, but 1,500 do.
 """
 
 

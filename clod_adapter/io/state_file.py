@@ -45,6 +45,9 @@ def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
     Raises:
         ClodError: the file cannot be read, is damaged, or no training state.
     """
+    path = Path(path)
+    if path.exists() and not path.is_file():  # a pipe would be waited for
+        raise ClodError(f"{path}: cannot be read (it is not a regular file); remove it to start afresh")
     try:
         with safe_open(path, framework="pt") as file:
             # Copies, since the file will change under a memory map.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -80,3 +81,9 @@ def assert_refused(path: Path) -> None:
     with pytest.raises(ClodError, match="is no training state or damaged") as caught:
         load_state(path)
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.resume.safetensors")
+    with pytest.raises(ClodError, match="not a regular file"):
+        load_state(tmp_path / "pipe.resume.safetensors")
