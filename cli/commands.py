@@ -1,4 +1,4 @@
-"""The command lines: texts and options of each command. What a command does is in its module, imported to run it."""
+"""The commands: what ``--help`` says of each. What a command does is in its module, imported to run it."""
 
 from __future__ import annotations
 
@@ -6,8 +6,16 @@ from argparse import ArgumentParser
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from clod_adapter.cli.dials import BUDGETS, add_dial_options
-from clod_adapter.cli.settings import add_settings
+from clod_adapter.cli.dials import BUDGETS
+from clod_adapter.cli.options import (
+    adapt_options,
+    apply_options,
+    bake_options,
+    demo_options,
+    evaluate_options,
+    render_options,
+    robustness_options,
+)
 
 
 @dataclass(frozen=True)
@@ -25,118 +33,6 @@ class Command:
     usage: str
     epilog: str
     add_arguments: Callable[[ArgumentParser], None]
-
-
-def _add_activated(parser: ArgumentParser) -> None:
-    parser.add_argument(
-        "--activated", choices=["none", "opacity", "scales", "both"],
-        help="what a checkpoint stores activated: opacities as such, scales as lengths; asked for where it looks so",
-    )  # fmt: skip
-
-
-def _adapt(parser: ArgumentParser) -> None:
-    parser.add_argument(
-        "ply", metavar="PLY", help="the checkpoint: a PLY in Inria's 3DGS layout, or gsplat's .pt; never modified"
-    )
-    parser.add_argument(
-        "--images", metavar="DIR",
-        help="the scene: photographs in DIR/images and their COLMAP model in DIR/sparse/0, or nerfstudio's or "
-        "instant-ngp's DIR/transforms.json (default: none, see below)",
-    )  # fmt: skip
-    add_settings(parser)
-    parser.add_argument(
-        "-o", "--out", metavar="OUT.ply", help="output (default: PLY's name with _clod, in this folder)"
-    )
-    parser.add_argument("--resume", action="store_true", help="go on with the same command where it was interrupted")
-    parser.add_argument("--device", choices=["auto", "cpu"], default="auto", help="where to train (default: auto)")
-    parser.add_argument(
-        "--misaligned-ok", action="store_true", help="train even where a checkpoint does not fit the photographs"
-    )
-    parser.add_argument("--report", action="store_true", help="also a page to look at, OUT.html, and its charts")
-    _add_activated(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
-
-
-def _add_images(parser: ArgumentParser) -> None:
-    scene = "the scene: photographs and their COLMAP model or transforms.json"
-    parser.add_argument("--images", metavar="DIR", required=True, help=scene)
-
-
-def _evaluate(parser: ArgumentParser) -> None:
-    parser.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one as the baseline")
-    _add_images(parser)
-    default = "dial values, 1 (full quality) and up (default: 1 2 3 5 as far as trained, and the last one trained)"
-    add_dial_options(parser, default, "(mean over the held-out views)", several=True, required=False)
-    parser.add_argument(
-        "--base", metavar="BASE.ply", help="also the unadapted checkpoint, cut by rank to as many Gaussians as each row"
-    )
-    parser.add_argument(
-        "--against", metavar="FILE.ply", nargs="+", default=[],
-        help="also other files, and beside each MODEL.ply at the dial value that keeps as many Gaussians",
-    )  # fmt: skip
-    parser.add_argument(
-        "--popping", action="store_true", help="also how evenly the picture changes with the dial and with the camera"
-    )
-    parser.add_argument("--report", metavar="OUT.html", help="also a page to look at, and beside it its charts")
-    _add_activated(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
-
-
-def _render(parser: ArgumentParser) -> None:
-    parser.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one")
-    _add_images(parser)
-    parser.add_argument("-o", "--out", metavar="FOLDER", required=True, help="where the pictures go; made if missing")
-    add_dial_options(
-        parser, "dial values (default: 1); several are put side by side", "(mean over the pictures)", several=True,
-        required=False,
-    )  # fmt: skip
-    parser.add_argument(
-        "--views", metavar="NAME", nargs="+", default=["held-out"],
-        help="photographs whose cameras to render, by name, or all, or held-out (default)",
-    )  # fmt: skip
-    parser.add_argument("--beside", action="store_true", help="put the photograph left of the renderings")
-    _add_activated(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
-
-
-def _bake(parser: ArgumentParser) -> None:
-    parser.add_argument("model", metavar="MODEL.ply", help="an adapted file")
-    parser.add_argument("-o", "--out", metavar="PLAIN.ply", required=True, help="what to write; replaced if it exists")
-    add_dial_options(parser, "the dial value", "(in the file written)", several=False, required=True)
-    _add_activated(parser)
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-
-
-def _apply(parser: ArgumentParser) -> None:
-    parser.add_argument("base", metavar="BASE.ply", help="the checkpoint that was adapted")
-    parser.add_argument("adapter", metavar="ADAPTER.safetensors", help="what clod-adapt wrote beside its PLY")
-    parser.add_argument("-o", "--out", metavar="OUT.ply", required=True, help="what to write; replaced if it exists")
-    _add_activated(parser)
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-
-
-def _robustness(parser: ArgumentParser) -> None:
-    parser.add_argument("ply", metavar="PLY", nargs="+", help="checkpoints of one scene; they are never modified")
-    _add_images(parser)
-    parser.add_argument(
-        "--max-sv", metavar="S", type=float, nargs="+", default=[1.0, 3.0, 5.0, 7.0],
-        help="the ranges: largest dial value of each adaptation; 1 adapts at full detail only (default: 1 3 5 7)",
-    )  # fmt: skip
-    add_settings(parser, without=["max_sv"])
-    parser.add_argument(
-        "-o", "--out", metavar="DIR", default="robustness",
-        help="where everything goes and is resumed from (default: robustness)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--misaligned-ok", action="store_true", help="train even where a checkpoint does not fit the photographs"
-    )
-    _add_activated(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
-
-
-def _demo(parser: ArgumentParser) -> None:
-    parser.add_argument("-o", "--out", metavar="DIR", default="demo", help="where everything goes (default: demo)")
-    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
 ADAPT = Command(
@@ -200,7 +96,7 @@ examples:
   clod-adapt garden.ply --images garden --quiet --json > report.json
   clod-adapt garden.ply --max-sv 5
 """,
-    add_arguments=_adapt,
+    add_arguments=adapt_options,
 )
 EVALUATE = Command(
     module="evaluate",
@@ -247,7 +143,7 @@ examples:
   clod-adapt eval garden_clod.ply --images garden --keep 500000 200000
   clod-adapt eval garden_clod.ply --images garden --report garden.html
 """,
-    add_arguments=_evaluate,
+    add_arguments=evaluate_options,
 )
 RENDER = Command(
     module="render",
@@ -268,7 +164,7 @@ examples:
   clod-adapt render garden_clod.ply --images garden -o out --sv 1 2 5 --beside
   clod-adapt render garden_clod.ply --images garden -o out --views a.jpg --sv 2
 """,
-    add_arguments=_render,
+    add_arguments=render_options,
 )
 BAKE = Command(
     module="bake",
@@ -293,7 +189,7 @@ examples:
   clod-adapt bake garden_clod.ply --sv 2 -o garden_s2.ply
   clod-adapt bake garden_clod.ply --keep 200000 -o garden_200k.ply
 """,
-    add_arguments=_bake,
+    add_arguments=bake_options,
 )
 APPLY = Command(
     module="apply",
@@ -307,7 +203,7 @@ that was adapted: its SHA-256 is compared with the one in the adapter.
 example:
   clod-adapt apply garden.ply garden_clod.safetensors -o again.ply
 """,
-    add_arguments=_apply,
+    add_arguments=apply_options,
 )
 ROBUSTNESS = Command(
     module="robustness",
@@ -339,7 +235,7 @@ true); with none, exit code 130. To start afresh, remove DIR.
 example:
   clod-adapt robustness 3dgs.ply mask.ply --images garden --max-sv 1 3 5 7
 """,
-    add_arguments=_robustness,
+    add_arguments=robustness_options,
 )
 DEMO = Command(
     module="demo",
@@ -361,5 +257,5 @@ in DIR afterwards:
   dial.png          one held-out view at several dial values
   curve.png         quality against the number of Gaussians
 """,
-    add_arguments=_demo,
+    add_arguments=demo_options,
 )
