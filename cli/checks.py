@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import os
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 
-from clod_adapter.cli.dials import check_dials, has_dial
+from clod_adapter.cli.dials import given_budget
 from clod_adapter.cli.files import Outputs, check_output, check_ply_name, labels
 from clod_adapter.cli.settings import make_config, make_configs
 from clod_adapter.errors import ClodError
-from clod_adapter.io.ply_columns import sh_degree_of
-from clod_adapter.io.ply_header import read_header
+from clod_adapter.io.ply_columns import SIGMA, sh_degree_of
+from clod_adapter.io.ply_header import PREFIX, ROW, all_comments, read_header
 from clod_adapter.io.pt import check_pt, is_pt
 from clod_adapter.io.scene_folder import find_cameras, photograph_folders
 from clod_adapter.report.charts import chart_file
@@ -91,6 +92,40 @@ def check_page(path: Path, charts: list[str], inputs: list[str]) -> None:
         raise ClodError(f"{path}: --report names the page to write, so it must end in .html")
     for file in (path, *(chart_file(path, name) for name in charts)):
         check_output(file, inputs)
+
+
+def check_dials(args: Namespace, model: str, *, measured: bool = True) -> None:
+    """Refuses values that are none, and budgets that the file's header says nothing can be solved for.
+
+    Args:
+        measured: whether the command can time frames where the file has no times.
+    """
+    for virtual_scale in args.sv or ():
+        if not 1 <= virtual_scale < math.inf:
+            raise ClodError(f"--sv has {virtual_scale:g}, dial values must be at least 1 (1 is full quality)")
+    budget = given_budget(args)
+    if budget is None:
+        return
+    name, option, values = budget
+    for value in values:
+        if not 0 < value < math.inf:
+            raise ClodError(f"{option} has {value:g}, it must be positive and finite")
+    if not has_dial(model):
+        raise ClodError(f"{model}: has no sigma_d, so no dial for {option}; give it one first: clod-adapt {model} ...")
+    needed = name == "psnr_drop" or (name == "fps" and not measured)
+    if needed and not any(comment.startswith(f"{PREFIX}{ROW} ") for comment in all_comments(read_header(Path(model)))):
+        raise ClodError(
+            f"{model}: has no calibration in its header, which {option} needs; adapt it again, and let it measure to "
+            "the end, or give --sv or --keep"
+        )
+
+
+def has_dial(model: str) -> bool:
+    """Whether the file's header has a sigma_d, which no .pt has."""
+    if is_pt(Path(model)):
+        return False
+    header = read_header(Path(model))
+    return "vertex" in header and SIGMA in {column.name for column in header["vertex"].properties}
 
 
 def check_checkpoint(path: str) -> None:

@@ -2,15 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import Any
-
-from clod_adapter.errors import ClodError
-from clod_adapter.io.ply_columns import SIGMA
-from clod_adapter.io.ply_header import PREFIX, ROW, all_comments, read_header
-from clod_adapter.io.pt import is_pt
 
 # Option, metavar, type, help. All but the first are budgets, under the names that budget.dial_for has for them.
 OPTIONS: tuple[tuple[str, str, type, str], ...] = (
@@ -50,37 +43,3 @@ def given_budget(args: Namespace) -> tuple[str, str, list[float]] | None:
         if getattr(args, name) is not None:
             return name, f"--{name.replace('_', '-')}", getattr(args, name)
     return None
-
-
-def check_dials(args: Namespace, model: str, *, measured: bool = True) -> None:
-    """Refuses values that are none, and budgets that the file's header says nothing can be solved for.
-
-    Args:
-        measured: whether the command can time frames where the file has no times.
-    """
-    for virtual_scale in args.sv or ():
-        if not 1 <= virtual_scale < math.inf:
-            raise ClodError(f"--sv has {virtual_scale:g}, dial values must be at least 1 (1 is full quality)")
-    budget = given_budget(args)
-    if budget is None:
-        return
-    name, option, values = budget
-    for value in values:
-        if not 0 < value < math.inf:
-            raise ClodError(f"{option} has {value:g}, it must be positive and finite")
-    if not has_dial(model):
-        raise ClodError(f"{model}: has no sigma_d, so no dial for {option}; give it one first: clod-adapt {model} ...")
-    needed = name == "psnr_drop" or (name == "fps" and not measured)
-    if needed and not any(comment.startswith(f"{PREFIX}{ROW} ") for comment in all_comments(read_header(Path(model)))):
-        raise ClodError(
-            f"{model}: has no calibration in its header, which {option} needs; adapt it again, and let it measure to "
-            "the end, or give --sv or --keep"
-        )
-
-
-def has_dial(model: str) -> bool:
-    """Whether the file's header has a sigma_d, which no .pt has."""
-    if is_pt(Path(model)):
-        return False
-    header = read_header(Path(model))
-    return "vertex" in header and SIGMA in {column.name for column in header["vertex"].properties}
