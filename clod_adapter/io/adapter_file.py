@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
@@ -23,6 +22,8 @@ from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.origin import NOWHERE, Origin
+from clod_adapter.io.regular import refuse_irregular
+from clod_adapter.io.tensor_file import read_tensors
 
 KEY = "clod_adapter"
 FORMAT = "clod-adapter"
@@ -107,12 +108,9 @@ def _origin(values: Any) -> Origin:
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    if path.exists() and not path.is_file():  # a pipe would be waited for
-        raise ClodError(f"{path}: cannot be read (it is not a regular file); give the name of a file")
+    refuse_irregular(path)
     try:
-        with safe_open(path, framework="pt") as file:
-            # Copies, since the file may change under a memory map.
-            return {name: file.get_tensor(name).clone() for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+        return read_tensors(path)
     except OSError as error:
         raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
     except Exception as error:  # SafetensorError, and whatever a crafted header provokes

@@ -8,6 +8,7 @@ from pathlib import Path
 import pycolmap
 
 from clod_adapter.errors import ClodError
+from clod_adapter.io.regular import refuse_irregular
 
 
 def check_records(model: Path) -> None:
@@ -19,8 +20,7 @@ def check_records(model: Path) -> None:
     for name, after in _RECORDS.items():
         path = model / name
         for other in (path, path.with_suffix(".txt")):
-            if other.exists() and not other.is_file():  # a pipe would be waited for
-                raise ClodError(f"{other}: cannot be read (it is not a regular file); copy the model again")
+            refuse_irregular(other, "copy the model again")
         if not path.is_file():
             continue
         try:

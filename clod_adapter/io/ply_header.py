@@ -15,6 +15,7 @@ from clod_adapter.calibration import AGAINST, Calibration, CalibrationRow
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.foreign import refuse
+from clod_adapter.io.regular import refuse_irregular
 from clod_adapter.io.version import package_version
 
 PREFIX = "clod_adapter "
@@ -46,8 +47,7 @@ def read_head(path: Path) -> Head:
         ClodError: the file cannot be read, is not a PLY, or its header is damaged or longer than 1 MB.
     """
     try:
-        if path.exists() and not path.is_file():  # a pipe would be waited for
-            raise ClodError(f"{path}: cannot be read (it is not a regular file); give the name of a file")
+        refuse_irregular(path)
         with open(path, "rb") as file:
             start = file.read(_HEADER_LIMIT)
     except (OSError, ValueError) as error:  # ValueError: a name that holds a NUL

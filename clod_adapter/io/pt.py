@@ -17,6 +17,7 @@ from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
 from clod_adapter.io.foreign import refuse
 from clod_adapter.io.ply_columns import column_map, inria_dtype
+from clod_adapter.io.regular import refuse_irregular
 
 SUFFIX = ".pt"
 # As gsplat's trainer names its parameters, and as they are called here.
@@ -40,8 +41,7 @@ def check_pt(path: Path) -> None:
         ClodError: it is not, or cannot be read.
     """
     try:
-        if path.exists() and not path.is_file():
-            raise ClodError(f"{path}: cannot be read (it is not a regular file); give the name of a file")
+        refuse_irregular(path)
         with open(path, "rb") as file:
             start = file.read(64)
         if start.startswith(b"\x80"):

@@ -10,12 +10,13 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from safetensors import safe_open
 from safetensors.torch import save
 
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.regular import refuse_irregular
+from clod_adapter.io.tensor_file import read_tensors
 from clod_adapter.training_state import TrainingState
 
 KEY = "clod_adapter_state"
@@ -46,13 +47,10 @@ def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
         ClodError: the file cannot be read, is damaged, or no training state.
     """
     path = Path(path)
-    if path.exists() and not path.is_file():  # a pipe would be waited for
-        raise ClodError(f"{path}: cannot be read (it is not a regular file); remove it to start afresh")
+    refuse_irregular(path, "remove it to start afresh")
     try:
-        with safe_open(path, framework="pt") as file:
-            # Copies, since the file will change under a memory map.
-            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-            about = json.loads((file.metadata() or {})[KEY])
+        tensors, metadata = read_tensors(path)
+        about = json.loads(metadata[KEY])
         belongs, attenuation = about.pop("belongs"), AttenuationConfig(**about.pop("attenuation"))
         order, random = tuple(map(int, about.pop("order"))), dict(about.pop("random"))
         counts = {name: int(about.pop(name)) for name in ("averaged", "steps")}

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from clod_adapter.config import AttenuationConfig
@@ -70,7 +71,7 @@ def test_what_is_no_state_is_named(tmp_path: Path, state: TrainingState) -> None
 )
 def test_a_damaged_description(tmp_path: Path, state: TrainingState, changes: dict[str, Any] | None) -> None:
     save_state(tmp_path / "good", state, BELONGS)
-    with state_file.safe_open(tmp_path / "good", framework="pt") as file:
+    with safe_open(tmp_path / "good", framework="pt") as file:
         about = json.loads(file.metadata()[state_file.KEY])
     text = "[]" if changes is None else json.dumps(about | changes)
     save_file(load_file(tmp_path / "good"), tmp_path / "bad", {state_file.KEY: text})

@@ -1,0 +1,13 @@
+"""Files that can be read without waiting."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from clod_adapter.errors import ClodError
+
+
+def refuse_irregular(path: Path, remedy: str = "give the name of a file") -> None:
+    """Raises the ClodError of what is there but no regular file: a pipe would be waited for."""
+    if path.exists() and not path.is_file():
+        raise ClodError(f"{path}: cannot be read (it is not a regular file); {remedy}")
