@@ -17,6 +17,7 @@ from clod_adapter.calibration import Calibration
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.origin import NOWHERE, Origin
 from clod_adapter.io.version import package_version
 
 HALF_ERROR = 2e-3  # the rounding that a difference may suffer, as a share of the largest
@@ -49,7 +50,7 @@ class Adapter:
     config: dict[str, Any]
     version: str = field(default_factory=package_version)
     calibration: Calibration | None = None
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    origin: Origin = NOWHERE
 
     def __post_init__(self) -> None:
         if self.sigma_d.dim() != 1 or self.sigma_d.dtype != torch.float32:
@@ -104,7 +105,7 @@ def extract(
     *,
     fingerprint: str,
     config: dict[str, Any],
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    origin: Origin = NOWHERE,
 ) -> Adapter:
     """What has to be added to ``base`` to get ``adapted``, rounded to float16 differences.
 

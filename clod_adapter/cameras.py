@@ -97,6 +97,11 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
     return 1.1 * (min(largest, 3 * middle) or largest)
 
 
+def near_plane(extent: float) -> float:
+    """NEAR; below SMALL_EXTENT nearer in proportion to the extent of the scene, world units, > 0."""
+    return NEAR * min(extent / SMALL_EXTENT, 1.0)
+
+
 def in_its_unit(scene: Scene) -> Scene:
     """The scene with a near plane that fits its unit: where the cameras' extent is below 1, by that much nearer.
 
@@ -107,6 +112,6 @@ def in_its_unit(scene: Scene) -> Scene:
         return scene
 
     def nearer(views: tuple[View, ...]) -> tuple[View, ...]:
-        return tuple(replace(view, camera=replace(view.camera, near=NEAR * extent / SMALL_EXTENT)) for view in views)
+        return tuple(replace(view, camera=replace(view.camera, near=near_plane(extent))) for view in views)
 
     return replace(scene, train=nearer(scene.train), test=nearer(scene.test))

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import NEAR, Camera, Scene, View
+from clod_adapter.cameras import Camera, Scene, View, near_plane
 from clod_adapter.config import AdaptConfig, require
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
@@ -241,11 +241,9 @@ def _looking(eye: Tensor, target: Tensor, zoom: float) -> Camera:
     viewmat = torch.eye(4)
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    # As cameras.in_its_unit has it for photographs.
-    near = NEAR * min(float((target - eye).norm()), 1.0)
     width, height = LOOK
     K = torch.tensor([[zoom * width, 0, width / 2], [0, zoom * width, height / 2], [0, 0, 1.0]])
-    return Camera(viewmat, K, width, height, near=near)
+    return Camera(viewmat, K, width, height, near=near_plane(float((target - eye).norm())))
 
 
 def _resized(camera: Camera, width: int, height: int, number: int) -> Camera:

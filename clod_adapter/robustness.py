@@ -20,6 +20,7 @@ from clod_adapter.compare import by_opacity
 from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.origin import NOWHERE, Origin
 from clod_adapter.train import Progress, adapt
 
 # Shares of the untouched base that its baseline keeps.
@@ -52,7 +53,7 @@ def adapt_at_range(
     virtual_scales: Sequence[float],
     *,
     fingerprint: str,
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    origin: Origin = NOWHERE,
     follow: Callable[[Progress], None] | None = None,
     measured: Callable[[int, int], None] | None = None,
 ) -> Outcome:

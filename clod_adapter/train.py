@@ -24,7 +24,7 @@ from clod_adapter.optimizer import RowAdam
 from clod_adapter.render import splat
 from clod_adapter.training_state import Adapted, Progress, TrainingState
 
-__all__ = ["Adapted", "Progress", "TrainingState", "adapt", "camera_extent"]
+__all__ = ["Adapted", "Progress", "TrainingState", "adapt"]
 
 # Sigma stays where the equation still tells values apart; below, a Gaussian would be gone for good.
 SIGMA_RANGE = (1e-4, SIGMA_MAX)

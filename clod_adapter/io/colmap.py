@@ -12,10 +12,11 @@ import torch
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.origin import NOWHERE
 from clod_adapter.io.scene_folder import find_cameras
 
 
-def load_points(folder: str | Path, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> torch.Tensor:
+def load_points(folder: str | Path, origin: Sequence[float] = NOWHERE) -> torch.Tensor:
     """``[M, 3]`` float64, the points of the scene's COLMAP model less ``origin``, world units; none without a model.
 
     The model is one that loads.

@@ -18,6 +18,7 @@ from clod_adapter.cameras import Camera, Scene, View, in_its_unit
 from clod_adapter.errors import ClodError
 from clod_adapter.io.colmap_model import read_model
 from clod_adapter.io.images import Note, read_image
+from clod_adapter.io.origin import NOWHERE
 from clod_adapter.io.posed import HUGE, PosedImage
 from clod_adapter.io.scene_folder import find_cameras, find_photographs
 from clod_adapter.io.transforms import read_transforms
@@ -29,7 +30,7 @@ def load_scene(
     *,
     test_every: int = 8,
     max_width: int = 1600,
-    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    origin: Sequence[float] = NOWHERE,
     progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
     """Reads posed photographs: a COLMAP model (binary or text, any version) or a transforms.json, and its images.
