@@ -2,6 +2,7 @@
 #
 #   make demo    install and run the demo
 #   make test    install, then lint, format check, types, tests
+#   make peers   install what some tests compare with and otherwise skip: Node 22 and splat-transform, by npm, 400 MB
 #   make clean   remove .venv and everything that was built or cached; what the demo made, in demo/, stays
 #
 # PYTHON    the interpreter that .venv is made from.
@@ -12,8 +13,9 @@ PIP_ARGS ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
+PEERS := $(CURDIR)/$(VENV)/peers
 
-.PHONY: demo test clean
+.PHONY: demo test peers clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/clod-adapt demo
@@ -22,7 +24,9 @@ test: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest
+	PATH="$(PEERS)/node_modules/.bin:$$PATH" $(BIN)/python -m pytest
+
+peers: $(PEERS)/.installed
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
@@ -31,6 +35,10 @@ clean:
 # One stamp per extra: a second call installs nothing unless what is to be installed changed.
 $(VENV)/.installed-%: pyproject.toml constraints.txt | $(BIN)/pip
 	$(BIN)/python -m pip install $(PIP_ARGS) -c constraints.txt -e ".[$*]"
+	touch $@
+
+$(PEERS)/.installed: | $(BIN)/pip
+	npm install --no-fund --no-audit --prefix "$(PEERS)" node@22.23.3 @playcanvas/splat-transform@3.7.0
 	touch $@
 
 # pip and not python: it comes last, so a venv that was interrupted is made again.
