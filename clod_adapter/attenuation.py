@@ -151,6 +151,32 @@ def attenuate(
     check_dial(virtual_scale)
     opacity_logits, sigma_d, d = conform(opacity_logits=opacity_logits, sigma_d=sigma_d, d=d)
     opacities, log_opacities = _Attenuate.apply(opacity_logits, sigma_d, d.detach(), float(virtual_scale), config.eps)
+    return _cut(opacities, log_opacities, virtual_scale, config)
+
+
+def attenuate_activated(
+    opacities: Tensor, sigma_d: Tensor, d: Tensor, virtual_scale: float, config: AttenuationConfig
+) -> Attenuated:
+    """The same from activated ``opacities [N]``, in [0, 1], as rasterizers are given them.
+
+    ``a'' = a exp(log_attenuation)``, differentiable, once, in ``opacities`` and ``sigma_d``. The slope by the opacity
+    is finite throughout: at 1 it is the factor's and the cut's, as anywhere, and at 0 that of a'' is the factor while
+    those of ``log_opacities`` (-inf) and ``drawn`` count as 0.
+
+    Raises:
+        ClodError: the dial is below 1 or not finite, or the shapes differ.
+    """
+    check_dial(virtual_scale)
+    opacities, sigma_d, d = conform(opacities=opacities, sigma_d=sigma_d, d=d)
+    opaque = torch.full_like(opacities, math.inf)
+    factor, log_factor = _Attenuate.apply(opaque, sigma_d, d.detach(), float(virtual_scale), config.eps)
+    nothing = opacities <= 0
+    logs = opacities.masked_fill(nothing, 1).log().masked_fill(nothing, -math.inf)  # no slope, rather than 1 / 0
+    return _cut(opacities * factor, logs + log_factor, virtual_scale, config)
+
+
+def _cut(opacities: Tensor, log_opacities: Tensor, virtual_scale: float, config: AttenuationConfig) -> Attenuated:
+    """Who stays of the faded opacities, and what is drawn of them."""
     threshold = log_threshold(config.tau, virtual_scale)
     keep = log_opacities.detach() > threshold
     # The hard cut's product is five times as fast as where.

@@ -15,6 +15,7 @@ from torch import Tensor
 from clod_adapter.attenuation import (
     SIGMA_MAX,
     attenuate,
+    attenuate_activated,
     log_attenuation,
     normalized_distances,
     normalizing_distance,
@@ -343,3 +344,36 @@ def test_bad_calls_are_named() -> None:
         extinction_scale(three, four, three, config())
     with pytest.raises(ClodError, match="virtual_scale is nan"):
         log_attenuation(three, three, math.nan, 0.0)
+
+
+@pytest.mark.parametrize("cut", ["hard", "soft"])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_activated_opacities_give_what_their_logits_do(cut: str, dtype: torch.dtype) -> None:
+    logits, sigma, d = (column.to(dtype) for column in grid(LOGITS, SIGMAS, DISTANCES))
+    for scale in SCALES:
+        settings = config(0.3 / scale, cut=cut)
+        want = attenuate(logits, sigma, d, scale, settings)
+        got = attenuate_activated(logits.sigmoid(), sigma, d, scale, settings)
+        assert torch.equal(got.opacities, want.opacities) and torch.equal(got.keep, want.keep)
+        torch.testing.assert_close(got.drawn, want.drawn, rtol=2e-6 if dtype == torch.float32 else 1e-14, atol=0)
+
+
+@pytest.mark.parametrize("cut", ["hard", "soft"])
+def test_gradients_of_activated_opacities(cut: str) -> None:
+    """Against finite differences where there are such, and by hand at 0 and 1."""
+    settings = config(0.02, cut=cut)
+    a = torch.tensor([0.05, 0.3, 0.9, 0.999, 0.041], dtype=torch.float64, requires_grad=True)
+    sigma = torch.tensor([2.0, 0.7, 0.4, 30.0, 9.0], dtype=torch.float64, requires_grad=True)
+    d = torch.tensor([0.1, 0.4, 0.3, 0.0, 0.2], dtype=torch.float64)
+    kept = attenuate_activated(a, sigma, d, 2.0, settings).keep
+    assert kept.all()
+    assert torch.autograd.gradcheck(lambda a, sigma: attenuate_activated(a, sigma, d, 2.0, settings).drawn, (a, sigma))
+    ends = torch.tensor([0.0, 1.0, 0.0, 1.0], dtype=torch.float64, requires_grad=True)
+    reach = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
+    result = attenuate_activated(ends, reach, torch.tensor([0.5, 0.5, 0.0, 0.0]).double(), 1.0, settings)
+    assert result.keep.tolist() == [False, True, False, True]
+    slope_a, slope_sigma = torch.autograd.grad(result.drawn.sum(), [ends, reach])
+    factor = math.exp(-0.125)
+    assert slope_a.tolist() == pytest.approx([0, factor, 0, 1]) and slope_sigma.tolist() == pytest.approx(
+        [0, factor * 0.25, 0, 0]
+    )
