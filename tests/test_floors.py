@@ -38,7 +38,7 @@ FLOORS = [
     {"render"},
     {"importance", "popping", "budget", "placement", "alignment", "alignment_frames", "alignment_guess"},
     {"train", "evaluate", "export", "viewer", "compare"},
-    {"report", "robustness"},
+    {"report", "robustness", "integrations"},
     {"demo"},
     {""},  # the package itself, whose __init__ re-exports from all of the above
     {"cli"},

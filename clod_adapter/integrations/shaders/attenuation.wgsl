@@ -1,0 +1,23 @@
+// What is drawn of a Gaussian's opacity (CLoD-GS, Eq. 2, and its cut); 0 where it is left out.
+//   opacity   activated, in [0, 1]
+//   sigma     the file's sigma_d
+//   distance  |mean - camera| / D, at least 0
+//   scale     the dial s, at least 1
+//   eps, tau  of the file's header
+//   soft      the header's cut: true where it fades to 0, false for the paper's hard one
+// golden.json beside this file has values to test it with.
+fn clodOpacity(opacity: f32, sigma: f32, distance: f32, scale: f32, eps: f32, tau: f32, soft: bool) -> f32 {
+  let unit = max(max(sigma, 0.0), sqrt(eps));
+  let far = distance * scale;
+  var faded = opacity;
+  if (far > 0.0) {
+    if (far >= 100.0 * unit) { return 0.0; }  // exp(-3333) at most; and from here on nothing is divided by 0
+    let x = far / unit;  // in this unit no square underflows or overflows
+    let reach = max(sigma, 0.0) / unit;
+    let root = sqrt(eps) / unit;
+    faded *= exp(-x * x / (2.0 * reach * reach + root * root));
+  }
+  let threshold = tau * scale;
+  if (!(faded > threshold)) { return 0.0; }
+  return select(faded, faded * min(2.0 * (faded / threshold - 1.0), 1.0), soft);
+}

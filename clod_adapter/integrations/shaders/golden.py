@@ -1,0 +1,79 @@
+"""Makes ``golden.json``: what the equation's float64 form says, for the tests of it in other languages.
+
+    python -m clod_adapter.integrations.shaders.golden
+
+A row is opacity, sigma, distance, scale, eps, tau, soft, then what these give: ``faded``, the attenuated opacity
+``a''``, and ``drawn``, what a rasterizer is given of it. The inputs are float32's numbers, written in full. A float32
+implementation passes if for every row ``|result - drawn| <= tolerance faded``, and 0 where drawn is 0.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from clod_adapter.attenuation import attenuate_activated
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.extinction import extinction_scale
+
+COLUMNS = ("opacity", "sigma", "distance", "scale", "eps", "tau", "soft", "faded", "drawn")
+TOLERANCE = 3e-5  # float32's rounding times the cut's steepest slope and the exponent's largest size, with room
+TAU, EPS = 0.02, 1e-8
+
+
+def rows() -> list[list[Any]]:
+    """The inputs: the ordinary and the extreme, then each cut from both of its sides."""
+    ordinary = itertools.product((0.03, 0.4, 1.0), (0.2, 1.5), (0.05, 1.2), (1.0, 2.5, 7.0), (EPS,), (TAU,))
+    extreme = itertools.chain(
+        itertools.product((0.0, 1.0), (-1.0, 0.0, 1e30), (0.0,), (1.0, 100.0), (0.0, EPS), (TAU,)),
+        itertools.product((0.9,), (-1.0, 0.0, 1e-25, 1e-6, 1e30), (1e-25, 1e-6, 1e4), (40.0,), (0.0, EPS), (1 / 255,)),
+        itertools.product((0.5,), (0.01, 5.0), (1e-3, 1.0), (30.0, 100.0), (0.0, 1e-2), (1e-6,)),
+        [(0.5, 1.0, 0.0, 2.0, EPS, 0.25), (1.0, 1.0, 0.0, 1.0, EPS, 0.5)],  # a'' = tau s, and is not kept; and 2 tau s
+    )
+    found = [list(map(_float32, row)) for row in itertools.chain(ordinary, extreme)]
+    for opacity, sigma, distance in itertools.product((0.3, 0.999), (0.1, 0.8, 4.0), (0.0, 1.2)):
+        leaves = _leaves_at(opacity, sigma, distance)
+        shares = (0.5, 0.9, 0.999, 1.001)  # of the dial value at which it goes; between the first two it begins to fade
+        dials = [scale for scale in (leaves * share for share in shares) if 1 <= scale <= 100]
+        found += [list(map(_float32, (opacity, sigma, distance, scale, EPS, TAU))) for scale in dials]
+    return [[*row, soft] for row in found for soft in (False, True)]
+
+
+def golden() -> dict[str, Any]:
+    """The file's contents."""
+    finished = [[*row, *_results(row)] for row in rows()]
+    return {"columns": COLUMNS, "tolerance": TOLERANCE, "rows": finished}
+
+
+def _results(row: list[Any]) -> tuple[float, float]:
+    *values, scale, eps, tau, soft = row
+    config = AttenuationConfig(tau=tau, eps=eps, cut="soft" if soft else "hard", max_sv=1)
+    opacity, sigma, distance = (torch.tensor([value], dtype=torch.float64) for value in values)
+    result = attenuate_activated(opacity, sigma, distance, scale, config)
+    return float(result.opacities), float(result.drawn)
+
+
+def _leaves_at(opacity: float, sigma: float, distance: float) -> float:
+    config = AttenuationConfig(tau=_float32(TAU), eps=_float32(EPS), max_sv=1)
+    values = [torch.tensor([_float32(value)], dtype=torch.float64) for value in (opacity, sigma, distance)]
+    return float(extinction_scale(values[0].logit(), values[1], values[2], config))
+
+
+def _float32(value: float) -> float:
+    return float(np.float32(value))
+
+
+def text() -> str:
+    """The file, a row a line."""
+    content = golden()
+    lines = ",\n".join(f"  {json.dumps(row)}" for row in content.pop("rows"))
+    return f'{json.dumps(content)[:-1]}, "rows": [\n{lines}\n]}}\n'
+
+
+if __name__ == "__main__":
+    Path(__file__).with_name("golden.json").write_text(text(), encoding="utf-8")

@@ -1,0 +1,136 @@
+"""The shader functions give the golden values, in a real WebGL 2 and a real WebGPU; so does the equation itself."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+from typing import Any
+
+import pytest
+
+import browser
+from clod_adapter.integrations.shaders import golden
+
+SHADERS = files("clod_adapter.integrations.shaders")
+STORED = json.loads(SHADERS.joinpath("golden.json").read_text(encoding="utf-8"))
+INPUTS = [row[:7] for row in STORED["rows"]]
+
+# One vertex a row, its result caught by transform feedback.
+WEBGL = """([source, rows]) => {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) return "this Chromium has no WebGL 2";
+  const shader = (type, text) => {
+    const made = gl.createShader(type);
+    gl.shaderSource(made, "#version 300 es\\nprecision highp float;\\n" + text);
+    gl.compileShader(made);
+    if (!gl.getShaderParameter(made, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(made));
+    return made;
+  };
+  const program = gl.createProgram();
+  gl.attachShader(program, shader(gl.VERTEX_SHADER, `
+    in vec4 a; in vec3 b; out float drawn;
+    ${source}
+    void main() { drawn = clodOpacity(a.x, a.y, a.z, a.w, b.x, b.y, b.z > 0.5); gl_PointSize = 1.0; }`));
+  gl.attachShader(program, shader(gl.FRAGMENT_SHADER, "out vec4 colour; void main() { colour = vec4(1.0); }"));
+  gl.transformFeedbackVaryings(program, ["drawn"], gl.SEPARATE_ATTRIBS);
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
+  gl.useProgram(program);
+  gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+  gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(rows.flat()), gl.STATIC_DRAW);
+  for (const [name, size, offset] of [["a", 4, 0], ["b", 3, 16]]) {
+    const at = gl.getAttribLocation(program, name);
+    gl.enableVertexAttribArray(at);
+    gl.vertexAttribPointer(at, size, gl.FLOAT, false, 28, offset);
+  }
+  const caught = gl.createBuffer();
+  gl.bindBuffer(gl.TRANSFORM_FEEDBACK_BUFFER, caught);
+  gl.bufferData(gl.TRANSFORM_FEEDBACK_BUFFER, 4 * rows.length, gl.STREAM_READ);
+  gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, caught);
+  gl.enable(gl.RASTERIZER_DISCARD);
+  gl.beginTransformFeedback(gl.POINTS);
+  gl.drawArrays(gl.POINTS, 0, rows.length);
+  gl.endTransformFeedback();
+  const drawn = new Float32Array(rows.length);
+  gl.getBufferSubData(gl.TRANSFORM_FEEDBACK_BUFFER, 0, drawn);
+  if (gl.getError()) throw new Error("WebGL reports an error");
+  return Array.from(drawn);
+}"""
+
+# One invocation a row, from one storage buffer to another.
+WEBGPU = """async ([source, rows]) => {
+  const adapter = navigator.gpu && await navigator.gpu.requestAdapter();
+  if (!adapter) return "this Chromium has no WebGPU adapter";
+  const device = await adapter.requestDevice();
+  const module = device.createShaderModule({code: source + `
+    @group(0) @binding(0) var<storage, read> rows: array<f32>;
+    @group(0) @binding(1) var<storage, read_write> drawn: array<f32>;
+    @compute @workgroup_size(1) fn main(@builtin(global_invocation_id) id: vec3u) {
+      let at = 7u * id.x;
+      drawn[id.x] = clodOpacity(rows[at], rows[at + 1u], rows[at + 2u], rows[at + 3u], rows[at + 4u], rows[at + 5u],
+                                rows[at + 6u] > 0.5);
+    }`});
+  const faults = (await module.getCompilationInfo()).messages;
+  if (faults.length) throw new Error(faults.map(fault => fault.message).join("; "));
+  const pipeline = device.createComputePipeline({layout: "auto", compute: {module, entryPoint: "main"}});
+  const given = new Float32Array(rows.flat()), bytes = 4 * rows.length;
+  const input = device.createBuffer({size: given.byteLength, usage: GPUBufferUsage.STORAGE | GPUBufferUsage.COPY_DST});
+  const output = device.createBuffer({size: bytes, usage: GPUBufferUsage.STORAGE | GPUBufferUsage.COPY_SRC});
+  const copy = device.createBuffer({size: bytes, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST});
+  device.queue.writeBuffer(input, 0, given);
+  const encoder = device.createCommandEncoder(), pass = encoder.beginComputePass();
+  pass.setPipeline(pipeline);
+  pass.setBindGroup(0, device.createBindGroup({layout: pipeline.getBindGroupLayout(0), entries: [
+    {binding: 0, resource: {buffer: input}}, {binding: 1, resource: {buffer: output}}]}));
+  pass.dispatchWorkgroups(rows.length);
+  pass.end();
+  encoder.copyBufferToBuffer(output, 0, copy, 0, bytes);
+  device.queue.submit([encoder.finish()]);
+  await copy.mapAsync(GPUMapMode.READ);
+  return Array.from(new Float32Array(copy.getMappedRange()));
+}"""
+
+
+def run(script: str, shader: str) -> list[float]:
+    """What the shader draws of every golden row."""
+    source = SHADERS.joinpath(shader).read_text(encoding="utf-8")
+    rows = [[float(value) for value in row] for row in INPUTS]
+    with browser.launch() as chromium:
+        page = chromium.new_page()
+        page.route("**/*", lambda route: route.fulfill(body="<!doctype html>", content_type="text/html"))
+        page.goto("http://127.0.0.1/")  # answered above; WebGPU is only given to pages from a secure place
+        result: Any = page.evaluate(script, [source, rows])
+    if isinstance(result, str):
+        browser.missing(result)
+    return result
+
+
+@pytest.mark.parametrize(("script", "shader"), [(WEBGL, "attenuation.glsl"), (WEBGPU, "attenuation.wgsl")])
+def test_a_browser_draws_the_golden_values(script: str, shader: str) -> None:
+    drawn = run(script, shader)
+    assert len(drawn) == len(STORED["rows"])
+    for got, row in zip(drawn, STORED["rows"], strict=True):
+        *_, faded, want = row
+        assert abs(got - want) <= STORED["tolerance"] * faded and (want > 0 or got == 0), (row, got)
+
+
+def test_the_stored_values_are_those_of_the_equation() -> None:
+    """To rounding: exp differs between processors."""
+    made = golden.golden()
+    assert (list(made["columns"]), made["tolerance"]) == (STORED["columns"], STORED["tolerance"])
+    for row, want in zip(made["rows"], STORED["rows"], strict=True):
+        assert row[:7] == want[:7] and row[7:] == pytest.approx(want[7:], rel=1e-12, abs=1e-300)
+
+
+def test_the_rows_reach_every_branch() -> None:
+    """Some fade and some do not, some are kept whole; at the camera, without a reach, on both sides of both cuts."""
+    rows = [dict(zip(STORED["columns"], row, strict=True)) for row in STORED["rows"]]
+    assert 200 <= len(rows) <= 400
+    for soft in (False, True):
+        mine = [row for row in rows if row["soft"] is soft]
+        assert any(row["drawn"] == 0 < row["faded"] for row in mine)
+        assert any(row["drawn"] == row["faded"] < row["opacity"] for row in mine)
+        assert any(0 < row["drawn"] < row["faded"] for row in mine) is soft
+        assert any(row["distance"] == 0 and row["sigma"] <= 0 and row["eps"] == 0 and row["drawn"] > 0 for row in mine)
+        assert any(row["distance"] > 0 and row["sigma"] <= 0 and row["eps"] == 0 for row in mine)
+        assert any(abs(row["faded"] / (row["tau"] * row["scale"]) - 1) < 0.01 for row in mine)
