@@ -28,6 +28,7 @@ FLOORS = [
         "collapse",
         "counting",
         "extinction",
+        "hook",
         "losses",
         "metrics",
         "optimizer",

@@ -14,6 +14,7 @@ from plyfile import PlyData, PlyElement
 from clod_adapter.calibration import Calibration
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.hook import Hook
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.origin import AXES, NOWHERE, Origin, origin_of, relative
 from clod_adapter.io.ply_body import read_vertex
@@ -55,6 +56,16 @@ class Checkpoint:
     path: Path
     calibration: Calibration | None = None
     origin: Origin = NOWHERE
+
+    def hook(self, virtual_scale: float = 1.0) -> Hook:
+        """The dial for a renderer that has these Gaussians: it turns their opacities into what is drawn of them.
+
+        Raises:
+            ClodError: the file has no sigma_d, or the dial is below 1 or not finite.
+        """
+        if self.gaussians.sigma_d is None or self.gaussians.attenuation is None:
+            raise ClodError(f"{self.path}: it has no sigma_d, so there is no dial; clod-adapt adapt gives it one")
+        return Hook(self.gaussians.sigma_d, self.gaussians.attenuation, virtual_scale)
 
 
 def load(path: str | Path, *, activated: Activated | None = None, origin: Origin | None = None) -> Checkpoint:

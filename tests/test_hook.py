@@ -1,0 +1,102 @@
+"""The hook gives the opacities that a rendering has, in numpy and in torch, or says what it needs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import clod_adapter
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.hook import Hook
+from clod_adapter.render import dial
+from scenes import camera, gaussians
+
+N = 200
+
+
+def adapted(**settings: Any) -> Gaussians:
+    plain = gaussians(N, 1, 0)
+    sigma_d = torch.rand(N, generator=torch.Generator().manual_seed(1)) * 1.5
+    values = {"tau": 0.02, "scene_distance": 3.0, "max_sv": 5.0}
+    return plain.replace(sigma_d=sigma_d, attenuation=AttenuationConfig(**(values | settings)))
+
+
+def hook_of(model: Gaussians, virtual_scale: float = 3.0) -> Hook:
+    return Hook(model.sigma_d, model.attenuation, virtual_scale)
+
+
+def test_from_a_file(tmp_path: Path) -> None:
+    model, view = adapted(), camera()
+    clod_adapter.save(tmp_path / "model.ply", model)
+    hook = clod_adapter.load(tmp_path / "model.ply").hook(virtual_scale=3)
+    drawn, keep = hook(model.means, model.opacities, view.viewmat, view.K, view.width, view.height)
+    want = dial(model, view, 3.0)
+    assert torch.equal(keep, want.keep) and 0 < int(keep.sum()) < N
+    torch.testing.assert_close(drawn, want.drawn)
+
+
+@pytest.mark.parametrize("cut", ["hard", "soft"])
+@pytest.mark.parametrize("normalizer", ["scene", "quantile", "max"])
+def test_numpy_and_torch_agree_with_a_rendering(normalizer: str, cut: str) -> None:
+    model, view = adapted(normalizer=normalizer, cut=cut), camera()
+    given = (model.means, model.opacities, view.viewmat, view.K)
+    drawn, keep = hook_of(model)(*given, view.width, view.height)
+    want = dial(model, view, 3.0)
+    assert torch.equal(keep, want.keep)
+    torch.testing.assert_close(drawn, want.drawn)
+    same, who = hook_of(model)(*(tensor.numpy() for tensor in given), view.width, view.height)
+    assert (type(same).__name__, same.dtype, who.dtype) == ("ndarray", "float32", "bool")
+    assert (same == drawn.numpy()).all() and (who == keep.numpy()).all()
+
+
+def test_shape_and_type_are_those_of_the_opacities() -> None:
+    model, view = adapted(), camera()
+    column, _ = hook_of(model)(model.means, model.opacities[:, None], view.viewmat)
+    assert column.shape == (N, 1)
+    double, keep = hook_of(model)(model.means.double(), model.opacities.double(), view.viewmat.double())
+    assert double.dtype == torch.float64 and keep.shape == (N,)
+    half, _ = hook_of(model)(model.means, model.opacities.half(), view.viewmat)
+    assert half.dtype == torch.float16
+    torch.testing.assert_close(column[:, 0].double(), double, rtol=1e-4, atol=1e-6)
+
+
+def test_gradients_reach_opacities_and_sigma_d_and_nothing_else() -> None:
+    model, view = adapted(), camera()
+    a, sigma = model.opacities.double().requires_grad_(), model.sigma_d.double().requires_grad_()
+    means, viewmat = model.means.double().requires_grad_(), view.viewmat.double().requires_grad_()
+    keep = Hook(sigma, model.attenuation, 2.0)(means, a, viewmat)[1]
+    a, sigma, means = (tensor[keep].detach().requires_grad_() for tensor in (a, sigma, means))
+
+    def drawn(a: torch.Tensor, sigma: torch.Tensor) -> torch.Tensor:
+        return Hook(sigma, model.attenuation, 2.0)(means, a, viewmat)[0]
+
+    assert torch.autograd.gradcheck(drawn, (a, sigma), eps=1e-8)
+    assert torch.autograd.grad(drawn(a, sigma).sum(), [means, viewmat], allow_unused=True) == (None, None)
+
+
+def test_it_is_turned_by_replacing() -> None:
+    model, view = adapted(), camera()
+    kept = [
+        int(replace(hook_of(model), virtual_scale=s)(model.means, model.opacities, view.viewmat)[1].sum())
+        for s in (1, 2, 5)
+    ]
+    assert kept[0] > kept[1] > kept[2] > 0
+
+
+def test_misuse_is_explained(tmp_path: Path) -> None:
+    model, view = adapted(normalizer="max"), camera()
+    with pytest.raises(ClodError, match="normalizer max needs K, width and height"):
+        hook_of(model)(model.means, model.opacities, view.viewmat)
+    with pytest.raises(ClodError, match=r"for 200 Gaussians, but means is \(199, 3\)"):
+        hook_of(model)(model.means[1:], model.opacities, view.viewmat, view.K, 64, 48)
+    with pytest.raises(ClodError, match="virtual_scale is 0.5"):
+        hook_of(model, 0.5)
+    clod_adapter.save(tmp_path / "plain.ply", gaussians(5, 0, 0))
+    with pytest.raises(ClodError, match="plain.ply: it has no sigma_d, so there is no dial"):
+        clod_adapter.load(tmp_path / "plain.ply").hook(virtual_scale=3)
