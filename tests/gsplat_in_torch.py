@@ -1,0 +1,110 @@
+"""gsplat 1.5.3's own ``rasterization`` without CUDA: its Python as it stands, torch in place of its five kernels.
+
+Slow, for a few dozen Gaussians on a few tiles. What the kernels do is in it: rows of an opacity below 1/255 are dropped
+in the projection and narrow by their opacity, packed rows, tiles and keys are in the kernels' order, and what the
+packed kernels cannot do (a background, gsplat's issue 764) is refused.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN = 1 / 255, 0.999, 1e-4
+
+
+def install(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Has gsplat find these where it looks for its kernels."""
+    from gsplat import rendering
+    from gsplat.cuda import _torch_impl
+
+    def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor) -> Tensor:
+        return _torch_impl._spherical_harmonics(degree, dirs, coeffs)
+
+    for function in (fully_fused_projection, isect_tiles, rasterize_to_pixels, spherical_harmonics):
+        monkeypatch.setattr(rendering, function.__name__, function)
+    monkeypatch.setattr(rendering, "isect_offset_encode", _torch_impl._isect_offset_encode)
+
+
+def fully_fused_projection(
+    means: Tensor, covars: None, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int,
+    *, eps2d: float, packed: bool, near_plane: float, far_plane: float, radius_clip: float, sparse_grad: bool,
+    calc_compensations: bool, camera_model: str, opacities: Tensor,
+) -> tuple[Any, ...]:  # fmt: skip
+    from gsplat.cuda import _torch_impl
+
+    covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
+    radii, *values, compensations = _torch_impl._fully_fused_projection(
+        means, covars, viewmats, Ks, width, height, eps2d, near_plane, far_plane, calc_compensations, camera_model
+    )
+    shown = opacities[..., None, :] * (1 if compensations is None else compensations)
+    narrower = (2 * (shown / ALPHA_MIN).clamp(min=1).log()).sqrt() / 3.33
+    radii = torch.ceil(radii * narrower.clamp(max=1)[..., None]).int() * (shown >= ALPHA_MIN)[..., None].int()
+    if not packed:
+        return radii, *values, compensations
+    flat = radii.reshape(-1, *radii.shape[-3:])  # [B, C, N, 2]
+    ids = torch.nonzero((flat > 0).all(-1), as_tuple=True)
+    rows = [value.reshape(*flat.shape[:3], *value.shape[len(radii.shape) - 1 :])[ids] for value in (radii, *values)]
+    return *ids, *rows, None if compensations is None else compensations.reshape(flat.shape[:3])[ids]
+
+
+@torch.no_grad()
+def isect_tiles(
+    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int, *,
+    segmented: bool, packed: bool, n_images: int, image_ids: Tensor | None, gaussian_ids: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    if image_ids is None:
+        image_ids = torch.arange(n_images).repeat_interleave(means2d.shape[-2])
+    centre, reach, depth = means2d.reshape(-1, 2) / tile_size, radii.reshape(-1, 2) / tile_size, depths.flatten()
+    most = torch.tensor([tile_width, tile_height])
+    low = torch.floor(centre - reach).long().clamp(min=torch.zeros(2).long(), max=most)
+    high = torch.ceil(centre + reach).long().clamp(min=torch.zeros(2).long(), max=most)
+    counts = (high - low).prod(-1) * (reach > 0).all(-1)
+    ids = torch.repeat_interleave(counts)
+    nth, across = torch.arange(len(ids)) - (counts.cumsum(0) - counts)[ids], (high - low)[ids, 0]
+    tiles = (low[ids, 1] + nth // across) * tile_width + low[ids, 0] + nth % across
+    bits = (tile_width * tile_height).bit_length()
+    keys = (image_ids[ids] << 32 + bits) | (tiles << 32) | depth[ids].float().view(torch.int32).long()
+    keys, order = torch.sort(keys, stable=True)
+    return counts.int().reshape(depths.shape), keys, ids[order].int()
+
+
+def rasterize_to_pixels(
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int, tile_size: int,
+    isect_offsets: Tensor, flatten_ids: Tensor, *, backgrounds: Tensor | None, packed: bool, absgrad: bool,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    assert not packed or backgrounds is None
+    if absgrad and means2d.requires_grad:  # the kernel sums the absolute values of all pixels: more than this
+        means2d.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient.abs()))
+    table = [means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten(), colors.reshape(-1, colors.shape[-1])]
+    images = isect_offsets.shape[:-2]
+    bounds = [*isect_offsets.flatten().tolist(), len(flatten_ids)]
+    canvas = means2d.new_zeros(math.prod(images), height, width, colors.shape[-1] + 1)
+    places = itertools.product(*map(range, (len(canvas), *isect_offsets.shape[-2:])))
+    for tile, (image, row, column) in enumerate(places):
+        ids = flatten_ids[bounds[tile] : bounds[tile + 1]].long()
+        top, left = row * tile_size, column * tile_size
+        part = canvas[image, top : top + tile_size, left : left + tile_size]
+        y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in part.shape[:2]), indexing="ij")
+        part += _blend([values[ids] for values in table], (x + left).to(canvas), (y + top).to(canvas))
+    drawn, alphas = canvas[..., :-1], canvas[..., -1:]
+    if backgrounds is not None:
+        drawn = drawn + (1 - alphas) * backgrounds.reshape(len(canvas), 1, 1, -1)
+    return drawn.unflatten(0, images), alphas.unflatten(0, images)
+
+
+def _blend(table: list[Tensor], x: Tensor, y: Tensor) -> Tensor:
+    """Colours and alpha ``[H, W, D + 1]`` of Gaussians in order of depth."""
+    centres, conics, opacities, colors = table
+    dx, dy = x[..., None] - centres[:, 0], y[..., None] - centres[:, 1]
+    a, b, c = conics.unbind(-1)
+    alpha = (opacities * torch.exp(-(0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy))).clamp(max=ALPHA_MAX)
+    alpha = alpha * (alpha >= ALPHA_MIN)
+    after = torch.cumprod(1 - alpha, -1)
+    weights = alpha * torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], -1) * (after > TRANSMITTANCE_MIN)
+    return torch.cat([weights @ colors, weights.sum(-1, keepdim=True)], -1)

@@ -1,0 +1,315 @@
+"""The wrapper against gsplat 1.5.3 itself: on its kernels where there is CUDA, else on torch in their place."""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import importlib.util
+import inspect
+import sys
+import weakref
+from collections.abc import Callable
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import gsplat_in_torch
+from clod_adapter.attenuation import attenuate, normalized_distances
+from clod_adapter.cameras import Camera
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.render import render
+from scenes import camera, ring, scene
+
+N, WIDTH, HEIGHT = 40, 40, 28
+SOFT = AttenuationConfig(tau=0.02, cut="soft", scene_distance=4.0, max_sv=5.0)
+WHOLE = AttenuationConfig(tau=0.02, max_sv=5.0)  # what has an opacity above tau and no decay stays as it is
+STORED = (
+    "means quats scales opacities colors viewmats Ks width height near_plane=0.01 far_plane=10000000000.0 "
+    "radius_clip=0.0 eps2d=0.3 sh_degree=None packed=True tile_size=16 backgrounds=None render_mode='RGB' "
+    "sparse_grad=False absgrad=False rasterize_mode='classic' channel_chunk=32 distributed=False "
+    "camera_model='pinhole' segmented=False covars=None with_ut=False with_eval3d=False radial_coeffs=None "
+    "tangential_coeffs=None thin_prism_coeffs=None ftheta_coeffs=None "
+    "rolling_shutter=<RollingShutterType.GLOBAL: 4> viewmats_rs=None"
+).replace(": 4", ":4")
+OURS = ["*", "sigma_d=None", "virtual_scale=1.0", "attenuation=None"]
+
+
+class Tools(SimpleNamespace):
+    """gsplat's function, ours, and the device that both work on."""
+
+    theirs: Callable[..., Any]
+    ours: Callable[..., Any]
+    device: str
+
+
+@pytest.fixture(params=["cpu", "cuda"])
+def tools(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Tools:
+    gsplat = pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    if request.param == "cpu":
+        gsplat_in_torch.install(monkeypatch)
+    from clod_adapter.integrations import gsplat as wrapper
+
+    return Tools(theirs=gsplat.rasterization, ours=wrapper.rasterization, device=request.param)
+
+
+def names(function: Callable[..., Any]) -> list[str]:
+    """Its parameters with their defaults, in order."""
+    found, keyword = [], False
+    for p in inspect.signature(function).parameters.values():
+        found += ["*"] if p.kind is p.KEYWORD_ONLY and not keyword else []
+        keyword = p.kind is p.KEYWORD_ONLY
+        default = repr(p.default).replace(": 4", ":4")
+        found.append(p.name if p.default is p.empty else f"{p.name}={default}")
+    return found
+
+
+def test_the_signature_is_gsplats_and_three_more(tools: Tools) -> None:
+    assert names(tools.theirs) == STORED.split()
+    assert names(tools.ours) == STORED.split() + OURS
+
+
+def standing_in(monkeypatch: pytest.MonkeyPatch, module: ModuleType | None) -> ModuleType:
+    """A second copy of the wrapper, made while ``module`` is all there is of gsplat."""
+    monkeypatch.setitem(sys.modules, "gsplat", module)
+    spec = importlib.util.find_spec("clod_adapter.integrations.gsplat")
+    assert spec is not None and spec.loader is not None
+    copy = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(copy)
+    return copy
+
+
+def test_without_gsplat_the_signature_and_the_arguments_are_passed_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    space: dict[str, Any] = {}
+    parameters = ", ".join(STORED.replace("<RollingShutterType.GLOBAL:4>", "'GLOBAL'").split())
+    exec(f"def rasterization({parameters}):\n    return locals()", space)
+    module = ModuleType("gsplat")
+    module.rasterization = space["rasterization"]
+    wrapper = standing_in(monkeypatch, module)
+    assert names(wrapper.rasterization) == [*names(space["rasterization"]), *OURS]
+    given, views = arguments(N, 1)
+    plain = wrapper.rasterization(*given.values(), *views.values(), 0.3, packed=False)
+    assert (plain["near_plane"], plain["packed"], plain["tile_size"]) == (0.3, False, 16)
+    passed = wrapper.rasterization(*given.values(), *views.values(), sigma_d=torch.full((N,), 1e9), attenuation=SOFT)
+    same(passed.pop("opacities"), faded(given, views, torch.full((N,), 1e9), 1.0, SOFT)[0])
+    want = space["rasterization"](*given.values(), *views.values())
+    assert all(passed[name] is want[name] for name in passed)
+
+
+def test_where_gsplat_is_absent_the_install_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ImportError, match="pip install gsplat==1.5.3"):
+        standing_in(monkeypatch, None)
+
+
+def arguments(n: int, cameras: int, batch: tuple[int, ...] = (), **dtype: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The Gaussians' arguments, colours of SH degree 1 among them, and the cameras', with these dimensions before."""
+    copies = [scene(n, 1, seed, size=0.2) for seed in range(max(1, *batch, 1))]
+
+    def stacked(name: str) -> Tensor:
+        rows = [torch.cat([s["sh0"], s["shN"]], 1) if name == "colors" else s[name] for s in copies]
+        return (torch.stack(rows) if batch else rows[0]).to(**dtype)
+
+    given = {name: stacked(name) for name in ("means", "quats", "scales", "opacities", "colors")}
+    views = ring(cameras * len(copies), WIDTH, HEIGHT) if cameras > 1 or batch else [camera(WIDTH, HEIGHT)]
+    matrices = {"viewmats": [view.viewmat for view in views], "Ks": [view.K for view in views]}
+    shaped = {name: torch.stack(of).reshape(*batch, cameras, *of[0].shape).to(**dtype) for name, of in matrices.items()}
+    return given, {**shaped, "width": WIDTH, "height": HEIGHT}
+
+
+def faded(
+    given: dict[str, Any], views: dict[str, Any], sigma_d: Tensor, dial: float, config: AttenuationConfig
+) -> list[Tensor]:
+    """``[N]`` for each camera of unbatched arguments, by way of the logits."""
+    found = []
+    for viewmat, K in zip(views["viewmats"], views["Ks"], strict=True):
+        d = normalized_distances(given["means"], Camera(viewmat, K, WIDTH, HEIGHT), config)
+        found.append(attenuate(given["opacities"].logit(), sigma_d, d, dial, config).drawn)
+    return found
+
+
+def reach(n: int, *batch: int, **kind: Any) -> Tensor:
+    return 0.2 + torch.rand(*batch, n, generator=torch.Generator().manual_seed(7)).to(**kind)
+
+
+def same(ours: Any, theirs: Any) -> None:
+    """Both tensors, or both the same plain value."""
+    if isinstance(theirs, Tensor):
+        assert ours.dtype == theirs.dtype
+        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6)
+    else:
+        assert ours == theirs
+
+
+LAYOUTS = {
+    "one camera": {"cameras": 1},
+    "three cameras": {"cameras": 3},
+    "two scenes of one camera": {"cameras": 1, "batch": (2,)},
+    "two scenes of three cameras": {"cameras": 3, "batch": (2,)},
+}
+
+
+@pytest.mark.parametrize("packed", [True, False], ids=["packed", "unpacked"])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_without_fading_it_is_gsplats_own_call(tools: Tools, layout: str, packed: bool) -> None:
+    """Every value of meta among it, where nothing fades and gsplat can draw all cameras in one call."""
+    given, views = arguments(N, device=tools.device, **LAYOUTS[layout])
+    given["opacities"] = given["opacities"].clamp(min=0.03)
+    if packed and tools.device == "cuda" and "scenes" in layout:
+        pytest.skip("gsplat 1.5.3's packed projection takes the first scene's opacities for all")
+    options = {"sh_degree": 1, "packed": packed, "render_mode": "RGB+ED", "rasterize_mode": "antialiased"}
+    theirs = tools.theirs(**given, **views, **options)
+    ours = tools.ours(**given, **views, **options, sigma_d=torch.full_like(given["opacities"], 1e9), attenuation=WHOLE)
+    assert list(ours[2]) == list(theirs[2])
+    for mine, want in ((ours[0], theirs[0]), (ours[1], theirs[1]), *((ours[2][k], theirs[2][k]) for k in theirs[2])):
+        same(mine, want)
+
+
+@pytest.mark.parametrize("cut", ["hard", "soft"])
+@pytest.mark.parametrize("packed", [True, False], ids=["packed", "unpacked"])
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_faded_it_is_gsplat_camera_by_camera(tools: Tools, cameras: int, packed: bool, cut: str) -> None:
+    """Pictures, alphas, and the gradients of all that is differentiated, the projected centres' among them."""
+    config = AttenuationConfig(tau=0.02, cut=cut, normalizer="quantile", max_sv=5.0)
+    given, views = arguments(N, cameras, device=tools.device)
+    leaves = {name: value.clone().requires_grad_() for name, value in given.items()}
+    leaves |= {"viewmats": views["viewmats"].clone().requires_grad_(), "sigma_d": reach(N, device=tools.device)}
+    leaves["sigma_d"].requires_grad_()
+    options = {"sh_degree": 1, "packed": packed, "absgrad": True}
+
+    views = views | {"viewmats": leaves["viewmats"]}
+    inputs = {name: leaves[name] for name in given}
+    ours = tools.ours(**inputs, **views, **options, sigma_d=leaves["sigma_d"], virtual_scale=2.0, attenuation=config)
+    opacities = faded(inputs, views, leaves["sigma_d"], 2.0, config)
+    assert any(0 < int((drawn == 0).sum()) < N for drawn in opacities)
+    theirs = []
+    for c, drawn in enumerate(opacities):
+        single = {"viewmats": views["viewmats"][c : c + 1], "Ks": views["Ks"][c : c + 1]}
+        theirs.append(tools.theirs(**inputs | {"opacities": drawn}, **views | single, **options))
+    torch.testing.assert_close(ours[0], torch.cat([part[0] for part in theirs]), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(ours[1], torch.cat([part[1] for part in theirs]), rtol=1e-4, atol=1e-5)
+
+    points = [ours[2]["means2d"], *(part[2]["means2d"] for part in theirs)]
+    for point in points:
+        point.retain_grad()
+    weights = torch.rand(ours[0].shape, generator=torch.Generator().manual_seed(1)).to(tools.device)
+    first = torch.autograd.grad((ours[0] * weights).sum() + ours[1].sum(), list(leaves.values()), retain_graph=True)
+    loss = sum((part[0] * w).sum() + part[1].sum() for part, w in zip(theirs, weights, strict=True))
+    second = torch.autograd.grad(loss, list(leaves.values()), retain_graph=True)
+    for name, mine, want in zip(leaves, first, second, strict=True):
+        torch.testing.assert_close(mine, want, rtol=1e-3, atol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
+    assert float(first[-1].abs().max()) > 0
+
+    # A second pass, in which the centres have a loss of their own: it adds to their grad.
+    ((ours[0] * weights).sum() + ours[1].sum() + points[0].square().sum()).backward()
+    (loss + sum(point.square().sum() for point in points[1:])).backward()
+    for kind in ("grad", "absgrad"):
+        want = torch.cat([getattr(point, kind) for point in points[1:]])
+        assert getattr(points[0], kind).shape == points[0].shape
+        torch.testing.assert_close(getattr(points[0], kind), want, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("packed", [True, False], ids=["packed", "unpacked"])
+def test_its_slope_by_sigma_is_that_of_finite_differences(tools: Tools, packed: bool) -> None:
+    if tools.device == "cuda":
+        pytest.skip("gsplat's kernels are float32's")
+    given, views = arguments(12, 2, dtype=torch.float64)
+    given["opacities"] = given["opacities"].clamp(min=0.2)
+    weights = torch.rand(2, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1)).double()
+
+    def loss(sigma_d: Tensor) -> Tensor:
+        options = {"sh_degree": 1, "packed": packed, "sigma_d": sigma_d, "virtual_scale": 1.5, "attenuation": SOFT}
+        return (tools.ours(**given, **views, **options)[0] * weights).sum()
+
+    sigma_d = (0.8 + reach(12, dtype=torch.float64)).requires_grad_()
+    # The rasterizer leaves out what is fainter than 1/255: a jump that finite differences may meet.
+    assert torch.autograd.gradcheck(loss, sigma_d, eps=1e-7, atol=1e-4, rtol=1e-4)
+
+
+def test_it_draws_what_the_package_draws(tools: Tools) -> None:
+    """Picture, alpha and the gradient of sigma_d, against ``render`` with the package's own rasterizer."""
+    given, views = arguments(N, 1)
+    colors, logs, logits = given["colors"], given["scales"].log(), given["opacities"].logit()
+    base = Gaussians(given["means"], given["quats"], logs, logits, colors[:, :1], colors[:, 1:])
+    sigma = [reach(N).requires_grad_(), reach(N).to(tools.device).requires_grad_()]
+    model = base.replace(sigma_d=sigma[0], attenuation=SOFT)
+    own = render(model, Camera(views["viewmats"][0], views["Ks"][0], WIDTH, HEIGHT), 2.0)
+    moved = {k: v.to(tools.device) if isinstance(v, Tensor) else v for k, v in (given | views).items()}
+    image, alpha, _ = tools.ours(**moved, sh_degree=1, sigma_d=sigma[1], virtual_scale=2.0, attenuation=SOFT)
+    torch.testing.assert_close(image[0].cpu(), own.image, rtol=1e-3, atol=2e-3)
+    torch.testing.assert_close(alpha[0, :, :, 0].cpu(), own.alpha, rtol=1e-3, atol=2e-3)
+    slopes = [
+        torch.autograd.grad(picture.sum(), s)[0].cpu() for picture, s in zip((own.image, image), sigma, strict=True)
+    ]
+    assert float((slopes[0] - slopes[1]).norm()) < 0.01 * float(slopes[0].norm())
+
+
+def test_colours_and_backgrounds_of_each_camera(tools: Tools) -> None:
+    given, views = arguments(N, 2, (2,), device=tools.device)
+    given["colors"] = torch.rand(2, 2, N, 5, generator=torch.Generator().manual_seed(0)).to(tools.device)
+    options = {"packed": False, "backgrounds": torch.rand(2, 2, 5).to(tools.device)}
+    wide = torch.full_like(given["opacities"], 1e9)
+    ours = tools.ours(**given, **views, **options, sigma_d=wide, attenuation=AttenuationConfig(tau=1e-6))
+    same(ours[0], tools.theirs(**given, **views, **options)[0])
+
+
+@pytest.mark.parametrize("packed", [True, False], ids=["packed", "unpacked"])
+def test_gsplats_strategy_takes_its_meta(tools: Tools, packed: bool) -> None:
+    """The statistics that gsplat densifies by: of the caller's rows, and the same where nothing fades."""
+    from gsplat import DefaultStrategy
+
+    given, views = arguments(N, 3, device=tools.device)
+    given["opacities"] = given["opacities"].clamp(min=0.03)
+    states = []
+    for function, extra in (
+        (tools.theirs, {}),
+        (tools.ours, {"sigma_d": torch.full_like(given["opacities"], 1e9), "attenuation": WHOLE}),
+    ):
+        params = {name: torch.nn.Parameter(value) for name, value in given.items()}
+        image, _, meta = function(**params, **views, sh_degree=1, packed=packed, **extra)
+        strategy = DefaultStrategy(refine_scale2d_stop_iter=9, verbose=False)
+        state = strategy.initialize_state()
+        strategy.step_pre_backward(params, {}, state, 0, meta)
+        image.square().sum().backward()
+        strategy._update_state(params, state, meta, packed=packed)
+        states.append(state)
+    for name in ("grad2d", "count", "radii"):
+        torch.testing.assert_close(states[1][name], states[0][name], rtol=1e-4, atol=1e-4)
+    assert float(states[0]["grad2d"].max()) > 0
+
+
+def test_nothing_stays_in_memory(tools: Tools) -> None:
+    """The hooks that carry the gradients hold nothing that holds them, with or without a backward pass."""
+    given, views = arguments(N, 2, device=tools.device)
+    given["means"].requires_grad_()
+    gc.collect()
+    gc.disable()
+    try:
+        for backward in (False, True):
+            colors, alphas, meta = tools.ours(
+                **given, **views, sh_degree=1, sigma_d=reach(N, device=tools.device), attenuation=SOFT
+            )
+            points = weakref.ref(meta["means2d"])
+            if backward:
+                colors.sum().backward()
+            del colors, alphas, meta
+            assert points() is None
+    finally:
+        gc.enable()
+
+
+def test_misuse_is_explained(tools: Tools) -> None:
+    given, views = arguments(N, 2, device=tools.device)
+    with pytest.raises(ClodError, match="distributed=True shares one opacity"):
+        tools.ours(**given, **views, distributed=True, sigma_d=given["opacities"])
+    with pytest.raises(ClodError, match=r"sigma_d is \(39,\) and opacities \(40,\)"):
+        tools.ours(**given, **views, sigma_d=given["opacities"][1:])
+    with pytest.raises(ClodError, match="virtual_scale is 0.5"):
+        tools.ours(**given, **views, sigma_d=given["opacities"], virtual_scale=0.5)
+    with pytest.raises(TypeError, match="missing a required argument: 'viewmats'"):
+        tools.ours(*given.values(), sigma_d=given["opacities"])
