@@ -1,0 +1,165 @@
+"""The class against what the fork draws of the kept rows alone: stand-ins for five forks, the installed one on CUDA."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import inria_forks
+from clod_adapter.attenuation import attenuate, normalized_distances
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from scenes import camera, scene
+
+N = 150
+VIEW = camera(48, 36, off_centre=(0.5, 0.5))
+DIAL = 2.0
+
+
+def wrapper(monkeypatch: pytest.MonkeyPatch, installed: ModuleType | None) -> ModuleType:
+    """A copy of our module, made while ``installed`` is the rasterizer there is."""
+    monkeypatch.setitem(sys.modules, "diff_gaussian_rasterization", installed)
+    spec = importlib.util.find_spec("clod_adapter.integrations.inria")
+    assert spec is not None and spec.loader is not None
+    copy = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(copy)
+    return copy
+
+
+def arguments(*further: str, device: str = "cpu") -> dict[str, Any]:
+    """A fork's arguments by their names, of as many Gaussians behind the camera as before it, leaves of autograd."""
+    s = scene(N, 1, 0, size=0.2)
+    values = {
+        "means3D": s["means"] * 3, "means2D": torch.zeros(N, 3), "opacities": s["opacities"][:, None],
+        "shs": torch.cat([s["sh0"], s["shN"]], 1), "scales": s["scales"],
+        "rotations": torch.nn.functional.normalize(s["quats"]),
+    }  # fmt: skip
+    made = {name: value.to(device).requires_grad_() for name, value in values.items()}
+    return made | {name: torch.ones(N, 2, device=device) for name in further}
+
+
+def config(**changes: Any) -> AttenuationConfig:
+    return AttenuationConfig(**{"tau": 0.02, "cut": "soft", "scene_distance": 5.0, "max_sv": 5.0} | changes)
+
+
+def faded(given: dict[str, Any], sigma_d: Tensor, settings: AttenuationConfig) -> Any:
+    d = normalized_distances(given["means3D"], VIEW, settings)
+    return attenuate(given["opacities"][:, 0].logit(), sigma_d, d, DIAL, settings)
+
+
+def reach() -> Tensor:
+    return (0.2 + torch.rand(N, generator=torch.Generator().manual_seed(7))).requires_grad_()
+
+
+@pytest.mark.parametrize("normalizer", ["scene", "max"])
+@pytest.mark.parametrize("name", inria_forks.FORKS)
+def test_it_draws_what_the_fork_draws_of_the_kept_rows(
+    name: str, normalizer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    further, results = inria_forks.FORKS[name].further, inria_forks.FORKS[name].results.split()
+    fork, settings = inria_forks.module(name), config(normalizer=normalizer)
+    raster_settings = inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
+    given, sigma_d = arguments(*further), reach()
+    result = faded(given, sigma_d, settings)
+    keep = result.keep
+    assert 0 < int(keep.sum()) < N
+    rows = {key: value[keep] for key, value in given.items()} | {"opacities": result.drawn[keep, None]}
+    want = fork.GaussianRasterizer(raster_settings)(**rows)
+
+    ours = wrapper(monkeypatch, fork).GaussianRasterizer(raster_settings)
+    got = ours(**given, sigma_d=sigma_d, virtual_scale=DIAL, attenuation=settings)
+    for result, mine, theirs in zip(results, got, want, strict=True):
+        if result in ("radii", "touched"):  # of all rows, 0 for who is left out
+            assert torch.equal(mine[keep], theirs) and len(mine) == N and not mine[~keep].any()
+        elif result != "features":
+            torch.testing.assert_close(mine, theirs, rtol=1e-5, atol=1e-5)
+
+    leaves = [value for value in given.values() if value.requires_grad] + [sigma_d]
+    weights = torch.rand(got[0].shape, generator=torch.Generator().manual_seed(1))
+    slopes = [torch.autograd.grad((picture[0] * weights).sum(), leaves) for picture in (got, want)]
+    for leaf, mine, theirs in zip(leaves, *slopes, strict=True):
+        assert mine.shape == leaf.shape and not mine[~keep].any()
+        torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-4)
+    assert float(slopes[0][-1].abs().max()) > 0
+
+
+@pytest.mark.parametrize("name", inria_forks.FORKS)
+def test_without_sigma_d_it_is_the_fork(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    fork, given = inria_forks.module(name), arguments(*inria_forks.FORKS[name].further)
+    ours = wrapper(monkeypatch, fork)
+    assert ours.GaussianRasterizationSettings is fork.GaussianRasterizationSettings
+    raster_settings = inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
+    rasterizer = ours.GaussianRasterizer(raster_settings=raster_settings)
+    assert isinstance(rasterizer, fork.GaussianRasterizer)
+    assert torch.equal(
+        rasterizer.markVisible(given["means3D"]), given["means3D"] @ VIEW.viewmat[2, :3] + VIEW.viewmat[2, 3] > 0.2
+    )
+    for mine, want in zip(rasterizer(**given), fork.GaussianRasterizer(raster_settings)(**given), strict=True):
+        assert torch.equal(mine, want)
+
+
+def test_by_position(monkeypatch: pytest.MonkeyPatch) -> None:
+    fork = inria_forks.module("w-pose")
+    ours = wrapper(monkeypatch, fork).GaussianRasterizer(
+        inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
+    )
+    g, theta = arguments(), torch.zeros(3)
+    more = {"sigma_d": reach(), "virtual_scale": DIAL, "attenuation": config()}
+    order = ("means3D", "means2D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
+    by_position = ours(*(g.get(name) for name in order), theta, theta, **more)
+    assert torch.equal(by_position[0], ours(**g, theta=theta, rho=theta, **more)[0])
+
+
+def test_misuse_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    fork = inria_forks.module("inria 2024")
+    ours = wrapper(monkeypatch, fork).GaussianRasterizer
+    kind, given = fork.GaussianRasterizationSettings, arguments()
+    with pytest.raises(ClodError, match="prefiltered is True.*set it to False"):
+        ours(inria_forks.settings_of(kind, VIEW, prefiltered=True))(**given, sigma_d=reach())
+    with pytest.raises(ClodError, match=r"the dial is for 149 Gaussians, but means is \(150, 3\)"):
+        ours(inria_forks.settings_of(kind, VIEW))(**given, sigma_d=reach()[1:])
+    with pytest.raises(ClodError, match="virtual_scale is 0"):
+        ours(inria_forks.settings_of(kind, VIEW))(**given, sigma_d=reach(), virtual_scale=0)
+    with pytest.raises(ImportError, match="pip install .*graphdeco-inria/diff-gaussian-rasterization"):
+        wrapper(monkeypatch, None)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_the_installed_fork() -> None:
+    """On CUDA, whichever it is, called as Inria's own renderer calls it."""
+    fork = pytest.importorskip("diff_gaussian_rasterization")
+    from clod_adapter.integrations.inria import GaussianRasterizer
+
+    fields = {"projmatrix": _full_projection().cuda(), "antialiasing": False}
+    raster_settings = inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW, **fields)
+    raster_settings = raster_settings._replace(
+        **{name: getattr(raster_settings, name).cuda() for name in ("bg", "viewmatrix", "campos")}
+    )
+    given, sigma_d = arguments(device="cuda"), reach()
+    result = faded({name: value.cpu() for name, value in given.items()}, sigma_d, config())
+    keep = result.keep.cuda()
+    rows = {name: value[keep] for name, value in given.items()} | {"opacities": result.drawn.cuda()[keep, None]}
+    want = fork.GaussianRasterizer(raster_settings)(**rows)
+    got = GaussianRasterizer(raster_settings)(**given, sigma_d=sigma_d.cuda(), virtual_scale=DIAL, attenuation=config())
+    torch.testing.assert_close(got[0], want[0], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        torch.autograd.grad(got[0].sum(), sigma_d)[0],
+        torch.autograd.grad(want[0].sum(), sigma_d)[0],
+        rtol=1e-3,
+        atol=1e-3,
+    )
+
+
+def _full_projection() -> Tensor:
+    """Inria's projmatrix: world to clip space, multiplied from the right."""
+    near, far = 0.01, 100.0
+    clip = torch.zeros(4, 4)
+    clip[0, 0], clip[1, 1] = 2 * VIEW.K[0, 0] / VIEW.width, 2 * VIEW.K[1, 1] / VIEW.height
+    clip[2, 2], clip[2, 3], clip[3, 2] = far / (far - near), -far * near / (far - near), 1.0
+    return (clip @ VIEW.viewmat).T
