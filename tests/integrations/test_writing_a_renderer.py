@@ -1,0 +1,123 @@
+"""The page for writers of renderers and the two examples beside it say what is so."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import sys
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import clod_adapter
+import gsplat_in_torch
+from clod_adapter import integrations
+from clod_adapter.attenuation import attenuate_activated
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.hook import Hook
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "writing_a_renderer.md").read_text(encoding="utf-8")
+DIALS = (1, 2, 3, 5)
+
+
+def my_opacity(
+    opacity: float, sigma: float, distance: float, scale: float, eps: float, tau: float, soft: bool
+) -> float:
+    """float32's, of the package."""
+    config = AttenuationConfig(eps=eps, tau=tau, cut="soft" if soft else "hard", max_sv=1)
+    values = (torch.tensor([value], dtype=torch.float32) for value in (opacity, sigma, distance))
+    return float(attenuate_activated(*values, scale, config).drawn)
+
+
+@pytest.fixture
+def adapted(capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> clod_adapter.Gaussians:
+    """Written as adapted.ply in the test's folder."""
+    monkeypatch.chdir(tmp_path)
+    sigma_d = 0.5 + 3 * torch.rand(len(capture.gaussians), generator=torch.Generator().manual_seed(0))
+    attenuation = AttenuationConfig(tau=0.02, cut="soft", scene_distance=5.0)
+    gaussians = capture.gaussians.replace(sigma_d=sigma_d, attenuation=attenuation)
+    clod_adapter.save("adapted.ply", gaussians)
+    return gaussians
+
+
+def test_its_golden_loop_runs() -> None:
+    (block,) = (text for text in re.findall(r"```python\n(.*?)```", PAGE, re.S) if "golden" in text)
+    exec(block, {"my_opacity": my_opacity})
+    with pytest.raises(AssertionError):
+        exec(block, {"my_opacity": lambda *row: my_opacity(*row) * 1.001})
+
+
+def test_its_hook_runs(adapted: clod_adapter.Gaussians) -> None:
+    (block,) = (text for text in re.findall(r"```python\n(.*?)```", PAGE, re.S) if ".hook(" in text)
+    names: dict[str, Any] = {"means": adapted.means, "opacities": adapted.opacities, "viewmat": torch.eye(4)}
+    Path("adapted.ply").rename("model.ply")
+    exec(block, names | {"clod_adapter": clod_adapter, "K": torch.eye(3), "width": 2, "height": 2}, names)
+    want = Hook(adapted.sigma_d, adapted.attenuation, 3.0)(adapted.means, adapted.opacities, torch.eye(4))
+    assert torch.equal(names["opacities"], want[0]) and torch.equal(names["keep"], want[1])
+
+
+def test_its_defaults_are_those_of_the_reader() -> None:
+    told = dict(re.findall(r"`(\w+)`\s+\(`?(?:default )?([\w./-]+)`?\)", PAGE.split("2. **Activate**")[0]))
+    assert set(told) == {field.name for field in fields(AttenuationConfig)}
+    for name, value in told.items():
+        default = getattr(AttenuationConfig(), name)
+        assert value == default if isinstance(default, str) else eval(value) == pytest.approx(default)
+
+
+def example(name: str, *words: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", [name, *map(str, words)])
+    runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+
+
+def test_the_hook_example(
+    adapted: clod_adapter.Gaussians, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example("04_hook.py", "adapted.ply", monkeypatch=monkeypatch)
+    counts = [int(row.split(": ")[1].split()[0]) for row in capsys.readouterr().out.splitlines()]
+    assert counts == sorted(counts, reverse=True) and counts[0] > counts[-1] > 0
+    pictures = [np.asarray(Image.open(f"adapted_dots_sv{dial}.png")) for dial in DIALS]
+    assert all(picture.shape == (240, 320, 3) and picture.any() for picture in pictures)
+    assert len({picture.tobytes() for picture in pictures}) == 4
+
+
+def test_the_gsplat_example(
+    adapted: clod_adapter.Gaussians, capture: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its pictures are the package's own."""
+    pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    if device == "cpu":
+        gsplat_in_torch.install(monkeypatch)
+    main = runpy.run_path(str(ROOT / "examples" / "03_gsplat.py"))["main"]
+    main("adapted.ply", str(capture.scene), device)
+    assert capsys.readouterr().out.count("of 300 Gaussians a camera") == 4
+    camera = clod_adapter.load_scene(capture.scene).test[0].camera
+    for dial in DIALS:
+        own = clod_adapter.render(adapted, camera, dial).pixels.numpy().astype(float)
+        assert np.abs(np.asarray(Image.open(f"adapted_gsplat_sv{dial}.png")) - own).mean() < 0.1
+
+
+def test_misuse_of_the_examples_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capture: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for name, words, error in (
+        ("03_gsplat.py", [], "python examples/03_gsplat.py"),
+        ("03_gsplat.py", ["missing.ply", "scene"], "error: gsplat draws on CUDA devices only"),
+        ("04_hook.py", [], "python examples/04_hook.py"),
+        ("04_hook.py", ["missing.ply"], "error: missing.ply: .*check the path"),
+        ("04_hook.py", [capture.ply], "it has no sigma_d, so there is no dial"),
+    ):
+        with pytest.raises(SystemExit, match=error):
+            example(name, *words, monkeypatch=monkeypatch)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    monkeypatch.delitem(sys.modules, "clod_adapter.integrations.gsplat", raising=False)
+    monkeypatch.delattr(integrations, "gsplat", raising=False)
+    with pytest.raises(SystemExit, match="error: gsplat cannot be imported; .*pip install gsplat==1.5.3"):
+        example("03_gsplat.py", "missing.ply", "scene", monkeypatch=monkeypatch)
