@@ -45,7 +45,9 @@ def arguments(*further: str, device: str = "cpu") -> dict[str, Any]:
 
 
 def config(**changes: Any) -> AttenuationConfig:
-    return AttenuationConfig(**{"tau": 0.02, "cut": "soft", "scene_distance": 5.0, "max_sv": 5.0} | changes)
+    return AttenuationConfig(
+        **{"tau": 0.02, "cut": "soft", "scene_distance": 5.0, "quantile": 0.5, "max_sv": 5.0} | changes
+    )
 
 
 def faded(given: dict[str, Any], sigma_d: Tensor, settings: AttenuationConfig) -> Any:
@@ -57,7 +59,7 @@ def reach() -> Tensor:
     return (0.2 + torch.rand(N, generator=torch.Generator().manual_seed(7))).requires_grad_()
 
 
-@pytest.mark.parametrize("normalizer", ["scene", "max"])
+@pytest.mark.parametrize("normalizer", ["scene", "quantile"])
 @pytest.mark.parametrize("name", inria_forks.FORKS)
 def test_it_draws_what_the_fork_draws_of_the_kept_rows(
     name: str, normalizer: str, monkeypatch: pytest.MonkeyPatch
