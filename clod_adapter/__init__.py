@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from clod_adapter.evaluate import evaluate
     from clod_adapter.export import bake
     from clod_adapter.gaussians import Gaussians
+    from clod_adapter.hook import Hook
     from clod_adapter.io.adapter_file import load_adapter, save_adapter
     from clod_adapter.io.ply import Checkpoint, load, save
     from clod_adapter.io.scene import load_scene
@@ -49,6 +50,7 @@ on_first_use(__name__, {
     "evaluate": ("evaluate",),
     "export": ("bake",),
     "gaussians": ("Gaussians",),
+    "hook": ("Hook",),
     "io.adapter_file": ("load_adapter", "save_adapter"),
     "io.scene": ("load_scene",),
     "io.ply": ("Checkpoint", "load", "save"),
@@ -59,6 +61,6 @@ on_first_use(__name__, {
 
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
-    "DialValue", "Gaussians", "Rendering", "Scene", "View", "adapt", "attach", "bake", "detach", "dial_for", "evaluate",
-    "extract", "imagine", "load", "load_adapter", "load_scene", "place", "render", "save", "save_adapter",
+    "DialValue", "Gaussians", "Hook", "Rendering", "Scene", "View", "adapt", "attach", "bake", "detach", "dial_for",
+    "evaluate", "extract", "imagine", "load", "load_adapter", "load_scene", "place", "render", "save", "save_adapter",
 ]  # fmt: skip
