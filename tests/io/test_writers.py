@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.io import ply
+from clod_adapter.io.writers import WRITERS, write, writer_of
+from scenes import gaussians
+
+
+def test_the_table_is_light() -> None:
+    code = "import sys, clod_adapter.io.writers; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_suffixes(tmp_path: Path) -> None:
+    assert writer_of("a/B.PLY") is WRITERS[".ply"]
+    for name in ("a.obj", "a"):
+        with pytest.raises(ClodError, match="no format to write"):
+            write(tmp_path / name, gaussians(3, 0, 0))
+
+
+def test_ply(tmp_path: Path) -> None:
+    g = gaussians(20, 3, 0).replace(sigma_d=torch.rand(20), attenuation=AttenuationConfig(tau=0.02))
+    assert write(tmp_path / "a.ply", g, ("why",), origin=(1e6, 0.0, 0.0)) == ()
+    again = ply.load(tmp_path / "a.ply", origin=(1e6, 0.0, 0.0))
+    assert again.gaussians.attenuation == g.attenuation and "why" in again.comments
+    for name, tensor in g.tensors().items():
+        assert torch.equal(tensor, again.gaussians.tensors()[name]), name
