@@ -43,6 +43,18 @@ def turned(a: torch.Tensor, b: torch.Tensor) -> float:
     return float(4 * torch.asin(apart.clamp(max=2**0.5) / 2).max())
 
 
+def covariances(g: Gaussians) -> torch.Tensor:
+    """``[N, 3, 3]`` float64 of the ellipsoids, whichever of several rotations says so."""
+    w, x, y, z = (g.quats.double() / g.quats.double().norm(dim=1, keepdim=True)).unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    axes = torch.stack(rows, 1).reshape(-1, 3, 3) * g.log_scales.double().exp()[:, None]
+    return axes @ axes.mT
+
+
 def damaged(whole: bytes, data: st.DataObject) -> bytes:
     """A file cut short, or with a few bytes changed, its beginning more often than the rest."""
     if data.draw(st.booleans()):

@@ -14,6 +14,14 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import check_target
 from clod_adapter.io.regular import refuse_irregular
 
+# The axes in which each spherical harmonic is odd, in the order of ``Gaussians.shN``.
+_ODD = (
+    "y", "z", "x",
+    "xy", "yz", "", "xz", "",
+    "y", "xyz", "y", "z", "x", "z", "x",
+    "xy", "yz", "xy", "yz", "", "xz", "", "xz", "",
+)  # fmt: skip
+
 
 def arrays_of(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
     """The float32 arrays of ``Gaussians.tensors``, fit to be written to ``path``.
@@ -51,6 +59,22 @@ def gaussians_of(path: Path, arrays: Mapping[str, np.ndarray], attenuation: Atte
         return Gaussians(**tensors, attenuation=attenuation)
     except ClodError as error:
         raise ClodError(f"{path}: {error}; export it again") from error
+
+
+def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarray]:
+    """The same Gaussians turned half way round ``x`` or ``z``, between axes with y down and with y up.
+
+    Exact, and undone by itself. With ``P`` the turn (two signs), means become ``P mu``, rotations ``P R P``, which
+    gives the same ellipsoids, and harmonics change sign where they are odd in an odd number of the axes that flip.
+    """
+    signs = {name: np.float32(1 if name == axis else -1) for name in "xyz"}
+    harmonics = [np.prod([signs[name] for name in odd]) for odd in _ODD]
+    bands = arrays["shN"].shape[1]
+    return {
+        **arrays, "means": arrays["means"] * np.array([*signs.values()], np.float32),
+        "quats": arrays["quats"] * np.array([1, *signs.values()], np.float32),
+        "shN": arrays["shN"] * np.array(harmonics[:bands], np.float32)[:, None],
+    }  # fmt: skip
 
 
 def normalized(quats: np.ndarray) -> np.ndarray:
