@@ -11,6 +11,7 @@ from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io import ply
 from clod_adapter.io.writers import WRITERS, write, writer_of
+from formats import model
 from scenes import gaussians
 
 
@@ -34,3 +35,10 @@ def test_ply(tmp_path: Path) -> None:
     assert again.gaussians.attenuation == g.attenuation and "why" in again.comments
     for name, tensor in g.tensors().items():
         assert torch.equal(tensor, again.gaussians.tensors()[name]), name
+
+
+def test_opaque_gaussians_are_finite_in_a_ply(tmp_path: Path) -> None:
+    (note,) = write(tmp_path / "a.ply", model())
+    assert note == "1 opacities of +inf are written as 20, which is 1 too"
+    again = ply.load(tmp_path / "a.ply").gaussians
+    assert torch.equal(again.opacities, model().opacities) and again.opacity_logits.isfinite().all()
