@@ -23,7 +23,7 @@ def write_ply(
     origin: Origin = NOWHERE,
     calibration: Calibration | None = None,
 ) -> tuple[str, ...]:
-    """Writes every value as it is, opacity = +inf aside, and ``about`` as comments; ``writers.write`` has the arguments.
+    """Writes every value as it is (but opacity = +inf), ``about`` as comments; ``writers.write`` has the arguments.
 
     Raises:
         ClodError: as ``ply.save``.

@@ -33,6 +33,7 @@ class Writer(NamedTuple):
 WRITERS = {
     ".ply": Writer("ply_plain", "write_ply", True),
     ".glb": Writer("glb", "write_glb", True),
+    ".spz": Writer("spz", "write_spz", True),
     ".safetensors": Writer("model_safetensors", "write_safetensors", True),
     ".splat": Writer("splat", "write_splat", False),
 }
