@@ -11,14 +11,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.origin import NOWHERE, Origin
 from clod_adapter.io.version import package_version
+
+if TYPE_CHECKING:
+    from clod_adapter.gaussians import Gaussians
 
 KEY = "clod_adapter"
 FORMAT = "clod-model"

@@ -35,6 +35,7 @@ WRITERS = {
     ".glb": Writer("glb", "write_glb", True),
     ".spz": Writer("spz", "write_spz", True),
     ".safetensors": Writer("model_safetensors", "write_safetensors", True),
+    ".pt": Writer("pt_model", "write_pt", True),
     ".splat": Writer("splat", "write_splat", False),
 }
 

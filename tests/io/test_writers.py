@@ -10,6 +10,7 @@ import torch
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io import ply
+from clod_adapter.io.models import LOADERS, load_model
 from clod_adapter.io.writers import WRITERS, write, writer_of
 from formats import model
 from scenes import gaussians
@@ -42,3 +43,34 @@ def test_opaque_gaussians_are_finite_in_a_ply(tmp_path: Path) -> None:
     assert note == "1 opacities of +inf are written as 20, which is 1 too"
     again = ply.load(tmp_path / "a.ply").gaussians
     assert torch.equal(again.opacities, model().opacities) and again.opacity_logits.isfinite().all()
+
+
+@pytest.mark.parametrize("suffix", LOADERS)
+def test_what_is_written_is_read(tmp_path: Path, suffix: str) -> None:
+    g = model(1)
+    g = g if WRITERS[suffix].carries_sigma else g.replace(sigma_d=None, attenuation=None)
+    write(tmp_path / f"a{suffix.upper()}", g)
+    again = load_model(tmp_path / f"a{suffix.upper()}").gaussians
+    assert len(again) == len(g) and again.attenuation == g.attenuation
+    assert set(WRITERS) == {".ply", *LOADERS}
+    with pytest.raises(ClodError, match="is none of .glb"):
+        load_model(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("suffix", LOADERS)
+def test_files_that_are_not_there(tmp_path: Path, suffix: str) -> None:
+    for name in (f"missing{suffix}", f"folder{suffix}"):
+        (tmp_path / f"folder{suffix}").mkdir(exist_ok=True)
+        with pytest.raises(ClodError, match=f"{name}: cannot be read"):
+            load_model(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_nothing_is_half_written(tmp_path: Path, suffix: str) -> None:
+    plain = model(1).replace(sigma_d=None, attenuation=None)
+    for g in (plain.select(torch.zeros(40, dtype=torch.bool)), plain.replace(sh0=plain.sh0 * torch.nan)):
+        with pytest.raises(ClodError, match="a" + suffix):
+            write(tmp_path / f"a{suffix}", g)
+    with pytest.raises(ClodError, match="does not exist"):
+        write(tmp_path / "folder" / f"a{suffix}", plain)
+    assert not list(tmp_path.iterdir())
