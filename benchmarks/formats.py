@@ -98,7 +98,7 @@ def sigma_errors(gaussians: clod.Gaussians, again: clod.Gaussians) -> dict[str, 
     """
     if gaussians.sigma_d is None or again.sigma_d is None or gaussians.attenuation is None:
         return {"sigma_error": None, "decay_error": None}
-    there = (again.means - gaussians.means).norm(dim=1) <= 0.01 * gaussians.means.norm(dim=1).clamp(min=0.1)
+    there = (again.means - gaussians.means).abs().amax(1) <= 1e-3
     old, new = gaussians.sigma_d.double()[there], again.sigma_d.double()[there]
     decays = [(sigma.clamp(min=0).square() + gaussians.attenuation.eps / 2).sqrt() for sigma in (old, new)]
     return {
