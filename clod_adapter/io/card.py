@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 KEY = "clod_adapter"
 FORMAT = "clod-model"
 FORMAT_VERSION = 1
-LIMIT = 1 << 20  # bytes; of a long calibration it has a few thousand
 
 
 @dataclass(frozen=True)
