@@ -19,9 +19,8 @@ CONTENTS = (
 # The same by suffix, for formats that no first bytes tell apart.
 SUFFIXES = {
     ".splat": ("a .splat file: 8-bit colours and rotations, no view-dependent colour", _CONVERT),
-    ".ksplat": ("a .ksplat file, compressed for a web viewer", _CONVERT),
     ".spz": ("an SPZ file, compressed for delivery", _CONVERT),
-    ".sog": ("a SOG file, compressed for delivery", _CONVERT),
+    ".lcc": ("an LCC file, compressed for delivery", _CONVERT),
     ".hier": (
         "a Hierarchical-3DGS tree, whose levels of detail are its own",
         "use the chunk's point_cloud.ply that the tree was built from",
@@ -52,14 +51,20 @@ ARCHIVES = (
 )
 
 
-def refuse(path: Path, start: bytes) -> NoReturn:
-    """Raises the ClodError of a file that begins with ``start`` and so is no PLY."""
+def refuse_known(path: Path, start: bytes) -> None:
+    """Raises the ClodError of a file that, whatever its name, is no splat, by what it begins with."""
     if not start:
         raise ClodError(f"{path}: is empty; copy or export it again")
-    text, suffix = start.lstrip()[:64].lower(), path.suffix.lower()
+    text = start.lstrip()[:64].lower()
     for magic, what, remedy in CONTENTS:
         if text.startswith(magic):
             raise ClodError(f"{path}: is {what}; {remedy}")
+
+
+def refuse(path: Path, start: bytes) -> NoReturn:
+    """Raises the ClodError of a file that begins with ``start`` and so is no PLY."""
+    refuse_known(path, start)
+    suffix = path.suffix.lower()
     if suffix in SUFFIXES:
         what, remedy = SUFFIXES[suffix]
         raise ClodError(f"{path}: is {what}; {remedy.format(suffix=path.suffix)}")

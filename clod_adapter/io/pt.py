@@ -16,10 +16,10 @@ import numpy as np
 from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
 from clod_adapter.io.foreign import refuse
-from clod_adapter.io.ply_columns import column_map, inria_dtype
+from clod_adapter.io.ply_columns import rows_of
 from clod_adapter.io.regular import refuse_irregular
+from clod_adapter.io.rows import Rows
 
-SUFFIX = ".pt"
 # As gsplat's trainer names its parameters, and as they are called here.
 _NAMES = {
     "means": "means", "quats": "quats", "scales": "log_scales", "opacities": "opacity_logits",
@@ -27,11 +27,6 @@ _NAMES = {
 }  # fmt: skip
 _PICKLE_LIMIT = 1 << 20  # bytes; of a few tensors it has a few hundred
 _PLAIN = r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|torch \w+Storage"
-
-
-def is_pt(path: Path) -> bool:
-    """Whether the file is to be read as one: by its name alone, so that no other is ever unpickled."""
-    return path.suffix.lower() == SUFFIX
 
 
 def check_pt(path: Path) -> None:
@@ -79,8 +74,8 @@ def _check_pickle(path: Path, data: bytes) -> None:
         raise ClodError(f"{path}: is damaged ({error}); copy or export it again") from error
 
 
-def read_pt(path: Path) -> tuple[np.ndarray, int, list[str]]:
-    """``[N]`` rows in Inria's layout of a dictionary with ``splats``, their SH degree, and notes.
+def read_pt(path: Path) -> Rows:
+    """The Gaussians of a dictionary with ``splats``.
 
     The values are as in that layout: scales are logarithms, opacities logits.
 
@@ -112,7 +107,8 @@ def read_pt(path: Path) -> tuple[np.ndarray, int, list[str]]:
             f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {found}); export it as a PLY"
         )
     vertex, degree = _rows(path, {name: _values(path, name, splats) for name in _NAMES})
-    return vertex, degree, ["gsplat's trainer may have normalised the coordinates; photographs must be in the same"]
+    note = "gsplat's trainer may have normalised the coordinates; photographs must be in the same"
+    return Rows(vertex, degree, notes=(note,))
 
 
 def _values(path: Path, name: str, splats: dict[str, Any]) -> np.ndarray:
@@ -143,9 +139,4 @@ def _rows(path: Path, values: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
     if bands + 1 not in degrees:
         raise ClodError(f"{path}: splats['shN'] has {bands} coefficients, which fit no SH degree; export it again")
     degree = degrees[bands + 1]
-    columns, vertex = column_map(degree), np.zeros(count, inria_dtype(degree))
-    for name, attribute in _NAMES.items():
-        flat = values[name].reshape(count, len(columns[attribute]))
-        for k, column in enumerate(columns[attribute]):
-            vertex[column] = flat[:, k]
-    return vertex, degree
+    return rows_of({attribute: values[name] for name, attribute in _NAMES.items()}, degree), degree
