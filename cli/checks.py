@@ -8,6 +8,7 @@ from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 
+from clod_adapter.cli.checks_inspect import check_inspect
 from clod_adapter.cli.dials import given_budget
 from clod_adapter.cli.files import Outputs, check_output, check_ply_name, labels
 from clod_adapter.cli.settings import make_config, make_configs
@@ -169,5 +170,6 @@ CHECKS: dict[str, Callable[[Namespace], None]] = {
     "render": check_render,
     "bake": check_bake,
     "robustness": check_robustness,
+    "inspect": check_inspect,
     "demo": lambda args: None,
 }

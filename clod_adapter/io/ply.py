@@ -20,6 +20,7 @@ from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, inria_dtype, r
 from clod_adapter.io.ply_header import read_attenuation, read_calibration, write_comments
 from clod_adapter.io.ply_values import Activated, as_stored_by_inria
 from clod_adapter.io.readers import read_rows
+from clod_adapter.io.usable import row_rules
 
 
 @dataclass(frozen=True)
@@ -152,21 +153,9 @@ def blank(count: int, sh_degree: int, origin: Origin = NOWHERE) -> Checkpoint:
 
 def _usable_rows(path: Path, table: np.ndarray, names: list[str]) -> tuple[np.ndarray, list[str]]:
     """``[N]`` bool, which rows to keep, and a note for every reason by which some went."""
-    total = len(table)
-    opacity = table[:, names.index("opacity")]
-    finite = np.isfinite(table)
-    finite[:, names.index("opacity")] |= opacity == np.inf
-    rotated = (table[:, [names.index(name) for name in column_map(0)["quats"]]] != 0).any(1)
-    exists = np.ones(total, bool)
-    if all(name in names for name in MASKS):
-        first, second = (table[:, names.index(name)] for name in MASKS)
-        exists = ~(first < second)  # as sigmoid(first - second) >= 0.5; NaN is for the next rule
+    total, opacity = len(table), table[:, names.index("opacity")]
     notes, keep = [], np.ones(total, bool)
-    for rule, reason in (
-        (exists, "MaskGaussian existence probability below 0.5"),
-        (finite.all(1), "a value is not finite"),
-        (rotated, "rotation is zero"),
-    ):
+    for rule, reason in row_rules(table, names):
         gone = int((keep & ~rule).sum())
         keep = keep & rule
         if gone:
