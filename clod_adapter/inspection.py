@@ -132,7 +132,7 @@ def _inspect_splat(path: Path, rows: Rows, head: Head | None) -> Inspection:
     doubts = {} if rows.settled else in_question(rows.vertex)
     columns = tuple((name, str(rows.vertex.dtype[name])) for name in rows.vertex.dtype.names or ()) if head else ()
     vertex, _, changes = as_stored_by_inria(path, rows.vertex, choice_of(doubts))
-    origin = origin_of(vertex)
+    origin = origin_of(vertex) if rows.origin is None else rows.origin
     attenuation, notes = read_attenuation(path, rows.comments) if SIGMA in (vertex.dtype.names or ()) else (None, [])
     tau = attenuation.tau if attenuation else AdaptConfig().tau
     values = values_of(vertex, rows.sh_degree, origin, tau)

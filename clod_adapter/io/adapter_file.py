@@ -21,6 +21,7 @@ from clod_adapter.calibration import Calibration
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.card import FORMAT as MODEL
 from clod_adapter.io.origin import NOWHERE, Origin
 from clod_adapter.io.regular import refuse_irregular
 from clod_adapter.io.tensor_file import read_tensors
@@ -75,6 +76,8 @@ def load_adapter(path: str | Path) -> Adapter:
         raise ClodError(f"{path}: is a safetensors file but no clod-adapter; give a file that this package wrote")
     try:
         about = json.loads(metadata[KEY])
+        if about["format"] == MODEL:
+            raise ClodError("is a whole model and no adapter; it needs no base, give it in the model's place")
         if about["format"] != FORMAT:
             raise ClodError(f"is not a clod-adapter file but {about['format']!r}; give a file that this package wrote")
         if about["format_version"] > FORMAT_VERSION:

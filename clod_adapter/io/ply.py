@@ -76,7 +76,8 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
     names = [name for group in columns.values() for name in group]
     extras = [name for name in (SIGMA, *MASKS) if name in (vertex.dtype.names or ())]
     table = read_table(vertex, names + extras)
-    origin = origin_of(vertex) if origin is None else origin
+    if origin is None:
+        origin = origin_of(vertex) if rows.origin is None else rows.origin
     if any(origin):
         table[:, :3] = relative(vertex, origin)
     keep, notes = _usable_rows(path, table, names + extras)

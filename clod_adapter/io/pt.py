@@ -1,4 +1,8 @@
-"""Checkpoints of gsplat's trainer, ``.pt``: the one format here that is a pickle, of which only tensors are taken."""
+"""Checkpoints of gsplat's trainer, ``.pt``: the one format here that is a pickle, of which only tensors are taken.
+
+Those written here have one more tensor among the ``splats``, ``sigma_d``, and beside them the description (``card``)
+as a string under ``clod_adapter``. The trainer and its viewers take the tensors that they know, by name.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +19,17 @@ import numpy as np
 
 from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
+from clod_adapter.io.card import KEY
 from clod_adapter.io.foreign import refuse
-from clod_adapter.io.ply_columns import rows_of
+from clod_adapter.io.ply_columns import SIGMA
 from clod_adapter.io.regular import refuse_irregular
-from clod_adapter.io.rows import Rows
 
 # As gsplat's trainer names its parameters, and as they are called here.
-_NAMES = {
+NAMES = {
     "means": "means", "quats": "quats", "scales": "log_scales", "opacities": "opacity_logits",
     "sh0": "sh0", "shN": "shN",
 }  # fmt: skip
+FRAME = "gsplat's trainer may have normalised the coordinates; photographs must be in the same"
 _PICKLE_LIMIT = 1 << 20  # bytes; of a few tensors it has a few hundred
 _PLAIN = r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|torch \w+Storage"
 
@@ -74,30 +79,17 @@ def _check_pickle(path: Path, data: bytes) -> None:
         raise ClodError(f"{path}: is damaged ({error}); copy or export it again") from error
 
 
-def read_pt(path: Path) -> Rows:
-    """The Gaussians of a dictionary with ``splats``.
+def read_splats(path: Path) -> tuple[dict[str, np.ndarray], str | None]:
+    """The parameters by gsplat's names, float32, of one number of rows and fitting shapes; and the description, if any.
 
-    The values are as in that layout: scales are logarithms, opacities logits.
-
-    Read with ``weights_only``: a pickle that calls anything but what makes tensors is refused, and nothing is called.
+    The values are as in Inria's layout: scales are logarithms, opacities logits. What ``sigma_d``, if there, means,
+    ``pt_model.load_pt`` tells. Read with ``weights_only``: a pickle that calls anything but what makes tensors is
+    refused, and nothing is called.
 
     Raises:
         ClodError: not such a checkpoint, damaged, or more than tensors.
     """
-    import torch  # here and not above, as check_pt does without
-
-    check_pt(path)
-    try:
-        # Mapped, so that what else a checkpoint holds (optimisers, networks) is not read.
-        with warnings.catch_warnings(action="ignore"):
-            checkpoint = torch.load(str(path), map_location="cpu", weights_only=True, mmap=True)
-    except pickle.UnpicklingError as error:
-        raise ClodError(
-            f"{path}: holds more than tensors, or is damaged, and was not unpickled; export the checkpoint as a PLY"
-        ) from error
-    except Exception as error:  # torch lets RuntimeError, KeyError, TypeError and more through
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ClodError(f"{path}: is damaged ({reason}); copy or export it again") from error
+    checkpoint = _load(path)
     splats = checkpoint.get("splats") if isinstance(checkpoint, dict) else None
     if not isinstance(splats, dict):
         found = (
@@ -106,9 +98,30 @@ def read_pt(path: Path) -> Rows:
         raise ClodError(
             f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {found}); export it as a PLY"
         )
-    vertex, degree = _rows(path, {name: _values(path, name, splats) for name in _NAMES})
-    note = "gsplat's trainer may have normalised the coordinates; photographs must be in the same"
-    return Rows(vertex, degree, notes=(note,))
+    wanted = (*NAMES, SIGMA) if SIGMA in splats else tuple(NAMES)
+    values = {name: _values(path, name, splats) for name in wanted}
+    _check_shapes(path, values)
+    text = checkpoint.get(KEY)
+    if text is not None and not isinstance(text, str):
+        raise ClodError(f"{path}: its description is damaged (a {type(text).__name__}); export the file again")
+    return values, text
+
+
+def _load(path: Path) -> Any:
+    import torch  # here and not above, as check_pt does without
+
+    check_pt(path)
+    try:
+        # Mapped, so that what else a checkpoint holds (optimisers, networks) is not read.
+        with warnings.catch_warnings(action="ignore"):
+            return torch.load(str(path), map_location="cpu", weights_only=True, mmap=True)
+    except pickle.UnpicklingError as error:
+        raise ClodError(
+            f"{path}: holds more than tensors, or is damaged, and was not unpickled; export the checkpoint as a PLY"
+        ) from error
+    except Exception as error:  # torch lets RuntimeError, KeyError, TypeError and more through
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ClodError(f"{path}: is damaged ({reason}); copy or export it again") from error
 
 
 def _values(path: Path, name: str, splats: dict[str, Any]) -> np.ndarray:
@@ -125,18 +138,15 @@ def _values(path: Path, name: str, splats: dict[str, Any]) -> np.ndarray:
     return value.detach().float().numpy()
 
 
-def _rows(path: Path, values: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
+def _check_shapes(path: Path, values: dict[str, np.ndarray]) -> None:
     count = len(values["means"]) if values["means"].ndim else 0
     bands = values["shN"].shape[1] if values["shN"].ndim == 3 else -1
     shapes = {
         "means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,), "sh0": (count, 1, 3),
-        "shN": (count, bands, 3),
+        "shN": (count, bands, 3), SIGMA: (count,),
     }  # fmt: skip
-    for name, shape in shapes.items():
-        if values[name].shape != shape:
-            raise ClodError(f"{path}: splats[{name!r}] has shape {values[name].shape}, not {shape}; export it again")
-    degrees = {bands: degree for degree, bands in SH_COUNTS.items()}
-    if bands + 1 not in degrees:
+    for name, value in values.items():
+        if value.shape != shapes[name]:
+            raise ClodError(f"{path}: splats[{name!r}] has shape {value.shape}, not {shapes[name]}; export it again")
+    if bands + 1 not in SH_COUNTS.values():
         raise ClodError(f"{path}: splats['shN'] has {bands} coefficients, which fit no SH degree; export it again")
-    degree = degrees[bands + 1]
-    return rows_of({attribute: values[name] for name, attribute in _NAMES.items()}, degree), degree

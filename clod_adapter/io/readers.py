@@ -16,7 +16,8 @@ class Reader(NamedTuple):
         module: under ``clod_adapter.io``.
         read: its function that makes ``Rows`` of a file.
         check: its function that refuses, without torch, what by its first bytes is no such file.
-        has_dial: its function that says, without torch, whether a file has a sigma_d; none where none can.
+        has_dial: its function that says whether a file has a sigma_d, without torch where that can be; none where
+            none can have one.
     """
 
     module: str
@@ -26,11 +27,16 @@ class Reader(NamedTuple):
 
 
 PLY = Reader("ply_rows", "read_ply", "check_ply", "ply_has_dial")
+MODEL = Reader("model_rows", "read_model", "check_model", "model_has_dial")
 CONVERTED = Reader("splat_transform", "read_converted", "check_converted")
 # Whatever is not listed is read as a PLY, and what is none is named by what it is.
 READERS = {
     ".ply": PLY,
-    ".pt": Reader("pt", "read_pt", "check_pt"),
+    ".pt": MODEL,
+    ".glb": MODEL,
+    ".spz": MODEL,
+    ".splat": MODEL,
+    ".safetensors": MODEL,
     ".sog": CONVERTED,
     ".ksplat": CONVERTED,
 }
@@ -62,7 +68,7 @@ def check_readable(path: Path) -> None:
 
 
 def file_has_dial(path: Path) -> bool:
-    """Whether the file has a sigma_d, by its header.
+    """Whether the file has a sigma_d.
 
     Raises:
         ClodError: as ``check_readable``.

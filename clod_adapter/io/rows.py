@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clod_adapter.io.origin import Origin
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -18,6 +20,7 @@ class Rows:
         notes: what is to be known of the file, one line each.
         settled: whether the format says that opacities are logits and scales logarithms; if not, their range is
             looked at.
+        origin: what the file says its coordinates are to be relative to, world units; they are not so here.
     """
 
     vertex: np.ndarray
@@ -25,3 +28,4 @@ class Rows:
     comments: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     settled: bool = False
+    origin: Origin | None = None

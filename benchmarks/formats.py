@@ -1,0 +1,131 @@
+"""What each file format keeps: bytes a Gaussian, seconds, the error of sigma_d, and the pictures beside the PLY's.
+
+    python benchmarks/formats.py plush_half
+    python benchmarks/formats.py --table                  # the rows as a Markdown table
+
+A checkpoint gets a sigma_d without training (``importance.start``), is written in each format that carries one and
+read again; the pictures are of the dial at s, means over the held-out views, against those of the PLY. ``.splat``
+carries none: what is baked at s goes through it, and is compared with what is baked at s in the PLY. PSNR is between
+floating-point pictures, and null where they are equal. Each format adds one row to ``results/formats.jsonl``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
+
+import torch
+from common import RESULTS, append, capture
+
+import clod_adapter as clod
+from clod_adapter.importance import seeing, start
+from clod_adapter.io.models import load_model
+from clod_adapter.io.writers import WRITERS, write
+
+FILE = "formats.jsonl"
+DIALS = (1.0, 5.0)
+REPEATS = 5
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*")
+    parser.add_argument("--table", action="store_true", help="print the rows there are")
+    args = parser.parse_args()
+    if args.table:
+        print_table()
+    for scene in args.scenes:
+        run(scene, clod.AdaptConfig(max_sv=max(DIALS)))
+
+
+def run(scene: str, config: clod.AdaptConfig) -> None:
+    base = clod.load(capture(scene) / "pretrained.ply").gaussians
+    photographs = clod.load_scene(capture(scene))
+    model = start(base, seeing(base, photographs.train), config, lambda *_: None)
+    cameras = [view.camera for view in photographs.test]
+    baked = {s: clod.bake(model, s) for s in DIALS}
+    for suffix, writer in WRITERS.items():
+        sources = {s: model if writer.carries_sigma else baked[s] for s in DIALS}
+        row: dict[str, Any] = {}
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"model{suffix}"
+            for s in reversed(DIALS):
+                row |= round_trip(path, sources[s], row)
+                row[f"s{s:g}"] = pictures(sources[s], read(path), cameras, s)
+        append(FILE, {
+            "benchmark": "formats", "scene": scene, "config": asdict(config), "suffix": suffix, "views": len(cameras),
+            "dial": writer.carries_sigma, "threads": torch.get_num_threads(), **row,
+        })  # fmt: skip
+
+
+def read(path: Path) -> clod.Gaussians:
+    return clod.load(path).gaussians if path.suffix == ".ply" else load_model(path).gaussians
+
+
+def round_trip(path: Path, gaussians: clod.Gaussians, before: dict[str, Any]) -> dict[str, Any]:
+    """What writing and reading take; nothing more where the same Gaussians have been through it."""
+    if before and before["count"] == len(gaussians):
+        return {}
+    writing, reading = [], []
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        notes = write(path, gaussians)
+        written = time.perf_counter()
+        again = read(path)
+        writing.append(written - began)
+        reading.append(time.perf_counter() - written)
+    return {
+        "count": len(gaussians), "sh_degree": gaussians.sh_degree, "notes": notes,
+        "bytes_per_gaussian": round(path.stat().st_size / len(gaussians), 2),
+        "write_seconds": round(median(writing), 4), "read_seconds": round(median(reading), 4),
+        "sigma_error": sigma_error(gaussians, again),
+    }  # fmt: skip
+
+
+def sigma_error(gaussians: clod.Gaussians, again: clod.Gaussians) -> float | None:
+    """The largest relative error of sigma_d; None without one."""
+    if gaussians.sigma_d is None or again.sigma_d is None:
+        return None
+    return float(((again.sigma_d - gaussians.sigma_d).abs() / gaussians.sigma_d.abs()).nan_to_num().max())
+
+
+@torch.no_grad()
+def pictures(
+    gaussians: clod.Gaussians, again: clod.Gaussians, cameras: Sequence[clod.Camera], s: float
+) -> dict[str, Any]:
+    """PSNR between the two and the share of the Gaussians that the dial keeps in each, means over the views."""
+    errors, kept = [], []
+    for camera in cameras:
+        ours, theirs = (clod.render(each, camera, virtual_scale=s) for each in (gaussians, again))
+        errors.append(float((ours.image.clamp(0, 1) - theirs.image.clamp(0, 1)).double().square().mean()))
+        kept.append((float(ours.kept.float().mean()), float(theirs.kept.float().mean())))
+    decibels = [-10 * math.log10(error) for error in errors if error > 0]
+    return {
+        "psnr": round(fmean(decibels), 2) if len(decibels) == len(errors) else None,
+        "kept": [round(fmean(share), 5) for share in zip(*kept, strict=True)],
+    }  # fmt: skip
+
+
+def print_table() -> None:
+    rows = [json.loads(line) for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines()]
+    print("| scene | format | bytes | write | read | sigma_d error | PSNR s = 1 | s = 5 |")
+    print("|---|---|---|---|---|---|---|---|")
+    for row in rows:
+        pictures = ["equal" if row[f"s{s:g}"]["psnr"] is None else f"{row[f's{s:g}']['psnr']:.1f} dB" for s in DIALS]
+        error = "none carried" if row["sigma_error"] is None else f"{row['sigma_error']:.1g}"
+        print(
+            f"| {row['scene']} | {row['suffix']} | {row['bytes_per_gaussian']:.1f} | {row['write_seconds']:.2f} s "
+            f"| {row['read_seconds']:.2f} s | {error} | {' | '.join(pictures)} |"
+        )
+
+
+if __name__ == "__main__":
+    main()

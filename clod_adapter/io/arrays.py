@@ -1,0 +1,121 @@
+"""Gaussians as numpy arrays: checked before they are written, made into Gaussians after they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.atomic import check_target
+from clod_adapter.io.regular import refuse_irregular
+
+OPAQUE = 20.0
+"""Fully opaque, as a finite logit: its sigmoid is 1 in float32. Some readers do not take +inf."""
+
+# The axes in which each spherical harmonic is odd, in the order of ``Gaussians.shN``.
+_ODD = (
+    "y", "z", "x",
+    "xy", "yz", "", "xz", "",
+    "y", "xyz", "y", "z", "x", "z", "x",
+    "xy", "yz", "xy", "yz", "", "xz", "", "xz", "",
+)  # fmt: skip
+
+
+def arrays_of(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """The float32 arrays of ``Gaussians.tensors``, fit to be written to ``path``.
+
+    Raises:
+        ClodError: there are none, a value is not finite (opacity = +inf aside), a rotation is zero, or the target
+            cannot be written.
+    """
+    check_target(path)
+    if len(gaussians) == 0:
+        raise ClodError(f"{path}: there are no Gaussians to write, and no reader takes a file without any")
+    arrays = {
+        name: np.ascontiguousarray(tensor.detach().float().cpu().numpy())
+        for name, tensor in gaussians.tensors().items()
+    }
+    for name, array in arrays.items():
+        finite = np.isfinite(array) | (array == np.inf) if name == "opacity_logits" else np.isfinite(array)
+        if not finite.all():
+            raise ClodError(f"{path}: {name} holds a value that is not finite; drop such rows first, as load does")
+    if not arrays["quats"].any(1).all():
+        raise ClodError(f"{path}: a rotation is zero; drop such rows first, as load does")
+    return arrays
+
+
+def gaussians_of(path: Path, arrays: Mapping[str, np.ndarray], attenuation: AttenuationConfig | None) -> Gaussians:
+    """Gaussians of the arrays, as float32.
+
+    Raises:
+        ClodError: there are none, or the arrays do not fit together.
+    """
+    tensors = {name: torch.from_numpy(np.array(array, np.float32, order="C")) for name, array in arrays.items()}
+    if not all(tensor.ndim and len(tensor) for tensor in tensors.values()):
+        raise ClodError(f"{path}: has no Gaussians in it; export it again")
+    try:
+        return Gaussians(**tensors, attenuation=attenuation)
+    except ClodError as error:
+        raise ClodError(f"{path}: {error}; export it again") from error
+
+
+def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarray]:
+    """The same Gaussians turned half way round ``x`` or ``z``, between axes with y down and with y up.
+
+    Exact, and undone by itself. With ``P`` the turn (two signs), means become ``P mu``, rotations ``P R P``, which
+    gives the same ellipsoids, and harmonics change sign where they are odd in an odd number of the axes that flip.
+    """
+    signs = {name: np.float32(1 if name == axis else -1) for name in "xyz"}
+    harmonics = [np.prod([signs[name] for name in odd]) for odd in _ODD]
+    bands = arrays["shN"].shape[1]
+    return {
+        **arrays, "means": arrays["means"] * np.array([*signs.values()], np.float32),
+        "quats": arrays["quats"] * np.array([1, *signs.values()], np.float32),
+        "shN": arrays["shN"] * np.array(harmonics[:bands], np.float32)[:, None],
+    }  # fmt: skip
+
+
+def normalized(quats: np.ndarray) -> np.ndarray:
+    """``[N, 4]`` float32 quaternions of unit length; none is zero, however short."""
+    wide = quats.astype(np.float64)
+    wide /= np.abs(wide).max(1, keepdims=True)
+    return (wide / np.linalg.norm(wide, axis=1, keepdims=True)).astype(np.float32)
+
+
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    """Opacities of logits, in float64; 1 for +inf."""
+    with np.errstate(over="ignore"):
+        return 1 / (1 + np.exp(-logits.astype(np.float64)))
+
+
+def logit(opacities: np.ndarray) -> np.ndarray:
+    """The inverse of ``sigmoid``."""
+    wide = opacities.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log(wide) - np.log1p(-wide)
+
+
+def logits_of_bytes(levels: np.ndarray) -> np.ndarray:
+    """Logits of opacities in 255ths; the first and the last are taken at a quarter of a level from 0 and 1.
+
+    All that is nearer to 0 or 1 was rounded to them, and no reader is given infinite values.
+    """
+    return logit(np.clip(levels.astype(np.float64), 0.25, 254.75) / 255)
+
+
+def read_whole(path: Path) -> bytes:
+    """A file's bytes.
+
+    Raises:
+        ClodError: it cannot be read.
+    """
+    try:
+        refuse_irregular(path)
+        return path.read_bytes()
+    except (OSError, ValueError) as error:  # ValueError: a name that holds a NUL
+        raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error

@@ -1,0 +1,132 @@
+"""SPZ files (Niantic), version 3, and in a record of our own sigma_d where there is a dial.
+
+One gzip stream: a 16-byte header, then one array after another: positions in 24-bit fixed point, opacities, colours
+and logarithms of scales in bytes, rotations in four bytes, spherical harmonics in bytes, of 5 bits at degree 1 and 4
+above, as the reference (``load-spz.cc``) writes them.
+
+Records of vendors follow the arrays, flagged in the header: type, length, bytes. Readers skip types that they do not
+know; most do not even read so far. Two are written:
+
+- Adobe's of the axes, which says that they are a checkpoint's (x right, y down, z ahead). The format's own are
+  OpenGL's, but the reference's ``ply_to_spz``, splat-transform, SuperSplat and gsply all leave those of the PLY, so
+  that turned numbers would be upside down in them;
+- ours, ``RECORD``: the length of the description (``card``) as uint32, the description, then sigma_d as float16, which
+  keeps it to 5e-4. What is larger than there is room for becomes the largest, 65504, which is no decay: it takes less
+  than ``(d' s)^2 1.2e-10`` of an opacity.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from clod_adapter.calibration import Calibration
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.arrays import arrays_of, normalized, sigmoid
+from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.card import card_text, write_card
+from clod_adapter.io.origin import NOWHERE, Origin
+
+HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
+MAGIC, VERSION = 0x5053474E, 3
+RECORD = 0x434C0001  # vendor "CL", its first extension
+AXES = 0xADBE0003  # SPZ_ADOBE_coordinate_system
+RDF = 6  # right, down, forward
+EXTENDED = 2  # the flag of records after the arrays
+MOST = 10_000_000  # Gaussians that the reference reads
+DEGREE = 3  # the highest that all readers know
+COLOR = 0.15  # of the range of bytes to one of sh0
+MAGNITUDE = 511 * math.sqrt(2)  # of the three components of a rotation that are not the largest
+_BITS = {1: 5, 2: 4, 3: 4}  # of the harmonics of each degree
+_SIGMA_MOST = float(np.finfo(np.float16).max)
+
+
+def write_spz(
+    path: str | Path,
+    gaussians: Gaussians,
+    about: Sequence[str] = (),
+    *,
+    origin: Origin = NOWHERE,
+    calibration: Calibration | None = None,
+) -> tuple[str, ...]:
+    """Writes to the format's 8 bits or so; ``writers.write`` has the arguments and errors.
+
+    Positions have as many of their 24 bits for the fraction as the farthest leaves, 20 at most. Our record is written
+    where there is a dial, an origin or something to say.
+
+    Raises:
+        ClodError: more than 10,000,000 Gaussians, or one farther than 4,000,000 from 0, besides.
+    """
+    path = Path(path)
+    arrays = arrays_of(path, gaussians)
+    farthest = float(np.abs(arrays["means"]).max())
+    if len(gaussians) > MOST or farthest > 4e6:
+        raise ClodError(
+            f"{path}: an .spz holds at most {MOST:,} Gaussians within 4,000,000 of 0, these are {len(gaussians):,} "
+            f"within {farthest:.4g}; keep fewer or write a .ply"
+        )
+    bits = min(20, 22 - math.frexp(farthest)[1])
+    degree = min(gaussians.sh_degree, DEGREE)
+    told = gaussians.sigma_d is not None or any(origin) or calibration is not None or bool(about)
+    header = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, bits, EXTENDED, 0)
+    parts = [header, *_packed(arrays, bits, degree), struct.pack("<III", AXES, 4, RDF)]
+    if told:
+        text = card_text(write_card(gaussians, about, origin, calibration)).encode()
+        sigma = np.clip(arrays.get("sigma_d", np.zeros(0)), -_SIGMA_MOST, _SIGMA_MOST).astype("<f2").tobytes()
+        parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(sigma), len(text)) + text + sigma)
+    with atomic_path(path) as temporary:
+        gzip = zlib.compressobj(wbits=31)
+        temporary.write_bytes(gzip.compress(b"".join(parts)) + gzip.flush())
+    return _losses(arrays, bits, degree)
+
+
+def _packed(arrays: dict[str, np.ndarray], bits: int, degree: int) -> list[bytes]:
+    fixed = np.round(arrays["means"].astype(np.float64) * 2.0**bits).astype("<i4")
+    parts = [
+        np.ascontiguousarray(fixed[..., None].view(np.uint8)[..., :3]),
+        _bytes(255 * sigmoid(arrays["opacity_logits"])),
+        _bytes(255 * (COLOR * arrays["sh0"] + 0.5)),
+        _bytes(16 * (arrays["log_scales"] + 10)),
+        _packed_quats(arrays["quats"]),
+    ]
+    for band in range(1, degree + 1):
+        levels = np.round(128 * arrays["shN"][:, band**2 - 1 : (band + 1) ** 2 - 1] + 128)
+        step = 1 << (8 - _BITS[band])
+        parts.append(_bytes(np.floor((levels + step // 2) / step) * step))
+    harmonics = np.concatenate(parts[5:], 1) if degree else np.zeros(0, np.uint8)
+    return [part.tobytes() for part in (*parts[:5], harmonics)]
+
+
+def _packed_quats(quats: np.ndarray) -> np.ndarray:
+    """``[N]`` uint32: the largest component's index in xyzw, then of each other a sign and 9 bits, over sqrt(1/2)."""
+    xyzw = np.roll(normalized(quats), -1, axis=1).astype(np.float64)
+    rows, largest = np.arange(len(xyzw)), np.abs(xyzw).argmax(1)
+    xyzw *= np.where(xyzw[rows, largest] < 0, -1.0, 1.0)[:, None]
+    packed = largest.astype(np.uint32)
+    for axis in range(4):
+        level = np.floor(MAGNITUDE * np.abs(xyzw[:, axis]) + 0.5).clip(max=511).astype(np.uint32)
+        more = (packed << 10) | (np.uint32(512) * (xyzw[:, axis] < 0)) | level
+        packed = np.where(largest == axis, packed, more)
+    return packed.astype("<u4")
+
+
+def _losses(arrays: dict[str, np.ndarray], bits: int, degree: int) -> tuple[str, ...]:
+    notes = [f"positions are rounded to {2.0**-bits:.1g}, colours, opacities, scales and rotations to about 8 bits"]
+    if arrays["shN"][:, (degree + 1) ** 2 - 1 :].any():
+        notes.append(f"spherical harmonics above degree {DEGREE} are dropped")
+    beyond = {
+        "harmonics beyond 1": np.abs(arrays["shN"]).max(initial=0) > 1.01,
+        "colours beyond the range": np.abs(arrays["sh0"]).max() > 0.51 / COLOR,
+        "scales beyond e^-10 to e^5.9": (np.abs(arrays["log_scales"] + 2.03125) > 8).any(),
+    }
+    return (*notes, *(f"{what} are cut to it" for what, there in beyond.items() if there))
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return np.clip(np.round(values), 0, 255).astype(np.uint8)
