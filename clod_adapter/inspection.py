@@ -11,7 +11,7 @@ from clod_adapter.calibration import Calibration
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.inspection_values import FAR, Values, values_of
-from clod_adapter.io.authorship import is_antialiased, looks_like
+from clod_adapter.io.authorship import NERFSTUDIO, is_antialiased, looks_like
 from clod_adapter.io.origin import Origin, origin_of
 from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map
 from clod_adapter.io.ply_header import PREFIX, Head, read_attenuation, read_calibration, read_head
@@ -148,9 +148,11 @@ def _inspect_splat(path: Path, rows: Rows, head: Head | None) -> Inspection:
         comments=tuple(comment for comment in rows.comments if not comment.startswith(PREFIX)), values=values, tau=tau,
         origin=origin, dial=dial,
     )  # fmt: skip
+    writer = looks_like(head) if head else _writer(rows)
+    if writer == NERFSTUDIO:
+        notes = [*notes, "in nerfstudio's own frame: its dataparser_transforms.json belongs into the scene's folder"]
     return Inspection(
-        path=str(path), size=path.stat().st_size, what=_what(path, rows, splat),
-        writer=looks_like(head) if head else _writer(rows), splat=splat, about=None,
+        path=str(path), size=path.stat().st_size, what=_what(path, rows, splat), writer=writer, splat=splat, about=None,
         oddities=tuple(_oddities(splat, doubts)), left_out=tuple(_left_out(splat, rows, changes)),
         notes=(*rows.notes, *notes),
     )  # fmt: skip
