@@ -16,8 +16,10 @@ from clod_adapter.io.ply_header import PREFIX, write_comments
 from clod_adapter.io.pt import check_pt
 from clod_adapter.io.regular import refuse_irregular
 from clod_adapter.io.rows import Rows
+from clod_adapter.io.splat_transform import check_converted, read_converted
 
-_START: dict[str, tuple[bytes, ...]] = {".glb": (b"glTF",), ".spz": (b"\x1f\x8b", b"NGSP")}
+_NEW_SPZ = b"NGSP"  # how version 4 begins, which splat-transform is asked to read; earlier ones are gzipped
+_START: dict[str, tuple[bytes, ...]] = {".glb": (b"glTF",), ".spz": (b"\x1f\x8b", _NEW_SPZ)}
 QUANTISED = {
     ".splat": "quantised: colours, opacities and rotations in 8 bits, no view-dependent colour",
     ".spz": "quantised: positions in 24 bits, scales, opacities and harmonics in 8, rotations in 10 or 8",
@@ -42,6 +44,10 @@ def check_model(path: Path) -> None:
     refuse_known(path, start)
     if suffix in _START and not start.startswith(_START[suffix]):
         raise ClodError(f"{path}: is no {suffix} file by its first bytes; copy or export it again")
+    if start.startswith(_NEW_SPZ):
+        return check_converted(path, " of version 4")
+    if suffix == ".splat" and path.stat().st_size % 32:
+        raise ClodError(f"{path}: is no .splat file, whose rows have 32 bytes; copy or export it again")
     if suffix == ".safetensors" and '"clod-adapter"' in _description(path):
         raise ClodError(f"{path}: is an adapter, no model; clod-adapt apply BASE.ply {path.name} -o OUT.ply makes one")
 
@@ -52,7 +58,7 @@ def model_has_dial(path: Path) -> bool:
 
     suffix = path.suffix.lower()
     check_model(path)
-    if suffix == ".splat":
+    if suffix == ".splat" or _is_new_spz(path):
         return False
     if suffix == ".pt":
         with zipfile.ZipFile(path) as archive:  # check_pt has looked at it
@@ -69,6 +75,8 @@ def read_model(path: Path) -> Rows:
     from clod_adapter.io.models import load_model  # here and not above, as check_model does without torch
 
     check_model(path)
+    if _is_new_spz(path):
+        return read_converted(path)
     model = load_model(path)
     g, card = model.gaussians, model.card
     arrays = {name: tensor.numpy() for name, tensor in g.tensors().items()}
@@ -87,6 +95,11 @@ def read_model(path: Path) -> Rows:
     notes = (*model.notes, *([QUANTISED[suffix]] if suffix in QUANTISED else []))
     settled = suffix != ".pt" or bool(card.version)  # a .pt of another program may hold anything
     return Rows(rows, g.sh_degree, _comments(card), notes, settled, card.origin if any(card.origin) else None)
+
+
+def _is_new_spz(path: Path) -> bool:
+    with open(path, "rb") as file:
+        return path.suffix.lower() == ".spz" and file.read(4) == _NEW_SPZ
 
 
 def _fields(vertex: np.ndarray) -> list[tuple[str, np.dtype]]:

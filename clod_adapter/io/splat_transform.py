@@ -21,8 +21,11 @@ INSTALL = "npm install -g @playcanvas/splat-transform (with Node 22 or newer)"
 LIMIT_S = 1800.0  # five million Gaussians take about a minute
 
 
-def check_converted(path: Path) -> None:
+def check_converted(path: Path, version: str = "") -> None:
     """Refuses what is no file, is something else whatever its name, or cannot be converted here.
+
+    Args:
+        version: of the format, where only one is read in this way.
 
     Raises:
         ClodError: it is, or splat-transform is not installed.
@@ -36,8 +39,8 @@ def check_converted(path: Path) -> None:
     refuse_known(path, start)
     if shutil.which(PROGRAM) is None:
         raise ClodError(
-            f"{path}: {path.suffix} is read through {PROGRAM}, which is not installed: {INSTALL}; better still, adapt "
-            "the PLY that it was made from"
+            f"{path}: {path.suffix}{version} is read through {PROGRAM}, which is not installed: {INSTALL}; better "
+            "still, adapt the PLY that it was made from"
         )
 
 
