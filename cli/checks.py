@@ -8,13 +8,13 @@ from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 
+from clod_adapter.cli.checks_inspect import check_inspect
 from clod_adapter.cli.dials import given_budget
 from clod_adapter.cli.files import Outputs, check_output, check_ply_name, labels
 from clod_adapter.cli.settings import make_config, make_configs
 from clod_adapter.errors import ClodError
-from clod_adapter.io.ply_columns import SIGMA, sh_degree_of
 from clod_adapter.io.ply_header import PREFIX, ROW, all_comments, read_header
-from clod_adapter.io.pt import check_pt, is_pt
+from clod_adapter.io.readers import PLY, check_readable, file_has_dial, reader_of
 from clod_adapter.io.scene_folder import find_cameras, photograph_folders
 from clod_adapter.report.charts import chart_file
 from clod_adapter.report.style import check_matplotlib
@@ -113,27 +113,25 @@ def check_dials(args: Namespace, model: str, *, measured: bool = True) -> None:
     if not has_dial(model):
         raise ClodError(f"{model}: has no sigma_d, so no dial for {option}; give it one first: clod-adapt {model} ...")
     needed = name == "psnr_drop" or (name == "fps" and not measured)
-    if needed and not any(comment.startswith(f"{PREFIX}{ROW} ") for comment in all_comments(read_header(Path(model)))):
+    if needed and reader_of(Path(model)) is PLY and not _has_calibration(model):  # others say so when they are read
         raise ClodError(
             f"{model}: has no calibration in its header, which {option} needs; adapt it again, and let it measure to "
             "the end, or give --sv or --keep"
         )
 
 
+def _has_calibration(model: str) -> bool:
+    return any(comment.startswith(f"{PREFIX}{ROW} ") for comment in all_comments(read_header(Path(model))))
+
+
 def has_dial(model: str) -> bool:
-    """Whether the file's header has a sigma_d, which no .pt has."""
-    if is_pt(Path(model)):
-        return False
-    header = read_header(Path(model))
-    return "vertex" in header and SIGMA in {column.name for column in header["vertex"].properties}
+    """Whether the file's header has a sigma_d."""
+    return file_has_dial(Path(model))
 
 
 def check_checkpoint(path: str) -> None:
-    """Refuses what by its header is no checkpoint, and what is no .pt where it is called one."""
-    if is_pt(Path(path)):
-        check_pt(Path(path))
-    else:
-        sh_degree_of(Path(path), read_header(Path(path)))
+    """Refuses what by its first bytes is no checkpoint."""
+    check_readable(Path(path))
 
 
 def check_scene(folder: str) -> None:
@@ -172,5 +170,6 @@ CHECKS: dict[str, Callable[[Namespace], None]] = {
     "render": check_render,
     "bake": check_bake,
     "robustness": check_robustness,
+    "inspect": check_inspect,
     "demo": lambda args: None,
 }

@@ -19,7 +19,7 @@ from clod_adapter.placement import complement, imagine, place
 def read_checkpoint(
     path: str, console: Console, activated: Activated | None = None, origin: Origin | None = None
 ) -> Checkpoint:
-    """Reads a PLY, or gsplat's .pt, and says what is in it; the options as ``load`` takes them."""
+    """Reads a checkpoint and says what is in it; the options as ``load`` takes them."""
     with console.status(f"reading {path} ({size(Path(path))}) ..."):
         checkpoint = load(path, activated=activated, origin=origin)
     gaussians = checkpoint.gaussians

@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import Any
 
 from clod_adapter.cli.commands import ADAPT, APPLY, BAKE, DEMO, EVALUATE, RENDER, ROBUSTNESS, Command
+from clod_adapter.cli.help_inspect import INSPECT
 from clod_adapter.cli.interrupts import sigterm_as_interrupt
 from clod_adapter.cli.parser import Parser, make_parser
 from clod_adapter.errors import ClodError
@@ -22,7 +23,8 @@ PROG = "clod-adapt"
 
 # Adapting is the main job and needs no word.
 COMMANDS: dict[str, Command] = {
-    "eval": EVALUATE, "render": RENDER, "bake": BAKE, "apply": APPLY, "robustness": ROBUSTNESS, "demo": DEMO,
+    "eval": EVALUATE, "render": RENDER, "bake": BAKE, "apply": APPLY, "inspect": INSPECT, "robustness": ROBUSTNESS,
+    "demo": DEMO,
 }  # fmt: skip
 
 

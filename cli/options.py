@@ -17,7 +17,9 @@ def _add_activated(parser: ArgumentParser) -> None:
 
 def adapt_options(parser: ArgumentParser) -> None:
     parser.add_argument(
-        "ply", metavar="PLY", help="the checkpoint: a PLY in Inria's 3DGS layout, or gsplat's .pt; never modified"
+        "ply",
+        metavar="PLY",
+        help="the checkpoint: a PLY in Inria's 3DGS layout, or another file that inspect reads; never modified",
     )
     parser.add_argument(
         "--images", metavar="DIR",

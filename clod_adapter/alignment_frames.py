@@ -20,9 +20,8 @@ GSPLAT = (
     "apply the inverse of its parser's transform to it"
 )
 NERFSTUDIO = (
-    "it is in the frame that nerfstudio normalises the world to: undo the transform and scale in its "
-    "dataparser_transforms.json, or train with its colmap dataparser and --orientation-method none --center-method "
-    "none --auto-scale-poses False --assume-colmap-world-coordinate-convention False"
+    "it is in the frame that nerfstudio normalises the world to: put a copy of the dataparser_transforms.json that "
+    "ns-train wrote beside its config.yml into the scene's folder"
 )
 # How nerfstudio's readers turn COLMAP's world before they normalise it: not, today's way, and the older one.
 NERFSTUDIO_TURNS = (

@@ -18,10 +18,7 @@ CONTENTS = (
 )
 # The same by suffix, for formats that no first bytes tell apart.
 SUFFIXES = {
-    ".splat": ("a .splat file: 8-bit colours and rotations, no view-dependent colour", _CONVERT),
-    ".ksplat": ("a .ksplat file, compressed for a web viewer", _CONVERT),
-    ".spz": ("an SPZ file, compressed for delivery", _CONVERT),
-    ".sog": ("a SOG file, compressed for delivery", _CONVERT),
+    ".lcc": ("an LCC file, compressed for delivery", _CONVERT),
     ".hier": (
         "a Hierarchical-3DGS tree, whose levels of detail are its own",
         "use the chunk's point_cloud.ply that the tree was built from",
@@ -34,10 +31,6 @@ SUFFIXES = {
         "a trainer's own checkpoint, as Inria's code writes it to resume from",
         "use the point_cloud/iteration_N/point_cloud.ply beside it",
     ),
-    ".safetensors": (
-        "an adapter or another safetensors file, no checkpoint",
-        "give the PLY; clod-adapt apply BASE.ply ADAPTER.safetensors makes one of an adapter",
-    ),
     ".json": ("a JSON document; of an unbundled SOG it is the table of contents", _CONVERT),
 }
 # The same by first bytes, where neither of the two above knows better.
@@ -48,18 +41,24 @@ ARCHIVES = (
     (b"BZh", "compressed with bzip2", "unpack it first: bunzip2"),
     (b"\x28\xb5\x2f\xfd", "compressed with Zstandard", "unpack it first: unzstd"),
     (b"7z\xbc\xaf\x27\x1c", "a 7z archive", "unpack it first"),
-    (b"glTF", "a glTF model", "give the splat as a .ply in Inria's 3DGS layout"),
+    (b"glTF", "a glTF model", "call it .glb"),
 )
+
+
+def refuse_known(path: Path, start: bytes) -> None:
+    """Raises the ClodError of a file that, whatever its name, is no splat, by what it begins with."""
+    if not start:
+        raise ClodError(f"{path}: is empty; copy or export it again")
+    text = start.lstrip()[:64].lower()
+    for magic, what, remedy in CONTENTS:
+        if text.startswith(magic):
+            raise ClodError(f"{path}: is {what}; {remedy}")
 
 
 def refuse(path: Path, start: bytes) -> NoReturn:
     """Raises the ClodError of a file that begins with ``start`` and so is no PLY."""
-    if not start:
-        raise ClodError(f"{path}: is empty; copy or export it again")
-    text, suffix = start.lstrip()[:64].lower(), path.suffix.lower()
-    for magic, what, remedy in CONTENTS:
-        if text.startswith(magic):
-            raise ClodError(f"{path}: is {what}; {remedy}")
+    refuse_known(path, start)
+    suffix = path.suffix.lower()
     if suffix in SUFFIXES:
         what, remedy = SUFFIXES[suffix]
         raise ClodError(f"{path}: is {what}; {remedy.format(suffix=path.suffix)}")

@@ -1,4 +1,4 @@
-"""Checkpoints as PLY files: a tolerant reader, and a strict writer of the extended file."""
+"""Checkpoints: a tolerant reader, and a strict writer of the extended PLY."""
 
 from __future__ import annotations
 
@@ -17,23 +17,16 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.origin import AXES, NOWHERE, Origin, origin_of, relative
-from clod_adapter.io.ply_body import read_vertex
-from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, inria_dtype, read_table, sh_degree_of
-from clod_adapter.io.ply_header import (
-    PREFIX,
-    all_comments,
-    read_attenuation,
-    read_calibration,
-    read_head,
-    write_comments,
-)
+from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, inria_dtype, read_table
+from clod_adapter.io.ply_header import read_attenuation, read_calibration, write_comments
 from clod_adapter.io.ply_values import Activated, as_stored_by_inria
-from clod_adapter.io.pt import is_pt, read_pt
+from clod_adapter.io.readers import read_rows
+from clod_adapter.io.usable import row_rules
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A PLY as read: its Gaussians, and what the writer needs to give the rest back untouched.
+    """A file as read: its Gaussians, and what the writer needs to give the rest back untouched.
 
     Attributes:
         gaussians: the usable Gaussians, float32; with sigma_d and attenuation if the file is extended.
@@ -71,17 +64,16 @@ class Checkpoint:
 def load(path: str | Path, *, activated: Activated | None = None, origin: Origin | None = None) -> Checkpoint:
     """Reads a checkpoint of plain Gaussians, in Inria's, MaskGaussian's, Mip-Splatting's or our extended layout.
 
-    Any property order, byte order or ascii, with or without normals, SH degree 0 to 4. Rows with a
-    value that is not finite in a used column, or with a zero rotation, are dropped and counted in
-    the notes; opacity = +inf stays and means fully opaque. In MaskGaussian's old layout
-    (``masks_0, masks_1``) rows with existence probability sigmoid(masks_0 - masks_1) < 0.5 go too.
-    Mip-Splatting's ``filter_3D`` is fused into scale and opacity. A name that ends in ``.pt`` is read
-    as a checkpoint of gsplat's trainer.
+    The name's suffix says which format it is (``readers.READERS``); the rest of this is of PLY. Any property order,
+    byte order or ascii, with or without normals, SH degree 0 to 4. Rows with a value that is not finite in a used
+    column, or with a zero rotation, are dropped and counted in the notes; opacity = +inf stays and means fully opaque.
+    In MaskGaussian's old layout (``masks_0, masks_1``) rows with existence probability sigmoid(masks_0 - masks_1) < 0.5
+    go too. Mip-Splatting's ``filter_3D`` is fused into scale and opacity.
 
     Args:
         activated: which values to take as activated already, where no opacity is below -0.1 and half are at
             most 1, or no scale is below 0, as in no usual file of logits and logarithms: "none", "opacity",
-            "scales" or "both". Files that this package wrote are not in question.
+            "scales" or "both". Files that this package wrote, and formats that settle it, are not in question.
         origin: what the means are to be relative to, as another checkpoint's are; by default what suits them.
 
     Raises:
@@ -89,14 +81,14 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
             ``activated`` is None.
     """
     path = Path(path)
-    vertex, sh_degree, comments, others = _read_rows(path)
-    ours = any(comment.startswith(PREFIX) for comment in comments)
-    vertex, was, changes = as_stored_by_inria(path, vertex, "none" if ours else activated)
-    columns = column_map(sh_degree)
+    rows = read_rows(path)
+    vertex, was, changes = as_stored_by_inria(path, rows.vertex, "none" if rows.settled else activated)
+    columns = column_map(rows.sh_degree)
     names = [name for group in columns.values() for name in group]
     extras = [name for name in (SIGMA, *MASKS) if name in (vertex.dtype.names or ())]
     table = read_table(vertex, names + extras)
-    origin = origin_of(vertex) if origin is None else origin
+    if origin is None:
+        origin = origin_of(vertex) if rows.origin is None else rows.origin
     if any(origin):
         table[:, :3] = relative(vertex, origin)
     keep, notes = _usable_rows(path, table, names + extras)
@@ -107,14 +99,16 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
         vertex, table = vertex[keep], table[keep]
     gaussians, calibration = _gaussians(table, columns), None
     if SIGMA in extras:
-        attenuation, remarks = read_attenuation(path, comments)
+        attenuation, remarks = read_attenuation(path, rows.comments)
         sigma_d = torch.from_numpy(table[:, len(names)].copy())
         gaussians = gaussians.replace(sigma_d=sigma_d, attenuation=attenuation)
-        calibration, doubts = read_calibration(comments, len(gaussians))
+        calibration, doubts = read_calibration(rows.comments, len(gaussians))
         notes += remarks + doubts
-    notes = [*changes, *notes, *others]
+    notes = [*changes, *notes, *rows.notes]
     fingerprint = _sha256(path) if was == "none" else f"{was}:{_sha256(path)}"
-    return Checkpoint(gaussians, vertex, (*comments, *changes), tuple(notes), fingerprint, path, calibration, origin)
+    return Checkpoint(
+        gaussians, vertex, (*rows.comments, *changes), tuple(notes), fingerprint, path, calibration, origin
+    )
 
 
 def save(
@@ -169,33 +163,11 @@ def blank(count: int, sh_degree: int, origin: Origin = NOWHERE) -> Checkpoint:
     return Checkpoint(gaussians, vertex, (), (), "", Path(), origin=origin)
 
 
-def _read_rows(path: Path) -> tuple[np.ndarray, int, tuple[str, ...], list[str]]:
-    """The rows, their SH degree, the comments, and notes."""
-    if is_pt(path):
-        vertex, degree, notes = read_pt(path)
-        return vertex, degree, (), notes
-    head = read_head(path)
-    degree = sh_degree_of(path, head.ply)
-    return read_vertex(path, head), degree, all_comments(head.ply), _not_kept(head.ply)
-
-
 def _usable_rows(path: Path, table: np.ndarray, names: list[str]) -> tuple[np.ndarray, list[str]]:
     """``[N]`` bool, which rows to keep, and a note for every reason by which some went."""
-    total = len(table)
-    opacity = table[:, names.index("opacity")]
-    finite = np.isfinite(table)
-    finite[:, names.index("opacity")] |= opacity == np.inf
-    rotated = (table[:, [names.index(name) for name in column_map(0)["quats"]]] != 0).any(1)
-    exists = np.ones(total, bool)
-    if all(name in names for name in MASKS):
-        first, second = (table[:, names.index(name)] for name in MASKS)
-        exists = ~(first < second)  # as sigmoid(first - second) >= 0.5; NaN is for the next rule
+    total, opacity = len(table), table[:, names.index("opacity")]
     notes, keep = [], np.ones(total, bool)
-    for rule, reason in (
-        (exists, "MaskGaussian existence probability below 0.5"),
-        (finite.all(1), "a value is not finite"),
-        (rotated, "rotation is zero"),
-    ):
+    for rule, reason in row_rules(table, names):
         gone = int((keep & ~rule).sum())
         keep = keep & rule
         if gone:
@@ -251,13 +223,6 @@ def _with_doubles(vertex: np.ndarray, origin: Origin) -> np.ndarray:
 
 def _numpy(tensor: torch.Tensor) -> np.ndarray:
     return np.ascontiguousarray(tensor.detach().float().cpu().numpy())
-
-
-def _not_kept(header: PlyData) -> list[str]:
-    """A note on the parts of the file that an output will not carry."""
-    parts = [f"element {element.name}" for element in header if element.name != "vertex"]
-    parts += ["obj_info"] if header.obj_info else []
-    return [f"not carried over to outputs: {', '.join(parts)}"] if parts else []
 
 
 def _sha256(path: Path) -> str:

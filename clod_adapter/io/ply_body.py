@@ -1,4 +1,4 @@
-"""The vertex rows of a PLY. Not plyfile's reader, which allocates whatever the header claims and is slow on ascii."""
+"""The rows of a PLY. Not plyfile's reader, which allocates whatever the header claims and is slow on ascii."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.ply_header import Head
 
 
-def read_vertex(path: Path, head: Head) -> np.ndarray:
-    """``[N]`` structured array of the ``vertex`` element, in file order and type, native byte order.
+def read_element(path: Path, head: Head, name: str = "vertex") -> np.ndarray:
+    """``[N]`` structured array of an element, by default the vertices, in file order and type, native byte order.
 
-    That element must have no lists (``sh_degree_of`` sees to it). The file's length is compared with the rows that
-    the header claims before anything is allocated for them. Elements after it are not read.
+    That element must be there and have no lists (``sh_degree_of`` and ``check_packed`` see to it). The file's length
+    is compared with the rows that the header claims before anything is allocated for them. Elements after it are not
+    read.
 
     Raises:
-        ClodError: the file is shorter than its header says, damaged, or has lists before its vertices.
+        ClodError: the file is shorter than its header says, damaged, or has lists before the element.
     """
     try:
         with open(path, "rb") as file:
             _check_length(path, head, os.fstat(file.fileno()).st_size)
             file.seek(head.size)
-            return _read_text(file, head) if head.ply.text else _read_binary(path, file, head)
+            return _read_text(file, head, name) if head.ply.text else _read_binary(path, file, head, name)
     except OSError as error:
         raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
     except (ValueError, TypeError, MemoryError) as error:  # numpy's; a ValueError of text that is no number, too
@@ -56,8 +57,8 @@ def _least_bytes(element: PlyElement, text: bool) -> int:
     return sum(np.dtype(kind).itemsize for kind in kinds)
 
 
-def _read_text(file: BinaryIO, head: Head) -> np.ndarray:
-    element, count, before = _vertex(head)
+def _read_text(file: BinaryIO, head: Head, name: str) -> np.ndarray:
+    element, count, before = _element(head, name)
     with (
         io.TextIOWrapper(file, "ascii") as text,
         warnings.catch_warnings(action="ignore"),  # of blank lines, and of no lines at all
@@ -70,11 +71,11 @@ def _read_text(file: BinaryIO, head: Head) -> np.ndarray:
     return rows
 
 
-def _read_binary(path: Path, file: BinaryIO, head: Head) -> np.ndarray:
-    element, count, before = _vertex(head)
+def _read_binary(path: Path, file: BinaryIO, head: Head, name: str) -> np.ndarray:
+    element, count, before = _element(head, name)
     for other, rows in before:
         if any(isinstance(p, PlyListProperty) for p in other.properties):
-            raise ClodError(f"{path}: element {other.name} has lists and stands before the vertices; write it last")
+            raise ClodError(f"{path}: element {other.name} has lists and stands before {name}; write it last")
         file.seek(rows * _least_bytes(other, False), os.SEEK_CUR)
     found = np.fromfile(file, element.dtype(head.ply.byte_order), count)
     if len(found) != count:
@@ -82,8 +83,8 @@ def _read_binary(path: Path, file: BinaryIO, head: Head) -> np.ndarray:
     return found.astype(element.dtype("="), copy=False)
 
 
-def _vertex(head: Head) -> tuple[PlyElement, int, list[tuple[PlyElement, int]]]:
-    """The vertex element, its rows, and the elements before it with theirs."""
+def _element(head: Head, name: str) -> tuple[PlyElement, int, list[tuple[PlyElement, int]]]:
+    """The element, its rows, and the elements before it with theirs."""
     elements = list(zip(head.ply, head.counts, strict=True))
-    at = next(k for k, (element, _) in enumerate(elements) if element.name == "vertex")
+    at = next(k for k, (element, _) in enumerate(elements) if element.name == name)
     return *elements[at], elements[:at]

@@ -6,7 +6,7 @@ The names ``f_dc_*`` and ``f_rest_*`` exist nowhere else; the reader and the wri
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,6 @@ MASKS = ("masks_0", "masks_1")
 
 # (column pattern, what such a file is, what to do about it)
 FOREIGN = (
-    (r"packed_\w+", "a compressed PLY", "decompress it first: splat-transform IN.ply OUT.ply"),
     (
         r"f_offset_\d+|f_anchor_feat_\d+",
         "a Scaffold-GS or Octree-GS file: anchors from which a network makes Gaussians per view",
@@ -43,6 +42,17 @@ def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
         "sh0": tuple(f"f_dc_{c}" for c in range(3)),
         "shN": tuple(f"f_rest_{c * bands + k}" for k in range(bands) for c in range(3)),
     }
+
+
+def rows_of(attributes: Mapping[str, np.ndarray], sh_degree: int) -> np.ndarray:
+    """``[N]`` rows in Inria's layout of the values of each Gaussians attribute, ``[N, ...]``."""
+    columns, count = column_map(sh_degree), len(attributes["means"])
+    vertex = np.zeros(count, inria_dtype(sh_degree))
+    for attribute, group in columns.items():
+        flat = attributes[attribute].reshape(count, len(group))
+        for k, column in enumerate(group):
+            vertex[column] = flat[:, k]
+    return vertex
 
 
 def inria_dtype(sh_degree: int) -> np.dtype:
@@ -79,12 +89,8 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
     properties = header["vertex"].properties
     types = {p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype for p in properties}
     _refuse_foreign(path, set(types))
-    rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in types)
-    degrees = {3 * (count - 1): degree for degree, count in SH_COUNTS.items()}
-    if rest not in degrees:
-        wanted = ", ".join(map(str, degrees))
-        raise ClodError(f"{path}: {rest} f_rest_* properties fit no SH degree ({wanted} do); export the file again")
-    for name in [name for group in column_map(degrees[rest]).values() for name in group]:
+    degree = degree_of(path, sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in types))
+    for name in [name for group in column_map(degree).values() for name in group]:
         if name not in types:
             raise ClodError(f"{path}: property {name} is missing; export the file again in Inria's 3DGS layout")
         if types[name] not in ("f4", "f8"):
@@ -92,6 +98,19 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
     lists = [name for name, kind in types.items() if kind == "list"]
     if lists:
         raise ClodError(f"{path}: property {lists[0]} is a list, which splat viewers cannot read; remove it")
+    return degree
+
+
+def degree_of(path: Path, rest: int) -> int:
+    """The SH degree that this many ``f_rest_*`` make.
+
+    Raises:
+        ClodError: they make none.
+    """
+    degrees = {3 * (count - 1): degree for degree, count in SH_COUNTS.items()}
+    if rest not in degrees:
+        wanted = ", ".join(map(str, degrees))
+        raise ClodError(f"{path}: {rest} f_rest_* properties fit no SH degree ({wanted} do); export the file again")
     return degrees[rest]
 
 

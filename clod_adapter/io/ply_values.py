@@ -6,6 +6,7 @@ Mip-Splatting (Yu et al., CVPR 2024, equation 9) stores a filter beside them, ``
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -37,13 +38,7 @@ def as_stored_by_inria(
     """
     if activated is not None and activated not in get_args(Activated):
         raise ClodError(f"activated is {activated!r}, it must be one of {', '.join(get_args(Activated))}")
-    opacity, scales = _table(vertex, _OPACITY), _table(vertex, _SCALES)
-    found = {}
-    # Half of the values at most 1: not so of logits whose faint ones were pruned.
-    if (extent := _range(opacity, _FAINTEST)) and np.nanmedian(opacity) <= 1:
-        found["opacity"] = extent
-    if extent := _range(scales, 0.0):
-        found["scales"] = extent
+    found = in_question(vertex)
     if found and activated is None:
         raise ClodError(f"{path}: {_question(found)}")
     taken = [name for name in found if activated in (name, "both")]
@@ -56,8 +51,25 @@ def as_stored_by_inria(
     if FILTER in (vertex.dtype.names or ()):
         vertex = _fused(vertex)
         notes.append("Mip-Splatting's filter_3D is fused into scale and opacity, and left out of outputs")
-    was: Activated = "both" if len(taken) == 2 else "opacity" if "opacity" in taken else "scales" if taken else "none"
-    return vertex, was, notes
+    return vertex, choice_of(taken), notes
+
+
+def in_question(vertex: np.ndarray) -> dict[str, tuple[float, float]]:
+    """The range of "opacity" and of "scales", of each if it looks activated."""
+    opacity, scales = _table(vertex, _OPACITY), _table(vertex, _SCALES)
+    found = {}
+    # Half of the values at most 1: not so of logits whose faint ones were pruned.
+    if (extent := _range(opacity, _FAINTEST)) and np.nanmedian(opacity) <= 1:
+        found["opacity"] = extent
+    if extent := _range(scales, 0.0):
+        found["scales"] = extent
+    return found
+
+
+def choice_of(found: Iterable[str]) -> Activated:
+    """What to say of values in question if they are activated."""
+    kinds = set(found)
+    return "both" if len(kinds) == 2 else "opacity" if "opacity" in kinds else "scales" if kinds else "none"
 
 
 def _range(values: np.ndarray, least: float) -> tuple[float, float] | None:
@@ -71,7 +83,7 @@ def _range(values: np.ndarray, least: float) -> tuple[float, float] | None:
 
 def _question(found: dict[str, tuple[float, float]]) -> str:
     ranges = " and ".join(f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in found.items())
-    choice = "both" if len(found) == 2 else next(iter(found))
+    choice = choice_of(found)
     return (
         f"has {ranges}, which looks like activated values where a 3DGS file has logits (opacity) and logarithms "
         f"(scales); if they are, say --activated {choice}, and if not, --activated none (activated= in Python)"

@@ -21,10 +21,9 @@ from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
 from clod_adapter.io.card import KEY
 from clod_adapter.io.foreign import refuse
-from clod_adapter.io.ply_columns import SIGMA, column_map, inria_dtype
+from clod_adapter.io.ply_columns import SIGMA
 from clod_adapter.io.regular import refuse_irregular
 
-SUFFIX = ".pt"
 # As gsplat's trainer names its parameters, and as they are called here.
 NAMES = {
     "means": "means", "quats": "quats", "scales": "log_scales", "opacities": "opacity_logits",
@@ -33,11 +32,6 @@ NAMES = {
 FRAME = "gsplat's trainer may have normalised the coordinates; photographs must be in the same"
 _PICKLE_LIMIT = 1 << 20  # bytes; of a few tensors it has a few hundred
 _PLAIN = r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|torch \w+Storage"
-
-
-def is_pt(path: Path) -> bool:
-    """Whether the file is to be read as one: by its name alone, so that no other is ever unpickled."""
-    return path.suffix.lower() == SUFFIX
 
 
 def check_pt(path: Path) -> None:
@@ -85,26 +79,15 @@ def _check_pickle(path: Path, data: bytes) -> None:
         raise ClodError(f"{path}: is damaged ({error}); copy or export it again") from error
 
 
-def read_pt(path: Path) -> tuple[np.ndarray, int, list[str]]:
-    """``[N]`` rows in Inria's layout of a dictionary with ``splats``, their SH degree, and notes.
-
-    The values are as in that layout: scales are logarithms, opacities logits. ``sigma_d``, if there, is the last
-    column; what it means, ``pt_model.load_pt`` tells.
-
-    Read with ``weights_only``: a pickle that calls anything but what makes tensors is refused, and nothing is called.
-
-    Raises:
-        ClodError: not such a checkpoint, damaged, or more than tensors.
-    """
-    values, _ = read_splats(path)
-    return *_rows(values), [FRAME]
-
-
 def read_splats(path: Path) -> tuple[dict[str, np.ndarray], str | None]:
     """The parameters by gsplat's names, float32, of one number of rows and fitting shapes; and the description, if any.
 
+    The values are as in Inria's layout: scales are logarithms, opacities logits. What ``sigma_d``, if there, means,
+    ``pt_model.load_pt`` tells. Read with ``weights_only``: a pickle that calls anything but what makes tensors is
+    refused, and nothing is called.
+
     Raises:
-        ClodError: as ``read_pt``.
+        ClodError: not such a checkpoint, damaged, or more than tensors.
     """
     checkpoint = _load(path)
     splats = checkpoint.get("splats") if isinstance(checkpoint, dict) else None
@@ -167,18 +150,3 @@ def _check_shapes(path: Path, values: dict[str, np.ndarray]) -> None:
             raise ClodError(f"{path}: splats[{name!r}] has shape {value.shape}, not {shapes[name]}; export it again")
     if bands + 1 not in SH_COUNTS.values():
         raise ClodError(f"{path}: splats['shN'] has {bands} coefficients, which fit no SH degree; export it again")
-
-
-def _rows(values: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
-    count = len(values["means"])
-    degree = {bands: degree for degree, bands in SH_COUNTS.items()}[values["shN"].shape[1] + 1]
-    columns = column_map(degree)
-    extra = [(SIGMA, "f4")] if SIGMA in values else []
-    vertex = np.zeros(count, [*inria_dtype(degree).descr, *extra])
-    for name, attribute in NAMES.items():
-        flat = values[name].reshape(count, len(columns[attribute]))
-        for k, column in enumerate(columns[attribute]):
-            vertex[column] = flat[:, k]
-    if extra:
-        vertex[SIGMA] = values[SIGMA]
-    return vertex, degree

@@ -45,7 +45,7 @@ def load_pt(path: str | Path) -> Model:
     """Reads a checkpoint of gsplat's trainer, or one written here.
 
     Raises:
-        ClodError: as ``pt.read_pt``, or the description is damaged.
+        ClodError: as ``pt.read_splats``, or the description is damaged.
     """
     path = Path(path)
     values, text = read_splats(path)

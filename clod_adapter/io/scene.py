@@ -17,6 +17,7 @@ from PIL import Image
 from clod_adapter.cameras import Camera, Scene, View, in_its_unit
 from clod_adapter.errors import ClodError
 from clod_adapter.io.colmap_model import read_model
+from clod_adapter.io.dataparser import trained_frame
 from clod_adapter.io.images import Note, read_image
 from clod_adapter.io.origin import NOWHERE
 from clod_adapter.io.posed import HUGE, PosedImage
@@ -39,6 +40,9 @@ def load_scene(
     (nerfstudio, instant-ngp, Blender's synthetic scenes) too. A model's images are looked for in ``images`` and
     ``folder``, then beside the model and its parent, then in ``images_2``, ``images_4``, ``images_8`` and, for
     distorted cameras, ``input``. What was done to the photographs is in the scene's notes.
+
+    Where the folder has nerfstudio's ``dataparser_transforms.json``, the cameras are brought into the frame that it
+    trained in, in which it exports its splats (``dataparser``).
 
     Views are sorted by image name; of those that the scene lists, present or not, the 0th, 8th, 16th... are held out,
     as Inria's code does (``llffhold``). A single image is for training. With ``transforms_train.json`` and
@@ -66,6 +70,8 @@ def load_scene(
     images, notes = (read_transforms if cameras.is_file() else read_model)(cameras)
     if not cameras.is_file() and (folder / "transforms.json").is_file():
         notes.append("the cameras are the COLMAP model's, not those of transforms.json")
+    if frame := trained_frame(folder, cameras):
+        images, notes = frame.bring(images, cameras), [*notes, frame.note]
     names = [image.name for image in images]
     paths, more = find_photographs(folder, cameras, names, raw=not all(image.is_pinhole for image in images))
     notes += more

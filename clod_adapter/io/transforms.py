@@ -18,6 +18,7 @@ from clod_adapter.io.images import image_size
 from clod_adapter.io.posed import PosedImage, check_posed
 from clod_adapter.io.scene_folder import inside
 
+DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in
 MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 PERSPECTIVE = ("", "SIMPLE_PINHOLE", "PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -53,7 +54,7 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str]]:
 
 
 def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[str]]:
-    content = _json(path)
+    content = read_json(path)
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
         raise ClodError(f"{path}: has no list of frames; give nerfstudio's or instant-ngp's transforms.json")
@@ -66,14 +67,19 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
         camera = _camera(where, path.parent / name, ChainMap(frame, content))
         images.append(check_posed(PosedImage(name, _viewmat(where, frame), camera, held_out), path))
     notes = []
-    if "applied_transform" in content:
+    if "applied_transform" in content and not path.with_name(DATAPARSER).is_file():
         notes.append(f"{path.name} turned COLMAP's world (applied_transform): a checkpoint of the turned one is needed")
     if any("mask_path" in frame for frame in frames):
         notes.append(f"the masks of {path.name} are not used")
     return images, notes
 
 
-def _json(path: Path) -> Any:
+def read_json(path: Path) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        ClodError: it cannot be read, is damaged, or larger than MAX_BYTES.
+    """
     try:
         if path.stat().st_size > MAX_BYTES:
             raise ClodError(f"{path}: is larger than {MAX_BYTES >> 20} MB, so it is no list of cameras; check the path")

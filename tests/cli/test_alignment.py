@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image, ImageOps
+from scipy.spatial.transform import Rotation
 
 from clod_adapter.io.scene import load_scene
 from clod_adapter.render import render
+from nerfstudio_frames import APPLIED, trained
 
 FAST = ("--iters", 1, "--max-sv", 4)
 
@@ -104,3 +108,34 @@ def test_robustness_stops_too(clod: Any, capture: Any, turned: Path, tmp_path: P
     words = ("--max-sv", 2, "--iters", 1, "--misaligned-ok", "--json")
     done = clod("robustness", turned, "--images", capture.scene, *words)
     assert done.code == 0 and "x, -y, -z" in json.loads(done.out)["notes"][0], done
+
+
+def test_nerfstudios_export_fits_with_its_transforms_beside_the_photographs(
+    clod: Any, capture: Any, tmp_path: Path
+) -> None:
+    views = load_scene(capture.scene)
+    viewmats = torch.stack([view.camera.viewmat.double() for view in (*views.train, *views.test)])
+    opengl = torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
+    turn = np.vstack([APPLIED["today"], [0, 0, 0, 1]])
+    _, written = trained(turn @ torch.linalg.inv(viewmats).numpy() @ opengl.numpy(), APPLIED["today"])
+    similarity, scale = np.array(written["transform"]), written["scale"]
+    w, x, y, z = torch.from_numpy(Rotation.from_matrix(similarity[:, :3]).as_quat(scalar_first=True)).float()
+    product = torch.stack([
+        torch.stack([w, -x, -y, -z]), torch.stack([x, w, -z, y]), torch.stack([y, z, w, -x]),
+        torch.stack([z, -y, x, w]),
+    ])  # fmt: skip
+    g, matrix = capture.gaussians, torch.from_numpy(similarity).float()
+    exported = g.replace(
+        means=scale * (g.means @ matrix[:, :3].T + matrix[:, 3]), quats=g.quats @ product.T,
+        log_scales=g.log_scales + math.log(scale), shN=g.shN * 0,
+    )  # fmt: skip
+    splat = capture.write(tmp_path / "splat.ply", exported)
+    scene = scene_of(capture, tmp_path, lambda picture: picture)
+    done = clod(splat, "--images", scene, *FAST)
+    assert done.code == 2 and "put a copy of the dataparser_transforms.json that ns-train wrote" in done.err, done
+    (scene / "dataparser_transforms.json").write_text(json.dumps(written))
+    done = clod(splat, "--images", scene, *FAST, "--json")
+    report = json.loads(done.out)
+    assert done.code == 0 and "warning" not in done.err, done
+    assert report["alignment"]["psnr"] > report["alignment"]["mean_colour_psnr"] + 6
+    assert any("frame of dataparser_transforms.json" in note for note in report["notes"])

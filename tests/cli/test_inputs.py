@@ -12,6 +12,8 @@ import torch
 from plyfile import PlyData
 
 from clod_adapter.cli.main import COMMANDS, build_parser
+from clod_adapter.io.writers import write
+from packing import write_packed
 
 TINY = ("--iters", 4, "--max-sv", 4, "--out", "dial.ply")
 
@@ -70,13 +72,27 @@ def test_values_that_look_activated_are_asked_about(clod: Any, capture: Any, tmp
 def test_every_command_that_reads_a_checkpoint_takes_the_answer() -> None:
     for name in ("", *COMMANDS):
         options = {option for action in build_parser(name)._actions for option in action.option_strings}
-        assert ("--activated" in options) == (name != "demo"), name
+        assert ("--activated" in options) == (name not in ("demo", "inspect")), name
 
 
 @pytest.mark.parametrize(
-    ("name", "message"), [("a.hier", "Hierarchical-3DGS"), ("a.splat", "splat-transform"), ("a.ckpt", "ns-export")]
+    ("name", "message"), [("a.hier", "Hierarchical-3DGS"), ("a.lcc", "splat-transform"), ("a.ckpt", "ns-export")]
 )
 def test_other_formats_are_refused_before_the_work(clod: Any, tmp_path: Path, name: str, message: str) -> None:
     (tmp_path / name).write_bytes(bytes(100))
     done = clod(name, "--out", "dial.ply")
     assert done.code == 2 and message in done.err and len(done.err.splitlines()) == 1, done
+
+
+@pytest.mark.parametrize("name", ["base.compressed.ply", "base.spz", "base.splat", "base.glb", "base.safetensors"])
+def test_other_formats_get_a_dial(clod: Any, capture: Any, tmp_path: Path, name: str) -> None:
+    if name.endswith(".ply"):
+        write_packed(tmp_path / name, capture.gaussians)
+    else:
+        write(tmp_path / name, capture.gaussians)
+    done = clod(name, "--images", capture.scene, *TINY)
+    quantised = Path(name).suffix in (".ply", ".spz", ".splat")
+    assert done.code == 0 and ("note: quantised" in done.err) == quantised, done
+    assert clod("apply", name, "dial.safetensors", "--out", "again.ply").code == 0
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
+    assert clod("eval", name, "--images", capture.scene, "--keep", 10).code == 2

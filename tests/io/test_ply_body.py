@@ -12,7 +12,7 @@ from plyfile import PlyData, PlyElement
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.ply import load
-from clod_adapter.io.ply_body import read_vertex
+from clod_adapter.io.ply_body import read_element
 from clod_adapter.io.ply_columns import inria_dtype
 from clod_adapter.io.ply_header import read_head
 
@@ -97,7 +97,7 @@ def test_rows_are_those_of_plyfile(tmp_path: Path, order: str) -> None:
     text = order == "ascii"
     elements = [camera, PlyElement.describe(vertex, "vertex"), face]
     PlyData(elements, text=text, byte_order="=" if text else order).write(str(tmp_path / "in.ply"))
-    found = read_vertex(tmp_path / "in.ply", read_head(tmp_path / "in.ply"))
+    found = read_element(tmp_path / "in.ply", read_head(tmp_path / "in.ply"))
     expected = PlyData.read(str(tmp_path / "in.ply"))["vertex"].data
     assert found.dtype == vertex.dtype and found.dtype.isnative and found.flags.writeable
     for name in vertex.dtype.names:

@@ -107,7 +107,7 @@ def test_claims_take_no_memory(tmp_path: Path) -> None:
         ({"splats": splats() | {"means": torch.tensor(1.0)}}, "shape"),
         ({"splats": splats() | {"means": torch.zeros(12, 3).int()}}, "no plain tensor"),
         ({"splats": splats() | {"means": torch.eye(3).to_sparse()}}, "more than tensors"),
-        ({"splats": splats(0)}, "no usable Gaussian"),
+        ({"splats": splats(0)}, "has no Gaussians"),
     ],
 )  # fmt: skip
 def test_other_checkpoints(tmp_path: Path, checkpoint: Any, message: str) -> None:

@@ -1,0 +1,131 @@
+"""``clod-adapt inspect``: what a file is, on one screen."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from clod_adapter.calibration import Calibration
+from clod_adapter.cli.console import duration
+from clod_adapter.cli.files import size
+from clod_adapter.inspection import Inspection, Splat, inspect
+from clod_adapter.inspection_values import Spread
+from clod_adapter.io.version import package_version
+
+WIDTH = 13  # of the names at the left
+MOST_ROWS = 8  # of a calibration: the first and last are always shown
+MOST_LINES = 6  # of oddities, and of what is left out
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    found = inspect(args.file)
+    print("\n".join(lines_of(found)))
+    return {"command": "inspect", "version": package_version(), **found.as_dict()}
+
+
+def lines_of(found: Inspection) -> list[str]:
+    """What is printed, line by line."""
+    lines = [f"{found.path} ({size(Path(found.path))})", _line("what", found.what)]
+    if found.writer:
+        by_us = found.writer.startswith("clod-adapter")
+        lines.append(_line("written by" if by_us else "looks like", found.writer))
+    if found.splat is not None:
+        lines += splat_lines(found.splat)
+    if found.about is not None:
+        lines += tensor_lines(found.about)
+    lines += _block("odd", [oddity.says for oddity in found.oddities])
+    lines += _block("left out", found.left_out)
+    return lines + _block("note", found.notes)
+
+
+def splat_lines(splat: Splat) -> list[str]:
+    """Counts, ranges and the dial."""
+    v = splat.values
+    count = f"{v.count:,}" if v.count == v.total else f"{v.count:,} usable of {v.total:,}"
+    lines = [_line("Gaussians", count), _line("harmonics", _harmonics(splat))]
+    if splat.encoding:
+        names = ", ".join(splat.extra[:6]) + (", ..." if len(splat.extra) > 6 else "")
+        more = f", of them unknown here: {names}" if splat.extra else ""
+        lines.append(_line("layout", f"{splat.encoding}, {len(splat.columns)} properties{more}"))
+    rows = [*zip("xyz", v.position, strict=True), ("scale", v.scale), ("opacity", v.opacity)]
+    rows += [("sigma_d", v.sigma)] if v.sigma is not None else []
+    lines += ["", *spread_table(rows), ""]
+    lines.append(
+        _line("shares", f"{v.fainter_than_tau:.1%} fainter than tau = {splat.tau:.3g}, "
+        f"{v.fainter_than_visible:.1%} than 1/255; {v.needles:.1%} needles")
+    )  # fmt: skip
+    if splat.dial is None:
+        return [*lines, _line("dial", "none: no sigma_d")]
+    a = splat.dial.attenuation
+    lines.append(_line("dial", f"s = 1 to {a.max_sv:g}, {a.cut} cut at tau, distances over {_normalizer(a)}"))
+    return lines + calibration_lines(splat.dial.calibration)
+
+
+def spread_table(rows: Sequence[tuple[str, Spread]]) -> list[str]:
+    """A line for each range, under a line of names."""
+    names = ("least", "1 %", "median", "99 %", "greatest")
+    lines = [" " * WIDTH + "".join(f"{name:>11}" for name in names)]
+    for name, spread in rows:
+        numbers = (spread.least, spread.low, spread.median, spread.high, spread.greatest)
+        lines.append(f"{name:<{WIDTH}}" + "".join(f"{number:>11.4g}" for number in numbers))
+    return lines
+
+
+def calibration_lines(calibration: Calibration | None) -> list[str]:
+    """The table that the file carries, thinned out where it is long."""
+    if calibration is None:
+        return [_line("calibration", "none: --fps and --psnr-drop have nothing to go by")]
+    c, rows = calibration, list(calibration.rows)
+    if len(rows) > MOST_ROWS:
+        rows = [rows[round(k * (len(rows) - 1) / (MOST_ROWS - 1))] for k in range(MOST_ROWS)]
+    lines = [_line("calibration", f"against {c.against}, {c.views} views of {c.width}x{c.height}, on {c.machine}")]
+    lines.append(" " * WIDTH + f"{'s':>6}{'Gaussians':>12}{'PSNR':>9}{'SSIM':>8}{'frame ms':>10}")
+    for row in rows:
+        numbers = f"{row.virtual_scale:>6.3g}{row.kept:>12,.0f}{row.psnr:>9.2f}{row.ssim:>8.3f}{row.frame_ms:>10.1f}"
+        lines.append(" " * WIDTH + numbers)
+    return lines
+
+
+def tensor_lines(about: dict[str, Any]) -> list[str]:
+    """Of an adapter or a training state."""
+    lines = [_line("Gaussians", f"{about['count']:,}")]
+    if about["kind"] == "state":
+        after = f"{about['steps']} steps in {duration(about['seconds'])}, loss {about['loss']:.4g}"
+        return [*lines, _line("after", after), _line("of", ", ".join(f"{k} {v}" for k, v in about["belongs"].items()))]
+    lines.append(_line("for the file", f"with SHA-256 {about['base']}"))
+    lines.append(
+        _line("changes", ", ".join(f"{k} ({v})" for k, v in about["updates"].items()) or "nothing but sigma_d")
+    )
+    settings = ", ".join(f"{key} {value}" for key, value in about["config"].items() if key in SETTINGS)
+    lines.append(_line("trained with", settings or "settings that are not known"))
+    lines += ["", *spread_table([("sigma_d", Spread(**about["sigma"]))]), ""]
+    a = about["attenuation"]
+    lines.append(_line("dial", f"s = 1 to {a['max_sv']:g}, {a['cut']} cut at tau = {a['tau']:.3g}"))
+    calibration = about["calibration"]
+    return lines + calibration_lines(calibration and Calibration.from_dict(calibration))
+
+
+SETTINGS = ("max_sv", "iters", "seed", "tau", "cut")  # of those trained with, the ones worth a line
+
+
+def _harmonics(splat: Splat) -> str:
+    used = splat.values.used_sh_degree
+    return f"degree {splat.sh_degree}" + (f", of which only {used} is used" if used < splat.sh_degree else "")
+
+
+def _normalizer(attenuation: Any) -> str:
+    if attenuation.normalizer == "scene":
+        return f"{attenuation.scene_distance:.4g}"
+    return f"each view's {attenuation.normalizer}"
+
+
+def _block(name: str, says: Iterable[str]) -> list[str]:
+    said = list(says)
+    lines = [_line(name if k == 0 else "", line) for k, line in enumerate(said[:MOST_LINES])]
+    return lines + ([_line("", f"and {len(said) - MOST_LINES} more: --json")] if len(said) > MOST_LINES else [])
+
+
+def _line(name: str, says: str) -> str:
+    return f"{name:<{WIDTH}}{''.join(c if c.isprintable() else ' ' for c in says)}"

@@ -1,0 +1,80 @@
+"""``clod-adapt inspect``, as users see it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+TINY = ("--iters", 3, "--quiet", "--out", "dial.ply")
+
+
+@pytest.fixture
+def files(clod: Any, capture: Any, tmp_path: Path) -> Path:
+    assert clod(capture.ply, "--images", capture.scene, *TINY).code == 0
+    return tmp_path
+
+
+def test_a_plain_file_on_one_screen(clod: Any, capture: Any) -> None:
+    done = clod("inspect", capture.ply)
+    lines = done.out.splitlines()
+    assert done.code == 0 and done.err == "" and len(lines) <= 24 and all(len(line) <= 120 for line in lines)
+    assert lines[0].startswith(f"{capture.ply} (") and lines[2].startswith("looks like   Inria's trainer")
+    assert lines[3] == "Gaussians    300" and "dial         none: no sigma_d" in lines
+    at = next(k for k, line in enumerate(lines) if line.split() == ["least", "1", "%", "median", "99", "%", "greatest"])
+    assert [line.split()[0] for line in lines[at + 1 : at + 6]] == ["x", "y", "z", "scale", "opacity"]
+    assert len({len(line) for line in lines[at : at + 6]}) == 1
+
+
+def test_a_dial_and_its_calibration(clod: Any, files: Path) -> None:
+    done = clod("inspect", "dial.ply")
+    assert done.code == 0 and "written by   clod-adapter" in done.out and "s = 1 to 5, soft cut" in done.out
+    lines = done.out.splitlines()
+    at = next(k for k, line in enumerate(lines) if "Gaussians" in line and "PSNR" in line)
+    table = [line.split() for line in lines[at + 1 : at + 9]]
+    assert [row[0] for row in (table[0], table[-1])] == ["1", "5"] and len(lines) <= 32
+    assert all(len(row) == 5 for row in table)
+
+
+def test_json_has_everything(clod: Any, files: Path) -> None:
+    done = clod("inspect", "dial.ply", "--json")
+    report = json.loads(done.out)
+    assert done.code == 0 and done.err == "" and report["command"] == "inspect" and report["path"] == "dial.ply"
+    splat = report["splat"]
+    assert splat["count"] == splat["total"] == 300 and splat["columns"][-1] == ["sigma_d", "float32"]
+    assert splat["dial"]["attenuation"]["max_sv"] == 5 and splat["dial"]["calibration"]["rows"][0]["virtual_scale"] == 1
+    assert {"least", "low", "median", "high", "greatest"} == set(splat["sigma"]) and len(splat["position"]) == 3
+    told = json.loads((files / "dial.json").read_text())
+    assert splat["dial"]["calibration"] == told["calibration"]
+
+
+def test_an_adapter(clod: Any, files: Path) -> None:
+    done = clod("inspect", "dial.safetensors")
+    assert done.code == 0 and "an adapter" in done.out and "with SHA-256 " in done.out and "max_sv 5" in done.out
+    report = json.loads(clod("inspect", "dial.safetensors", "--json").out)
+    assert report["about"]["count"] == 300 and report["splat"] is None and report["about"]["config"]["iters"] == 3
+
+
+@pytest.mark.parametrize("name", ["missing.ply", "missing.safetensors", "broken.ply", "broken.safetensors", "a.txt"])
+def test_what_cannot_be_read_exits_2_with_one_line(clod: Any, tmp_path: Path, name: str) -> None:
+    if "missing" not in name:
+        (tmp_path / name).write_bytes(b"ply\nformat" if name.endswith(".ply") else b"\0\1\2")
+    for extra in ((), ("--json",)):
+        done = clod("inspect", name, *extra)
+        assert done.code == 2 and done.out == "" and len(done.err.splitlines()) == 1, done
+        assert done.err.startswith(f"clod-adapt: error: {name}: ")
+
+
+def test_a_ply_takes_no_torch(capture: Any) -> None:
+    code = f"import sys; from clod_adapter.cli.main import main; main(['inspect', {str(capture.ply)!r}]); "
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", code + "sys.exit('torch' in sys.modules)"], stdout=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": str(root)}, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0
