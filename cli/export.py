@@ -129,7 +129,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         outputs, lost = write_files(export, level_paths(out, args.levels) if args.levels else [out], dials)
     for note in dict.fromkeys(lost):
         console.say(f"  note: {note}")
-    print("\n".join([*map(describe, outputs), *exactness(export, dials)]))
+    print("\n".join([*(describe(output, len(gaussians)) for output in outputs), *exactness(export, dials)]))
     return {
         "command": "export", "version": package_version(), "model": args.model, "base_count": len(gaussians),
         "camera": camera.name if camera else None, "order": args.order, "outputs": outputs,
@@ -193,13 +193,15 @@ def write_set(export: Export, out: Path, dials: list[float] | None) -> tuple[lis
     return [{"file": str(out / LOD_META), "levels": levels, "count": sum(counts), "bytes": total}], list(notes)
 
 
-def describe(output: dict[str, Any]) -> str:
-    """A line on an output."""
-    line = f"wrote {output['file']} ({size(output['bytes'])}): {output['count']:,} Gaussians"
+def describe(output: dict[str, Any], total: int) -> str:
+    """A line on an output of a model of ``total`` Gaussians."""
+    line = f"wrote {output['file']} ({size(output['bytes'])}): {output['count']:,}"
     if levels := output.get("levels"):
         shown = ", ".join(f"{level['count']:,} at s = {level['virtual_scale']:.5g}" for level in levels)
-        return f"{line} in {len(levels)} levels, {shown}"
-    return line if output["virtual_scale"] is None else f"{line}, s = {output['virtual_scale']:.5g}"
+        return f"{line} Gaussians in {len(levels)} levels, {shown}"
+    if output["virtual_scale"] is None:
+        return f"{line} Gaussians"
+    return f"{line} of {total:,} Gaussians, s = {output['virtual_scale']:.5g}"
 
 
 def exactness(export: Export, dials: list[float] | None) -> list[str]:

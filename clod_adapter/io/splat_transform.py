@@ -56,10 +56,12 @@ class SplatTransform:
             ClodError: it is not there, it or its Node is too old, or it does not run; with the install line.
         """
         given = os.environ.get(VARIABLE, "")
-        command = _words(given) or ("splat-transform",)
-        if shutil.which(command[0]) is None:
-            where = f"{command[0]}, which {VARIABLE} names, is" if given else "splat-transform is"
+        name, *more = _words(given) or ("splat-transform",)
+        program = shutil.which(name)
+        if program is None:
+            where = f"{name}, which {VARIABLE} names, is" if given else "splat-transform is"
             raise ClodError(f"{where} not installed; {HELP}")
+        command = (program, *more)
         said = _ask(command, "--version")
         version, node = re.search(r"splat-transform v(\d+)\.(\d+)\.(\d+)", said), re.search(r"node:v(\d+)", said)
         if node is not None and int(node[1]) < NODE_NEEDED:
@@ -76,7 +78,8 @@ class SplatTransform:
     def run(self, *words: str | Path, timeout: float, progress: Callable[[float], None] | None = None) -> float:
         """Runs it with these words, replacing outputs; the seconds it took.
 
-        Ctrl-C, and whatever else is raised here meanwhile, ends it too.
+        A Path is made absolute, so that it is no option and no address, whatever it begins with. Ctrl-C, and whatever
+        else is raised here meanwhile, ends it too.
 
         Args:
             timeout: seconds after which it is ended.
@@ -85,7 +88,7 @@ class SplatTransform:
         Raises:
             ClodError: it fails, with the last it said, or takes longer than that.
         """
-        command = [*self.command, "-w", *(() if self.gpu else ON_CPU), *map(str, words)]
+        command = [*self.command, "-w", *(() if self.gpu else ON_CPU), *map(_word, words)]
         began = time.perf_counter()
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -118,6 +121,10 @@ def _words(given: str) -> tuple[str, ...]:
         return tuple(shlex.split(given))
     except ValueError as error:
         raise ClodError(f"{VARIABLE} is {given!r}, which is no command ({error}); {HELP}") from error
+
+
+def _word(word: str | Path) -> str:
+    return str(word.absolute()) if isinstance(word, Path) else word
 
 
 def _ask(command: tuple[str, ...], question: str) -> str:

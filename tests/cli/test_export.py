@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 import struct
 import sys
 from collections.abc import Callable
@@ -76,6 +77,7 @@ def test_baking(clod: Any, dialled: Path, tmp_path: Path) -> None:
     report = json.loads(done.out)
     baked, want = load(tmp_path / "plain.ply"), clod_adapter.bake(load(dialled).gaussians, 2.0)
     assert done.code == 0 and "lossy" in done.err and "world units from the camera only" in done.err
+    assert f"{len(load('plain.ply').gaussians)} of 300 Gaussians, s = 2\n" in done.err
     (output,) = report["outputs"]
     assert output["count"] == len(baked.gaussians) == len(want) < report["base_count"] == 300
     assert output | {"count": 0} == {
@@ -311,6 +313,8 @@ def test_packing(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
 
 def test_a_streaming_set(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
     tool("(out.parent / '0_0').mkdir(); (out.parent / '0_0' / 'a.webp').write_text('1234')")
+    assert clod("export", dialled, "--levels", "1,4", "--lod-meta", "--out=-o").code == 0  # no option of the tool's
+    shutil.rmtree(tmp_path / "-o")
     (tmp_path / "out").mkdir()  # empty, and so not in the way
     done = clod("export", dialled, "--levels", "1,2,4", "--lod-meta", "-o", "out", "--json")
     (output,) = json.loads(done.out)["outputs"]

@@ -78,8 +78,8 @@ def test_it_is_run_with_the_words_and_timed(tmp_path: Path) -> None:
     seconds = tool.run("a.ply", out, timeout=60, progress=ticks.append)
     assert out.read_text() == "-w -g cpu -i 1 a.ply" and 0.5 < seconds < 30
     assert len(ticks) > 1 and ticks == sorted(ticks) and ticks[-1] <= seconds
-    SplatTransform(tool.command, "3.7.0", gpu=True).run("a.ply", out, timeout=60)
-    assert out.read_text() == "-w a.ply"
+    SplatTransform(tool.command, "3.7.0", gpu=True).run(Path("-a.ply"), out, timeout=60)
+    assert out.read_text() == f"-w {Path.cwd() / '-a.ply'}"
 
 
 @pytest.mark.parametrize(
