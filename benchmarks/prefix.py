@@ -10,7 +10,7 @@ stand in the file:
 
 - ``extinction``: by falling s* at d' = 1, what ``clod-adapt export --order extinction`` writes;
 - ``extinction, s = 1 baked``: the same with ``--sv 1``, so faded a little, and shorter;
-- ``extinction, views``: by the mean of log s* over the cameras trained on;
+- ``extinction, views``: by the mean of log s* over the cameras trained on, about what ``--images`` gives there;
 - ``own``, ``opacity``, ``removal error``: the adapted file as it is, by falling opacity, by falling removal error;
 - ``base, ...``: the untouched checkpoint in the adapted one's order of extinction, by opacity, by removal error.
 
@@ -29,9 +29,7 @@ from common import RESULTS, append, capture
 from torch import Tensor
 
 import clod_adapter as clod
-from clod_adapter.attenuation import normalized_distances
 from clod_adapter.cli.console import Console
-from clod_adapter.extinction import extinction_scale
 from clod_adapter.importance import removal_error
 
 FILE = "prefix.jsonl"
@@ -85,7 +83,7 @@ def orders(adapted: clod.Gaussians, base: clod.Gaussians, views: tuple[clod.View
     return {
         "extinction": plain.select(rows),
         "extinction, s = 1 baked": clod.bake(adapted.select(rows), 1.0),
-        "extinction, views": plain.select(falling(over_views(adapted, views))),
+        "extinction, views": plain.select(clod.order_by_extinction(adapted, [view.camera for view in views])),
         "own": plain,
         "opacity": plain.select(falling(plain.opacity_logits)),
         "removal error": plain.select(falling(removal_error(plain, views, seed=0))),
@@ -93,17 +91,6 @@ def orders(adapted: clod.Gaussians, base: clod.Gaussians, views: tuple[clod.View
         "base, opacity": base.select(falling(base.opacity_logits)),
         "base, removal error": base.select(falling(removal_error(base, views, seed=0))),
     }
-
-
-def over_views(adapted: clod.Gaussians, views: tuple[clod.View, ...]) -> Tensor:
-    """``[N]`` mean of log s* over the cameras of ``views``."""
-    assert adapted.sigma_d is not None and adapted.attenuation is not None
-    total = torch.zeros(len(adapted), dtype=torch.float64)
-    for view in views:
-        distances = normalized_distances(adapted.means, view.camera, adapted.attenuation)
-        scales = extinction_scale(adapted.opacity_logits, adapted.sigma_d, distances, adapted.attenuation)
-        total += scales.double().clamp(min=1e-30).log()
-    return total / len(views)
 
 
 def falling(worth: Tensor) -> Tensor:

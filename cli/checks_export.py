@@ -39,8 +39,10 @@ def check_together(args: Namespace, bakes: bool) -> None:
         raise ClodError("--levels has the dial values; give no other with it")
     if args.lod_meta and not args.levels:
         raise ClodError("--lod-meta is a set of levels; give them, as in --levels 1,2,4,7")
-    if (args.camera is None) != (args.images is None):
-        raise ClodError("--camera names a photograph of the scene in --images; give both or neither")
+    if args.camera is not None and args.images is None:
+        raise ClodError("--camera names a photograph of a scene; give that too, with --images")
+    if args.images is not None and args.camera is None and not args.order:
+        raise ClodError("--images is for the cameras of --camera and --order; give one of them with it")
     if args.camera is not None and not bakes:
         raise ClodError("--camera is where a dial value is baked for; give one, as in --sv 2")
 

@@ -114,11 +114,11 @@ class Export:
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
     model = read_checkpoint(args.model, console, args.activated)
-    camera, notes = reference(args, model, console)
+    camera, cameras, notes = reference(args, model, console)
     dials, more = dial_values(args, model, camera, console)
     gaussians = model.gaussians
     if args.order:
-        gaussians = gaussians.select(order_by_extinction(gaussians, camera))
+        gaussians = gaussians.select(order_by_extinction(gaussians, cameras))
     notes += [*more, *left_out(model)]
     for note in notes:
         console.say(note)
@@ -137,19 +137,23 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def reference(args: argparse.Namespace, model: Checkpoint, console: Console) -> tuple[Camera | None, list[str]]:
-    """The camera to bake for, if one is asked for, and notes on the photographs."""
-    if args.camera is None:
-        return None, []
+def reference(
+    args: argparse.Namespace, model: Checkpoint, console: Console
+) -> tuple[Camera | None, list[Camera], list[str]]:
+    """The camera to bake for, if one is asked for; those to order by, that one or the scene's; and notes on these."""
+    if args.images is None:
+        return None, [], []
     scene = read_scene(args.images, console, model.origin)
-    views = [*scene.train, *scene.test]
+    views, notes = [*scene.train, *scene.test], list(scene.notes)
+    if args.camera is None:
+        return None, [view.camera for view in views], notes
     found = [view.camera for view in views if named(view, args.camera)]
     if not found:
         some = ", ".join(sorted(view.camera.name for view in views)[:3])
         raise ClodError(f"--camera has {args.camera!r}, and no photograph is called that; names here are like {some}")
     if len(found) > 1:
         raise ClodError(f"--camera has {args.camera!r}, which {found[0].name} and {found[1].name} are; give the suffix")
-    return found[0], list(scene.notes)
+    return found[0], found, notes
 
 
 def dial_values(

@@ -42,7 +42,7 @@ def export_options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--camera", metavar="PHOTO", help="bake for this photograph's camera; its name, with or without suffix"
     )
-    parser.add_argument("--images", metavar="DIR", help="the scene with that photograph")
+    parser.add_argument("--images", metavar="DIR", help="the scene: of --camera, or to order by")
     parser.add_argument(
         "--order", choices=["extinction"],
         help="put the rows in the order in which the dial keeps them longest, for renderers that draw a prefix",
@@ -84,9 +84,11 @@ a folder that must not be there yet (or be empty): lod-meta.json, level 0 the
 finest, and the chunks that a streaming viewer loads.
 
 --order extinction is for renderers that draw the first n rows, whatever n: the
-first n are those that the dial keeps at n, drawn with the opacities that stand
-in the file. Best with --sv 1, as far as that keeps enough: such prefixes come
-within 0.1 dB of the dial (benchmarks/prefix.py), but they pop where it fades.
+first n are those that the dial keeps at n at the normalised distance 1 or from
+--camera, or with --images those that it keeps longest over all cameras, which
+is better where distances differ much. They are drawn with the opacities that
+stand in the file: on two captures 0.1 to 0.6 dB below the dial at many rows, up
+to 0.8 above it at few (benchmarks/prefix.py), and they pop where it fades.
 
 SIBR reads a baked .ply; the SH degree it takes from sh_degree in the cfg_args
 beside the model, up to 3, and its released versions do not show degree 0.
@@ -105,7 +107,8 @@ examples:
   clod-adapt export garden_clod.ply -o garden.glb
   clod-adapt export garden_clod.ply --levels 1,2,4,7 -o garden.ply
   clod-adapt export garden_clod.ply --levels 1,2,4,7 --lod-meta -o garden_lod
-  clod-adapt export garden_clod.ply --sv 1 --order extinction -o sorted.ply
+  clod-adapt export garden_clod.ply --order extinction --images garden \\
+      -o sorted.ply
 """,
     add_arguments=export_options,
 )

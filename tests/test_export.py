@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import attenuate
+from clod_adapter.attenuation import attenuate, normalized_distances
 from clod_adapter.budget import dial_for
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
@@ -102,7 +102,7 @@ def test_for_a_camera_a_count_is_exact() -> None:
 @pytest.mark.parametrize("view", [None, camera()], ids=["apart", "camera"])
 def test_prefixes_are_what_the_dial_keeps(view: Camera | None) -> None:
     some = spread()
-    rows = order_by_extinction(some, view)
+    rows = order_by_extinction(some, [view] if view else ())
     assert torch.equal(rows.sort().values, torch.arange(300))
     ordered = some.select(rows)
     for s in (1.0, 1.7, 3.0):
@@ -119,6 +119,19 @@ def test_rows_that_leave_together_stay_in_their_order() -> None:
     some = attach(some, torch.linspace(0.1, 2, 40), CONFIG)
     scales = extinction_scale(some.opacity_logits, some.sigma_d, torch.ones(40), CONFIG)[order_by_extinction(some)]
     assert (scales.diff() <= 0).all() and scales[0] > scales[-1]
+
+
+def test_over_cameras_the_mean_counts() -> None:
+    some, near = spread(), camera()
+    assert some.sigma_d is not None
+    viewmat = near.viewmat.clone()
+    viewmat[2, 3] += 3
+    cameras = [near, replace(near, viewmat=viewmat)]
+    distances = [normalized_distances(some.means, each, CONFIG) for each in cameras]
+    scales = [extinction_scale(some.opacity_logits, some.sigma_d, d, CONFIG).double() for d in distances]
+    product = (scales[0] * scales[1])[order_by_extinction(some, cameras)]
+    assert (product.diff() <= 1e-12 * product[:-1]).all()
+    assert not torch.equal(order_by_extinction(some, cameras), order_by_extinction(some, cameras[:1]))
 
 
 def test_bad_calls_are_named() -> None:

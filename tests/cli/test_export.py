@@ -242,6 +242,18 @@ def test_an_order_for_prefixes(clod: Any, dialled: Path) -> None:
     assert torch.equal(load("first.ply").gaussians.means, gaussians.means[rows[:n]])
 
 
+def test_an_order_over_the_scenes_cameras(clod: Any, capture: Any, dialled: Path) -> None:
+    gaussians, scene = load(dialled).gaussians, clod_adapter.load_scene(capture.scene)
+    cameras = [view.camera for view in (*scene.train, *scene.test)]
+    words = ("export", dialled, "--order", "extinction", "--images", capture.scene)
+    assert clod(*words, "-o", "all.ply").code == 0
+    assert same(load("all.ply").gaussians, gaussians.select(clod_adapter.order_by_extinction(gaussians, cameras)))
+    assert clod(*words, "--camera", "003", "--sv", 2, "-o", "one.ply").code == 0
+    camera = next(each for each in cameras if each.name == "003.png")
+    ordered = gaussians.select(clod_adapter.order_by_extinction(gaussians, [camera]))
+    assert same(load("one.ply").gaussians, clod_adapter.bake(ordered, 2.0, camera))
+
+
 def saved(path: Path, degree: int) -> Any:
     """A model of that SH degree with a dial at ``path``."""
     from scenes import gaussians
