@@ -8,6 +8,7 @@ from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 
+from clod_adapter.cli.checks_export import check_export
 from clod_adapter.cli.checks_inspect import check_inspect
 from clod_adapter.cli.dials import given_budget
 from clod_adapter.cli.files import Outputs, check_output, check_ply_name, labels
@@ -53,16 +54,6 @@ def check_render(args: Namespace) -> None:
     check_checkpoint(args.model)
     check_scene(args.images)
     check_folder(Path(args.out), Path(args.images))
-
-
-def check_bake(args: Namespace) -> None:
-    out = Path(args.out)
-    check_ply_name(out, "--out")
-    check_output(out, [args.model])
-    check_dials(args, args.model, measured=False)
-    check_checkpoint(args.model)
-    if not has_dial(args.model):
-        raise ClodError(f"{args.model}: has no sigma_d, so there is no dial value to bake; it is plain already")
 
 
 def check_apply(args: Namespace) -> None:
@@ -168,7 +159,7 @@ CHECKS: dict[str, Callable[[Namespace], None]] = {
     "evaluate": check_evaluate,
     "apply": check_apply,
     "render": check_render,
-    "bake": check_bake,
+    "export": check_export,
     "robustness": check_robustness,
     "inspect": check_inspect,
     "demo": lambda args: None,

@@ -10,7 +10,6 @@ from clod_adapter.cli.dials import BUDGETS
 from clod_adapter.cli.options import (
     adapt_options,
     apply_options,
-    bake_options,
     demo_options,
     evaluate_options,
     render_options,
@@ -165,31 +164,6 @@ examples:
   clod-adapt render garden_clod.ply --images garden -o out --views a.jpg --sv 2
 """,
     add_arguments=render_options,
-)
-BAKE = Command(
-    module="bake",
-    summary="Write one dial value as a plain PLY; lossy.",
-    description="""\
-Write one dial value of an adapted file as a plain PLY in Inria's layout, for
-viewers that do not know the dial: the Gaussians it keeps, faded for good.
-""",
-    usage="MODEL.ply (--sv S | --keep N | ...) -o PLAIN.ply",
-    epilog="""\
-Lossy, and exact at one distance only. The dial fades a Gaussian by its distance
-from the camera, and a plain file has no camera: what is written is how it looks
-from the normalised distance 1 (the far end of the scene as the training cameras
-saw it), so that what is nearer comes out fainter than it should. Other columns
-of the file are left out. Keep the adapted file: this cannot be undone.
-
---keep is exact: PLAIN.ply has N Gaussians. --fps and --psnr-drop find the dial
-value in the calibration stored in MODEL.ply, which is of the adapted file and,
-for frame times, of the machine that a note names: here they are estimates.
-
-examples:
-  clod-adapt bake garden_clod.ply --sv 2 -o garden_s2.ply
-  clod-adapt bake garden_clod.ply --keep 200000 -o garden_200k.ply
-""",
-    add_arguments=bake_options,
 )
 APPLY = Command(
     module="apply",

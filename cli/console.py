@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -29,14 +29,27 @@ class Console:
                 sys.stderr.flush()
 
     @contextmanager
-    def status(self, text: str) -> Iterator[None]:
-        """Shows on a terminal what is being done, while it is, where there is no telling how far it is."""
-        shown = None
+    def status(self, text: str) -> Iterator[Callable[[str], None]]:
+        """Shows on a terminal what is being done, while it is, where there is no telling how far it is.
+
+        Gives a function to show something else with; off a terminal that is a line now and then.
+        """
+        shown, printed = None, time.perf_counter()
         if not self.quiet and sys.stderr.isatty():
             with _unbreakable():
                 shown = tqdm(bar_format="{desc}", desc=text, file=sys.stderr, leave=False, dynamic_ncols=True)
+
+        def show(more: str) -> None:
+            nonlocal printed
+            if shown is not None:
+                with _unbreakable():
+                    shown.set_description_str(more)
+            elif time.perf_counter() - printed >= LINE_EVERY:
+                printed = time.perf_counter()
+                self.say(more)
+
         try:
-            yield
+            yield show
         finally:
             if shown is not None:
                 with _unbreakable():

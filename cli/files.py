@@ -81,7 +81,7 @@ def labels(paths: Sequence[str]) -> list[str]:
     return names
 
 
-def size(path: Path) -> str:
-    """Of a file: ``4 kB``, ``12.3 MB``."""
-    count = path.stat().st_size
+def size(of: Path | int) -> str:
+    """Of a file, or of so many bytes: ``4 kB``, ``12.3 MB``."""
+    count = of if isinstance(of, int) else of.stat().st_size
     return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{max(count / 1e3, 1):.0f} kB"

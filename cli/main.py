@@ -12,7 +12,8 @@ from contextlib import nullcontext, redirect_stdout
 from importlib import import_module
 from typing import Any
 
-from clod_adapter.cli.commands import ADAPT, APPLY, BAKE, DEMO, EVALUATE, RENDER, ROBUSTNESS, Command
+from clod_adapter.cli.commands import ADAPT, APPLY, DEMO, EVALUATE, RENDER, ROBUSTNESS, Command
+from clod_adapter.cli.help_export import EXPORT
 from clod_adapter.cli.help_inspect import INSPECT
 from clod_adapter.cli.interrupts import sigterm_as_interrupt
 from clod_adapter.cli.parser import Parser, make_parser
@@ -23,7 +24,7 @@ PROG = "clod-adapt"
 
 # Adapting is the main job and needs no word.
 COMMANDS: dict[str, Command] = {
-    "eval": EVALUATE, "render": RENDER, "bake": BAKE, "apply": APPLY, "inspect": INSPECT, "robustness": ROBUSTNESS,
+    "inspect": INSPECT, "eval": EVALUATE, "render": RENDER, "export": EXPORT, "apply": APPLY, "robustness": ROBUSTNESS,
     "demo": DEMO,
 }  # fmt: skip
 

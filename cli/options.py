@@ -82,14 +82,6 @@ def render_options(parser: ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
-def bake_options(parser: ArgumentParser) -> None:
-    parser.add_argument("model", metavar="MODEL.ply", help="an adapted file")
-    parser.add_argument("-o", "--out", metavar="PLAIN.ply", required=True, help="what to write; replaced if it exists")
-    add_dial_options(parser, "the dial value", "(in the file written)", several=False, required=True)
-    _add_activated(parser)
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
-
-
 def apply_options(parser: ArgumentParser) -> None:
     parser.add_argument("base", metavar="BASE.ply", help="the checkpoint that was adapted")
     parser.add_argument("adapter", metavar="ADAPTER.safetensors", help="what clod-adapt wrote beside its PLY")

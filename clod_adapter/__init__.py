@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from clod_adapter.config import AdaptConfig, AttenuationConfig
     from clod_adapter.errors import ClodError
     from clod_adapter.evaluate import evaluate
-    from clod_adapter.export import bake
+    from clod_adapter.export import bake, order_by_extinction
     from clod_adapter.gaussians import Gaussians
     from clod_adapter.hook import Hook
     from clod_adapter.io.adapter_file import load_adapter, save_adapter
@@ -48,7 +48,7 @@ on_first_use(__name__, {
     "config": ("AdaptConfig", "AttenuationConfig"),
     "errors": ("ClodError",),
     "evaluate": ("evaluate",),
-    "export": ("bake",),
+    "export": ("bake", "order_by_extinction"),
     "gaussians": ("Gaussians",),
     "hook": ("Hook",),
     "io.adapter_file": ("load_adapter", "save_adapter"),
@@ -62,5 +62,6 @@ on_first_use(__name__, {
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
     "DialValue", "Gaussians", "Hook", "Rendering", "Scene", "View", "adapt", "attach", "bake", "detach", "dial_for",
-    "evaluate", "extract", "imagine", "load", "load_adapter", "load_scene", "place", "render", "save", "save_adapter",
+    "evaluate", "extract", "imagine", "load", "load_adapter", "load_scene", "order_by_extinction", "place", "render",
+    "save", "save_adapter",
 ]  # fmt: skip

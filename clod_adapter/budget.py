@@ -7,7 +7,7 @@
 - PSNR is read off the calibration table that is stored with the file (``calibration.py``).
 - Frames a second are of a machine, a picture size, and what else runs there. Where there are cameras some frames are
   timed (``frame_times``, a second or two): under load the times of one machine differ by a factor of ten. The
-  table's own times are taken only where they are handed over, or (``clod-adapt bake``) where nothing can be timed.
+  table's own times are taken only where they are handed over, or (``clod-adapt export``) where nothing can be timed.
 
 A budget that already s = 1 keeps within is no error: the dial is 1, and a note says so. s = 1 keeps fewer Gaussians
 than the file has. No budget is met beyond ``max_sv``: the equation goes on, but nothing was trained there.

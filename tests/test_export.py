@@ -1,4 +1,4 @@
-"""Baking: the plain Gaussians look, at the distance they are baked for, as the dial shows them there."""
+"""Baking: the plain Gaussians look, where they are baked for, as the dial shows them there. And the dial's order."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import attenuate
+from clod_adapter.attenuation import attenuate, normalized_distances
+from clod_adapter.budget import dial_for
+from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.export import bake
-from clod_adapter.extinction import sigma_for_extinction
+from clod_adapter.export import bake, order_by_extinction
+from clod_adapter.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
 from scenes import camera, gaussians
@@ -71,6 +73,67 @@ def test_a_dial_that_does_nothing_changes_nothing() -> None:
     assert torch.equal(baked.opacity_logits, some.opacity_logits[some.opacities > 1 / 255])
 
 
+def spread(n: int = 300, normalizer: str = "scene", cut: str = "soft") -> Gaussians:
+    """At many distances from ``camera()``, with decays at which some stay and some go."""
+    sigma = torch.rand(n, generator=torch.Generator().manual_seed(2)) * 2 + 0.1
+    return attach(gaussians(n, 1, 7), sigma, replace(CONFIG, cut=cut, normalizer=normalizer))
+
+
+@CUTS
+@pytest.mark.parametrize("normalizer", ["scene", "quantile", "max"])
+def test_for_a_camera_it_is_the_same_picture_from_there(cut: str, normalizer: str) -> None:
+    some = spread(normalizer=normalizer, cut=cut)
+    want, baked = render(some, camera(), 2.5), bake(some, 2.5, camera())
+    assert 0 < len(baked) < 300 and len(baked) == want.kept.sum()
+    torch.testing.assert_close(render(baked, camera()).image, want.image, atol=2e-5, rtol=0)
+    elsewhere = bake(some, 2.5)
+    assert (render(elsewhere, camera()).image - want.image).abs().max() > 0.01  # which is what the camera is for
+
+
+def test_for_a_camera_a_count_is_exact() -> None:
+    some = spread()
+    few, many = len(bake(some, CONFIG.max_sv, camera())), len(bake(some, 1.0, camera()))
+    assert few + 10 < many
+    for wanted in range(few, many, 7):
+        s = dial_for(some, keep=wanted, cameras=[camera()]).virtual_scale
+        assert len(bake(some, s, camera())) == wanted
+
+
+@pytest.mark.parametrize("view", [None, camera()], ids=["apart", "camera"])
+def test_prefixes_are_what_the_dial_keeps(view: Camera | None) -> None:
+    some = spread()
+    rows = order_by_extinction(some, [view] if view else ())
+    assert torch.equal(rows.sort().values, torch.arange(300))
+    ordered = some.select(rows)
+    for s in (1.0, 1.7, 3.0):
+        kept = len(bake(some, s, view))
+        assert 0 < kept < 300
+        head = bake(ordered, s, view)
+        assert torch.equal(head.means, ordered.means[:kept])  # those kept are the first, in their order
+
+
+def test_rows_that_leave_together_stay_in_their_order() -> None:
+    some = gaussians(40, 0, 3)
+    same = attach(some.replace(opacity_logits=torch.zeros(40)), torch.ones(40), CONFIG)
+    assert torch.equal(order_by_extinction(same), torch.arange(40))
+    some = attach(some, torch.linspace(0.1, 2, 40), CONFIG)
+    scales = extinction_scale(some.opacity_logits, some.sigma_d, torch.ones(40), CONFIG)[order_by_extinction(some)]
+    assert (scales.diff() <= 0).all() and scales[0] > scales[-1]
+
+
+def test_over_cameras_the_mean_counts() -> None:
+    some, near = spread(), camera()
+    assert some.sigma_d is not None
+    viewmat = near.viewmat.clone()
+    viewmat[2, 3] += 3
+    cameras = [near, replace(near, viewmat=viewmat)]
+    distances = [normalized_distances(some.means, each, CONFIG) for each in cameras]
+    scales = [extinction_scale(some.opacity_logits, some.sigma_d, d, CONFIG).double() for d in distances]
+    product = (scales[0] * scales[1])[order_by_extinction(some, cameras)]
+    assert (product.diff() <= 1e-12 * product[:-1]).all()
+    assert not torch.equal(order_by_extinction(some, cameras), order_by_extinction(some, cameras[:1]))
+
+
 def test_bad_calls_are_named() -> None:
     with pytest.raises(ClodError, match="no sigma_d"):
         bake(gaussians(3, 0, 0), 1.0)
@@ -78,3 +141,7 @@ def test_bad_calls_are_named() -> None:
         bake(sphere(), 0.5)
     with pytest.raises(ClodError, match="no Gaussian is kept at s = 200"):
         bake(sphere(), 200.0)
+    with pytest.raises(ClodError, match="kept at s = 200 from the camera 'a.jpg'"):
+        bake(sphere(), 200.0, replace(camera(), name="a.jpg"))
+    with pytest.raises(ClodError, match="no sigma_d, so no order"):
+        order_by_extinction(gaussians(3, 0, 0))

@@ -9,6 +9,7 @@ import numpy as np
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.card import Card
+from clod_adapter.io.converted import check_converted, read_converted
 from clod_adapter.io.foreign import refuse_known
 from clod_adapter.io.origin import AXES
 from clod_adapter.io.ply_columns import SIGMA, rows_of
@@ -16,7 +17,6 @@ from clod_adapter.io.ply_header import PREFIX, write_comments
 from clod_adapter.io.pt import check_pt
 from clod_adapter.io.regular import refuse_irregular
 from clod_adapter.io.rows import Rows
-from clod_adapter.io.splat_transform import check_converted, read_converted
 
 _NEW_SPZ = b"NGSP"  # how version 4 begins, which splat-transform is asked to read; earlier ones are gzipped
 _START: dict[str, tuple[bytes, ...]] = {".glb": (b"glTF",), ".spz": (b"\x1f\x8b", _NEW_SPZ)}
@@ -45,7 +45,8 @@ def check_model(path: Path) -> None:
     if suffix in _START and not start.startswith(_START[suffix]):
         raise ClodError(f"{path}: is no {suffix} file by its first bytes; copy or export it again")
     if start.startswith(_NEW_SPZ):
-        return check_converted(path, " of version 4")
+        check_converted(path, " of version 4")
+        return
     if suffix == ".splat" and path.stat().st_size % 32:
         raise ClodError(f"{path}: is no .splat file, whose rows have 32 bytes; copy or export it again")
     if suffix == ".safetensors" and '"clod-adapter"' in _description(path):

@@ -99,3 +99,20 @@ def test_quiet_and_closed(stream: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_duration(seconds: float, text: str) -> None:
     assert duration(seconds) == text
+
+
+def test_a_status_may_say_more(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    monkeypatch.setattr("clod_adapter.cli.console.time", SimpleNamespace(perf_counter=lambda: now))
+    with Console().status("packing ...") as show:
+        for now in range(1, 31):
+            show(f"packing, {now} s")
+    assert capsys.readouterr().err.splitlines() == ["packing, 10 s", "packing, 20 s", "packing, 30 s"]
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    with Console().status("packing ...") as show:
+        show("packing, 1 s")
+    lines = terminal.getvalue().split("\r")
+    assert "packing, 1 s" in terminal.getvalue() and not lines[-1].strip() and "\n" not in terminal.getvalue()
+    with Console(quiet=True).status("packing ...") as show:
+        show("packing, 99 s")
+    assert "99" not in terminal.getvalue()

@@ -1,4 +1,4 @@
-"""Budgets on the command line: ``eval``, ``render`` and ``bake`` with --keep, --fps and --psnr-drop."""
+"""Budgets on the command line: ``eval``, ``render`` and ``export`` with --keep, --fps and --psnr-drop."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_an_unusable_calibration_is_the_reason_given(clod: Any, dialled: Path, t
     data = dialled.read_bytes().replace(b"calibrated_with 300 ", b"calibrated_with 299 ")
     extra = b"element face 0\nproperty list uchar int vertex_indices\nend_header"  # a note of its own, after it
     (tmp_path / "other.ply").write_bytes(data.replace(b"end_header", extra, 1))
-    done = clod("bake", "other.ply", "--psnr-drop", 1, "-o", "x.ply")
+    done = clod("export", "other.ply", "--psnr-drop", 1, "-o", "x.ply")
     said = "other.ply: --psnr-drop: the calibration in the header is of 299 Gaussians and ignored, these are 300; adapt"
     assert done.code == 2 and said in done.err and "not carried over" in done.err
 
@@ -172,36 +172,27 @@ def test_names_that_would_collide_keep_their_suffix(capture: Any) -> None:
     assert of("a.jpg", "a.png") == ["a.jpg.png", "a.png.png"]
 
 
-def test_bake(clod: Any, dialled: Path, tmp_path: Path) -> None:
-    done = clod("bake", dialled, "--sv", 2, "-o", "plain.ply", "--json")
-    report = json.loads(done.out)
-    baked, want = load(tmp_path / "plain.ply"), clod_adapter.bake(load(dialled).gaussians, 2.0)
-    assert done.code == 0 and "lossy" in done.err and "world units from the camera only" in done.err
-    assert report["kept"] == len(baked.gaussians) == len(want) < report["base_count"] == 300
-    for name, values in want.tensors().items():
-        assert (getattr(baked.gaussians, name) == values).all()
-    names = list(baked.vertex.dtype.names or ())
-    assert names[:6] == ["x", "y", "z", "nx", "ny", "nz"] and "sigma_d" not in names
-    assert any(comment.startswith("baked at s = 2 and d' = 1") for comment in baked.comments)
-
-
 def test_dial_values_beyond_the_trained_ones_are_noted(clod: Any, capture: Any, dialled: Path) -> None:
-    for words in (("render", dialled, "--images", capture.scene, "-o", "out"), ("bake", dialled, "-o", "plain.ply")):
+    for words in (("render", dialled, "--images", capture.scene, "-o", "out"), ("export", dialled, "-o", "plain.ply")):
         (note,) = json.loads(clod(*words, "--sv", 4.5, "--json").out)["notes"]
         assert note == "trained up to s = 4; beyond that nothing was learned"
 
 
-def test_bake_to_a_budget(clod: Any, dialled: Path, tmp_path: Path) -> None:
+def test_baking_to_a_budget(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    def baked(*words: object) -> Any:
+        report = json.loads(clod("export", *words, "--json").out)
+        return report, report["outputs"][0]
+
     gaussians = load(dialled).gaussians
     n = (len(clod_adapter.bake(gaussians, 1.0)) + len(clod_adapter.bake(gaussians, 4.0))) // 2
-    assert json.loads(clod("bake", dialled, "--keep", n, "-o", "n.ply", "--json").out)["kept"] == n
+    assert baked(dialled, "--keep", n, "-o", "n.ply")[1]["count"] == n == len(load("n.ply").gaussians)
     there = with_times(dialled, tmp_path / "there.ply", machine="another", width=640, height=480)
-    report = json.loads(clod("bake", there, "--fps", 250, "-o", "f.ply", "--json").out)
-    assert report["virtual_scale"] == pytest.approx(2)
+    report, output = baked(there, "--fps", 250, "-o", "f.ply")
+    assert output["virtual_scale"] == pytest.approx(2)
     assert report["notes"] == ["--fps 250: s = 2 (frame times of another at 640x480)"]
-    done = clod("bake", there, "--fps", 10**6, "-o", "g.ply")
+    done = clod("export", there, "--fps", 10**6, "-o", "g.ply")
     assert done.code == 2 and done.err.rstrip().endswith("500 a second (frame times of another at 640x480)")
     assert not (tmp_path / "g.ply").exists()
     rows = stored(dialled).rows
-    done = clod("bake", dialled, "--psnr-drop", rows[0].psnr - rows[2].psnr, "-o", "p.ply", "--json")
-    assert json.loads(done.out)["virtual_scale"] == pytest.approx(rows[2].virtual_scale)
+    output = baked(dialled, "--psnr-drop", rows[0].psnr - rows[2].psnr, "-o", "p.ply")[1]
+    assert output["virtual_scale"] == pytest.approx(rows[2].virtual_scale)

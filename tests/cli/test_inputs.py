@@ -40,7 +40,7 @@ def test_gsplats_checkpoint_gets_a_dial(clod: Any, capture: Any, tmp_path: Path)
     assert done.code == 0 and "note: gsplat's trainer may have normalised" in done.err, done
     assert clod("apply", "ckpt.pt", "dial.safetensors", "--out", "again.ply").code == 0
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
-    done = clod("bake", "ckpt.pt", "--sv", 2, "--out", "b.ply")
+    done = clod("export", "ckpt.pt", "--sv", 2, "--out", "b.ply")
     assert done.code == 2 and "has no sigma_d" in done.err
 
 

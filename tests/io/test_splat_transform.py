@@ -1,71 +1,116 @@
+"""The tool that may or may not be there: stand-ins for what can be wrong with it, and the real one where it is."""
+
 from __future__ import annotations
 
-import shutil
-import subprocess
+import shlex
+import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
-import torch
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.ply import blank, load, save
-from clod_adapter.io.readers import check_readable, file_has_dial
-from scenes import gaussians
+from clod_adapter.io.splat_transform import INSTALL, SplatTransform
 
-REAL = shutil.which("splat-transform")
+GOOD = "'node:v22.1.0;splat-transform v3.7.2 (abc)'"
 
 
-def stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
-    """A program of that name on an otherwise empty path."""
-    program = folder / "bin" / "splat-transform"
-    program.parent.mkdir()
-    program.write_text(f"#!/bin/sh\n{script}\n")
-    program.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{program.parent}:/usr/bin:/bin")
+@pytest.fixture
+def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Makes a stand-in that runs these lines of Python with ``words``, and has the environment name it."""
+
+    def make(*lines: str) -> None:
+        script = tmp_path / "with space" / "tool.py"
+        script.parent.mkdir(exist_ok=True)
+        script.write_text("\n".join(["import sys, time", "words = sys.argv[1:]", *lines]))
+        monkeypatch.setenv("CLOD_SPLAT_TRANSFORM", shlex.join([sys.executable, str(script)]))
+
+    return make
 
 
-@pytest.mark.parametrize("name", ["a.sog", "a.KSPLAT", "a.spz"])
-def test_reads_what_it_converts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    was = gaussians(5, 1, 0)
-    save(tmp_path / "plain.ply", was, blank(5, 1))
-    stand_in(tmp_path, monkeypatch, f'echo "$@" >{tmp_path}/seen; cp {tmp_path}/plain.ply "$4"')
-    (tmp_path / name).write_bytes(b"NGSP, if it is an SPZ: of version 4")
-    check_readable(tmp_path / name)
-    assert not file_has_dial(tmp_path / name)
-    found = load(tmp_path / name)
-    assert torch.equal(found.gaussians.means, was.means) and "quantised" in found.notes[0]
-    assert (tmp_path / "seen").read_text().startswith(f"--quiet --overwrite {tmp_path.resolve() / name} ")
+def test_it_is_found(tool: Any) -> None:
+    tool(f"print({GOOD} if words == ['--version'] else '[0] A GPU')")
+    found = SplatTransform.find()
+    assert (found.version, found.gpu, found.command[0]) == ("3.7.2", True, sys.executable)
+    tool(f"print({GOOD} if words == ['--version'] else 'No GPU adapters found.')")
+    assert not SplatTransform.find().gpu
 
 
-def test_without_it_the_install_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a.sog").write_bytes(b"PK\x03\x04")
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("print('node:v20.9.0;splat-transform v3.7.0')", "run by Node 20 and needs 22 or newer; "),
+        ("print('node:v22.9.0;splat-transform v2.7.1')", "splat-transform is 2.7.1, 3.7 or newer is needed; "),
+        ("print('node:v22.9.0;splat-transform v3.6.9')", "is 3.6.9, 3.7 or newer"),
+        ("print('something v9.9.9')", "does not run as splat-transform; "),
+        ("sys.exit('node: --import= is not allowed in NODE_OPTIONS')", "does not run as splat-transform; "),
+    ],
+)
+def test_what_is_too_old_or_something_else_is_refused(tool: Any, line: str, said: str) -> None:
+    tool(line)
+    with pytest.raises(ClodError) as error:
+        SplatTransform.find()
+    assert said in str(error.value) and INSTALL in str(error.value)
+
+
+def test_where_it_is_not(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("CLOD_SPLAT_TRANSFORM", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
-    for read in (check_readable, load):
-        with pytest.raises(ClodError, match="a.sog: .*npm install -g @playcanvas/splat-transform"):
-            read(tmp_path / "a.sog")
+    with pytest.raises(ClodError, match="^splat-transform is not installed; in a folder of its own: npm install"):
+        SplatTransform.find()
+    monkeypatch.setenv("CLOD_SPLAT_TRANSFORM", "nowhere/tool -g 0")
+    with pytest.raises(ClodError, match="^nowhere/tool, which CLOD_SPLAT_TRANSFORM names, is not installed; "):
+        SplatTransform.find()
+    monkeypatch.setenv("CLOD_SPLAT_TRANSFORM", "a 'b")
+    with pytest.raises(ClodError, match="which is no command"):
+        SplatTransform.find()
 
 
-def test_what_it_cannot_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stand_in(tmp_path, monkeypatch, 'echo "  Error: not a zip" >&2; echo "   at main" >&2; exit 1')
-    (tmp_path / "a.sog").write_bytes(b"anything")
-    with pytest.raises(ClodError, match=r"a.sog: splat-transform cannot read it \(Error: not a zip\)"):
-        load(tmp_path / "a.sog")
-    with pytest.raises(ClodError, match="missing.sog: cannot be read"):
-        load(tmp_path / "missing.sog")
-    (tmp_path / "a.sog").write_bytes(b"")
-    with pytest.raises(ClodError, match="a.sog: is empty"):
-        load(tmp_path / "a.sog")
+def stand_in(*lines: str) -> SplatTransform:
+    code = "\n".join(["import sys, time", "words = sys.argv[1:]", *lines])
+    return SplatTransform((sys.executable, "-c", code), "3.7.0")
 
 
-@pytest.mark.skipif(REAL is None, reason="splat-transform is not installed")
-@pytest.mark.parametrize("name", ["a.sog", "a.spz"])
-def test_the_real_one(tmp_path: Path, name: str) -> None:
-    was = gaussians(300, 1, 0)
-    save(tmp_path / "plain.ply", was, blank(300, 1))
-    subprocess.run([REAL, "-q", "-g", "cpu", tmp_path / "plain.ply", tmp_path / name], check=True)
-    found = load(tmp_path / name).gaussians
-    order, theirs = was.means[:, 0].argsort(), found.means[:, 0].argsort()
-    assert (was.means[order] - found.means[theirs]).abs().max() < 1e-3
-    (tmp_path / f"b{name}").write_bytes((tmp_path / name).read_bytes()[:400])
-    with pytest.raises(ClodError, match=f"b{name}: splat-transform cannot read it"):
-        load(tmp_path / f"b{name}")
+def test_it_is_run_with_the_words_and_timed(tmp_path: Path) -> None:
+    out, ticks = tmp_path / "out", list[float]()
+    tool = stand_in("open(words[-1], 'w').write(' '.join(words[:-1]))", "time.sleep(0.5)")
+    seconds = tool.run("a.ply", out, timeout=60, progress=ticks.append)
+    assert out.read_text() == "-w -g cpu -i 1 a.ply" and 0.5 < seconds < 30
+    assert len(ticks) > 1 and ticks == sorted(ticks) and ticks[-1] <= seconds
+    SplatTransform(tool.command, "3.7.0", gpu=True).run(Path("-a.ply"), out, timeout=60)
+    assert out.read_text() == f"-w {Path.cwd() / '-a.ply'}"
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (
+            ["print('splat-transform v3.7.0')", "print('  ✗ Error: no room')", "print('    at f (x.mjs:1)')",
+             "print('✗ failed in 0.1s')", "sys.exit(1)"], "Error: no room",
+        ),
+        (["sys.stderr.write('first\\nlast\\n')", "sys.exit(3)"], "last"),
+        (["sys.exit(1)"], "it said nothing"),
+    ],
+)  # fmt: skip
+def test_a_failure_is_told_in_its_words(lines: list[str], said: str) -> None:
+    with pytest.raises(ClodError, match=f"^splat-transform 3.7.0 failed: {said}$"):
+        stand_in("sys.stdout.reconfigure(encoding='utf-8')", *lines).run(timeout=60)
+
+
+def test_it_is_ended_when_its_time_is_up_or_the_user_has_enough(tmp_path: Path) -> None:
+    began = time.perf_counter()
+    mark = tmp_path / "mark"
+    tool = stand_in("time.sleep(5)", f"open({str(mark)!r}, 'w')")
+    with pytest.raises(ClodError, match="took longer than 1 s"):
+        tool.run(timeout=1)
+
+    def enough(seconds: float) -> None:
+        if seconds > 0.3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tool.run(timeout=60, progress=enough)
+    assert time.perf_counter() - began < 4.5
+    time.sleep(max(0.0, 6.5 - (time.perf_counter() - began)))
+    assert not mark.exists()

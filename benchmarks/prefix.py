@@ -1,0 +1,117 @@
+"""What a renderer that draws the first n rows of a file shows, by the order of the rows.
+
+    python benchmarks/prefix.py plush_clod.ply plush_half --base pretrained
+    python benchmarks/prefix.py --table                    # the rows as a Markdown table
+
+The model is an adapted file of the capture. At each dial value the counts are the mean over the held-out views, and
+what is drawn of that many Gaussians is measured on them. First the dial itself, and a file baked at d' = 1 for that
+count; then prefixes of files whose rows are in an order, drawn as such a renderer draws them, with the opacities that
+stand in the file:
+
+- ``extinction``: by falling s* at d' = 1, what ``clod-adapt export --order extinction`` writes;
+- ``extinction, s = 1 baked``: the same with ``--sv 1``, so faded a little, and shorter;
+- ``extinction, views``: by the mean of log s* over the cameras trained on, about what ``--images`` gives there;
+- ``own``, ``opacity``, ``removal error``: the adapted file as it is, by falling opacity, by falling removal error;
+- ``base, ...``: the untouched checkpoint in the adapted one's order of extinction, by opacity, by removal error.
+
+Each run adds a row to ``results/prefix.jsonl``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from common import RESULTS, append, capture
+from torch import Tensor
+
+import clod_adapter as clod
+from clod_adapter.cli.console import Console
+from clod_adapter.importance import removal_error
+
+FILE = "prefix.jsonl"
+DIALS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", nargs="?", help="an adapted PLY")
+    parser.add_argument("scene", nargs="?", help="its capture")
+    parser.add_argument("--base", default="pretrained", help="the capture's checkpoint that was adapted")
+    parser.add_argument("--table", action="store_true", help="print the rows there are")
+    args = parser.parse_args()
+    if args.model and args.scene:
+        measure(args.model, args.scene, args.base)
+    if args.table:
+        print_table()
+
+
+def measure(model: str, scene: str, checkpoint: str) -> None:
+    adapted, base = clod.load(model).gaussians, clod.load(capture(scene) / f"{checkpoint}.ply").gaussians
+    photographs, console = clod.load_scene(capture(scene)), Console()
+    held_out = photographs.test
+
+    def psnr(gaussians: clod.Gaussians, what: str, s: float = 1.0) -> tuple[float, float]:
+        row = clod.evaluate(gaussians, held_out, [s])[0]
+        console.say(f"{what}: {row.psnr:.2f} dB with {row.kept:,.0f}")
+        return row.psnr, row.kept
+
+    ordered = orders(adapted, base, photographs.train)
+    rows = []
+    for s in [s for s in DIALS if adapted.attenuation and s <= adapted.attenuation.max_sv]:
+        found, kept = psnr(adapted, f"dial {s:g}", s)
+        count = round(kept)
+        drawn = {"dial": found}
+        at = clod.dial_for(adapted, keep=count).virtual_scale
+        baked = clod.bake(adapted, at)
+        drawn["baked"] = psnr(baked, "baked")[0] if len(baked) == count else None
+        for what, gaussians in ordered.items():
+            drawn[what] = psnr(head(gaussians, count), what)[0] if count <= len(gaussians) else None
+        rows.append({"virtual_scale": s, "count": count, "share": count / len(adapted), "psnr": drawn})
+    append(FILE, {
+        "benchmark": "prefix", "model": Path(model).name, "scene": scene, "gaussians": len(adapted),
+        "all": {"adapted": psnr(clod.detach(adapted), "all, unfaded")[0], "base": psnr(base, "base")[0]}, "rows": rows,
+    })  # fmt: skip
+
+
+def orders(adapted: clod.Gaussians, base: clod.Gaussians, views: tuple[clod.View, ...]) -> dict[str, clod.Gaussians]:
+    """What stands in each file, without a dial, in its order."""
+    plain, rows = clod.detach(adapted), clod.order_by_extinction(adapted)
+    return {
+        "extinction": plain.select(rows),
+        "extinction, s = 1 baked": clod.bake(adapted.select(rows), 1.0),
+        "extinction, views": plain.select(clod.order_by_extinction(adapted, [view.camera for view in views])),
+        "own": plain,
+        "opacity": plain.select(falling(plain.opacity_logits)),
+        "removal error": plain.select(falling(removal_error(plain, views, seed=0))),
+        "base, extinction": base.select(rows),
+        "base, opacity": base.select(falling(base.opacity_logits)),
+        "base, removal error": base.select(falling(removal_error(base, views, seed=0))),
+    }
+
+
+def falling(worth: Tensor) -> Tensor:
+    return worth.argsort(descending=True, stable=True)
+
+
+def head(gaussians: clod.Gaussians, count: int) -> clod.Gaussians:
+    return gaussians.select(torch.arange(count))
+
+
+def print_table() -> None:
+    """PSNR on the held-out views, a line for an order and a column for a count."""
+    for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
+        row: dict[str, Any] = json.loads(line)
+        print(f"\n{row['scene']}, {row['model']}: all {row['gaussians']:,} unfaded {row['all']['adapted']:.2f} dB")
+        print("| drawn | " + " | ".join(f"{point['count']:,}" for point in row["rows"]) + " |")
+        print("|---" * (1 + len(row["rows"])) + "|")
+        for what in row["rows"][0]["psnr"]:
+            cells = [f"{value:.2f}" if (value := point["psnr"][what]) is not None else "-" for point in row["rows"]]
+            print(f"| {what} | " + " | ".join(cells) + " |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""The text and the options of ``clod-adapt export``."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, ArgumentTypeError
+from itertools import pairwise
+from math import inf
+
+from clod_adapter.cli.commands import Command
+from clod_adapter.cli.dials import add_dial_options
+from clod_adapter.cli.export_formats import format_table
+from clod_adapter.cli.options import _add_activated
+
+DIGITS = 6  # significant ones of a level, all of which its file's name has
+
+
+def levels_of(text: str) -> list[float]:
+    """The dial values of ``1,2,4,7``."""
+    try:
+        levels = [float(f"{float(word):.{DIGITS}g}") for word in text.split(",")]
+    except ValueError:
+        levels = []
+    if not levels or levels[0] < 1 or not all(a < b for a, b in pairwise([*levels, inf])):
+        raise ArgumentTypeError(f"{text!r} must be rising dial values of at least 1, as in 1,2,4,7")
+    return levels
+
+
+def export_options(parser: ArgumentParser) -> None:
+    parser.add_argument("model", metavar="MODEL", help="an adapted file, or a plain one to convert")
+    parser.add_argument(
+        "-o", "--out", metavar="OUT", required=True, help="what to write, by its suffix; replaced if it exists"
+    )
+    add_dial_options(parser, "the dial value to bake", "(in the file written)", several=False, required=False)
+    parser.add_argument(
+        "--levels", metavar="S,S,...", type=levels_of,
+        help="several dial values, each baked into a file of its own, OUT_s1.ply, OUT_s2.ply, ...; all or none appear",
+    )  # fmt: skip
+    parser.add_argument(
+        "--lod-meta", action="store_true",
+        help="the levels as one streaming set in the new folder OUT, for PlayCanvas's viewers (by splat-transform)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--camera", metavar="PHOTO", help="bake for this photograph's camera; its name, with or without suffix"
+    )
+    parser.add_argument("--images", metavar="DIR", help="the scene: of --camera, or to order by")
+    parser.add_argument(
+        "--order", choices=["extinction"],
+        help="put the rows in the order in which the dial keeps them longest, for renderers that draw a prefix",
+    )  # fmt: skip
+    _add_activated(parser)
+    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
+
+
+EXPORT = Command(
+    module="export",
+    summary="Write a file for other tools: another format, or plain.",
+    description="""\
+Write a model for other tools: in another format, with its dial where the format
+has room for it, or with one dial value baked in, for viewers without a dial.
+""",
+    usage="MODEL -o OUT [--sv S | --keep N | ... | --levels S,...]",
+    epilog=f"""\
+by the suffix of OUT:
+  suffix           dial  values
+{format_table()}
+Where the dial is kept and no dial value is given, nothing is baked. A plain
+MODEL is converted. Columns that Inria's layout does not have are left out.
+
+Baking keeps the Gaussians of one dial value, faded for good: lossy, and exact
+at one distance only. The dial fades a Gaussian by its distance from the camera,
+and a plain file has no camera: what is written is how it looks from the
+normalised distance 1 (the far end of the scene as the training cameras saw it),
+so that what is nearer comes out fainter than it should. With --camera and
+--images it is how it looks from there, exact from that place and near it. Keep
+the adapted file: this cannot be undone.
+
+--keep is exact: OUT has N Gaussians. --fps and --psnr-drop find the dial value
+in the calibration stored in MODEL, which is of the adapted file and, for frame
+times, of the machine that a note names: here they are estimates. With --camera
+frames are timed here first, from there.
+
+--levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on. With --lod-meta OUT is
+a folder that must not be there yet (or be empty): lod-meta.json, level 0 the
+finest, and the chunks that a streaming viewer loads.
+
+--order extinction is for renderers that draw the first n rows, whatever n: the
+first n are those that the dial keeps at n at the normalised distance 1 or from
+--camera, or with --images those that it keeps longest over all cameras, which
+is better where distances differ much. They are drawn with the opacities that
+stand in the file: on two captures 0.1 to 0.6 dB below the dial at many rows, up
+to 0.8 above it at few (benchmarks/prefix.py), and they pop where it fades.
+
+SIBR reads a baked .ply; the SH degree it takes from sh_degree in the cfg_args
+beside the model, up to 3, and its released versions do not show degree 0.
+
+.sog, .compressed.ply and --lod-meta need splat-transform 3.7 with Node 22, on
+the PATH or as the command in CLOD_SPLAT_TRANSFORM. In a folder of its own:
+  npm install node@22 @playcanvas/splat-transform@3.7
+  PATH=$PWD/node_modules/node/bin:$PWD/node_modules/.bin:$PATH
+Without a GPU, SOG's spherical harmonics take minutes for 100,000 Gaussians.
+
+examples:
+  clod-adapt export garden_clod.ply --sv 2 -o garden_s2.ply
+  clod-adapt export garden_clod.ply --keep 200000 -o garden_200k.ply
+  clod-adapt export garden_clod.ply --sv 3 --camera a.jpg --images garden \\
+      -o from_a.ply
+  clod-adapt export garden_clod.ply -o garden.glb
+  clod-adapt export garden_clod.ply --levels 1,2,4,7 -o garden.ply
+  clod-adapt export garden_clod.ply --levels 1,2,4,7 --lod-meta -o garden_lod
+  clod-adapt export garden_clod.ply --order extinction --images garden \\
+      -o sorted.ply
+""",
+    add_arguments=export_options,
+)
