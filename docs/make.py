@@ -1,8 +1,8 @@
-"""Writes what of the documentation is made by a program: the reference of the commands, and the equation's picture.
+"""Writes what of the documentation a program makes: the commands, the settings, and the equation's picture.
 
     python docs/make.py
 
-A test compares the reference with the parsers. The picture needs matplotlib (``pip install '.[plots]'``).
+Tests compare the two pages with the parsers and the configs. The picture needs matplotlib (``pip install '.[plots]'``).
 """
 
 from __future__ import annotations
@@ -14,11 +14,40 @@ from pathlib import Path
 import clod_adapter  # noqa: F401  (before torch)
 from clod_adapter.cli.commands import ADAPT, Command
 from clod_adapter.cli.main import COMMANDS, PROG, build_parser
+from clod_adapter.config import AdaptConfig, AttenuationConfig, describe
 
 HERE = Path(__file__).resolve().parent
-COMMANDS_PAGE, PICTURE = HERE / "commands.md", HERE / "images" / "equation.png"
+PICTURE = HERE / "images" / "equation.png"
 SIGMAS = (0.2, 0.4, 0.8)
 OPACITY, TAU = 0.8, 0.02
+
+
+SETTINGS = """\
+# Settings
+
+Written by `python docs/make.py` from the configs themselves. Both are frozen, take keywords only, and refuse
+values that make no sense.
+
+## AdaptConfig
+
+How an adaptation is run: `clod.adapt(gaussians, scene, clod.AdaptConfig(max_sv=5, iters=400))`. On the
+command line there are `--max-sv`, `--iters`, `--time-budget`, `--seed` and `--form`; the rest is for
+experiments, and [Method](method.md) says what each was measured to do. `AdaptConfig.paper()` is the paper's
+own form.
+
+| field | default | paper | what |
+|---|---|---|---|
+{rows}
+
+## AttenuationConfig
+
+How `sigma_d` is to be read: the constants of [the equation](equation.md), which travel with the file. The
+defaults are those of a dial that is attached by hand; training writes its own.
+
+| field | default | what |
+|---|---|---|
+{fields}
+"""
 
 
 def commands_page() -> str:
@@ -51,6 +80,24 @@ def option_row(action: argparse.Action) -> str:
     )
     text = " ".join((action.help or "").split()).replace("|", "\\|")
     return f"| `{f'{names} {value}'.strip()}` | {text} |"
+
+
+def settings_page() -> str:
+    """Every field of the two configs, with its default, and where the paper's own form has another, that."""
+    ours, paper, travels = AdaptConfig(), AdaptConfig.paper(), AttenuationConfig()
+    rows = []
+    for name, text in describe(AdaptConfig).items():
+        value, other = getattr(ours, name), getattr(paper, name)
+        rows.append(f"| `{name}` | {shown(value)} | {shown(other) if other != value else ''} | {text} |")
+    about = describe(AttenuationConfig)
+    fields = [f"| `{name}` | {shown(getattr(travels, name))} | {text} |" for name, text in about.items()]
+    return SETTINGS.format(rows="\n".join(rows), fields="\n".join(fields))
+
+
+def shown(value: object) -> str:
+    if value is None:
+        return "none"
+    return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
 
 
 def fence(text: str) -> str:
@@ -98,9 +145,13 @@ def equation_picture(path: Path) -> None:
 
 
 def main() -> None:
-    COMMANDS_PAGE.write_text(commands_page(), encoding="utf-8")
+    for name, make in PAGES.items():
+        (HERE / name).write_text(make(), encoding="utf-8")
     equation_picture(PICTURE)
-    print(f"wrote {COMMANDS_PAGE} and {PICTURE}")
+    print(f"wrote {', '.join(PAGES)} and {PICTURE.relative_to(HERE)}")
+
+
+PAGES = {"commands.md": commands_page, "settings.md": settings_page}
 
 
 if __name__ == "__main__":

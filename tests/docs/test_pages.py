@@ -86,6 +86,16 @@ def cell(row: Mapping[str, Any]) -> str:
     return f"{float(row['psnr']):.2f} @ {100 * float(row['kept_share']):.0f} %"
 
 
+def test_the_pruned_checkpoint_is_as_measured() -> None:
+    with (RESULTS / "robustness.csv").open(encoding="utf-8") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["max_sv"] == "5.0"]
+    (page,) = [table for table in tables(DOCS / "from_maskgaussian.md") if table[0] == ["dial", "3DGS", "mask-pruned"]]
+    for name, *written in page[1:]:
+        found = [row for row in rows if f"s = {float(row['virtual_scale']):g}" == name]
+        assert [row["checkpoint"] for row in found] == ["pretrained", "pretrained_mask"]
+        assert written == [f"{float(row['psnr']):.2f} @ {float(row['kept']):,.0f}" for row in found], name
+
+
 def test_the_long_dials_are_those_that_were_measured() -> None:
     rows = [json.loads(line) for line in (RESULTS / "adapt.jsonl").read_text(encoding="utf-8").splitlines()]
     (page,) = [table for table in tables(DOCS / "max_sv.md") if table[0][1:2] == ["plush_half, 5"]]
