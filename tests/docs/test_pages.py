@@ -6,6 +6,7 @@ import csv
 import json
 import re
 from collections.abc import Iterator, Mapping
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -110,3 +111,12 @@ def test_the_long_dials_are_those_that_were_measured() -> None:
         columns.append({f"s = {row['virtual_scale']:g}": cell(row) for row in run["rows"]})
     for name, *written in page[1:]:
         assert written == [column.get(name, "") for column in columns], name
+
+
+def test_the_keys_are_those_of_the_viewer() -> None:
+    source = ROOT / "clod_adapter" / "viewer" / "web" / "src" / "page.html"
+    if not source.exists():
+        pytest.skip("there is no viewer yet")
+    help = re.findall(r"<dt>(.+?)</dt><dd>(.+?)</dd>", source.read_text(encoding="utf-8"))
+    (page,) = [table for table in tables(DOCS / "viewing.md") if len(table[1]) == 2]
+    assert [tuple(row) for row in page[1:]] == [(unescape(keys), unescape(text)) for keys, text in help]
