@@ -16,7 +16,6 @@ from clod_adapter.cli.main import COMMANDS, build_parser, main
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "examples" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-SETUP = re.compile(r"^<!-- setup\n(.*?)^-->$", re.DOTALL | re.MULTILINE)  # Python that a reader has already
 FENCE = re.compile(r"^( *)(`{3,})(\w*)\n(.*?)^\1\2 *$", re.DOTALL | re.MULTILINE)
 SHELL = ("sh", "console")
 LANGUAGES = {*SHELL, "python", "text", "json", "glsl", "wgsl", "html", "css", "js"}
@@ -57,15 +56,14 @@ class Block:
 
 
 def blocks(page: Path) -> list[Block]:
-    """In the order of the page; what a ``<!-- setup`` comment holds is one of Python."""
     text = page.read_text(encoding="utf-8")
-    found = [Block(page, text.count("\n", 0, m.start()) + 1, "python", m[1], "") for m in SETUP.finditer(text)]
+    found = []
     for match in FENCE.finditer(text):
         marker = re.search(r"<!-- not run: ([^>]+?) -->\s*\Z", text[: match.start()])
         language = match[3] or ("sh" if page.name == "README.md" else "")
         line = text.count("\n", 0, match.start()) + 1
         found.append(Block(page, line, language, textwrap.dedent(match[4]), marker[1] if marker else ""))
-    return sorted(found, key=lambda block: block.line)
+    return found
 
 
 def spoken(page: Path, program: str) -> list[str]:

@@ -13,15 +13,14 @@ from plyfile import PlyData, PlyElement
 
 @pytest.fixture(scope="session")
 def desk(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``scene/``, ``pretrained.ply``, ``pretrained_mask.ply`` (MaskGaussian's old layout), ``pretrained_clod.*``, also
-    as ``model.ply``, and ``demo/`` with the names that the demo leaves."""
+    """``scene/``, ``pretrained.ply``, ``pretrained_mask.ply`` (MaskGaussian's old layout), ``pretrained_clod.*``, and
+    ``demo/`` with the names that the demo leaves."""
     folder = tmp_path_factory.mktemp("desk")
     shutil.copytree(capture.scene, folder / "scene")
     shutil.copyfile(capture.ply, folder / "pretrained.ply")
     write_masked(capture.ply, folder / "pretrained_mask.ply")
     for suffix in (".ply", ".safetensors", ".json"):
         shutil.copyfile(dialled.with_suffix(suffix), folder / f"pretrained_clod{suffix}")
-    shutil.copyfile(dialled, folder / "model.ply")
     shutil.copytree(capture.scene, folder / "demo" / "capture")
     shutil.copyfile(capture.ply, folder / "demo" / "base.ply")
     shutil.copyfile(dialled, folder / "demo" / "gallery.ply")
