@@ -2,6 +2,7 @@
 #
 #   make demo    install and run the demo
 #   make test    install, then lint, format check, types, tests
+#   make docs    install what the documentation needs, and build it as a site in build/docs
 #   make peers   install what some tests compare with and otherwise skip: Node 22 and splat-transform, by npm, 400 MB
 #   make clean   remove .venv and everything that was built or cached; what the demo made, in demo/, stays
 #
@@ -15,7 +16,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PEERS := $(CURDIR)/$(VENV)/peers
 
-.PHONY: demo test peers clean
+.PHONY: demo test docs peers clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/clod-adapt demo
@@ -25,6 +26,10 @@ test: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	PATH="$(PEERS)/node_modules/.bin:$$PATH" $(BIN)/python -m pytest
+
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "open build/docs/index.html"
 
 peers: $(PEERS)/.installed
 

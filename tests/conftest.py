@@ -19,6 +19,7 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from clod_adapter.cameras import Camera
+from clod_adapter.cli.main import main
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.colmap import write_model
 from clod_adapter.io.ply_columns import column_map
@@ -64,6 +65,15 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
         image = (render(gaussians, camera).image.clamp(0, 1) * 255).round().to(torch.uint8)
         Image.fromarray(image.numpy()).save(scene / "images" / name)
     return Capture(scene, _write_inria(folder / "base.ply", gaussians), gaussians, _write_inria)
+
+
+@pytest.fixture(scope="session")
+def dialled(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The capture's checkpoint with a dial up to 4 and its calibration, as the main job leaves it."""
+    path = tmp_path_factory.mktemp("dialled") / "dial.ply"
+    words = [capture.ply, "--images", capture.scene, "--iters", 12, "--max-sv", 4, "--out", path, "--quiet", "--json"]
+    assert main([str(word) for word in words]) == 0
+    return path
 
 
 def _write_inria(path: Path, gaussians: Gaussians) -> Path:

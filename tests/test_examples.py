@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import runpy
 import shutil
 import sys
@@ -16,7 +17,8 @@ from PIL import Image
 import clod_adapter
 from clod_adapter.io.ply import blank
 
-EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("[0-9]*.py"))
+FOLDER = Path(__file__).resolve().parents[1] / "examples"
+EXAMPLES = {int(path.name[:2]): path for path in sorted(FOLDER.glob("[0-9]*.py"))}
 
 
 @pytest.fixture
@@ -25,8 +27,8 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     monkeypatch.chdir(tmp_path)
 
     def start(number: int, *words: object) -> str:
-        monkeypatch.setattr(sys, "argv", [EXAMPLES[number - 1].name, *map(str, words)])
-        runpy.run_path(str(EXAMPLES[number - 1]), run_name="__main__")
+        monkeypatch.setattr(sys, "argv", [EXAMPLES[number].name, *map(str, words)])
+        runpy.run_path(str(EXAMPLES[number]), run_name="__main__")
         return capsys.readouterr().out
 
     return start
@@ -77,13 +79,37 @@ def test_a_scene_without_held_out_views(run: Any, capture: Any, monkeypatch: pyt
     assert "of 300 Gaussians" in run(2, capture.ply, capture.scene)
 
 
-@pytest.mark.parametrize("number", [1, 2])
+def test_budgets(run: Any, dialled: Path, capture: Any) -> None:
+    printed = run(5, dialled, capture.scene).splitlines()
+    names = ["50% of", "25% of", "10% of", "0.1 dB", "0.5 dB", "1 dB", "10 frames", "30 frames", "60 frames"]
+    assert len(printed) == 9 and all(line.startswith(name) for line, name in zip(printed, names, strict=True))
+    found = [float(line.partition("s = ")[2].split()[0]) for line in (printed[0], *printed[3:6])]
+    assert 1 < found[0] < 4 and 1 < found[1] <= found[2] <= found[3] <= 4
+    assert "out of reach: at s = 4" in printed[2]  # a tenth is less than the far end keeps, and that is said
+
+
+def test_the_adapter_goes_on_and_off(run: Any, dialled: Path, capture: Any, tmp_path: Path) -> None:
+    printed = run(6, capture.ply, dialled.with_suffix(".safetensors"), "again.ply")
+    assert "changed: sigma_d, " in printed and f"{capture.ply}, bit for bit" in printed
+    assert (tmp_path / "again.ply").read_bytes() == dialled.read_bytes()
+
+
+def test_another_base_is_refused(run: Any, dialled: Path, capture: Any, tmp_path: Path) -> None:
+    other = capture.write(tmp_path / "other.ply", capture.gaussians.replace(sh0=capture.gaussians.sh0 + 1))
+    with pytest.raises(SystemExit, match="a different base was given"):
+        run(6, other, dialled.with_suffix(".safetensors"))
+    assert not (tmp_path / "again.ply").exists()
+
+
+@pytest.mark.parametrize("number", [1, 2, 5, 6])
 def test_misuse_is_explained(run: Any, number: int) -> None:
-    with pytest.raises(SystemExit, match=f"python examples/{EXAMPLES[number - 1].name}"):
+    with pytest.raises(SystemExit, match=f"python examples/{EXAMPLES[number].name}"):
         run(number)
-    with pytest.raises(SystemExit, match="error: missing.ply: .*check the path"):
+    with pytest.raises(SystemExit, match="error: (missing.ply|nowhere): .*check the path"):
         run(number, "missing.ply", "nowhere")
 
 
-def test_numbers_have_no_gaps() -> None:
-    assert [int(path.name[:2]) for path in EXAMPLES] == list(range(1, len(EXAMPLES) + 1))
+def test_the_list_names_them_all() -> None:
+    listed = re.findall(r"\]\((.+?)\)", (FOLDER / "README.md").read_text(encoding="utf-8"))
+    assert listed == [path.name for path in EXAMPLES.values()]
+    assert list(EXAMPLES) == list(range(1, len(EXAMPLES) + 1))

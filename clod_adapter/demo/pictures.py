@@ -110,7 +110,6 @@ def quality_curve(
         draw_curve(above, ordered, base_row, "psnr", BLUE)
         draw_curve(below, ordered, base_row, "ssim", ORANGE)
         above.set_ylabel("PSNR (dB)")
-        above.legend(loc="lower right", frameon=False, fontsize=8.5)
         below.set_ylabel("SSIM")
         below.set_xlabel("Gaussians kept (log scale)")
         label_log(below.xaxis)
@@ -120,15 +119,18 @@ def quality_curve(
 def draw_curve(
     axes: Any, rows: Sequence[Mapping[str, float]], base_row: Mapping[str, float] | None, key: str, colour: str
 ) -> None:
-    """One quality measure against count, the points labelled with their dial values."""
+    """One quality measure against count, the points labelled with their dial values, the base by its name."""
     counts, values = [row["kept"] for row in rows], [row[key] for row in rows]
     axes.set_xscale("log")
     axes.margins(x=0.1, y=0.16)
-    axes.plot(counts, values, "-o", color=colour, markersize=5.5, linewidth=1.8, label="dial, one file", zorder=3)
+    axes.plot(counts, values, "-o", color=colour, markersize=5.5, linewidth=1.8, zorder=3)
     for row, count, value in zip(rows, counts, values, strict=True):
-        name = f"s = {row['virtual_scale']:g}"
+        name = f"{row['virtual_scale']:g}"  # neighbours near s = 1 leave no room for more
+        name = f"s = {name}" if row in (rows[0], rows[-1]) else name
         axes.annotate(name, (count, value), (-4, 5), textcoords="offset points", ha="right", fontsize=8.5)
     if base_row:
         style = {"color": "white", "markeredgecolor": INK, "markersize": 7, "zorder": 2}
-        axes.plot(base_row["kept"], base_row[key], "D", label="base", **style)
+        axes.plot(base_row["kept"], base_row[key], "D", **style)
+        spot = (base_row["kept"], base_row[key])
+        axes.annotate("base", spot, (0, 8), textcoords="offset points", ha="center", fontsize=8.5)
     tidy(axes)

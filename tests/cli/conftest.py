@@ -7,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -55,12 +54,3 @@ def spawn() -> Callable[..., subprocess.Popen[str]]:
             signal.signal(signal.SIGINT, before)
 
     return start
-
-
-@pytest.fixture(scope="session")
-def dialled(capture: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The capture's checkpoint with a dial up to 4 and its calibration, as the main job leaves it."""
-    path = tmp_path_factory.mktemp("dialled") / "dial.ply"
-    words = [capture.ply, "--images", capture.scene, "--iters", 12, "--max-sv", 4, "--out", path, "--quiet", "--json"]
-    assert main([str(word) for word in words]) == 0
-    return path

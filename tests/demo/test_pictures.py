@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from clod_adapter.demo import pictures
 from clod_adapter.demo.pictures import Panel, dial_strip, quality_curve
 from clod_adapter.errors import ClodError
 
@@ -44,6 +45,36 @@ def test_curve_is_drawn(tmp_path: Path, base: dict[str, float] | None) -> None:
     quality_curve(tmp_path / "curve.png", ROWS, base, "quality")
     picture = load(tmp_path / "curve.png")
     assert min(picture.shape[:2]) > 500 and 0.01 < (picture < 128).any(2).mean() < 0.5
+
+
+def test_no_label_of_the_curve_lies_on_another_or_on_a_mark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rows of the demo itself."""
+    pytest.importorskip("matplotlib")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.transforms import Bbox
+
+    kept = {1: 36067, 1.25: 30257, 1.5: 26078, 2: 20385, 2.5: 16961, 3: 14718, 4: 12408, 5: 11425}
+    psnr, ssim = (29.26, 29.31, 29.28, 29.14, 28.98, 28.77, 28.27, 27.65), (920, 920, 920, 918, 916, 913, 906, 898)
+    rows = [
+        {"virtual_scale": s, "kept": n, "psnr": p, "ssim": q / 1000}
+        for (s, n), p, q in zip(kept.items(), psnr, ssim, strict=True)
+    ]
+    figures = []
+    monkeypatch.setattr(pictures, "save", lambda figure, path: figures.append(figure))
+    quality_curve(tmp_path / "curve.png", rows, {"kept": 60000, "psnr": 27.52, "ssim": 0.8992}, "quality")
+    renderer = FigureCanvasAgg(figures[0]).get_renderer()
+    figures[0].draw(renderer)
+    for axes in figures[0].axes:
+        labels = [text.get_window_extent(renderer) for text in axes.texts]
+        marks = [
+            Bbox.from_bounds(x - 8, y - 8, 16, 16)
+            for line in axes.lines
+            for x, y in axes.transData.transform(line.get_xydata())
+        ]
+        assert len(labels) == len(marks) == len(rows) + 1
+        for k, label in enumerate(labels):
+            assert not label.count_overlaps([*labels[:k], *labels[k + 1 :], *marks]), axes.texts[k].get_text()
+        assert axes.get_legend() is None
 
 
 def test_without_matplotlib_the_install_line_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

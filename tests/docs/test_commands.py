@@ -1,0 +1,67 @@
+"""Every command in the documentation is run, or it is said why it is not, and then it parses."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clod_adapter.cli.main import COMMANDS
+from fences import COMING, LANGUAGES, PAGES, ROOT, SHELL, blocks, parse, run, skipped, spoken
+
+IDS = [str(page.relative_to(ROOT)) for page in PAGES]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_blocks_run_in_the_order_of_the_page(page: Path, desk: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    shutil.copytree(desk, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {"__name__": "__main__"}
+    for block in blocks(page):
+        assert block.language in LANGUAGES, f"{block.place}: {block.language or 'no language'}; text is not run"
+        if block.reason:
+            continue
+        try:
+            if block.language == "python":
+                exec(compile(block.text, block.place, "exec"), names)
+            elif block.language in SHELL:
+                for words in block.commands():
+                    if not skipped(words):
+                        run(words)
+        except (Exception, SystemExit) as error:
+            pytest.fail(f"{block.place}: {error}")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_what_is_not_run_has_options_that_there_are(page: Path) -> None:
+    unrun = [words for block in blocks(page) if block.language in SHELL for words in block.commands()]
+    said = [command.split() for command in spoken(page, "clod-adapt")]
+    for words in [*unrun, *said]:
+        if words[0] == "clod-adapt":
+            parse(words)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_benchmarks_have_the_options_that_are_named(page: Path) -> None:
+    for command in spoken(page, "python benchmarks/"):
+        script, *words = command.split()[1:]
+        folder = ROOT / "benchmarks"
+        source = (ROOT / script).read_text(encoding="utf-8") + (folder / "common.py").read_text(encoding="utf-8")
+        for option in re.findall(r"--[a-z][a-z-]*", " ".join(words)):
+            assert f'"{option}"' in source, f"{page.name}: {command}: no {option}"
+
+
+def test_the_reasons_are_reasons() -> None:
+    for page in PAGES:
+        for block in blocks(page):
+            assert not block.reason or len(block.reason.split()) >= 3, f"{block.place}: {block.reason}"
+        # A marker that stands above no block would be one that somebody believes in.
+        marked = page.read_text(encoding="utf-8").count("<!-- not run:")
+        assert marked == sum(bool(block.reason) for block in blocks(page)), page.name
+
+
+def test_what_is_there_is_not_coming() -> None:
+    assert not set(COMING) & set(COMMANDS), "take it out of COMING: its blocks can be run"

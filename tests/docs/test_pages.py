@@ -1,0 +1,122 @@
+"""The pages against what they are about: the report's fields, and the numbers in tables against their rows."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Iterator, Mapping
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clod_adapter.cli.main import main
+from fences import ROOT
+
+DOCS, RESULTS = ROOT / "docs", ROOT / "benchmarks" / "results"
+
+
+def keys(value: Any) -> Iterator[str]:
+    """Of all objects in it, but those of the settings, which the Python page lists."""
+    if isinstance(value, dict):
+        for name, entry in value.items():
+            yield name
+            yield from keys(entry) if name != "config" else ()
+    elif isinstance(value, list):
+        for entry in value:
+            yield from keys(entry)
+
+
+def test_every_field_of_the_reports_is_explained(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    explained = set(re.findall(r"`([a-z_0-9]+)`", (DOCS / "report.md").read_text(encoding="utf-8")))
+    model, scene = str(desk / "pretrained_clod.ply"), str(desk / "scene")
+    base = str(desk / "pretrained.ply")
+    words = [
+        "eval",
+        model,
+        "--images",
+        scene,
+        "--sv",
+        "1",
+        "3",
+        "--base",
+        base,
+        "--against",
+        base,
+        "--popping",
+        "--quiet",
+    ]
+    capsys.readouterr()
+    assert main([*words, "--json"]) == 0
+    measured = json.loads(capsys.readouterr().out)
+    adapted = json.loads(desk.joinpath("pretrained_clod.json").read_text(encoding="utf-8"))
+    assert {"rows", "alignment", "frame_ms"} <= set(keys(adapted)) and {"ranked", "moved"} <= set(keys(measured))
+    missing = (set(keys(adapted)) | set(keys(measured))) - explained
+    assert not missing, f"docs/report.md does not explain {sorted(missing)}"
+
+
+def tables(page: Path) -> list[list[list[str]]]:
+    """Of each table its rows, of each row its cells, without emphasis."""
+    found = re.findall(r"(?:^\|.*\|\n)+", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return [
+        [
+            [cell.strip(" *") for cell in line.strip("|\n").split("|")]
+            for line in table.splitlines()
+            if "---" not in line
+        ]
+        for table in found
+    ]
+
+
+def test_the_ranges_are_those_that_were_measured() -> None:
+    with (RESULTS / "robustness.csv").open(encoding="utf-8") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["max_sv"] != "base"]
+    cells = {
+        (row["checkpoint"], float(row["max_sv"]), f"s = {float(row['virtual_scale']):g}"): cell(row) for row in rows
+    }
+    ranges = (1, 3, 5, 7)
+    page = [table for table in tables(DOCS / "max_sv.md") if table[0] == ["dial", *(f"max_sv {m}" for m in ranges)]]
+    for table, checkpoint in zip(page, ("pretrained", "pretrained_mask"), strict=True):
+        for name, *written in table[1:]:
+            assert written == [cells[checkpoint, max_sv, name] for max_sv in ranges], f"{checkpoint}, {name}"
+
+
+def cell(row: Mapping[str, Any]) -> str:
+    return f"{float(row['psnr']):.2f} @ {100 * float(row['kept_share']):.0f} %"
+
+
+def test_the_pruned_checkpoint_is_as_measured() -> None:
+    with (RESULTS / "robustness.csv").open(encoding="utf-8") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["max_sv"] == "5.0"]
+    (page,) = [table for table in tables(DOCS / "from_maskgaussian.md") if table[0] == ["dial", "3DGS", "mask-pruned"]]
+    for name, *written in page[1:]:
+        found = [row for row in rows if f"s = {float(row['virtual_scale']):g}" == name]
+        assert [row["checkpoint"] for row in found] == ["pretrained", "pretrained_mask"]
+        assert written == [f"{float(row['psnr']):.2f} @ {float(row['kept']):,.0f}" for row in found], name
+
+
+def test_the_long_dials_are_those_that_were_measured() -> None:
+    rows = [json.loads(line) for line in (RESULTS / "adapt.jsonl").read_text(encoding="utf-8").splitlines()]
+    (page,) = [table for table in tables(DOCS / "max_sv.md") if table[0][1:2] == ["plush_half, 5"]]
+    titles = page[0][1:]
+    columns = []
+    for scene, max_sv in (title.split(", ") for title in titles):
+        (run,) = [
+            row for row in rows
+            if (row["scene"], row["label"]) == (scene, f"ours, max_sv {max_sv}")
+            and row["config"]["iters"] == 1500 and row["config"].get("seed", 0) == 0
+        ]  # fmt: skip
+        columns.append({f"s = {row['virtual_scale']:g}": cell(row) for row in run["rows"]})
+    for name, *written in page[1:]:
+        assert written == [column.get(name, "") for column in columns], name
+
+
+def test_the_keys_are_those_of_the_viewer() -> None:
+    source = ROOT / "clod_adapter" / "viewer" / "web" / "src" / "page.html"
+    if not source.exists():
+        pytest.skip("there is no viewer yet")
+    help = re.findall(r"<dt>(.+?)</dt><dd>(.+?)</dd>", source.read_text(encoding="utf-8"))
+    (page,) = [table for table in tables(DOCS / "viewing.md") if len(table[1]) == 2]
+    assert [tuple(row) for row in page[1:]] == [(unescape(keys), unescape(text)) for keys, text in help]

@@ -1,0 +1,118 @@
+"""The site: links that lead somewhere, nothing fetched from elsewhere, and pages that say what the code says."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import runpy
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+import clod_adapter
+from fences import FENCE, PAGES, ROOT
+
+DOCS = ROOT / "docs"
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)|(?:href|src)=\"([^\"]+)\"")
+
+
+def anchors(page: Path) -> set[str]:
+    """Of the headings, as Markdown's toc extension makes them, and as GitHub does for these."""
+    found = set()
+    for title in re.findall(r"^#+ +(.+?) *$", FENCE.sub("", page.read_text(encoding="utf-8")), re.MULTILINE):
+        plain = re.sub(r"[^\w\s-]", "", re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", title)).strip().lower()
+        found.add(re.sub(r"[-\s]+", "-", plain))
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_and_anchors_are_there(page: Path) -> None:
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    for target in (one or other for one, other in LINK.findall(text)):
+        if target.startswith(("https://", "http://")):
+            continue
+        file, _, anchor = target.partition("#")
+        found = (page.parent / file).resolve() if file else page
+        assert found.exists(), f"{page.name}: {target}: no such file"
+        assert not anchor or anchor in anchors(found), f"{page.name}: {target}: no such heading"
+
+
+@pytest.mark.parametrize("name", ["commands.md", "settings.md"])
+def test_the_reference_is_current(name: str) -> None:
+    made = runpy.run_path(str(DOCS / "make.py"))["PAGES"][name]()
+    assert (DOCS / name).read_text(encoding="utf-8") == made, "run python docs/make.py"
+
+
+def test_the_picture_of_the_equation_is_drawn(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    made = runpy.run_path(str(DOCS / "make.py"))
+    made["equation_picture"](tmp_path / "equation.png")
+    assert (tmp_path / "equation.png").stat().st_size > 10_000 and made["PICTURE"].is_file()
+
+
+def test_the_python_page_has_every_name_where_it_lives() -> None:
+    listed = re.findall(r"^::: (\S+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(listed) == sorted(f"clod_adapter.{clod_adapter._homes[name]}.{name}" for name in clod_adapter.__all__)
+
+
+def test_the_colours_are_those_of_the_reports() -> None:
+    ours, theirs = DOCS / "style.css", ROOT / "clod_adapter" / "report" / "style.css"
+    pairs = [re.findall(r"(--[a-z0-9-]+): ([^;]+);", path.read_text(encoding="utf-8")) for path in (ours, theirs)]
+    names = {name for name, _ in pairs[1]}
+    assert [(name, value) for name, value in pairs[0] if name in names] == pairs[1]
+
+
+class Fetched(HTMLParser):
+    """What a browser fetches by itself to show a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.urls: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        named = dict(attrs)
+        fetches = "src" if tag != "link" else "href" if named.get("rel") != "canonical" else ""
+        self.urls += [named[fetches] or ""] if fetches in named else []
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built as ``make docs`` does, where a link that leads nowhere or a page that is not in the list is an error."""
+    pytest.importorskip("mkdocs", reason="pip install '.[docs]'")
+    out = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def test_nothing_is_fetched_from_elsewhere(site: Path) -> None:
+    pages = sorted(site.glob("*.html"))
+    assert len(pages) > len(list(DOCS.glob("*.md")))
+    for page in pages:
+        fetched = Fetched(page.read_text(encoding="utf-8")).urls
+        assert fetched or page.name == "error_vs_time.html"
+        far = [url for url in fetched if re.match(r"([a-z]+:)?//", url) and not url.startswith("data:")]
+        assert not far, f"{page.name} fetches {far}"
+    for style in site.rglob("*.css"):
+        assert not re.search(r"url\([\"']?(https?:)?//|@import", style.read_text(encoding="utf-8")), style.name
+
+
+def test_the_search_knows_the_pages_and_the_docstrings(site: Path) -> None:
+    index = json.loads((site / "search" / "search_index.json").read_text(encoding="utf-8"))
+    places = {entry["location"].partition("#")[0] for entry in index["docs"]}
+    assert {f"{page.stem}.html" for page in DOCS.glob("*.md")} == places
+    assert {"api.html#clod_adapter.io.ply.load", "api.html#clod_adapter.train.adapt"} <= {
+        entry["location"] for entry in index["docs"]
+    }
+    assert (site / "search" / "search_index.js").is_file()  # what a page opened from a folder searches
+
+
+def test_only_pages_are_published(site: Path) -> None:
+    assert not list(site.rglob("*.py")) and not list(site.rglob("*.md"))
