@@ -8,6 +8,7 @@ from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 
+from clod_adapter.cli.checks_view import check_view
 from clod_adapter.cli.dials import given_budget
 from clod_adapter.cli.files import Outputs, check_output, check_ply_name, labels
 from clod_adapter.cli.settings import make_config, make_configs
@@ -173,4 +174,5 @@ CHECKS: dict[str, Callable[[Namespace], None]] = {
     "bake": check_bake,
     "robustness": check_robustness,
     "demo": lambda args: None,
+    "view": check_view,
 }

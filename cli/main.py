@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import Any
 
 from clod_adapter.cli.commands import ADAPT, APPLY, BAKE, DEMO, EVALUATE, RENDER, ROBUSTNESS, Command
+from clod_adapter.cli.help_view import VIEW
 from clod_adapter.cli.interrupts import sigterm_as_interrupt
 from clod_adapter.cli.parser import Parser, make_parser
 from clod_adapter.errors import ClodError
@@ -23,6 +24,7 @@ PROG = "clod-adapt"
 # Adapting is the main job and needs no word.
 COMMANDS: dict[str, Command] = {
     "eval": EVALUATE, "render": RENDER, "bake": BAKE, "apply": APPLY, "robustness": ROBUSTNESS, "demo": DEMO,
+    "view": VIEW,
 }  # fmt: skip
 
 
@@ -55,7 +57,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def run(command: Command, args: argparse.Namespace) -> None:
-    """Runs a command and prints its report where --json asks for it."""
+    """Runs a command and prints its report where --json asks for it; a command without one has printed its own."""
     from clod_adapter.cli.checks import CHECKS  # here and not above, as --help needs nothing of what it imports
     from clod_adapter.cli.report import jsonable
 
@@ -64,7 +66,7 @@ def run(command: Command, args: argparse.Namespace) -> None:
     aside = io.StringIO() if args.quiet else sys.stderr
     with redirect_stdout(aside) if args.json else nullcontext(), sigterm_as_interrupt():
         report = module.run(args)
-    if args.json:
+    if args.json and report is not None:
         print(json.dumps(jsonable(report), allow_nan=False))
 
 
