@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import re
-import shlex
-import shutil
-import subprocess
 import sys
 import tempfile
-import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from plyfile import PlyData, PlyElement
 
 import clod_adapter as clod
+from clod_adapter.io.splat_transform import SplatTransform
 
-INSTALL = "npm install node@22 @playcanvas/splat-transform@3.7"
-HELP = (
-    f"splat-transform needs Node 22 or newer. In a folder of its own: {INSTALL}; then "
-    "PATH=FOLDER/node_modules/node/bin:FOLDER/node_modules/.bin:$PATH, or the command in SPLAT_TRANSFORM"
-)
+TIMEOUT = 3600.0  # seconds
 
 
 @dataclass(frozen=True)
@@ -29,26 +20,24 @@ class Merger:
     """The tool, and the folder that keeps what it made.
 
     Attributes:
-        command: how it is started.
-        version: of the tool; files of another version are not taken for its own.
+        tool: splat-transform; files of another version are not taken for its own.
         cache: the folder, made when needed.
     """
 
-    command: tuple[str, ...]
-    version: str
+    tool: SplatTransform
     cache: Path
+
+    @property
+    def version(self) -> str:
+        return self.tool.version
 
     @classmethod
     def find(cls, cache: Path) -> Merger:
-        """From ``SPLAT_TRANSFORM`` or the PATH; leaves with the install line where it is missing or too old."""
-        command = tuple(shlex.split(os.environ.get("SPLAT_TRANSFORM", "splat-transform")))
-        if not command or shutil.which(command[0]) is None:
-            sys.exit(f"splat-transform is not on the PATH. {HELP}")
-        said = subprocess.run([*command, "--version"], capture_output=True, text=True)
-        found = re.search(r"v(\d+)\.(\d+)\.(\d+)", said.stdout + said.stderr)
-        if found is None or int(found[1]) < 3:  # 2.7 takes minutes for what takes 3 seconds
-            sys.exit(f"{shlex.join(command)} is no splat-transform 3 that runs. {HELP}")
-        return cls(command, ".".join(found.groups()), cache)
+        """The tool that is here; leaves with the install line where it is missing or too old."""
+        try:
+            return cls(replace(SplatTransform.find(), gpu=False), cache)
+        except clod.ClodError as error:
+            sys.exit(str(error))
 
     def merge(self, base: clod.Checkpoint, count: int) -> tuple[clod.Gaussians, float]:
         """The base merged to ``count`` Gaussians, and the seconds that the tool took, then or now."""
@@ -67,12 +56,10 @@ class Merger:
         """Writes ``merged.ply`` into the folder; the seconds it took."""
         source, merged = folder / "base.ply", folder / "merged.ply"
         _write_plain(source, base)
-        began = time.perf_counter()
-        command = [*self.command, "-q", "-w", "-g", "cpu", str(source), "--decimate", str(count), str(merged)]
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode or not merged.exists():
-            sys.exit(f"{shlex.join(command)} failed: {(done.stderr or done.stdout).strip()}")
-        return time.perf_counter() - began
+        try:
+            return self.tool.run("-q", source, "--decimate", str(count), merged, timeout=TIMEOUT)
+        except clod.ClodError as error:
+            sys.exit(str(error))
 
 
 def _write_plain(path: Path, base: clod.Checkpoint) -> None:

@@ -1,0 +1,140 @@
+"""splat-transform, PlayCanvas's converter of splat files: an optional tool of its own that needs Node, found and run.
+
+It compresses to SOG and to compressed PLY, makes streaming sets of several levels, and merges Gaussians.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from clod_adapter.errors import ClodError
+
+VARIABLE = "CLOD_SPLAT_TRANSFORM"
+NEEDED, NODE_NEEDED = (3, 7), 22
+INSTALL = "npm install node@22 @playcanvas/splat-transform@3.7"
+HELP = (
+    f"in a folder of its own: {INSTALL}; then PATH=FOLDER/node_modules/node/bin:FOLDER/node_modules/.bin:$PATH, or the "
+    f"command in {VARIABLE}"
+)
+ASKING = 30.0  # seconds that a question about itself may take
+TICK = 0.2  # seconds between two looks at whether it is done
+# Without a GPU, where a round of SOG's clustering of spherical harmonics takes minutes and its ten would take an hour.
+ON_CPU = ("-g", "cpu", "-i", "1")
+# Has the very Node that runs the tool say its version, whatever wrapper or symbolic link starts it.
+_SAY_NODE = "--import=data:text/javascript,process.stderr.write(`node:${process.version};`)"
+
+
+@dataclass(frozen=True)
+class SplatTransform:
+    """The tool as it is here.
+
+    Attributes:
+        command: how it is started.
+        version: of the tool, three numbers.
+        gpu: whether it sees a GPU; without one it clusters spherical harmonics on the CPU, in one round.
+    """
+
+    command: tuple[str, ...]
+    version: str
+    gpu: bool = False
+
+    @classmethod
+    def find(cls) -> SplatTransform:
+        """The one in the environment's ``CLOD_SPLAT_TRANSFORM``, a command with its words, or on the PATH.
+
+        Raises:
+            ClodError: it is not there, it or its Node is too old, or it does not run; with the install line.
+        """
+        given = os.environ.get(VARIABLE, "")
+        command = _words(given) or ("splat-transform",)
+        if shutil.which(command[0]) is None:
+            where = f"{command[0]}, which {VARIABLE} names, is" if given else "splat-transform is"
+            raise ClodError(f"{where} not installed; {HELP}")
+        said = _ask(command, "--version")
+        version, node = re.search(r"splat-transform v(\d+)\.(\d+)\.(\d+)", said), re.search(r"node:v(\d+)", said)
+        if node is not None and int(node[1]) < NODE_NEEDED:
+            raise ClodError(f"splat-transform is run by Node {node[1]} and needs {NODE_NEEDED} or newer; {HELP}")
+        if version is None:
+            raise ClodError(f"{shlex.join(command)} does not run as splat-transform; {HELP}")
+        found = tuple(map(int, version.groups()))
+        if found[:2] < NEEDED:
+            wanted = ".".join(map(str, NEEDED))
+            raise ClodError(f"splat-transform is {'.'.join(version.groups())}, {wanted} or newer is needed; {HELP}")
+        gpu = re.search(r"(?m)^\s*\[\d+\] \S", _ask(command, "--list-gpus")) is not None
+        return cls(command, ".".join(version.groups()), gpu)
+
+    def run(self, *words: str | Path, timeout: float, progress: Callable[[float], None] | None = None) -> float:
+        """Runs it with these words, replacing outputs; the seconds it took.
+
+        Ctrl-C, and whatever else is raised here meanwhile, ends it too.
+
+        Args:
+            timeout: seconds after which it is ended.
+            progress: called now and then with the seconds so far.
+
+        Raises:
+            ClodError: it fails, with the last it said, or takes longer than that.
+        """
+        command = [*self.command, "-w", *(() if self.gpu else ON_CPU), *map(str, words)]
+        began = time.perf_counter()
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            encoding="utf-8", errors="replace",
+        )  # fmt: skip
+        try:
+            said = None
+            while said is None:
+                taken = time.perf_counter() - began
+                if taken > timeout:
+                    raise ClodError(f"splat-transform was ended, it took longer than {timeout:.0f} s")
+                if progress:
+                    progress(taken)
+                with suppress(subprocess.TimeoutExpired):
+                    said, _ = process.communicate(timeout=TICK)
+        except BaseException:
+            process.kill()
+            process.communicate()
+            raise
+        if process.returncode:
+            raise ClodError(f"splat-transform {self.version} failed: {_reason(said)}")
+        return time.perf_counter() - began
+
+
+def _words(given: str) -> tuple[str, ...]:
+    """The words of a command; a path with spaces in it that is there needs no quotes."""
+    if not given or shutil.which(given):
+        return (given,) if given else ()
+    try:
+        return tuple(shlex.split(given))
+    except ValueError as error:
+        raise ClodError(f"{VARIABLE} is {given!r}, which is no command ({error}); {HELP}") from error
+
+
+def _ask(command: tuple[str, ...], question: str) -> str:
+    """All it says to a question about itself; nothing where it does not run."""
+    options = f"{os.environ.get('NODE_OPTIONS', '')} {_SAY_NODE}".strip()
+    try:
+        done = subprocess.run(
+            [*command, question], stdin=subprocess.DEVNULL, capture_output=True, text=True, encoding="utf-8",
+            errors="replace", timeout=ASKING, env={**os.environ, "NODE_OPTIONS": options},
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return f"{done.stderr}\n{done.stdout}"
+
+
+def _reason(said: str) -> str:
+    """The line that says what went wrong, or the last one; not where in the tool's own code, nor how long it took."""
+    lines = [line.strip(" \t✗·▸") for line in said.splitlines()]
+    lines = [line for line in lines if line and not line.startswith(("at ", "failed in "))]
+    errors = [line for line in lines if "Error" in line]
+    return (errors or lines or ["it said nothing"])[-1]
