@@ -24,7 +24,7 @@ const css = await build({ ...shared, entryPoints: [new URL("src/style.css", here
 writeFileSync(new URL("viewer.css", out), css.outputFiles[0].text);
 writeFileSync(new URL("page.html", out), readFileSync(new URL("src/page.html", here)));
 
-const sources = ["build.mjs", "package-lock.json", "package.json"];
+const sources = ["../../integrations/shaders/attenuation.glsl", "build.mjs", "package-lock.json", "package.json"];
 sources.push(...readdirSync(new URL("src", here), { recursive: true }).filter((name) => /\.\w+$/.test(name)).map((name) => `src/${name}`));
 const lines = sources.sort().map((name) => `${createHash("sha256").update(readFileSync(new URL(name, here))).digest("hex")}  ${name}`);
 writeFileSync(new URL("SOURCES.sha256", out), `${lines.join("\n")}\n`);

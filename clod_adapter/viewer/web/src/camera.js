@@ -2,13 +2,14 @@
 import { add, cross, dot, row, turned, unit } from "./vector.js";
 
 const FIELD = (50 * Math.PI) / 180; // across the shorter side, where no camera says
+const NEAR = 0.01; // of the near plane, world units, as clod_adapter/cameras.py
 const STEEPEST = 0.995; // |forward . up|: orbiting stops before it looks straight up or down
 
 export function createCamera() {
   const camera = {
     rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], // rows: right, down, forward, in world axes
     eye: [0, 0, 0], up: [0, -1, 0], reach: 1, // reach: how far ahead the point lies that orbiting turns about
-    near: 0.01,
+    near: NEAR,
     field: FIELD, // of view across the canvas's shorter side, radians
     exact: null, // {fx, fy, cx, cy, width, height} while a camera is reproduced to the pixel
 
@@ -25,7 +26,7 @@ export function createCamera() {
       camera.rotation = [0, 1, 2].flatMap((k) => viewmat[k].slice(0, 3));
       const t = [0, 1, 2].map((k) => viewmat[k][3]);
       camera.eye = [0, 1, 2].map((k) => -dot([0, 1, 2].map((j) => viewmat[j][k]), t));
-      if (near > 0) camera.near = near;
+      camera.near = near > 0 ? near : NEAR;
       camera.exact = { fx: K[0][0], fy: K[1][1], cx: K[0][2], cy: K[1][2], width, height };
       const [side, f] = width < height ? [width, K[0][0]] : [height, K[1][1]];
       camera.field = 2 * Math.atan(side / 2 / f);
@@ -76,7 +77,7 @@ export function createCamera() {
         return;
       }
       camera.up = [0, -1, 0]; // COLMAP's y points down, and so do the files trained on it
-      camera.near = Math.min(0.01, 1e-3 * radius);
+      camera.near = Math.min(NEAR, 1e-3 * radius);
       camera.field = FIELD;
       camera.reach = (1.1 * radius) / Math.tan(FIELD / 2);
       const forward = unit([0, 0.25, 1]);

@@ -1,5 +1,5 @@
 // One splat on the GPU, and its worker, which knows who is kept at a dial value and in which order they are drawn.
-import { dataTexture } from "./gpu.js";
+import { WIDTH, dataTexture, heightOf } from "./gpu.js";
 import { half } from "./half.js";
 import { BAND_TEXELS } from "./shaders.js";
 import workerSource from "worker:./worker.js";
@@ -18,20 +18,19 @@ export function createModel(gl, gaussians, about) {
   const sigma = attenuation ? gaussians.sigma : null;
   const extent = extentOf(means);
   worker.ask("model", { means, opacityLogits, sigma, attenuation }, [means.buffer]);
-  let spare = [new ArrayBuffer(4 * count), new ArrayBuffer(4 * count)];
+  const spare = []; // buffers for orders, which go to the worker and back
   return {
     ...about, attenuation, count, degree, records, higher, extent,
-    /** Asks the worker for the rows to draw, and hands them to the GPU: {kept, drawn, distance}. */
-    async order(request) {
-      const buffer = spare.pop() ?? new ArrayBuffer(4 * count);
+    /** Has the worker find the rows to draw, and calls `use({rows, drawn, kept, distance})` with them. */
+    async order(request, use) {
+      const buffer = spare.pop() ?? new ArrayBuffer(4 * WIDTH * heightOf(count));
       const answer = await worker.ask("order", { ...request, rows: buffer }, [buffer]);
+      use({ ...answer, rows: new Uint32Array(answer.rows) });
       spare.push(answer.rows);
-      return { ...answer, indices: new Uint32Array(answer.rows, 0, answer.drawn) };
     },
     dialFor: (view, wanted) => worker.ask("dialFor", { view, wanted, maxSv: about.max_sv }),
     destroy() {
       worker.stop();
-      spare = [];
       gl.deleteTexture(records);
       gl.deleteTexture(higher);
     },

@@ -1,5 +1,6 @@
 // The page's configuration and the files in it or beside it.
 import { readFile } from "./formats/index.js";
+import { unpacked } from "./formats/zip.js";
 
 /** The configuration that the page was written with; an empty page (a viewer for dropped files) has none. */
 export function readConfig() {
@@ -24,16 +25,17 @@ export async function fetchModel(entry) {
   };
 }
 
-/** Bytes from the same origin (`href`), or base64 out of an `element` of the page, `gzip` if it says so. */
+/** Bytes from the same origin (`href`), or base64 out of an `element` of the page, which it then leaves. */
 async function bytesOf({ href, element, gzip }) {
   if (href) {
     const response = await fetch(href);
     if (!response.ok) throw new Error(`the server answered ${response.status} ${response.statusText}`);
     return response.arrayBuffer();
   }
-  const text = document.getElementById(element)?.textContent;
-  if (!text) throw new Error("the page does not hold it; write the page again");
-  const bytes = Uint8Array.from(atob(text.trim()), (letter) => letter.charCodeAt(0));
-  if (!gzip) return bytes.buffer;
-  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+  const holder = document.getElementById(element);
+  if (!holder) throw new Error("the page does not hold it; write the page again");
+  const letters = atob(holder.textContent.trim()), bytes = new Uint8Array(letters.length);
+  holder.remove();
+  for (let i = 0; i < bytes.length; i++) bytes[i] = letters.charCodeAt(i);
+  return gzip ? (await unpacked(bytes, "gzip")).buffer : bytes.buffer;
 }

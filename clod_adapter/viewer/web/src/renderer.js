@@ -1,46 +1,51 @@
-// Draws models: each Gaussian is projected once into a buffer, then drawn as one quad, the farthest first, into a
+// Draws models: each Gaussian is projected once, a pixel each, then drawn as one quad, the farthest first, into a
 // half-float picture, so that hundreds of blended layers are not rounded to 8 bits each.
-import { instances, program, unfiltered } from "./gpu.js";
-import { PROJECTED, copyFragment, copyVertex, nothing, projectVertex, splatFragment, splatVertex } from "./shaders.js";
-
-const STRIDE = 12; // floats of a projected Gaussian
-const LAYOUT = [[0, 2, 0], [1, 3, 2], [2, 3, 5], [3, 4, 8]];
+import { WIDTH, bindTextures, framebuffer, heightOf, program, quads, texture } from "./gpu.js";
+import { copyVertex, copyFragment, projectFragment, splatFragment, splatVertex } from "./shaders.js";
 
 export function createRenderer(canvas) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
   if (!gl) throw new Error("this browser has no WebGL2; try a current Chrome, Edge, Firefox or Safari");
   const precise = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
-  const projectors = new Map();
-  const splat = program(gl, splatVertex, splatFragment), copy = program(gl, copyVertex, copyFragment);
-  const feedback = gl.createTransformFeedback(), projected = gl.createBuffer();
-  const quads = instances(gl, projected, STRIDE, LAYOUT), target = gl.createFramebuffer();
-  const picture = gl.createTexture(), rowArray = gl.createVertexArray(), empty = gl.createVertexArray();
-  let capacity = 0, width = 0, height = 0;
+  const projectors = new Map(), splat = program(gl, splatVertex, splatFragment), copy = program(gl, copyVertex, copyFragment);
+  const corners = quads(gl), empty = gl.createVertexArray();
+  const projected = { textures: [], target: null, height: 0 }, picture = { texture: null, target: null };
+  let width = 0, height = 0;
 
   function resize(view) {
     if (view.width === width && view.height === height) return;
     ({ width, height } = view);
     [canvas.width, canvas.height] = [width, height];
-    gl.bindTexture(gl.TEXTURE_2D, picture);
-    const [internal, type] = precise ? [gl.RGBA16F, gl.HALF_FLOAT] : [gl.RGBA8, gl.UNSIGNED_BYTE];
-    gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, gl.RGBA, type, null);
-    unfiltered(gl);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, picture, 0);
+    gl.deleteTexture(picture.texture);
+    gl.deleteFramebuffer(picture.target);
+    picture.texture = precise
+      ? texture(gl, gl.RGBA16F, width, height, gl.RGBA, gl.HALF_FLOAT)
+      : texture(gl, gl.RGBA8, width, height, gl.RGBA, gl.UNSIGNED_BYTE);
+    picture.target = framebuffer(gl, [picture.texture]);
+  }
+
+  function makeRoom(rows) {
+    if (rows <= projected.height) return;
+    projected.textures.forEach((old) => gl.deleteTexture(old));
+    gl.deleteFramebuffer(projected.target);
+    projected.textures = [0, 1, 2].map(() => texture(gl, gl.RGBA32UI, WIDTH, rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT));
+    projected.target = framebuffer(gl, projected.textures);
+    projected.height = rows;
+  }
+
+  function projector(degree) {
+    if (!projectors.has(degree)) projectors.set(degree, program(gl, copyVertex, projectFragment(degree)));
+    return projectors.get(degree);
   }
 
   function project(side, view) {
-    const { model } = side;
-    if (!projectors.has(model.degree)) {
-      projectors.set(model.degree, program(gl, projectVertex(model.degree), nothing, PROJECTED));
-    }
-    const { made, uniforms: u } = projectors.get(model.degree);
+    const { model } = side, { made, uniforms: u } = projector(model.degree);
+    makeRoom(heightOf(model.count));
+    gl.bindFramebuffer(gl.FRAMEBUFFER, projected.target);
+    gl.viewport(0, 0, WIDTH, heightOf(side.drawn));
     gl.useProgram(made);
-    for (const [unit, name] of [[0, "records"], [1, "higher"]]) {
-      gl.activeTexture(gl.TEXTURE0 + unit);
-      gl.bindTexture(gl.TEXTURE_2D, model[name]);
-      if (u[name]) gl.uniform1i(u[name], unit);
-    }
+    bindTextures(gl, u, { order: side.order, records: model.records, higher: model.higher });
+    gl.uniform1i(u.drawn, side.drawn);
     gl.uniformMatrix3fv(u.view, true, view.rotation);
     gl.uniform3fv(u.eye, view.eye);
     gl.uniform4f(u.pinhole, view.fx, view.fy, view.cx, view.cy);
@@ -53,76 +58,59 @@ export function createRenderer(canvas) {
       gl.uniform1f(u.tau, model.attenuation.tau);
       gl.uniform1i(u.soft, model.attenuation.cut === "soft");
     }
-    gl.bindVertexArray(rowArray);
-    gl.bindBuffer(gl.ARRAY_BUFFER, side.rows);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.bindBuffer(gl.ARRAY_BUFFER, null);
-    gl.bindTransformFeedback(gl.TRANSFORM_FEEDBACK, feedback);
-    gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, projected);
-    gl.enable(gl.RASTERIZER_DISCARD);
-    gl.beginTransformFeedback(gl.POINTS);
-    gl.drawArrays(gl.POINTS, 0, side.drawn);
-    gl.endTransformFeedback();
-    gl.disable(gl.RASTERIZER_DISCARD);
-    gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, null);
-    gl.bindTransformFeedback(gl.TRANSFORM_FEEDBACK, null);
+    gl.bindVertexArray(empty);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
   function paint(side, view) {
+    gl.bindFramebuffer(gl.FRAMEBUFFER, picture.target);
+    gl.viewport(0, 0, width, height);
     gl.useProgram(splat.made);
+    const [first, second, third] = projected.textures;
+    bindTextures(gl, splat.uniforms, { first, second, third });
     gl.uniform3f(splat.uniforms.size, view.width, view.height, view.near);
-    gl.bindVertexArray(quads);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, side.drawn);
-    gl.bindVertexArray(null);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.enable(gl.SCISSOR_TEST);
+    const from = Math.round(side.from * width), to = Math.round(side.to * width);
+    gl.scissor(from, 0, to - from, height);
+    gl.bindVertexArray(corners);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * WIDTH, gl.UNSIGNED_SHORT, 0, heightOf(side.drawn));
+    gl.disable(gl.SCISSOR_TEST);
+    gl.disable(gl.BLEND);
   }
 
   return {
     gl,
-    /** New rows for a side; the buffers grow with them. */
-    upload(side, indices) {
-      side.rows ??= gl.createBuffer();
-      gl.bindBuffer(gl.ARRAY_BUFFER, side.rows);
-      gl.bufferData(gl.ARRAY_BUFFER, indices, gl.DYNAMIC_DRAW);
-      if (indices.length > capacity) {
-        capacity = side.model.count;
-        gl.bindBuffer(gl.ARRAY_BUFFER, projected);
-        gl.bufferData(gl.ARRAY_BUFFER, 4 * STRIDE * capacity, gl.DYNAMIC_COPY);
-      }
-      gl.bindBuffer(gl.ARRAY_BUFFER, null);
-      side.drawn = indices.length;
+    /** New rows for a side, `drawn` of them, in whole lines of WIDTH. */
+    upload(side, rows, drawn) {
+      const lines = heightOf(side.model.count);
+      side.order ??= texture(gl, gl.R32UI, WIDTH, lines, gl.RED_INTEGER, gl.UNSIGNED_INT);
+      gl.bindTexture(gl.TEXTURE_2D, side.order);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, heightOf(drawn), gl.RED_INTEGER, gl.UNSIGNED_INT, rows);
+      side.drawn = drawn;
     },
     release(side) {
-      gl.deleteBuffer(side.rows);
-      side.rows = null;
+      gl.deleteTexture(side.order);
+      side.order = null;
     },
     /** Draws the sides, each in its share [from, to] of the picture's width, and shows it. */
     draw(sides, view) {
       resize(view);
-      gl.viewport(0, 0, width, height);
-      gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, picture.target);
       gl.clearColor(0, 0, 0, 0);
       gl.clear(gl.COLOR_BUFFER_BIT);
       for (const side of sides) {
         if (!side.drawn) continue;
-        gl.disable(gl.BLEND);
         project(side, view);
-        gl.enable(gl.BLEND);
-        gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-        gl.enable(gl.SCISSOR_TEST);
-        const from = Math.round(side.from * width), to = Math.round(side.to * width);
-        gl.scissor(from, 0, to - from, height);
         paint(side, view);
-        gl.disable(gl.SCISSOR_TEST);
       }
-      gl.disable(gl.BLEND);
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      gl.viewport(0, 0, width, height);
       gl.useProgram(copy.made);
-      gl.activeTexture(gl.TEXTURE0);
-      gl.bindTexture(gl.TEXTURE_2D, picture);
+      bindTextures(gl, copy.uniforms, { picture: picture.texture });
       gl.bindVertexArray(empty);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
-      gl.bindVertexArray(null);
     },
     /** Resolves with the milliseconds since `began` once the GPU has finished what it was given. */
     finished(began) {

@@ -8,11 +8,11 @@ export function createStage(renderer, canvas, camera) {
   const state = { dial: 1, equation: true, wipe: null, other: "base" };
   const listeners = { frame: () => {}, error: () => {} };
   let main = makeSide(), second = makeSide(), model = null, base = null;
-  let version = 0, drawn = -1, coarse = 1, moved = -Infinity, rest = 0, frame = 0, took = null, timing = false;
+  let version = 0, drawn = -1, coarse = 1, moved = -Infinity, rest = 0, frame = 0, took = null, timing = false, warm = false;
   const waiting = [];
 
   function makeSide() {
-    return { model: null, rows: null, drawn: 0, have: -1, kept: 0, distance: 1, from: 0, to: 1, busy: false };
+    return { model: null, order: null, drawn: 0, have: -1, kept: 0, distance: 1, from: 0, to: 1, busy: false };
   }
 
   /** What each side is to show now. */
@@ -74,6 +74,10 @@ export function createStage(renderer, canvas, camera) {
 
   function timed(ms) {
     timing = false;
+    if (!warm) { // the first frame compiles, and says nothing about the next
+      warm = true;
+      return schedule();
+    }
     took = ms;
     if (ms > SLOW) coarse = Math.max(coarse * 0.8, COARSEST);
     else if (ms < FAST) coarse = Math.min(coarse * 1.1, 1);
@@ -85,11 +89,12 @@ export function createStage(renderer, canvas, camera) {
     if (side.busy || (side.have === present && side.model === of)) return;
     side.busy = true;
     try {
-      const { indices, kept, distance } = await of.order({ view, dial, equation });
-      if (of.gone) return;
-      side.model = of;
-      renderer.upload(side, indices);
-      Object.assign(side, { have: present, kept, distance });
+      await of.order({ view, dial, equation }, ({ rows, drawn: count, kept, distance }) => {
+        if (of.gone) return;
+        if (side.model !== of) renderer.release(side);
+        Object.assign(side, { model: of, have: present, kept, distance });
+        renderer.upload(side, rows, count);
+      });
     } catch (error) {
       listeners.error(error);
       side.have = present; // once is enough

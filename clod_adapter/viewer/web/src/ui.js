@@ -9,39 +9,59 @@ export const elementsOf = (document) =>
 const toDial = (tick, most) => (most > 1 ? most ** (tick / TICKS) : 1);
 const toTick = (dial, most) => (most > 1 ? Math.round((TICKS * Math.log(dial)) / Math.log(most)) : 0);
 
+/** PSNR at a dial value, linear in log s between the calibration's rows; null outside of them. */
+function calibrated(rows, dial) {
+  const next = rows.findIndex((row) => row.virtual_scale >= dial);
+  if (next < 0) return null;
+  if (rows[next].virtual_scale === dial || next === 0) return rows[next].virtual_scale === dial ? rows[next].psnr : null;
+  const [a, b] = [rows[next - 1], rows[next]];
+  const part = Math.log(dial / a.virtual_scale) / Math.log(b.virtual_scale / a.virtual_scale);
+  return a.psnr + part * (b.psnr - a.psnr);
+}
+
 /** `actions`: what the panel asks for; see main.js. */
 export function createUi(elements, stage, actions) {
   const { state } = stage;
   const most = () => stage.model?.max_sv ?? 1;
 
   function show() {
-    const { model } = stage;
-    const dialled = Boolean(model?.attenuation);
+    const { model } = stage, dialled = Boolean(model?.attenuation), kind = comparison();
     for (const control of [elements.dial, elements.target, elements.equation]) control.disabled = !dialled;
+    for (const control of [elements.compare, elements.reset, elements.link, elements.move]) control.disabled = !model;
     elements.noDial.hidden = !model || dialled;
     elements.noDial.textContent = model?.no_dial ?? "";
-    elements.dial.value = toTick(state.dial, most());
-    elements.dial.setAttribute("aria-valuetext", `s = ${state.dial.toFixed(2)}`);
-    elements.dialValue.textContent = dialled ? `s = ${state.dial.toFixed(2)}` : "";
-    elements.dialEnd.textContent = dialled ? `s = ${most()}` : "";
+    slide(elements.dial, elements.dialValue, dialled ? state.dial : null);
     elements.equation.checked = state.equation && dialled;
-    elements.compare.value = state.wipe === null ? "off" : state.other === "base" ? "base" : "dial";
+    elements.compare.value = kind;
     for (const option of elements.compare.options) option.disabled = option.value === "dial" && !dialled;
-    elements.other.hidden = elements.compare.value !== "dial";
-    if (state.other !== "base") elements.other.value = toTick(state.other, most());
+    elements.otherRow.hidden = kind !== "dial";
+    if (kind === "dial") slide(elements.other, elements.otherValue, state.other);
     elements.move.textContent = actions.flying() ? "Fly" : "Orbit";
-    elements.move.setAttribute("aria-pressed", actions.flying());
+    elements.canvas.classList.toggle("flying", actions.flying());
   }
 
+  function slide(slider, output, dial) {
+    slider.value = toTick(dial ?? 1, most());
+    output.textContent = dial === null ? "" : said(dial);
+    slider.setAttribute("aria-valuetext", dial === null ? "none" : said(dial));
+  }
+
+  /** What has changed with the last frame. */
   function frame() {
-    const { total, kept } = stage.counts(), other = stage.otherCounts();
-    elements.counts.textContent = total ? `${integer(kept)} of ${integer(total)} (${share(kept, total)})` : "";
+    const { model } = stage, { total, kept } = stage.counts(), other = stage.otherCounts();
+    elements.counts.textContent = total ? `${integer(kept)} of ${integer(total)} kept (${share(kept, total)})` : "";
     elements.frame.textContent = stage.frameMs === null ? "" : `${stage.frameMs.toFixed(stage.frameMs < 10 ? 1 : 0)} ms a frame`;
+    const psnr = model?.attenuation && state.equation ? calibrated(model.calibration, state.dial) : null;
+    elements.quality.textContent = psnr === null ? "" : `${psnr.toFixed(1)} dB`;
     if (!other) return;
-    elements.wipeLeft.textContent = `${stage.model.attenuation && state.equation ? `s = ${state.dial.toFixed(2)}` : "as stored"} · ${integer(kept)}`;
-    elements.wipeRight.textContent = `${state.other === "base" ? "base" : `s = ${state.other.toFixed(2)}`} · ${integer(other.kept)}`;
+    const left = !model.attenuation ? model.name : state.equation ? said(state.dial) : "equation off";
+    const right = state.other === "base" ? "base" : state.equation ? said(state.other) : "equation off";
+    elements.wipeLeft.textContent = `${left} · ${integer(kept)}`;
+    elements.wipeRight.textContent = `${right} · ${integer(other.kept)}`;
   }
 
+  const comparison = () => (state.wipe === null ? "off" : state.other === "base" ? "base" : "dial");
+  const said = (dial) => `s = ${dial.toFixed(2)}`;
   const share = (kept, total) => `${((100 * kept) / total).toFixed(kept === total ? 0 : 1)} %`;
 
   elements.dial.addEventListener("input", () => actions.setDial(toDial(elements.dial.value, most())));
@@ -64,17 +84,18 @@ export function createUi(elements, stage, actions) {
   });
 
   function fold() {
-    elements.body.hidden = !elements.body.hidden;
-    elements.fold.textContent = elements.body.hidden ? "Show" : "Hide";
-    elements.fold.setAttribute("aria-expanded", !elements.body.hidden);
+    elements.more.hidden = !elements.more.hidden;
+    elements.fold.setAttribute("aria-expanded", !elements.more.hidden);
   }
+  if (window.matchMedia("(max-width: 40rem), (max-height: 30rem)").matches) fold();
 
   const keys = {
     e: () => elements.equation.disabled || actions.setEquation(!state.equation),
-    c: () => actions.compare({ off: "base", base: stage.model?.attenuation ? "dial" : "off", dial: "off" }[elements.compare.value]),
-    v: actions.toggleFlying, l: actions.copyLink, f: actions.fullScreen, h: fold, 0: actions.reset,
+    c: () => actions.compare({ off: "base", base: stage.model?.attenuation ? "dial" : "off", dial: "off" }[comparison()]),
+    v: actions.toggleFlying, l: actions.copyLink, f: actions.fullScreen, m: fold, 0: actions.reset,
     o: () => elements.file.click(), n: () => actions.nextCamera(1), p: () => actions.nextCamera(-1),
     "[": () => nudge(-20), "]": () => nudge(20), "?": () => elements.help.showModal(),
+    h: () => { elements.panel.hidden = !elements.panel.hidden; },
   };
   const nudge = (ticks) => {
     if (stage.model?.attenuation) actions.setDial(toDial(Math.min(Math.max(toTick(state.dial, most()) + ticks, 0), TICKS), most()));
@@ -94,7 +115,7 @@ export function createUi(elements, stage, actions) {
       elements.message.hidden = !text;
       elements.message.firstElementChild.textContent = text ?? "";
     },
-    note(text) { elements.targetNote.textContent = text; },
+    note(text) { elements.note.textContent = text; },
     busy(text) {
       elements.busy.hidden = !text;
       elements.busy.textContent = text ?? "";

@@ -13,7 +13,14 @@ export function blank(count, degree) {
 
 export const SH_C0 = 0.28209479177387814;
 
-export const logit = (a) => Math.log(a) - Math.log1p(-a);
+/** In [-40, 40], as bytes say 0 and 1 exactly. */
+export const logit = (a) => Math.min(Math.max(Math.log(a) - Math.log1p(-a), -40), 40);
+
+/** The unit quaternion of four whose `largest` component is left out of `three`. */
+export function smallestThree(largest, three) {
+  const rest = Math.sqrt(Math.max(0, 1 - three.reduce((sum, value) => sum + value * value, 0)));
+  return [...three.slice(0, largest), rest, ...three.slice(largest)];
+}
 
 /** Without the rows that no picture can use: a value that is not finite, or a rotation of zero (io/ply.py). */
 export function usable(gaussians) {

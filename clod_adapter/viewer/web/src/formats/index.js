@@ -1,7 +1,12 @@
 // Which reader a file needs, by its first bytes, and what the page is told about it.
+import { isCompressed, readCompressed } from "./compressed.js";
 import { usable } from "./gaussians.js";
 import { readHeader, readPly } from "./ply.js";
 import { readCalibration, readSettings } from "./settings.js";
+import { readSog } from "./sog.js";
+import { readSplat } from "./splat.js";
+import { readSpz } from "./spz.js";
+import { unpacked } from "./zip.js";
 
 const NO_SIGMA = "This file has no sigma_d, so the dial has nothing to work with. Adapt it first: clod-adapt";
 
@@ -21,10 +26,14 @@ export async function readFile(buffer, name) {
 }
 
 async function readGaussians(bytes, name) {
+  if (!bytes.length) throw new Error("it is empty; copy or export it again");
   const magic = String.fromCharCode(...bytes.subarray(0, 4));
   if (/^ply[\r\n]/.test(magic)) {
     const header = readHeader(bytes);
-    return readPly(bytes, header);
+    return isCompressed(header) ? readCompressed(bytes, header) : readPly(bytes, header);
   }
-  throw new Error(bytes.length ? "it is no splat that this page reads (.ply)" : "it is empty");
+  if (magic.startsWith("\x1f\x8b")) return readSpz(await unpacked(bytes, "gzip"));
+  if (magic.startsWith("PK")) return readSog(bytes);
+  if (/\.splat$/i.test(name) && bytes.length % 32 === 0) return readSplat(bytes); // which has no mark of its own
+  throw new Error("it is no splat that this page reads (.ply, .compressed.ply, .sog, .spz, .splat)");
 }

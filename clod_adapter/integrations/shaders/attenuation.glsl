@@ -1,0 +1,25 @@
+// What is drawn of a Gaussian's opacity (CLoD-GS, Eq. 2, and its cut); 0 where it is left out.
+//   opacity   activated, in [0, 1]
+//   sigma     the file's sigma_d
+//   distance  |mean - camera| / D, at least 0
+//   scale     the dial s, at least 1
+//   eps, tau  of the file's header
+//   soft      the header's cut: true where it fades to 0, false for the paper's hard one
+// For highp floats; golden.json beside this file has values to test it with.
+float clodOpacity(float opacity, float sigma, float distance, float scale, float eps, float tau, bool soft) {
+  float reach = max(sigma, 0.0);
+  float root = sqrt(eps);
+  float unit = max(reach, root);
+  float x = distance * scale;
+  float faded = opacity;
+  if (x > 0.0) {
+    if (x >= 100.0 * unit) return 0.0;  // exp(-3333) at most; and from here on nothing is divided by 0
+    x /= unit;  // in this unit no square underflows or overflows
+    reach /= unit;
+    root /= unit;
+    faded *= exp(-x * x / (2.0 * reach * reach + root * root));
+  }
+  float threshold = tau * scale;
+  if (!(faded > threshold)) return 0.0;
+  return soft ? faded * min(2.0 * (faded / threshold - 1.0), 1.0) : faded;
+}
