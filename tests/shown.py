@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from clod_adapter.viewer.payload import page_config
 from clod_adapter.viewer.server import Server
 
 SIZE = {"width": 640, "height": 480}
+SECONDS = 10  # until waiting ends
 RESTED = 250  # ms after a movement, while which slow devices draw fewer pixels
 
 
@@ -46,6 +48,16 @@ class Shown:
         return self.page.evaluate(
             f"async (given) => {{ const r = await {script}; await clod.settled(); return r }}", *arguments
         )
+
+    def until(self, condition: str) -> None:
+        """Waits until it holds. Not Playwright's wait_for_function, which the page's policy forbids to evaluate."""
+        script = f"""() => new Promise((resolve, reject) => {{
+            const late = new Error("never " + {json.dumps(condition)});
+            const ended = setTimeout(() => reject(late), {SECONDS}000);
+            const look = () => ({condition}) ? (clearTimeout(ended), resolve()) : setTimeout(look, 20);
+            look();
+        }})"""
+        self.page.evaluate(script)
 
     def text(self, selector: str) -> str:
         return str(self.page.inner_text(selector))

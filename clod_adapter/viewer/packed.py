@@ -32,19 +32,25 @@ class Packed:
     sigma: bytes | None
 
 
-def pack(payload: Payload, tool: SplatTransform, progress: Callable[[float], None] | None = None) -> Packed:
-    """Packs a splat; ``progress`` is called now and then with the seconds that a part of it has taken so far.
+def pack(
+    payload: Payload, tool: SplatTransform, folder: Path, progress: Callable[[float], None] | None = None
+) -> Packed:
+    """Packs a splat.
 
     SOG has no room for sigma_d and puts the rows in Morton order. So they are put in that order first, as a PLY, which
     keeps all columns; of one that is in it already the order stays.
+
+    Args:
+        folder: an absolute one that has room for three PLYs of it, in a folder there that is removed.
+        progress: called now and then with the seconds that a part has taken so far.
 
     Raises:
         ClodError: splat-transform fails, takes too long, or loses Gaussians.
     """
     count = len(payload.gaussians)
     timeout = TIMEOUT + TIMEOUT_EACH * count
-    with TemporaryDirectory() as folder:
-        rows, ordered, sog = (Path(folder) / name for name in ("rows.ply", "ordered.ply", "packed.sog"))
+    with TemporaryDirectory(dir=folder, prefix=".tmp-") as made:
+        rows, ordered, sog = (Path(made) / name for name in ("rows.ply", "ordered.ply", "packed.sog"))
         with open(rows, "wb") as file:
             file.writelines(payload.blocks())
         tool.run(rows, ordered, "-m", timeout=timeout, progress=progress)

@@ -11,7 +11,6 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
-from html import escape
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -59,7 +58,9 @@ def write_page(
     for element, checkpoint in (("clod-model", model), ("clod-base", base)):
         if checkpoint is not None:
             payload = Payload.of(checkpoint)
-            entry, held = _held(element, payload, pack(payload, tool, progress) if tool else None)
+            entry, held = _held(
+                element, payload, pack(payload, tool, Path(path).absolute().parent, progress) if tool else None
+            )
             entries.append(entry)
             data |= held
     config = page_config(entries[0], entries[1] if base else None, cameras, virtual_scale)
@@ -90,7 +91,7 @@ def policy(connect: str = "") -> str:
 
 def _document(config: Mapping[str, Any], data: Iterable[bytes], meta: str) -> Iterator[bytes]:
     """The page in pieces, for data that are large; ``meta`` goes into its head."""
-    rest = _part(PAGE).replace("<title></title>", f"<title>{escape(config['title'])}</title>")
+    rest = _part(PAGE)
     filled: dict[str, Iterable[bytes]] = {
         PLACES[0]: (f"{meta}<style>{_part(STYLE)}</style>".encode(),),
         PLACES[1]: (f'<script type="application/json" id="clod-config">{embedded(config)}</script>'.encode(),),

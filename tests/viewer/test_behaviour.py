@@ -104,10 +104,17 @@ def test_a_dropped_file_is_shown(show: Any, files: Any, gaussians: Gaussians, fo
     written = path.with_name("written.ply")
     PlyData([element], text=form == "ascii", byte_order=">" if form == "big-endian" else "<").write(str(written))
     drop(plain, "other.ply", written.read_bytes())
-    plain.page.wait_for_function("document.title === 'other.ply'")
+    plain.until("document.title === 'other.ply'")
     plain.camera(camera)
     plain.run("clod.setDial(2)")
     assert plain.page.is_enabled("#dial") and np.array_equal(plain.picture(), wanted)
+
+
+def test_a_name_is_text_on_the_page(show: Any, files: Any, gaussians: Gaussians) -> None:
+    name = "<img src=x onerror=clod=1><script>clod=1<!script>&amp;'\".ply"
+    shown = show(files.save(plain_of(gaussians), name))
+    assert shown.text("#title") == name and shown.page.title() == name and name in shown.text("#no-dial")
+    assert shown.page.query_selector("img") is None
 
 
 def test_keys_move_the_dial(show: Any, files: Any, gaussians: Gaussians) -> None:
@@ -130,12 +137,12 @@ def test_keys_move_the_dial(show: Any, files: Any, gaussians: Gaussians) -> None
 
 
 def test_a_count_is_kept_to(show: Any, files: Any, gaussians: Gaussians) -> None:
-    shown, camera = show(files.save(gaussians)), scenes.camera(320, 240)
+    shown, camera = show(files.save(gaussians), viewport={"width": 1000, "height": 760}), scenes.camera(320, 240)
     shown.camera(camera)
     wanted = clod_adapter.dial_for(gaussians, keep=300, cameras=[camera]).virtual_scale
     shown.page.fill("#target", "300")
     shown.page.keyboard.press("Enter")
-    shown.page.wait_for_function("document.getElementById('target-note').textContent !== ''")
+    shown.until("document.getElementById('note').textContent !== ''")
     assert shown.counts()["kept"] == 300
     assert shown.text("#dial-value") == f"s = {wanted:.2f}"
 
@@ -168,7 +175,7 @@ def test_a_link_restores_the_view(show: Any, files: Any, gaussians: Gaussians) -
     shown.page.mouse.move(160, 90, steps=3)
     shown.page.mouse.up()
     shown.page.keyboard.press("l")
-    shown.page.wait_for_function("location.hash !== ''")
+    shown.until("location.hash !== ''")
     again = show(*words, address=shown.page.evaluate("location.hash"))
     assert again.text("#dial-value") == "s = 2.50" and again.counts() == shown.counts()
     assert np.abs(shown.picture().astype(int) - again.picture()).mean() < 0.05  # the link has seven digits
