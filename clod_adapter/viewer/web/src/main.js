@@ -32,7 +32,7 @@ async function start() {
     return;
   }
   const [model, base] = await Promise.all([config.model, config.base].map((entry) => entry && fetchNamed(entry)));
-  show(model, base, config.cameras);
+  show(model, base, config.cameras, config.virtual_scale);
   applyLink(readLink(location.hash));
   window.addEventListener("hashchange", () => applyLink(readLink(location.hash)));
   await stage.settled();
@@ -40,7 +40,7 @@ async function start() {
 
 const fetchNamed = (entry) => fetchModel(entry).catch((error) => { throw new Error(`${entry.name}: ${error.message}`); });
 
-function show(model, base, cameras) {
+function show(model, base, cameras, dial) {
   const { renderer, stage, camera, ui } = viewer;
   const make = ({ gaussians, about }) => createModel(renderer.gl, gaussians, about);
   Object.assign(stage.state, { dial: 1, equation: true, wipe: null, other: "base" });
@@ -49,7 +49,7 @@ function show(model, base, cameras) {
   viewer.cameraNumber = 0;
   camera.fit(stage.model.extent, cameras);
   camera.exact = null;
-  stage.state.dial = clampDial(config.virtual_scale);
+  stage.state.dial = clampDial(dial);
   ui.busy(null);
   ui.note("");
   changed();
@@ -145,7 +145,7 @@ async function load(buffer, name) {
   const { ui, stage } = viewer;
   ui.busy(`Reading ${name}`);
   try {
-    show(await readFile(buffer, name), null, []);
+    show(await readFile(buffer, name), null, [], 1);
     document.title = elements.title.textContent = name;
     ui.say(null);
     await stage.settled();
@@ -188,6 +188,7 @@ window.clod = {
   settled: () => viewer.stage.settled(),
   counts: () => viewer.stage.counts(),
   async capture() {
+    viewer.stage.still();
     await viewer.stage.settled();
     viewer.stage.redraw();
     return elements.canvas.toDataURL("image/png");

@@ -119,7 +119,13 @@ export function createStage(renderer, canvas, camera) {
     counts: () => ({ total: model?.count ?? 0, kept: main.kept, drawn: main.drawn }),
     otherCounts: () => (state.wipe === null ? null : { total: second.model?.count ?? 0, kept: second.kept }),
     settled: () => (drawn === version || !model ? Promise.resolve() : new Promise((resolve) => { waiting.push(resolve); schedule(); })),
-    /** The picture as a PNG data URL: drawn and read in one go, as the canvas keeps nothing between frames. */
+    /** As when nothing moves: at full resolution. */
+    still() {
+      if (performance.now() - moved >= REST) return;
+      moved = -Infinity;
+      change();
+    },
+    /** Once more, to be read at once: the canvas keeps nothing between frames. */
     redraw() {
       renderer.draw(sides().map(({ side }) => side), camera.view(...size()));
     },

@@ -87,7 +87,7 @@ export function createUi(elements, stage, actions) {
     elements.more.hidden = !elements.more.hidden;
     elements.fold.setAttribute("aria-expanded", !elements.more.hidden);
   }
-  if (window.matchMedia("(max-width: 40rem), (max-height: 30rem)").matches) fold();
+  if (window.matchMedia("(max-width: 34rem), (max-height: 28rem)").matches) fold();
 
   const keys = {
     e: () => elements.equation.disabled || actions.setEquation(!state.equation),
@@ -115,7 +115,7 @@ export function createUi(elements, stage, actions) {
       elements.message.hidden = !text;
       elements.message.firstElementChild.textContent = text ?? "";
     },
-    note(text) { elements.note.textContent = text; },
+    note(text) { elements.targetNote.textContent = text; },
     busy(text) {
       elements.busy.hidden = !text;
       elements.busy.textContent = text ?? "";

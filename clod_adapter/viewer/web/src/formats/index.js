@@ -8,18 +8,18 @@ import { readSplat } from "./splat.js";
 import { readSpz } from "./spz.js";
 import { unpacked } from "./zip.js";
 
-const NO_SIGMA = "This file has no sigma_d, so the dial has nothing to work with. Adapt it first: clod-adapt";
+const noDial = (name) => `${name} has no sigma_d, so there is no dial to turn; give it one: clod-adapt ${name} --images SCENE`;
 
 /** {gaussians, about}: what a dropped file holds, and its settings as the page's configuration would give them. */
 export async function readFile(buffer, name) {
   const gaussians = usable(await readGaussians(new Uint8Array(buffer), name));
   const dialled = gaussians.sigma !== null;
-  const settings = dialled ? readSettings(gaussians.comments) : null;
+  const settings = dialled ? gaussians.settings ?? readSettings(gaussians.comments) : null;
   return {
     gaussians,
     about: {
       name, attenuation: settings, max_sv: settings?.max_sv ?? 1, notes: gaussians.notes,
-      no_dial: dialled ? null : `${NO_SIGMA} ${name}`,
+      no_dial: dialled ? null : noDial(name),
       calibration: readCalibration(gaussians.comments, gaussians.count),
     },
   };
@@ -33,6 +33,7 @@ async function readGaussians(bytes, name) {
     return isCompressed(header) ? readCompressed(bytes, header) : readPly(bytes, header);
   }
   if (magic.startsWith("\x1f\x8b")) return readSpz(await unpacked(bytes, "gzip"));
+  if (magic === "NGSP") throw new Error("it is .spz of version 4, which this page does not read; write version 3, or a .ply");
   if (magic.startsWith("PK")) return readSog(bytes);
   if (/\.splat$/i.test(name) && bytes.length % 32 === 0) return readSplat(bytes); // which has no mark of its own
   throw new Error("it is no splat that this page reads (.ply, .compressed.ply, .sog, .spz, .splat)");
