@@ -1,6 +1,7 @@
 // Pointer, wheel, touch and keys on the canvas: orbit or fly.
 
 const TURN = 0.005; // radians a pixel
+const TAP = 1 / 30; // seconds that the shortest press counts for
 const KEYS = { // right, down, forward
   w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], pageup: [0, -1, 0], pagedown: [0, 1, 0],
 };
@@ -47,8 +48,13 @@ export function createControls(canvas, camera, moved) {
 
   function step(time) {
     if (!held.size) return;
-    const seconds = Math.min((time - last) / 1000, 0.1);
+    act(Math.min((time - last) / 1000, 0.1));
     last = time;
+    requestAnimationFrame(step);
+  }
+
+  /** What the held keys do in so many seconds. */
+  function act(seconds) {
     const speed = camera.reach * seconds * (fast ? 3 : 0.8);
     for (const key of held) {
       if (KEYS[key]) camera.move(...KEYS[key].map((k) => k * speed));
@@ -57,7 +63,6 @@ export function createControls(canvas, camera, moved) {
       else turn(...ARROWS[key].map((k) => (mode.flying ? 1 : -1) * k * 260 * seconds));
     }
     moved();
-    requestAnimationFrame(step);
   }
 
   canvas.addEventListener("pointerdown", (event) => {
@@ -73,18 +78,20 @@ export function createControls(canvas, camera, moved) {
     nearer(Math.exp(Math.max(-60, Math.min(60, event.deltaY * (event.deltaMode ? 20 : 1))) * 0.002));
     moved();
   }, { passive: false });
-  canvas.addEventListener("keydown", (event) => {
-    const key = event.key.toLowerCase();
-    if (event.ctrlKey || event.metaKey || event.altKey || !(KEYS[key] || ARROWS[key] || "+=-".includes(key))) return;
+  document.addEventListener("keydown", (event) => {
+    const key = event.key.toLowerCase(), ours = KEYS[key] || ARROWS[key] || ["+", "=", "-"].includes(key);
+    if (!ours || ![canvas, document.body].includes(event.target) || event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();
     fast = event.shiftKey;
+    if (held.has(key)) return;
     if (!held.size) {
       last = performance.now();
       requestAnimationFrame(step);
     }
     held.add(key);
+    act(TAP);
   });
-  canvas.addEventListener("keyup", (event) => held.delete(event.key.toLowerCase()));
-  for (const [target, kind] of [[canvas, "blur"], [window, "blur"]]) target.addEventListener(kind, () => held.clear());
+  document.addEventListener("keyup", (event) => held.delete(event.key.toLowerCase()));
+  for (const target of [canvas, window]) target.addEventListener("blur", () => held.clear());
   return mode;
 }

@@ -26,11 +26,8 @@ async function start() {
   elements.canvas.addEventListener("webglcontextlost", () => viewer.ui.say("The graphics device went away; reload the page."));
   listenForFiles();
   document.title = elements.title.textContent = config.title || "clod-adapter";
-  if (!config.model) {
-    viewer.ui.busy("Drop a splat here, or open one");
-    viewer.ui.show();
-    return;
-  }
+  viewer.ui.show();
+  if (!config.model) return viewer.ui.busy("Drop a splat here, or open one");
   const [model, base] = await Promise.all([config.model, config.base].map((entry) => entry && fetchNamed(entry)));
   show(model, base, config.cameras, config.virtual_scale);
   applyLink(readLink(location.hash));
@@ -43,8 +40,9 @@ const fetchNamed = (entry) => fetchModel(entry).catch((error) => { throw new Err
 function show(model, base, cameras, dial) {
   const { renderer, stage, camera, ui } = viewer;
   const make = ({ gaussians, about }) => createModel(renderer.gl, gaussians, about);
+  const [made, madeBase] = [make(model), base && make(base)];
   Object.assign(stage.state, { dial: 1, equation: true, wipe: null, other: "base" });
-  stage.show(make(model), base && make(base));
+  stage.show(made, madeBase);
   viewer.cameras = cameras;
   viewer.cameraNumber = 0;
   camera.fit(stage.model.extent, cameras);

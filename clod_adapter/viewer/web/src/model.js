@@ -8,16 +8,9 @@ const SH_C0 = 0.28209479177387814;
 
 /** `about`: name, attenuation or null, no_dial, max_sv, calibration. `gaussians`: as the readers in formats/ make them. */
 export function createModel(gl, gaussians, about) {
-  const { count, degree } = gaussians;
-  const worker = startWorker();
-  const records = dataTexture(gl, 4 * count, Float32Array, (target) => fillRecords(target, gaussians));
-  const texels = BAND_TEXELS[degree];
-  const higher = dataTexture(gl, texels * count, Uint32Array, (target) => fillBands(target, gaussians, texels));
-  const { means, opacityLogits } = gaussians;
-  const attenuation = gaussians.sigma ? about.attenuation : null;
-  const sigma = attenuation ? gaussians.sigma : null;
-  const extent = extentOf(means);
-  worker.ask("model", { means, opacityLogits, sigma, attenuation }, [means.buffer]);
+  const { count, degree, means, opacityLogits } = gaussians, { records, higher } = upload(gl, gaussians);
+  const attenuation = gaussians.sigma ? about.attenuation : null, extent = extentOf(means), worker = startWorker();
+  worker.ask("model", { means, opacityLogits, sigma: attenuation && gaussians.sigma, attenuation }, [means.buffer]);
   const spare = []; // buffers for orders, which go to the worker and back
   return {
     ...about, attenuation, count, degree, records, higher, extent,
@@ -34,6 +27,15 @@ export function createModel(gl, gaussians, about) {
       gl.deleteTexture(records);
       gl.deleteTexture(higher);
     },
+  };
+}
+
+/** Apart, so that nothing that lives on holds the values after they are on the GPU. */
+function upload(gl, gaussians) {
+  const texels = BAND_TEXELS[gaussians.degree];
+  return {
+    records: dataTexture(gl, 4 * gaussians.count, Float32Array, (target) => fillRecords(target, gaussians)),
+    higher: dataTexture(gl, texels * gaussians.count, Uint32Array, (target) => fillBands(target, gaussians, texels)),
   };
 }
 

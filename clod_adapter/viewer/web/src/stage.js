@@ -8,7 +8,7 @@ export function createStage(renderer, canvas, camera) {
   const state = { dial: 1, equation: true, wipe: null, other: "base" };
   const listeners = { frame: () => {}, error: () => {} };
   let main = makeSide(), second = makeSide(), model = null, base = null;
-  let version = 0, drawn = -1, coarse = 1, moved = -Infinity, rest = 0, frame = 0, took = null, timing = false, warm = false;
+  let version = 0, drawn = -1, coarse = 1, moved = -Infinity, rest = 0, frame = 0, took = null, timing = false, warm = false, fresh = false;
   const waiting = [];
 
   function makeSide() {
@@ -42,7 +42,8 @@ export function createStage(renderer, canvas, camera) {
     schedule();
   }
 
-  function schedule() {
+  function schedule(sorted = false) {
+    fresh ||= sorted;
     frame ||= requestAnimationFrame(draw);
   }
 
@@ -52,6 +53,10 @@ export function createStage(renderer, canvas, camera) {
     const present = version, view = camera.view(...size()), shown = sides();
     for (const wanted of shown) ask(wanted, view, present);
     if (shown.some(({ side, model: of }) => side.have < 0 || side.model !== of)) return; // not sorted once yet
+    // At rest the sorted frame follows at once, and is enough; while it moves, an old order is better than none.
+    const complete = shown.every(({ side }) => side.have === present);
+    if (!complete && !fresh && performance.now() - moved > REST) return;
+    fresh = false;
     shown.forEach(({ side, dial, equation, model: of }, k) => {
       side.dial = dial;
       side.dialled = equation && of.attenuation !== null;
@@ -60,7 +65,6 @@ export function createStage(renderer, canvas, camera) {
     });
     const began = performance.now();
     renderer.draw(shown.map(({ side }) => side), view);
-    const complete = shown.every(({ side }) => side.have === present);
     if (!timing) {
       timing = true;
       renderer.finished(began).then(timed);
@@ -100,7 +104,7 @@ export function createStage(renderer, canvas, camera) {
       side.have = present; // once is enough
     }
     side.busy = false;
-    schedule();
+    schedule(true);
   }
 
   return {

@@ -27,7 +27,9 @@ export function createUi(elements, stage, actions) {
   function show() {
     const { model } = stage, dialled = Boolean(model?.attenuation), kind = comparison();
     for (const control of [elements.dial, elements.target, elements.equation]) control.disabled = !dialled;
-    for (const control of [elements.compare, elements.reset, elements.link, elements.move]) control.disabled = !model;
+    for (const control of [elements.reset, elements.link, elements.move]) control.disabled = !model;
+    elements.compare.disabled = !dialled && !stage.base;
+    elements.compare.options[1].textContent = stage.base ? "with the base" : "without the equation";
     elements.noDial.hidden = !model || dialled;
     elements.noDial.textContent = model?.no_dial ?? "";
     slide(elements.dial, elements.dialValue, dialled ? state.dial : null);
@@ -55,12 +57,12 @@ export function createUi(elements, stage, actions) {
     elements.quality.textContent = psnr === null ? "" : `${psnr.toFixed(1)} dB`;
     if (!other) return;
     const left = !model.attenuation ? model.name : state.equation ? said(state.dial) : "equation off";
-    const right = state.other === "base" ? "base" : state.equation ? said(state.other) : "equation off";
+    const right = state.other === "base" ? (stage.base ? "base" : "equation off") : state.equation ? said(state.other) : "equation off";
     elements.wipeLeft.textContent = `${left} · ${integer(kept)}`;
     elements.wipeRight.textContent = `${right} · ${integer(other.kept)}`;
   }
 
-  const comparison = () => (state.wipe === null ? "off" : state.other === "base" ? "base" : "dial");
+  const comparison = () => (state.wipe === null ? "off" : state.other === "base" ? (stage.base ? "base" : "equation off") : "dial");
   const said = (dial) => `s = ${dial.toFixed(2)}`;
   const share = (kept, total) => `${((100 * kept) / total).toFixed(kept === total ? 0 : 1)} %`;
 
@@ -91,7 +93,7 @@ export function createUi(elements, stage, actions) {
 
   const keys = {
     e: () => elements.equation.disabled || actions.setEquation(!state.equation),
-    c: () => actions.compare({ off: "base", base: stage.model?.attenuation ? "dial" : "off", dial: "off" }[comparison()]),
+    c: () => elements.compare.disabled || actions.compare({ off: "base", base: stage.model?.attenuation ? "dial" : "off", dial: "off" }[comparison()]),
     v: actions.toggleFlying, l: actions.copyLink, f: actions.fullScreen, m: fold, 0: actions.reset,
     o: () => elements.file.click(), n: () => actions.nextCamera(1), p: () => actions.nextCamera(-1),
     "[": () => nudge(-20), "]": () => nudge(20), "?": () => elements.help.showModal(),
