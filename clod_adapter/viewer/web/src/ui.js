@@ -62,7 +62,7 @@ export function createUi(elements, stage, actions) {
     elements.wipeRight.textContent = `${right} · ${integer(other.kept)}`;
   }
 
-  const comparison = () => (state.wipe === null ? "off" : state.other === "base" ? (stage.base ? "base" : "equation off") : "dial");
+  const comparison = () => (state.wipe === null ? "off" : state.other === "base" ? "base" : "dial");
   const said = (dial) => `s = ${dial.toFixed(2)}`;
   const share = (kept, total) => `${((100 * kept) / total).toFixed(kept === total ? 0 : 1)} %`;
 
