@@ -10,6 +10,7 @@ from pathlib import Path
 
 from clod_adapter.cli.checks_export import check_export
 from clod_adapter.cli.checks_inspect import check_inspect
+from clod_adapter.cli.checks_view import check_view
 from clod_adapter.cli.dials import given_budget
 from clod_adapter.cli.files import Outputs, check_output, check_ply_name, labels
 from clod_adapter.cli.settings import make_config, make_configs
@@ -163,4 +164,5 @@ CHECKS: dict[str, Callable[[Namespace], None]] = {
     "robustness": check_robustness,
     "inspect": check_inspect,
     "demo": lambda args: None,
+    "view": check_view,
 }

@@ -15,6 +15,7 @@ from typing import Any
 from clod_adapter.cli.commands import ADAPT, APPLY, DEMO, EVALUATE, RENDER, ROBUSTNESS, Command
 from clod_adapter.cli.help_export import EXPORT
 from clod_adapter.cli.help_inspect import INSPECT
+from clod_adapter.cli.help_view import VIEW
 from clod_adapter.cli.interrupts import sigterm_as_interrupt
 from clod_adapter.cli.parser import Parser, make_parser
 from clod_adapter.errors import ClodError
@@ -24,8 +25,8 @@ PROG = "clod-adapt"
 
 # Adapting is the main job and needs no word.
 COMMANDS: dict[str, Command] = {
-    "inspect": INSPECT, "eval": EVALUATE, "render": RENDER, "export": EXPORT, "apply": APPLY, "robustness": ROBUSTNESS,
-    "demo": DEMO,
+    "view": VIEW, "inspect": INSPECT, "eval": EVALUATE, "render": RENDER, "export": EXPORT, "apply": APPLY,
+    "robustness": ROBUSTNESS, "demo": DEMO,
 }  # fmt: skip
 
 
@@ -58,7 +59,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def run(command: Command, args: argparse.Namespace) -> None:
-    """Runs a command and prints its report where --json asks for it."""
+    """Runs a command and prints its report where --json asks for it; a command without one has printed its own."""
     from clod_adapter.cli.checks import CHECKS  # here and not above, as --help needs nothing of what it imports
     from clod_adapter.cli.report import jsonable
 
@@ -67,7 +68,7 @@ def run(command: Command, args: argparse.Namespace) -> None:
     aside = io.StringIO() if args.quiet else sys.stderr
     with redirect_stdout(aside) if args.json else nullcontext(), sigterm_as_interrupt():
         report = module.run(args)
-    if args.json:
+    if args.json and report is not None:
         print(json.dumps(jsonable(report), allow_nan=False))
 
 

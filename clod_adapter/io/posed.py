@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,12 @@ class PosedImage:
     def is_pinhole(self) -> bool:
         """Whether straight lines are straight in it: no distortion, or only coefficients of 0."""
         return self.camera.is_perspective_pinhole() and self.camera.is_undistorted()
+
+    def relative_to(self, origin: Sequence[float]) -> PosedImage:
+        """In a world that begins at ``origin [3]``; in float64, as far from 0 float32 has no digits left."""
+        viewmat = self.viewmat.copy()
+        viewmat[:3, 3] += viewmat[:3, :3] @ np.asarray(origin, np.float64)
+        return replace(self, viewmat=viewmat)
 
 
 def check_posed(image: PosedImage, source: Path) -> PosedImage:

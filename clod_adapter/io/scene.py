@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -79,18 +78,11 @@ def load_scene(
     held_out = _held_out(images, test_every)
     if not any(image.name not in held_out for image, _ in present):
         raise ClodError(f"{folder}: has no photograph to train on, as all that are there are held out; add more")
-    present = [(_relative(image, np.asarray(origin, np.float64)), path) for image, path in present]
+    present = [(image.relative_to(origin), path) for image, path in present]
     views, more = _load(present, folder, max_width, progress)
     train = tuple(view for view in views if view.camera.name not in held_out)
     test = tuple(view for view in views if view.camera.name in held_out)
     return in_its_unit(Scene(train, test, (*notes, *more)))
-
-
-def _relative(image: PosedImage, origin: np.ndarray) -> PosedImage:
-    """The image in a world that begins at ``origin``; in float64, as far from 0 float32 has no digits left."""
-    viewmat = image.viewmat.copy()
-    viewmat[:3, 3] += viewmat[:3, :3] @ origin
-    return replace(image, viewmat=viewmat)
 
 
 def _held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:

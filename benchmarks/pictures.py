@@ -1,0 +1,87 @@
+"""The pictures of the viewer and of a report for README, of the demo's scene, by a headless Chromium.
+
+    clod-adapt demo                  # makes demo/base.ply, demo/gallery.ply and demo/capture
+    python benchmarks/pictures.py    # docs/images/viewer.webp and docs/images/report.webp
+
+The viewer: a held-out view with the wipe between the dial's end and the checkpoint; without the time of a frame, which
+is that of WebGL in software here. The report: the top of the page that ``clod-adapt eval --report`` writes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from common import ROOT
+from PIL import Image
+
+import clod_adapter as clod
+from clod_adapter.io.atomic import atomic_path
+
+sys.path.insert(0, str(ROOT / "tests"))
+import browser  # noqa: E402
+from shown import RESTED, Shown, serve  # noqa: E402
+
+IMAGES = ROOT / "docs" / "images"
+SIZE, TALL = {"width": 1280, "height": 800}, {"width": 1100, "height": 1300}
+LARGEST = 300_000  # bytes
+VIEW = 0  # the held-out view across the whole room
+DIAL = 5.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("demo", nargs="?", default="demo", help="the folder of clod-adapt demo (default: demo)")
+    folder = Path(parser.parse_args().demo)
+    with browser.launch() as chromium:
+        for name, picture in (("viewer", viewer(chromium, folder)), ("report", report(chromium, folder))):
+            keep(IMAGES / f"{name}.webp", picture)
+
+
+def viewer(chromium: Any, folder: Path) -> bytes:
+    """The page in dark."""
+    camera = clod.load_scene(folder / "capture").test[VIEW].camera
+    words = [folder / "gallery.ply", "--base", folder / "base.ply", "--images", folder / "capture", "--sv", DIAL]
+    with serve(*words) as url, chromium.new_context(viewport=SIZE, color_scheme="dark") as context:
+        shown = Shown(context.new_page()).ready(url)
+        cameras = shown.run("JSON.parse(document.getElementById('clod-config').textContent).cameras.map((c) => c.name)")
+        for _ in range(cameras.index(camera.name)):  # as a user goes to it, so that the view fills the window
+            shown.page.keyboard.press("n")
+        shown.run("clod.setWipe(0.55, 'base')")
+        shown.page.evaluate("document.getElementById('frame').style.visibility = 'hidden'")
+        shown.page.wait_for_timeout(RESTED)
+        shown.run("clod.settled()")
+        return bytes(shown.page.screenshot(timeout=120_000))
+
+
+def report(chromium: Any, folder: Path) -> bytes:
+    """The top of an evaluation's page in light."""
+    with tempfile.TemporaryDirectory() as made, chromium.new_context(viewport=TALL, color_scheme="light") as context:
+        out = Path(made) / "gallery.html"
+        words = ["eval", "gallery.ply", "--images", "capture", "--base", "base.ply", "--report", str(out), "--quiet"]
+        command = [sys.executable, "-m", "clod_adapter.cli.main", *words]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder)  # names without a folder on the page
+        page = context.new_page()
+        page.goto(out.as_uri())
+        return bytes(page.screenshot())
+
+
+def keep(path: Path, picture: bytes) -> None:
+    """Writes a screenshot as WebP, as sharp as fits."""
+    for quality in (90, 80, 70, 60):
+        file = io.BytesIO()
+        Image.open(io.BytesIO(picture)).convert("RGB").save(file, "WEBP", quality=quality, method=6)
+        if len(file.getvalue()) <= LARGEST:
+            break
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(file.getvalue())
+    print(f"wrote {path}: {len(file.getvalue()) / 1e3:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""What ``clod-adapt view --help`` says, and its options."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser
+
+from clod_adapter.cli.commands import Command
+from clod_adapter.cli.options import _add_activated
+
+
+def view_options(parser: ArgumentParser) -> None:
+    parser.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one: then without a dial")
+    parser.add_argument("--base", metavar="BASE.ply", help="the unadapted checkpoint, or another file, to wipe against")
+    parser.add_argument("--images", metavar="DIR", help="the scene: a COLMAP model or transforms.json, for its cameras")
+    parser.add_argument("--sv", metavar="S", type=float, default=1.0, help="the dial when the page opens (default: 1)")
+    parser.add_argument("--port", metavar="P", type=int, default=0, help="where to listen (default: a free port)")
+    parser.add_argument("--no-browser", action="store_true", help="print the address, and open nothing")
+    _add_activated(parser)
+    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
+
+
+VIEW = Command(
+    module="view",
+    summary="Look at a file in the browser, and turn its dial.",
+    description="""\
+Look at a file in the browser, turn its dial, and move through the scene.
+
+Serves a page on this machine's loopback address, prints the address, opens it
+in the browser, and stays until Ctrl-C.
+""",
+    usage="MODEL.ply [--base BASE.ply] [--images DIR] [options]",
+    epilog="""\
+The page shows how many Gaussians the dial leaves in and what a frame takes,
+switches the equation off and on, and puts two dial values, or the file and its
+--base, on both sides of a line that is dragged. Another file can be dropped on
+it. The address in the browser holds the view: who has the page open at the same
+port sees the same.
+
+--images is for the cameras only, which the page then jumps between; photographs
+need not be there. Without it the page looks at the middle of the scene.
+
+Nobody else can reach the page: it listens on 127.0.0.1, and nothing is fetched
+from elsewhere or sent. From another machine, forward the port:
+  ssh -L 8000:127.0.0.1:8000 HOST clod-adapt view MODEL.ply --port 8000
+To send what you see to somebody, write it as a file:
+  clod-adapt export MODEL.ply -o page.html
+
+--json prints its object at once, as the command stays: {"url": ..., ...}.
+
+exit codes: 0 ended by Ctrl-C or SIGTERM; 2 bad input, or the port is taken
+
+examples:
+  clod-adapt view garden_clod.ply
+  clod-adapt view garden_clod.ply --base garden.ply --images garden --sv 3
+  clod-adapt view garden.ply --no-browser --port 8000
+""",
+    add_arguments=view_options,
+)

@@ -1,0 +1,67 @@
+"""``clod-adapt view``: the page that shows a file and turns its dial, on loopback until Ctrl-C."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import webbrowser
+from typing import Any
+
+from clod_adapter.cameras import Camera
+from clod_adapter.cli.console import Console
+from clod_adapter.cli.inputs import read_checkpoint
+from clod_adapter.io.poses import load_cameras
+from clod_adapter.io.version import package_version
+from clod_adapter.viewer.page import policy, served_page
+from clod_adapter.viewer.payload import Payload, page_config
+from clod_adapter.viewer.server import Answer, Server
+
+MODEL, BASE = "/files/model", "/files/base"
+
+
+def run(args: argparse.Namespace) -> None:
+    """Serves until it is interrupted; prints the address, or with --json the object, before that."""
+    console = Console(args.quiet)
+    answers, report = prepare(args, console)
+    with Server(answers, args.port) as server:
+        report |= {"url": server.url, "port": server.port}
+        # Not after the command, as main prints other reports: a script needs the address while it is served.
+        shown = json.dumps(report) if args.json else f"{server.url}  (Ctrl-C ends)"
+        print(shown, file=sys.__stdout__ if args.json else None, flush=True)
+        if not args.no_browser and not open_browser(server.url):
+            console.say(f"no browser to open here; open {server.url} in one, through ssh -L from another machine")
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            console.say("ended")
+
+
+def prepare(args: argparse.Namespace, console: Console) -> tuple[dict[str, Answer], dict[str, Any]]:
+    """What is served, by path, and what is reported of it."""
+    model = read_checkpoint(args.model, console, args.activated)
+    base = read_checkpoint(args.base, console, args.activated, model.origin) if args.base else None
+    cameras, notes = load_cameras(args.images, model.origin) if args.images else (list[Camera](), list[str]())
+    for note in notes:
+        console.say(f"  note: {note}")
+    payloads = {MODEL: Payload.of(model)} | ({BASE: Payload.of(base)} if base else {})
+    entries = [payload.describe(href=path) for path, payload in payloads.items()]
+    page = served_page(page_config(entries[0], entries[1] if base else None, cameras, args.sv))
+    answers = {"/": Answer("text/html; charset=utf-8", len(page), lambda: (page,), policy("'self'"))}
+    for path, payload in payloads.items():
+        answers[path] = Answer("application/octet-stream", payload.size, payload.blocks)
+    return answers, {
+        "command": "view", "version": package_version(), "model": args.model, "base": args.base, "scene": args.images,
+        "base_count": len(model.gaussians), "cameras": len(cameras), "notes": [*model.notes, *notes],
+    }  # fmt: skip
+
+
+def open_browser(url: str) -> bool:
+    """Whether a browser was opened in a window of its own; one that runs in the terminal is none."""
+    try:
+        browser = webbrowser.get()
+    except webbrowser.Error:
+        return False
+    if type(browser) is webbrowser.GenericBrowser:  # lynx, w3m and the like, which would take over the terminal
+        return False
+    return browser.open(url)

@@ -1,0 +1,43 @@
+"""The cameras of a scene without its photographs, which nobody has to have or to decode."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from clod_adapter.cameras import Camera, camera_extent, near_plane
+from clod_adapter.io.colmap_model import read_model
+from clod_adapter.io.origin import NOWHERE
+from clod_adapter.io.scene_folder import find_cameras
+from clod_adapter.io.transforms import read_transforms
+
+
+def load_cameras(folder: str | Path, origin: Sequence[float] = NOWHERE) -> tuple[list[Camera], list[str]]:
+    """The cameras that ``scene.load_scene`` would give photographs to, sorted by name, and notes.
+
+    A distorted one is the pinhole of the same focal length and centre, not that of its undistorted photograph. Of a
+    transforms.json that says no size, cameras whose photograph is missing too are left out.
+
+    Args:
+        folder: the scene's, usually the one with ``sparse/0/`` or ``transforms.json``.
+        origin: ``[3]`` what the world is to be relative to, in its units: ``Checkpoint.origin``.
+
+    Raises:
+        ClodError: no cameras there, or none that is usable.
+    """
+    source = find_cameras(Path(folder))
+    images, notes = (read_transforms if source.is_file() else read_model)(source)
+    cameras = []
+    for image in images:
+        pinhole = image.camera
+        if min(pinhole.width, pinhole.height) > 1:
+            viewmat = torch.from_numpy(image.relative_to(origin).viewmat).float()
+            K = torch.from_numpy(pinhole.calibration_matrix()).float()
+            cameras.append(Camera(viewmat, K, pinhole.width, pinhole.height, image.name))
+    if unsized := len(images) - len(cameras):
+        notes.append(f"{unsized} of {len(images)} cameras left out: neither {source.name} nor a photograph has a size")
+    extent = camera_extent(cameras) if cameras else 0.0
+    return [replace(camera, near=near_plane(extent)) if extent else camera for camera in cameras], notes

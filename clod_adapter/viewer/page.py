@@ -1,0 +1,137 @@
+"""The viewer's page: the built parts put together, for the server or as one file that holds its splats too.
+
+The page asks for nothing from elsewhere, and may not: its policy names, by their hashes, the one script and the one
+style that a browser is to run of it, and no address that it could reach but that of the server that gave it.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from clod_adapter.cameras import Camera
+from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.ply import Checkpoint
+from clod_adapter.io.splat_transform import SplatTransform
+from clod_adapter.viewer.packed import Packed, pack
+from clod_adapter.viewer.payload import Payload, page_config
+
+PAGE, STYLE, SCRIPT = "page.html", "viewer.css", "viewer.js"
+PLACES = ("<!--CLOD-STYLE-->", "<!--CLOD-CONFIG-->", "<!--CLOD-DATA-->", "<!--CLOD-SCRIPT-->")  # in this order
+
+
+def served_page(config: Mapping[str, Any]) -> bytes:
+    """The page that fetches its splats from the server it came from."""
+    return b"".join(_document(config, (), ""))
+
+
+def write_page(
+    path: str | Path,
+    model: Checkpoint,
+    *,
+    base: Checkpoint | None = None,
+    cameras: Sequence[Camera] = (),
+    virtual_scale: float = 1.0,
+    tool: SplatTransform | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> None:
+    """Writes the page as one file that holds all it shows, to open from a disk, without a network.
+
+    Args:
+        model: with or without a dial.
+        base: to be shown beside it; relative to the same origin.
+        cameras: to jump between, in the world of the Gaussians (relative to the origin).
+        virtual_scale: the dial when the page opens, >= 1.
+        tool: packs the splats to a fifth of their size, with values rounded (``packed.pack``, as ``progress``);
+            without it they are in the page as they are.
+
+    Raises:
+        ClodError: the file cannot be written, or they cannot be packed.
+    """
+    entries, data = list[dict[str, Any]](), dict[str, Iterable[bytes]]()
+    for element, checkpoint in (("clod-model", model), ("clod-base", base)):
+        if checkpoint is not None:
+            payload = Payload.of(checkpoint)
+            entry, held = _held(
+                element, payload, pack(payload, tool, Path(path).absolute().parent, progress) if tool else None
+            )
+            entries.append(entry)
+            data |= held
+    config = page_config(entries[0], entries[1] if base else None, cameras, virtual_scale)
+    meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.writelines(_document(config, _elements(data), meta))
+
+
+def _held(element: str, payload: Payload, packed: Packed | None) -> tuple[dict[str, Any], dict[str, Iterable[bytes]]]:
+    """A splat's entry of the configuration, and the bytes that the page holds of it, by the id of their element."""
+    if packed is None:
+        return payload.describe(element=element), {element: payload.blocks()}
+    if packed.sigma is None:
+        return payload.describe(element=element, format="sog"), {element: (packed.sog,)}
+    beside = f"{element}-sigma"
+    entry = payload.describe(element=element, format="sog", sigma={"element": beside, "gzip": True})
+    return entry, {element: (packed.sog,), beside: (packed.sigma,)}
+
+
+def policy(connect: str = "") -> str:
+    """The page's Content-Security-Policy; ``connect`` says where it may fetch from besides what is in it."""
+    script, style = (f"'sha256-{_digest(_part(name))}'" for name in (SCRIPT, STYLE))
+    return (
+        f"default-src 'none'; script-src {script}; style-src {style}; img-src data: blob:; "
+        f"connect-src {connect} data: blob:; worker-src blob:; base-uri 'none'; form-action 'none'"
+    )
+
+
+def _document(config: Mapping[str, Any], data: Iterable[bytes], meta: str) -> Iterator[bytes]:
+    """The page in pieces, for data that are large; ``meta`` goes into its head."""
+    rest = _part(PAGE)
+    filled: dict[str, Iterable[bytes]] = {
+        PLACES[0]: (f"{meta}<style>{_part(STYLE)}</style>".encode(),),
+        PLACES[1]: (f'<script type="application/json" id="clod-config">{embedded(config)}</script>'.encode(),),
+        PLACES[2]: data,
+        PLACES[3]: (f'<script type="module">{_part(SCRIPT)}</script>'.encode(),),
+    }
+    for place, pieces in filled.items():
+        before, _, rest = rest.partition(place)
+        yield before.encode()
+        yield from pieces
+    yield rest.encode()
+
+
+def embedded(value: Any) -> str:
+    """JSON that no name in it can end the script element of: with a < it would have to begin."""
+    return json.dumps(value, allow_nan=False, ensure_ascii=False).replace("<", "\\u003c")
+
+
+def _elements(data: Mapping[str, Iterable[bytes]]) -> Iterator[bytes]:
+    """A script element for each, by its id, that holds the bytes as base64."""
+    for element, blocks in data.items():
+        yield f'<script type="application/octet-stream" id="{element}">'.encode()
+        yield from _base64(blocks)
+        yield b"</script>\n"
+
+
+def _base64(blocks: Iterable[bytes]) -> Iterator[bytes]:
+    left = b""
+    for block in blocks:
+        left += block
+        whole = len(left) - len(left) % 3  # what is encoded without padding
+        yield base64.b64encode(left[:whole])
+        left = left[whole:]
+    yield base64.b64encode(left)
+
+
+@cache
+def _part(name: str) -> str:
+    return (files("clod_adapter.viewer") / "static" / name).read_text(encoding="utf-8")
+
+
+def _digest(text: str) -> str:
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")

@@ -1,0 +1,129 @@
+"""What the viewer's page is given of a checkpoint: its Gaussians as one plain kind of PLY, and in JSON what it is.
+
+Whatever file the Gaussians came from (ascii, big-endian, doubles, masks, a .pt), the page sees one layout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement
+
+from clod_adapter.calibration import Calibration
+from clod_adapter.cameras import Camera
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.ply import Checkpoint
+from clod_adapter.io.ply_columns import SIGMA, column_map, inria_dtype
+from clod_adapter.io.ply_header import write_comments
+from clod_adapter.io.version import package_version
+
+ROWS = 1 << 14  # in a block
+OPAQUE = 20.0  # logit of an opacity that float32 cannot tell from 1; pages do not take +inf
+
+
+@dataclass(frozen=True)
+class Payload:
+    """A splat as the page reads it.
+
+    Attributes:
+        name: the file's, without its folder.
+        gaussians: without their empty SH bands, means relative to the checkpoint's origin.
+        calibration: what its dial values keep and cost, if the file says so.
+    """
+
+    name: str
+    gaussians: Gaussians
+    calibration: Calibration | None = None
+
+    @classmethod
+    def of(cls, checkpoint: Checkpoint) -> Payload:
+        name = checkpoint.path.name.encode("utf-8", "replace").decode()  # the file system's may hold what is no text
+        return cls(name, checkpoint.gaussians.without_empty_bands(), checkpoint.calibration)
+
+    @cached_property
+    def head(self) -> bytes:
+        """The PLY's header, with the dial's settings and calibration as comments."""
+        names = [name for name in inria_dtype(self.gaussians.sh_degree).names or () if name not in ("nx", "ny", "nz")]
+        names += [SIGMA] if self.gaussians.sigma_d is not None else []
+        row = np.zeros((), [(name, "<f4") for name in names])
+        comments = write_comments(self.gaussians.attenuation, (), calibration=self.calibration)
+        element = PlyElement.describe(np.broadcast_to(row, len(self.gaussians)), "vertex", comments=comments)
+        return f"{PlyData([element], byte_order='<').header}\n".encode("ascii")
+
+    @property
+    def size(self) -> int:
+        """Bytes of the PLY."""
+        attributes = 4 * sum(map(len, column_map(self.gaussians.sh_degree).values()))
+        return len(self.head) + len(self.gaussians) * (attributes + 4 * (self.gaussians.sigma_d is not None))
+
+    def blocks(self) -> Iterator[bytes]:
+        """The PLY, little-endian float32 in Inria's layout without normals, ``sigma_d`` last; never all of it at once.
+
+        A logit above 20 is written as 20: the same opacity in float32.
+        """
+        yield self.head
+        for start in range(0, len(self.gaussians), ROWS):
+            yield _rows(self.gaussians, slice(start, start + ROWS)).astype("<f4", copy=False).tobytes()
+
+    def describe(self, **where: Any) -> dict[str, Any]:
+        """The entry of the page's configuration; ``where`` replaces what says how the Gaussians are had."""
+        attenuation = self.gaussians.attenuation
+        return {
+            "name": self.name, "href": None, "element": None, "format": "ply", "sigma": None,
+            "count": len(self.gaussians), "max_sv": attenuation.max_sv if attenuation else 1.0,
+            "attenuation": asdict(attenuation) if attenuation else None,
+            "no_dial": None if attenuation else no_dial(self.name), "calibration": _rows_of(self.calibration),
+        } | where  # fmt: skip
+
+
+def page_config(
+    model: Mapping[str, Any], base: Mapping[str, Any] | None, cameras: Sequence[Camera], virtual_scale: float
+) -> dict[str, Any]:
+    """The page's configuration.
+
+    Args:
+        model, base: from ``Payload.describe``.
+        cameras: to jump between, in this order; in the world of the Gaussians.
+        virtual_scale: the dial when the page opens, >= 1.
+    """
+    return {
+        "version": package_version(), "title": model["name"], "model": model, "base": base,
+        "cameras": [_camera(camera) for camera in cameras], "virtual_scale": virtual_scale,
+    }  # fmt: skip
+
+
+def no_dial(name: str) -> str:
+    """Why the dial of a plain file does nothing, and what to do."""
+    return f"{name} has no sigma_d, so there is no dial to turn; give it one: clod-adapt {name} --images SCENE"
+
+
+def _rows(gaussians: Gaussians, rows: slice) -> np.ndarray:
+    """``[n, P]`` float32 values of these Gaussians in the order of the header."""
+    g = gaussians
+    count = len(g.means[rows])
+    parts = [
+        g.means[rows], g.sh0[rows].reshape(count, 3), g.shN[rows].transpose(1, 2).reshape(count, -1),
+        g.opacity_logits[rows].clamp(max=OPAQUE)[:, None], g.log_scales[rows], g.quats[rows],
+    ]  # fmt: skip
+    parts += [g.sigma_d[rows][:, None]] if g.sigma_d is not None else []
+    return torch.cat(parts, 1).detach().float().cpu().numpy()
+
+
+def _rows_of(calibration: Calibration | None) -> list[dict[str, float]]:
+    rows = calibration.rows if calibration else ()
+    return [{"virtual_scale": row.virtual_scale, "count": row.kept, "psnr": row.psnr} for row in rows]
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    def short(matrix: torch.Tensor) -> list[list[float]]:
+        return [[float(f"{value:.9g}") for value in row] for row in matrix.tolist()]  # all that float32 has
+
+    return {
+        "name": camera.name, "viewmat": short(camera.viewmat), "K": short(camera.K), "width": camera.width,
+        "height": camera.height, "near": camera.near,
+    }  # fmt: skip

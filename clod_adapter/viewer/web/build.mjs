@@ -1,0 +1,31 @@
+// Makes ../static out of src: one minified script, the style, the page's template, and the sources' fingerprint.
+import { createHash } from "node:crypto";
+import { readFileSync, readdirSync, writeFileSync } from "node:fs";
+import { build } from "esbuild";
+
+const here = new URL(".", import.meta.url), out = new URL("../static/", here);
+const shared = { bundle: true, minify: true, format: "iife", target: "es2022", write: false, loader: { ".glsl": "text" } };
+
+/** `worker:./x.js` is the text of x.js with what it imports, for a Worker out of a Blob. */
+const worker = {
+  name: "worker",
+  setup({ onResolve, onLoad }) {
+    onResolve({ filter: /^worker:/ }, ({ path, resolveDir }) => ({ path: `${resolveDir}/${path.slice(9)}`, namespace: "worker" }));
+    onLoad({ filter: /.*/, namespace: "worker" }, async ({ path }) => {
+      const { outputFiles } = await build({ ...shared, entryPoints: [path] });
+      return { contents: outputFiles[0].text, loader: "text" };
+    });
+  },
+};
+
+const { outputFiles } = await build({ ...shared, entryPoints: [new URL("src/main.js", here).pathname], plugins: [worker] });
+writeFileSync(new URL("viewer.js", out), outputFiles[0].text);
+const css = await build({ ...shared, entryPoints: [new URL("src/style.css", here).pathname] });
+writeFileSync(new URL("viewer.css", out), css.outputFiles[0].text);
+writeFileSync(new URL("page.html", out), readFileSync(new URL("src/page.html", here)));
+
+const sources = ["../../integrations/shaders/attenuation.glsl", "build.mjs", "package-lock.json", "package.json"];
+sources.push(...readdirSync(new URL("src", here), { recursive: true }).filter((name) => /\.\w+$/.test(name)).map((name) => `src/${name}`));
+const lines = sources.sort().map((name) => `${createHash("sha256").update(readFileSync(new URL(name, here))).digest("hex")}  ${name}`);
+writeFileSync(new URL("SOURCES.sha256", out), `${lines.join("\n")}\n`);
+console.log(`viewer.js ${outputFiles[0].contents.length} bytes`);

@@ -1,0 +1,89 @@
+// The dial's equation in float64, as clod_adapter/attenuation.py and extinction.py have it: who is kept, and when a
+// Gaussian leaves. A Gaussian is kept iff  log a - (d s)^2 / (2 v) > log(tau s),  d = |mean - eye| / D,
+// 2 v = 2 relu(sigma)^2 + eps. Runs in the worker (order.js).
+
+const HUGE = 1e300; // stands for 1/0: 0 * HUGE is 0, as d = 0 keeps a Gaussian whatever its sigma is
+
+/** Per Gaussian log a and 1 / (2 v), which no camera changes. */
+export function prepare(opacityLogits, sigma, eps) {
+  const count = opacityLogits.length;
+  const logA = new Float64Array(count), inverse = new Float64Array(count);
+  for (let i = 0; i < count; i++) {
+    const l = opacityLogits[i], reach = Math.max(sigma[i], 0);
+    logA[i] = l >= 0 ? -Math.log1p(Math.exp(-l)) : l - Math.log1p(Math.exp(l));
+    inverse[i] = Math.min(1 / (2 * reach * reach + eps), HUGE);
+  }
+  return { logA, inverse };
+}
+
+/** D, what distances are divided by, world units (attenuation.normalizing_distance). */
+export function normalizingDistance(means, view, attenuation) {
+  if (attenuation.normalizer === "scene") return attenuation.scene_distance;
+  const [x, y, z] = view.eye, count = means.length / 3;
+  const inside = new Float64Array(count);
+  let found = 0;
+  for (const everywhere of [false, true]) {
+    for (let i = 0; i < count; i++) {
+      const px = means[3 * i], py = means[3 * i + 1], pz = means[3 * i + 2];
+      if (everywhere || inFrustum(px, py, pz, view)) inside[found++] = Math.hypot(px - x, py - y, pz - z);
+    }
+    if (found) break;
+  }
+  if (!found) return 1;
+  const distances = inside.subarray(0, found);
+  if (attenuation.normalizer === "max") return Math.max(distances.reduce((a, b) => Math.max(a, b)), 2 ** -126);
+  const rank = Math.min(Math.max(Math.ceil(attenuation.quantile * found), 1), found);
+  return Math.max(distances.sort()[rank - 1], 2 ** -126);
+}
+
+function inFrustum(px, py, pz, { rotation: r, eye, fx, fy, cx, cy, width, height, near }) {
+  const x = px - eye[0], y = py - eye[1], z = pz - eye[2];
+  const depth = r[6] * x + r[7] * y + r[8] * z;
+  if (!(depth > near)) return false;
+  const u = fx * (r[0] * x + r[1] * y + r[2] * z) + cx * depth;
+  const v = fy * (r[3] * x + r[4] * y + r[5] * z) + cy * depth;
+  return u >= 0 && u < width * depth && v >= 0 && v < height * depth;
+}
+
+/** The dial values s* at which the Gaussians leave, descending; kept iff s < s*. Closed form by Lambert's W. */
+export function extinctionScales(means, { logA, inverse }, eye, distance, tau) {
+  const scales = new Float64Array(logA.length);
+  for (let i = 0; i < logA.length; i++) {
+    const d = Math.hypot(means[3 * i] - eye[0], means[3 * i + 1] - eye[1], means[3 * i + 2] - eye[2]) / distance;
+    const ratio = d * Math.sqrt(2 * inverse[i]); // d / sqrt(v)
+    const w = lambertOfExp(2 * (logA[i] - Math.log(tau) + Math.log(ratio)));
+    scales[i] = w < 1 ? Math.exp(logA[i] - 0.5 * w) / tau : Math.sqrt(w) / ratio; // the same twice, each where exact
+  }
+  return scales.sort().reverse();
+}
+
+/** W(e^x): the w > 0 with w + log w = x (Fritsch, Shafer and Crowley, CACM 16(2), 1973). */
+function lambertOfExp(x) {
+  x = Math.min(Math.max(x, -80), 1e4);
+  let w = x > 1 ? x - Math.log(x) : 1 / (1 + Math.exp(-x));
+  for (let step = 0; step < 2; step++) {
+    const r = x - Math.log(w) - w, q = 2 * (1 + w) * (1 + w + (2 / 3) * r);
+    w *= 1 + (r / (1 + w)) * ((q - r) / (q - 2 * r));
+  }
+  return w;
+}
+
+/** How many are kept at one dial value, from descending s*. */
+export function countAt(scales, dial) {
+  let low = 0, high = scales.length;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (scales[middle] > dial) low = middle + 1;
+    else high = middle;
+  }
+  return low;
+}
+
+/** The smallest dial in [1, maxSv] that keeps at most `wanted` (budget.dial_for), and how many it keeps. */
+export function dialForCount(scales, wanted, maxSv) {
+  const most = countAt(scales, 1), fewest = countAt(scales, maxSv);
+  if (wanted >= most) return { dial: 1, kept: most };
+  if (wanted <= fewest) return { dial: maxSv, kept: fewest };
+  const dial = Math.min(Math.sqrt(scales[wanted - 1] * scales[wanted]), maxSv);
+  return { dial, kept: countAt(scales, dial) };
+}

@@ -1,0 +1,112 @@
+// PLY: the header, and files of plain Gaussians in any order and type of columns, ascii or binary (io/ply.py).
+import { blank } from "./gaussians.js";
+
+const TYPES = {
+  char: ["Int8", 1], int8: ["Int8", 1], uchar: ["Uint8", 1], uint8: ["Uint8", 1], short: ["Int16", 2], int16: ["Int16", 2],
+  ushort: ["Uint16", 2], uint16: ["Uint16", 2], int: ["Int32", 4], int32: ["Int32", 4], uint: ["Uint32", 4],
+  uint32: ["Uint32", 4], float: ["Float32", 4], float32: ["Float32", 4], double: ["Float64", 8], float64: ["Float64", 8],
+};
+const FOREIGN = [
+  [/^f_(offset|anchor_feat)_\d+$/, "this is a Scaffold-GS or Octree-GS file, which holds anchors and no plain Gaussians"],
+];
+const HEADER_LIMIT = 1 << 20;
+
+/** {elements: [{name, count, properties: [{name, type, size, offset}], size}], format, comments, length}. */
+export function readHeader(bytes) {
+  const text = new TextDecoder("latin1").decode(bytes.subarray(0, HEADER_LIMIT));
+  const end = /[\r\n]end_header(\r\n|\n|\r)/.exec(text);
+  if (!end) throw new Error("the PLY header has no end, so the file is truncated; copy or export it again");
+  const header = { elements: [], comments: [], format: "", length: end.index + end[0].length };
+  for (const line of text.slice(0, end.index).split(/\r\n|\n|\r/).slice(1)) {
+    const words = line.trim().split(/\s+/), last = header.elements.at(-1);
+    if (words[0] === "comment") header.comments.push(line.replace(/^\s*comment ?/, ""));
+    else if (words[0] === "format") header.format = words[1];
+    else if (words[0] === "element" && /^\d+$/.test(words[2])) {
+      header.elements.push({ name: words[1], count: Number(words[2]), properties: [], size: 0 });
+    } else if (words[0] === "property" && last && words[1] === "list") {
+      last.properties.push({ name: words.at(-1), type: "list" });
+      last.size = NaN;
+    } else if (words[0] === "property" && last && TYPES[words[1]]) {
+      const [type, size] = TYPES[words[1]];
+      last.properties.push({ name: words[2], type, size, offset: last.size });
+      last.size += size;
+    } else if (words[0] !== "obj_info" && line.trim()) {
+      throw new Error(`the PLY header is damaged ("${line.slice(0, 40)}"); export the file again`);
+    }
+  }
+  return header;
+}
+
+/** Plain or extended Gaussians. */
+export function readPly(bytes, header) {
+  const vertex = header.elements.find((element) => element.name === "vertex");
+  if (!vertex) throw new Error("it has no vertex element; give a splat in Inria's 3DGS layout");
+  const degree = degreeOf(vertex);
+  const columns = header.format === "ascii" ? asciiColumns(bytes, header, vertex) : binaryColumns(bytes, header, vertex);
+  const gaussians = { ...blank(vertex.count, degree), comments: header.comments };
+  const put = (target, stride, at, name) => columns(name, (i, value) => { target[stride * i + at] = value; });
+  ["x", "y", "z"].forEach((name, k) => put(gaussians.means, 3, k, name));
+  for (let k = 0; k < 4; k++) put(gaussians.quats, 4, k, `rot_${k}`);
+  for (let k = 0; k < 3; k++) put(gaussians.logScales, 3, k, `scale_${k}`);
+  for (let k = 0; k < 3; k++) put(gaussians.sh0, 3, k, `f_dc_${k}`);
+  put(gaussians.opacityLogits, 1, 0, "opacity");
+  const bands = gaussians.coefficients;
+  for (let k = 0; k < bands; k++) for (let c = 0; c < 3; c++) put(gaussians.shN, 3 * bands, 3 * k + c, `f_rest_${c * bands + k}`);
+  if (vertex.properties.some((property) => property.name === "sigma_d")) {
+    gaussians.sigma = new Float32Array(vertex.count);
+    put(gaussians.sigma, 1, 0, "sigma_d");
+  }
+  return gaussians;
+}
+
+function degreeOf({ properties }) {
+  const names = new Set(properties.map((property) => property.name));
+  for (const [pattern, what] of FOREIGN) if ([...names].some((name) => pattern.test(name))) throw new Error(what);
+  if (!names.has("f_dc_0") && !names.has("scale_0")) {
+    throw new Error("f_dc_0 and scale_0 are missing, so this is a mesh or a point cloud; give a trained splat");
+  }
+  if (names.has("scale_0") && !names.has("scale_2")) throw new Error("scale_2 is missing: this is a 2DGS file of flat disks");
+  const rest = [...names].filter((name) => /^f_rest_\d+$/.test(name)).length;
+  const degree = [0, 9, 24, 45, 72].indexOf(rest);
+  if (degree < 0) throw new Error(`${rest} f_rest_* properties fit no SH degree; export the file again`);
+  for (const name of ["x", "y", "z", "opacity", "rot_0", "rot_1", "rot_2", "rot_3", "scale_1", "f_dc_1", "f_dc_2"]) {
+    if (!names.has(name)) throw new Error(`property ${name} is missing; export the file again in Inria's 3DGS layout`);
+  }
+  return degree;
+}
+
+function binaryColumns(bytes, header, vertex) {
+  let start = header.length;
+  for (const element of header.elements) {
+    if (element === vertex) break;
+    start += element.count * element.size;
+  }
+  if (Number.isNaN(start + vertex.size)) throw new Error("it has lists, which splats have not; export the file again");
+  const least = start + vertex.count * vertex.size;
+  if (bytes.length < least) {
+    throw new Error(`it is truncated: its header claims ${least} bytes, and it has ${bytes.length}; copy or export it again`);
+  }
+  const little = header.format === "binary_little_endian", view = new DataView(bytes.buffer, bytes.byteOffset + start);
+  return (name, each) => {
+    const { type, offset } = vertex.properties.find((property) => property.name === name);
+    const get = DataView.prototype[`get${type}`];
+    for (let i = 0, at = offset; i < vertex.count; i++, at += vertex.size) each(i, get.call(view, at, little));
+  };
+}
+
+function asciiColumns(bytes, header, vertex) {
+  const lines = new TextDecoder("latin1").decode(bytes.subarray(header.length)).split(/\r\n|\n|\r/);
+  let first = 0;
+  for (const element of header.elements) {
+    if (element === vertex) break;
+    first += element.count;
+  }
+  const rows = lines.slice(first, first + vertex.count).map((line) => line.trim().split(/\s+/).map(Number));
+  if (rows.length < vertex.count || rows.some((row) => row.length !== vertex.properties.length)) {
+    throw new Error("it is truncated or damaged; copy or export it again");
+  }
+  return (name, each) => {
+    const k = vertex.properties.findIndex((property) => property.name === name);
+    rows.forEach((row, i) => each(i, row[k]));
+  };
+}

@@ -1,0 +1,130 @@
+// Draws models: each Gaussian is projected once, a pixel each, then drawn as one quad, the farthest first, into a
+// half-float picture, so that hundreds of blended layers are not rounded to 8 bits each.
+import { WIDTH, bindTextures, framebuffer, heightOf, program, quads, texture } from "./gpu.js";
+import { copyVertex, copyFragment, projectFragment, splatFragment, splatVertex } from "./shaders.js";
+
+export function createRenderer(canvas) {
+  const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
+  if (!gl) throw new Error("this browser has no WebGL2; try a current Chrome, Edge, Firefox or Safari");
+  const precise = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
+  const projectors = new Map(), splat = program(gl, splatVertex, splatFragment), copy = program(gl, copyVertex, copyFragment);
+  const corners = quads(gl), empty = gl.createVertexArray();
+  const projected = { textures: [], target: null, height: 0 }, picture = { texture: null, target: null };
+  let width = 0, height = 0;
+
+  function resize(view) {
+    if (view.width === width && view.height === height) return;
+    ({ width, height } = view);
+    [canvas.width, canvas.height] = [width, height];
+    gl.deleteTexture(picture.texture);
+    gl.deleteFramebuffer(picture.target);
+    picture.texture = precise
+      ? texture(gl, gl.RGBA16F, width, height, gl.RGBA, gl.HALF_FLOAT)
+      : texture(gl, gl.RGBA8, width, height, gl.RGBA, gl.UNSIGNED_BYTE);
+    picture.target = framebuffer(gl, [picture.texture]);
+  }
+
+  function makeRoom(rows) {
+    if (rows <= projected.height) return;
+    projected.textures.forEach((old) => gl.deleteTexture(old));
+    gl.deleteFramebuffer(projected.target);
+    projected.textures = [0, 1, 2].map(() => texture(gl, gl.RGBA32UI, WIDTH, rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT));
+    projected.target = framebuffer(gl, projected.textures);
+    projected.height = rows;
+  }
+
+  function projector(degree) {
+    if (!projectors.has(degree)) projectors.set(degree, program(gl, copyVertex, projectFragment(degree)));
+    return projectors.get(degree);
+  }
+
+  function project(side, view) {
+    const { model } = side, { made, uniforms: u } = projector(model.degree);
+    makeRoom(heightOf(model.count));
+    gl.bindFramebuffer(gl.FRAMEBUFFER, projected.target);
+    gl.viewport(0, 0, WIDTH, heightOf(side.drawn));
+    gl.useProgram(made);
+    bindTextures(gl, u, { order: side.order, records: model.records, higher: model.higher });
+    gl.uniform1i(u.drawn, side.drawn);
+    gl.uniformMatrix3fv(u.view, true, view.rotation);
+    gl.uniform3fv(u.eye, view.eye);
+    gl.uniform4f(u.pinhole, view.fx, view.fy, view.cx, view.cy);
+    gl.uniform3f(u.size, view.width, view.height, view.near);
+    gl.uniform1i(u.dialled, side.dialled);
+    if (side.dialled) {
+      gl.uniform1f(u.dial, side.dial);
+      gl.uniform1f(u.distance_unit, side.distance);
+      gl.uniform1f(u.eps, model.attenuation.eps);
+      gl.uniform1f(u.tau, model.attenuation.tau);
+      gl.uniform1i(u.soft, model.attenuation.cut === "soft");
+    }
+    gl.bindVertexArray(empty);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  function paint(side, view) {
+    gl.bindFramebuffer(gl.FRAMEBUFFER, picture.target);
+    gl.viewport(0, 0, width, height);
+    gl.useProgram(splat.made);
+    const [first, second, third] = projected.textures;
+    bindTextures(gl, splat.uniforms, { first, second, third });
+    gl.uniform3f(splat.uniforms.size, view.width, view.height, view.near);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.enable(gl.SCISSOR_TEST);
+    const from = Math.round(side.from * width), to = Math.round(side.to * width);
+    gl.scissor(from, 0, to - from, height);
+    gl.bindVertexArray(corners);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * WIDTH, gl.UNSIGNED_SHORT, 0, heightOf(side.drawn));
+    gl.disable(gl.SCISSOR_TEST);
+    gl.disable(gl.BLEND);
+  }
+
+  return {
+    gl,
+    /** New rows for a side, `drawn` of them, in whole lines of WIDTH. */
+    upload(side, rows, drawn) {
+      const lines = heightOf(side.model.count);
+      side.order ??= texture(gl, gl.R32UI, WIDTH, lines, gl.RED_INTEGER, gl.UNSIGNED_INT);
+      gl.bindTexture(gl.TEXTURE_2D, side.order);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, heightOf(drawn), gl.RED_INTEGER, gl.UNSIGNED_INT, rows);
+      side.drawn = drawn;
+    },
+    release(side) {
+      gl.deleteTexture(side.order);
+      side.order = null;
+    },
+    /** Draws the sides, each in its share [from, to] of the picture's width, and shows it. */
+    draw(sides, view) {
+      resize(view);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, picture.target);
+      gl.clearColor(0, 0, 0, 0);
+      gl.clear(gl.COLOR_BUFFER_BIT);
+      for (const side of sides) {
+        if (!side.drawn) continue;
+        project(side, view);
+        paint(side, view);
+      }
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      gl.viewport(0, 0, width, height);
+      gl.useProgram(copy.made);
+      bindTextures(gl, copy.uniforms, { picture: picture.texture });
+      gl.bindVertexArray(empty);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    },
+    /** Resolves with the milliseconds since `began` once the GPU has finished what it was given. */
+    finished(began) {
+      const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+      gl.flush();
+      return new Promise((resolve) => {
+        const look = () => {
+          const state = gl.clientWaitSync(fence, 0, 0);
+          if (state === gl.TIMEOUT_EXPIRED) return setTimeout(look, 1);
+          gl.deleteSync(fence);
+          resolve(performance.now() - began);
+        };
+        setTimeout(look, 0);
+      });
+    },
+  };
+}

@@ -1,0 +1,94 @@
+"""``clod-adapt view`` without a browser: what it says, what it serves, how it ends."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import socket
+import urllib.request
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import clod_adapter
+from clod_adapter.cli import view
+
+
+def fetch(url: str) -> bytes:
+    with urllib.request.urlopen(url, timeout=10) as response:
+        return bytes(response.read())
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_serves_until_it_is_interrupted(spawn: Any, capture: Any, dialled: Path, tmp_path: Path, end: int) -> None:
+    words = [dialled, "--base", capture.ply, "--images", capture.scene, "--sv", 2, "--no-browser", "--json"]
+    process = spawn("view", *words, cwd=tmp_path)
+    report = json.loads(process.stdout.readline())
+    assert report["url"] == f"http://127.0.0.1:{report['port']}/" and report["cameras"] == 10
+    (config,) = re.findall(r'id="clod-config">(.*?)</script>', fetch(report["url"]).decode(), re.DOTALL)
+    config = json.loads(config)
+    assert config["title"] == "dial.ply" and config["virtual_scale"] == 2 and len(config["cameras"]) == 10
+    assert (config["model"]["href"], config["base"]["href"]) == ("/files/model", "/files/base")
+    for entry in (config["model"], config["base"]):
+        (tmp_path / "served.ply").write_bytes(fetch(report["url"] + entry["href"][1:]))
+        served = clod_adapter.load(tmp_path / "served.ply").gaussians
+        assert len(served) == entry["count"] and (served.attenuation is None) == (entry["attenuation"] is None)
+    process.send_signal(end)
+    out, err = process.communicate(timeout=20)
+    assert (process.returncode, out) == (0, "") and "Traceback" not in err and "GET" not in err, err
+
+
+def test_prints_the_address(spawn: Any, capture: Any, tmp_path: Path) -> None:
+    process = spawn("view", capture.ply, "--no-browser", "--quiet", cwd=tmp_path)
+    line = process.stdout.readline()
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/  \(Ctrl-C ends\)\n", line)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=20) == ("", "") and process.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("missing.ply", "missing.ply: .*check the path"),
+        ("PLY --base text.ply", "text.ply: is not a PLY"),
+        ("PLY --images nowhere", "nowhere: is not a folder"),
+        ("PLY --port 65536", "--port is 65536, it must be between 1 and 65535"),
+        ("PLY --port x", "--port: invalid int value: 'x'"),
+        ("PLY --sv 0.5", "--sv is 0.5, it must be at least 1"),
+        ("PLY --sv nan", "--sv is nan"),
+        ("PLY --no-browser --port TAKEN", "port \\d+ of 127.0.0.1 cannot be listened on .*give another"),
+    ],
+)
+def test_refuses(clod: Any, capture: Any, tmp_path: Path, line: str, said: str) -> None:
+    (tmp_path / "text.ply").write_text("hello")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        words = {"PLY": capture.ply, "TAKEN": taken.getsockname()[1]}
+        done = clod("view", *[words.get(word, word) for word in line.split()])
+    assert (done.code, done.out) == (2, "") and re.search(f"^clod-adapt: error: .*{said}", done.err, re.MULTILINE), done
+
+
+class Browser(webbrowser.BaseBrowser):
+    def __init__(self) -> None:
+        super().__init__("a browser")
+        self.opened: list[str] = []
+
+    def open(self, url: str, new: int = 0, autoraise: bool = True) -> bool:
+        self.opened.append(url)
+        return True
+
+
+def test_opens_a_browser_but_none_in_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    browser = Browser()
+    monkeypatch.setattr(webbrowser, "get", lambda: browser)
+    assert view.open_browser("http://127.0.0.1:1/") and browser.opened == ["http://127.0.0.1:1/"]
+    monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("true"))
+    assert not view.open_browser("http://127.0.0.1:1/")
+
+    def none() -> None:
+        raise webbrowser.Error("could not locate runnable browser")
+
+    monkeypatch.setattr(webbrowser, "get", none)
+    assert not view.open_browser("http://127.0.0.1:1/")

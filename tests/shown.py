@@ -1,0 +1,86 @@
+"""The viewer's page in a browser tab, and a server for it."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from clod_adapter.cameras import Camera
+from clod_adapter.cli.console import Console
+from clod_adapter.cli.main import build_parser
+from clod_adapter.cli.view import prepare
+from clod_adapter.viewer.payload import page_config
+from clod_adapter.viewer.server import Server
+
+SIZE = {"width": 640, "height": 480}
+SECONDS = 10  # until waiting ends
+RESTED = 250  # ms after a movement, while which slow devices draw fewer pixels
+
+
+@dataclass
+class Shown:
+    """The page in a tab; its methods wait until what they asked for is drawn."""
+
+    page: Any
+    errors: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.page.on("console", lambda message: message.type == "error" and self.errors.append(message.text))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("request", lambda request: self.asked.append(request.url))
+
+    def ready(self, url: str) -> Shown:
+        self.page.goto(url)
+        self.run("clod.ready")
+        return self
+
+    def run(self, script: str, *arguments: object) -> Any:
+        return self.page.evaluate(
+            f"async (given) => {{ const r = await {script}; await clod.settled(); return r }}", *arguments
+        )
+
+    def until(self, condition: str) -> None:
+        """Waits until it holds. Not Playwright's wait_for_function, which the page's policy forbids to evaluate."""
+        script = f"""() => new Promise((resolve, reject) => {{
+            const late = new Error("never " + {json.dumps(condition)});
+            const ended = setTimeout(() => reject(late), {SECONDS}000);
+            const look = () => ({condition}) ? (clearTimeout(ended), resolve()) : setTimeout(look, 20);
+            look();
+        }})"""
+        self.page.evaluate(script)
+
+    def text(self, selector: str) -> str:
+        return str(self.page.inner_text(selector))
+
+    def camera(self, camera: Camera) -> None:
+        entry = page_config({"name": ""}, None, [camera], 1.0)["cameras"][0]
+        self.run("clod.setCamera(given)", entry)
+
+    def picture(self) -> np.ndarray:
+        """``[H, W, 3]`` uint8, of the splats alone, at full resolution, as when nothing moves."""
+        self.page.wait_for_timeout(RESTED)
+        data = self.run("clod.capture()").partition(",")[2]
+        return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
+
+    def counts(self) -> dict[str, int]:
+        return dict(self.page.evaluate("clod.settled().then(clod.counts)"))
+
+
+@contextmanager
+def serve(*words: object) -> Iterator[str]:
+    """The address of what ``clod-adapt view`` serves for these words."""
+    answers, _ = prepare(build_parser("view").parse_args([str(word) for word in words]), Console(quiet=True))
+    with Server(answers) as server:
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        yield server.url
+        server.shutdown()
