@@ -7,7 +7,7 @@ from pathlib import Path
 
 from clod_adapter.cli import checks
 from clod_adapter.cli.dials import given_budget
-from clod_adapter.cli.export_formats import FORMATS, LOD_META, PACKED, level_paths, suffix_of, suffixes
+from clod_adapter.cli.export_formats import FORMATS, LOD_META, PACKED, PAGE, level_paths, suffix_of, suffixes
 from clod_adapter.cli.files import check_output
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import check_target
@@ -41,8 +41,11 @@ def check_together(args: Namespace, bakes: bool) -> None:
         raise ClodError("--lod-meta is a set of levels; give them, as in --levels 1,2,4,7")
     if args.camera is not None and args.images is None:
         raise ClodError("--camera names a photograph of a scene; give that too, with --images")
-    if args.images is not None and args.camera is None and not args.order:
-        raise ClodError("--images is for the cameras of --camera and --order; give one of them with it")
+    page = Path(args.out).suffix.lower() == PAGE
+    if args.images is not None and args.camera is None and not args.order and not page:
+        raise ClodError(f"--images is for the cameras of --camera, --order and a {PAGE}; give one of them with it")
+    if page and (args.levels or args.camera is not None or args.order):
+        raise ClodError(f"a {PAGE} shows the whole dial; leave out --levels, --camera and --order")
     if args.camera is not None and not bakes:
         raise ClodError("--camera is where a dial value is baked for; give one, as in --sv 2")
 

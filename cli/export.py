@@ -14,9 +14,9 @@ from clod_adapter.cameras import Camera
 from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console, duration
 from clod_adapter.cli.evaluate import choose_dials
-from clod_adapter.cli.export_formats import LOD_META, PACKED, level_paths, suffix_of
+from clod_adapter.cli.export_formats import LOD_META, PACKED, PAGE, level_paths, suffix_of
 from clod_adapter.cli.files import size
-from clod_adapter.cli.inputs import read_checkpoint, read_scene
+from clod_adapter.cli.inputs import read_checkpoint
 from clod_adapter.cli.render import named
 from clod_adapter.cli.report import Stopwatch
 from clod_adapter.errors import ClodError
@@ -25,9 +25,11 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.ply_columns import MASKS, SIGMA, inria_dtype
+from clod_adapter.io.poses import load_cameras
 from clod_adapter.io.splat_transform import SplatTransform
 from clod_adapter.io.version import package_version
 from clod_adapter.io.writers import write
+from clod_adapter.viewer.page import write_page
 
 TIMEOUT, TIMEOUT_EACH = 600.0, 0.02  # seconds for splat-transform, and per Gaussian; ten times what was measured
 
@@ -40,6 +42,7 @@ class Export:
         model: as read.
         gaussians: the model's, in the order asked for.
         camera: what is baked for; None for the normalised distance 1.
+        cameras: of the scene, for a page to jump between.
         ordered: whether the rows have been put in order.
         console: for splat-transform's progress.
     """
@@ -47,6 +50,7 @@ class Export:
     model: Checkpoint
     gaussians: Gaussians
     camera: Camera | None
+    cameras: list[Camera]
     ordered: bool
     console: Console
 
@@ -61,6 +65,8 @@ class Export:
 
     def write(self, path: Path, suffix: str, virtual_scale: float | None) -> tuple[int, tuple[str, ...]]:
         """Writes a file; how many Gaussians are in it, and notes on what has no room there."""
+        if suffix == PAGE:
+            return len(self.gaussians), self._write_page(path, virtual_scale or 1.0)
         gaussians, about = self.piece(virtual_scale)
         if suffix in PACKED:
             return len(gaussians), self._pack(path, suffix, gaussians, about)
@@ -83,6 +89,19 @@ class Export:
                 counts.append(len(gaussians))
             notes = self._transform(words, folder / LOD_META, sum(counts))
         return counts, notes
+
+    def _write_page(self, path: Path, virtual_scale: float) -> tuple[str, ...]:
+        """Writes the page, packed where there is something to pack it with."""
+        try:
+            tool = SplatTransform.find()
+        except ClodError as error:
+            write_page(path, self.model, cameras=self.cameras, virtual_scale=virtual_scale)
+            return (f"the splat is in the page as it is; packed, the page would be a sixth of this: {error}",)
+        with ticking(self.console, f"splat-transform {tool.version}, {len(self.gaussians):,} Gaussians") as tick:
+            write_page(
+                path, self.model, cameras=self.cameras, virtual_scale=virtual_scale, tool=tool, progress=tick
+            )  # fmt: skip
+        return ("the splat is packed: values are rounded",)
 
     def _pack(self, path: Path, suffix: str, gaussians: Gaussians, about: tuple[str, ...]) -> tuple[str, ...]:
         with TemporaryDirectory(dir=path.parent, prefix=".tmp-") as folder:
@@ -114,7 +133,7 @@ class Export:
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
     model = read_checkpoint(args.model, console, args.activated)
-    camera, cameras, notes = reference(args, model, console)
+    camera, cameras, notes = reference(args, model)
     dials, more = dial_values(args, model, camera, console)
     gaussians = model.gaussians
     if args.order:
@@ -122,14 +141,15 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     notes += [*more, *left_out(model)]
     for note in notes:
         console.say(note)
-    export = Export(model, gaussians, camera, bool(args.order), console)
+    export = Export(model, gaussians, camera, cameras, bool(args.order), console)
     if args.lod_meta:
         outputs, lost = write_set(export, out, dials)
     else:
         outputs, lost = write_files(export, level_paths(out, args.levels) if args.levels else [out], dials)
     for note in dict.fromkeys(lost):
         console.say(f"  note: {note}")
-    print("\n".join([*(describe(output, len(gaussians)) for output in outputs), *exactness(export, dials)]))
+    baked = None if out.suffix.lower() == PAGE else dials
+    print("\n".join([*(describe(output, len(gaussians)) for output in outputs), *exactness(export, baked)]))
     return {
         "command": "export", "version": package_version(), "model": args.model, "base_count": len(gaussians),
         "camera": camera.name if camera else None, "order": args.order, "outputs": outputs,
@@ -137,19 +157,16 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def reference(
-    args: argparse.Namespace, model: Checkpoint, console: Console
-) -> tuple[Camera | None, list[Camera], list[str]]:
+def reference(args: argparse.Namespace, model: Checkpoint) -> tuple[Camera | None, list[Camera], list[str]]:
     """The camera to bake for, if one is asked for; those to order by, that one or the scene's; and notes on these."""
     if args.images is None:
         return None, [], []
-    scene = read_scene(args.images, console, model.origin)
-    views, notes = [*scene.train, *scene.test], list(scene.notes)
+    cameras, notes = load_cameras(args.images, model.origin)
     if args.camera is None:
-        return None, [view.camera for view in views], notes
-    found = [view.camera for view in views if named(view, args.camera)]
+        return None, cameras, notes
+    found = [camera for camera in cameras if named(camera, args.camera)]
     if not found:
-        some = ", ".join(sorted(view.camera.name for view in views)[:3])
+        some = ", ".join(camera.name for camera in cameras[:3])
         raise ClodError(f"--camera has {args.camera!r}, and no photograph is called that; names here are like {some}")
     if len(found) > 1:
         raise ClodError(f"--camera has {args.camera!r}, which {found[0].name} and {found[1].name} are; give the suffix")

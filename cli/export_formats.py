@@ -10,6 +10,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.writers import WRITERS
 
 LOD_META = "lod-meta.json"
+PAGE = ".html"
 
 
 @dataclass(frozen=True)
@@ -40,12 +41,16 @@ FORMATS = {
     ".pt": Format(("exact; as gsplat's trainer saves its own",)),
     ".splat": Format(("8 bits, no view-dependent colour",), ordered=False, sigma=False),
     **PACKED,
+    PAGE: Format(
+        ("the viewer with the splat in it, one file to send;", "exact, or by splat-transform 8 to 16 bits"),
+        ordered=False,
+    ),
 }
 
 
 def suffixes() -> list[str]:
     """Those that can be written."""
-    return [suffix for suffix in FORMATS if suffix in WRITERS or suffix in PACKED]
+    return [suffix for suffix in FORMATS if suffix in WRITERS or suffix in PACKED or suffix == PAGE]
 
 
 def format_table() -> str:

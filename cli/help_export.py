@@ -9,7 +9,7 @@ from math import inf
 from clod_adapter.cli.commands import Command
 from clod_adapter.cli.dials import add_dial_options
 from clod_adapter.cli.export_formats import format_table
-from clod_adapter.cli.options import _add_activated
+from clod_adapter.cli.options import add_activated
 
 DIGITS = 6  # significant ones of a level, all of which its file's name has
 
@@ -42,12 +42,12 @@ def export_options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--camera", metavar="PHOTO", help="bake for this photograph's camera; its name, with or without suffix"
     )
-    parser.add_argument("--images", metavar="DIR", help="the scene: of --camera, or to order by")
+    parser.add_argument("--images", metavar="DIR", help="the scene: of --camera, to order by, or for a page's views")
     parser.add_argument(
         "--order", choices=["extinction"],
         help="put the rows in the order in which the dial keeps them longest, for renderers that draw a prefix",
     )  # fmt: skip
-    _add_activated(parser)
+    add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
 
 
@@ -93,6 +93,10 @@ to 0.8 above it at few (benchmarks/prefix.py), and they pop where it fades.
 SIBR reads a baked .ply; the SH degree it takes from sh_degree in the cfg_args
 beside the model, up to 3, and its released versions do not show degree 0.
 
+A .html is what "clod-adapt view" shows, in one file to send to somebody; it
+needs no network. --sv is where its dial stands at first, and --images gives it
+the photographs' cameras to jump between.
+
 .sog, .compressed.ply and --lod-meta need splat-transform 3.7 with Node 22, on
 the PATH or as the command in CLOD_SPLAT_TRANSFORM. In a folder of its own:
   npm install node@22 @playcanvas/splat-transform@3.7
@@ -105,6 +109,7 @@ examples:
   clod-adapt export garden_clod.ply --sv 3 --camera a.jpg --images garden \\
       -o from_a.ply
   clod-adapt export garden_clod.ply -o garden.glb
+  clod-adapt export garden_clod.ply --images garden -o garden.html
   clod-adapt export garden_clod.ply --levels 1,2,4,7 -o garden.ply
   clod-adapt export garden_clod.ply --levels 1,2,4,7 --lod-meta -o garden_lod
   clod-adapt export garden_clod.ply --order extinction --images garden \\

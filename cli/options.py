@@ -8,7 +8,7 @@ from clod_adapter.cli.dials import add_dial_options
 from clod_adapter.cli.settings import add_settings
 
 
-def _add_activated(parser: ArgumentParser) -> None:
+def add_activated(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--activated", choices=["none", "opacity", "scales", "both"],
         help="what a checkpoint stores activated: opacities as such, scales as lengths; asked for where it looks so",
@@ -36,7 +36,7 @@ def adapt_options(parser: ArgumentParser) -> None:
         "--misaligned-ok", action="store_true", help="train even where a checkpoint does not fit the photographs"
     )
     parser.add_argument("--report", action="store_true", help="also a page to look at, OUT.html, and its charts")
-    _add_activated(parser)
+    add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
@@ -61,7 +61,7 @@ def evaluate_options(parser: ArgumentParser) -> None:
         "--popping", action="store_true", help="also how evenly the picture changes with the dial and with the camera"
     )
     parser.add_argument("--report", metavar="OUT.html", help="also a page to look at, and beside it its charts")
-    _add_activated(parser)
+    add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
@@ -78,7 +78,7 @@ def render_options(parser: ArgumentParser) -> None:
         help="photographs whose cameras to render, by name, or all, or held-out (default)",
     )  # fmt: skip
     parser.add_argument("--beside", action="store_true", help="put the photograph left of the renderings")
-    _add_activated(parser)
+    add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
@@ -86,7 +86,7 @@ def apply_options(parser: ArgumentParser) -> None:
     parser.add_argument("base", metavar="BASE.ply", help="the checkpoint that was adapted")
     parser.add_argument("adapter", metavar="ADAPTER.safetensors", help="what clod-adapt wrote beside its PLY")
     parser.add_argument("-o", "--out", metavar="OUT.ply", required=True, help="what to write; replaced if it exists")
-    _add_activated(parser)
+    add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
 
 
@@ -105,7 +105,7 @@ def robustness_options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--misaligned-ok", action="store_true", help="train even where a checkpoint does not fit the photographs"
     )
-    _add_activated(parser)
+    add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 

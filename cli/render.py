@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from clod_adapter.cameras import Scene, View
+from clod_adapter.cameras import Camera, Scene, View
 from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.evaluate import choose_dials
@@ -76,15 +76,15 @@ def pick_views(scene: Scene, wanted: Sequence[str]) -> list[View]:
     if list(wanted) == ["held-out"]:
         return list(scene.test or scene.train)  # of a single photograph none is held out
     for name in wanted:
-        if not any(named(view, name) for view in views):
+        if not any(named(view.camera, name) for view in views):
             some = ", ".join(view.camera.name for view in views[:3])
             raise ClodError(f"--views has {name!r}, and no photograph is called that; names here are like {some}")
-    return [view for view in views if any(named(view, name) for name in wanted)]
+    return [view for view in views if any(named(view.camera, name) for name in wanted)]
 
 
-def named(view: View, name: str) -> bool:
+def named(camera: Camera, name: str) -> bool:
     """By the photograph's whole name, or without its suffix."""
-    return name in (view.camera.name, str(Path(view.camera.name).with_suffix("")))
+    return name in (camera.name, str(Path(camera.name).with_suffix("")))
 
 
 def files(views: Sequence[View]) -> list[Path]:

@@ -26,8 +26,6 @@ SKIPPED = {
     "make": "makes an environment of its own; make test is what runs this",
     "clod-adapt demo": "takes three minutes; tests/cli/test_demo.py runs it with the long parts replaced",
 }
-# Commands that are documented before they are there.
-COMING = ("inspect", "export", "view")
 
 
 @dataclass(frozen=True)
@@ -77,15 +75,9 @@ def spoken(page: Path, program: str) -> list[str]:
 
 def parse(words: list[str]) -> None:
     """Raises the ClodError of ``clod-adapt`` options that there are not."""
-    if is_coming(words):
-        return
     words = words[: words.index(">")] if ">" in words else words
     name = words[1] if len(words) > 1 and words[1] in COMMANDS else ""
     build_parser(name).parse_args(words[2:] if name else words[1:])
-
-
-def is_coming(words: list[str]) -> bool:
-    return len(words) > 1 and words[0] == "clod-adapt" and words[1] in COMING
 
 
 def run(words: list[str]) -> None:
@@ -120,6 +112,4 @@ def _run_python(words: list[str]) -> None:
 
 def skipped(words: list[str]) -> str:
     """Why a command is not run, wherever it stands; empty where it is."""
-    if is_coming(words):
-        return "is not there yet"
     return SKIPPED.get(words[0], "") or SKIPPED.get(" ".join(words[:2]), "")

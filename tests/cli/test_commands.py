@@ -153,7 +153,10 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("export DIALLED -o x.ply --lod-meta --levels 1,2", "x.ply: with --lod-meta, --out names the folder"),
         ("export DIALLED -o lod-meta.json --lod-meta --levels 1,2", "--out names the folder that lod-meta.json is to"),
         ("export DIALLED -o x.ply --sv 2 --camera 003", "--camera names a photograph of a scene; give that too"),
-        ("export DIALLED -o x.ply --sv 2 --images SCENE", "--images is for the cameras of --camera and --order"),
+        (
+            "export DIALLED -o x.ply --sv 2 --images SCENE",
+            "--images is for the cameras of --camera, --order and a .html",
+        ),
         (
             "export DIALLED -o x.ply --camera 003 --images SCENE",
             "--camera is where a dial value is baked for; give one",

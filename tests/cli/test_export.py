@@ -120,10 +120,9 @@ def test_a_camera_that_two_photographs_are(clod: Any, capture: Any, dialled: Pat
 
     from clod_adapter.cli import export
 
-    scene = clod_adapter.load_scene(capture.scene)
-    first, second, *rest = scene.train
-    twins = [replace(v, camera=replace(v.camera, name=n)) for v, n in ((first, "a.jpg"), (second, "a.png"))]
-    monkeypatch.setattr(export, "read_scene", lambda *_: replace(scene, train=(*twins, *rest)))
+    (first, second, *rest), notes = export.load_cameras(capture.scene)
+    twins = [replace(first, name="a.jpg"), replace(second, name="a.png")]
+    monkeypatch.setattr(export, "load_cameras", lambda *_: ([*twins, *rest], notes))
     words = ("export", dialled, "--sv", 2, "--images", capture.scene, "-o", "x.ply", "--camera")
     done = clod(*words, "a")
     assert done.code == 2 and "--camera has 'a', which a.jpg and a.png are; give the suffix" in done.err

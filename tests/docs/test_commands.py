@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from clod_adapter.cli.main import COMMANDS
-from fences import COMING, LANGUAGES, PAGES, ROOT, SHELL, blocks, parse, run, skipped, spoken
+from fences import LANGUAGES, PAGES, ROOT, SHELL, blocks, parse, run, skipped, spoken
 
 IDS = [str(page.relative_to(ROOT)) for page in PAGES]
 
@@ -61,7 +60,3 @@ def test_the_reasons_are_reasons() -> None:
         # A marker that stands above no block would be one that somebody believes in.
         marked = page.read_text(encoding="utf-8").count("<!-- not run:")
         assert marked == sum(bool(block.reason) for block in blocks(page)), page.name
-
-
-def test_what_is_there_is_not_coming() -> None:
-    assert not set(COMING) & set(COMMANDS), "take it out of COMING: its blocks can be run"

@@ -1,0 +1,47 @@
+"""``clod-adapt export -o page.html``."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import clod_adapter
+
+
+@pytest.mark.parametrize("sv", [None, 2])
+def test_a_page_holds_the_splat_and_its_dial(
+    clod: Any, dialled: Path, tmp_path: Path, sv: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CLOD_SPLAT_TRANSFORM", "there-is-none")
+    done = clod("export", dialled, "-o", "page.html", *(["--sv", sv] if sv else []), "--json")
+    assert done.code == 0 and "there-is-none" in done.err, done
+    assert "exact" not in done.err.replace("as it is", "")
+    (output,) = json.loads(done.out)["outputs"]
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    (config,) = re.findall('id="clod-config">(.*?)</script>', text)
+    model = json.loads(config)["model"]
+    assert json.loads(config)["virtual_scale"] == (sv or 1)
+    (tmp_path / "held.ply").write_bytes(base64.b64decode(re.findall('id="clod-model">(.*?)</script>', text)[0]))
+    held = clod_adapter.load(tmp_path / "held.ply")
+    assert len(held.gaussians) == model["count"] == output["count"] and model["name"] == dialled.name
+    assert held.gaussians.sigma_d is not None and model["attenuation"] and model["calibration"]
+    assert [path.name for path in tmp_path.glob(".tmp-*")] == []
+
+
+def test_a_page_has_the_cameras_of_the_scene(clod: Any, dialled: Path, capture: Any, tmp_path: Path) -> None:
+    assert clod("export", dialled, "-o", "page.html", "--images", capture.scene).code == 0
+    (config,) = re.findall('id="clod-config">(.*?)</script>', (tmp_path / "page.html").read_text(encoding="utf-8"))
+    names = [camera["name"] for camera in json.loads(config)["cameras"]]
+    assert names == sorted(path.name for path in (capture.scene / "images").iterdir())
+
+
+@pytest.mark.parametrize("words", [("--levels", "1,2"), ("--order", "extinction")])
+def test_a_page_is_of_the_whole_dial(clod: Any, dialled: Path, tmp_path: Path, words: tuple[str, ...]) -> None:
+    done = clod("export", dialled, "-o", "page.html", *words)
+    assert done.code == 2 and "leave out --levels, --camera and --order" in done.err
+    assert not list(tmp_path.glob("page*"))
