@@ -155,7 +155,7 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("export DIALLED -o x.ply --sv 2 --camera 003", "--camera names a photograph of a scene; give that too"),
         (
             "export DIALLED -o x.ply --sv 2 --images SCENE",
-            "--images is for the cameras of --camera, --order and a .html",
+            "--images is for the cameras of --camera, --order",
         ),
         (
             "export DIALLED -o x.ply --camera 003 --images SCENE",
