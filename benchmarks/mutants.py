@@ -22,6 +22,7 @@ import numpy as np
 import pycolmap
 import torch
 from common import SHARED
+from mutants_models import described, model_inputs, unpacked
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
@@ -31,7 +32,7 @@ from clod_adapter.io.ply_columns import inria_dtype
 from clod_adapter.io.ply_header import read_head
 
 Input = dict[str, bytes]
-FORMATS = ("ply", "safetensors", "colmap", "transforms", "pt")
+FORMATS = ("ply", "safetensors", "colmap", "transforms", "pt", "models")
 IMAGES = ("a.png", "b.png", "c.png")
 SIZE = (8, 6)
 CAMERAS = {
@@ -43,7 +44,8 @@ CAMERAS = {
 def make(kind: str, folder: Path) -> list[Input]:
     """The undamaged inputs of a format; ``folder`` is for files on the way."""
     makers: dict[str, Callable[[Path], list[Input]]] = {
-        "ply": _plys, "safetensors": _adapters, "colmap": _models, "transforms": _transforms, "pt": _pts
+        "ply": _plys, "safetensors": _adapters, "colmap": _models, "transforms": _transforms, "pt": _pts,
+        "models": lambda folder: model_inputs(folder, _base(folder).gaussians),
     }  # fmt: skip
     return makers[kind](folder)
 
@@ -100,10 +102,7 @@ def _plys(folder: Path) -> list[Input]:
 
 def _adapters(folder: Path) -> list[Input]:
     """Of sigma_d alone, and of all updates with a calibration, through a base and its adapted copy."""
-    inputs = []
-    path = folder / "base.ply"
-    path.write_bytes(_ply(_vertex(6))["model.ply"])
-    base = clod.load(path)
+    inputs, base = [], _base(folder)
     gaussians = clod.attach(base.gaussians, torch.rand(6), clod.AttenuationConfig())
     row = {"virtual_scale": 1.0, "kept": 6.0, "psnr": 30.0, "ssim": 0.9, "frame_ms": 1.0}
     tuned = gaussians.replace(**{name: value + 0.1 for name, value in gaussians.tensors().items()})
@@ -112,6 +111,12 @@ def _adapters(folder: Path) -> list[Input]:
         save_adapter(folder / "a.safetensors", adapter)
         inputs.append({"a.safetensors": (folder / "a.safetensors").read_bytes()})
     return inputs
+
+
+def _base(folder: Path) -> clod.Checkpoint:
+    path = folder / "base.ply"
+    path.write_bytes(_ply(_vertex(6))["model.ply"])
+    return clod.load(path)
 
 
 def _model(*kinds: str) -> pycolmap.Reconstruction:
@@ -331,5 +336,9 @@ def _place(data: bytearray, chance: random.Random) -> int:
     return chance.randrange(max(1, min(len(data), 200) if chance.random() < 0.33 else len(data)))
 
 
-INSIDE = {".safetensors": _describe, ".pt": _repack, ".json": _document}
+INSIDE = {
+    ".safetensors": _describe, ".pt": _repack, ".json": _document,
+    ".spz": lambda data, chance: unpacked(data, chance, damage),
+    ".glb": lambda data, chance: described(data, chance, damage, _replace),
+}  # fmt: skip
 WAYS = (_flip, _truncate, _drop, _insert, _word, _number, _number, _chunk, _line, _line)
