@@ -26,12 +26,10 @@ from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.ply_columns import MASKS, SIGMA, inria_dtype
 from clod_adapter.io.poses import load_cameras
-from clod_adapter.io.splat_transform import SplatTransform
+from clod_adapter.io.splat_transform import SplatTransform, time_limit
 from clod_adapter.io.version import package_version
 from clod_adapter.io.writers import write
 from clod_adapter.viewer.page import write_page
-
-TIMEOUT, TIMEOUT_EACH = 600.0, 0.02  # seconds for splat-transform, and per Gaussian; ten times what was measured
 
 
 @dataclass(frozen=True)
@@ -115,7 +113,7 @@ class Export:
     def _transform(self, words: list[str | Path], out: Path, count: int) -> tuple[str, ...]:
         tool = SplatTransform.find()
         with ticking(self.console, f"splat-transform {tool.version}, {count:,} Gaussians") as tick:
-            seconds = tool.run(*words, out, timeout=TIMEOUT + TIMEOUT_EACH * count, progress=tick)
+            seconds = tool.run(*words, out, timeout=time_limit(count), progress=tick)
         self.console.say(f"splat-transform took {duration(seconds)}")
         notes = ["values are rounded, and the rows are in an order of splat-transform's"]
         if any(self.model.origin):

@@ -63,17 +63,19 @@ class Attenuated(NamedTuple):
 
 @torch.no_grad()
 def normalized_distances(means: Tensor, camera: Camera, config: AttenuationConfig) -> Tensor:
-    """``[N]`` the equation's d: ``|mu - c| / D``, without unit, >= 0.
+    """``[N]`` the equation's d: ``|mu - c| / D``, without unit, >= 0, in float32 or, from float64, in float64.
 
     D is ``normalizing_distance``. A constant for autograd: no gradient reaches ``means``, whose light
-    update during training is left to the picture.
+    update during training is left to the picture. ``torch.autocast`` changes nothing here.
 
     Args:
         means: ``[N, 3]`` world units.
     """
-    x, y, z = (means - camera.position.to(means)).unbind(1)  # three times as fast as a norm over rows of 3
-    distances = x.square().addcmul_(y, y).addcmul_(z, z).sqrt_()
-    return distances.div_(normalizing_distance(distances, means, camera, config))
+    means = means.to(torch.promote_types(means.dtype, torch.float32))  # float16's square overflows from 256 on
+    with torch.autocast(means.device.type, enabled=False):  # it would round the camera's place to 3 digits
+        x, y, z = (means - camera.position.to(means)).unbind(1)  # three times as fast as a norm over rows of 3
+        distances = x.square().addcmul_(y, y).addcmul_(z, z).sqrt_()
+        return distances.div_(normalizing_distance(distances, means, camera, config))
 
 
 @torch.no_grad()

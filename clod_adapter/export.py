@@ -12,10 +12,7 @@ from clod_adapter.attenuation import attenuate, normalized_distances
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
 from clod_adapter.extinction import extinction_scale
-from clod_adapter.gaussians import Gaussians
-
-# Fully opaque, as a finite logit: its sigmoid is 1 in float32. Some readers do not take +inf.
-OPAQUE = 20.0
+from clod_adapter.gaussians import OPAQUE, Gaussians
 
 
 @torch.no_grad()
@@ -26,7 +23,7 @@ def bake(gaussians: Gaussians, virtual_scale: float, camera: Camera | None = Non
     the d' that ``camera`` has. Lossy: the result has neither the dial nor the other Gaussians, and is what a renderer
     of the adapted file shows only for what is at that distance, ``scene_distance`` with the default normaliser, or from
     where the camera is. Nearer Gaussians come out fainter than they should be, or are missing; farther ones stronger.
-    Where the dial does nothing the logits are as they were.
+    Where the dial does nothing the logits are as they were, but for +inf, which becomes ``OPAQUE``.
 
     Args:
         gaussians: with a dial.
@@ -47,9 +44,9 @@ def bake(gaussians: Gaussians, virtual_scale: float, camera: Camera | None = Non
         raise ClodError(f"no Gaussian is kept at s = {virtual_scale:g} {where}; bake a smaller s")
     # From log a'', and by expm1 and not 1 - o, which cancels where o is near 1; the cut's part of it is 1 for most.
     drawn = faded.log_opacities + (faded.drawn / faded.opacities).log()
-    baked = drawn - torch.log(-torch.expm1(drawn))
-    baked = torch.where(drawn == torch.nn.functional.logsigmoid(logits), logits, baked)
-    plain = detach(gaussians.replace(opacity_logits=baked.to(logits).clamp(max=OPAQUE)))
+    baked = (drawn - torch.log(-torch.expm1(drawn))).clamp(max=OPAQUE)
+    same = (drawn == torch.nn.functional.logsigmoid(logits)) & logits.isfinite()
+    plain = detach(gaussians.replace(opacity_logits=torch.where(same, logits, baked.to(logits))))
     return plain.select(faded.keep)
 
 

@@ -14,6 +14,9 @@ from clod_adapter.errors import ClodError
 SH_C0 = 0.28209479177387814
 """The degree-0 harmonic, ``1 / (2 sqrt(pi))``: seen without higher bands a colour is ``0.5 + SH_C0 sh0``."""
 
+OPAQUE = 20.0
+"""The logit of an opacity that float32 cannot tell from 1; stands for +inf, which not every reader takes."""
+
 
 @dataclass(frozen=True)
 class Gaussians:

@@ -42,13 +42,14 @@ class Hook:
         check_dial(self.virtual_scale)
 
     def __call__(
-        self, means: Array, opacities: Array, viewmat: Array, K: Array | None = None, width: int = 1, height: int = 1,
+        self, means: Array, opacities: Array, viewmat: Any, K: Any = None, width: int = 1, height: int = 1,
         near: float = NEAR,
     ) -> tuple[Array, Array]:  # fmt: skip
         """The opacities to draw with, 0 for who is left out, and ``[N]`` bool who is kept (CLoD-GS Eq. 2, its mask).
 
         numpy in, numpy out; torch in, torch out, on the means' device, differentiable in ``opacities`` and in
-        ``sigma_d``. Distances are constants: no gradient reaches ``means`` and ``viewmat``.
+        ``sigma_d``. Distances are constants: no gradient reaches ``means`` and ``viewmat``. The camera's arguments may
+        be of either kind, as viewers have them in numpy beside Gaussians on a GPU.
 
         Args:
             means: ``[N, 3]`` world units.
@@ -60,21 +61,15 @@ class Hook:
         Raises:
             ClodError: the shapes do not fit the hook or each other, or a normaliser that needs K has none.
         """
-        if isinstance(means, np.ndarray):
-            intrinsics = None if K is None else torch.tensor(K)
-            given = torch.tensor(means), torch.tensor(opacities), torch.tensor(viewmat)
-            drawn, keep = self._of(*given, intrinsics, width, height, near)
-            return drawn.detach().numpy(), keep.numpy()
-        return self._of(means, opacities, viewmat, K, width, height, near)
-
-    def _of(
-        self, means: Tensor, opacities: Tensor, viewmat: Tensor, K: Tensor | None, width: int, height: int, near: float
-    ) -> tuple[Tensor, Tensor]:
         if K is None and self.attenuation.normalizer != "scene":
             raise ClodError(f"normalizer {self.attenuation.normalizer} needs K, width and height in the hook's call")
-        camera = Camera(viewmat, torch.eye(3).to(viewmat) if K is None else K.to(viewmat), width, height, near=near)
-        result = self.attenuate(means, opacities, camera)
-        return result.drawn.reshape(opacities.shape).to(opacities.dtype), result.keep
+        camera = Camera(_matrix(viewmat), _matrix(np.eye(3) if K is None else K), width, height, near=near)
+        shown = _tensor(opacities)
+        result = self.attenuate(_tensor(means), shown, camera)
+        drawn = result.drawn.reshape(shown.shape).to(shown.dtype)
+        if isinstance(means, Tensor):
+            return drawn, result.keep
+        return drawn.detach().numpy(), result.keep.numpy()
 
     def attenuate(self, means: Tensor, opacities: Tensor, camera: Camera) -> Attenuated:
         """The same of a ``Camera``, with all that ``attenuation.attenuate`` returns."""
@@ -87,3 +82,17 @@ class Hook:
         distances = normalized_distances(means, camera, self.attenuation)
         sigma_d = self.sigma_d.to(means.device)
         return attenuate_activated(opacities.reshape(n), sigma_d, distances, self.virtual_scale, self.attenuation)
+
+
+def _tensor(values: Any) -> Tensor:
+    """A tensor as it is; else a copy, as torch takes neither another byte order nor steps backwards."""
+    if isinstance(values, Tensor):
+        return values
+    array = np.asarray(values)
+    return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), order="C"))
+
+
+def _matrix(values: Any) -> Tensor:
+    """In float32 at least: neither whole numbers nor float16 are enough for a camera."""
+    matrix = _tensor(values)
+    return matrix.to(torch.promote_types(matrix.dtype, torch.float32))

@@ -69,8 +69,11 @@ def test_a_gaussian_at_the_threshold_has_an_opacity_that_a_file_can_hold(cut: st
 
 def test_a_dial_that_does_nothing_changes_nothing() -> None:
     some = gaussians(50, 0, 1)
+    some.opacity_logits[:2] = torch.tensor([22.0, math.inf])  # more than opaque is left, no number is not
     baked = bake(attach(some), 1.0)
-    assert torch.equal(baked.opacity_logits, some.opacity_logits[some.opacities > 1 / 255])
+    want = some.opacity_logits[some.opacities > 1 / 255]
+    assert (float(baked.opacity_logits[1]), float(want[1])) == (20.0, math.inf)
+    assert torch.equal(baked.opacity_logits[2:], want[2:]) and baked.opacity_logits[0] == 22
 
 
 def spread(n: int = 300, normalizer: str = "scene", cut: str = "soft") -> Gaussians:

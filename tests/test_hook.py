@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -64,6 +65,45 @@ def test_shape_and_type_are_those_of_the_opacities() -> None:
     half, _ = hook_of(model)(model.means, model.opacities.half(), view.viewmat)
     assert half.dtype == torch.float16
     torch.testing.assert_close(column[:, 0].double(), double, rtol=1e-4, atol=1e-6)
+
+
+def test_float16_and_autocast_cost_no_distance() -> None:
+    """Farther away than float16 has squares for, and with products that autocast would round to bfloat16."""
+    model, view = adapted(scene_distance=300.0, normalizer="quantile"), camera()
+    viewmat = view.viewmat.clone()
+    viewmat[:3, 3] = torch.tensor([100.0, 200.0, 300.0])
+    given = (viewmat, view.K, view.width, view.height)
+    means = (300 * model.means).half()
+    drawn, keep = hook_of(model)(means.float(), model.opacities, *given)
+    assert 0 < int(keep.sum()) < N
+    half, same = hook_of(model)(means, model.opacities, *given)
+    assert torch.equal(half, drawn) and torch.equal(same, keep)
+    with torch.autocast("cpu", torch.bfloat16):
+        cast, same = hook_of(model)(means.float(), model.opacities, *given)
+    assert torch.equal(cast, drawn) and torch.equal(same, keep)
+
+
+def test_arrays_as_viewers_have_them() -> None:
+    """A camera of the other kind, or of whole numbers, arrays read backwards or in the other byte order, lists."""
+    model, view = adapted(normalizer="max"), camera()
+    means, a, viewmat = model.means.numpy(), model.opacities.numpy(), view.viewmat.numpy()
+    hook, size = hook_of(model), (view.width, view.height)
+    want = hook(means, a, viewmat, view.K.numpy(), *size)
+    mixed = hook(model.means, model.opacities, viewmat, view.K.numpy(), *size)
+    assert isinstance(mixed[0], torch.Tensor) and (mixed[0].numpy() == want[0]).all()
+    for others in (
+        (means, a, view.viewmat, view.K),
+        (means[::-1][::-1], np.stack([a, a], 1)[:, 0], np.asfortranarray(viewmat), view.K.numpy()),
+        (means.astype(">f4"), a.astype(">f4"), viewmat.astype(">f8"), view.K.numpy()),
+        (means.tolist(), a, viewmat.tolist(), view.K.tolist()),
+    ):
+        drawn, keep = hook(*others, *size)
+        assert type(drawn) is type(keep) is np.ndarray and drawn.dtype.isnative
+        assert (keep == want[1]).all() and np.allclose(drawn, want[0], rtol=1e-5)
+    whole = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]])
+    assert (
+        hook(means, a, whole, view.K.numpy(), *size)[0] == hook(means, a, whole * 1.0, view.K.numpy(), *size)[0]
+    ).all()
 
 
 def test_gradients_reach_opacities_and_sigma_d_and_nothing_else() -> None:

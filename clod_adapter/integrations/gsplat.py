@@ -57,7 +57,12 @@ def rasterization(
     Equals gsplat called with ``attenuation.attenuate``'s opacities, for several cameras ``[..., C, 4, 4]`` camera by
     camera. Differentiable in ``sigma_d`` and all that gsplat differentiates in; the distances are constants, so the
     dial adds nothing to the gradients of ``means`` and ``viewmats``. ``meta`` is gsplat's: ``means2d`` takes
-    ``retain_grad()`` and, with ``absgrad``, has its ``absgrad``, as the densification strategies need it.
+    ``retain_grad()`` and, with ``absgrad``, has its ``absgrad``, as the densification strategies need it. (Of several
+    cameras it is a copy of what was drawn from, which ``torch.autograd.grad`` and hooks of its own do not reach.)
+
+    The distance is that from the centre of ``viewmats``, whatever the camera: an orthographic one that steps back sees
+    the same, fainter; of a rolling shutter it is the start. For the normalisers ``max`` and ``quantile`` those are in
+    sight that a pinhole with these ``Ks`` has in its image; ``scene``, the usual one, does without.
 
     Args:
         args, kwargs: gsplat's own, by position or by name.

@@ -7,9 +7,10 @@ color, radii, *others = GaussianRasterizer(raster_settings)(
 )
 
 Forks differ in their settings, in further arguments and in what they return; this class is the installed one's own and
-passes all of it on. Who is left out is handed over with opacity 0 and at the camera's centre, where every fork culls it
-first of all (nearer than 0.2): it costs what a Gaussian out of sight costs, which opacity 0 alone would not save. All
-rows stay in their places: radii are 0 there, and the gradients of every input keep their shapes.
+passes all of it on. Who is left out is handed over with opacity 0 and just behind the camera's centre, where a fork
+culls it first of all, whether by depth (0.2, or nearer where someone has changed that) or, as for panoramas, by
+distance: it costs what a Gaussian out of sight costs, which opacity 0 alone would not save. All rows stay in their
+places: radii are 0 there, and the gradients of every input keep their shapes.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from clod_adapter.cameras import NEAR
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.hook import Hook
@@ -75,7 +77,8 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
         drawn, keep = hook(
             means3D, opacities, viewmat, _intrinsics(settings), settings.image_width, settings.image_height
         )
-        means3D = torch.where(keep[:, None], means3D, settings.campos.to(means3D))
+        hidden = settings.campos - NEAR * settings.viewmatrix[:3, 2]  # against the way the camera looks
+        means3D = torch.where(keep[:, None], means3D, hidden.to(means3D))
         return super().forward(means3D, means2D, drawn, *args, **kwargs)
 
 

@@ -14,9 +14,6 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import check_target
 from clod_adapter.io.regular import refuse_irregular
 
-OPAQUE = 20.0
-"""Fully opaque, as a finite logit: its sigmoid is 1 in float32. Some readers do not take +inf."""
-
 # The axes in which each spherical harmonic is odd, in the order of ``Gaussians.shN``.
 _ODD = (
     "y", "z", "x",

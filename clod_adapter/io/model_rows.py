@@ -15,7 +15,7 @@ from clod_adapter.io.origin import AXES
 from clod_adapter.io.ply_columns import SIGMA, rows_of
 from clod_adapter.io.ply_header import PREFIX, write_comments
 from clod_adapter.io.pt import check_pt
-from clod_adapter.io.regular import refuse_irregular
+from clod_adapter.io.regular import read_start
 from clod_adapter.io.rows import Rows
 
 _NEW_SPZ = b"NGSP"  # how version 4 begins, which splat-transform is asked to read; earlier ones are gzipped
@@ -35,12 +35,7 @@ def check_model(path: Path) -> None:
     suffix = path.suffix.lower()
     if suffix == ".pt":
         return check_pt(path)
-    try:
-        refuse_irregular(path)
-        with open(path, "rb") as file:
-            start = file.read(64)
-    except (OSError, ValueError) as error:
-        raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
+    start = read_start(path)
     refuse_known(path, start)
     if suffix in _START and not start.startswith(_START[suffix]):
         raise ClodError(f"{path}: is no {suffix} file by its first bytes; copy or export it again")

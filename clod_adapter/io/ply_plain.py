@@ -9,8 +9,7 @@ from pathlib import Path
 import torch
 
 from clod_adapter.calibration import Calibration
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.arrays import OPAQUE
+from clod_adapter.gaussians import OPAQUE, Gaussians
 from clod_adapter.io.origin import NOWHERE, Origin
 from clod_adapter.io.ply import blank, save
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from clod_adapter.cameras import Camera, camera_extent, near_plane
+from clod_adapter.errors import ClodError
 from clod_adapter.io.colmap_model import read_model
 from clod_adapter.io.origin import NOWHERE
 from clod_adapter.io.scene_folder import find_cameras
@@ -39,5 +40,9 @@ def load_cameras(folder: str | Path, origin: Sequence[float] = NOWHERE) -> tuple
             cameras.append(Camera(viewmat, K, pinhole.width, pinhole.height, image.name))
     if unsized := len(images) - len(cameras):
         notes.append(f"{unsized} of {len(images)} cameras left out: neither {source.name} nor a photograph has a size")
-    extent = camera_extent(cameras) if cameras else 0.0
+    if not cameras:
+        raise ClodError(
+            f"{source}: says no photograph's size, and none of them is there; put them beside it, or w and h into it"
+        )
+    extent = camera_extent(cameras)
     return [replace(camera, near=near_plane(extent)) if extent else camera for camera in cameras], notes

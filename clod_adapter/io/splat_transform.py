@@ -26,6 +26,7 @@ HELP = (
     f"command in {VARIABLE}"
 )
 ASKING = 30.0  # seconds that a question about itself may take
+LIMIT, LIMIT_EACH = 600.0, 0.02  # seconds for a run, and per Gaussian; ten times what was measured
 TICK = 0.2  # seconds between two looks at whether it is done
 # Without a GPU, where a round of SOG's clustering of spherical harmonics takes minutes, and its usual ten take an hour.
 # Two rounds more give 0.02 dB.
@@ -111,6 +112,11 @@ class SplatTransform:
         if process.returncode:
             raise ClodError(f"splat-transform {self.version} failed: {_reason(said)}")
         return time.perf_counter() - began
+
+
+def time_limit(count: int) -> float:
+    """Seconds after which a run over this many Gaussians has hung."""
+    return LIMIT + LIMIT_EACH * count
 
 
 def _words(given: str) -> tuple[str, ...]:

@@ -12,11 +12,10 @@ import numpy as np
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.ply import load
-from clod_adapter.io.splat_transform import SplatTransform
+from clod_adapter.io.splat_transform import SplatTransform, time_limit
 from clod_adapter.viewer.payload import Payload
 
 BITS = 11  # of a sigma_d's fraction that are kept; it is off by at most 2^-12 of itself
-TIMEOUT, TIMEOUT_EACH = 600.0, 0.02  # seconds for splat-transform, and per Gaussian; ten times what was measured
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ def pack(
         ClodError: splat-transform fails, takes too long, or loses Gaussians.
     """
     count = len(payload.gaussians)
-    timeout = TIMEOUT + TIMEOUT_EACH * count
+    timeout = time_limit(count)
     with TemporaryDirectory(dir=folder, prefix=".tmp-") as made:
         rows, ordered, sog = (Path(made) / name for name in ("rows.ply", "ordered.ply", "packed.sog"))
         with open(rows, "wb") as file:

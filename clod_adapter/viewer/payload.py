@@ -16,14 +16,13 @@ from plyfile import PlyData, PlyElement
 
 from clod_adapter.calibration import Calibration
 from clod_adapter.cameras import Camera
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.gaussians import OPAQUE, Gaussians
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.ply_columns import SIGMA, column_map, inria_dtype
 from clod_adapter.io.ply_header import write_comments
 from clod_adapter.io.version import package_version
 
 ROWS = 1 << 14  # in a block
-OPAQUE = 20.0  # logit of an opacity that float32 cannot tell from 1; pages do not take +inf
 
 
 @dataclass(frozen=True)

@@ -353,8 +353,8 @@ def test_a_streaming_set(clod: Any, dialled: Path, tmp_path: Path, tool: Any) ->
 def test_where_the_tool_fails_nothing_is_left(
     clod: Any, dialled: Path, tmp_path: Path, tool: Any, monkeypatch: Any, behave: str, code: int, said: str, lod: bool
 ) -> None:
-    monkeypatch.setattr("clod_adapter.cli.export.TIMEOUT", 1.0)
-    monkeypatch.setattr("clod_adapter.cli.export.TIMEOUT_EACH", 0.0)
+    monkeypatch.setattr("clod_adapter.io.splat_transform.LIMIT", 1.0)
+    monkeypatch.setattr("clod_adapter.io.splat_transform.LIMIT_EACH", 0.0)
     monkeypatch.setenv("PYTHONIOENCODING", "utf-8")
     tool(behave)
     done = clod("export", dialled, "--levels", "1,2", *(("--lod-meta", "-o", "out") if lod else ("-o", "x.sog")))

@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 
 from clod_adapter.cli.main import main
+from clod_adapter.config import AdaptConfig
+from clod_adapter.counting import count_law
 from fences import ROOT
 
 DOCS, RESULTS = ROOT / "docs", ROOT / "benchmarks" / "results"
@@ -111,6 +113,13 @@ def test_the_long_dials_are_those_that_were_measured() -> None:
         columns.append({f"s = {row['virtual_scale']:g}": cell(row) for row in run["rows"]})
     for name, *written in page[1:]:
         assert written == [column.get(name, "") for column in columns], name
+
+
+def test_the_law_is_what_training_presses_towards() -> None:
+    config = AdaptConfig()
+    (dials, law) = next(rows for rows in tables(DOCS / "equation.md") if rows[0][0] == "s")
+    for s, share in zip(dials[1:], law[1:], strict=True):
+        assert share == f"{count_law(float(s), config.start_share, config.exponent):.0%}".replace("%", " %")
 
 
 def test_the_keys_are_those_of_the_viewer() -> None:

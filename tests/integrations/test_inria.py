@@ -15,7 +15,7 @@ import inria_forks
 from clod_adapter.attenuation import attenuate, normalized_distances
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
-from scenes import camera, scene
+from scenes import camera, ring, scene
 
 N = 150
 VIEW = camera(48, 36, off_centre=(0.5, 0.5))
@@ -104,6 +104,16 @@ def test_without_sigma_d_it_is_the_fork(name: str, monkeypatch: pytest.MonkeyPat
     )
     for mine, want in zip(rasterizer(**given), fork.GaussianRasterizer(raster_settings)(**given), strict=True):
         assert torch.equal(mine, want)
+
+
+def test_who_is_left_out_is_out_of_sight_of_a_fork_that_culls_at_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From many places, as rounding has a point at the camera's centre now before it and now behind."""
+    monkeypatch.setattr(inria_forks, "NEAREST", 0.0)
+    fork, given, sigma_d = inria_forks.module("inria 2024"), arguments(), torch.full((N,), 1e-3)
+    for view in ring(31, 48, 36):
+        settings = inria_forks.settings_of(fork.GaussianRasterizationSettings, view)
+        rasterizer = wrapper(monkeypatch, fork).GaussianRasterizer(settings)
+        assert not rasterizer(**given, sigma_d=sigma_d, virtual_scale=DIAL, attenuation=config())[1].any()
 
 
 def test_by_position(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,6 +56,13 @@ def test_a_camera_without_a_size_is_left_out(tmp_path: Path) -> None:
     assert notes == ["1 of 2 cameras left out: neither transforms.json nor a photograph has a size"]
 
 
+def test_where_no_camera_has_a_size_there_are_none(tmp_path: Path) -> None:
+    frames = [{"file_path": "0.png", "transform_matrix": torch.eye(4).tolist()}]
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
+    with pytest.raises(ClodError, match="transforms.json: says no photograph's size.*put them beside it, or w"):
+        load_cameras(tmp_path)
+
+
 def test_no_cameras(tmp_path: Path) -> None:
     with pytest.raises(ClodError, match="no COLMAP model"):
         load_cameras(tmp_path)
