@@ -23,7 +23,7 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 248\n"
         ("a.ply", b"<?xml version='1.0'?><Error>", "XML document"),
         ("a.ply", gzip.compress(b"ply\n"), "gzip.*gunzip"),
         ("a.ply.gz", gzip.compress(b"ply\n"), "gzip.*gunzip"),
-        ("a.spz", b"NGSP" + bytes(60), "spz of version 4 is read through splat-transform|cannot read it"),
+        ("a.spz", b"NGSP" + bytes(60), "spz of version 4 is read through splat-transform|cannot be read"),
         ("a.spz", bytes(64), "no .spz file by its first bytes"),
         ("a.glb", bytes(64), "no .glb file by its first bytes"),
         ("a.ply", b"glTF", "glTF model; call it .glb"),
