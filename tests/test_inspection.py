@@ -268,6 +268,7 @@ def test_other_formats(tmp_path: Path) -> None:
         ("a.ply", b"<html>", "web page"),
         ("a.ply", b"version https://git-lfs.github.com/spec/v1\n", "Git LFS pointer"),
         ("a.ckpt", b"PK\x03\x04", "Nerfstudio"),
+        ("a.safetensors", b"version https://git-lfs.github.com/spec/v1\n", "Git LFS pointer"),
         ("a.safetensors", b"xxxxxxxxxxxxxxxx", "no safetensors file or damaged"),
         ("a.pt", b"PK\x03\x04", "damaged or truncated"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "mesh or a point"),

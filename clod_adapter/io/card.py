@@ -7,7 +7,6 @@ and lines on how the file came about.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.io.origin import NOWHERE, Origin
+from clod_adapter.io.origin import NOWHERE, Origin, parse_origin
 from clod_adapter.io.version import package_version
 
 if TYPE_CHECKING:
@@ -97,7 +96,7 @@ def read_card(path: Path, text: str | bytes | dict[str, Any] | None, total: int)
         return Card(
             attenuation=_attenuation(values["attenuation"], notes) if "attenuation" in values else None,
             calibration=calibration,
-            origin=_origin(values.get("origin", NOWHERE)),
+            origin=parse_origin(values.get("origin", NOWHERE)),
             about=tuple(map(str, values.get("about", ()))),
             version=str(values["package_version"]),
         ), notes
@@ -133,10 +132,3 @@ def _calibration(values: dict[str, Any], total: int) -> tuple[Calibration | None
     if calibration.total != total:
         return None, [f"the calibration is of {calibration.total} Gaussians and ignored, these are {total}"]
     return calibration, []
-
-
-def _origin(values: Any) -> Origin:
-    x, y, z = map(float, values)
-    if not all(map(math.isfinite, (x, y, z))):
-        raise ValueError(f"origin is {values!r:.80}, not finite")
-    return x, y, z

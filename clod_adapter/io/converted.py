@@ -10,7 +10,7 @@ from clod_adapter.io.foreign import refuse_known
 from clod_adapter.io.ply_body import read_element
 from clod_adapter.io.ply_columns import sh_degree_of
 from clod_adapter.io.ply_header import read_head
-from clod_adapter.io.regular import refuse_irregular
+from clod_adapter.io.regular import read_start
 from clod_adapter.io.rows import Rows
 from clod_adapter.io.splat_transform import SplatTransform
 
@@ -26,12 +26,7 @@ def check_converted(path: Path, version: str = "") -> SplatTransform:
     Raises:
         ClodError: it is, or splat-transform is not here, or too old.
     """
-    try:
-        refuse_irregular(path)
-        with open(path, "rb") as file:
-            start = file.read(64)
-    except (OSError, ValueError) as error:
-        raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
+    start = read_start(path)
     refuse_known(path, start)
     try:
         return SplatTransform.find()

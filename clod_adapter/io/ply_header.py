@@ -15,7 +15,7 @@ from clod_adapter.calibration import AGAINST, Calibration, CalibrationRow
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.foreign import refuse
-from clod_adapter.io.regular import refuse_irregular
+from clod_adapter.io.regular import read_start
 from clod_adapter.io.version import package_version
 
 PREFIX = "clod_adapter "
@@ -46,12 +46,7 @@ def read_head(path: Path) -> Head:
     Raises:
         ClodError: the file cannot be read, is not a PLY, or its header is damaged or longer than 1 MB.
     """
-    try:
-        refuse_irregular(path)
-        with open(path, "rb") as file:
-            start = file.read(_HEADER_LIMIT)
-    except (OSError, ValueError) as error:  # ValueError: a name that holds a NUL
-        raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
+    start = read_start(path, _HEADER_LIMIT)
     if not re.match(rb"ply\r?\n|ply\r", start):
         refuse(path, start)
     end = re.search(rb"[\r\n]end_header(\r?\n|\r)", start)

@@ -34,6 +34,8 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 248\n"
         ("a.hier", bytes(64), "Hierarchical-3DGS.*point_cloud.ply"),
         ("a.ckpt", b"PK\x03\x04rest", "Nerfstudio.*ns-export gaussian-splat"),
         ("chkpnt30000.pth", b"PK\x03\x04rest", "Inria.*point_cloud.ply"),
+        ("a.safetensors", LFS, "Git LFS pointer.*git lfs pull"),
+        ("a.safetensors", b"", "is empty"),
         ("a.safetensors", bytes(64), "no safetensors file or damaged"),
         ("meta.json", b"{}", "SOG.*splat-transform"),
         ("a.ply", b"solid teapot", "is not a PLY file"),
