@@ -10,7 +10,7 @@ import numpy as np
 from clod_adapter.errors import ClodError
 from clod_adapter.io.card import KEY, Card
 from clod_adapter.io.converted import check_converted, read_converted
-from clod_adapter.io.foreign import refuse_known
+from clod_adapter.io.foreign import refuse, refuse_known
 from clod_adapter.io.origin import AXES
 from clod_adapter.io.ply_columns import SIGMA, rows_of
 from clod_adapter.io.ply_header import PREFIX, write_comments
@@ -39,7 +39,7 @@ def check_model(path: Path) -> None:
     start = read_start(path)
     refuse_known(path, start)
     if suffix in _START and not start.startswith(_START[suffix]):
-        raise ClodError(f"{path}: is no {suffix} file by its first bytes; copy or export it again")
+        refuse(path, start, f"is no {suffix} file by its first bytes; copy or export it again")
     if start.startswith(_NEW_SPZ):
         check_converted(path, " of version 4")
         return

@@ -44,7 +44,7 @@ def check_pt(path: Path) -> None:
     if start.startswith(b"\x80"):
         raise ClodError(f"{path}: is a pickle in PyTorch's format before 1.6; load it and torch.save it again")
     if not start.startswith(b"PK"):
-        refuse(path, start)
+        refuse(path, start, "is no file of torch.save; export the checkpoint as a PLY")
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
