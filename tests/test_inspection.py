@@ -259,6 +259,8 @@ def test_other_formats(tmp_path: Path) -> None:
     found = inspect(write_packed(tmp_path / "a.compressed.ply", scenes.gaussians(30, 2, 0)))
     assert found.splat is not None and found.what == "a splat, compressed PLY" and found.writer == "SuperSplat 2.6.2"
     assert found.splat.values.count == 30 and "quantised" in found.notes[0] and found.splat.extra == ()
+    kinds = [(f"packed_{name}", "uint32") for name in ("position", "rotation", "scale", "color")]
+    assert sorted(found.splat.columns) == sorted(kinds)
 
 
 @pytest.mark.parametrize(
