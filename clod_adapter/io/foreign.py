@@ -1,4 +1,4 @@
-"""Files that are not what they are called: what they are, by their first bytes and their name, and what to do about them."""
+"""Files that are not what they are called: what they are, by first bytes and name, and what to do about them."""
 
 from __future__ import annotations
 
