@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib import recfunctions as rec
 
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.arrays import gaussians_of, half_turn, logit, read_whole
-from clod_adapter.io.card import KEY, Card, Model, read_card, settings_of
+from clod_adapter.io.card import KEY, Model, read_card, settings_of
 from clod_adapter.io.glb import DEGREE, EXTENSION, HALF_TURN, SIGMA, coefficient
-from clod_adapter.io.origin import Origin
+from clod_adapter.io.origin import AXES, NOWHERE, Origin, origin_of
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _FLOAT = 5126
@@ -66,11 +68,12 @@ def load_glb(path: str | Path) -> Model:
     except (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
         raise ClodError(f"{path}: is damaged or no such .glb ({error!r:.80}); {_REMEDY}") from error
     card, notes = read_card(path, text, len(arrays["means"]))
-    if text is None:
-        card = Card(origin=moved)
-    stored = _stored(arrays)
+    stored = _stored(arrays) if turned else half_turn(_stored(arrays), "z")
+    if moved != card.origin:  # not as we wrote it
+        stored["means"], moved = _moved(stored["means"], moved)
+        card = replace(card, origin=moved)
     attenuation = settings_of(path, card, notes) if "sigma_d" in arrays else None
-    return Model(gaussians_of(path, stored if turned else half_turn(stored, "z"), attenuation), card, tuple(notes))
+    return Model(gaussians_of(path, stored, attenuation), card, tuple(notes))
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -149,6 +152,13 @@ def _placed(gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
     if not np.isfinite([x, y, z]).all():
         raise ClodError("its node moves it by what is not finite; export it again")
     return turned, (0.0 - x, 0.0 - y, z)
+
+
+def _moved(means: np.ndarray, by: Origin) -> tuple[np.ndarray, Origin]:
+    """Means, and what they are relative to: moved where that is not far, as float32 has digits for it there."""
+    wide = means.astype(np.float64) + by
+    far = origin_of(rec.unstructured_to_structured(wide, names=list(AXES)))
+    return (means, by) if any(far) else (wide.astype(np.float32), NOWHERE)
 
 
 def _stored(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -165,6 +165,18 @@ def test_files_of_others(tmp_path: Path) -> None:
     assert g.quats.tolist() == [[1, 0, 0, 0]] * 5 and torch.isposinf(g.opacity_logits).all()
 
 
+def test_a_model_of_ours_that_was_moved(tmp_path: Path) -> None:
+    """Where its node stands now is where it is, whatever its description says."""
+    write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
+    to = [-1e6, 0.0, 0.0]
+    again, card, _ = load_glb(rewritten(tmp_path / "a.glb", lambda g: g["nodes"][0].update(translation=to)))
+    assert card.origin == (1e6, 0.0, 0.0) and again.attenuation == model().attenuation
+    near = {"translation": [1.0, -2.0, 4.0]}  # no origin: float32 has digits for it
+    moved, card, _ = load_glb(rewritten(tmp_path / "a.glb", lambda g: g["nodes"][0].update(near)))
+    assert not any(card.origin)
+    torch.testing.assert_close(moved.means, again.means + torch.tensor([-1.0, 2.0, 4.0]))
+
+
 def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ClodError, match="a scale is beyond"):
         write(tmp_path / "a.glb", model().replace(log_scales=torch.full((40, 3), 90.0)))
