@@ -25,6 +25,7 @@ from clod_adapter.io.version import package_version
 
 EXTENSION = "KHR_gaussian_splatting"
 SIGMA = "_SIGMA_D"
+COLOR_SPACE = "srgb_rec709_display"
 DEGREE = 3  # the highest that the extension has
 HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # about z, as xyzw: x right, y down becomes x left, y up; as splat-transform has it
 _LIMIT = 1 << 32  # bytes of a file, whose header says how many in 32 bits
@@ -70,7 +71,7 @@ def write_glb(
         offset += array.nbytes
     attributes = pygltflib.Attributes(**{name: index for index, name in enumerate(columns)})
     how = {
-        "kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective",
+        "kernel": "ellipse", "colorSpace": COLOR_SPACE, "projection": "perspective",
         "sortingMethod": "cameraDistance",
     }  # fmt: skip
     primitive = pygltflib.Primitive(attributes=attributes, mode=pygltflib.POINTS, extensions={EXTENSION: how})

@@ -15,7 +15,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.arrays import gaussians_of, half_turn, logit, read_whole
 from clod_adapter.io.card import KEY, Model, read_card, settings_of
-from clod_adapter.io.glb import DEGREE, EXTENSION, HALF_TURN, SIGMA, coefficient
+from clod_adapter.io.glb import COLOR_SPACE, DEGREE, EXTENSION, HALF_TURN, SIGMA, coefficient
 from clod_adapter.io.origin import AXES, NOWHERE, Origin, origin_of
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
@@ -51,7 +51,8 @@ def load_glb(path: str | Path) -> Model:
     path = Path(path)
     try:
         gltf, binary = _chunks(read_whole(path))
-        mesh, attributes = _find(gltf)
+        (mesh, primitive), *others = _find(gltf)
+        attributes, doubts = primitive["attributes"], _doubts(primitive, len(others))
         arrays = {key: _read(gltf, binary, attributes[name], width) for key, (name, width) in _ATTRIBUTES.items()}
         degree = 0
         while degree < DEGREE and coefficient(degree + 1, 0) in attributes:
@@ -73,7 +74,7 @@ def load_glb(path: str | Path) -> Model:
         stored["means"], moved = _moved(stored["means"], moved)
         card = replace(card, origin=moved)
     attenuation = settings_of(path, card, notes) if "sigma_d" in arrays else None
-    return Model(gaussians_of(path, stored, attenuation), card, tuple(notes))
+    return Model(gaussians_of(path, stored, attenuation), card, (*doubts, *notes))
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -96,18 +97,28 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     return json.loads(found[_JSON]), found.get(_BIN, b"")
 
 
-def _find(gltf: dict[str, Any]) -> tuple[int, dict[str, Any]]:
-    """The first mesh with Gaussians, by its number, and their attributes."""
-    for number, mesh in enumerate(gltf.get("meshes", [])):
-        for primitive in mesh["primitives"]:
-            about = primitive.get("extensions", {}).get(EXTENSION)
-            if about is None:
-                continue
-            attributes = primitive["attributes"]
-            if about.get("extensions") or any(name not in attributes for name, _ in _ATTRIBUTES.values()):
-                raise ClodError("its Gaussians are compressed, or have no spherical harmonics; export them as a .ply")
-            return number, attributes
-    raise ClodError(f"has no Gaussians in it ({EXTENSION}), so it is a mesh; give a checkpoint of Gaussians")
+def _find(gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
+    """The primitives with Gaussians, of which there is one at least, each after the number of its mesh."""
+    found = [
+        (number, primitive)
+        for number, mesh in enumerate(gltf.get("meshes", []))
+        for primitive in mesh["primitives"]
+        if EXTENSION in primitive.get("extensions", {})
+    ]
+    if not found:
+        raise ClodError(f"has no Gaussians in it ({EXTENSION}), so it is a mesh; give a checkpoint of Gaussians")
+    _, first = found[0]
+    compressed = first["extensions"][EXTENSION].get("extensions")
+    if compressed or any(name not in first["attributes"] for name, _ in _ATTRIBUTES.values()):
+        raise ClodError("its Gaussians are compressed, or have no spherical harmonics; export them as a .ply")
+    return found
+
+
+def _doubts(primitive: dict[str, Any], others: int) -> list[str]:
+    """What of the file is not heeded."""
+    space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
+    notes = [f"its colours are in {space!r:.40}, and taken as {COLOR_SPACE}"] if space != COLOR_SPACE else []
+    return notes + ([f"{others} more primitives with Gaussians in it are left out"] if others else [])
 
 
 def _read(gltf: dict[str, Any], binary: bytes, number: int, width: int) -> np.ndarray:
