@@ -68,7 +68,11 @@ def test_files_that_are_not_there(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize("suffix", WRITERS)
 def test_nothing_is_half_written(tmp_path: Path, suffix: str) -> None:
     plain = model(1).replace(sigma_d=None, attenuation=None)
-    for g in (plain.select(torch.zeros(40, dtype=torch.bool)), plain.replace(sh0=plain.sh0 * torch.nan)):
+    unfit = (
+        plain.select(torch.zeros(40, dtype=torch.bool)), plain.replace(sh0=plain.sh0 * torch.nan),
+        plain.replace(quats=plain.quats * 0),
+    )  # fmt: skip
+    for g in unfit:
         with pytest.raises(ClodError, match="a" + suffix):
             write(tmp_path / f"a{suffix}", g)
     with pytest.raises(ClodError, match="does not exist"):
