@@ -13,7 +13,7 @@ from numpy.lib import recfunctions as rec
 
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.arrays import gaussians_of, half_turn, logit, read_whole
+from clod_adapter.io.arrays import gaussians_of, half_turn, logit, logs_of, read_whole
 from clod_adapter.io.card import KEY, Model, read_card, settings_of
 from clod_adapter.io.glb import COLOR_SPACE, DEGREE, EXTENSION, HALF_TURN, SIGMA, coefficient
 from clod_adapter.io.origin import AXES, NOWHERE, Origin, origin_of
@@ -30,7 +30,6 @@ _ATTRIBUTES = {
 _REMEDY = "export it again, as a .ply"
 IDENTITY = [0.0, 0.0, 0.0, 1.0]  # as xyzw
 _FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
-_TINY = float(np.finfo(np.float32).tiny)
 
 
 def read_glb(path: str | Path) -> Gaussians:
@@ -174,10 +173,9 @@ def _moved(means: np.ndarray, by: Origin) -> tuple[np.ndarray, Origin]:
 
 def _stored(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """As checkpoints store them."""
-    scales = np.log(np.maximum(arrays["log_scales"].astype(np.float64), _TINY))
     quats = np.roll(arrays["quats"], 1, axis=1)
     logits = logit(np.clip(arrays["opacity_logits"], 0, 1))
     return {
-        **arrays, "log_scales": scales, "quats": quats, "opacity_logits": np.maximum(logits, _FAINTEST),
-        "sh0": arrays["sh0"][:, None],
+        **arrays, "log_scales": logs_of(arrays["log_scales"]), "quats": quats,
+        "opacity_logits": np.maximum(logits, _FAINTEST), "sh0": arrays["sh0"][:, None],
     }  # fmt: skip
