@@ -51,5 +51,7 @@ def _said_in_one_line(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    except MemoryError:  # of a file that is whole
+        raise
     except Exception as error:  # SafetensorError, and whatever a crafted header provokes
         raise ClodError(f"{path}: is no safetensors file or damaged ({error}); copy or export it again") from error
