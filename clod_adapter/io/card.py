@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 KEY = "clod_adapter"
 FORMAT = "clod-model"
 FORMAT_VERSION = 1
+_LONGEST = 1 << 16  # letters of a description's lines; a PLY's header has to have room for them
 
 
 @dataclass(frozen=True)
@@ -92,13 +93,16 @@ def read_card(path: Path, text: str | bytes | dict[str, Any] | None, total: int)
             raise ClodError(
                 f"its format {values['format_version']!r:.20} is too new for this version; upgrade clod-adapter"
             )
+        about, version = tuple(map(str, values.get("about", ()))), str(values["package_version"])
+        if sum(map(len, about)) + len(version) > _LONGEST:
+            raise ClodError(f"its description has more than {_LONGEST:,} letters; export the file again")
         calibration, notes = _calibration(values, total)
         return Card(
             attenuation=_attenuation(values["attenuation"], notes) if "attenuation" in values else None,
             calibration=calibration,
             origin=parse_origin(values.get("origin", NOWHERE)),
-            about=tuple(map(str, values.get("about", ()))),
-            version=str(values["package_version"]),
+            about=about,
+            version=version,
         ), notes
     except ClodError as error:
         raise ClodError(f"{path}: {error}") from error

@@ -88,6 +88,12 @@ def test_lines_of_others_are_made_fit_for_a_header(tmp_path: Path) -> None:
     assert load(tmp_path / "out.ply").gaussians.attenuation == g.attenuation
 
 
+def test_lines_that_no_header_has_room_for(tmp_path: Path) -> None:
+    write(tmp_path / "a.safetensors", model(0), ("long",) * 20_000)
+    with pytest.raises(ClodError, match="a.safetensors: its description has more than 65,536 letters"):
+        load(tmp_path / "a.safetensors")
+
+
 @pytest.mark.parametrize("suffix", LOADERS)
 def test_the_check_does_without_torch(tmp_path: Path, suffix: str) -> None:
     write(tmp_path / f"a{suffix}", model(0).replace(sigma_d=None, attenuation=None))
