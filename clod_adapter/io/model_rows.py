@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,7 +92,14 @@ def read_model(path: Path) -> Rows:
     suffix = path.suffix.lower()
     notes = (*model.notes, *([QUANTISED[suffix]] if suffix in QUANTISED else []))
     settled = suffix != ".pt" or bool(card.version)  # a .pt of another program may hold anything
-    return Rows(rows, g.sh_degree, _comments(card), notes, settled, card.origin if any(card.origin) else None)
+    return Rows(
+        rows,
+        g.sh_degree,
+        _comments(replace(card, attenuation=g.attenuation)),
+        notes,
+        settled,
+        card.origin if any(card.origin) else None,
+    )
 
 
 def _is_new_spz(path: Path) -> bool:
