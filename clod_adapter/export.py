@@ -13,9 +13,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
 from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import Gaussians
-
-# Fully opaque, as a finite logit: its sigmoid is 1 in float32. Some readers do not take +inf.
-OPAQUE = 20.0
+from clod_adapter.io.arrays import OPAQUE
 
 
 @torch.no_grad()

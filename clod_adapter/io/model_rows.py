@@ -76,7 +76,8 @@ def read_model(path: Path) -> Rows:
     if _is_new_spz(path):
         return read_converted(path)
     model = load_model(path)
-    g, card = model.gaussians, model.card
+    g = model.gaussians
+    card = replace(model.card, attenuation=g.attenuation)  # the defaults, where the file is silent
     arrays = {name: tensor.numpy() for name, tensor in g.tensors().items()}
     vertex = rows_of(arrays, g.sh_degree)
     kinds = [(name, np.dtype("f8") if name in AXES and any(card.origin) else kind) for name, kind in _fields(vertex)]
@@ -92,14 +93,7 @@ def read_model(path: Path) -> Rows:
     suffix = path.suffix.lower()
     notes = (*model.notes, *([QUANTISED[suffix]] if suffix in QUANTISED else []))
     settled = suffix != ".pt" or bool(card.version)  # a .pt of another program may hold anything
-    return Rows(
-        rows,
-        g.sh_degree,
-        _comments(replace(card, attenuation=g.attenuation)),
-        notes,
-        settled,
-        card.origin if any(card.origin) else None,
-    )
+    return Rows(rows, g.sh_degree, _comments(card), notes, settled, card.origin if any(card.origin) else None)
 
 
 def _is_new_spz(path: Path) -> bool:
