@@ -25,6 +25,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.ply_columns import MASKS, SIGMA, inria_dtype
+from clod_adapter.io.ply_header import PREFIX
 from clod_adapter.io.poses import load_cameras
 from clod_adapter.io.splat_transform import SplatTransform, time_limit
 from clod_adapter.io.version import package_version
@@ -53,13 +54,15 @@ class Export:
     console: Console
 
     def piece(self, virtual_scale: float | None) -> tuple[Gaussians, tuple[str, ...]]:
-        """The Gaussians of one file, baked if there is a dial value, and lines on how they came about."""
-        about = ["rows in the order in which the dial keeps them longest"] if self.ordered else []
-        if virtual_scale is None:
-            return self.gaussians, tuple(about)
-        place = "d' = 1" if self.camera is None else f"the camera at {self._position()}"
-        about.insert(0, f"baked at s = {virtual_scale:.6g} and {place} by clod-adapter: exact there only")
-        return bake(self.gaussians, virtual_scale, self.camera), tuple(about)
+        """The Gaussians of one file, baked if there is a dial value; lines on how they came about, its own too."""
+        about = [comment for comment in self.model.comments if not comment.startswith(PREFIX)]
+        gaussians = self.gaussians
+        if virtual_scale is not None:
+            place = "d' = 1" if self.camera is None else f"the camera at {self._position()}"
+            about.append(f"baked at s = {virtual_scale:.6g} and {place} by clod-adapter: exact there only")
+            gaussians = bake(gaussians, virtual_scale, self.camera)
+        about += ["rows in the order in which the dial keeps them longest"] if self.ordered else []
+        return gaussians, tuple(dict.fromkeys(about))
 
     def write(self, path: Path, suffix: str, virtual_scale: float | None) -> tuple[int, tuple[str, ...]]:
         """Writes a file; how many Gaussians are in it, and notes on what has no room there."""

@@ -49,6 +49,7 @@ def splat_lines(splat: Splat) -> list[str]:
         names = ", ".join(splat.extra[:6]) + (", ..." if len(splat.extra) > 6 else "")
         more = f", of them unknown here: {names}" if splat.extra else ""
         lines.append(_line("layout", f"{splat.encoding}, {len(splat.columns)} properties{more}"))
+    lines += _block("says", splat.comments)
     rows = [*zip("xyz", v.position, strict=True), ("scale", v.scale), ("opacity", v.opacity)]
     rows += [("sigma_d", v.sigma)] if v.sigma is not None else []
     lines += ["", *spread_table(rows), ""]

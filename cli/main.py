@@ -51,6 +51,9 @@ def main(argv: list[str] | None = None) -> int:
         # The reader of a pipe is gone; without this Python complains once more when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except MemoryError as error:
+        print(f"{PROG}: error: there is not enough memory ({error or 'allocating'}); free some", file=sys.stderr)
+        return 2
     except OSError as error:
         name = f"{error.filename}: " if error.filename is not None else ""
         print(f"{PROG}: error: {name}{error.strerror or error}; check the path and its permissions", file=sys.stderr)

@@ -7,12 +7,15 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.inspection_values import FAR, Values, values_of
 from clod_adapter.io.authorship import NERFSTUDIO, is_antialiased, looks_like
 from clod_adapter.io.origin import Origin, origin_of
+from clod_adapter.io.packed_ply import is_packed
 from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map
 from clod_adapter.io.ply_header import PREFIX, Head, read_attenuation, read_calibration, read_head
 from clod_adapter.io.ply_values import FILTER, as_stored_by_inria, choice_of, in_question
@@ -130,7 +133,7 @@ def inspect(path: str | Path) -> Inspection:
 
 def _inspect_splat(path: Path, rows: Rows, head: Head | None) -> Inspection:
     doubts = {} if rows.settled else in_question(rows.vertex)
-    columns = tuple((name, str(rows.vertex.dtype[name])) for name in rows.vertex.dtype.names or ()) if head else ()
+    columns = _columns(head)
     vertex, _, changes = as_stored_by_inria(path, rows.vertex, choice_of(doubts))
     origin = origin_of(vertex) if rows.origin is None else rows.origin
     attenuation, notes = read_attenuation(path, rows.comments) if SIGMA in (vertex.dtype.names or ()) else (None, [])
@@ -144,7 +147,7 @@ def _inspect_splat(path: Path, rows: Rows, head: Head | None) -> Inspection:
         dial, notes = Dial(attenuation, calibration), [*notes, *remarks]
     splat = Splat(
         sh_degree=rows.sh_degree, encoding=_encoding(head), columns=columns,
-        extra=_extra([name for name, _ in columns], rows.sh_degree),
+        extra=() if head and is_packed(head.ply) else _extra([name for name, _ in columns], rows.sh_degree),
         comments=tuple(comment for comment in rows.comments if not comment.startswith(PREFIX)), values=values, tau=tau,
         origin=origin, dial=dial,
     )  # fmt: skip
@@ -156,6 +159,12 @@ def _inspect_splat(path: Path, rows: Rows, head: Head | None) -> Inspection:
         oddities=tuple(_oddities(splat, doubts)), left_out=tuple(_left_out(splat, rows, changes)),
         notes=(*rows.notes, *notes),
     )  # fmt: skip
+
+
+def _columns(head: Head | None) -> tuple[tuple[str, str], ...]:
+    """The vertices' properties and their types, as they are in the file."""
+    found = head.ply["vertex"].properties if head else ()
+    return tuple((column.name, str(np.dtype(column.val_dtype))) for column in found)
 
 
 def _encoding(head: Head | None) -> str:

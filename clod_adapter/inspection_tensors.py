@@ -6,14 +6,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
-
-from clod_adapter.errors import ClodError
 from clod_adapter.inspection_values import Spread
 from clod_adapter.io.adapter_file import FORMAT, KEY, load_adapter
-from clod_adapter.io.regular import refuse_irregular
 from clod_adapter.io.state_file import KEY as STATE_KEY
 from clod_adapter.io.state_file import load_state
+from clod_adapter.io.tensor_file import read_metadata
 
 
 def inspect_tensors(path: Path) -> tuple[str, dict[str, Any]] | None:
@@ -22,14 +19,7 @@ def inspect_tensors(path: Path) -> tuple[str, dict[str, Any]] | None:
     Raises:
         ClodError: it cannot be read, or is damaged.
     """
-    refuse_irregular(path)
-    try:
-        with safe_open(path, framework="np") as file:
-            metadata = file.metadata() or {}
-    except (OSError, ValueError) as error:
-        raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error}); check it") from error
-    except SafetensorError as error:
-        raise ClodError(f"{path}: is no safetensors file or damaged ({error}); copy or export it again") from error
+    metadata = read_metadata(path)
     if STATE_KEY in metadata:
         return "the state of an interrupted run, for --resume", _state(path)
     if KEY in metadata and f'"{FORMAT}"' in metadata[KEY]:

@@ -259,6 +259,8 @@ def test_other_formats(tmp_path: Path) -> None:
     found = inspect(write_packed(tmp_path / "a.compressed.ply", scenes.gaussians(30, 2, 0)))
     assert found.splat is not None and found.what == "a splat, compressed PLY" and found.writer == "SuperSplat 2.6.2"
     assert found.splat.values.count == 30 and "quantised" in found.notes[0] and found.splat.extra == ()
+    kinds = [(f"packed_{name}", "uint32") for name in ("position", "rotation", "scale", "color")]
+    assert sorted(found.splat.columns) == sorted(kinds)
 
 
 @pytest.mark.parametrize(
@@ -268,6 +270,7 @@ def test_other_formats(tmp_path: Path) -> None:
         ("a.ply", b"<html>", "web page"),
         ("a.ply", b"version https://git-lfs.github.com/spec/v1\n", "Git LFS pointer"),
         ("a.ckpt", b"PK\x03\x04", "Nerfstudio"),
+        ("a.safetensors", b"version https://git-lfs.github.com/spec/v1\n", "Git LFS pointer"),
         ("a.safetensors", b"xxxxxxxxxxxxxxxx", "no safetensors file or damaged"),
         ("a.pt", b"PK\x03\x04", "damaged or truncated"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "mesh or a point"),

@@ -12,9 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from safetensors.torch import save
-from torch import Tensor
 
 from clod_adapter.adapter import Adapter
 from clod_adapter.calibration import Calibration
@@ -22,9 +20,8 @@ from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.card import FORMAT as MODEL
-from clod_adapter.io.origin import NOWHERE, Origin
-from clod_adapter.io.regular import refuse_irregular
-from clod_adapter.io.tensor_file import read_tensors
+from clod_adapter.io.origin import NOWHERE, parse_origin
+from clod_adapter.io.tensor_file import load_tensors
 
 KEY = "clod_adapter"
 FORMAT = "clod-adapter"
@@ -71,7 +68,7 @@ def load_adapter(path: str | Path) -> Adapter:
     Raises:
         ClodError: the file cannot be read, is damaged, no adapter, or of a newer format.
     """
-    tensors, metadata = _read(Path(path))
+    tensors, metadata = load_tensors(Path(path))
     if KEY not in metadata:
         raise ClodError(f"{path}: is a safetensors file but no clod-adapter; give a file that this package wrote")
     try:
@@ -95,26 +92,9 @@ def load_adapter(path: str | Path) -> Adapter:
             config=about["config"],
             version=about["package_version"],
             calibration=Calibration.from_dict(about["calibration"]) if "calibration" in about else None,
-            origin=_origin(about.get("origin", NOWHERE)),
+            origin=parse_origin(about.get("origin", NOWHERE)),
         )
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ClodError(f"{path}: its description is damaged ({error!r}); copy or export the adapter again") from error
     except ClodError as error:
         raise ClodError(f"{path}: {error}") from error
-
-
-def _origin(values: Any) -> Origin:
-    x, y, z = map(float, values)
-    if not np.isfinite((x, y, z)).all():
-        raise ValueError(f"origin is {values!r:.80}, not finite")
-    return x, y, z
-
-
-def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    refuse_irregular(path)
-    try:
-        return read_tensors(path)
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    except Exception as error:  # SafetensorError, and whatever a crafted header provokes
-        raise ClodError(f"{path}: is no safetensors file or damaged ({error}); copy or export it again") from error

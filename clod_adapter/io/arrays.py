@@ -10,10 +10,11 @@ import torch
 
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import check_target
 from clod_adapter.io.regular import refuse_irregular
 
+_TINY = float(np.finfo(np.float32).tiny)
 # The axes in which each spherical harmonic is odd, in the order of ``Gaussians.shN``.
 _ODD = (
     "y", "z", "x",
@@ -95,6 +96,36 @@ def logit(opacities: np.ndarray) -> np.ndarray:
     wide = opacities.astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.log(wide) - np.log1p(-wide)
+
+
+def scales_of(path: Path, log_scales: np.ndarray) -> np.ndarray:
+    """Standard deviations of their logarithms, float32.
+
+    Raises:
+        ClodError: one is beyond float32's range.
+    """
+    with np.errstate(over="ignore"):
+        scales = np.exp(log_scales)
+    if not np.isfinite(scales).all():
+        raise ClodError(f"{path}: a scale is beyond float32's range; drop such rows first")
+    return scales
+
+
+def logs_of(scales: np.ndarray) -> np.ndarray:
+    """The inverse of ``scales_of``, in float64; of what is 0 or less, that of the least number."""
+    with np.errstate(invalid="ignore"):  # a NaN that signals
+        return np.log(np.maximum(scales.astype(np.float64), _TINY))
+
+
+def colours_of(sh0: np.ndarray, opacities: np.ndarray) -> np.ndarray:
+    """``[N, 4]`` uint8 RGBA, as seen without the higher harmonics."""
+    colours = 0.5 + SH_C0 * sh0.reshape(-1, 3).astype(np.float64)
+    return bytes_of(255 * np.concatenate([colours, opacities[:, None]], 1))
+
+
+def bytes_of(values: np.ndarray) -> np.ndarray:
+    """The nearest of 0 to 255."""
+    return np.clip(np.round(values), 0, 255).astype(np.uint8)
 
 
 def logits_of_bytes(levels: np.ndarray) -> np.ndarray:

@@ -7,7 +7,6 @@ and lines on how the file came about.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.io.origin import NOWHERE, Origin
+from clod_adapter.io.origin import NOWHERE, Origin, parse_origin
 from clod_adapter.io.version import package_version
 
 if TYPE_CHECKING:
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
 KEY = "clod_adapter"
 FORMAT = "clod-model"
 FORMAT_VERSION = 1
+_LONGEST = 1 << 16  # letters of a description's lines; a PLY's header has to have room for them
 
 
 @dataclass(frozen=True)
@@ -93,13 +93,16 @@ def read_card(path: Path, text: str | bytes | dict[str, Any] | None, total: int)
             raise ClodError(
                 f"its format {values['format_version']!r:.20} is too new for this version; upgrade clod-adapter"
             )
+        about, version = tuple(map(str, values.get("about", ()))), str(values["package_version"])
+        if sum(map(len, about)) + len(version) > _LONGEST:
+            raise ClodError(f"its description has more than {_LONGEST:,} letters; export the file again")
         calibration, notes = _calibration(values, total)
         return Card(
             attenuation=_attenuation(values["attenuation"], notes) if "attenuation" in values else None,
             calibration=calibration,
-            origin=_origin(values.get("origin", NOWHERE)),
-            about=tuple(map(str, values.get("about", ()))),
-            version=str(values["package_version"]),
+            origin=parse_origin(values.get("origin", NOWHERE)),
+            about=about,
+            version=version,
         ), notes
     except ClodError as error:
         raise ClodError(f"{path}: {error}") from error
@@ -133,10 +136,3 @@ def _calibration(values: dict[str, Any], total: int) -> tuple[Calibration | None
     if calibration.total != total:
         return None, [f"the calibration is of {calibration.total} Gaussians and ignored, these are {total}"]
     return calibration, []
-
-
-def _origin(values: Any) -> Origin:
-    x, y, z = map(float, values)
-    if not all(map(math.isfinite, (x, y, z))):
-        raise ValueError(f"origin is {values!r:.80}, not finite")
-    return x, y, z

@@ -1,4 +1,4 @@
-"""Files that are no PLY: what they are, by their first bytes and their name, and what to do about them."""
+"""Files that are not what they are called: what they are, by first bytes and name, and what to do about them."""
 
 from __future__ import annotations
 
@@ -42,6 +42,9 @@ ARCHIVES = (
     (b"\x28\xb5\x2f\xfd", "compressed with Zstandard", "unpack it first: unzstd"),
     (b"7z\xbc\xaf\x27\x1c", "a 7z archive", "unpack it first"),
     (b"glTF", "a glTF model", "call it .glb"),
+    (b"NGSP", "an SPZ file", "call it .spz"),
+    (b"ply\n", "a PLY file", "call it .ply"),
+    (b"ply\r", "a PLY file", "call it .ply"),
 )
 
 
@@ -55,8 +58,10 @@ def refuse_known(path: Path, start: bytes) -> None:
             raise ClodError(f"{path}: is {what}; {remedy}")
 
 
-def refuse(path: Path, start: bytes) -> NoReturn:
-    """Raises the ClodError of a file that begins with ``start`` and so is no PLY."""
+def refuse(
+    path: Path, start: bytes, otherwise: str = "is not a PLY file; convert it to a .ply in Inria's 3DGS layout first"
+) -> NoReturn:
+    """Raises the ClodError of a file that begins with ``start`` and so is not what its name says: by default a PLY."""
     refuse_known(path, start)
     suffix = path.suffix.lower()
     if suffix in SUFFIXES:
@@ -65,4 +70,4 @@ def refuse(path: Path, start: bytes) -> NoReturn:
     for magic, what, remedy in ARCHIVES:
         if start.startswith(magic):
             raise ClodError(f"{path}: is {what}; {remedy}")
-    raise ClodError(f"{path}: is not a PLY file; convert it to a .ply in Inria's 3DGS layout first")
+    raise ClodError(f"{path}: {otherwise}")

@@ -16,8 +16,8 @@ import numpy as np
 
 from clod_adapter.calibration import Calibration
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import SH_C0, Gaussians
-from clod_adapter.io.arrays import arrays_of, normalized, sigmoid
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.arrays import arrays_of, colours_of, normalized, scales_of, sigmoid
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.card import KEY, write_card
 from clod_adapter.io.origin import NOWHERE, Origin
@@ -25,6 +25,7 @@ from clod_adapter.io.version import package_version
 
 EXTENSION = "KHR_gaussian_splatting"
 SIGMA = "_SIGMA_D"
+COLOR_SPACE = "srgb_rec709_display"
 DEGREE = 3  # the highest that the extension has
 HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # about z, as xyzw: x right, y down becomes x left, y up; as splat-transform has it
 _LIMIT = 1 << 32  # bytes of a file, whose header says how many in 32 bits
@@ -70,7 +71,7 @@ def write_glb(
         offset += array.nbytes
     attributes = pygltflib.Attributes(**{name: index for index, name in enumerate(columns)})
     how = {
-        "kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective",
+        "kernel": "ellipse", "colorSpace": COLOR_SPACE, "projection": "perspective",
         "sortingMethod": "cameraDistance",
     }  # fmt: skip
     primitive = pygltflib.Primitive(attributes=attributes, mode=pygltflib.POINTS, extensions={EXTENSION: how})
@@ -89,16 +90,12 @@ def _in_gltf(origin: Origin) -> list[float] | None:
 def _columns(path: Path, gaussians: Gaussians) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     """The attributes, and what the extension has no room for."""
     arrays = arrays_of(path, gaussians)
-    with np.errstate(over="ignore"):
-        scales = np.exp(arrays["log_scales"])
-    if not np.isfinite(scales).all():
-        raise ClodError(f"{path}: a scale is beyond float32's range; drop such rows first")
+    scales = scales_of(path, arrays["log_scales"])
     opacities = sigmoid(arrays["opacity_logits"]).astype(np.float32)
     sh0 = arrays["sh0"].reshape(-1, 3)
-    colors = np.concatenate([0.5 + SH_C0 * sh0, opacities[:, None]], 1)
     columns: dict[str, np.ndarray] = {
         "POSITION": arrays["means"],
-        "COLOR_0": np.clip(np.round(255 * colors), 0, 255).astype(np.uint8),
+        "COLOR_0": colours_of(sh0, opacities),
         f"{EXTENSION}:ROTATION": np.ascontiguousarray(np.roll(normalized(arrays["quats"]), -1, axis=1)),
         f"{EXTENSION}:SCALE": scales,
         f"{EXTENSION}:OPACITY": opacities,

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib import recfunctions as rec
 
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.arrays import gaussians_of, half_turn, logit, read_whole
-from clod_adapter.io.card import KEY, Card, Model, read_card, settings_of
-from clod_adapter.io.glb import DEGREE, EXTENSION, HALF_TURN, SIGMA, coefficient
-from clod_adapter.io.origin import Origin
+from clod_adapter.io.arrays import gaussians_of, half_turn, logit, logs_of, read_whole
+from clod_adapter.io.card import KEY, Model, read_card, settings_of
+from clod_adapter.io.glb import COLOR_SPACE, DEGREE, EXTENSION, HALF_TURN, SIGMA, coefficient
+from clod_adapter.io.origin import AXES, NOWHERE, Origin, origin_of
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _FLOAT = 5126
@@ -28,7 +30,6 @@ _ATTRIBUTES = {
 _REMEDY = "export it again, as a .ply"
 IDENTITY = [0.0, 0.0, 0.0, 1.0]  # as xyzw
 _FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
-_TINY = float(np.finfo(np.float32).tiny)
 
 
 def read_glb(path: str | Path) -> Gaussians:
@@ -49,7 +50,8 @@ def load_glb(path: str | Path) -> Model:
     path = Path(path)
     try:
         gltf, binary = _chunks(read_whole(path))
-        mesh, attributes = _find(gltf)
+        (mesh, primitive), *others = _find(gltf)
+        attributes, doubts = primitive["attributes"], _doubts(primitive, len(others))
         arrays = {key: _read(gltf, binary, attributes[name], width) for key, (name, width) in _ATTRIBUTES.items()}
         degree = 0
         while degree < DEGREE and coefficient(degree + 1, 0) in attributes:
@@ -66,11 +68,12 @@ def load_glb(path: str | Path) -> Model:
     except (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
         raise ClodError(f"{path}: is damaged or no such .glb ({error!r:.80}); {_REMEDY}") from error
     card, notes = read_card(path, text, len(arrays["means"]))
-    if text is None:
-        card = Card(origin=moved)
-    stored = _stored(arrays)
+    stored = _stored(arrays) if turned else half_turn(_stored(arrays), "z")
+    if moved != card.origin:  # not as we wrote it
+        stored["means"], moved = _moved(stored["means"], moved)
+        card = replace(card, origin=moved)
     attenuation = settings_of(path, card, notes) if "sigma_d" in arrays else None
-    return Model(gaussians_of(path, stored if turned else half_turn(stored, "z"), attenuation), card, tuple(notes))
+    return Model(gaussians_of(path, stored, attenuation), card, (*doubts, *notes))
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -93,18 +96,28 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     return json.loads(found[_JSON]), found.get(_BIN, b"")
 
 
-def _find(gltf: dict[str, Any]) -> tuple[int, dict[str, Any]]:
-    """The first mesh with Gaussians, by its number, and their attributes."""
-    for number, mesh in enumerate(gltf.get("meshes", [])):
-        for primitive in mesh["primitives"]:
-            about = primitive.get("extensions", {}).get(EXTENSION)
-            if about is None:
-                continue
-            attributes = primitive["attributes"]
-            if about.get("extensions") or any(name not in attributes for name, _ in _ATTRIBUTES.values()):
-                raise ClodError("its Gaussians are compressed, or have no spherical harmonics; export them as a .ply")
-            return number, attributes
-    raise ClodError(f"has no Gaussians in it ({EXTENSION}), so it is a mesh; give a checkpoint of Gaussians")
+def _find(gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
+    """The primitives with Gaussians, of which there is one at least, each after the number of its mesh."""
+    found = [
+        (number, primitive)
+        for number, mesh in enumerate(gltf.get("meshes", []))
+        for primitive in mesh["primitives"]
+        if EXTENSION in primitive.get("extensions", {})
+    ]
+    if not found:
+        raise ClodError(f"has no Gaussians in it ({EXTENSION}), so it is a mesh; give a checkpoint of Gaussians")
+    _, first = found[0]
+    compressed = first["extensions"][EXTENSION].get("extensions")
+    if compressed or any(name not in first["attributes"] for name, _ in _ATTRIBUTES.values()):
+        raise ClodError("its Gaussians are compressed, or have no spherical harmonics; export them as a .ply")
+    return found
+
+
+def _doubts(primitive: dict[str, Any], others: int) -> list[str]:
+    """What of the file is not heeded."""
+    space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
+    notes = [f"its colours are in {space!r:.40}, and taken as {COLOR_SPACE}"] if space != COLOR_SPACE else []
+    return notes + ([f"{others} more primitives with Gaussians in it are left out"] if others else [])
 
 
 def _read(gltf: dict[str, Any], binary: bytes, number: int, width: int) -> np.ndarray:
@@ -151,12 +164,18 @@ def _placed(gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
     return turned, (0.0 - x, 0.0 - y, z)
 
 
+def _moved(means: np.ndarray, by: Origin) -> tuple[np.ndarray, Origin]:
+    """Means, and what they are relative to: moved where that is not far, as float32 has digits for it there."""
+    wide = means.astype(np.float64) + by
+    far = origin_of(rec.unstructured_to_structured(wide, names=list(AXES)))
+    return (means, by) if any(far) else (wide.astype(np.float32), NOWHERE)
+
+
 def _stored(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """As checkpoints store them."""
-    scales = np.log(np.maximum(arrays["log_scales"].astype(np.float64), _TINY))
     quats = np.roll(arrays["quats"], 1, axis=1)
     logits = logit(np.clip(arrays["opacity_logits"], 0, 1))
     return {
-        **arrays, "log_scales": scales, "quats": quats, "opacity_logits": np.maximum(logits, _FAINTEST),
-        "sh0": arrays["sh0"][:, None],
+        **arrays, "log_scales": logs_of(arrays["log_scales"]), "quats": quats,
+        "opacity_logits": np.maximum(logits, _FAINTEST), "sh0": arrays["sh0"][:, None],
     }  # fmt: skip

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.card import Card
+from clod_adapter.io.card import KEY, Card
 from clod_adapter.io.converted import check_converted, read_converted
-from clod_adapter.io.foreign import refuse_known
+from clod_adapter.io.foreign import refuse, refuse_known
 from clod_adapter.io.origin import AXES
 from clod_adapter.io.ply_columns import SIGMA, rows_of
 from clod_adapter.io.ply_header import PREFIX, write_comments
 from clod_adapter.io.pt import check_pt
 from clod_adapter.io.regular import read_start
 from clod_adapter.io.rows import Rows
+from clod_adapter.io.tensor_file import read_metadata
 
 _NEW_SPZ = b"NGSP"  # how version 4 begins, which splat-transform is asked to read; earlier ones are gzipped
 _START: dict[str, tuple[bytes, ...]] = {".glb": (b"glTF",), ".spz": (b"\x1f\x8b", _NEW_SPZ)}
@@ -38,13 +40,13 @@ def check_model(path: Path) -> None:
     start = read_start(path)
     refuse_known(path, start)
     if suffix in _START and not start.startswith(_START[suffix]):
-        raise ClodError(f"{path}: is no {suffix} file by its first bytes; copy or export it again")
+        refuse(path, start, f"is no {suffix} file by its first bytes; copy or export it again")
     if start.startswith(_NEW_SPZ):
         check_converted(path, " of version 4")
         return
     if suffix == ".splat" and path.stat().st_size % 32:
         raise ClodError(f"{path}: is no .splat file, whose rows have 32 bytes; copy or export it again")
-    if suffix == ".safetensors" and '"clod-adapter"' in _description(path):
+    if suffix == ".safetensors" and '"clod-adapter"' in read_metadata(path).get(KEY, ""):
         raise ClodError(f"{path}: is an adapter, no model; clod-adapt apply BASE.ply {path.name} -o OUT.ply makes one")
 
 
@@ -74,7 +76,8 @@ def read_model(path: Path) -> Rows:
     if _is_new_spz(path):
         return read_converted(path)
     model = load_model(path)
-    g, card = model.gaussians, model.card
+    g = model.gaussians
+    card = replace(model.card, attenuation=g.attenuation)  # the defaults, where the file is silent
     arrays = {name: tensor.numpy() for name, tensor in g.tensors().items()}
     vertex = rows_of(arrays, g.sh_degree)
     kinds = [(name, np.dtype("f8") if name in AXES and any(card.origin) else kind) for name, kind in _fields(vertex)]
@@ -109,14 +112,3 @@ def _comments(card: Card) -> tuple[str, ...]:
         return tuple(line for line in about if not line.startswith(PREFIX))
     comments = write_comments(card.attenuation, about, card.version or None, card.calibration)
     return tuple(comment for comment in comments if card.version or not comment.startswith(f"{PREFIX}version "))
-
-
-def _description(path: Path) -> str:
-    """What a safetensors file says of itself under our key; "" of other files, which reading it refuses."""
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="np") as file:
-            return str((file.metadata() or {}).get("clod_adapter", ""))
-    except (OSError, SafetensorError, ValueError):
-        return ""

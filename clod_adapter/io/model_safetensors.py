@@ -18,8 +18,7 @@ from clod_adapter.io.arrays import arrays_of, gaussians_of
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.card import KEY, Model, card_text, read_card, settings_of, write_card
 from clod_adapter.io.origin import NOWHERE, Origin
-from clod_adapter.io.regular import refuse_irregular
-from clod_adapter.io.tensor_file import read_tensors
+from clod_adapter.io.tensor_file import load_tensors
 
 _NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 
@@ -54,13 +53,7 @@ def load_safetensors(path: str | Path) -> Model:
         ClodError: the file cannot be read, is damaged, an adapter or another safetensors file.
     """
     path = Path(path)
-    refuse_irregular(path)
-    try:
-        tensors, metadata = read_tensors(path)
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    except Exception as error:  # SafetensorError, and whatever a crafted header provokes
-        raise ClodError(f"{path}: is no safetensors file or damaged ({error}); copy or export it again") from error
+    tensors, metadata = load_tensors(path)
     if KEY not in metadata:
         raise ClodError(f"{path}: is a safetensors file but no model of clod-adapter; give a file that it wrote")
     total = len(tensors["means"]) if "means" in tensors and tensors["means"].ndim else 0

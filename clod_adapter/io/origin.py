@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,14 @@ def origin_of(vertex: np.ndarray) -> Origin:
     # Doubles may spread by less than their largest has digits for.
     unit = 2.0 ** math.ceil(math.log2(max(spread, FINEST * float(np.abs(middle).max()))))
     x, y, z = (float(value) for value in np.round(middle / unit) * unit + 0.0)  # no -0
+    return x, y, z
+
+
+def parse_origin(values: Any) -> Origin:
+    """What a description says is the origin; raises the TypeError or ValueError of what is none."""
+    x, y, z = map(float, values)
+    if not all(map(math.isfinite, (x, y, z))):
+        raise ValueError(f"origin is {values!r:.80}, not finite")
     return x, y, z
 
 

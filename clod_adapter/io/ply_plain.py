@@ -10,6 +10,7 @@ import torch
 
 from clod_adapter.calibration import Calibration
 from clod_adapter.gaussians import OPAQUE, Gaussians
+from clod_adapter.io.arrays import arrays_of
 from clod_adapter.io.origin import NOWHERE, Origin
 from clod_adapter.io.ply import blank, save
 
@@ -25,8 +26,9 @@ def write_ply(
     """Writes every value as it is (but opacity = +inf), ``about`` as comments; ``writers.write`` has the arguments.
 
     Raises:
-        ClodError: as ``ply.save``.
+        ClodError: as ``ply.save``, or a rotation is zero.
     """
+    arrays_of(Path(path), gaussians)  # which refuses what load would drop
     base = replace(blank(len(gaussians), gaussians.sh_degree, origin), comments=tuple(about))
     opaque = gaussians.opacity_logits == torch.inf
     finite = torch.where(opaque, torch.full_like(gaussians.opacity_logits, OPAQUE), gaussians.opacity_logits)

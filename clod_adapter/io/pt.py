@@ -22,7 +22,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.card import KEY
 from clod_adapter.io.foreign import refuse
 from clod_adapter.io.ply_columns import SIGMA
-from clod_adapter.io.regular import refuse_irregular
+from clod_adapter.io.regular import read_start
 
 # As gsplat's trainer names its parameters, and as they are called here.
 NAMES = {
@@ -40,14 +40,12 @@ def check_pt(path: Path) -> None:
     Raises:
         ClodError: it is not, or cannot be read.
     """
+    start = read_start(path)
+    if start.startswith(b"\x80"):
+        raise ClodError(f"{path}: is a pickle in PyTorch's format before 1.6; load it and torch.save it again")
+    if not start.startswith(b"PK"):
+        refuse(path, start, "is no file of torch.save; export the checkpoint as a PLY")
     try:
-        refuse_irregular(path)
-        with open(path, "rb") as file:
-            start = file.read(64)
-        if start.startswith(b"\x80"):
-            raise ClodError(f"{path}: is a pickle in PyTorch's format before 1.6; load it and torch.save it again")
-        if not start.startswith(b"PK"):
-            refuse(path, start)
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
             pickles = [entry for entry in entries if entry.filename.endswith("/data.pkl")]

@@ -13,15 +13,15 @@ def refuse_irregular(path: Path, remedy: str = "give the name of a file") -> Non
         raise ClodError(f"{path}: cannot be read (it is not a regular file); {remedy}")
 
 
-def read_start(path: Path, most: int = 64) -> bytes:
-    """The first bytes of a file.
+def read_start(path: Path, size: int = 64) -> bytes:
+    """The first bytes of a file, ``size`` of them at most.
 
     Raises:
-        ClodError: it cannot be read.
+        ClodError: it cannot be read, or is no regular file.
     """
     try:
         refuse_irregular(path)
         with open(path, "rb") as file:
-            return file.read(most)
+            return file.read(size)
     except (OSError, ValueError) as error:  # ValueError: a name that holds a NUL
         raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error

@@ -15,13 +15,23 @@ import numpy as np
 from clod_adapter.calibration import Calibration
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
-from clod_adapter.io.arrays import arrays_of, gaussians_of, logits_of_bytes, normalized, read_whole, sigmoid
+from clod_adapter.io.arrays import (
+    arrays_of,
+    bytes_of,
+    colours_of,
+    gaussians_of,
+    logits_of_bytes,
+    logs_of,
+    normalized,
+    read_whole,
+    scales_of,
+    sigmoid,
+)
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.card import Card, Model
 from clod_adapter.io.origin import NOWHERE, Origin
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
-_TINY = float(np.finfo(np.float32).tiny)
 
 
 def write_splat(
@@ -37,19 +47,15 @@ def write_splat(
     if gaussians.sigma_d is not None:
         raise ClodError(f"{path}: .splat has no room for sigma_d; choose a dial value to bake")
     arrays = arrays_of(path, gaussians)
-    with np.errstate(over="ignore"):
-        scales = np.exp(arrays["log_scales"])
-    if not np.isfinite(scales).all():
-        raise ClodError(f"{path}: a scale is beyond float32's range; drop such rows first")
+    scales = scales_of(path, arrays["log_scales"])
     opacities = sigmoid(arrays["opacity_logits"])
     # As logarithms, in which no volume is too small.
     with np.errstate(divide="ignore"):
         order = np.argsort(-(arrays["log_scales"].astype(np.float64).sum(1) + np.log(opacities)), kind="stable")
-    colors = np.concatenate([0.5 + SH_C0 * arrays["sh0"].reshape(-1, 3), opacities[:, None]], 1)
     rows = np.empty(len(gaussians), _ROW)
     rows["means"], rows["scales"] = arrays["means"], scales
-    rows["rgba"] = _bytes(255 * colors)
-    rows["quats"] = _bytes(128 * normalized(arrays["quats"]) + 128)
+    rows["rgba"] = colours_of(arrays["sh0"], opacities)
+    rows["quats"] = bytes_of(128 * normalized(arrays["quats"]) + 128)
     with atomic_path(path) as temporary:
         temporary.write_bytes(rows[order].tobytes())
     notes = ["colours, opacities and rotations are rounded to 8 bits, and the rows are in another order"]
@@ -74,15 +80,10 @@ def load_splat(path: str | Path) -> Model:
         raise ClodError(f"{path}: {len(data)} bytes are no .splat file, whose rows have 32; copy or export it again")
     rows = np.frombuffer(data, _ROW)
     rgba = rows["rgba"].astype(np.float32)
-    with np.errstate(invalid="ignore"):  # a NaN that signals
-        scales = np.log(np.maximum(rows["scales"].astype(np.float64), _TINY))
     arrays = {
-        "means": rows["means"], "log_scales": scales, "quats": (rows["quats"].astype(np.float32) - 128) / 128,
+        "means": rows["means"], "log_scales": logs_of(rows["scales"]),
+        "quats": (rows["quats"].astype(np.float32) - 128) / 128,
         "opacity_logits": logits_of_bytes(rows["rgba"][:, 3]), "shN": np.zeros((len(rows), 0, 3)),
         "sh0": ((rgba[:, None, :3] / 255) - 0.5) / SH_C0,
     }  # fmt: skip
     return Model(gaussians_of(path, arrays, None), Card())
-
-
-def _bytes(values: np.ndarray) -> np.ndarray:
-    return np.clip(np.round(values), 0, 255).astype(np.uint8)

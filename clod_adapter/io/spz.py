@@ -29,7 +29,7 @@ import numpy as np
 from clod_adapter.calibration import Calibration
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.arrays import arrays_of, normalized, sigmoid
+from clod_adapter.io.arrays import arrays_of, bytes_of, normalized, sigmoid
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.card import card_text, write_card
 from clod_adapter.io.origin import NOWHERE, Origin
@@ -104,17 +104,18 @@ def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, 
 
 
 def _packed(arrays: dict[str, np.ndarray], bits: int, degree: int) -> list[bytes]:
+    # Far beyond what a byte has room for, but not so far that it overflows.
+    sh0, harmonics = np.clip(arrays["sh0"], -9, 9), np.clip(arrays["shN"][:, : (degree + 1) ** 2 - 1], -9, 9)
     fixed = np.round(arrays["means"].astype(np.float64) * 2.0**bits).clip(-(2**23), 2**23 - 1).astype("<i4")
     parts = [
         np.ascontiguousarray(fixed[..., None].view(np.uint8)[..., :3]),
-        _bytes(255 * sigmoid(arrays["opacity_logits"])),
-        _bytes(255 * (COLOR * arrays["sh0"] + 0.5)),
-        _bytes(16 * (arrays["log_scales"] + 10)),
+        bytes_of(255 * sigmoid(arrays["opacity_logits"])),
+        bytes_of(255 * (COLOR * sh0 + 0.5)),
+        bytes_of(16 * (arrays["log_scales"] + 10)),
         _packed_quats(arrays["quats"]),
     ]
-    harmonics = arrays["shN"][:, : (degree + 1) ** 2 - 1]
     step = 1 << (8 - _BITS)
-    parts.append(_bytes(128 + step * np.round(128 / step * harmonics)))
+    parts.append(bytes_of(128 + step * np.round(128 / step * harmonics)))
     return [part.tobytes() for part in parts]
 
 
@@ -141,7 +142,3 @@ def _losses(arrays: dict[str, np.ndarray], bits: int, degree: int) -> tuple[str,
         "scales beyond e^-10 to e^5.9": (np.abs(arrays["log_scales"] + 2.03125) > 8).any(),
     }
     return (*notes, *(f"{what} are cut to it" for what, there in beyond.items() if there))
-
-
-def _bytes(values: np.ndarray) -> np.ndarray:
-    return np.clip(np.round(values), 0, 255).astype(np.uint8)

@@ -1,11 +1,20 @@
-"""Safetensors files, whole."""
+"""Safetensors files, whole, and what they say of themselves."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from safetensors import safe_open
-from torch import Tensor
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.foreign import refuse_known
+from clod_adapter.io.regular import read_start
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -13,3 +22,36 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     with safe_open(path, framework="pt") as file:
         # Copies, since the file may change under a memory map.
         return {name: file.get_tensor(name).clone() for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+
+
+def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The tensors and the metadata of a file that somebody gave.
+
+    Raises:
+        ClodError: it cannot be read, is something else, or damaged.
+    """
+    with _said_in_one_line(path):
+        return read_tensors(path)
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """The metadata alone, without torch.
+
+    Raises:
+        ClodError: as ``load_tensors``.
+    """
+    with _said_in_one_line(path), safe_open(path, framework="np") as file:
+        return file.metadata() or {}
+
+
+@contextmanager
+def _said_in_one_line(path: Path) -> Iterator[None]:
+    refuse_known(path, read_start(path))
+    try:
+        yield
+    except OSError as error:
+        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    except MemoryError:  # of a file that is whole
+        raise
+    except Exception as error:  # SafetensorError, and whatever a crafted header provokes
+        raise ClodError(f"{path}: is no safetensors file or damaged ({error}); copy or export it again") from error

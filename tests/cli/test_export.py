@@ -61,6 +61,14 @@ def real_tool() -> None:
         pytest.skip(str(error))
 
 
+def test_how_it_came_about_goes_along(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    assert clod("export", dialled, "--sv", 2, "-o", "a.spz").code == 0
+    for source, out in (("a.spz", "b.safetensors"), ("b.safetensors", "c.ply")):
+        assert clod("export", source, "-o", out).code == 0
+    assert sum(comment.startswith("baked at s = 2 and d' = 1") for comment in load("c.ply").comments) == 1
+    assert "says         baked at s = 2" in clod("inspect", "c.ply").out
+
+
 def files(folder: Path) -> list[str]:
     """All that is in a folder, hidden ones too."""
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))

@@ -78,3 +78,15 @@ def test_a_ply_takes_no_torch(capture: Any) -> None:
         env={**os.environ, "PYTHONPATH": str(root)}, check=False,
     )  # fmt: skip
     assert done.returncode == 0
+
+
+def test_files_beyond_the_memory(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    from clod_adapter.cli import inspect
+
+    def exhaust(path: str) -> None:
+        raise MemoryError("Unable to allocate 8 TiB")
+
+    monkeypatch.setattr(inspect, "inspect", exhaust)
+    done = clod("inspect", capture.ply)
+    assert done.code == 2 and "not enough memory (Unable to allocate 8 TiB)" in done.err
+    assert len(done.err.splitlines()) == 1

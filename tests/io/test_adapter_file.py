@@ -82,6 +82,9 @@ def test_unreadable(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "missing", tmp_path / "pipe"):
         with pytest.raises(ClodError, match=str(path)):
             load_adapter(path)
+    (tmp_path / "pointer").write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
+    with pytest.raises(ClodError, match="Git LFS pointer"):
+        load_adapter(tmp_path / "pointer")
     save_file({"a": torch.ones(1)}, tmp_path / "other")
     with pytest.raises(ClodError, match="no clod-adapter"):
         load_adapter(tmp_path / "other")

@@ -165,6 +165,29 @@ def test_files_of_others(tmp_path: Path) -> None:
     assert g.quats.tolist() == [[1, 0, 0, 0]] * 5 and torch.isposinf(g.opacity_logits).all()
 
 
+def test_a_model_of_ours_that_was_moved(tmp_path: Path) -> None:
+    """Where its node stands now is where it is, whatever its description says."""
+    write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
+    to = [-1e6, 0.0, 0.0]
+    again, card, _ = load_glb(rewritten(tmp_path / "a.glb", lambda g: g["nodes"][0].update(translation=to)))
+    assert card.origin == (1e6, 0.0, 0.0) and again.attenuation == model().attenuation
+    near = {"translation": [1.0, -2.0, 4.0]}  # no origin: float32 has digits for it
+    moved, card, _ = load_glb(rewritten(tmp_path / "a.glb", lambda g: g["nodes"][0].update(near)))
+    assert not any(card.origin)
+    torch.testing.assert_close(moved.means, again.means + torch.tensor([-1.0, 2.0, 4.0]))
+
+
+def test_what_is_not_heeded_is_said(tmp_path: Path) -> None:
+    write(tmp_path / "a.glb", model(0, 5))
+
+    def change(g: dict[str, Any]) -> None:
+        g["meshes"].append({"primitives": [*g["meshes"][0]["primitives"], {"attributes": {"POSITION": 0}}]})
+        g["meshes"][0]["primitives"][0]["extensions"][KHR]["colorSpace"] = "lin_rec709_display"
+
+    colours, others = load_glb(rewritten(tmp_path / "a.glb", change)).notes
+    assert "'lin_rec709_display'" in colours and others.startswith("1 more primitives")
+
+
 def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ClodError, match="a scale is beyond"):
         write(tmp_path / "a.glb", model().replace(log_scales=torch.full((40, 3), 90.0)))

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from clod_adapter.adapter import extract
 from clod_adapter.errors import ClodError
@@ -86,6 +88,23 @@ def test_lines_of_others_are_made_fit_for_a_header(tmp_path: Path) -> None:
     assert "caf?" in found.comments and found.gaussians.attenuation == g.attenuation
     save(tmp_path / "out.ply", found.gaussians, found)
     assert load(tmp_path / "out.ply").gaussians.attenuation == g.attenuation
+
+
+def test_lines_that_no_header_has_room_for(tmp_path: Path) -> None:
+    write(tmp_path / "a.safetensors", model(0), ("long",) * 20_000)
+    with pytest.raises(ClodError, match="a.safetensors: its description has more than 65,536 letters"):
+        load(tmp_path / "a.safetensors")
+
+
+def test_settings_that_are_not_there_are_said_once(tmp_path: Path) -> None:
+    write(tmp_path / "a.safetensors", model(0))
+    path = tmp_path / "a.safetensors"
+    with safe_open(path, framework="pt") as file:
+        tensors, text = {name: file.get_tensor(name) for name in file.keys()}, file.metadata()["clod_adapter"]  # noqa: SIM118
+    card = json.loads(text)
+    card.pop("attenuation")
+    save_file(tensors, path, {"clod_adapter": json.dumps(card)})
+    assert sum("defaults used" in note for note in load(path).notes) == 1
 
 
 @pytest.mark.parametrize("suffix", LOADERS)

@@ -68,9 +68,23 @@ def test_files_that_are_not_there(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize("suffix", WRITERS)
 def test_nothing_is_half_written(tmp_path: Path, suffix: str) -> None:
     plain = model(1).replace(sigma_d=None, attenuation=None)
-    for g in (plain.select(torch.zeros(40, dtype=torch.bool)), plain.replace(sh0=plain.sh0 * torch.nan)):
+    unfit = (
+        plain.select(torch.zeros(40, dtype=torch.bool)), plain.replace(sh0=plain.sh0 * torch.nan),
+        plain.replace(quats=plain.quats * 0),
+    )  # fmt: skip
+    for g in unfit:
         with pytest.raises(ClodError, match="a" + suffix):
             write(tmp_path / f"a{suffix}", g)
     with pytest.raises(ClodError, match="does not exist"):
         write(tmp_path / "folder" / f"a{suffix}", plain)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_colours_of_any_size(tmp_path: Path, suffix: str) -> None:
+    plain = model(1).replace(sigma_d=None, attenuation=None)
+    most = torch.finfo(torch.float32).max
+    write(tmp_path / f"a{suffix}", plain.replace(sh0=plain.sh0.sign() * most, shN=plain.shN.sign() * most))
+    again = ply.load(tmp_path / f"a{suffix}").gaussians
+    assert len(again) == 40 and torch.equal(again.sh0.sign().unique(), torch.tensor([-1.0, 1.0]))
