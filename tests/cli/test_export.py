@@ -343,6 +343,25 @@ def test_a_streaming_set(clod: Any, dialled: Path, tmp_path: Path, tool: Any) ->
 
 
 @pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("-o", "."), ".: is the folder you are in; give --out the name of a new one"),
+        (("-o", "out", "--order", "extinction"), "a streaming set has an order of its own; leave out --order"),
+    ],
+)
+def test_a_streaming_set_that_cannot_be_is_refused_before_any_work(
+    clod: Any, dialled: Path, tmp_path: Path, tool: Any, monkeypatch: Any, words: tuple[str, ...], said: str
+) -> None:
+    tool()
+    monkeypatch.setattr("clod_adapter.cli.main.import_command", None)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    monkeypatch.chdir(empty)
+    done = clod("export", dialled, "--levels", "1,2", "--lod-meta", *words)
+    assert done.code == 2 and done.err.splitlines() == [f"clod-adapt: error: {said}"] and files(tmp_path) == ["empty"]
+
+
+@pytest.mark.parametrize(
     ("behave", "code", "said"),
     [
         ("print('✗ Error: no memory'); sys.exit(1)", 2, "splat-transform 3.7.0 failed: Error: no memory"),
