@@ -13,6 +13,7 @@ from typing import Any
 from clod_adapter.cameras import Camera
 from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console, duration
+from clod_adapter.cli.dials import opens_at
 from clod_adapter.cli.evaluate import choose_dials
 from clod_adapter.cli.export_formats import LOD_META, PACKED, PAGE, level_paths, suffix_of
 from clod_adapter.cli.files import size
@@ -176,10 +177,13 @@ def reference(args: argparse.Namespace, model: Checkpoint) -> tuple[Camera | Non
 def dial_values(
     args: argparse.Namespace, model: Checkpoint, camera: Camera | None, console: Console
 ) -> tuple[list[float] | None, list[str]]:
-    """The dial values to bake, None where the dial is to stay; and notes on them."""
+    """The dial values to bake, for a page where it opens, None where the dial is to stay; and notes on them."""
     solved, notes = (args.levels, []) if args.levels else solve_dials(args, model, [camera] if camera else (), console)
     if solved is None:
         return None, notes
+    if Path(args.out).suffix.lower() == PAGE and model.gaussians.attenuation is not None:
+        opening, more = opens_at(solved[0], model.gaussians.attenuation.max_sv)
+        return [opening], notes + more
     dials, beyond = choose_dials(solved, model.gaussians.attenuation)
     return dials, notes + beyond
 
@@ -222,6 +226,8 @@ def describe(output: dict[str, Any], total: int) -> str:
         return f"{line} Gaussians in {len(levels)} levels, {shown}"
     if output["virtual_scale"] is None:
         return f"{line} Gaussians"
+    if output["file"].lower().endswith(PAGE):
+        return f"{line} Gaussians, the dial at s = {output['virtual_scale']:.5g} at first"
     return f"{line} of {total:,} Gaussians, s = {output['virtual_scale']:.5g}"
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from clod_adapter.cameras import Camera
 from clod_adapter.cli.console import Console
+from clod_adapter.cli.dials import opens_at
 from clod_adapter.cli.inputs import read_checkpoint
 from clod_adapter.io.poses import load_cameras
 from clod_adapter.io.version import package_version
@@ -42,11 +43,14 @@ def prepare(args: argparse.Namespace, console: Console) -> tuple[dict[str, Answe
     model = read_checkpoint(args.model, console, args.activated)
     base = read_checkpoint(args.base, console, args.activated, model.origin) if args.base else None
     cameras, notes = load_cameras(args.images, model.origin) if args.images else (list[Camera](), list[str]())
+    attenuation = model.gaussians.attenuation
+    opening, more = opens_at(args.sv, attenuation.max_sv if attenuation else None)
+    notes += more
     for note in notes:
         console.say(f"  note: {note}")
     payloads = {MODEL: Payload.of(model)} | ({BASE: Payload.of(base)} if base else {})
     entries = [payload.describe(href=path) for path, payload in payloads.items()]
-    page = served_page(page_config(entries[0], entries[1] if base else None, cameras, args.sv))
+    page = served_page(page_config(entries[0], entries[1] if base else None, cameras, opening))
     answers = {"/": Answer("text/html; charset=utf-8", len(page), lambda: (page,), policy("'self'"))}
     for path, payload in payloads.items():
         answers[path] = Answer("application/octet-stream", payload.size, payload.blocks)

@@ -41,6 +41,21 @@ def test_serves_until_it_is_interrupted(spawn: Any, capture: Any, dialled: Path,
     assert (process.returncode, out) == (0, "") and "Traceback" not in err and "GET" not in err, err
 
 
+@pytest.mark.parametrize(
+    ("dial", "opens", "said"), [(True, 4, "the page's dial ends at s = 4"), (False, 1, "no dial to be at s = 9")]
+)
+def test_a_dial_value_that_the_page_does_not_have_is_noted(
+    spawn: Any, capture: Any, dialled: Path, tmp_path: Path, dial: bool, opens: float, said: str
+) -> None:
+    process = spawn("view", dialled if dial else capture.ply, "--sv", 9, "--no-browser", "--json", cwd=tmp_path)
+    report = json.loads(process.stdout.readline())
+    (config,) = re.findall(r'id="clod-config">(.*?)</script>', fetch(report["url"]).decode(), re.DOTALL)
+    assert json.loads(config)["virtual_scale"] == opens and any(said in note for note in report["notes"])
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=20)
+    assert said in err
+
+
 def test_prints_the_address(spawn: Any, capture: Any, tmp_path: Path) -> None:
     process = spawn("view", capture.ply, "--no-browser", "--quiet", cwd=tmp_path)
     line = process.stdout.readline()
