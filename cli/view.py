@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import subprocess
 import sys
 import webbrowser
 from typing import Any
@@ -19,6 +21,7 @@ from clod_adapter.viewer.payload import Payload, page_config
 from clod_adapter.viewer.server import Answer, Server
 
 MODEL, BASE = "/files/model", "/files/base"
+IN_TERMINAL = ("lynx", "w3m", "links", "links2", "elinks", "www-browser")  # those would take it over
 
 
 def run(args: argparse.Namespace) -> None:
@@ -66,6 +69,15 @@ def open_browser(url: str) -> bool:
         browser = webbrowser.get()
     except webbrowser.Error:
         return False
-    if type(browser) is webbrowser.GenericBrowser:  # lynx, w3m and the like, which would take over the terminal
+    if type(browser) is not webbrowser.GenericBrowser:
+        return browser.open(url)
+    if "BROWSER" not in os.environ or browser.basename in IN_TERMINAL:
         return False
-    return browser.open(url)
+    # A program of the user's, or of an editor that shows the page where its window is. Its open() would wait for it.
+    command = [browser.name, *(word.replace("%s", url) for word in browser.args)]
+    nowhere = subprocess.DEVNULL
+    try:
+        subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere, start_new_session=True)
+    except OSError:
+        return False
+    return True

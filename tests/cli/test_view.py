@@ -6,6 +6,7 @@ import json
 import re
 import signal
 import socket
+import time
 import urllib.request
 import webbrowser
 from pathlib import Path
@@ -99,6 +100,7 @@ def test_opens_a_browser_but_none_in_the_terminal(monkeypatch: pytest.MonkeyPatc
     browser = Browser()
     monkeypatch.setattr(webbrowser, "get", lambda: browser)
     assert view.open_browser("http://127.0.0.1:1/") and browser.opened == ["http://127.0.0.1:1/"]
+    monkeypatch.delenv("BROWSER", raising=False)
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("true"))
     assert not view.open_browser("http://127.0.0.1:1/")
 
@@ -106,4 +108,21 @@ def test_opens_a_browser_but_none_in_the_terminal(monkeypatch: pytest.MonkeyPatc
         raise webbrowser.Error("could not locate runnable browser")
 
     monkeypatch.setattr(webbrowser, "get", none)
+    assert not view.open_browser("http://127.0.0.1:1/")
+
+
+def test_opens_the_program_that_browser_names(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """As editors name one that opens the page where their window is; it is not waited for."""
+    helper = tmp_path / "helper.sh"
+    helper.write_text(f'#!/bin/sh\necho "$1" > {tmp_path}/part; mv {tmp_path}/part {tmp_path}/url; sleep 3\n')
+    helper.chmod(0o755)
+    monkeypatch.setenv("BROWSER", str(helper))
+    monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser(str(helper)))
+    began = time.monotonic()
+    assert view.open_browser("http://127.0.0.1:1/") and time.monotonic() - began < 30
+    while not (tmp_path / "url").exists():
+        time.sleep(0.02)
+    assert (tmp_path / "url").read_text() == "http://127.0.0.1:1/\n"
+    monkeypatch.setenv("BROWSER", "lynx")
+    monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("lynx"))
     assert not view.open_browser("http://127.0.0.1:1/")
