@@ -26,6 +26,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.ply_columns import MASKS, SIGMA, inria_dtype
+from clod_adapter.io.ply_header import PREFIX
 from clod_adapter.io.poses import load_cameras
 from clod_adapter.io.splat_transform import SplatTransform
 from clod_adapter.io.version import package_version
@@ -57,12 +58,16 @@ class Export:
 
     def piece(self, virtual_scale: float | None) -> tuple[Gaussians, tuple[str, ...]]:
         """The Gaussians of one file, baked if there is a dial value, and lines on how they came about."""
-        about = ["rows in the order in which the dial keeps them longest"] if self.ordered else []
+        about = [
+            comment for comment in self.model.comments if not comment.startswith(PREFIX)
+        ]  # of earlier exports, too
+        if self.ordered:
+            about.insert(0, "rows in the order in which the dial keeps them longest")
         if virtual_scale is None:
-            return self.gaussians, tuple(about)
+            return self.gaussians, tuple(dict.fromkeys(about))
         place = "d' = 1" if self.camera is None else f"the camera at {self._position()}"
         about.insert(0, f"baked at s = {virtual_scale:.6g} and {place} by clod-adapter: exact there only")
-        return bake(self.gaussians, virtual_scale, self.camera), tuple(about)
+        return bake(self.gaussians, virtual_scale, self.camera), tuple(dict.fromkeys(about))
 
     def write(self, path: Path, suffix: str, virtual_scale: float | None) -> tuple[int, tuple[str, ...]]:
         """Writes a file; how many Gaussians are in it, and notes on what has no room there."""

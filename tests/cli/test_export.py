@@ -217,6 +217,17 @@ def test_what_other_columns_there_were_is_said(clod: Any, dialled: Path, tmp_pat
     assert same(load("x.ply").gaussians, load(dialled).gaussians)
 
 
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".glb", ".pt", ".safetensors"])
+def test_what_the_file_says_of_itself_goes_along(clod: Any, dialled: Path, tmp_path: Path, suffix: str) -> None:
+    data = dialled.read_bytes().replace(b"\nproperty", b"\ncomment SplatRenderMode: mip\nproperty", 1)
+    (tmp_path / "mip.ply").write_bytes(data)
+    assert clod("export", "mip.ply", "--sv", 2, "-o", f"baked{suffix}").code == 0
+    assert clod("export", f"baked{suffix}", "-o", "again.ply").code == 0
+    header = (tmp_path / "again.ply").read_bytes().partition(b"end_header")[0].decode()
+    for line in ("baked at s = 2 and d' = 1 by clod-adapter: exact there only", "SplatRenderMode: mip"):
+        assert header.count(f"comment {line}\n") == 1
+
+
 def test_far_from_0_doubles_are_noted(clod: Any, dialled: Path, tmp_path: Path) -> None:
     model, vertex = load(dialled), PlyData.read(str(dialled), mmap=False)["vertex"]
     far = vertex.data.astype([(n, "f8" if n in "xyz" else t) for n, t in vertex.data.dtype.descr])
