@@ -170,12 +170,10 @@ def reference(args: argparse.Namespace, model: Checkpoint) -> tuple[Camera | Non
     cameras, notes = load_cameras(args.images, model.origin)
     if args.camera is None:
         return None, cameras, notes
-    found = [camera for camera in cameras if named(camera, args.camera)]
-    if not found:
-        some = ", ".join(camera.name for camera in cameras[:3])
-        raise ClodError(f"--camera has {args.camera!r}, and no photograph is called that; names here are like {some}")
+    found = named(cameras, args.camera, "--camera")
     if len(found) > 1:
-        raise ClodError(f"--camera has {args.camera!r}, which {found[0].name} and {found[1].name} are; give the suffix")
+        both = f"{found[0].name} and {found[1].name}"
+        raise ClodError(f"--camera has {args.camera!r}, which {both} are; give the whole name")
     return found[0], found, notes
 
 

@@ -125,8 +125,14 @@ def test_a_camera_that_two_photographs_are(clod: Any, capture: Any, dialled: Pat
     monkeypatch.setattr(export, "load_cameras", lambda *_: ([*twins, *rest], notes))
     words = ("export", dialled, "--sv", 2, "--images", capture.scene, "-o", "x.ply", "--camera")
     done = clod(*words, "a")
-    assert done.code == 2 and "--camera has 'a', which a.jpg and a.png are; give the suffix" in done.err
+    assert done.code == 2 and "--camera has 'a', which a.jpg and a.png are; give the whole name" in done.err
     assert clod(*words, "a.png").code == 0
+    twins = [replace(first, name="images/a.jpg"), replace(second, name="a.jpg")]
+    assert clod(*words, "a.jpg").code == 0
+    assert clod(*words, "images/a").code == 0
+    twins = [replace(first, name="images/b.jpg")]  # as a transforms.json has them
+    assert clod(*words, "b.jpg").code == 0 and clod(*words, "b").code == 0
+    assert clod(*words, "c").code == 2
 
 
 def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
