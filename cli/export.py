@@ -102,7 +102,7 @@ class Export:
             tool = SplatTransform.find()
         except ClodError as error:
             write_page(path, self.model, cameras=self.cameras, virtual_scale=virtual_scale)
-            return (f"the splat is in the page as it is; packed, the page would be a sixth of this: {error}",)
+            return (f"the splat is in the page as it is; packed, the page would be a fifth of this: {error}",)
         with ticking(self.console, f"splat-transform {tool.version}, {len(self.gaussians):,} Gaussians") as tick:
             write_page(
                 path, self.model, cameras=self.cameras, virtual_scale=virtual_scale, tool=tool, progress=tick
