@@ -39,6 +39,8 @@ def check_together(args: Namespace, bakes: bool) -> None:
         raise ClodError("--levels has the dial values; give no other with it")
     if args.lod_meta and not args.levels:
         raise ClodError("--lod-meta is a set of levels; give them, as in --levels 1,2,4,7")
+    if args.lod_meta and args.order:
+        raise ClodError("a streaming set has an order of its own; leave out --order")
     if args.camera is not None and args.images is None:
         raise ClodError("--camera names a photograph of a scene; give that too, with --images")
     page = Path(args.out).suffix.lower() == PAGE
@@ -61,6 +63,8 @@ def check_outputs(args: Namespace) -> None:
         raise ClodError(f"{out}: with --lod-meta, --out names the folder that {LOD_META} is to be in, not a file")
     if out.exists() and not out.is_dir():
         raise ClodError(f"{out}: is a file; with --lod-meta give --out the name of a new folder")
+    if not out.name:  # ".", the folder one is in, which cannot be put in the place of itself
+        raise ClodError(f"{out}: is the folder you are in; give --out the name of a new one")
     check_target(out)
 
 

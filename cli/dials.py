@@ -37,6 +37,19 @@ def add_dial_options(parser: ArgumentParser, sv_help: str, where: str, *, severa
         group.add_argument(option, metavar=metavar, type=kind, nargs=count, help=text.format(where=where, times=times))
 
 
+def opens_at(virtual_scale: float, max_sv: float | None) -> tuple[float, list[str]]:
+    """Where the dial of a page stands at first, and a note where that is not what was asked for.
+
+    Args:
+        max_sv: where it ends; None for a file without a dial.
+    """
+    if max_sv is None:
+        return 1.0, [f"no sigma_d, so no dial to be at s = {virtual_scale:g}"] if virtual_scale > 1 else []
+    if virtual_scale > max_sv:
+        return max_sv, [f"the page's dial ends at s = {max_sv:g}, as far as was trained for, and opens there"]
+    return virtual_scale, []
+
+
 def given_budget(args: Namespace) -> tuple[str, str, list[float]] | None:
     """The budget's name, its option and its values, if one is given."""
     for name, *_ in OPTIONS:

@@ -13,6 +13,7 @@ from typing import Any
 from clod_adapter.cameras import Camera
 from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console, duration
+from clod_adapter.cli.dials import opens_at
 from clod_adapter.cli.evaluate import choose_dials
 from clod_adapter.cli.export_formats import LOD_META, PACKED, PAGE, level_paths, suffix_of
 from clod_adapter.cli.files import size
@@ -97,7 +98,7 @@ class Export:
             tool = SplatTransform.find()
         except ClodError as error:
             write_page(path, self.model, cameras=self.cameras, virtual_scale=virtual_scale)
-            return (f"the splat is in the page as it is; packed, the page would be a sixth of this: {error}",)
+            return (f"the splat is in the page as it is; packed, the page would be a fifth of this: {error}",)
         with ticking(self.console, f"splat-transform {tool.version}, {len(self.gaussians):,} Gaussians") as tick:
             write_page(
                 path, self.model, cameras=self.cameras, virtual_scale=virtual_scale, tool=tool, progress=tick
@@ -165,22 +166,23 @@ def reference(args: argparse.Namespace, model: Checkpoint) -> tuple[Camera | Non
     cameras, notes = load_cameras(args.images, model.origin)
     if args.camera is None:
         return None, cameras, notes
-    found = [camera for camera in cameras if named(camera, args.camera)]
-    if not found:
-        some = ", ".join(camera.name for camera in cameras[:3])
-        raise ClodError(f"--camera has {args.camera!r}, and no photograph is called that; names here are like {some}")
+    found = named(cameras, args.camera, "--camera")
     if len(found) > 1:
-        raise ClodError(f"--camera has {args.camera!r}, which {found[0].name} and {found[1].name} are; give the suffix")
+        both = f"{found[0].name} and {found[1].name}"
+        raise ClodError(f"--camera has {args.camera!r}, which {both} are; give the whole name")
     return found[0], found, notes
 
 
 def dial_values(
     args: argparse.Namespace, model: Checkpoint, camera: Camera | None, console: Console
 ) -> tuple[list[float] | None, list[str]]:
-    """The dial values to bake, None where the dial is to stay; and notes on them."""
+    """The dial values to bake, for a page where it opens, None where the dial is to stay; and notes on them."""
     solved, notes = (args.levels, []) if args.levels else solve_dials(args, model, [camera] if camera else (), console)
     if solved is None:
         return None, notes
+    if Path(args.out).suffix.lower() == PAGE and model.gaussians.attenuation is not None:
+        opening, more = opens_at(solved[0], model.gaussians.attenuation.max_sv)
+        return [opening], notes + more
     dials, beyond = choose_dials(solved, model.gaussians.attenuation)
     return dials, notes + beyond
 
@@ -223,6 +225,8 @@ def describe(output: dict[str, Any], total: int) -> str:
         return f"{line} Gaussians in {len(levels)} levels, {shown}"
     if output["virtual_scale"] is None:
         return f"{line} Gaussians"
+    if output["file"].lower().endswith(PAGE):
+        return f"{line} Gaussians, the dial at s = {output['virtual_scale']:.5g} at first"
     return f"{line} of {total:,} Gaussians, s = {output['virtual_scale']:.5g}"
 
 

@@ -94,8 +94,8 @@ SIBR reads a baked .ply; the SH degree it takes from sh_degree in the cfg_args
 beside the model, up to 3, and its released versions do not show degree 0.
 
 A .html is what "clod-adapt view" shows, in one file to send to somebody; it
-needs no network. --sv is where its dial stands at first, and --images gives it
-the photographs' cameras to jump between.
+needs no network. --sv, or a budget, is where its dial stands at first, and
+--images gives it the photographs' cameras to jump between.
 
 .sog, .compressed.ply and --lod-meta need splat-transform 3.7 with Node 22, on
 the PATH or as the command in CLOD_SPLAT_TRANSFORM. In a folder of its own:

@@ -27,7 +27,7 @@ splat-transform where that is installed, and the formats of clod-adapt export.
 A file that is none of these is refused with what it is, where that shows.
 
   looks like   a guess from comments and the order of properties, never a proof
-  says         the file's own comments on how it came about
+  says         comments in the file, by which to know a baked one
   needle       a Gaussian more than 10 times as long as its second axis
   tau          opacity below which the dial leaves out at s = 1: the file's own,
                or the one that adapting would start from

@@ -39,9 +39,11 @@ port sees the same.
 --images is for the cameras only, which the page then jumps between; photographs
 need not be there. Without it the page looks at the middle of the scene.
 
-Nobody else can reach the page: it listens on 127.0.0.1, and nothing is fetched
-from elsewhere or sent. From another machine, forward the port:
-  ssh -L 8000:127.0.0.1:8000 HOST clod-adapt view MODEL.ply --port 8000
+No other machine can reach the page: it listens on 127.0.0.1, and nothing is
+fetched from elsewhere or sent. To see it from another one, forward the port
+(with -t, or Ctrl-C ends ssh alone):
+  ssh -t -L 8000:127.0.0.1:8000 HOST \\
+      clod-adapt view MODEL.ply --no-browser --port 8000
 To send what you see to somebody, write it as a file:
   clod-adapt export MODEL.ply -o page.html
 

@@ -16,7 +16,8 @@ from clod_adapter.io.version import package_version
 
 WIDTH = 13  # of the names at the left
 MOST_ROWS = 8  # of a calibration: the first and last are always shown
-MOST_LINES = 6  # of oddities, and of what is left out
+MOST_LINES = 6  # of oddities, of what is left out, and of what the file says
+LONGEST = 100  # letters of a comment, of which a file may have any number
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
@@ -49,7 +50,7 @@ def splat_lines(splat: Splat) -> list[str]:
         names = ", ".join(splat.extra[:6]) + (", ..." if len(splat.extra) > 6 else "")
         more = f", of them unknown here: {names}" if splat.extra else ""
         lines.append(_line("layout", f"{splat.encoding}, {len(splat.columns)} properties{more}"))
-    lines += _block("says", splat.comments)
+    lines += _block("says", (comment[:LONGEST] for comment in splat.comments))
     rows = [*zip("xyz", v.position, strict=True), ("scale", v.scale), ("opacity", v.opacity)]
     rows += [("sigma_d", v.sigma)] if v.sigma is not None else []
     lines += ["", *spread_table(rows), ""]

@@ -75,16 +75,27 @@ def pick_views(scene: Scene, wanted: Sequence[str]) -> list[View]:
         return views
     if list(wanted) == ["held-out"]:
         return list(scene.test or scene.train)  # of a single photograph none is held out
-    for name in wanted:
-        if not any(named(view.camera, name) for view in views):
-            some = ", ".join(view.camera.name for view in views[:3])
-            raise ClodError(f"--views has {name!r}, and no photograph is called that; names here are like {some}")
-    return [view for view in views if any(named(view.camera, name) for name in wanted)]
+    cameras = [view.camera for view in views]
+    chosen = {camera.name for name in wanted for camera in named(cameras, name, "--views")}
+    return [view for view in views if view.camera.name in chosen]
 
 
-def named(camera: Camera, name: str) -> bool:
-    """By the photograph's whole name, or without its suffix."""
-    return name in (camera.name, str(Path(camera.name).with_suffix("")))
+def named(cameras: Sequence[Camera], name: str, option: str) -> list[Camera]:
+    """Those of the photograph of that whole name; where there is none, without its suffix, its folder, or both.
+
+    Raises:
+        ClodError: no photograph is called that.
+    """
+    whole = [camera for camera in cameras if camera.name == name]
+    if found := whole or [camera for camera in cameras if name in _shorter(camera.name)]:
+        return found
+    some = ", ".join(camera.name for camera in cameras[:3])
+    raise ClodError(f"{option} has {name!r}, and no photograph is called that; names here are like {some}")
+
+
+def _shorter(name: str) -> tuple[str, ...]:
+    path = PureWindowsPath(name)
+    return str(Path(name).with_suffix("")), path.name, path.stem
 
 
 def files(views: Sequence[View]) -> list[Path]:

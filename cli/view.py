@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import subprocess
 import sys
 import webbrowser
 from typing import Any
 
 from clod_adapter.cameras import Camera
 from clod_adapter.cli.console import Console
+from clod_adapter.cli.dials import opens_at
 from clod_adapter.cli.inputs import read_checkpoint
 from clod_adapter.io.poses import load_cameras
 from clod_adapter.io.version import package_version
@@ -18,6 +21,7 @@ from clod_adapter.viewer.payload import Payload, page_config
 from clod_adapter.viewer.server import Answer, Server
 
 MODEL, BASE = "/files/model", "/files/base"
+IN_TERMINAL = ("lynx", "w3m", "links", "links2", "elinks", "www-browser")  # those would take it over
 
 
 def run(args: argparse.Namespace) -> None:
@@ -42,11 +46,14 @@ def prepare(args: argparse.Namespace, console: Console) -> tuple[dict[str, Answe
     model = read_checkpoint(args.model, console, args.activated)
     base = read_checkpoint(args.base, console, args.activated, model.origin) if args.base else None
     cameras, notes = load_cameras(args.images, model.origin) if args.images else (list[Camera](), list[str]())
+    attenuation = model.gaussians.attenuation
+    opening, more = opens_at(args.sv, attenuation.max_sv if attenuation else None)
+    notes += more
     for note in notes:
         console.say(f"  note: {note}")
     payloads = {MODEL: Payload.of(model)} | ({BASE: Payload.of(base)} if base else {})
     entries = [payload.describe(href=path) for path, payload in payloads.items()]
-    page = served_page(page_config(entries[0], entries[1] if base else None, cameras, args.sv))
+    page = served_page(page_config(entries[0], entries[1] if base else None, cameras, opening))
     answers = {"/": Answer("text/html; charset=utf-8", len(page), lambda: (page,), policy("'self'"))}
     for path, payload in payloads.items():
         answers[path] = Answer("application/octet-stream", payload.size, payload.blocks)
@@ -62,6 +69,15 @@ def open_browser(url: str) -> bool:
         browser = webbrowser.get()
     except webbrowser.Error:
         return False
-    if type(browser) is webbrowser.GenericBrowser:  # lynx, w3m and the like, which would take over the terminal
+    if type(browser) is not webbrowser.GenericBrowser:
+        return browser.open(url)
+    if "BROWSER" not in os.environ or browser.basename in IN_TERMINAL:
         return False
-    return browser.open(url)
+    # A program of the user's, or of an editor that shows the page where its window is. Its open() would wait for it.
+    command = [browser.name, *(word.replace("%s", url) for word in browser.args)]
+    nowhere = subprocess.DEVNULL
+    try:
+        subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere, start_new_session=True)
+    except OSError:
+        return False
+    return True

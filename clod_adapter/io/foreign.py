@@ -9,11 +9,13 @@ from clod_adapter.errors import ClodError
 
 _CONVERT = "convert it: splat-transform IN{suffix} OUT.ply; better still, adapt the PLY that it was made from"
 
+_PAGE = "which clod-adapt export wrote to be opened in a browser, or a download went wrong"
+
 # What a file begins with (white space aside), what it then is whatever its name, and what to do.
 CONTENTS = (
     (b"version https://git-lfs", "a Git LFS pointer, not the file it stands for", "fetch that: git lfs pull"),
-    (b"<!doctype html", "a web page, so a download went wrong", "download the file itself"),
-    (b"<html", "a web page, so a download went wrong", "download the file itself"),
+    (b"<!doctype html", f"a web page, {_PAGE}", "download the file itself"),
+    (b"<html", f"a web page, {_PAGE}", "download the file itself"),
     (b"<?xml", "an XML document, perhaps an error that a server sent", "download the file itself"),
 )
 # The same by suffix, for formats that no first bytes tell apart.

@@ -133,8 +133,14 @@ def test_a_camera_that_two_photographs_are(clod: Any, capture: Any, dialled: Pat
     monkeypatch.setattr(export, "load_cameras", lambda *_: ([*twins, *rest], notes))
     words = ("export", dialled, "--sv", 2, "--images", capture.scene, "-o", "x.ply", "--camera")
     done = clod(*words, "a")
-    assert done.code == 2 and "--camera has 'a', which a.jpg and a.png are; give the suffix" in done.err
+    assert done.code == 2 and "--camera has 'a', which a.jpg and a.png are; give the whole name" in done.err
     assert clod(*words, "a.png").code == 0
+    twins = [replace(first, name="images/a.jpg"), replace(second, name="a.jpg")]
+    assert clod(*words, "a.jpg").code == 0
+    assert clod(*words, "images/a").code == 0
+    twins = [replace(first, name="images/b.jpg")]  # as a transforms.json has them
+    assert clod(*words, "b.jpg").code == 0 and clod(*words, "b").code == 0
+    assert clod(*words, "c").code == 2
 
 
 def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
@@ -223,6 +229,17 @@ def test_what_other_columns_there_were_is_said(clod: Any, dialled: Path, tmp_pat
     report = json.loads(clod("export", "labelled.ply", "-o", "x.ply", "--json").out)
     assert report["notes"] == ["columns left out: label"]
     assert same(load("x.ply").gaussians, load(dialled).gaussians)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".glb", ".pt", ".safetensors"])
+def test_what_the_file_says_of_itself_goes_along(clod: Any, dialled: Path, tmp_path: Path, suffix: str) -> None:
+    data = dialled.read_bytes().replace(b"\nproperty", b"\ncomment SplatRenderMode: mip\nproperty", 1)
+    (tmp_path / "mip.ply").write_bytes(data)
+    assert clod("export", "mip.ply", "--sv", 2, "-o", f"baked{suffix}").code == 0
+    assert clod("export", f"baked{suffix}", "-o", "again.ply").code == 0
+    header = (tmp_path / "again.ply").read_bytes().partition(b"end_header")[0].decode()
+    for line in ("baked at s = 2 and d' = 1 by clod-adapter: exact there only", "SplatRenderMode: mip"):
+        assert header.count(f"comment {line}\n") == 1
 
 
 def test_far_from_0_doubles_are_noted(clod: Any, dialled: Path, tmp_path: Path) -> None:
@@ -348,6 +365,25 @@ def test_a_streaming_set(clod: Any, dialled: Path, tmp_path: Path, tool: Any) ->
     assert words[1::3] == ["-l"] * 3 and words[2::3] == ["0", "1", "2"] and words[-1].endswith("/lod-meta.json")
     done = clod("export", dialled, "--levels", "1,2", "--lod-meta", "-o", "out")
     assert done.code == 2 and "out: is a folder that is not empty" in done.err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("-o", "."), ".: is the folder you are in; give --out the name of a new one"),
+        (("-o", "out", "--order", "extinction"), "a streaming set has an order of its own; leave out --order"),
+    ],
+)
+def test_a_streaming_set_that_cannot_be_is_refused_before_any_work(
+    clod: Any, dialled: Path, tmp_path: Path, tool: Any, monkeypatch: Any, words: tuple[str, ...], said: str
+) -> None:
+    tool()
+    monkeypatch.setattr("clod_adapter.cli.main.import_command", None)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    monkeypatch.chdir(empty)
+    done = clod("export", dialled, "--levels", "1,2", "--lod-meta", *words)
+    assert done.code == 2 and done.err.splitlines() == [f"clod-adapt: error: {said}"] and files(tmp_path) == ["empty"]
 
 
 @pytest.mark.parametrize(

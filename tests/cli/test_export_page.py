@@ -40,6 +40,15 @@ def test_a_page_has_the_cameras_of_the_scene(clod: Any, dialled: Path, capture: 
     assert names == sorted(path.name for path in (capture.scene / "images").iterdir())
 
 
+def test_what_is_said_of_a_page(clod: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CLOD_SPLAT_TRANSFORM", "there-is-none")
+    done = clod("export", dialled, "-o", "page.html", "--sv", 2)
+    assert "Gaussians, the dial at s = 2 at first" in done.out and " of " not in done.out
+    done = clod("export", dialled, "-o", "page.html", "--sv", 9, "--json")
+    report = json.loads(done.out)
+    assert report["outputs"][0]["virtual_scale"] == 4 and any("dial ends at s = 4" in note for note in report["notes"])
+
+
 @pytest.mark.parametrize("words", [("--levels", "1,2"), ("--order", "extinction")])
 def test_a_page_is_of_the_whole_dial(clod: Any, dialled: Path, tmp_path: Path, words: tuple[str, ...]) -> None:
     done = clod("export", dialled, "-o", "page.html", *words)

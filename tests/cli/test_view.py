@@ -6,6 +6,7 @@ import json
 import re
 import signal
 import socket
+import time
 import urllib.request
 import webbrowser
 from pathlib import Path
@@ -39,6 +40,21 @@ def test_serves_until_it_is_interrupted(spawn: Any, capture: Any, dialled: Path,
     process.send_signal(end)
     out, err = process.communicate(timeout=20)
     assert (process.returncode, out) == (0, "") and "Traceback" not in err and "GET" not in err, err
+
+
+@pytest.mark.parametrize(
+    ("dial", "opens", "said"), [(True, 4, "the page's dial ends at s = 4"), (False, 1, "no dial to be at s = 9")]
+)
+def test_a_dial_value_that_the_page_does_not_have_is_noted(
+    spawn: Any, capture: Any, dialled: Path, tmp_path: Path, dial: bool, opens: float, said: str
+) -> None:
+    process = spawn("view", dialled if dial else capture.ply, "--sv", 9, "--no-browser", "--json", cwd=tmp_path)
+    report = json.loads(process.stdout.readline())
+    (config,) = re.findall(r'id="clod-config">(.*?)</script>', fetch(report["url"]).decode(), re.DOTALL)
+    assert json.loads(config)["virtual_scale"] == opens and any(said in note for note in report["notes"])
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=20)
+    assert said in err
 
 
 def test_prints_the_address(spawn: Any, capture: Any, tmp_path: Path) -> None:
@@ -84,6 +100,7 @@ def test_opens_a_browser_but_none_in_the_terminal(monkeypatch: pytest.MonkeyPatc
     browser = Browser()
     monkeypatch.setattr(webbrowser, "get", lambda: browser)
     assert view.open_browser("http://127.0.0.1:1/") and browser.opened == ["http://127.0.0.1:1/"]
+    monkeypatch.delenv("BROWSER", raising=False)
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("true"))
     assert not view.open_browser("http://127.0.0.1:1/")
 
@@ -91,4 +108,21 @@ def test_opens_a_browser_but_none_in_the_terminal(monkeypatch: pytest.MonkeyPatc
         raise webbrowser.Error("could not locate runnable browser")
 
     monkeypatch.setattr(webbrowser, "get", none)
+    assert not view.open_browser("http://127.0.0.1:1/")
+
+
+def test_opens_the_program_that_browser_names(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """As editors name one that opens the page where their window is; it is not waited for."""
+    helper = tmp_path / "helper.sh"
+    helper.write_text(f'#!/bin/sh\necho "$1" > {tmp_path}/part; mv {tmp_path}/part {tmp_path}/url; sleep 3\n')
+    helper.chmod(0o755)
+    monkeypatch.setenv("BROWSER", str(helper))
+    monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser(str(helper)))
+    began = time.monotonic()
+    assert view.open_browser("http://127.0.0.1:1/") and time.monotonic() - began < 30
+    while not (tmp_path / "url").exists():
+        time.sleep(0.02)
+    assert (tmp_path / "url").read_text() == "http://127.0.0.1:1/\n"
+    monkeypatch.setenv("BROWSER", "lynx")
+    monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("lynx"))
     assert not view.open_browser("http://127.0.0.1:1/")
