@@ -1,0 +1,72 @@
+"""The page under hands that are quick, careless, or on a device that cannot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import scenes
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.gaussians import Gaussians
+from shown import Shown
+
+DROP = """([name, data, wait, fails]) => {
+    const file = new File([new Uint8Array(data)], name), read = file.arrayBuffer.bind(file);
+    const later = new Promise((resolve) => setTimeout(resolve, wait));
+    file.arrayBuffer = () => later.then(() => fails ? Promise.reject(new DOMException("", "NotFoundError")) : read());
+    const event = new Event("drop", { bubbles: true, cancelable: true });
+    event.dataTransfer = { files: [file] };
+    document.body.dispatchEvent(event);
+}"""
+
+
+@pytest.fixture(scope="module")
+def gaussians() -> Gaussians:
+    sigma_d = torch.linspace(0.05, 6, 400)
+    attenuation = AttenuationConfig(tau=0.02, cut="soft", scene_distance=3.0)
+    return scenes.gaussians(400, 1, 5).replace(sigma_d=sigma_d, attenuation=attenuation)
+
+
+def plain_of(gaussians: Gaussians) -> Gaussians:
+    return gaussians.replace(sigma_d=None, attenuation=None)
+
+
+def drop(shown: Shown, name: str, data: bytes, *, wait: int = 0, fails: bool = False) -> None:
+    """Lets a file fall on the page that can be read after ``wait`` milliseconds, or never."""
+    shown.page.evaluate(DROP, [name, list(data), wait, fails])
+
+
+def target(shown: Shown, text: str) -> str:
+    """What the page says to a count that was typed."""
+    shown.page.fill("#target", text)
+    shown.page.evaluate("document.getElementById('target-note').textContent = ''")
+    shown.page.keyboard.press("Enter")
+    shown.until("document.getElementById('target-note').textContent !== ''")
+    return shown.text("#target-note")
+
+
+def test_a_key_is_let_go_whatever_shift_made_of_it(show: Any, files: Any, gaussians: Gaussians) -> None:
+    """On many keyboards + is Shift and =, and Shift may be let go first."""
+    shown = show(files.save(gaussians))
+    shown.page.evaluate("""() => {
+        const press = (kind, key) => new KeyboardEvent(kind, { key, code: "Equal", bubbles: true });
+        const canvas = document.getElementById("canvas");
+        for (const event of [press("keydown", "+"), press("keyup", "=")]) canvas.dispatchEvent(event);
+    }""")
+    shown.page.wait_for_timeout(100)
+    before = shown.picture()
+    assert np.array_equal(shown.picture(), before)
+
+
+def test_letters_move_from_the_dial_too_and_are_text_in_a_text(show: Any, files: Any, gaussians: Gaussians) -> None:
+    shown = show(files.save(gaussians), viewport={"width": 640, "height": 600})
+    before = shown.picture()
+    shown.page.focus("#target")
+    shown.page.keyboard.type("wasdech0")
+    assert shown.page.input_value("#target") == "wasdech0" and np.array_equal(shown.picture(), before)
+    shown.page.focus("#dial")
+    shown.page.keyboard.press("w")
+    assert not np.array_equal(shown.picture(), before)
