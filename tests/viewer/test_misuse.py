@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,30 @@ def target(shown: Shown, text: str) -> str:
     shown.page.keyboard.press("Enter")
     shown.until("document.getElementById('target-note').textContent !== ''")
     return shown.text("#target-note")
+
+
+def test_of_files_dropped_at_once_the_last_is_shown(show: Any, files: Any, gaussians: Gaussians) -> None:
+    path, one = files.save(gaussians), files.save(scenes.gaussians(9, 0, 1), "nine.ply")
+    shown = show(path)
+    drop(shown, "slow.ply", path.read_bytes(), wait=500)
+    drop(shown, "nine.ply", one.read_bytes())
+    shown.until("document.title === 'nine.ply'")
+    shown.page.wait_for_timeout(800)
+    assert shown.text("#title") == "nine.ply" and shown.counts()["total"] == 9
+
+
+def test_what_no_reader_foresaw_is_said_in_words(show: Any, files: Any, gaussians: Gaussians) -> None:
+    shown = show(files.save(gaussians))
+    drop(shown, "folder", b"", fails=True)
+    shown.until("!document.getElementById('message').hidden")
+    assert "folder" in shown.text("#message") and "cannot read it" in shown.text("#message")
+    for name, data in (
+        ("cut.spz", gzip.compress(bytes(100))[:-9]),
+        ("end.sog", b"PK\3\4" + bytes(60) + b"PK\5\6" + b"\xff" * 20),
+    ):
+        drop(shown, name, data)
+        shown.until(f"document.getElementById('message').textContent.includes('{name}')")
+        assert "it is damaged, or too large" in shown.text("#message")
 
 
 def test_a_key_is_let_go_whatever_shift_made_of_it(show: Any, files: Any, gaussians: Gaussians) -> None:

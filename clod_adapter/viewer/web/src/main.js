@@ -29,6 +29,7 @@ async function start() {
   viewer.ui.show();
   if (!config.model) return viewer.ui.busy("Drop a splat here, or open one");
   const [model, base] = await Promise.all([config.model, config.base].map((entry) => entry && fetchNamed(entry)));
+  if (loads) return; // another file was dropped meanwhile
   show(model, base, config.cameras, config.virtual_scale);
   applyLink(readLink(location.hash));
   window.addEventListener("hashchange", () => applyLink(readLink(location.hash)));
@@ -135,24 +136,34 @@ const actions = {
     }
   },
   fullScreen: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.()),
-  openFile: async (file) => load(await file.arrayBuffer(), file.name).catch(() => {}),
+  openFile(file) {
+    const unread = () => { throw new Error("the browser cannot read it: it is a folder, or too large"); };
+    return load(file.arrayBuffer().catch(unread), file.name).catch(() => {});
+  },
 };
 
-/** Shows another file; where it cannot be read what was shown stays, and the message says why. */
+let loads = 0;
+
+/** Shows another file, out of a buffer or a promise of one; of several the last. Where it cannot be read what was shown
+ *  stays, and the message says why. */
 async function load(buffer, name) {
-  const { ui, stage } = viewer;
+  const { ui, stage } = viewer, turn = ++loads;
   ui.busy(`Reading ${name}`);
   try {
-    show(await readFile(buffer, name), null, [], 1);
+    const read = await readFile(await buffer, name);
+    if (turn !== loads) return;
+    show(read, null, [], 1);
+    viewer.dropped = true;
+    ui.note(read.about.notes.join("; "));
     document.title = elements.title.textContent = name;
     ui.say(null);
     await stage.settled();
   } catch (error) {
     const message = `${name}: ${error.message}`;
-    ui.say(message);
+    if (turn === loads) ui.say(message);
     throw new Error(message);
   } finally {
-    ui.busy(null);
+    if (turn === loads) ui.busy(null);
   }
 }
 
