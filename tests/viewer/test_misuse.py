@@ -12,7 +12,7 @@ import torch
 import scenes
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
-from shown import Shown
+from shown import Shown, serve
 
 DROP = """([name, data, wait, fails]) => {
     const file = new File([new Uint8Array(data)], name), read = file.arrayBuffer.bind(file);
@@ -95,3 +95,16 @@ def test_letters_move_from_the_dial_too_and_are_text_in_a_text(show: Any, files:
     shown.page.focus("#dial")
     shown.page.keyboard.press("w")
     assert not np.array_equal(shown.picture(), before)
+
+
+def test_more_gaussians_than_the_device_takes_are_counted(chromium: Any, files: Any, gaussians: Gaussians) -> None:
+    small = """const real = WebGL2RenderingContext.prototype.getParameter;
+        WebGL2RenderingContext.prototype.getParameter = function (name) {
+            return name === this.MAX_TEXTURE_SIZE ? 2 : real.call(this, name);
+        };"""
+    with serve(files.save(scenes.gaussians(1100, 3, 5))) as url, chromium.new_context() as context:
+        context.add_init_script(small)
+        shown = Shown(context.new_page())
+        shown.page.goto(url)
+        shown.until("!document.getElementById('message').hidden")
+        assert "1,100 Gaussians" in shown.text("#message") and "takes 682" in shown.text("#message")

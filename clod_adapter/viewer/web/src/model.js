@@ -1,10 +1,11 @@
 // One splat on the GPU, and its worker, which knows who is kept at a dial value and in which order they are drawn.
-import { WIDTH, dataTexture, heightOf } from "./gpu.js";
+import { WIDTH, dataTexture, heightOf, mostTexels } from "./gpu.js";
 import { half } from "./half.js";
 import { BAND_TEXELS } from "./shaders.js";
 import workerSource from "worker:./worker.js";
 
 const SH_C0 = 0.28209479177387814;
+const RECORD_TEXELS = 4;
 
 /** `about`: name, attenuation or null, no_dial, max_sv, calibration. `gaussians`: as the readers in formats/ make them. */
 export function createModel(gl, gaussians, about) {
@@ -32,11 +33,19 @@ export function createModel(gl, gaussians, about) {
 
 /** Apart, so that nothing that lives on holds the values after they are on the GPU. */
 function upload(gl, gaussians) {
-  const texels = BAND_TEXELS[gaussians.degree];
-  return {
-    records: dataTexture(gl, 4 * gaussians.count, Float32Array, (target) => fillRecords(target, gaussians)),
+  const texels = BAND_TEXELS[gaussians.degree], integer = new Intl.NumberFormat("en").format;
+  if (gl.isContextLost()) throw new Error("the graphics device went away; reload the page");
+  const most = Math.floor(mostTexels(gl) / Math.max(texels, RECORD_TEXELS));
+  if (gaussians.count > most) {
+    throw new Error(`it has ${integer(gaussians.count)} Gaussians; this graphics device takes ${integer(most)} of its SH degree`);
+  }
+  const made = {
+    records: dataTexture(gl, RECORD_TEXELS * gaussians.count, Float32Array, (target) => fillRecords(target, gaussians)),
     higher: dataTexture(gl, texels * gaussians.count, Uint32Array, (target) => fillBands(target, gaussians, texels)),
   };
+  if (gl.getError() !== gl.OUT_OF_MEMORY) return made;
+  for (const each of Object.values(made)) gl.deleteTexture(each);
+  throw new Error(`this graphics device has too little memory for its ${integer(gaussians.count)} Gaussians`);
 }
 
 function fillRecords(target, { count, means, quats, logScales, opacityLogits, sh0, sigma }) {
