@@ -97,6 +97,12 @@ def test_letters_move_from_the_dial_too_and_are_text_in_a_text(show: Any, files:
     assert not np.array_equal(shown.picture(), before)
 
 
+def test_one_gaussian_is_seen_whole(show: Any, files: Any) -> None:
+    lone = scenes.gaussians(1, 0, 5).replace(opacity_logits=torch.tensor([5.0]))
+    picture = show(files.save(lone)).picture().max(2)
+    assert picture.max() > 20 and (picture[0].max(), picture[-1].max()) == (0, 0)
+
+
 def test_more_gaussians_than_the_device_takes_are_counted(chromium: Any, files: Any, gaussians: Gaussians) -> None:
     small = """const real = WebGL2RenderingContext.prototype.getParameter;
         WebGL2RenderingContext.prototype.getParameter = function (name) {
