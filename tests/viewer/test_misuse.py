@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gzip
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ import torch
 import scenes
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.colmap import write_model
 from shown import Shown, serve
 
 DROP = """([name, data, wait, fails]) => {
@@ -95,6 +98,22 @@ def test_letters_move_from_the_dial_too_and_are_text_in_a_text(show: Any, files:
     shown.page.focus("#dial")
     shown.page.keyboard.press("w")
     assert not np.array_equal(shown.picture(), before)
+
+
+def test_cameras_can_be_chosen_by_name(show: Any, files: Any, gaussians: Gaussians, tmp_path: Path) -> None:
+    cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))]
+    write_model(tmp_path, cameras, [camera.name for camera in cameras])
+    shown = show(files.save(gaussians), "--images", tmp_path, viewport={"width": 640, "height": 600})
+    assert shown.page.input_value("#camera") == "0.jpg"
+    shown.page.keyboard.press("n")
+    assert shown.page.input_value("#camera") == "1.jpg"
+    wanted = shown.picture()
+    shown.page.keyboard.press("p")
+    shown.page.select_option("#camera", "1.jpg")
+    assert np.array_equal(shown.picture(), wanted)
+    shown.page.mouse.move(500, 60)
+    shown.page.mouse.wheel(0, 200)
+    shown.until("document.getElementById('camera').selectedIndex === -1")
 
 
 def test_one_gaussian_is_seen_whole(show: Any, files: Any) -> None:

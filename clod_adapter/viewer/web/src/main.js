@@ -16,7 +16,10 @@ let viewer;
 async function start() {
   const renderer = createRenderer(elements.canvas), camera = createCamera();
   const stage = createStage(renderer, elements.canvas, camera);
-  const controls = createControls(elements.canvas, camera, () => stage.change({ moving: true }));
+  const controls = createControls(elements.canvas, camera, () => {
+    stage.change({ moving: true });
+    viewer.ui.at(null);
+  });
   const wipe = createWipe(elements, stage);
   viewer = { renderer, camera, stage, controls, wipe, cameraNumber: 0, cameras: config.cameras };
   viewer.ui = createUi(elements, stage, actions);
@@ -45,9 +48,8 @@ function show(model, base, cameras, dial) {
   Object.assign(stage.state, { dial: 1, equation: true, wipe: null, other: "base" });
   stage.show(made, madeBase);
   viewer.cameras = cameras;
-  viewer.cameraNumber = 0;
-  camera.fit(stage.model.extent, cameras);
-  camera.exact = null;
+  ui.list(cameras);
+  actions.reset();
   stage.state.dial = clampDial(dial);
   ui.busy(null);
   ui.note("");
@@ -65,7 +67,10 @@ function changed() {
 
 function applyLink({ eye, rotation, field, reach, dial, equation, wipe, other }) {
   const { camera, stage } = viewer;
-  if (eye && rotation) Object.assign(camera, { eye, rotation, exact: null });
+  if (eye && rotation) {
+    Object.assign(camera, { eye, rotation, exact: null });
+    viewer.ui.at(null);
+  }
   camera.field = field ?? camera.field;
   camera.reach = reach ?? camera.reach;
   Object.assign(stage.state, {
@@ -115,14 +120,19 @@ const actions = {
   reset() {
     viewer.camera.fit(viewer.stage.model.extent, viewer.cameras);
     viewer.camera.exact = null;
+    viewer.cameraNumber = 0;
+    viewer.ui.at(0);
     changed();
   },
   nextCamera(by) {
-    const { cameras, camera } = viewer;
-    if (!cameras.length) return;
-    viewer.cameraNumber = (viewer.cameraNumber + by + cameras.length) % cameras.length;
-    camera.set(cameras[viewer.cameraNumber]);
-    camera.exact = null;
+    const { length } = viewer.cameras;
+    if (length) actions.goTo((viewer.cameraNumber + by + length) % length);
+  },
+  goTo(number) {
+    viewer.camera.set(viewer.cameras[number]);
+    viewer.camera.exact = null;
+    viewer.cameraNumber = number;
+    viewer.ui.at(number);
     changed();
   },
   async copyLink() {

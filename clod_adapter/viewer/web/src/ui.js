@@ -71,6 +71,8 @@ export function createUi(elements, stage, actions) {
   elements.equation.addEventListener("change", () => actions.setEquation(elements.equation.checked));
   elements.compare.addEventListener("change", () => actions.compare(elements.compare.value));
   elements.target.addEventListener("change", () => actions.setTarget(elements.target.value));
+  elements.target.addEventListener("keydown", (event) => event.key === "Enter" && actions.setTarget(elements.target.value)); // also the same again
+  elements.camera.addEventListener("change", () => actions.goTo(elements.camera.selectedIndex));
   elements.move.addEventListener("click", actions.toggleFlying);
   elements.reset.addEventListener("click", actions.reset);
   elements.link.addEventListener("click", actions.copyLink);
@@ -117,6 +119,13 @@ export function createUi(elements, stage, actions) {
       elements.message.hidden = !text;
       elements.message.firstElementChild.textContent = text ?? "";
     },
+    /** The cameras to go to, by their names. */
+    list(cameras) {
+      elements.cameraRow.hidden = !cameras.length;
+      elements.camera.replaceChildren(...cameras.map(({ name }) => new Option(name)));
+    },
+    /** The camera that the view is of; null where it is of none. */
+    at(number) { elements.camera.selectedIndex = number ?? -1; },
     note(text) { elements.targetNote.textContent = text; },
     busy(text) {
       elements.busy.hidden = !text;
