@@ -100,6 +100,21 @@ def test_letters_move_from_the_dial_too_and_are_text_in_a_text(show: Any, files:
     assert not np.array_equal(shown.picture(), before)
 
 
+def test_the_box_takes_counts_alone_and_the_same_again(show: Any, files: Any, gaussians: Gaussians) -> None:
+    shown = show(files.save(gaussians), viewport={"width": 640, "height": 600})
+    for text in ("0", "-5", "1.5", "many"):
+        assert "A number of Gaussians" in target(shown, text) and shown.text("#dial-value") == "s = 1.00"
+    assert "keeps" in target(shown, "1,000,000")
+    shown.run("clod.setEquation(false)")
+    assert "keeps 150 in this view" in target(shown, "150")
+    assert shown.counts()["kept"] == 150 and shown.page.is_checked("#equation")
+    shown.run("clod.setDial(1)")
+    shown.page.evaluate("document.getElementById('target-note').textContent = ''")
+    shown.page.keyboard.press("Enter")
+    shown.until("document.getElementById('target-note').textContent !== ''")
+    assert shown.counts()["kept"] == 150
+
+
 def test_cameras_can_be_chosen_by_name(show: Any, files: Any, gaussians: Gaussians, tmp_path: Path) -> None:
     cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))]
     write_model(tmp_path, cameras, [camera.name for camera in cameras])

@@ -102,11 +102,12 @@ const actions = {
     else actions.setWipe(position, kind === "base" ? "base" : state.other === "base" ? viewer.stage.model.max_sv : state.other);
   },
   async setTarget(text) {
-    const wanted = Math.floor(Number(text.replaceAll(/[\s,_.']/g, "")));
+    const wanted = Number(text.replaceAll(/[\s,_.'](?=\d{3}(?!\d))/g, ""));
     if (!text.trim()) return viewer.ui.note("");
-    if (!(wanted > 0)) return viewer.ui.note("A number of Gaussians, such as 20000");
+    if (!(Number.isInteger(wanted) && wanted > 0)) return viewer.ui.note("A number of Gaussians, such as 20000");
     const { stage } = viewer;
     const { dial, kept } = await stage.model.dialFor(stage.view(), wanted);
+    stage.state.equation = true;
     actions.setDial(dial);
     const most = stage.model.max_sv;
     if (kept > wanted) viewer.ui.note(`At s = ${most}, the largest trained, ${kept.toLocaleString("en")} are kept here`);
