@@ -115,6 +115,11 @@ def test_the_box_takes_counts_alone_and_the_same_again(show: Any, files: Any, ga
     assert shown.counts()["kept"] == 150
 
 
+def test_a_link_asks_for_no_comparison_that_is_not_there(show: Any, files: Any, gaussians: Gaussians) -> None:
+    shown = show(files.save(plain_of(gaussians)), address="#wipe=0.5&other=3&dial=3")
+    assert shown.page.is_hidden("#wipe") and shown.page.input_value("#compare") == "off"
+
+
 def test_cameras_can_be_chosen_by_name(show: Any, files: Any, gaussians: Gaussians, tmp_path: Path) -> None:
     cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))]
     write_model(tmp_path, cameras, [camera.name for camera in cameras])
@@ -148,3 +153,26 @@ def test_more_gaussians_than_the_device_takes_are_counted(chromium: Any, files: 
         shown.page.goto(url)
         shown.until("!document.getElementById('message').hidden")
         assert "1,100 Gaussians" in shown.text("#message") and "takes 682" in shown.text("#message")
+
+
+def test_without_webgl_there_is_a_word_and_no_panel(chromium: Any, files: Any, gaussians: Gaussians) -> None:
+    with serve(files.save(gaussians)) as url, chromium.new_context() as context:
+        context.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+        shown = Shown(context.new_page())
+        shown.page.goto(url)
+        shown.until("!document.getElementById('message').hidden")
+        assert "WebGL2" in shown.text("#message") and shown.page.is_hidden("#panel")
+        assert shown.errors == []
+
+
+def test_keys_on_a_page_without_a_splat_do_nothing(chromium: Any, files: Any, gaussians: Gaussians) -> None:
+    with serve(files.save(gaussians)) as url, chromium.new_context() as context:
+        page = context.new_page()
+        page.route("**/files/model", lambda route: route.fulfill(body=b"ply\nformat"))
+        shown = Shown(page)
+        page.goto(url)
+        page.wait_for_selector("#message:not([hidden])")
+        for key in "0lvncpe[w+":
+            page.keyboard.press(key)
+        page.wait_for_timeout(100)
+        assert shown.errors == [] and shown.text("#target-note") == ""

@@ -73,9 +73,10 @@ function applyLink({ eye, rotation, field, reach, dial, equation, wipe, other })
   }
   camera.field = field ?? camera.field;
   camera.reach = reach ?? camera.reach;
+  const { attenuation } = stage.model, comparable = wipe !== null && (attenuation || stage.base);
   Object.assign(stage.state, {
-    dial: clampDial(dial ?? stage.state.dial), equation, wipe: wipe === null ? null : Math.min(Math.max(wipe, 0), 1),
-    other: other === "base" ? other : clampDial(other),
+    dial: clampDial(dial ?? stage.state.dial), equation, wipe: comparable ? Math.min(Math.max(wipe, 0), 1) : null,
+    other: other === "base" || !attenuation ? "base" : clampDial(other),
   });
   changed();
 }
@@ -141,7 +142,7 @@ const actions = {
     history.replaceState(null, "", link);
     try {
       await navigator.clipboard.writeText(link);
-      viewer.ui.note("Link copied");
+      viewer.ui.note(viewer.dropped ? "Link copied: to this view, not to the file" : "Link copied");
     } catch {
       viewer.ui.note("The link is in the address bar"); // file:// pages may not write to the clipboard
     }
@@ -192,6 +193,7 @@ function listenForFiles() {
 
 const ready = start().catch((error) => {
   elements.busy.hidden = true;
+  elements.panel.hidden = !viewer?.ui; // it works nothing without
   elements.message.hidden = false;
   elements.message.firstElementChild.textContent = error.message;
   throw error;
