@@ -39,7 +39,7 @@ async function start() {
   await stage.settled();
 }
 
-const fetchNamed = (entry) => fetchModel(entry).catch((error) => { throw new Error(`${entry.name}: ${error.message}`); });
+const fetchNamed = (entry) => fetchModel(entry, (part) => viewer.ui.busy(`Loading ${entry.name}: ${Math.floor(100 * part)} %`)).catch((error) => { throw new Error(`${entry.name}: ${error.message}`); });
 
 function show(model, base, cameras, dial) {
   const { renderer, stage, camera, ui } = viewer;
