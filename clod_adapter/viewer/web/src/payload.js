@@ -25,19 +25,17 @@ export async function fetchModel(entry, arrived) {
   };
 }
 
-/** Bytes from the same origin (`href`), or base64 out of an `element` of the page, which it then leaves. */
+/** Bytes from the same origin (`href`), or base64 out of the page's elements of an id, which it then leaves. */
 async function bytesOf({ href, element, gzip }, arrived) {
   if (href) {
     const response = await fetch(href);
     if (!response.ok) throw new Error(`the server answered ${response.status} ${response.statusText}`);
     return received(response, arrived);
   }
-  const holder = document.getElementById(element);
-  if (!holder) throw new Error("the page does not hold it; write the page again");
-  const letters = atob(holder.textContent.trim()), bytes = new Uint8Array(letters.length);
-  holder.remove();
-  for (let i = 0; i < bytes.length; i++) bytes[i] = letters.charCodeAt(i);
-  return gzip ? (await unpacked(bytes, "gzip")).buffer : bytes.buffer;
+  const holders = [...document.querySelectorAll(`[id="${element}"]`)];
+  if (!holders.length) throw new Error("the page does not hold it; write the page again");
+  const held = new Blob(holders.map(decoded));
+  return gzip ? (await unpacked(held, "gzip")).buffer : held.arrayBuffer();
 }
 
 async function received(response, arrived) {
@@ -51,4 +49,11 @@ async function received(response, arrived) {
     arrived(at / size);
   }
   return bytes.buffer;
+}
+
+function decoded(holder) {
+  const letters = atob(holder.textContent.trim()), bytes = new Uint8Array(letters.length);
+  holder.remove();
+  for (let i = 0; i < bytes.length; i++) bytes[i] = letters.charCodeAt(i);
+  return bytes;
 }
