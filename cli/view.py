@@ -42,6 +42,9 @@ def prepare(args: argparse.Namespace, console: Console) -> tuple[dict[str, Answe
     model = read_checkpoint(args.model, console, args.activated)
     base = read_checkpoint(args.base, console, args.activated, model.origin) if args.base else None
     cameras, notes = load_cameras(args.images, model.origin) if args.images else (list[Camera](), list[str]())
+    attenuation = model.gaussians.attenuation
+    if attenuation and args.sv > attenuation.max_sv:
+        notes.append(f"trained up to s = {attenuation.max_sv:g}, where the page's dial ends and opens")
     for note in notes:
         console.say(f"  note: {note}")
     payloads = {MODEL: Payload.of(model)} | ({BASE: Payload.of(base)} if base else {})

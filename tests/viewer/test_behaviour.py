@@ -14,6 +14,9 @@ from plyfile import PlyData, PlyElement
 
 import clod_adapter
 import scenes
+from clod_adapter.cli.console import Console
+from clod_adapter.cli.main import build_parser
+from clod_adapter.cli.view import prepare
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.colmap import write_model
@@ -148,6 +151,12 @@ def test_keys_move_the_dial(show: Any, files: Any, gaussians: Gaussians) -> None
     assert shown.counts()["kept"] == full
     shown.page.keyboard.press("e")
     assert shown.counts()["kept"] == 800 and not shown.page.is_checked("#equation")
+
+
+def test_a_dial_beyond_the_trained_is_said(files: Any, gaussians: Gaussians) -> None:
+    path = str(files.save(gaussians))
+    for sv, said in (("5", []), ("9", ["trained up to s = 5, where the page's dial ends and opens"])):
+        assert prepare(build_parser("view").parse_args([path, "--sv", sv]), Console(quiet=True))[1]["notes"] == said
 
 
 def test_a_count_is_kept_to(show: Any, files: Any, gaussians: Gaussians) -> None:
