@@ -23,6 +23,7 @@ from clod_adapter.viewer.packed import Packed, pack
 from clod_adapter.viewer.payload import Payload, page_config
 
 PAGE, STYLE, SCRIPT = "page.html", "viewer.css", "viewer.js"
+LETTERS = 1 << 26  # in an element from which on the next is begun; browsers end a text at some 5e8
 PLACES = ("<!--CLOD-STYLE-->", "<!--CLOD-CONFIG-->", "<!--CLOD-DATA-->", "<!--CLOD-SCRIPT-->")  # in this order
 
 
@@ -111,11 +112,18 @@ def embedded(value: Any) -> str:
 
 
 def _elements(data: Mapping[str, Iterable[bytes]]) -> Iterator[bytes]:
-    """A script element for each, by its id, that holds the bytes as base64."""
+    """A script element of that id for each, that holds the bytes as base64; several in turn where they are many."""
     for element, blocks in data.items():
-        yield f'<script type="application/octet-stream" id="{element}">'.encode()
-        yield from _base64(blocks)
-        yield b"</script>\n"
+        begin, end = f'<script type="application/octet-stream" id="{element}">'.encode(), b"</script>\n"
+        yield begin
+        held = 0
+        for letters in _base64(blocks):
+            if held > LETTERS:
+                yield end + begin
+                held = 0
+            yield letters
+            held += len(letters)
+        yield end
 
 
 def _base64(blocks: Iterable[bytes]) -> Iterator[bytes]:

@@ -14,10 +14,14 @@ from plyfile import PlyData, PlyElement
 
 import clod_adapter
 import scenes
+from clod_adapter.cli.console import Console
+from clod_adapter.cli.main import build_parser
+from clod_adapter.cli.view import prepare
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.colmap import write_model
 from clod_adapter.render import dial
+from clod_adapter.viewer import page, payload
 from clod_adapter.viewer.page import write_page
 from shown import SIZE, Shown, serve
 
@@ -149,6 +153,12 @@ def test_keys_move_the_dial(show: Any, files: Any, gaussians: Gaussians) -> None
     assert shown.counts()["kept"] == 800 and not shown.page.is_checked("#equation")
 
 
+def test_a_dial_beyond_the_trained_is_said(files: Any, gaussians: Gaussians) -> None:
+    path = str(files.save(gaussians))
+    for sv, said in (("5", []), ("9", ["the page's dial ends at s = 5, as far as was trained for, and opens there"])):
+        assert prepare(build_parser("view").parse_args([path, "--sv", sv]), Console(quiet=True))[1]["notes"] == said
+
+
 def test_a_count_is_kept_to(show: Any, files: Any, gaussians: Gaussians) -> None:
     shown, camera = show(files.save(gaussians), viewport={"width": 1000, "height": 760}), scenes.camera(320, 240)
     shown.camera(camera)
@@ -223,6 +233,20 @@ def test_cameras_of_the_scene(show: Any, files: Any, gaussians: Gaussians, tmp_p
         views.append(shown.picture())
     same = [[bool(np.abs(a.astype(int) - b).mean() < 0.5) for b in views] for a in views]
     assert same[0] == [True, False, False, True, False] and same[2] == [False, False, True, False, True]
+
+
+def test_one_file_holds_more_than_one_text_may(
+    chromium: Any, files: Any, gaussians: Gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In elements that follow each other."""
+    monkeypatch.setattr(page, "LETTERS", 40_000)
+    monkeypatch.setattr(payload, "ROWS", 100)
+    write_page(tmp_path / "page.html", clod_adapter.load(files.save(gaussians)))
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert text.count('id="clod-model"') > 2
+    with chromium.new_context(viewport=SIZE) as context:
+        shown = Shown(context.new_page()).ready((tmp_path / "page.html").as_uri())
+        assert shown.counts()["total"] == 800 and shown.errors == []
 
 
 def test_one_file_needs_no_network(chromium: Any, show: Any, files: Any, gaussians: Gaussians, tmp_path: Path) -> None:

@@ -5,12 +5,13 @@ const TAP = 1 / 30; // seconds that the shortest press counts for
 const KEYS = { // right, down, forward
   w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], pageup: [0, -1, 0], pagedown: [0, 1, 0],
 };
+const ZOOMS = { "+": -1, "=": -1, "-": 1 };
 const ARROWS = { arrowleft: [-1, 0], arrowright: [1, 0], arrowup: [0, -1], arrowdown: [0, 1] };
 
 /** `moved()` is called after every change of the camera. Returns {flying, reset}. */
 export function createControls(canvas, camera, moved) {
   const mode = { flying: false };
-  const pointers = new Map(), held = new Set();
+  const pointers = new Map(), held = new Map(); // keys by where they are: Shift changes what they say
   let last = 0, fast = false;
 
   function drag(event) {
@@ -56,14 +57,17 @@ export function createControls(canvas, camera, moved) {
   /** What the held keys do in so many seconds. */
   function act(seconds) {
     const speed = camera.reach * seconds * (fast ? 3 : 0.8);
-    for (const key of held) {
+    for (const key of held.values()) {
       if (KEYS[key]) camera.move(...KEYS[key].map((k) => k * speed));
-      else if (key === "+" || key === "=") nearer(Math.exp(-seconds));
-      else if (key === "-") nearer(Math.exp(seconds));
+      else if (ZOOMS[key]) nearer(Math.exp(ZOOMS[key] * seconds));
       else turn(...ARROWS[key].map((k) => (mode.flying ? 1 : -1) * k * 260 * seconds));
     }
     moved();
   }
+
+  /** Letters move wherever the focus is but in a text; arrows and pages are a slider's own. */
+  const listens = (target, key) =>
+    target === canvas || target === document.body || (key.length === 1 && !target.closest("input[type=text], select, dialog"));
 
   canvas.addEventListener("pointerdown", (event) => {
     canvas.focus({ preventScroll: true });
@@ -79,19 +83,20 @@ export function createControls(canvas, camera, moved) {
     moved();
   }, { passive: false });
   document.addEventListener("keydown", (event) => {
-    const key = event.key.toLowerCase(), ours = KEYS[key] || ARROWS[key] || ["+", "=", "-"].includes(key);
-    if (!ours || ![canvas, document.body].includes(event.target) || event.ctrlKey || event.metaKey || event.altKey) return;
+    const key = event.key.toLowerCase(), ours = KEYS[key] || ARROWS[key] || ZOOMS[key];
+    if (event.metaKey) held.clear(); // macOS does not say that they are let go
+    if (!ours || !listens(event.target, key) || event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();
     fast = event.shiftKey;
-    if (held.has(key)) return;
+    if (held.has(event.code)) return;
     if (!held.size) {
       last = performance.now();
       requestAnimationFrame(step);
     }
-    held.add(key);
+    held.set(event.code, key);
     act(TAP);
   });
-  document.addEventListener("keyup", (event) => held.delete(event.key.toLowerCase()));
+  document.addEventListener("keyup", (event) => held.delete(event.code));
   for (const target of [canvas, window]) target.addEventListener("blur", () => held.clear());
   return mode;
 }

@@ -26,11 +26,12 @@ export function program(gl, vertex, fragment) {
 
 export const heightOf = (texels) => Math.max(Math.ceil(texels / WIDTH), 1);
 
+/** How many texels a data texture may have. */
+export const mostTexels = (gl) => WIDTH * gl.getParameter(gl.MAX_TEXTURE_SIZE);
+
 /** `texels` texels of four values each as a texture WIDTH wide; `fill(target)` writes them. */
 export function dataTexture(gl, texels, kind, fill) {
-  const height = heightOf(texels);
-  if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("it has more Gaussians than this graphics device takes");
-  const data = new kind(4 * WIDTH * height);
+  const height = heightOf(texels), data = new kind(4 * WIDTH * height);
   fill(data);
   if (kind === Float32Array) return texture(gl, gl.RGBA32F, WIDTH, height, gl.RGBA, gl.FLOAT, data);
   return texture(gl, gl.RGBA32UI, WIDTH, height, gl.RGBA_INTEGER, gl.UNSIGNED_INT, data);
@@ -51,6 +52,9 @@ export function framebuffer(gl, textures) {
   gl.bindFramebuffer(gl.FRAMEBUFFER, made);
   textures.forEach((each, k) => gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + k, gl.TEXTURE_2D, each, 0));
   gl.drawBuffers(textures.map((_, k) => gl.COLOR_ATTACHMENT0 + k));
+  if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE && !gl.isContextLost()) {
+    throw new Error("this graphics device cannot draw what the viewer draws, or has too little memory for it");
+  }
   return made;
 }
 

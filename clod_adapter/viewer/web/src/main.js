@@ -16,7 +16,10 @@ let viewer;
 async function start() {
   const renderer = createRenderer(elements.canvas), camera = createCamera();
   const stage = createStage(renderer, elements.canvas, camera);
-  const controls = createControls(elements.canvas, camera, () => stage.change({ moving: true }));
+  const controls = createControls(elements.canvas, camera, () => {
+    stage.change({ moving: true });
+    viewer.ui.at(null);
+  });
   const wipe = createWipe(elements, stage);
   viewer = { renderer, camera, stage, controls, wipe, cameraNumber: 0, cameras: config.cameras };
   viewer.ui = createUi(elements, stage, actions);
@@ -29,13 +32,14 @@ async function start() {
   viewer.ui.show();
   if (!config.model) return viewer.ui.busy("Drop a splat here, or open one");
   const [model, base] = await Promise.all([config.model, config.base].map((entry) => entry && fetchNamed(entry)));
+  if (loads) return; // another file was dropped meanwhile
   show(model, base, config.cameras, config.virtual_scale);
   applyLink(readLink(location.hash));
   window.addEventListener("hashchange", () => applyLink(readLink(location.hash)));
   await stage.settled();
 }
 
-const fetchNamed = (entry) => fetchModel(entry).catch((error) => { throw new Error(`${entry.name}: ${error.message}`); });
+const fetchNamed = (entry) => fetchModel(entry, (part) => viewer.ui.busy(`Loading ${entry.name}: ${Math.floor(100 * part)} %`)).catch((error) => { throw new Error(`${entry.name}: ${error.message}`); });
 
 function show(model, base, cameras, dial) {
   const { renderer, stage, camera, ui } = viewer;
@@ -44,9 +48,8 @@ function show(model, base, cameras, dial) {
   Object.assign(stage.state, { dial: 1, equation: true, wipe: null, other: "base" });
   stage.show(made, madeBase);
   viewer.cameras = cameras;
-  viewer.cameraNumber = 0;
-  camera.fit(stage.model.extent, cameras);
-  camera.exact = null;
+  ui.list(cameras);
+  actions.reset();
   stage.state.dial = clampDial(dial);
   ui.busy(null);
   ui.note("");
@@ -64,12 +67,16 @@ function changed() {
 
 function applyLink({ eye, rotation, field, reach, dial, equation, wipe, other }) {
   const { camera, stage } = viewer;
-  if (eye && rotation) Object.assign(camera, { eye, rotation, exact: null });
+  if (eye && rotation) {
+    Object.assign(camera, { eye, rotation, exact: null });
+    viewer.ui.at(null);
+  }
   camera.field = field ?? camera.field;
   camera.reach = reach ?? camera.reach;
+  const { attenuation } = stage.model, comparable = wipe !== null && (attenuation || stage.base);
   Object.assign(stage.state, {
-    dial: clampDial(dial ?? stage.state.dial), equation, wipe: wipe === null ? null : Math.min(Math.max(wipe, 0), 1),
-    other: other === "base" ? other : clampDial(other),
+    dial: clampDial(dial ?? stage.state.dial), equation, wipe: comparable ? Math.min(Math.max(wipe, 0), 1) : null,
+    other: other === "base" || !attenuation ? "base" : clampDial(other),
   });
   changed();
 }
@@ -96,11 +103,12 @@ const actions = {
     else actions.setWipe(position, kind === "base" ? "base" : state.other === "base" ? viewer.stage.model.max_sv : state.other);
   },
   async setTarget(text) {
-    const wanted = Math.floor(Number(text.replaceAll(/[\s,_.']/g, "")));
+    const wanted = Number(text.replaceAll(/[\s,_.'](?=\d{3}(?!\d))/g, ""));
     if (!text.trim()) return viewer.ui.note("");
-    if (!(wanted > 0)) return viewer.ui.note("A number of Gaussians, such as 20000");
+    if (!(Number.isInteger(wanted) && wanted > 0)) return viewer.ui.note("A number of Gaussians, such as 20000");
     const { stage } = viewer;
     const { dial, kept } = await stage.model.dialFor(stage.view(), wanted);
+    stage.state.equation = true;
     actions.setDial(dial);
     const most = stage.model.max_sv;
     if (kept > wanted) viewer.ui.note(`At s = ${most}, the largest trained, ${kept.toLocaleString("en")} are kept here`);
@@ -114,14 +122,19 @@ const actions = {
   reset() {
     viewer.camera.fit(viewer.stage.model.extent, viewer.cameras);
     viewer.camera.exact = null;
+    viewer.cameraNumber = 0;
+    viewer.ui.at(0);
     changed();
   },
   nextCamera(by) {
-    const { cameras, camera } = viewer;
-    if (!cameras.length) return;
-    viewer.cameraNumber = (viewer.cameraNumber + by + cameras.length) % cameras.length;
-    camera.set(cameras[viewer.cameraNumber]);
-    camera.exact = null;
+    const { length } = viewer.cameras;
+    if (length) actions.goTo((viewer.cameraNumber + by + length) % length);
+  },
+  goTo(number) {
+    viewer.camera.set(viewer.cameras[number]);
+    viewer.camera.exact = null;
+    viewer.cameraNumber = number;
+    viewer.ui.at(number);
     changed();
   },
   async copyLink() {
@@ -129,30 +142,40 @@ const actions = {
     history.replaceState(null, "", link);
     try {
       await navigator.clipboard.writeText(link);
-      viewer.ui.note("Link copied");
+      viewer.ui.note(viewer.dropped ? "Link copied: to this view, not to the file" : "Link copied");
     } catch {
       viewer.ui.note("The link is in the address bar"); // file:// pages may not write to the clipboard
     }
   },
   fullScreen: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.()),
-  openFile: async (file) => load(await file.arrayBuffer(), file.name).catch(() => {}),
+  openFile(file) {
+    const unread = () => { throw new Error("the browser cannot read it: it is a folder, or too large"); };
+    return load(file.arrayBuffer().catch(unread), file.name).catch(() => {});
+  },
 };
 
-/** Shows another file; where it cannot be read what was shown stays, and the message says why. */
+let loads = 0;
+
+/** Shows another file, out of a buffer or a promise of one; of several the last. Where it cannot be read what was shown
+ *  stays, and the message says why. */
 async function load(buffer, name) {
-  const { ui, stage } = viewer;
+  const { ui, stage } = viewer, turn = ++loads;
   ui.busy(`Reading ${name}`);
   try {
-    show(await readFile(buffer, name), null, [], 1);
+    const read = await readFile(await buffer, name);
+    if (turn !== loads) return;
+    show(read, null, [], 1);
+    viewer.dropped = true;
+    ui.note(read.about.notes.join("; "));
     document.title = elements.title.textContent = name;
     ui.say(null);
     await stage.settled();
   } catch (error) {
     const message = `${name}: ${error.message}`;
-    ui.say(message);
+    if (turn === loads) ui.say(message);
     throw new Error(message);
   } finally {
-    ui.busy(null);
+    if (turn === loads) ui.busy(null);
   }
 }
 
@@ -170,6 +193,7 @@ function listenForFiles() {
 
 const ready = start().catch((error) => {
   elements.busy.hidden = true;
+  elements.panel.hidden = !viewer?.ui; // it works nothing without
   elements.message.hidden = false;
   elements.message.firstElementChild.textContent = error.message;
   throw error;

@@ -1,15 +1,16 @@
 // One splat on the GPU, and its worker, which knows who is kept at a dial value and in which order they are drawn.
-import { WIDTH, dataTexture, heightOf } from "./gpu.js";
+import { WIDTH, dataTexture, heightOf, mostTexels } from "./gpu.js";
 import { half } from "./half.js";
 import { BAND_TEXELS } from "./shaders.js";
 import workerSource from "worker:./worker.js";
 
 const SH_C0 = 0.28209479177387814;
+const RECORD_TEXELS = 4;
 
 /** `about`: name, attenuation or null, no_dial, max_sv, calibration. `gaussians`: as the readers in formats/ make them. */
 export function createModel(gl, gaussians, about) {
   const { count, degree, means, opacityLogits } = gaussians, { records, higher } = upload(gl, gaussians);
-  const attenuation = gaussians.sigma ? about.attenuation : null, extent = extentOf(means), worker = startWorker();
+  const attenuation = gaussians.sigma ? about.attenuation : null, extent = extentOf(gaussians), worker = startWorker();
   worker.ask("model", { means, opacityLogits, sigma: attenuation && gaussians.sigma, attenuation }, [means.buffer]);
   const spare = []; // buffers for orders, which go to the worker and back
   return {
@@ -32,11 +33,19 @@ export function createModel(gl, gaussians, about) {
 
 /** Apart, so that nothing that lives on holds the values after they are on the GPU. */
 function upload(gl, gaussians) {
-  const texels = BAND_TEXELS[gaussians.degree];
-  return {
-    records: dataTexture(gl, 4 * gaussians.count, Float32Array, (target) => fillRecords(target, gaussians)),
+  const texels = BAND_TEXELS[gaussians.degree], integer = new Intl.NumberFormat("en").format;
+  if (gl.isContextLost()) throw new Error("the graphics device went away; reload the page");
+  const most = Math.floor(mostTexels(gl) / Math.max(texels, RECORD_TEXELS));
+  if (gaussians.count > most) {
+    throw new Error(`it has ${integer(gaussians.count)} Gaussians; this graphics device takes ${integer(most)} of its SH degree`);
+  }
+  const made = {
+    records: dataTexture(gl, RECORD_TEXELS * gaussians.count, Float32Array, (target) => fillRecords(target, gaussians)),
     higher: dataTexture(gl, texels * gaussians.count, Uint32Array, (target) => fillBands(target, gaussians, texels)),
   };
+  if (gl.getError() !== gl.OUT_OF_MEMORY) return made;
+  for (const each of Object.values(made)) gl.deleteTexture(each);
+  throw new Error(`this graphics device has too little memory for its ${integer(gaussians.count)} Gaussians`);
 }
 
 function fillRecords(target, { count, means, quats, logScales, opacityLogits, sh0, sigma }) {
@@ -61,13 +70,16 @@ function fillBands(target, { count, degree, shN }, texels) {
   }
 }
 
-/** Where the bulk of the Gaussians is: the median, and the distance that holds 80 % of a sample of them. */
-function extentOf(means) {
+/** Where the bulk of the Gaussians is: the median, and the distance that holds 80 % of a sample of them; of few large
+ *  ones three times their size. */
+function extentOf({ means, logScales }) {
   const step = Math.max(Math.floor(means.length / 3 / 20000), 1), axes = [[], [], []];
   for (let i = 0; i < means.length / 3; i += step) for (let k = 0; k < 3; k++) axes[k].push(means[3 * i + k]);
   const centre = axes.map((axis) => Float64Array.from(axis).sort()[axis.length >> 1]);
   const distances = Float64Array.from(axes[0], (x, i) => Math.hypot(x - centre[0], axes[1][i] - centre[1], axes[2][i] - centre[2]));
-  return { centre, radius: Math.max(distances.sort()[Math.floor(0.8 * distances.length)], 1e-6) };
+  const sizes = Float64Array.from(axes[0], (_, i) => Math.exp(Math.max(...logScales.subarray(3 * step * i, 3 * step * i + 3))));
+  const radius = Math.max(distances.sort()[Math.floor(0.8 * distances.length)], 3 * sizes.sort()[sizes.length >> 1]);
+  return { centre, radius: Math.min(Math.max(radius, 1e-6), 1e30) };
 }
 
 function startWorker() {

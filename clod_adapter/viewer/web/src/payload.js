@@ -8,9 +8,9 @@ export function readConfig() {
   return { title: "", model: null, base: null, cameras: [], virtual_scale: 1, ...(element ? JSON.parse(element.textContent) : {}) };
 }
 
-/** {gaussians, about} of the configuration's `model` or `base`. */
-export async function fetchModel(entry) {
-  const { gaussians, about } = await readFile(await bytesOf(entry), entry.name);
+/** {gaussians, about} of the configuration's `model` or `base`; `arrived(part)` is told how much of it is here. */
+export async function fetchModel(entry, arrived) {
+  const { gaussians, about } = await readFile(await bytesOf(entry, arrived), entry.name);
   if (entry.sigma) gaussians.sigma = new Float32Array(await bytesOf(entry.sigma));
   if (gaussians.sigma && gaussians.sigma.length !== gaussians.count) {
     throw new Error(`it has ${gaussians.count} Gaussians and ${gaussians.sigma.length} values of sigma_d`);
@@ -25,17 +25,35 @@ export async function fetchModel(entry) {
   };
 }
 
-/** Bytes from the same origin (`href`), or base64 out of an `element` of the page, which it then leaves. */
-async function bytesOf({ href, element, gzip }) {
+/** Bytes from the same origin (`href`), or base64 out of the page's elements of an id, which it then leaves. */
+async function bytesOf({ href, element, gzip }, arrived) {
   if (href) {
     const response = await fetch(href);
     if (!response.ok) throw new Error(`the server answered ${response.status} ${response.statusText}`);
-    return response.arrayBuffer();
+    return received(response, arrived);
   }
-  const holder = document.getElementById(element);
-  if (!holder) throw new Error("the page does not hold it; write the page again");
+  const holders = [...document.querySelectorAll(`[id="${element}"]`)];
+  if (!holders.length) throw new Error("the page does not hold it; write the page again");
+  const held = new Blob(holders.map(decoded));
+  return gzip ? (await unpacked(held, "gzip")).buffer : held.arrayBuffer();
+}
+
+async function received(response, arrived) {
+  const size = Number(response.headers.get("Content-Length"));
+  if (!size || response.headers.has("Content-Encoding")) return response.arrayBuffer();
+  const bytes = new Uint8Array(size), reader = response.body.getReader();
+  let at = 0;
+  for (let { done, value } = await reader.read(); !done; { done, value } = await reader.read()) {
+    bytes.set(value, at);
+    at += value.length;
+    arrived(at / size);
+  }
+  return bytes.buffer;
+}
+
+function decoded(holder) {
   const letters = atob(holder.textContent.trim()), bytes = new Uint8Array(letters.length);
   holder.remove();
   for (let i = 0; i < bytes.length; i++) bytes[i] = letters.charCodeAt(i);
-  return gzip ? (await unpacked(bytes, "gzip")).buffer : bytes.buffer;
+  return bytes;
 }

@@ -8,7 +8,7 @@ export function createStage(renderer, canvas, camera) {
   const state = { dial: 1, equation: true, wipe: null, other: "base" };
   const listeners = { frame: () => {}, error: () => {} };
   let main = makeSide(), second = makeSide(), model = null, base = null;
-  let version = 0, drawn = -1, coarse = 1, moved = -Infinity, rest = 0, frame = 0, took = null, timing = false, warm = false, fresh = false;
+  let version = 0, drawn = -1, coarse = 1, moved = -Infinity, rest = 0, frame = 0, took = null, timing = false, warm = false, fresh = false, skipped = false;
   const waiting = [];
 
   function makeSide() {
@@ -37,14 +37,14 @@ export function createStage(renderer, canvas, camera) {
     if (moving) {
       moved = performance.now();
       clearTimeout(rest);
-      if (coarse < 1) rest = setTimeout(() => change(), REST + 20);
+      rest = setTimeout(() => coarse < 1 && change(), REST + 20);
     }
     schedule();
   }
 
   function schedule(sorted = false) {
     fresh ||= sorted;
-    frame ||= requestAnimationFrame(draw);
+    frame ||= requestAnimationFrame(() => draw().catch(listeners.error));
   }
 
   async function draw() {
@@ -53,6 +53,8 @@ export function createStage(renderer, canvas, camera) {
     const present = version, view = camera.view(...size()), shown = sides();
     for (const wanted of shown) ask(wanted, view, present);
     if (shown.some(({ side, model: of }) => side.have < 0 || side.model !== of)) return; // not sorted once yet
+    skipped = timing && took > SLOW; // one frame at a time, or a slow device shows where the camera was long ago
+    if (skipped) return;
     // At rest the sorted frame follows at once, and is enough; while it moves, an old order is better than none.
     const complete = shown.every(({ side }) => side.have === present);
     if (!complete && !fresh && performance.now() - moved > REST) return;
@@ -78,6 +80,7 @@ export function createStage(renderer, canvas, camera) {
 
   function timed(ms) {
     timing = false;
+    if (skipped) schedule();
     if (!warm) { // the first frame compiles, and says nothing about the next
       warm = true;
       return schedule();

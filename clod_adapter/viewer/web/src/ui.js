@@ -71,10 +71,13 @@ export function createUi(elements, stage, actions) {
   elements.equation.addEventListener("change", () => actions.setEquation(elements.equation.checked));
   elements.compare.addEventListener("change", () => actions.compare(elements.compare.value));
   elements.target.addEventListener("change", () => actions.setTarget(elements.target.value));
+  elements.target.addEventListener("keydown", (event) => event.key === "Enter" && actions.setTarget(elements.target.value)); // also the same again
+  elements.camera.addEventListener("change", () => actions.goTo(elements.camera.selectedIndex));
   elements.move.addEventListener("click", actions.toggleFlying);
   elements.reset.addEventListener("click", actions.reset);
   elements.link.addEventListener("click", actions.copyLink);
   elements.open.addEventListener("click", () => elements.file.click());
+  elements.full.hidden = !document.fullscreenEnabled; // iPhones have none
   elements.full.addEventListener("click", actions.fullScreen);
   elements.helpOpen.addEventListener("click", () => elements.help.showModal());
   elements.fold.addEventListener("click", fold);
@@ -94,7 +97,7 @@ export function createUi(elements, stage, actions) {
   const keys = {
     e: () => elements.equation.disabled || actions.setEquation(!state.equation),
     c: () => elements.compare.disabled || actions.compare({ off: "base", base: stage.model?.attenuation ? "dial" : "off", dial: "off" }[comparison()]),
-    v: actions.toggleFlying, l: actions.copyLink, f: actions.fullScreen, m: fold, 0: actions.reset,
+    v: () => elements.move.disabled || actions.toggleFlying(), l: () => elements.link.disabled || actions.copyLink(), f: actions.fullScreen, m: fold, 0: () => elements.reset.disabled || actions.reset(),
     o: () => elements.file.click(), n: () => actions.nextCamera(1), p: () => actions.nextCamera(-1),
     "[": () => nudge(-20), "]": () => nudge(20), "?": () => elements.help.showModal(),
     h: () => { elements.panel.hidden = !elements.panel.hidden; },
@@ -104,6 +107,7 @@ export function createUi(elements, stage, actions) {
   };
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || elements.help.open) return;
+    if (event.repeat && !"[]".includes(event.key)) return;
     if (event.target.matches("input[type=text], select")) return;
     const action = keys[event.key.toLowerCase()];
     if (!action) return;
@@ -117,6 +121,13 @@ export function createUi(elements, stage, actions) {
       elements.message.hidden = !text;
       elements.message.firstElementChild.textContent = text ?? "";
     },
+    /** The cameras to go to, by their names. */
+    list(cameras) {
+      elements.cameraRow.hidden = !cameras.length;
+      elements.camera.replaceChildren(...cameras.map(({ name }) => new Option(name)));
+    },
+    /** The camera that the view is of; null where it is of none. */
+    at(number) { elements.camera.selectedIndex = number ?? -1; },
     note(text) { elements.targetNote.textContent = text; },
     busy(text) {
       elements.busy.hidden = !text;

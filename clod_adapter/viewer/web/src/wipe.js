@@ -23,7 +23,7 @@ export function createWipe(elements, stage) {
     event.preventDefault();
   });
   wipe.addEventListener("pointermove", (event) => {
-    if (!wipe.hasPointerCapture(event.pointerId)) return;
+    if (!wipe.hasPointerCapture(event.pointerId) || stage.state.wipe === null) return;
     const box = wipe.parentElement.getBoundingClientRect();
     set((event.clientX - box.left) / box.width);
   });

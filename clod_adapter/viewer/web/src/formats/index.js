@@ -12,7 +12,7 @@ const noDial = (name) => `${name} has no sigma_d, so there is no dial to turn; g
 
 /** {gaussians, about}: what a dropped file holds, and its settings as the page's configuration would give them. */
 export async function readFile(buffer, name) {
-  const gaussians = usable(await readGaussians(new Uint8Array(buffer), name));
+  const gaussians = usable(await readGaussians(new Uint8Array(buffer), name).catch(said));
   const dialled = gaussians.sigma !== null;
   const settings = dialled ? gaussians.settings ?? readSettings(gaussians.comments) : null;
   return {
@@ -23,6 +23,12 @@ export async function readFile(buffer, name) {
       calibration: readCalibration(gaussians.comments, gaussians.count),
     },
   };
+}
+
+/** The readers' own words; what the browser says of bytes that lead nowhere is of no use. */
+function said(error) {
+  if (error.constructor === Error) throw error;
+  throw new Error("it is damaged, or too large for this browser; copy or export it again", { cause: error });
 }
 
 async function readGaussians(bytes, name) {

@@ -43,7 +43,7 @@ function readBands({ count, coefficients, shN }, { codebook }, palette, labels) 
 
 /** Pixels as stored. Through WebGL, as a 2D canvas would multiply the colours by alpha and round them. */
 function picturesReader(files) {
-  const gl = new OffscreenCanvas(1, 1).getContext("webgl2");
+  const gl = document.createElement("canvas").getContext("webgl2");
   gl.bindFramebuffer(gl.FRAMEBUFFER, gl.createFramebuffer());
   const read = async (name) => {
     if (!files.has(name)) throw new Error(`${name} is missing in it; copy or export it again`);
