@@ -8,9 +8,10 @@ import clod_adapter  # noqa: F401
 # isort: split
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ import torch
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
+import browser
 from clod_adapter.cameras import Camera
 from clod_adapter.cli.main import main
 from clod_adapter.gaussians import Gaussians
@@ -39,6 +41,13 @@ def shared_data() -> Callable[[str], Path]:
         return path
 
     return get
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """The one browser of a test process, in which Playwright allows no second; skips where there is none."""
+    with browser.launch() as chromium:
+        yield chromium
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from importlib.resources import files
 from typing import Any
 
@@ -91,12 +92,11 @@ WEBGPU = """async ([source, rows]) => {
 }"""
 
 
-def run(script: str, shader: str) -> list[float]:
+def run(chromium: Any, script: str, shader: str) -> list[float]:
     """What the shader draws of every golden row."""
     source = SHADERS.joinpath(shader).read_text(encoding="utf-8")
     rows = [[float(value) for value in row] for row in INPUTS]
-    with browser.launch() as chromium:
-        page = chromium.new_page()
+    with closing(chromium.new_page()) as page:
         page.route("**/*", lambda route: route.fulfill(body="<!doctype html>", content_type="text/html"))
         page.goto("http://127.0.0.1/")  # answered above; WebGPU is only given to pages from a secure place
         result: Any = page.evaluate(script, [source, rows])
@@ -106,8 +106,8 @@ def run(script: str, shader: str) -> list[float]:
 
 
 @pytest.mark.parametrize(("script", "shader"), [(WEBGL, "attenuation.glsl"), (WEBGPU, "attenuation.wgsl")])
-def test_a_browser_draws_the_golden_values(script: str, shader: str) -> None:
-    drawn = run(script, shader)
+def test_a_browser_draws_the_golden_values(chromium: Any, script: str, shader: str) -> None:
+    drawn = run(chromium, script, shader)
     assert len(drawn) == len(STORED["rows"])
     for got, row in zip(drawn, STORED["rows"], strict=True):
         *_, faded, want = row

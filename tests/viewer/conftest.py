@@ -11,15 +11,8 @@ from typing import Any
 
 import pytest
 
-import browser
 import clod_adapter
 from shown import SIZE, Shown, serve
-
-
-@pytest.fixture(scope="session")
-def chromium() -> Iterator[Any]:
-    with browser.launch() as chromium:
-        yield chromium
 
 
 @pytest.fixture
