@@ -32,10 +32,10 @@ def run(args: argparse.Namespace) -> None:
         report |= {"url": server.url, "port": server.port}
         # Not after the command, as main prints other reports: a script needs the address while it is served.
         shown = json.dumps(report) if args.json else f"{server.url}  (Ctrl-C ends)"
-        print(shown, file=sys.__stdout__ if args.json else None, flush=True)
-        if not args.no_browser and not open_browser(server.url):
-            console.say(f"no browser to open here; open {server.url} in one, through ssh -L from another machine")
-        try:
+        try:  # from the address on: who has read it may interrupt before the first request is waited for
+            print(shown, file=sys.__stdout__ if args.json else None, flush=True)
+            if not args.no_browser and not open_browser(server.url):
+                console.say(f"no browser to open here; open {server.url} in one, through ssh -L from another machine")
             server.serve_forever()
         except KeyboardInterrupt:
             console.say("ended")

@@ -16,6 +16,7 @@ import pytest
 
 import clod_adapter
 from clod_adapter.cli import view
+from clod_adapter.cli.main import main
 
 
 def fetch(url: str) -> bytes:
@@ -63,6 +64,17 @@ def test_prints_the_address(spawn: Any, capture: Any, tmp_path: Path) -> None:
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/  \(Ctrl-C ends\)\n", line)
     process.send_signal(signal.SIGINT)
     assert process.communicate(timeout=20) == ("", "") and process.returncode == 0
+
+
+@pytest.mark.parametrize("name", ["print", "open_browser"])
+def test_an_interrupt_right_after_the_address_ends_it_too(
+    capture: Any, monkeypatch: Any, capsys: Any, name: str
+) -> None:
+    def interrupted(*args: Any, **kwargs: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(view, name, interrupted, raising=False)
+    assert main(["view", str(capture.ply), "--quiet"]) == 0 and "interrupted" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
