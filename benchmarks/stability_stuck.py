@@ -131,22 +131,22 @@ def stuck(run: _Run) -> int:
 
     Who has left at every dial value needs a lift while nobody is kept, who does not fade a press while everybody is.
     """
-    p, config, camera = run.parameters, run.config, run.views[0].camera
-    distances = normalized_distances(p["means"], camera, run.attenuation)
+    p, config, camera, reading = run.parameters, run.config, run.views[0].camera, run.objective.attenuation
+    distances = normalized_distances(p["means"], camera, reading)
     seen = out = lifted = pressed = torch.zeros(len(distances), dtype=torch.bool)
     for s in DIALS:
         x = p[run.decay].detach().requires_grad_()
-        now = attenuate(p["opacity_logits"], run._sigma(x), distances, s, run.attenuation)
+        now = attenuate(p["opacity_logits"], run.objective.sigma(x), distances, s, reading)
         seen = seen | (torch.autograd.grad(now.drawn.sum(), x, retain_graph=True)[0] != 0)
         if s == 1:
             out = ~now.keep
-        if run.has_law:
+        if run.objective.has_law:
             none, all_ = (
-                count_gradient(now._replace(keep=kept), p["opacity_logits"], s, run.attenuation.tau, 1.0, config)
+                count_gradient(now._replace(keep=kept), p["opacity_logits"], s, reading.tau, 1.0, config)
                 for kept in (torch.zeros_like(now.keep), torch.ones_like(now.keep))
             )
             lifted, pressed = lifted | (none < 0), pressed | (all_ > 0)
         else:  # the paper's term knows no lift
-            count = soft_count(now.log_opacities, s, run.attenuation.tau, config.temperature)
+            count = soft_count(now.log_opacities, s, reading.tau, config.temperature)
             pressed = pressed | (torch.autograd.grad(count, x)[0] != 0)
     return int((~seen & ~torch.where(out, lifted, pressed)).sum())

@@ -65,6 +65,7 @@ class AdaptConfig:
 
     max_sv: float = option(5.0, "largest dial value to train for")
     iters: int = option(1500, "training steps")
+    batch: int = option(1, "views a step; step sizes grow with its root, so fewer steps of more views go as far")
     time_budget: float | None = option(
         None, "stop training after this many seconds, schedule included (default: no limit)"
     )
@@ -109,6 +110,7 @@ class AdaptConfig:
             require(not isinstance(value, float) or math.isfinite(value), name, value, "finite")
         require(self.max_sv >= 1, "max_sv", self.max_sv, "at least 1")
         require(self.iters >= 0, "iters", self.iters, "at least 0")
+        require(self.batch >= 1, "batch", self.batch, "at least 1")
         require(0 <= self.seed < 2**63, "seed", self.seed, "at least 0 and below 2^63")
         require(self.time_budget is None or self.time_budget > 0, "time_budget", self.time_budget, "positive seconds")
         require(0.5 < self.start_share <= 1, "start_share", self.start_share, "above 0.5 and at most 1")

@@ -12,22 +12,20 @@ from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances
 from clod_adapter.cameras import Scene, View, camera_extent
 from clod_adapter.config import AdaptConfig
-from clod_adapter.counting import count_gradient, paper_count
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import seeing, start
-from clod_adapter.losses import photometric_loss
+from clod_adapter.objective import Objective
 from clod_adapter.optimizer import RowAdam
-from clod_adapter.render import splat
 from clod_adapter.training_state import Adapted, Progress, TrainingState
 
 __all__ = ["Adapted", "Progress", "TrainingState", "adapt"]
 
-# Sigma stays where the equation still tells values apart; below, a Gaussian would be gone for good.
-SIGMA_RANGE = (1e-4, SIGMA_MAX)
+# Adam's decays, a view; of a batch their powers, and step sizes times its root: what a view does then stays the same
+# (Zhao et al., "On Scaling Up 3D Gaussian Splatting Training", ICLR 2025).
+BETA1, BETA2 = 0.9, 0.999
 
 
 def adapt(
@@ -36,14 +34,17 @@ def adapt(
     config: AdaptConfig | None = None,
     progress: Callable[[Progress], None] | None = None,
     resume: TrainingState | None = None,
+    *,
+    trained: int | None = None,
 ) -> Adapted:
     """Learns sigma_d for ``base`` on the training views of ``scene``, and updates the rest lightly.
 
-    Each step draws a view, renders it at full detail and at one log-uniform dial value s in [1, max_sv], and
-    minimises ``full_weight w_1 L_render(1) + w_s L_render(s)``, L_render being ``losses.photometric_loss`` and ``w_s =
-    (1 - weight_slope s / max_sv)^2``, while ``counting.count_gradient`` presses the share of Gaussians kept towards its
-    law by way of sigma_d. The outcome is the mean of the parameters over the last ``average`` of the steps: step sizes
-    can then stay long to the end. A base that already has a sigma_d is continued from.
+    Each step draws ``batch`` views (1 by default) and goes by the sum of their gradients. Each is rendered at full
+    detail and at one log-uniform dial value s in [1, max_sv], to minimise ``full_weight w_1 L_render(1) +
+    w_s L_render(s)``, L_render being ``losses.photometric_loss`` and ``w_s = (1 - weight_slope s / max_sv)^2``, while
+    ``counting.count_gradient`` presses the share of Gaussians kept towards its law by way of sigma_d. The outcome is
+    the mean of the parameters over the last ``average`` of the steps: step sizes can then stay long to the end. A base
+    that already has a sigma_d is continued from.
 
     ``AdaptConfig.paper`` gives CLoD-GS's own objective instead (section 3.3): one s a step and
     ``w_s (L_render + reg_weight L_reg)`` with ``L_reg = (s - 1)^2 relu(eta - s^-exponent)^2``, eta the share kept.
@@ -54,6 +55,7 @@ def adapt(
         resume: goes on from here (``Progress.state`` of an earlier call with the same base, views and config) and
             ends, on as many threads, with the same bits as an undisturbed run; a time budget counts from the first
             beginning.
+        trained: only the first so many Gaussians are trained; the others are drawn as they are. All by default.
 
     Raises:
         ClodError: no training views, none that has a Gaussian before it, no Gaussians, or ``resume`` is of something
@@ -77,8 +79,9 @@ def adapt(
     if resume is None:
         begun = start(lean, views, config, report)
     else:
-        begun = lean.replace(sigma_d=torch.ones(len(base)), attenuation=resume.attenuation)
-    run = _Run(begun, views, config, progress)
+        unset = torch.ones_like(base.opacity_logits)  # what is trained is in the state
+        begun = lean.replace(sigma_d=unset if base.sigma_d is None else base.sigma_d, attenuation=resume.attenuation)
+    run = _Run(begun, views, config, progress, trained)
     run.empty_bands = None if lean is base else base.shN.clone()
     run.start_seconds = time.perf_counter() - began
     if resume is not None:
@@ -95,38 +98,41 @@ class _Run:
         views: tuple[View, ...],
         config: AdaptConfig,
         progress: Callable[[Progress], None] | None,
+        trained: int | None = None,
     ):
         self.config, self.views, self.progress = config, views, progress
+        trained = len(start) if trained is None else trained
         assert start.sigma_d is not None and start.attenuation is not None
-        self.attenuation = start.attenuation
-        own = {"dtype": torch.float32, "copy": True, "memory_format": torch.contiguous_format}
-        self.parameters = {name: getattr(start, name).detach().to(**own) for name in ATTRIBUTES}
-        sigma = start.sigma_d.detach().float().clamp(*SIGMA_RANGE)
-        linear = config.parameter == "linear"
-        self.decay, self.range = ("sigma", SIGMA_RANGE) if linear else ("log_sigma", tuple(map(math.log, SIGMA_RANGE)))
-        self.parameters[self.decay] = sigma if linear else sigma.log()
-        self.optimizer = RowAdam(self.parameters)
-        self.has_law = config.count_term == "law" and config.max_sv > 1  # a range of one dial value asks for none
-        self.empty_bands: Tensor | None = None  # the base's whole shN, where what was left out of it comes back
-        self.all_rows = torch.ones(len(start), dtype=torch.bool)
         # Cameras all in one place say nothing of the scene's unit; the distances in their pictures do.
-        extent = camera_extent([view.camera for view in views]) or self.attenuation.scene_distance
-        self.rates = {
+        extent = camera_extent([view.camera for view in views]) or start.attenuation.scene_distance
+        rates = {
             "means": config.lr_means * extent, "quats": config.lr_quats, "log_scales": config.lr_scales,
             "opacity_logits": config.lr_opacities, "sh0": config.lr_sh0, "shN": config.lr_shN,
-            self.decay: config.lr_sigma,
         }  # fmt: skip
+        # What is stepped by row; a frozen attribute asks the rasterizer for no gradient.
+        tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
+        self.objective = Objective(config, start.attenuation, tuple(tuned), trained)
+        self.decay, self.stepped, self.range = self.objective.decay, self.objective.stepped, self.objective.decay_range
+        self.rates = {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
+        self.rates[self.decay] = config.lr_sigma * math.sqrt(config.batch)
+        own = {"dtype": torch.float32, "memory_format": torch.contiguous_format}
+        self.parameters = {
+            name: getattr(start, name).detach().to(**own, copy=name in self.stepped) for name in ATTRIBUTES
+        }
+        self.parameters[self.decay] = self.objective.parameter(start.sigma_d)
+        self.optimizer = RowAdam(self._trained(), beta1=BETA1**config.batch, beta2=BETA2**config.batch)
+        self.empty_bands: Tensor | None = None  # the base's whole shN, where what was left out of it comes back
+        self.all_rows = torch.ones(trained, dtype=torch.bool, device=start.means.device)
         self.random = np.random.default_rng(config.seed)
         self.order: list[int] = []
-        # What is stepped by row; a frozen attribute asks the rasterizer for no gradient.
-        self.tuned = [
-            n for n in ATTRIBUTES if n != "opacity_logits" and self.rates[n] > 0 and getattr(start, n).numel()
-        ]
-        self.stepped = [*self.tuned, "opacity_logits", self.decay]
         self.done, self.seconds, self.start_seconds = 0, 0.0, 0.0
         self.loss = math.nan
         self.mean: dict[str, Tensor] = {}  # of the parameters over the last ``average`` of the steps
         self.averaged = 0
+
+    def _trained(self) -> dict[str, Tensor]:
+        """What steps change: views of the first rows of the parameters."""
+        return {name: self.parameters[name][: self.objective.trained] for name in self.stepped}
 
     def run(self) -> Adapted:
         began, interrupted = time.perf_counter() - self.seconds, False
@@ -146,15 +152,15 @@ class _Run:
 
     def state(self) -> TrainingState:
         return TrainingState(
-            tensors=self._changing(), attenuation=self.attenuation, random=dict(self.random.bit_generator.state),
-            order=tuple(self.order), loss=self.loss, averaged=self.averaged, steps=self.done, seconds=self.seconds,
-            start_seconds=self.start_seconds,
+            tensors=self._changing(), attenuation=self.objective.attenuation,
+            random=dict(self.random.bit_generator.state), order=tuple(self.order), loss=self.loss,
+            averaged=self.averaged, steps=self.done, seconds=self.seconds, start_seconds=self.start_seconds,
         )  # fmt: skip
 
     def restore(self, state: TrainingState) -> None:
         """The inverse of ``state``."""
         if state.averaged:
-            self.mean = {name: torch.empty_like(self.parameters[name]) for name in self.stepped}
+            self.mean = {name: torch.empty_like(value) for name, value in self._trained().items()}
         own = self._changing()
         shapes = [{name: (t.shape, t.dtype) for name, t in tensors.items()} for tensors in (own, state.tensors)]
         if shapes[0] != shapes[1] or not all(0 <= view < len(self.views) for view in state.order):
@@ -175,7 +181,7 @@ class _Run:
 
     def _changing(self) -> dict[str, Tensor]:
         """The tensors themselves that steps change, named as in ``TrainingState``."""
-        kinds = {"parameter": self.parameters, **self.optimizer.state(), "mean": self.mean}
+        kinds = {"parameter": self._trained(), **self.optimizer.state(), "mean": self.mean}
         return {
             f"{kind}.{name}": values[name] for kind, values in kinds.items() for name in self.stepped if name in values
         }
@@ -185,24 +191,24 @@ class _Run:
         return max(by_steps, seconds / self.config.time_budget) if self.config.time_budget else by_steps
 
     def gaussians(self) -> Gaussians:
-        parameters = self.parameters | self.mean
+        rest = slice(self.objective.trained, None)
+        whole = all(len(self.parameters[name][rest]) == 0 for name in self.mean)
+        mean = self.mean if whole else {n: torch.cat([m, self.parameters[n][rest]]) for n, m in self.mean.items()}
+        parameters = self.parameters | mean
         values = {name: parameters[name] for name in ATTRIBUTES}
         if self.empty_bands is not None:
             values["shN"] = self.empty_bands
-        return Gaussians(**values, sigma_d=self._sigma(parameters[self.decay]), attenuation=self.attenuation)
+        sigma = self.objective.sigma(parameters[self.decay])
+        return Gaussians(**values, sigma_d=sigma, attenuation=self.objective.attenuation)
 
     def _average(self) -> None:
         """Takes the parameters as they stand into their mean; the optimiser goes on from where it is."""
-        now = {name: self.parameters[name] for name in self.stepped}
+        now = self._trained()
         self.averaged += 1
         if self.averaged == 1:
             self.mean = {name: value.clone() for name, value in now.items()}
         for name, mean in self.mean.items():
             mean.lerp_(now[name], 1 / self.averaged)
-
-    def _sigma(self, decay: Tensor) -> Tensor:
-        """``[N]`` sigma_d of the parameter that is trained for it."""
-        return decay if self.config.parameter == "linear" else decay.exp()
 
     def _draw(self) -> tuple[View, list[float]]:
         """A view (each once per round, in random order) and the dial values it is rendered at."""
@@ -217,40 +223,15 @@ class _Run:
 
     @torch_on_one_thread()
     def step(self, share_done: float) -> None:
-        """One view, its dial values, one update."""
-        view, dials = self._draw()
-        p = self.parameters
-        logits, decay = p["opacity_logits"].detach().requires_grad_(), p[self.decay].detach().requires_grad_()
-        leaves = {name: p[name].detach().requires_grad_(name in self.tuned) for name in ATTRIBUTES}
-        sigma = self._sigma(decay)
-        distances = normalized_distances(p["means"], view.camera, self.attenuation)
-        total, pull, kept = torch.zeros(()), torch.zeros_like(decay), torch.zeros(len(decay), dtype=torch.bool)
-        for s in dials:
-            dialled = attenuate(logits, sigma, distances, s, self.attenuation)
-            # Dropped rows have opacity 0: the rasterizer leaves them out, and they get no gradient.
-            image, _ = splat(Gaussians(**leaves), dialled.drawn, view.camera)
-            loss = photometric_loss(image, view.image, self.config.ssim_weight)
-            now = float(loss.detach())
-            weight = (1 - self.config.weight_slope * s / self.config.max_sv) ** 2
-            if len(dials) > 1 and s == 1:
-                weight *= self.config.full_weight
-            if self.config.count_term == "paper" and self.config.reg_weight > 0:
-                loss = loss + paper_count(dialled, s, self.attenuation.tau, self.config)
-            total = total + weight * loss
-            if self.has_law:
-                pull += count_gradient(dialled, p["opacity_logits"], s, self.attenuation.tau, weight * now, self.config)
-            kept |= dialled.keep
-            if s == dials[0]:
-                self.loss = now if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * now
-        leaves = {name: leaves[name] for name in self.tuned}
-        of_logits, of_decay, *of_leaves = torch.autograd.grad(total, [logits, decay, *leaves.values()])
-        pull = pull if self.config.parameter == "log" else pull / decay.detach()
+        """Some views, their dial values, one update."""
+        pull = self.objective.pull(self.parameters, [self._draw() for _ in range(self.config.batch)])
+        now = pull.loss / self.config.batch
+        self.loss = now if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * now
         rates = {name: rate * self.config.lr_final**share_done for name, rate in self.rates.items()}
-        self.optimizer.step(dict(zip(leaves, of_leaves, strict=True)), kept, rates)
         # The paper's count term moves opacities too, of those that have left as well.
-        rows = self.all_rows if self.config.count_term == "paper" else kept
-        self.optimizer.step({"opacity_logits": of_logits}, rows, rates)
-        self.optimizer.step({self.decay: of_decay + pull}, self.all_rows, rates)
-        p[self.decay].clamp_(*self.range)
+        everywhere = {self.decay} | ({"opacity_logits"} if self.config.count_term == "paper" else set())
+        for rows, names in ((pull.kept, set(self.stepped) - everywhere), (self.all_rows, everywhere)):
+            self.optimizer.step({name: pull.gradients[name] for name in self.stepped if name in names}, rows, rates)
+        self.parameters[self.decay].clamp_(*self.range)
         if share_done >= 1 - self.config.average:
             self._average()

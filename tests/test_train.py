@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from clod_adapter import importance, train
+from clod_adapter import importance, objective, train
 from clod_adapter.adapter import ATTRIBUTES, attach
 from clod_adapter.attenuation import SIGMA_MAX, attenuate, log_attenuation, normalized_distances
 from clod_adapter.cameras import Scene, camera_extent
@@ -232,7 +232,7 @@ def test_empty_bands_are_not_evaluated(
 ) -> None:
     """Unless they are to be tuned; the result has them either way."""
     base, bands = captured[0].replace(shN=torch.zeros_like(captured[0].shN)), []
-    for module in (train, importance):
+    for module in (objective, importance):
         monkeypatch.setattr(module, "splat", lambda g, *rest: bands.append(g.shN.shape[1]) or splat(g, *rest))
     found = adapt(base, captured[1], config_of(iters=4, lr_shN=rate)).gaussians
     assert set(bands) == {evaluated}
@@ -268,13 +268,51 @@ def test_one_step_by_hand(captured: tuple[Gaussians, Scene]) -> None:
     assert photometric_loss(render(after, view.camera).image, view.image) < seen[0].loss
 
 
+def test_a_batch_sums_what_its_views_ask(captured: tuple[Gaussians, Scene]) -> None:
+    """And its first step is as long as the root of its size says."""
+    base, scene = captured
+    begun, views, config = start(base, scene.train, config_of()), scene.train[:2], config_of(batch=2, sampling="pair")
+    run = train._Run(begun, views, config, None)
+    draws = [(view, [1.0, 2.0]) for view in views]
+    one, two = (run.objective.pull(run.parameters, [draw]) for draw in draws)
+    both = run.objective.pull(run.parameters, draws)
+    assert both.loss == one.loss + two.loss and torch.equal(both.kept, one.kept | two.kept)
+    for name in run.stepped:
+        assert torch.equal(both.gradients[name], one.gradients[name] + two.gradients[name]), name
+    before = run.parameters["sh0"].clone()
+    run.step(0.0)
+    longest = (run.parameters["sh0"] - before).abs().max()
+    assert longest == pytest.approx(2**0.5 * config.lr_sh0, rel=1e-2) and run.order == []
+
+
+def test_only_the_first_rows_are_trained(captured: tuple[Gaussians, Scene]) -> None:
+    """The others are in the pictures, and come out as they went in; what is trained goes on from a state, too."""
+    base, scene = captured
+    begun, few = start(base, scene.train, config_of()), len(base) // 3
+    states: list[TrainingState] = []
+
+    def keep(progress: Progress) -> None:
+        if progress.done == 5 and progress.state is not None:
+            states.append(copy.deepcopy(progress.state()))
+
+    config = config_of(iters=20, average=0.5)
+    found = adapt(begun, scene, config, keep, trained=few).gaussians
+    for name, value in found.tensors().items():
+        rounding = 1e-6 if name == "sigma_d" else 0.0  # its logarithm is what training holds
+        torch.testing.assert_close(value[few:], begun.tensors()[name][few:], rtol=rounding, atol=0.0)
+        assert not torch.equal(value[:few], begun.tensors()[name][:few]), name
+    assert_equal(adapt(begun, scene, config, None, states[0], trained=few).gaussians, found)
+    without = adapt(begun.select(torch.arange(few)), scene, config, trained=few).gaussians
+    assert not torch.equal(without.sh0, found.sh0[:few])
+
+
 def dials_of(
     captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch, **changes: Any
 ) -> tuple[list[float], list[torch.Tensor]]:
     """The dial values, max_sv 4, and the photographs of a training of 80 rounds."""
     scales, images = [], []
-    monkeypatch.setattr(train, "attenuate", lambda *a: scales.append(a[3]) or attenuate(*a))
-    monkeypatch.setattr(train, "photometric_loss", lambda *a: images.append(a[1]) or photometric_loss(*a))
+    monkeypatch.setattr(objective, "attenuate", lambda *a: scales.append(a[3]) or attenuate(*a))
+    monkeypatch.setattr(objective, "photometric_loss", lambda *a: images.append(a[1]) or photometric_loss(*a))
     some = attach(gaussians(5, 0, 0), torch.ones(5))
     adapt(some, captured[1], config_of(iters=80 * len(captured[1].train), max_sv=4.0, **changes))
     return scales, images

@@ -1,0 +1,126 @@
+"""What one view asks of the parameters: the training objective and its gradients."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from clod_adapter.adapter import ATTRIBUTES
+from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances
+from clod_adapter.cameras import View
+from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.counting import count_gradient, paper_count
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.losses import photometric_loss
+from clod_adapter.render import splat
+
+# Sigma stays where the equation still tells values apart; below, a Gaussian would be gone for good.
+SIGMA_RANGE = (1e-4, SIGMA_MAX)
+
+
+@dataclass
+class Pull:
+    """What views ask of the parameters; of several, their sum.
+
+    Attributes:
+        gradients: of what is trained, by parameter, of its first ``trained`` rows.
+        kept: ``[trained]`` bool, the rows that a picture had.
+        loss: photometric loss at the first dial value of each view, summed.
+    """
+
+    gradients: dict[str, Tensor]
+    kept: Tensor
+    loss: float
+
+    def __add__(self, other: Pull) -> Pull:
+        gradients = {name: mine + other.gradients[name] for name, mine in self.gradients.items()}
+        return Pull(gradients, self.kept | other.kept, self.loss + other.loss)
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The objective that ``train.adapt`` states, over parameters as it keeps them.
+
+    Attributes:
+        tuned: the attributes that are trained, beside ``opacity_logits`` and the decay, which always are.
+        trained: how many of the first rows are; the others are drawn as they are.
+    """
+
+    config: AdaptConfig
+    attenuation: AttenuationConfig
+    tuned: tuple[str, ...]
+    trained: int
+
+    @property
+    def decay(self) -> str:
+        """The name of the parameter that is trained for sigma_d."""
+        return "sigma" if self.config.parameter == "linear" else "log_sigma"
+
+    @property
+    def stepped(self) -> tuple[str, ...]:
+        """The names of all parameters that are trained."""
+        return (*self.tuned, "opacity_logits", self.decay)
+
+    @property
+    def has_law(self) -> bool:
+        """Whether the count law presses; a range of one dial value asks for none."""
+        return self.config.count_term == "law" and self.config.max_sv > 1
+
+    @property
+    def decay_range(self) -> tuple[float, float]:
+        low, high = SIGMA_RANGE
+        return SIGMA_RANGE if self.config.parameter == "linear" else (math.log(low), math.log(high))
+
+    def sigma(self, decay: Tensor) -> Tensor:
+        """``[N]`` sigma_d of its parameter."""
+        return decay if self.config.parameter == "linear" else decay.exp()
+
+    def parameter(self, sigma_d: Tensor) -> Tensor:
+        """The inverse of ``sigma``, within the range that is trained."""
+        sigma = sigma_d.detach().float().clamp(*SIGMA_RANGE)
+        return sigma if self.config.parameter == "linear" else sigma.log()
+
+    def pull(self, parameters: dict[str, Tensor], draws: Sequence[tuple[View, list[float]]]) -> Pull:
+        """The sum over ``draws``, each a view and the dial values it is rendered at."""
+        return reduce(Pull.__add__, (self._pull_of(parameters, view, dials) for view, dials in draws))
+
+    def _pull_of(self, parameters: dict[str, Tensor], view: View, dials: list[float]) -> Pull:
+        config, tau, first = self.config, self.attenuation.tau, slice(self.trained)
+        leaves = {name: parameters[name].detach().requires_grad_(name in self.stepped) for name in parameters}
+        logits, decay = leaves["opacity_logits"], leaves[self.decay]
+        sigma = self.sigma(decay)
+        distances = normalized_distances(parameters["means"], view.camera, self.attenuation)
+        of_attributes: dict[str, Any] = {name: leaves[name] for name in ATTRIBUTES}
+        photograph = view.image.to(decay.device)
+        total, count = decay.new_zeros(()), torch.zeros_like(decay[first])
+        kept = torch.zeros_like(count, dtype=torch.bool)
+        losses = []
+        for s in dials:
+            dialled = attenuate(logits, sigma, distances, s, self.attenuation)
+            # Dropped rows have opacity 0: the rasterizer leaves them out, and they get no gradient.
+            image, _ = splat(Gaussians(**of_attributes), dialled.drawn, view.camera)
+            loss = photometric_loss(image, photograph, config.ssim_weight)
+            losses.append(float(loss.detach()))
+            weight = self._weight(s, alone=len(dials) == 1)
+            if config.count_term == "paper" and config.reg_weight > 0:
+                loss = loss + paper_count(dialled, s, tau, config)
+            total = total + weight * loss
+            if self.has_law:
+                own = type(dialled)(*(tensor[first] for tensor in dialled))
+                count += count_gradient(own, parameters["opacity_logits"][first], s, tau, weight * losses[-1], config)
+            kept |= dialled.keep[first]
+        found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
+        gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}
+        count = count if config.parameter == "log" else count / decay.detach()[first]
+        return Pull(gradients | {self.decay: gradients[self.decay] + count}, kept, losses[0])
+
+    def _weight(self, s: float, *, alone: bool) -> float:
+        """w_s, times ``full_weight`` at the s = 1 that goes with another dial value."""
+        weight = (1 - self.config.weight_slope * s / self.config.max_sv) ** 2
+        return weight if alone or s > 1 else weight * self.config.full_weight
