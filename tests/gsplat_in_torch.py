@@ -19,16 +19,18 @@ ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN = 1 / 255, 0.999, 1e-4
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Has gsplat find these where it looks for its kernels."""
+    """Has gsplat, and who calls its kernels by themselves, find these where they look for them."""
+    import gsplat
     from gsplat import rendering
     from gsplat.cuda import _torch_impl
 
-    def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor) -> Tensor:
+    def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
         return _torch_impl._spherical_harmonics(degree, dirs, coeffs)
 
-    for function in (fully_fused_projection, isect_tiles, rasterize_to_pixels, spherical_harmonics):
-        monkeypatch.setattr(rendering, function.__name__, function)
-    monkeypatch.setattr(rendering, "isect_offset_encode", _torch_impl._isect_offset_encode)
+    for module in (rendering, gsplat):
+        for function in (fully_fused_projection, isect_tiles, rasterize_to_pixels, spherical_harmonics):
+            monkeypatch.setattr(module, function.__name__, function)
+        monkeypatch.setattr(module, "isect_offset_encode", _torch_impl._isect_offset_encode)
 
 
 def fully_fused_projection(
@@ -38,6 +40,7 @@ def fully_fused_projection(
 ) -> tuple[Any, ...]:  # fmt: skip
     from gsplat.cuda import _torch_impl
 
+    quats = quats / quats.norm(dim=-1, keepdim=True)  # as the kernel: of any length, and NaN where it is 0
     covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
     radii, *values, compensations = _torch_impl._fully_fused_projection(
         means, covars, viewmats, Ks, width, height, eps2d, near_plane, far_plane, calc_compensations, camera_model
