@@ -62,14 +62,14 @@ def isect_tiles(
     segmented: bool, packed: bool, n_images: int, image_ids: Tensor | None, gaussian_ids: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     if image_ids is None:
-        image_ids = torch.arange(n_images).repeat_interleave(means2d.shape[-2])
+        image_ids = torch.arange(n_images, device=depths.device).repeat_interleave(means2d.shape[-2])
     centre, reach, depth = means2d.reshape(-1, 2) / tile_size, radii.reshape(-1, 2) / tile_size, depths.flatten()
-    most = torch.tensor([tile_width, tile_height])
-    low = torch.floor(centre - reach).long().clamp(min=torch.zeros(2).long(), max=most)
-    high = torch.ceil(centre + reach).long().clamp(min=torch.zeros(2).long(), max=most)
+    most = torch.tensor([tile_width, tile_height], device=depths.device)
+    low = torch.floor(centre - reach).long().clamp(min=torch.zeros_like(most), max=most)
+    high = torch.ceil(centre + reach).long().clamp(min=torch.zeros_like(most), max=most)
     counts = (high - low).prod(-1) * (reach > 0).all(-1)
     ids = torch.repeat_interleave(counts)
-    nth, across = torch.arange(len(ids)) - (counts.cumsum(0) - counts)[ids], (high - low)[ids, 0]
+    nth, across = torch.arange(len(ids), device=depths.device) - (counts.cumsum(0) - counts)[ids], (high - low)[ids, 0]
     tiles = (low[ids, 1] + nth // across) * tile_width + low[ids, 0] + nth % across
     bits = (tile_width * tile_height).bit_length()
     keys = (image_ids[ids] << 32 + bits) | (tiles << 32) | depth[ids].float().view(torch.int32).long()

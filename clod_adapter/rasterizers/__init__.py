@@ -34,6 +34,12 @@ class Rasterizer(Protocol):
     ) -> tuple[Tensor, Tensor]: ...  # fmt: skip
 
 
+def wait_for(device: torch.device) -> None:
+    """Returns when the device has done what it was given, so that a clock may be read; the CPU always has."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
 def for_device(device: torch.device) -> Rasterizer:
     """The fastest rasterizer for tensors on ``device``, imported on first use.
 

@@ -45,8 +45,9 @@ def unusable() -> str | None:
         return f"gsplat cannot be imported ({what}): {INSTALL}"
     if _backend._C is None:
         return (
-            f"gsplat {gsplat.__version__} has no CUDA kernels and there is no CUDA toolkit to compile them with: install "
-            f"nvcc, or a build for your torch: {INSTALL} --index-url https://docs.gsplat.studio/whl/pt24cu124"
+            f"gsplat {gsplat.__version__} has no CUDA kernels, and there is no CUDA toolkit to compile them with: "
+            f"install nvcc, or a build for your torch, as in {INSTALL} --index-url "
+            "https://docs.gsplat.studio/whl/pt24cu124"
         )
     return None
 
