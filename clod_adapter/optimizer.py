@@ -26,7 +26,7 @@ class RowAdam:
     ):
         self.parameters = parameters
         self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
-        self._moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in parameters.items()}
+        self._moments = {name: (_zeros(p), _zeros(p)) for name, p in parameters.items()}
         self._steps = {name: torch.zeros(len(p), dtype=torch.int32, device=p.device) for name, p in parameters.items()}
         # After so many steps of its own a row's bias corrections are 1 in float32.
         last = math.ceil(-25 * math.log(2) / math.log(max(beta1, beta2)))
@@ -96,3 +96,10 @@ def _adam_rows(
 
 
 _adam = Fused(_adam_rows)
+
+
+def _zeros(parameter: Tensor) -> Tensor:
+    """Of its shape. On the CPU what is never stepped, as frozen harmonics are, takes no memory: no page is touched."""
+    if parameter.device.type != "cpu":
+        return torch.zeros_like(parameter)
+    return torch.from_numpy(np.zeros(parameter.shape, np.float32))
