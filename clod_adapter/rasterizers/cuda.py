@@ -70,8 +70,7 @@ def rasterize(
     for name, tensor in locals().items():
         if isinstance(tensor, Tensor) and tensor.is_cuda and tensor.dtype != torch.float32:
             raise ClodError(f"the CUDA rasterizer takes float32 only, and {name} is {tensor.dtype}: use .float()")
-    rows = (opacities.detach() >= ALPHA_MIN).nonzero()[:, 0]
-    geometry = [_Rows.apply(rows, x) for x in (means, quats, scales, opacities)]
+    rows, geometry = compact(means, quats, scales, opacities)
     drawn = _project(geometry, sh0, shN, rows, camera) if len(rows) else None
     if drawn is None or len(drawn["means2d"]) == 0:
         # Nothing to draw, but the inputs have gradients: 0.
@@ -80,6 +79,12 @@ def rasterize(
         return background + empty[..., None], empty
     image, alpha = _blend(drawn, camera)
     return image + (1 - alpha)[..., None] * background, alpha
+
+
+def compact(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """The numbers of the rows that are drawn, and the geometry and opacity of these alone."""
+    rows = (opacities.detach() >= ALPHA_MIN).nonzero()[:, 0]
+    return rows, [_Rows.apply(rows, x) for x in (means, quats, scales, opacities)]
 
 
 def _project(geometry: list[Tensor], sh0: Tensor, shN: Tensor, rows: Tensor, camera: Camera) -> dict[str, Tensor]:
