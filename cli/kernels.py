@@ -16,17 +16,18 @@ from clod_adapter.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.train import adapt
 
+CPU = torch.device("cpu")
 OTHER = ""
 # What a kernel takes of the time that all of them take to compile; only the time left that is shown depends on it.
 SHARES = {"project": 0.2, "project_gradient": 0.42, OTHER: 0.035}
 
 
-def prepare_kernels(console: Console, *, training: bool = True) -> None:
-    """Adapts and evaluates a miniature, so that all kernels that this takes are there."""
+def prepare_kernels(console: Console, device: torch.device = CPU, *, training: bool = True) -> None:
+    """Adapts and evaluates a miniature on the device, so that all kernels that this takes are there."""
     one = Gaussians(
         torch.zeros(1, 3), torch.ones(1, 4), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3),
         torch.zeros(1, 3, 3),
-    )  # fmt: skip
+    ).to(device)  # fmt: skip
     viewmat, K = torch.eye(4), torch.eye(3)
     viewmat[2, 3] = 2.0
     view = View(Camera(viewmat, K, 4, 4), torch.zeros(4, 4, 3, dtype=torch.uint8))

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from clod_adapter.losses import unit
+
 INSTALL = "pip install 'clod-adapter[eval]'"
 WEIGHTS = """python -c "import torchvision; torchvision.models.alexnet(weights='DEFAULT')\""""
 
@@ -66,15 +68,15 @@ def _make_flip() -> Metric:
 
 @torch.no_grad()
 def _lpips(network: Any, image: Tensor, target: Tensor) -> float:
-    ours, theirs = (x.permute(2, 0, 1)[None].contiguous() for x in _unit(image, target))
+    ours, theirs = (x.permute(2, 0, 1)[None].contiguous() for x in _both(image, target))
     return float(network.to(ours.device)(ours, theirs, normalize=True))
 
 
 def _flip(evaluate: Any, image: Tensor, target: Tensor) -> float:
-    ours, theirs = (x.cpu().numpy() for x in _unit(image, target))
+    ours, theirs = (x.cpu().numpy() for x in _both(image, target))
     return float(evaluate(theirs, ours, "LDR", applyMagma=False)[1])
 
 
-def _unit(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+def _both(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     image = image.detach().float().clamp(0, 1).contiguous()
-    return image, target.to(image) / 255
+    return image, unit(target, image)
