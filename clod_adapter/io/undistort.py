@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -18,6 +17,7 @@ from PIL import Image, PngImagePlugin
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.caches import user_caches
 from clod_adapter.io.images import Note
 from clod_adapter.io.posed import PosedImage
 
@@ -62,7 +62,7 @@ def cache_folder(scene: Path) -> Path:
     """
     scene = scene.resolve()
     name = f"{scene.name}-{hashlib.sha256(str(scene).encode(errors='surrogateescape')).hexdigest()[:8]}"
-    folder = _caches() / "clod-adapter" / "undistorted" / name
+    folder = user_caches() / "clod-adapter" / "undistorted" / name
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK | os.X_OK):
@@ -73,18 +73,6 @@ def cache_folder(scene: Path) -> Path:
             "to a folder that can be written to"
         ) from error
     return folder
-
-
-def _caches() -> Path:
-    if chosen := os.environ.get("XDG_CACHE_HOME"):
-        return Path(chosen)
-    try:
-        home = Path.home()
-    except RuntimeError as error:
-        raise ClodError("no home folder to keep undistorted photographs in; set XDG_CACHE_HOME to a folder") from error
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", home / "AppData" / "Local"))
-    return home / "Library" / "Caches" if sys.platform == "darwin" else home / ".cache"
 
 
 def kept(folder: Path, image: PosedImage, path: Path, max_width: int, make: Callable[[], Photograph]) -> Photograph:
