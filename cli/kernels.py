@@ -31,7 +31,7 @@ def prepare_kernels(console: Console, device: torch.device = CPU, *, training: b
     viewmat, K = torch.eye(4), torch.eye(3)
     viewmat[2, 3] = 2.0
     view = View(Camera(viewmat, K, 4, 4), torch.zeros(4, 4, 3, dtype=torch.uint8))
-    with announced_compiling(console, SHARES), _one_thread():
+    with announced_compiling(console, SHARES), one_thread():
         evaluate(one, [view], [1.0])
         if training:
             adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0))
@@ -40,7 +40,7 @@ def prepare_kernels(console: Console, device: torch.device = CPU, *, training: b
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """Of several, each would compile on its own once a Ctrl-C has ended that of the first."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
