@@ -104,7 +104,7 @@ def test_the_start_and_what_it_goes_by(setup: Setup) -> None:
 
 
 def test_numbers(setup: Setup) -> None:
-    """Rows, counts, dial values, popping, alignment, orders: those of the CPU, within what two rasterizers differ by."""
+    """Rows, counts, dial values, popping, alignment, orders: those of the CPU, within what rasterizers differ by."""
     cameras, test = setup.cameras, setup.scene.test
     rows, want = on_both(setup, lambda model: evaluate(model, test, [1.0, 3.0]))
     for mine, own in zip(rows, want, strict=True):
