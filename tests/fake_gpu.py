@@ -79,7 +79,8 @@ class _Functions(TorchFunctionMode):
 
 
 @lru_cache(maxsize=1)
-def _register() -> None:
+def register() -> None:
+    """Makes the device known to torch; before the first backward pass of a process."""
     from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
     class Module(_DummyBackendModule):
@@ -92,6 +93,6 @@ def _register() -> None:
 @contextmanager
 def fake_gpu() -> Iterator[torch.device]:
     """While it lasts there is the device."""
-    _register()
+    register()
     with _Dispatch(), _Functions():
         yield torch.device("gpu", 0)
