@@ -6,8 +6,8 @@
 
 ``tests``: the contract of every backend, the integration with gsplat, the optimiser and the compiled formula.
 ``plush``: plush_half adapted on the GPU and on the CPU with the same settings: seconds, and quality on held-out views.
-``city``: a synthetic city adapted (peak memory), then frames near and far at s = 1, 3, 7 beside plain gsplat, packed and
-not, on the same file in the same run, in turn: their times, the share that the dial takes (attenuation, cut and
+``city``: a synthetic city adapted (peak memory), then frames near and far at s = 1, 3, 7 beside plain gsplat, packed
+and not, on the same file in the same run, in turn: their times, the share that the dial takes (attenuation, cut and
 compaction), and PSNR against the full picture and against the truth.
 
 Each adds rows to ``results/gpu.jsonl``. Where there is no GPU, plain is this package's CPU rasterizer without the dial.
@@ -113,10 +113,8 @@ def adapt_plush(device: torch.device, size: Size, small: bool) -> list[dict[str,
     if small:
         base, scene = synthetic(size, torch.device("cpu"))
     else:
-        base, scene = (
-            clod.load(capture("plush_half") / "pretrained.ply").gaussians,
-            clod.load_scene(capture("plush_half")),
-        )
+        folder = capture("plush_half")
+        base, scene = clod.load(folder / "pretrained.ply").gaussians, clod.load_scene(folder)
     config = clod.AdaptConfig(**({"iters": size.plush_steps} if size.plush_steps else {}))
     rows = []
     for place in dict.fromkeys([device, torch.device("cpu")]):
@@ -186,7 +184,8 @@ def frames(model: clod.Gaussians, views: list[View], where: str, s: float, repea
     pixels = [(picture.clamp(0, 1) * 255).round().to(torch.uint8).cpu() for picture in full]
     return {
         "what": "frames", "where": where, "virtual_scale": s, "kept": fmean(int(p.kept.sum()) for p in shown), "ms": ms,
-        "faster": {name: ms[name] / ms["ours"] for name in plain}, "dial_share": (ms["dial"] + ms["compact"]) / ms["ours"],
+        "faster": {name: ms[name] / ms["ours"] for name in plain},
+        "dial_share": (ms["dial"] + ms["compact"]) / ms["ours"],
         "psnr_full": fmean(psnr(p.image, f) for p, f in zip(shown, pixels, strict=True)),
         "psnr_truth": fmean(psnr(p.image, view.image) for p, view in zip(shown, views, strict=True)),
         "plain_psnr_truth": fmean(psnr(f, view.image) for f, view in zip(full, views, strict=True)),
@@ -230,7 +229,7 @@ def compaction(model: clod.Gaussians, s: float) -> Callable[[Camera], Any]:
 
 
 def one_pass_differs(model: clod.Gaussians, camera: Camera, s: float) -> dict[str, float]:
-    """The compiled formula against the plain one: the largest difference of what is drawn, and Gaussians kept by one."""
+    """Compiled formula and plain one: the largest difference of what is drawn, and Gaussians that only one keeps."""
     assert model.sigma_d is not None and model.attenuation is not None
     fused = attenuate_seen(model.means, model.opacity_logits, model.sigma_d, camera, s, model.attenuation)
     on_cpu = model.to("cpu")
