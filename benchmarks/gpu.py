@@ -43,7 +43,10 @@ from clod_adapter.render import dial, splat
 
 CHECKS = ("tests", "plush", "city")
 DIALS = (1.0, 3.0, 7.0)
-TESTS = ("tests/rasterizers", "tests/integrations/test_gsplat.py", "tests/test_optimizer.py", "tests/test_fusing.py")
+TESTS = (
+    "tests/rasterizers", "tests/integrations/test_gsplat.py", "tests/test_devices.py", "tests/test_optimizer.py",
+    "tests/test_fusing.py",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -186,6 +189,7 @@ def frames(model: clod.Gaussians, views: list[View], where: str, s: float, repea
         "what": "frames", "where": where, "virtual_scale": s, "kept": fmean(int(p.kept.sum()) for p in shown), "ms": ms,
         "faster": {name: ms[name] / ms["ours"] for name in plain},
         "dial_share": (ms["dial"] + ms["compact"]) / ms["ours"],
+        "dial_share_of_plain": {name: (ms["dial"] + ms["compact"]) / ms[name] for name in plain},
         "psnr_full": fmean(psnr(p.image, f) for p, f in zip(shown, pixels, strict=True)),
         "psnr_truth": fmean(psnr(p.image, view.image) for p, view in zip(shown, views, strict=True)),
         "plain_psnr_truth": fmean(psnr(f, view.image) for f, view in zip(full, views, strict=True)),
