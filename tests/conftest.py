@@ -21,6 +21,7 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 import browser
+import fake_gpu
 from clod_adapter.cameras import Camera
 from clod_adapter.cli.main import main
 from clod_adapter.gaussians import Gaussians
@@ -28,7 +29,6 @@ from clod_adapter.io.colmap import write_model
 from clod_adapter.io.ply_columns import column_map
 from clod_adapter.render import render
 
-# Its test's device, before the first backward pass: autograd counts the devices there and then, for good.
 fake_gpu.register()
 
 
