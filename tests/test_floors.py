@@ -38,12 +38,12 @@ FLOORS = [
     {"io", "rasterizers", "adapter"},
     {"render"},
     {"importance", "popping", "budget", "placement", "alignment", "alignment_frames", "alignment_guess"},
-    {"inspection", "inspection_tensors", "inspection_values", "objective"},
+    {"inspection", "inspection_tensors", "inspection_values", "objective", "distributed", "drawing"},
     {"train", "evaluate", "export", "viewer", "compare"},
     {"report", "robustness", "integrations"},
     {"demo"},
     {""},  # the package itself, whose __init__ re-exports from all of the above
-    {"cli"},
+    {"cli", "__main__"},
 ]
 SEPARATE = [7]  # train, evaluate, export, ... do not import each other
 SOURCES = sorted([*(ROOT / PACKAGE).rglob("*.py"), *(ROOT / "cli").rglob("*.py")])
