@@ -76,6 +76,8 @@ class Peers:
             under_way += [dist.all_reduce(gradient, async_op=True) for gradient in gradients.values()]
             for work in under_way:
                 work.wait()
+            if kept.is_cuda:
+                torch.cuda.synchronize()  # NCCL's own wait returns at once, and its time would be another's
         return Pull(gradients, kept.bool(), float(loss))
 
     def map(self, function: Callable[[T], Tensor], items: Iterable[T]) -> Iterator[Tensor]:
