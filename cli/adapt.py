@@ -19,6 +19,7 @@ from clod_adapter.cli.inputs import complement_scene, place_scene, read_checkpoi
 from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.pages import AdaptPage
+from clod_adapter.cli.processes import describe_processes, explain, hurried, together
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, table, write_report
 from clod_adapter.cli.results import write, write_measured
 from clod_adapter.cli.resume import Saver
@@ -76,6 +77,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         if gaussians.sigma_d is None and adapter.attenuation.tau < config.tau:
             notes.append(f"tau is {adapter.attenuation.tau:.2g} and not {config.tau:g}: the Gaussians are faint")
             console.say(notes[-1])
+        if adapted.lost:
+            notes.append(f"training ended at step {adapted.steps}: {explain(adapted.lost)}")
+            console.say(notes[-1])
         result = adapter.apply(gaussians)
         report = describe_run(args, outputs, adapter, adapted) | {
             "sh_degree": result.sh_degree, "device": str(result.means.device), "seconds": watch.report(),
@@ -86,7 +90,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         with console.status(f"writing {outputs.ply} ..."):
             write(base, adapter, result, outputs, report)
         console.say(f"wrote {outputs.adapter} and {outputs.ply}")
-    skip, late = stop.requests > 0 and not adapted.interrupted, GracefulStop()
+    skip = stop.requests > 0 and not adapted.interrupted or hurried(adapted)
+    late = GracefulStop()
     with watch.time("evaluate"):
         rows, plain, cut_short = ([], [], True) if skip else measure_result(result, scene, config, console)
     if cut_short:
@@ -137,7 +142,7 @@ def describe_run(args: argparse.Namespace, outputs: Outputs, adapter: Adapter, a
         "teacher": "checkpoint" if args.images is None else "photographs",
         "base_count": len(adapter.sigma_d), "config": adapter.config, "attenuation": asdict(adapter.attenuation),
         "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
-        "outputs": outputs.names(),
+        "processes": describe_processes(adapted, adapter.config["batch"]), "outputs": outputs.names(),
     }  # fmt: skip
 
 
@@ -167,8 +172,8 @@ def train(
 ) -> Adapted:
     """Adapts while the user watches. Raises KeyboardInterrupt when there is nothing worth writing."""
     console, follow = follower.console, saver.watching(page.watching(follower) if page else follower)
-    with closing(follower):
-        adapted = adapt(base, scene, config, follow, saver.state)
+    with closing(follower), together(base, scene, config, saver.state, follower) as peers:
+        adapted = adapt(base, scene, config, follow, saver.state, peers=peers)
     if follower.stop.requests > 1:
         raise KeyboardInterrupt
     how = "interrupted after" if adapted.interrupted else "trained"

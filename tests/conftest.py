@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import fake_gpu
 import numpy as np
 import pytest
 import torch

@@ -38,7 +38,7 @@ FLOORS = [
     {"io", "rasterizers", "adapter"},
     {"render"},
     {"importance", "popping", "budget", "placement", "alignment", "alignment_frames", "alignment_guess"},
-    {"inspection", "inspection_tensors", "inspection_values", "objective"},
+    {"inspection", "inspection_tensors", "inspection_values", "objective", "distributed", "drawing"},
     {"train", "evaluate", "export", "viewer", "compare"},
     {"report", "robustness", "integrations"},
     {"demo"},
