@@ -29,8 +29,9 @@ def count_law(virtual_scale: float, share: float, exponent: float) -> float:
 
 
 def count_gradient(
-    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, loss: float, config: AdaptConfig
-) -> Tensor:
+    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, loss: float, config: AdaptConfig,
+    total: int | None = None,
+) -> Tensor:  # fmt: skip
     """``[N]`` what the count term adds to the gradient of log sigma_d at one dial value; opacities are held.
 
     That of ``loss reg_weight (eta / law - 1)^2``, eta the share kept, through ``count_slope``. Who is worth
@@ -39,19 +40,30 @@ def count_gradient(
     here, so that the same settings suit scenes and dial values that are fitted well or badly. Nothing presses the last
     Gaussian out. Where too few are kept, whoever has left is called back, however far below the cut: with a slope of
     at least ``LIFT / (temperature N)``.
+
+    Args:
+        total: what shares are of, at least N: also Gaussians that are not here because no view sees them. N by default.
     """
-    law = max(count_law(virtual_scale, config.start_share, config.exponent), 1 / len(opacity_logits))
-    eta = float(dialled.keep.sum()) / len(opacity_logits)
+    total = total or len(opacity_logits)
+    law = max(count_law(virtual_scale, config.start_share, config.exponent), 1 / total)
+    eta = float(dialled.keep.sum()) / total
     pressure = 2 * loss * config.reg_weight * (eta / law - 1) / law
     slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, config.temperature)
     if pressure < 0:
         slope = torch.where(dialled.keep, slope, slope.clamp(min=LIFT / (config.temperature * len(slope))))
-    return slope.mul_(pressure)
+    return slope.mul_(pressure * (len(slope) / total))
 
 
-def paper_count(dialled: Attenuated, virtual_scale: float, tau: float, config: AdaptConfig) -> Tensor:
-    """0-d, the paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2`` (section 3.3); eta is ``soft_count``."""
+def paper_count(
+    dialled: Attenuated, virtual_scale: float, tau: float, config: AdaptConfig, total: int | None = None
+) -> Tensor:
+    """0-d, the paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2`` (section 3.3); eta is ``soft_count``.
+
+    Args:
+        total: as in ``count_gradient``.
+    """
     count = soft_count(dialled.log_opacities, virtual_scale, tau, config.temperature)
+    count = count * (len(dialled.log_opacities) / (total or len(dialled.log_opacities)))
     excess = (count - virtual_scale**-config.exponent).clamp(min=0)
     return config.reg_weight * (virtual_scale - 1) ** 2 * excess**2
 

@@ -50,12 +50,14 @@ class Objective:
     Attributes:
         tuned: the attributes that are trained, beside ``opacity_logits`` and the decay, which always are.
         trained: how many of the first rows are; the others are drawn as they are.
+        total: how many Gaussians the count is a share of; by default those that are trained.
     """
 
     config: AdaptConfig
     attenuation: AttenuationConfig
     tuned: tuple[str, ...]
     trained: int
+    total: int | None = None
 
     @property
     def decay(self) -> str:
@@ -109,11 +111,12 @@ class Objective:
             losses.append(float(loss.detach()))
             weight = self._weight(s, alone=len(dials) == 1)
             if config.count_term == "paper" and config.reg_weight > 0:
-                loss = loss + paper_count(dialled, s, tau, config)
+                loss = loss + paper_count(dialled, s, tau, config, self.total)
             total = total + weight * loss
             if self.has_law:
                 own = type(dialled)(*(tensor[first] for tensor in dialled))
-                count += count_gradient(own, parameters["opacity_logits"][first], s, tau, weight * losses[-1], config)
+                logits_now, pull = parameters["opacity_logits"][first], weight * losses[-1]
+                count += count_gradient(own, logits_now, s, tau, pull, config, self.total)
             kept |= dialled.keep[first]
         found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
         gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}

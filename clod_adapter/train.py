@@ -36,6 +36,7 @@ def adapt(
     resume: TrainingState | None = None,
     *,
     trained: int | None = None,
+    total: int | None = None,
 ) -> Adapted:
     """Learns sigma_d for ``base`` on the training views of ``scene``, and updates the rest lightly.
 
@@ -56,6 +57,7 @@ def adapt(
             ends, on as many threads, with the same bits as an undisturbed run; a time budget counts from the first
             beginning.
         trained: only the first so many Gaussians are trained; the others are drawn as they are. All by default.
+        total: how many Gaussians the count law is a share of, where ``base`` is not all of them (``plan``).
 
     Raises:
         ClodError: no training views, none that has a Gaussian before it, no Gaussians, or ``resume`` is of something
@@ -81,11 +83,12 @@ def adapt(
     else:
         unset = torch.ones_like(base.opacity_logits)  # what is trained is in the state
         begun = lean.replace(sigma_d=unset if base.sigma_d is None else base.sigma_d, attenuation=resume.attenuation)
-    run = _Run(begun, views, config, progress, trained)
+    run = _Run(begun, views, config, progress, trained, total)
     run.empty_bands = None if lean is base else base.shN.clone()
     run.start_seconds = time.perf_counter() - began
     if resume is not None:
         run.restore(resume)
+    del resume  # by now a copy of what is in the run
     return run.run()
 
 
@@ -99,6 +102,7 @@ class _Run:
         config: AdaptConfig,
         progress: Callable[[Progress], None] | None,
         trained: int | None = None,
+        total: int | None = None,
     ):
         self.config, self.views, self.progress = config, views, progress
         trained = len(start) if trained is None else trained
@@ -111,7 +115,7 @@ class _Run:
         }  # fmt: skip
         # What is stepped by row; a frozen attribute asks the rasterizer for no gradient.
         tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
-        self.objective = Objective(config, start.attenuation, tuple(tuned), trained)
+        self.objective = Objective(config, start.attenuation, tuple(tuned), trained, total)
         self.decay, self.stepped, self.range = self.objective.decay, self.objective.stepped, self.objective.decay_range
         self.rates = {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
         self.rates[self.decay] = config.lr_sigma * math.sqrt(config.batch)
