@@ -34,7 +34,11 @@ FADING = 1.5  # times the threshold: fainter ones are drawn less than they are (
 
 
 def start(
-    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Callable[[str, int, int], None] | None = None
+    base: Gaussians,
+    views: Sequence[View],
+    config: AdaptConfig,
+    progress: Callable[[str, int, int], None] | None = None,
+    error: Tensor | None = None,
 ) -> Gaussians:
     """The Gaussians with a sigma_d to train from, by what they do in up to MOST_VIEWS of the views, evenly spread.
 
@@ -44,15 +48,17 @@ def start(
     Args:
         progress: called with "start" and the number of views done, and of those that are looked at in all; then with
             "order" and the number of Gaussians whose place is known, and of all of them.
+        error: ``[N]`` from ``removal_error``, of these views and seed, where it is known already.
     """
-    if base.sigma_d is not None and base.attenuation is not None and bool((base.sigma_d < SIGMA_MAX).any()):
+    if base.attenuation is not None and has_dial(base):
         return base.replace(attenuation=dataclasses.replace(base.attenuation, max_sv=config.max_sv))
     views = spread(views, MOST_VIEWS)
     attenuation = config.attenuation(scene_distance(base, views, config.quantile))
     if config.start in ("constant", "identity"):
         value = 1.0 if config.start == "constant" else WIDEST * config.max_sv
         return base.replace(sigma_d=torch.full((len(base),), value), attenuation=attenuation)
-    error = removal_error(base, views, seed=config.seed, progress=partial(progress, "start") if progress else None)
+    if error is None:
+        error = removal_error(base, views, seed=config.seed, progress=partial(progress, "start") if progress else None)
     attenuation = dataclasses.replace(attenuation, tau=fitting_tau(base.opacities, error, config))
     importance = error
     if config.start == "importance":
@@ -63,6 +69,11 @@ def start(
         base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent
     )
     return base.replace(sigma_d=sigma.minimum(WIDEST * config.max_sv * distances), attenuation=attenuation)
+
+
+def has_dial(base: Gaussians) -> bool:
+    """Whether there is a sigma_d that does anything."""
+    return base.sigma_d is not None and bool((base.sigma_d < SIGMA_MAX).any())
 
 
 def seeing(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
