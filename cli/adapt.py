@@ -8,12 +8,11 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import torch
-
 from clod_adapter.adapter import Adapter, detach, extract, trim
 from clod_adapter.cameras import Scene
 from clod_adapter.cli.alignment import require_alignment
 from clod_adapter.cli.console import Console, duration
+from clod_adapter.cli.devices import on_device, pick_device
 from clod_adapter.cli.evaluate import measure
 from clod_adapter.cli.files import Outputs, size
 from clod_adapter.cli.inputs import complement_scene, place_scene, read_checkpoint, read_scene
@@ -64,7 +63,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     saver = Saver(outputs.state, args.resume, config, console, stop)
     inputs = read_inputs(args, config, console, watch)
     base, scene, config = inputs.base, inputs.scene, inputs.config
-    gaussians = base.gaussians.to(pick_device(args.device))
+    gaussians = base.gaussians
     saver.belong(gaussians, scene, args.ply, args.images or "those placed for it")
     with watch.time("evaluate"):
         base_rows, notes = look_at_base(gaussians, scene, args, console)
@@ -127,10 +126,10 @@ def read_inputs(args: argparse.Namespace, config: AdaptConfig, console: Console,
         ClodError: something cannot be read, or checkpoint and photographs do not fit.
     """
     with watch.time("load"):
-        base = read_checkpoint(args.ply, console, args.activated)
+        base = on_device(read_checkpoint(args.ply, console, args.activated), pick_device(args.device, console))
         photographs = read_scene(args.images, console, base.origin) if args.images is not None else None
     with watch.time("kernels"):
-        prepare_kernels(console)
+        prepare_kernels(console, base.gaussians.means.device)
     if photographs is None:
         with watch.time("place"):
             return Inputs(base, place_scene(base.gaussians, config.seed, console), config, None, [])
@@ -149,11 +148,6 @@ def describe_run(args: argparse.Namespace, outputs: Outputs, adapter: Adapter, a
         "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
         "outputs": outputs.names(),
     }  # fmt: skip
-
-
-def pick_device(name: str) -> torch.device:
-    """Where to train; ``auto`` is the fastest device that there is a rasterizer for, which is the CPU."""
-    return torch.device("cpu" if name == "auto" else name)
 
 
 def look_at_base(

@@ -56,7 +56,7 @@ def start(
     attenuation = config.attenuation(scene_distance(base, views, config.quantile))
     if config.start in ("constant", "identity"):
         value = 1.0 if config.start == "constant" else WIDEST * config.max_sv
-        return base.replace(sigma_d=torch.full((len(base),), value), attenuation=attenuation)
+        return base.replace(sigma_d=torch.full_like(base.means[:, 0], value), attenuation=attenuation)
     if error is None:
         error = removal_error(base, views, seed=config.seed, progress=partial(progress, "start") if progress else None)
     attenuation = dataclasses.replace(attenuation, tau=fitting_tau(base.opacities, error, config))
@@ -124,7 +124,7 @@ def scene_distance(base: Gaussians, views: Sequence[View], quantile: float) -> f
     probe = AttenuationConfig(normalizer="quantile", quantile=quantile)
     total = 0.0
     for view in views:
-        distances = (base.means - view.camera.position).norm(dim=1)
+        distances = (base.means - view.camera.position.to(base.means)).norm(dim=1)
         total += float(normalizing_distance(distances, base.means, view.camera, probe))
     return total / len(views)
 
@@ -143,11 +143,13 @@ def removal_error(
         progress: called with the number of views done after each, and of all of them.
     """
     generator = torch.Generator().manual_seed(seed)
-    total = torch.zeros(len(gaussians))
+    total = torch.zeros_like(gaussians.means[:, 0])
     for done, view in enumerate(views, 1):
         opacities = gaussians.opacities.detach().requires_grad_()
         image, _ = splat(gaussians, opacities, view.camera)
-        signs = torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
+        signs = (
+            torch.randint(0, 2, image.shape, generator=generator, dtype=torch.uint8).to(image.device).to(image) * 2 - 1
+        )
         (gradient,) = torch.autograd.grad((image * signs).sum(), opacities)  # as grad_outputs they would import sympy
         total += (gradient * opacities.detach()).square()
         if progress:
@@ -157,7 +159,7 @@ def removal_error(
 
 def typical_distance(gaussians: Gaussians, views: Sequence[View], config: AttenuationConfig) -> Tensor:
     """``[N]`` the geometric mean over views of the normalised distance."""
-    logs = torch.zeros(len(gaussians))
+    logs = torch.zeros_like(gaussians.means[:, 0])
     for view in views:
         logs += normalized_distances(gaussians.means, view.camera, config).clamp(min=1e-6).log()
     return (logs / max(len(views), 1)).exp()
@@ -182,8 +184,8 @@ def sigma_from_importance(
         distances: ``[N]`` normalised distance at which the law is to hold.
         share: of all Gaussians, kept at s = 1; in (0.5, 1].
     """
-    rank = torch.empty(len(importance))
-    rank[importance.argsort(descending=True, stable=True)] = (torch.arange(len(importance)) + 0.5) / len(importance)
+    rank, order = torch.empty_like(distances), importance.argsort(descending=True, stable=True)
+    rank[order] = (torch.arange(len(rank), device=rank.device) + 0.5) / len(rank)
     power = (1 / rank + (rank**-2 - 4 * (1 / share - 1)).clamp(min=0).sqrt()) / 2
     extinction = torch.where(rank <= share, power ** (1 / exponent), share / rank)
     return sigma_for_extinction(gaussians.opacity_logits, distances, extinction, config)

@@ -77,7 +77,7 @@ class _Planner:
         with self._time("probe"):
             plan = self._attributes(plan, resumed)
         self.seconds["probe"] -= sum(state.seconds for state in plan.begun)  # which are steps of the training
-        left_out = tuple(Decision(what, "left out", None, "", why) for what, why in getattr(self.scene, "left_out", ()))
+        left_out = tuple(Decision(what, "left out", None, "", why) for what, why in self.scene.left_out)
         return replace(plan, decisions=(*self.decisions, *left_out), seconds=self.seconds)
 
     def _bands(self) -> int:

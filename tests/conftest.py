@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import fake_gpu
 import numpy as np
 import pytest
 import torch
@@ -26,6 +27,9 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.colmap import write_model
 from clod_adapter.io.ply_columns import column_map
 from clod_adapter.render import render
+
+# Its test's device, before the first backward pass: autograd counts the devices there and then, for good.
+fake_gpu.register()
 
 
 @pytest.fixture

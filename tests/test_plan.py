@@ -216,11 +216,8 @@ def test_a_checkpoint_that_shows_nothing(captured: tuple[Gaussians, Scene]) -> N
 
 def test_what_reading_left_out_is_told(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
-
-    class Read(Scene):
-        left_out = (("undistortion", "the cameras are pinholes"),)
-
-    plan = make_plan(base, Read(scene.train, scene.test), CONFIG, Overrule(keep=ALL))
+    read = replace(scene, left_out=(("undistortion", "the cameras are pinholes"),))
+    plan = make_plan(base, read, CONFIG, Overrule(keep=ALL))
     assert plan.decisions[-1] == Decision("undistortion", "left out", None, "", "the cameras are pinholes")
 
 
