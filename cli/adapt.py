@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import shlex
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from clod_adapter.adapter import Adapter, detach, extract
+from clod_adapter.adapter import Adapter, detach, extract, trim
 from clod_adapter.cameras import Scene
 from clod_adapter.cli.alignment import require_alignment
 from clod_adapter.cli.console import Console, duration
@@ -19,6 +19,7 @@ from clod_adapter.cli.inputs import complement_scene, place_scene, read_checkpoi
 from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.pages import AdaptPage
+from clod_adapter.cli.plan import decide
 from clod_adapter.cli.processes import describe_processes, explain, hurried, together
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, table, write_report
 from clod_adapter.cli.results import write, write_measured
@@ -31,8 +32,10 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import check_config
 from clod_adapter.io.atomic import remove_leftovers
 from clod_adapter.io.ply import Checkpoint
+from clod_adapter.io.trimming import trimmed
 from clod_adapter.io.version import package_version
-from clod_adapter.train import Adapted, adapt
+from clod_adapter.plan import Plan
+from clod_adapter.train import Adapted, Progress
 
 
 @dataclass(frozen=True)
@@ -69,11 +72,17 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     with stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
         page = AdaptPage(gaussians, scene, config, console) if args.report else None
         follower = Follower(console, stop, gaussians, scene.test, config.max_sv, base_rows[0] if base_rows else None)
-        adapted = train(gaussians, scene, config, follower, saver, page)
-        watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
+        plan = decide(args, gaussians, scene, config, follower, saver)
+        adapted = train(gaussians, scene, plan, follower, saver, page)
+        planning = sum(plan.seconds.values()) - plan.seconds["start"]
+        watch.seconds |= {"plan": planning, "start": adapted.start_seconds, "train": adapted.seconds}
+        kept, degree = (plan.kept, plan.sh_degree) if args.trim and plan.trims(gaussians) else (None, None)
+        base = trimmed(base, kept, degree)
         adapter = extract(
-            gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config), origin=base.origin
-        )
+            trim(gaussians, kept, degree), trim(adapted.gaussians, kept, degree), fingerprint=base.fingerprint,
+            config=asdict(config), origin=base.origin,
+        )  # fmt: skip
+        adapter = replace(adapter, kept=kept, sh_degree=degree)
         if gaussians.sigma_d is None and adapter.attenuation.tau < config.tau:
             notes.append(f"tau is {adapter.attenuation.tau:.2g} and not {config.tau:g}: the Gaussians are faint")
             console.say(notes[-1])
@@ -83,7 +92,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         result = adapter.apply(gaussians)
         report = describe_run(args, outputs, adapter, adapted) | {
             "sh_degree": result.sh_degree, "device": str(result.means.device), "seconds": watch.report(),
-            "resumed_from": saver.state and saver.state.steps, "alignment": inputs.alignment,
+            "resumed_from": saver.state and saver.state.steps, "alignment": inputs.alignment, "plan": plan.as_dict(),
             "notes": [*base.notes, *scene.notes, *notes, "the result was not measured"],
             "base_rows": [row.as_dict() for row in base_rows], "rows": [], "detached_row": None,
         }  # fmt: skip
@@ -140,7 +149,7 @@ def describe_run(args: argparse.Namespace, outputs: Outputs, adapter: Adapter, a
     return {
         "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
         "teacher": "checkpoint" if args.images is None else "photographs",
-        "base_count": len(adapter.sigma_d), "config": adapter.config, "attenuation": asdict(adapter.attenuation),
+        "base_count": adapter.base_count, "config": adapter.config, "attenuation": asdict(adapter.attenuation),
         "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
         "processes": describe_processes(adapted, adapter.config["batch"]), "outputs": outputs.names(),
     }  # fmt: skip
@@ -168,12 +177,21 @@ def look_at_base(
 
 
 def train(
-    base: Gaussians, scene: Scene, config: AdaptConfig, follower: Follower, saver: Saver, page: AdaptPage | None = None
+    base: Gaussians, scene: Scene, plan: Plan, follower: Follower, saver: Saver, page: AdaptPage | None = None
 ) -> Adapted:
-    """Adapts while the user watches. Raises KeyboardInterrupt when there is nothing worth writing."""
-    console, follow = follower.console, saver.watching(page.watching(follower) if page else follower)
-    with closing(follower), together(base, scene, config, saver.state, follower) as peers:
-        adapted = adapt(base, scene, config, follow, saver.state, peers=peers)
+    """Adapts as planned while the user watches. Raises KeyboardInterrupt when there is nothing worth writing."""
+    console, watching = follower.console, page.watching(follower) if page else follower
+
+    def whole(now: Progress) -> None:
+        watching(replace(now, gaussians=lambda: plan.whole(base, now.gaussians())))
+
+    state = saver.state or plan.take_state()
+    with closing(follower), together(plan, scene, state, follower) as peers:
+        adapted = plan.adapt(scene, saver.watching(whole), state, peers)
+    adapted = replace(
+        adapted, gaussians=plan.whole(base, adapted.gaussians),
+        start_seconds=adapted.start_seconds + plan.seconds["start"],
+    )  # fmt: skip
     if follower.stop.requests > 1:
         raise KeyboardInterrupt
     how = "interrupted after" if adapted.interrupted else "trained"

@@ -25,6 +25,8 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.distributed import PeerLost, Peers, joined
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.objective import Part
+from clod_adapter.plan import Plan
 from clod_adapter.train import adapt
 from clod_adapter.training_state import Adapted, Progress, TrainingState
 
@@ -44,6 +46,7 @@ class Job:
     views: tuple[View, ...]
     config: AdaptConfig
     state: TrainingState | None
+    part: Part
     device: str
 
 
@@ -59,10 +62,8 @@ def leading() -> Iterator[None]:
 
 
 @contextmanager
-def together(
-    base: Gaussians, scene: Scene, config: AdaptConfig, state: TrainingState | None, follower: Follower
-) -> Iterator[Peers | None]:
-    """The processes to train with, which then do so too; None where this one is alone.
+def together(plan: Plan, scene: Scene, state: TrainingState | None, follower: Follower) -> Iterator[Peers | None]:
+    """The processes to train with as planned, which then do so too; None where this one is alone.
 
     Raises:
         ClodError: within, what ended one of them, where the loss of a process is what ended this.
@@ -71,11 +72,12 @@ def together(
     if launch.size == 1:
         yield None
         return
-    follower.console.say(_describe(launch, config, base.means.device.type))
+    device = plan.start.means.device.type
+    follower.console.say(_describe(launch, plan.config, device))
     number = _store().add(JOBS, 1)
     try:
         with _threads(launch), joined(_of_job(number), launch.rank, launch.size) as peers:
-            peers.broadcast(Job(base, scene.train, config, state, base.means.device.type))
+            peers.broadcast(Job(plan.lean, scene.train, plan.config, state, plan.part, device))
             yield peers
     except PeerLost as error:
         if follower.stop.requests:  # which the others have heard of too
@@ -130,7 +132,7 @@ def _train_along(number: int, launch: Launch, stop: GracefulStop) -> None:
         if job.device == "cuda":
             torch.cuda.set_device(launch.local_rank)
         base = job.base.to(job.device)
-        adapt(base, Scene(job.views, ()), job.config, follow, job.state, peers=peers)
+        adapt(base, Scene(job.views, ()), job.config, follow, job.state, part=job.part, peers=peers)
 
 
 def _is_called(store: Store, number: int, stop: GracefulStop) -> bool:

@@ -19,7 +19,10 @@ from clod_adapter.train import Progress
 CHECK_EVERY = 10.0  # seconds between looks at the held-out views, at least
 CHECK_COST = 0.03  # share of the time that they may take, at most
 CHECK_VIEWS = 4
-LABELS = {"start": "importance", "order": "order of leaving", "train": "training"}
+LABELS = {
+    "bands": "SH bands", "start": "importance", "order": "order of leaving", "probe": "first steps",
+    "train": "training",
+}  # fmt: skip
 
 
 class Follower:
