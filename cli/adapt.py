@@ -20,6 +20,7 @@ from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.pages import AdaptPage
 from clod_adapter.cli.plan import decide
+from clod_adapter.cli.processes import Job, describe_processes, explain, hurried, together
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, table, write_report
 from clod_adapter.cli.results import write, write_measured
 from clod_adapter.cli.resume import Saver
@@ -85,6 +86,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         if gaussians.sigma_d is None and adapter.attenuation.tau < config.tau:
             notes.append(f"tau is {adapter.attenuation.tau:.2g} and not {config.tau:g}: the Gaussians are faint")
             console.say(notes[-1])
+        if adapted.lost:
+            notes.append(f"training ended at step {adapted.steps}: {explain(adapted.lost)}")
+            console.say(notes[-1])
         result = adapter.apply(gaussians)
         report = describe_run(args, outputs, adapter, adapted) | {
             "sh_degree": result.sh_degree, "device": str(result.means.device), "seconds": watch.report(),
@@ -95,7 +99,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         with console.status(f"writing {outputs.ply} ..."):
             write(base, adapter, result, outputs, report)
         console.say(f"wrote {outputs.adapter} and {outputs.ply}")
-    skip, late = stop.requests > 0 and not adapted.interrupted, GracefulStop()
+    skip = stop.requests > 0 and not adapted.interrupted or hurried(adapted)
+    late = GracefulStop()
     with watch.time("evaluate"):
         rows, plain, cut_short = ([], [], True) if skip else measure_result(result, scene, config, console)
     if cut_short:
@@ -146,7 +151,7 @@ def describe_run(args: argparse.Namespace, outputs: Outputs, adapter: Adapter, a
         "teacher": "checkpoint" if args.images is None else "photographs",
         "base_count": adapter.base_count, "config": adapter.config, "attenuation": asdict(adapter.attenuation),
         "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
-        "outputs": outputs.names(),
+        "processes": describe_processes(adapted, adapter.config["batch"]), "outputs": outputs.names(),
     }  # fmt: skip
 
 
@@ -180,8 +185,8 @@ def train(
     def whole(now: Progress) -> None:
         watching(replace(now, gaussians=lambda: plan.whole(base, now.gaussians())))
 
-    with closing(follower):
-        adapted = plan.adapt(scene, saver.watching(whole), saver.state)
+    with closing(follower), together(lambda: Job.of(plan, scene, saver.state), follower) as peers:
+        adapted = plan.adapt(scene, saver.watching(whole), saver.state, peers)
     adapted = replace(
         adapted, gaussians=plan.whole(base, adapted.gaussians),
         start_seconds=adapted.start_seconds + plan.seconds["start"],

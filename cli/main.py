@@ -18,6 +18,7 @@ from clod_adapter.cli.help_export import EXPORT
 from clod_adapter.cli.help_inspect import INSPECT
 from clod_adapter.cli.help_view import VIEW
 from clod_adapter.cli.interrupts import sigterm_as_interrupt
+from clod_adapter.cli.launch import launched, silence_but_first
 from clod_adapter.cli.parser import Parser, make_parser
 from clod_adapter.errors import ClodError
 from clod_adapter.io.version import package_version
@@ -36,11 +37,16 @@ def main(argv: list[str] | None = None) -> int:
 
     A report that has an exit_code of its own ends with that.
     """
+    with silence_but_first():
+        return _main(argv)
+
+
+def _main(argv: list[str] | None) -> int:
     words = sys.argv[1:] if argv is None else argv
     name = words[0] if words and words[0] in COMMANDS else ""
     try:
         args = build_parser(name).parse_args(words[1:] if name else words)
-        code = run(COMMANDS.get(name, ADAPT), args)
+        code = run_here(COMMANDS.get(name, ADAPT), args)
         sys.stdout.flush()
     except ClodError as error:
         print(f"{PROG}: error: {' '.join(str(error).splitlines())}", file=sys.stderr)
@@ -63,6 +69,23 @@ def main(argv: list[str] | None = None) -> int:
         print(f"{PROG}: error: {name}{error.strerror or error}; check the path and its permissions", file=sys.stderr)
         return 2
     return code
+
+
+def run_here(command: Command, args: argparse.Namespace) -> int:
+    """Runs a command, and returns its exit code; of several processes the first does, and the others help it adapt."""
+    launch = launched()
+    if launch.size == 1:
+        return run(command, args)
+    if command is not ADAPT:
+        raise ClodError("only adapting takes several processes; run this command without torchrun")
+    from clod_adapter.cli.processes import leading, take_part
+
+    if launch.rank > 0:
+        with sigterm_as_interrupt():
+            take_part()
+        return 0
+    with leading():
+        return run(command, args)
 
 
 def run(command: Command, args: argparse.Namespace) -> int:

@@ -109,7 +109,7 @@ def imagine(
     teacher = gaussians.without_empty_bands()
     views = []
     for camera in cameras:
-        views.append(View(camera, render(teacher, camera).pixels))
+        views.append(View(camera, render(teacher, camera).pixels.cpu()))
         if progress:
             progress(len(views), len(cameras))
     held_out = range(0, len(views), TEST_EVERY) if len(views) > 1 else range(0)

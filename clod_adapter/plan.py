@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from clod_adapter.adapter import trim
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
+from clod_adapter.distributed import Peers
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.needs import largest_change
@@ -96,18 +98,23 @@ class Plan:
         """The attributes that are not tuned, as NAMES has them."""
         return tuple(name for name, rate in RATES.items() if not getattr(self.config, rate))
 
-    @property
+    @cached_property
     def lean(self) -> Gaussians:
         """What is to be trained."""
         return trim(self.start, self.kept, None)
 
     def adapt(
-        self, scene: Scene, progress: Callable[[Progress], None] | None = None, resume: TrainingState | None = None
+        self,
+        scene: Scene,
+        progress: Callable[[Progress], None] | None = None,
+        resume: TrainingState | None = None,
+        peers: Peers | None = None,
     ) -> Adapted:
         """``train.adapt`` of what is to be trained; the count law remains a share of all Gaussians."""
+        total = len(self.start)
         if resume is None and self.begun:  # and let go of it, which is as large as all that is trained
-            return adapt(self.lean, scene, self.config, progress, self.begun.pop(), total=len(self.start))
-        return adapt(self.lean, scene, self.config, progress, resume, total=len(self.start))
+            return adapt(self.lean, scene, self.config, progress, self.begun.pop(), total=total, peers=peers)
+        return adapt(self.lean, scene, self.config, progress, resume, total=total, peers=peers)
 
     def whole(self, base: Gaussians, lean: Gaussians) -> Gaussians:
         """``lean``, trained, with what was left out put back: rows with the base's values and their start's sigma_d.

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import fake_gpu
 import numpy as np
 import pytest
 import torch
@@ -21,6 +20,7 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 import browser
+import fake_gpu
 from clod_adapter.cameras import Camera
 from clod_adapter.cli.main import main
 from clod_adapter.gaussians import Gaussians
@@ -28,7 +28,6 @@ from clod_adapter.io.colmap import write_model
 from clod_adapter.io.ply_columns import column_map
 from clod_adapter.render import render
 
-# Its test's device, before the first backward pass: autograd counts the devices there and then, for good.
 fake_gpu.register()
 
 

@@ -35,6 +35,9 @@ class Walled(Tensor):
         made.inner = real
         return made
 
+    def __repr__(self) -> str:  # type: ignore[override]
+        return f"Walled({self.inner!r})"
+
     @classmethod
     def __torch_dispatch__(cls, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return _run(function, args, kwargs or {})
@@ -80,7 +83,12 @@ class _Functions(TorchFunctionMode):
 
 @lru_cache(maxsize=1)
 def register() -> None:
-    """Makes the device known to torch; before the first backward pass of a process."""
+    """To be called before the process's first backward pass, when autograd makes a thread for each device there is.
+
+    Not where there is a GPU: autograd would take this one for the accelerator.
+    """
+    if torch.cuda.is_available():
+        return
     from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
     class Module(_DummyBackendModule):

@@ -38,7 +38,7 @@ FLOORS = [
     {"io", "rasterizers", "adapter"},
     {"render"},
     {"importance", "popping", "budget", "placement", "alignment", "alignment_frames", "alignment_guess"},
-    {"inspection", "inspection_tensors", "inspection_values", "objective", "needs"},
+    {"inspection", "inspection_tensors", "inspection_values", "objective", "distributed", "drawing", "needs"},
     {"train", "evaluate", "export", "viewer", "compare"},
     {"report", "robustness", "integrations", "plan", "planning"},
     {"demo"},

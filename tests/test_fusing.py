@@ -62,9 +62,9 @@ def results(given: dict[str, Tensor], view: Camera, config: AttenuationConfig, f
     return found
 
 
-@pytest.mark.parametrize("form", ["logits", "opacities"])
+@pytest.mark.parametrize("form", ["opacities"])
 def test_traced_it_is_the_same(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest, form: str) -> None:
-    config = AttenuationConfig(cut="hard") if form == "logits" else SOFT
+    config = AttenuationConfig(cut="hard")
     want = results(inputs(), camera(), config, form)
     request.getfixturevalue("everything_compiles")
     faster(monkeypatch)

@@ -22,12 +22,24 @@ def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def test_plush_and_city_small(script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     out = tmp_path / "gpu.jsonl"
-    words = ["gpu.py", "--device", "cpu", "--small", "--only", "plush", "city", "--count", "800", "--results", str(out)]
+    words = [
+        "gpu.py",
+        "--device",
+        "cpu",
+        "--small",
+        "--only",
+        "plush",
+        "city",
+        "--count",
+        "1000",
+        "--results",
+        str(out),
+    ]
     monkeypatch.setattr(sys, "argv", words)
     script.main()
     rows = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
     plush, adapted, *frames = rows
-    assert (plush["benchmark"], plush["on"], plush["count"]) == ("gpu plush", "cpu", 800)
+    assert (plush["benchmark"], plush["on"], plush["count"]) == ("gpu plush", "cpu", 1000)
     assert [row["virtual_scale"] for row in plush["rows"]] == [1.0, 3.0, 5.0] and plush["train_seconds"] > 0
     assert adapted["what"] == "adapt" and adapted["peak_bytes"] > adapted["base_bytes"] > 0
     assert [(r["where"], r["virtual_scale"]) for r in frames] == [(w, s) for w in ("near", "far") for s in (1, 3, 7)]
@@ -37,7 +49,7 @@ def test_plush_and_city_small(script: ModuleType, monkeypatch: pytest.MonkeyPatc
         assert row["one_pass_differs"] == {"drawn": 0.0, "kept_by_one": 0}
         assert math.isfinite(row["psnr_truth"])
     kept = [row["kept"] for row in frames[:3]]
-    assert 800 >= kept[0] > kept[1] > kept[2]
+    assert 1000 >= kept[0] > kept[1] > kept[2]
     fidelity = [row["psnr_full"] for row in frames[:3]]
     assert fidelity[0] > fidelity[1] > fidelity[2]
 
