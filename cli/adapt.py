@@ -20,7 +20,7 @@ from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.pages import AdaptPage
 from clod_adapter.cli.plan import decide
-from clod_adapter.cli.processes import describe_processes, explain, hurried, together
+from clod_adapter.cli.processes import Job, describe_processes, explain, hurried, together
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, table, write_report
 from clod_adapter.cli.results import write, write_measured
 from clod_adapter.cli.resume import Saver
@@ -185,9 +185,8 @@ def train(
     def whole(now: Progress) -> None:
         watching(replace(now, gaussians=lambda: plan.whole(base, now.gaussians())))
 
-    state = saver.state or plan.take_state()
-    with closing(follower), together(plan, scene, state, follower) as peers:
-        adapted = plan.adapt(scene, saver.watching(whole), state, peers)
+    with closing(follower), together(lambda: Job.of(plan, scene, saver.state), follower) as peers:
+        adapted = plan.adapt(scene, saver.watching(whole), saver.state, peers)
     adapted = replace(
         adapted, gaussians=plan.whole(base, adapted.gaussians),
         start_seconds=adapted.start_seconds + plan.seconds["start"],

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -49,6 +49,13 @@ class Job:
     part: Part
     device: str
 
+    @classmethod
+    def of(cls, plan: Plan, scene: Scene, state: TrainingState | None) -> Job:
+        """What ``plan.adapt`` does, from ``state`` or where the plan has begun."""
+        state = next(iter(plan.begun), None) if state is None else state
+        lean = plan.lean
+        return cls(lean, scene.train, plan.config, state, plan.part, lean.means.device.type)
+
 
 @contextmanager
 def leading() -> Iterator[None]:
@@ -62,8 +69,8 @@ def leading() -> Iterator[None]:
 
 
 @contextmanager
-def together(plan: Plan, scene: Scene, state: TrainingState | None, follower: Follower) -> Iterator[Peers | None]:
-    """The processes to train with as planned, which then do so too; None where this one is alone.
+def together(make_job: Callable[[], Job], follower: Follower) -> Iterator[Peers | None]:
+    """The processes to train with, which then do so too; None where this one is alone, and no job is made.
 
     Raises:
         ClodError: within, what ended one of them, where the loss of a process is what ended this.
@@ -72,12 +79,13 @@ def together(plan: Plan, scene: Scene, state: TrainingState | None, follower: Fo
     if launch.size == 1:
         yield None
         return
-    device = plan.start.means.device.type
-    follower.console.say(_describe(launch, plan.config, device))
+    job = make_job()
+    follower.console.say(_describe(launch, job.config, job.device))
     number = _store().add(JOBS, 1)
     try:
         with _threads(launch), joined(_of_job(number), launch.rank, launch.size) as peers:
-            peers.broadcast(Job(plan.lean, scene.train, plan.config, state, plan.part, device))
+            peers.broadcast(job)
+            del job
             yield peers
     except PeerLost as error:
         if follower.stop.requests:  # which the others have heard of too

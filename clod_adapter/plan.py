@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 from torch import Tensor
@@ -80,7 +81,7 @@ class Plan:
         kept: ``[N]`` bool, the rows that are trained; None for all of them.
         sh_degree: of what is trained.
         config: with step size 0 for what stays frozen.
-        begun: what ``take_state`` gives.
+        begun: what training goes on from where its first steps are done already; the first ``adapt`` takes it away.
         seconds: wall time of "bands", "unseen" (what the start would not look at) and "probe" (without the steps of the
             training), and of the "start".
     """
@@ -98,7 +99,7 @@ class Plan:
         """The attributes that are not tuned, as NAMES has them."""
         return tuple(name for name, rate in RATES.items() if not getattr(self.config, rate))
 
-    @property
+    @cached_property
     def lean(self) -> Gaussians:
         """What is to be trained."""
         return trim(self.start, self.kept, None)
@@ -108,10 +109,6 @@ class Plan:
         """For ``train.adapt`` of ``lean``: the count law remains a share of all Gaussians."""
         return Part(len(self.start) if self.kept is None else int(self.kept.sum()), total=len(self.start))
 
-    def take_state(self) -> TrainingState | None:
-        """What training goes on from where its first steps are done, once: it is as large as all that is trained."""
-        return self.begun.pop() if self.begun else None
-
     def adapt(
         self,
         scene: Scene,
@@ -119,9 +116,10 @@ class Plan:
         resume: TrainingState | None = None,
         peers: Peers | None = None,
     ) -> Adapted:
-        """``train.adapt`` of what is to be trained, from ``resume`` or else ``take_state``."""
-        state = resume or self.take_state()
-        return adapt(self.lean, scene, self.config, progress, state, part=self.part, peers=peers)
+        """``train.adapt`` of what is to be trained; the count law remains a share of all Gaussians."""
+        if resume is None and self.begun:  # and let go of it, which is as large as all that is trained
+            return adapt(self.lean, scene, self.config, progress, self.begun.pop(), part=self.part, peers=peers)
+        return adapt(self.lean, scene, self.config, progress, resume, part=self.part, peers=peers)
 
     def whole(self, base: Gaussians, lean: Gaussians) -> Gaussians:
         """``lean``, trained, with what was left out put back: rows with the base's values and their start's sigma_d.

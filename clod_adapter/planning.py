@@ -72,7 +72,7 @@ class _Planner:
         few = self.base.without_bands(degree)
         kept, error = self._unseen(few)
         with self._time("start"):
-            begun = start(few, self.views, self.config, self._report, error)
+            begun = start(few, self.views, self.config, self._report, error=error)
         plan = Plan((), begun, kept, degree, self.config)
         with self._time("probe"):
             plan = self._attributes(plan, resumed)

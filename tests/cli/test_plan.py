@@ -55,10 +55,11 @@ def test_the_plan_is_printed_before_training_and_stored(
     lines = done.err.splitlines()
     first = lines.index("plan:")
     assert re.search(r"^trained 24 steps", "\n".join(lines[first:]), re.M)
-    table = {line[2:].split("  ")[0]: line for line in lines[first + 1 : first + 9]}
+    table = {line[2:].split("  ")[0]: line for line in lines[first + 1 :] if line.startswith("  ")}
     assert re.search(r"left out +-?0\.0\d\d dB +lost without it, 8 training views +--with bands$", table["SH band 2"])
     assert re.search(r"kept +\d+\.\d+ dB +lost without them, .* --without bands$", table["SH band 1 to 2"])
     assert re.search(r"left out +\d+ +of 350 move no pixel of 8 .* --with unseen$", table["unseen Gaussians"])
+    assert re.search(r"left out +- +all 10 cameras are pinholes$", table["undistortion"])  # what reading them spared
     for name in ("means", "quats", "scales", "opacities", "sh0"):
         assert table[name].endswith(f"--without {name}"), done
     report = json.loads((tmp_path / "dial.json").read_text())
