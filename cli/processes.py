@@ -22,7 +22,7 @@ from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.launch import Launch, launched
 from clod_adapter.cli.training import Follower
 from clod_adapter.config import AdaptConfig
-from clod_adapter.distributed import PeerLost, Peers, joined
+from clod_adapter.distributed import PATIENCE, PeerLost, Peers, joined
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.train import adapt
@@ -153,7 +153,7 @@ def _store() -> Store:
     from torch.distributed.rendezvous import rendezvous
 
     try:
-        store, _, _ = next(iter(rendezvous("env://")))
+        store, _, _ = next(iter(rendezvous("env://", timeout=PATIENCE)))
     except (RuntimeError, ValueError) as error:
         raise ClodError(f"the processes cannot meet ({str(error).partition('. ')[0]}); use torchrun") from error
     return store
