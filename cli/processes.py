@@ -128,9 +128,16 @@ def _train_along(number: int, launch: Launch, stop: GracefulStop) -> None:
     with joined(_of_job(number), launch.rank, launch.size) as peers:
         job: Any = peers.broadcast(None)
         if job.device == "cuda":
-            torch.cuda.set_device(launch.local_rank)
+            _take_gpu(launch)
         base = job.base.to(job.device)
         adapt(base, Scene(job.views, ()), job.config, follow, job.state, peers=peers)
+
+
+def _take_gpu(launch: Launch) -> None:
+    """A GPU for each process on this machine."""
+    if (gpus := torch.cuda.device_count()) < launch.local_size:
+        raise ClodError(f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as there are")
+    torch.cuda.set_device(launch.local_rank)
 
 
 def _is_called(store: Store, number: int, stop: GracefulStop) -> bool:
