@@ -196,7 +196,7 @@ def test_interrupt_with_nothing_to_write(
 ) -> None:
     """One press before training, or two while it runs."""
 
-    def adapt(base: Any, scene: Any, config: Any, progress: Any, resume: Any) -> Any:
+    def adapt(base: Any, scene: Any, config: Any, progress: Any, resume: Any, **_: Any) -> Any:
         for _ in range(presses):
             signal.raise_signal(signal.SIGINT)
         if presses == 1:
