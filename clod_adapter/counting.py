@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -18,6 +18,18 @@ from clod_adapter.config import AdaptConfig
 LIFT = 1e-3
 
 
+class Quota(NamedTuple):
+    """What the count term asks of some Gaussians at one dial value.
+
+    Attributes:
+        share: of them, to be kept, above 0.
+        weight: how much being off it by ``share`` counts; ``1 / share`` where they are all that there are.
+    """
+
+    share: float
+    weight: float
+
+
 def count_law(virtual_scale: float, share: float, exponent: float) -> float:
     """The share of all Gaussians to keep at a dial value s: ``1 / (s^p + (1/share - 1) s^-p)``.
 
@@ -28,9 +40,16 @@ def count_law(virtual_scale: float, share: float, exponent: float) -> float:
     return 1 / (power + (1 / share - 1) / power)
 
 
+def law_quota(virtual_scale: float, count: int, config: AdaptConfig) -> Quota:
+    """What the count law asks of all ``count`` Gaussians: ``count_law``, and never that the last one goes."""
+    law = max(count_law(virtual_scale, config.start_share, config.exponent), 1 / max(count, 1))
+    return Quota(law, 1 / law)
+
+
 def count_gradient(
-    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, loss: float, config: AdaptConfig
-) -> Tensor:
+    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, loss: float, config: AdaptConfig,
+    quota: Quota | None = None,
+) -> Tensor:  # fmt: skip
     """``[N]`` what the count term adds to the gradient of log sigma_d at one dial value; opacities are held.
 
     That of ``loss reg_weight (eta / law - 1)^2``, eta the share kept, through ``count_slope``. Who is worth
@@ -39,10 +58,13 @@ def count_gradient(
     here, so that the same settings suit scenes and dial values that are fitted well or badly. Nothing presses the last
     Gaussian out. Where too few are kept, whoever has left is called back, however far below the cut: with a slope of
     at least ``LIFT / (temperature N)``.
+
+    Args:
+        quota: what is asked of them in place of the law, where they are not all that there are.
     """
-    law = max(count_law(virtual_scale, config.start_share, config.exponent), 1 / len(opacity_logits))
+    quota = quota or law_quota(virtual_scale, len(opacity_logits), config)
     eta = float(dialled.keep.sum()) / len(opacity_logits)
-    pressure = 2 * loss * config.reg_weight * (eta / law - 1) / law
+    pressure = 2 * loss * config.reg_weight * (eta / quota.share - 1) * quota.weight
     slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, config.temperature)
     if pressure < 0:
         slope = torch.where(dialled.keep, slope, slope.clamp(min=LIFT / (config.temperature * len(slope))))
