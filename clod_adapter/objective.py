@@ -31,13 +31,15 @@ class Part:
     Attributes:
         trained: how many of the first rows are; the others are only drawn.
         extent: of the whole scene's cameras, world units: the unit of position steps. By default that of the views.
-        quota: gives, for a view, a dial value and the loss there, what the count term asks of the trained rows; the
-            others are then drawn as if they had no dial. By default it asks for the law, and they are at the dial too.
+        quota: gives, for a view, a dial value and the loss there, what the count term asks of the trained rows; by
+            default the law.
+        rest_in_full: the others are drawn as if they had no dial, and not at the dial too.
     """
 
     trained: int
     extent: float | None = None
     quota: Callable[[View, float, float], Quota] | None = None
+    rest_in_full: bool = False
 
 
 @dataclass
@@ -113,7 +115,7 @@ class Objective:
 
     def _pull_of(self, parameters: dict[str, Tensor], view: View, dials: list[float]) -> Pull:
         config, tau, first = self.config, self.attenuation.tau, slice(self.trained)
-        dialled_rows = first if self.part.quota else slice(None)
+        dialled_rows = first if self.part.rest_in_full else slice(None)
         leaves = {name: parameters[name].detach().requires_grad_(name in self.stepped) for name in parameters}
         logits, decay = leaves["opacity_logits"], leaves[self.decay]
         sigma = self.sigma(decay[dialled_rows])
@@ -126,7 +128,7 @@ class Objective:
         for s in dials:
             dialled = attenuate(logits[dialled_rows], sigma, distances, s, self.attenuation)
             drawn = dialled.drawn
-            if self.part.quota:
+            if self.part.rest_in_full:
                 drawn = torch.cat([drawn, parameters["opacity_logits"][self.trained :].sigmoid()])
             # Dropped rows have opacity 0: the rasterizer leaves them out, and they get no gradient.
             image, _ = splat(Gaussians(**of_attributes), drawn, view.camera)
