@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from clod_adapter.cameras import Camera, Scene, View, in_its_unit
 from clod_adapter.errors import ClodError
 from clod_adapter.io.colmap_model import read_model
 from clod_adapter.io.dataparser import trained_frame
+from clod_adapter.io.image_cache import ImageCache
 from clod_adapter.io.images import Note, read_image
 from clod_adapter.io.origin import NOWHERE
 from clod_adapter.io.posed import HUGE, PosedImage
@@ -32,6 +34,7 @@ def load_scene(
     max_width: int = 1600,
     origin: Sequence[float] = NOWHERE,
     progress: Callable[[int, int], None] | None = None,
+    cache: ImageCache | None = None,
 ) -> Scene:
     """Reads posed photographs: a COLMAP model (binary or text, any version) or a transforms.json, and its images.
 
@@ -57,6 +60,7 @@ def load_scene(
             in Inria's code; the intrinsics follow, and a note says so.
         origin: ``[3]`` what the cameras' world is to be relative to, in its units: ``Checkpoint.origin``.
         progress: called with (images loaded, images in all).
+        cache: keeps the photographs, where not all are to be in memory; they are then read again when looked at.
 
     Raises:
         ClodError: no usable cameras; images that are damaged, of another shape than their camera, or named outside
@@ -79,7 +83,7 @@ def load_scene(
     if not any(image.name not in held_out for image, _ in present):
         raise ClodError(f"{folder}: has no photograph to train on, as all that are there are held out; add more")
     present = [(image.relative_to(origin), path) for image, path in present]
-    views, more = _load(present, folder, max_width, progress)
+    views, more = _load(present, folder, max_width, progress, cache)
     train = tuple(view for view in views if view.camera.name not in held_out)
     test = tuple(view for view in views if view.camera.name in held_out)
     return in_its_unit(Scene(train, test, (*notes, *more)))
@@ -96,6 +100,7 @@ def _load(
     folder: Path,
     max_width: int,
     progress: Callable[[int, int], None] | None,
+    keep: ImageCache | None,
 ) -> tuple[list[View], list[str]]:
     """The views of the images, decoded two at a time, and notes."""
     cache = None if all(image.is_pinhole for image, _ in present) else cache_folder(folder)
@@ -103,12 +108,19 @@ def _load(
     with warnings.catch_warnings(), ThreadPoolExecutor(2) as pool:
         # Large, but below the size at which it is refused: photographs are no attack.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        for view, remarks in pool.map(lambda each: _load_view(each[0], each[1], cache, max_width), present):
-            views.append(view)
+        loads = [partial(_load_view, image, path, cache, max_width) for image, path in present]
+        for (view, remarks), load in zip(pool.map(lambda load: load(), loads), loads, strict=True):
+            views.append(keep.store(view, partial(_again, load)) if keep else view)
             notes += remarks
             if progress:
                 progress(len(views), len(present))
     return views, _summary(notes, len(views))
+
+
+def _again(load: Callable[[], tuple[View, list[Note]]]) -> torch.Tensor:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        return load()[0].image
 
 
 def _summary(notes: Sequence[Note], total: int) -> list[str]:
