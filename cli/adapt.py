@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
@@ -13,12 +13,14 @@ import torch
 from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.cameras import Scene
 from clod_adapter.cli.alignment import require_alignment
+from clod_adapter.cli.chunked import Chunked
 from clod_adapter.cli.console import Console, duration
 from clod_adapter.cli.evaluate import measure
 from clod_adapter.cli.files import Outputs, size
 from clod_adapter.cli.inputs import complement_scene, place_scene, read_checkpoint, read_scene
 from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.kernels import prepare_kernels
+from clod_adapter.cli.memory_plan import image_cache, plan_memory, with_rows, without_rows
 from clod_adapter.cli.pages import AdaptPage
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, table, write_report
 from clod_adapter.cli.results import write, write_measured
@@ -58,18 +60,30 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     check_config(asdict(config))
     for path in vars(outputs).values():
         remove_leftovers(path)
-    saver = Saver(outputs.state, args.resume, config, console, stop)
+    resume = args.resume and (not args.memory or outputs.state.exists())  # chunks have files of their own
+    saver = Saver(outputs.state, resume, config, console, stop)
     inputs = read_inputs(args, config, console, watch)
     base, scene, config = inputs.base, inputs.scene, inputs.config
+    plan = plan_memory(args, base, scene, console)
+    chunked = Chunked.of(args, outputs, plan, base, scene, config, console, stop)
+    if chunked:
+        base = without_rows(base)
+        inputs = replace(inputs, base=base)
     gaussians = base.gaussians.to(pick_device(args.device))
-    saver.belong(gaussians, scene, args.ply, args.images or "those placed for it")
+    if chunked and args.chunk:
+        return chunked.alone(gaussians, scene, config)
+    if not chunked:
+        saver.belong(gaussians, scene, args.ply, args.images or "those placed for it")
     with watch.time("evaluate"):
         base_rows, notes = look_at_base(gaussians, scene, args, console)
     notes = [*inputs.notes, *notes]
     with stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
         page = AdaptPage(gaussians, scene, config, console) if args.report else None
         follower = Follower(console, stop, gaussians, scene.test, config.max_sv, base_rows[0] if base_rows else None)
-        adapted = train(gaussians, scene, config, follower, saver, page)
+        if chunked:
+            adapted = chunked.all(gaussians, scene, config)
+        else:
+            adapted = train(gaussians, scene, config, follower, saver, page)
         watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
         adapter = extract(
             gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config), origin=base.origin
@@ -78,11 +92,13 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             notes.append(f"tau is {adapter.attenuation.tau:.2g} and not {config.tau:g}: the Gaussians are faint")
             console.say(notes[-1])
         result = adapter.apply(gaussians)
+        base = with_rows(base, args) if chunked else base
         report = describe_run(args, outputs, adapter, adapted) | {
             "sh_degree": result.sh_degree, "device": str(result.means.device), "seconds": watch.report(),
             "resumed_from": saver.state and saver.state.steps, "alignment": inputs.alignment,
             "notes": [*base.notes, *scene.notes, *notes, "the result was not measured"],
             "base_rows": [row.as_dict() for row in base_rows], "rows": [], "detached_row": None,
+            **({"memory": asdict(plan)} if plan else {}),
         }  # fmt: skip
         with console.status(f"writing {outputs.ply} ..."):
             write(base, adapter, result, outputs, report)
@@ -102,6 +118,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     else:
         write_report(outputs.report, report)
     saver.close(finished=not adapted.interrupted and not cut_short)
+    if chunked and not cut_short:
+        chunked.remove()
     if page and not cut_short and not late.requests:  # after the report, which no failure of the page is to cost
         with watch.time("page"):
             written = page.write(outputs.ply.with_suffix(".html"), report, result, adapted.start_seconds)
@@ -119,7 +137,9 @@ def read_inputs(args: argparse.Namespace, config: AdaptConfig, console: Console,
     """
     with watch.time("load"):
         base = read_checkpoint(args.ply, console, args.activated)
-        photographs = read_scene(args.images, console, base.origin) if args.images is not None else None
+        photographs = (
+            read_scene(args.images, console, base.origin, image_cache(args)) if args.images is not None else None
+        )
     with watch.time("kernels"):
         prepare_kernels(console)
     if photographs is None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from clod_adapter.cli.checks_export import check_export
 from clod_adapter.cli.checks_inspect import check_inspect
+from clod_adapter.cli.checks_memory import check_memory
 from clod_adapter.cli.checks_view import check_view
 from clod_adapter.cli.dials import given_budget
 from clod_adapter.cli.files import Outputs, check_output, check_ply_name, labels
@@ -24,6 +25,7 @@ from clod_adapter.report.style import check_matplotlib
 
 def check_adapt(args: Namespace) -> None:
     make_config(args)
+    check_memory(args)
     Outputs.of(args.ply, args.out).check([args.ply])
     if args.report:
         check_page(Outputs.of(args.ply, args.out).ply.with_suffix(".html"), ["rendering", "adapting"], [args.ply])
