@@ -34,6 +34,7 @@ from clod_adapter.io.adapter_file import check_config
 from clod_adapter.io.atomic import remove_leftovers
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.version import package_version
+from clod_adapter.rasterizers.cpu import release_memory
 from clod_adapter.train import Adapted, adapt
 
 
@@ -84,6 +85,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             adapted = chunked.all(gaussians, scene, config)
         else:
             adapted = train(gaussians, scene, config, follower, saver, page)
+        release_memory()  # of the training, before its outcome is copied and written
         watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
         adapter = extract(
             gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config), origin=base.origin

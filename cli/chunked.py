@@ -146,6 +146,7 @@ class Chunked:
 
     def _load_start(self, base: Gaussians, views: Sequence[View]) -> Division:
         tensors, about = load_chunk(self.start_file, self.belongs)
+        device = base.means.device
         count = tensors["seen"].shape[-1] if "seen" in tensors else 0
         shapes = {
             "sigma_d": (torch.float32, (len(base),)), "block": (torch.int16, (len(base),)),
@@ -154,8 +155,9 @@ class Chunked:
         checked(self.start_file, tensors, shapes)
         if tensors["block"].unique().tolist() != list(range(count)):
             raise ClodError(f"{self.start_file}: a chunk has no Gaussians; remove it to have it made anew")
-        begun = base.replace(sigma_d=tensors["sigma_d"], attenuation=AttenuationConfig(**about["attenuation"]))
-        return Division(begun, tensors["block"], tensors["seen"], tensors["kept"], float(about["extent"]))
+        settings = AttenuationConfig(**about["attenuation"])
+        begun = base.replace(sigma_d=tensors["sigma_d"].to(device), attenuation=settings)
+        return Division(begun, tensors["block"].to(device), tensors["seen"], tensors["kept"], float(about["extent"]))
 
     def learn(
         self, division: Division, views: Sequence[View], config: AdaptConfig, block: int, number: int,
@@ -169,6 +171,7 @@ class Chunked:
             values, about = load_chunk(path, belongs)
             shapes = {n: (t.dtype, (len(rows), *t.shape[1:])) for n, t in division.begun.tensors().items()}
             checked(path, values, {n: shape for n, shape in shapes.items() if n in values or n == "sigma_d"})
+            values = {name: value.to(rows.device) for name, value in values.items()}
             return Learned(rows, values, int(about["steps"]), float(about["seconds"]))
         own = config_of(division, block, config, first=number == 1)
         state = path.with_suffix(".resume.safetensors")

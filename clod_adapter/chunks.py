@@ -137,7 +137,7 @@ def split(means: Tensor, count: int) -> Tensor:
         cut = first_size(len(rows), parts, fewer)
         order = np.argpartition(points[rows, int((high - low).argmax())], cut)
         todo += [(rows[order[:cut]], first, fewer), (rows[order[cut:]], first + fewer, parts - fewer)]
-    return torch.from_numpy(block)
+    return torch.from_numpy(block).to(means.device)
 
 
 def first_size(total: int, parts: int, fewer: int) -> int:
@@ -308,7 +308,7 @@ def target(gaussians: Gaussians, own: int, view: View) -> Tensor:
     marked[:own] = 0.5 / SH_C0
     mine, _ = splat(plain.replace(sh0=marked, shN=gaussians.shN[:, :0]), gaussians.opacities, view.camera)
     part = ((mine[..., :1] + BARE * own / len(gaussians)) / (alpha[..., None] + BARE)).clamp(0, 1)
-    return ((image + part * (view.image / 255 - image)).clamp(0, 1) * 255).round().to(torch.uint8)
+    return ((image + part * (view.image.to(image) / 255 - image)).clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 def config_of(division: Division, block: int, config: AdaptConfig, *, first: bool) -> AdaptConfig:
@@ -381,7 +381,7 @@ def merge(division: Division, learned: Sequence[Learned]) -> Gaussians:
     Raises:
         ClodError: a Gaussian is in none of them, or in two.
     """
-    times = torch.zeros(len(division.begun), dtype=torch.int32)
+    times = torch.zeros_like(division.block, dtype=torch.int32)
     for part in learned:
         times[part.rows] += 1
     if not bool((times == 1).all()):
