@@ -183,6 +183,7 @@ class Chunked:
                 cache=ImageCache(self.plan.cache),
             )  # fmt: skip
         if adapted.interrupted:
+            self.console.say(f"{name}: stopped after step {adapted.steps}; the same command goes on with it")
             raise KeyboardInterrupt
         release_memory()
         save_chunk(path, learned.values, {"steps": learned.steps, "seconds": learned.seconds}, belongs)

@@ -80,6 +80,12 @@ undisturbed (on as many threads). Without such a file it starts from the
 beginning, and says so; the finished run removes it. No file has its final name
 before it is whole.
 
+--memory 8GB plans what every phase takes, prints it, and adapts in chunks what
+does not fit: blocks of the scene, each with the views that see it, in two
+passes. Chunks can be jobs: with --chunk start, and then --chunk 1 and so on
+(once for each pass), in any order; the same command without --chunk does what
+is missing and writes the outputs, the same ones. Killed, it is repeated.
+
 Ctrl-C, or SIGTERM, while training stops after the step under way and writes the
 state for --resume and what was learned so far (exit code 0, "interrupted": true
 in the report); once more aborts, and the state last saved stays. While the

@@ -4,8 +4,8 @@ In a first pass each block is trained against the *checkpoint* of the others: th
 every dial value, which is what their own training aims at, and the block's pictures to be are the photographs as far as
 it can answer for them (``target``). So no block makes up for what another one will. (Against the others' start, at the
 same dial value, each brightens what all have faded: pictures of the merged result were 8 to 11 dB worse,
-docs/chunks.md.) In a second, light pass each goes on beside the others as the first has left them, at the dial, which
-brings the blocks into accord. Within a pass the jobs are independent, and their order does not matter; what they learn
+docs/chunks.md.) In a second pass each goes on beside the others as the first has left them, at the dial, which brings
+the blocks into accord. Within a pass the jobs are independent, and their order does not matter; what they learn
 is put together by rows.
 
 What an undivided run has for all of the scene, a block has its share of:
@@ -44,10 +44,10 @@ from clod_adapter.training_state import Adapted, Progress, TrainingState
 
 UNSEEN = 0.005  # of what all views show of a block, the share that those it is not trained on may show
 LEFT_OUT = 1e-3  # of a picture, the share that those Gaussians may show that are left out of it
-CONTEXT_VIEWS = 64  # that are looked at for what a block is drawn with, at most
+CONTEXT_VIEWS = 32  # that are looked at for what a block is drawn with, at most
 SMALLER = 4  # times, the pictures that tell which views see which blocks
 BARE = 0.01  # of a pixel: where Gaussians show less, blocks answer for it by their size too
-SECOND, LIGHT = 0.25, 0.3  # of the steps, those of the second pass, and how long they are beside those of the first
+SECOND = 0.25  # of the steps, those of the second pass
 LEAST_SEEN = 0.02  # of a picture: a block that shows less tells too little of the loss of the whole
 DIALS = 9  # at which the start's Gaussians are counted
 
@@ -312,15 +312,20 @@ def target(gaussians: Gaussians, own: int, view: View) -> Tensor:
 
 
 def config_of(division: Division, block: int, config: AdaptConfig, *, first: bool) -> AdaptConfig:
-    """The settings of one block in one pass: its steps, its share of a time budget, a seed of its own."""
+    """The settings of one block in one pass: its steps, how long they are, its share of a time budget, its own seed."""
     steps = division.steps(block, config)
     every = sum(division.steps(other, config) for other in range(division.count))
     light = round(SECOND * steps) if division.passes > 1 else 0
     own = steps - light if first else light
     seed = (config.seed + 1 + block + (0 if first else division.count)) % 2**63
     budget = config.time_budget and config.time_budget * own / max(every, 1) or None
-    config = replace(config, iters=own, time_budget=budget, seed=seed)
-    return config if first else replace(config.lighter(LIGHT), lr_sigma=LIGHT * config.lr_sigma, average=0.5)
+    # Step sizes fall as in an undivided run: from 1 to middle to lr_final.
+    middle = config.lr_final ** (1 - light / max(steps, 1))
+    last = replace(
+        config.lighter(middle), lr_sigma=middle * config.lr_sigma, lr_final=config.lr_final / middle,
+        average=min(config.average * steps / max(light, 1), 1.0),
+    )  # fmt: skip
+    return replace(replace(config, lr_final=middle) if first else last, iters=own, time_budget=budget, seed=seed)
 
 
 def adapt_chunk(

@@ -18,6 +18,7 @@ PIXEL = 260  # a pixel: picture, photograph, their maps and gradients, lists of 
 DRAWN = 640  # a Gaussian that is drawn, beside its attributes: scratch of the rasterizer, gradients
 TRAINED = 640  # one that is trained, on top: its copy, moments, mean, and the saving of all that
 ORDERED = 840  # one whose place in the order of leaving is looked for
+MERGED = 130  # one, while chunks are trained: what the pass before has made of it, and what this one has so far
 WRITTEN = 560  # one that is written: what changed, and the rows of the file
 IMAGES = 1 / 8  # of the limit, the share that photographs may take
 MOST_CHUNKS = 1024
@@ -96,7 +97,7 @@ def _plan(needs: Needs, limit: int, chunks: int) -> Plan:
         train = always + count * (held + DRAWN + TRAINED)
     else:
         held = needs.attributes + 8
-        train = always + count * (held + needs.attributes + DRAWN) + math.ceil(count / chunks) * TRAINED
+        train = always + count * (held + MERGED + needs.attributes + DRAWN) + math.ceil(count / chunks) * TRAINED
     base = PROCESS + count * (needs.row + 2 * needs.attributes)
     start = always + count * (held + max(DRAWN, ORDERED))
     write = always + count * (needs.attributes + needs.row + WRITTEN)

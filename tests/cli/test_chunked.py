@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from clod_adapter import memory
-from clod_adapter.cli import memory_plan, resume
+from clod_adapter.cli import memory_plan, resume, training
 from clod_adapter.io.chunk_file import load_chunk
 from clod_adapter.memory import Plan, make_plan
 from clod_adapter.training_state import Progress
@@ -174,3 +174,21 @@ def test_a_start_that_was_tampered_with(adapt: Callable[..., Any], tmp_path: Pat
         done = adapt("a.ply", "--chunk", 1)
         assert done.code == 2 and message in done.err, done
     assert memory.MOST_CHUNKS > CHUNKS
+
+
+def test_ctrl_c_leaves_what_is_finished(
+    adapt: Callable[..., Any], whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    call = training.Follower.__call__
+
+    def pressed(self: training.Follower, progress: Progress) -> None:
+        if progress.phase == "train" and progress.done == 3 and "chunk 2 of 3, pass 1" in self.labels["train"]:
+            self.stop.requests += 1
+        call(self, progress)
+
+    monkeypatch.setattr(training.Follower, "__call__", pressed)
+    done = adapt("a.ply")
+    assert done.code == 130 and "pass 1 of 2: stopped after step 3; the same command goes on with it" in done.err
+    assert (tmp_path / "a.chunk1.pass1.safetensors").exists() and not (tmp_path / "a.ply").exists()
+    monkeypatch.setattr(training.Follower, "__call__", call)
+    assert adapt("a.ply").code == 0 and outputs(tmp_path, "a") == whole
