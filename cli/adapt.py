@@ -8,13 +8,12 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import torch
-
 from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.cameras import Scene
 from clod_adapter.cli.alignment import require_alignment
 from clod_adapter.cli.chunked import Chunked
 from clod_adapter.cli.console import Console, duration
+from clod_adapter.cli.devices import on_device, pick_device
 from clod_adapter.cli.evaluate import measure
 from clod_adapter.cli.files import Outputs, size
 from clod_adapter.cli.inputs import complement_scene, place_scene, read_checkpoint, read_scene
@@ -22,6 +21,7 @@ from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.memory_plan import image_cache, plan_memory, with_rows, without_rows
 from clod_adapter.cli.pages import AdaptPage
+from clod_adapter.cli.processes import describe_processes, explain, hurried, together
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, table, write_report
 from clod_adapter.cli.results import write, write_measured
 from clod_adapter.cli.resume import Saver
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     if chunked:
         base = without_rows(base)
         inputs = replace(inputs, base=base)
-    gaussians = base.gaussians.to(pick_device(args.device))
+    gaussians = base.gaussians
     if chunked and args.chunk:
         return chunked.alone(gaussians, scene, config)
     if not chunked:
@@ -93,6 +93,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         if gaussians.sigma_d is None and adapter.attenuation.tau < config.tau:
             notes.append(f"tau is {adapter.attenuation.tau:.2g} and not {config.tau:g}: the Gaussians are faint")
             console.say(notes[-1])
+        if adapted.lost:
+            notes.append(f"training ended at step {adapted.steps}: {explain(adapted.lost)}")
+            console.say(notes[-1])
         result = adapter.apply(gaussians)
         base = with_rows(base, args) if chunked else base
         report = describe_run(args, outputs, adapter, adapted) | {
@@ -105,7 +108,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         with console.status(f"writing {outputs.ply} ..."):
             write(base, adapter, result, outputs, report)
         console.say(f"wrote {outputs.adapter} and {outputs.ply}")
-    skip, late = stop.requests > 0 and not adapted.interrupted, GracefulStop()
+    skip = stop.requests > 0 and not adapted.interrupted or hurried(adapted)
+    late = GracefulStop()
     with watch.time("evaluate"):
         rows, plain, cut_short = ([], [], True) if skip else measure_result(result, scene, config, console)
     if cut_short:
@@ -138,12 +142,11 @@ def read_inputs(args: argparse.Namespace, config: AdaptConfig, console: Console,
         ClodError: something cannot be read, or checkpoint and photographs do not fit.
     """
     with watch.time("load"):
-        base = read_checkpoint(args.ply, console, args.activated)
-        photographs = (
-            read_scene(args.images, console, base.origin, image_cache(args)) if args.images is not None else None
-        )
+        base = on_device(read_checkpoint(args.ply, console, args.activated), pick_device(args.device, console))
+        folder, cache = args.images, image_cache(args)
+        photographs = read_scene(folder, console, base.origin, cache) if folder is not None else None
     with watch.time("kernels"):
-        prepare_kernels(console)
+        prepare_kernels(console, base.gaussians.means.device)
     if photographs is None:
         with watch.time("place"):
             return Inputs(base, place_scene(base.gaussians, config.seed, console), config, None, [])
@@ -160,13 +163,8 @@ def describe_run(args: argparse.Namespace, outputs: Outputs, adapter: Adapter, a
         "teacher": "checkpoint" if args.images is None else "photographs",
         "base_count": len(adapter.sigma_d), "config": adapter.config, "attenuation": asdict(adapter.attenuation),
         "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
-        "outputs": outputs.names(),
+        "processes": describe_processes(adapted, adapter.config["batch"]), "outputs": outputs.names(),
     }  # fmt: skip
-
-
-def pick_device(name: str) -> torch.device:
-    """Where to train; ``auto`` is the fastest device that there is a rasterizer for, which is the CPU."""
-    return torch.device("cpu" if name == "auto" else name)
 
 
 def look_at_base(
@@ -195,8 +193,8 @@ def train(
 ) -> Adapted:
     """Adapts while the user watches. Raises KeyboardInterrupt when there is nothing worth writing."""
     console, follow = follower.console, saver.watching(page.watching(follower) if page else follower)
-    with closing(follower):
-        adapted = adapt(base, scene, config, follow, saver.state)
+    with closing(follower), together(base, scene, config, saver.state, follower) as peers:
+        adapted = adapt(base, scene, config, follow, saver.state, peers=peers)
     if follower.stop.requests > 1:
         raise KeyboardInterrupt
     how = "interrupted after" if adapted.interrupted else "trained"

@@ -14,6 +14,7 @@ from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.report import machine_name
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import Row
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.ply import Checkpoint
 
 
@@ -61,7 +62,7 @@ def time_frames(
     model: Checkpoint, cameras: Sequence[Camera], console: Console
 ) -> tuple[list[tuple[float, float]], list[str]]:
     """``budget.frame_times``, with its progress, and a note on how long frames take."""
-    prepare_kernels(console, training=False)
+    prepare_kernels(console, model.gaussians.means.device, training=False)
     with console.meter("timing") as meter:
         times = frame_times(
             model.gaussians, cameras, progress=lambda done, total: meter.update(done / total, f"{done}/{total}")
@@ -70,7 +71,7 @@ def time_frames(
     return times, [f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}"]
 
 
-def calibrate(rows: Sequence[Row], total: int, views: Sequence[View], against: str) -> Calibration:
-    """The table of the rows just measured on this machine; a ClodError where a PSNR is infinite."""
-    size = (views[0].camera.width, views[0].camera.height)
-    return Calibration.of(rows, total=total, views=len(views), size=size, machine=machine_name(), against=against)
+def calibrate(rows: Sequence[Row], measured: Gaussians, views: Sequence[View], against: str) -> Calibration:
+    """The table of the rows just measured here, where the Gaussians are; a ClodError where a PSNR is infinite."""
+    size, machine = (views[0].camera.width, views[0].camera.height), machine_name(measured.means.device.type)
+    return Calibration.of(rows, total=len(measured), views=len(views), size=size, machine=machine, against=against)

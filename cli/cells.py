@@ -76,7 +76,9 @@ class Cell:
     def cost(self, train_views: int, test_views: int) -> float:
         """About how long it takes, in rendered frames; a training step is taken for three."""
         measuring = float(len(self.points) * test_views)
-        return measuring + 3 * (self.config.iters + min(train_views, 64)) if self.config else measuring
+        if self.config is None:
+            return measuring
+        return measuring + 3 * (self.config.batch * self.config.iters + min(train_views, 64))
 
 
 def cells_of(

@@ -156,7 +156,7 @@ def check_folder(out: Path, scene: Path) -> None:
         raise ClodError(f"{out}: the scene's own photographs may be there; choose another --out")
 
 
-# By the command's module; the demo's only input is its --out, which it makes itself.
+# By the command's module; the demo's only input is its --out, which it makes itself, and the doctor has none.
 CHECKS: dict[str, Callable[[Namespace], None]] = {
     "adapt": check_adapt,
     "evaluate": check_evaluate,
@@ -167,4 +167,5 @@ CHECKS: dict[str, Callable[[Namespace], None]] = {
     "inspect": check_inspect,
     "demo": lambda args: None,
     "view": check_view,
+    "doctor": lambda args: None,
 }

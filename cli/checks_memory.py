@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 
+from clod_adapter.cli.launch import launched
 from clod_adapter.errors import ClodError
 from clod_adapter.memory import parse_size
 
@@ -11,6 +12,10 @@ from clod_adapter.memory import parse_size
 def check_memory(args: Namespace) -> None:
     if args.memory is not None:
         parse_size(args.memory)
+        if launched().size > 1:
+            raise ClodError(
+                "--memory is for one process: leave out torchrun, and give jobs of their own each a --chunk"
+            )
     if args.chunk is None:
         return
     if args.memory is None:

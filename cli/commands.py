@@ -86,6 +86,10 @@ passes. Chunks can be jobs: with --chunk start, and then --chunk 1 and so on
 (once for each pass), in any order; the same command without --chunk does what
 is missing and writes the outputs, the same ones. Killed, it is repeated.
 
+torchrun starts several processes, on one machine or many, which train together:
+each takes its part of a step's views, one by default. The outcome is that of
+one process with the same --batch, but for rounding. docs/many_processes.md.
+
 Ctrl-C, or SIGTERM, while training stops after the step under way and writes the
 state for --resume and what was learned so far (exit code 0, "interrupted": true
 in the report); once more aborts, and the state last saved stays. While the
@@ -100,6 +104,7 @@ examples:
   clod-adapt garden.ply --images garden --time-budget 120 --out out/dial.ply
   clod-adapt garden.ply --images garden --quiet --json > report.json
   clod-adapt garden.ply --max-sv 5
+  torchrun --nproc-per-node 8 -m clod_adapter garden.ply --images garden
 """,
     add_arguments=adapt_options,
 )

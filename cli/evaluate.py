@@ -10,6 +10,7 @@ from typing import Any
 from clod_adapter.cameras import View
 from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console
+from clod_adapter.cli.devices import on_device, pick_device
 from clod_adapter.cli.inputs import read_checkpoint, read_scene
 from clod_adapter.cli.instruments import Instruments
 from clod_adapter.cli.interrupts import GracefulStop
@@ -29,10 +30,11 @@ DIALS = (1.0, 2.0, 3.0, 5.0)
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch = Console(args.quiet), Stopwatch()
     with watch.time("load"):
-        model = read_checkpoint(args.model, console, args.activated)
+        device = pick_device(args.device, console)
+        model = on_device(read_checkpoint(args.model, console, args.activated), device)
 
         def beside(path: str) -> Gaussians:
-            return read_checkpoint(path, console, args.activated, model.origin).gaussians
+            return read_checkpoint(path, console, args.activated, model.origin).gaussians.to(device)
 
         base = beside(args.base) if args.base else None
         others = {path: beside(path) for path in args.against}
@@ -49,7 +51,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     for note in notes:
         console.say(note)
     with watch.time("kernels"):
-        prepare_kernels(console, training=base is not None)
+        prepare_kernels(console, device, training=base is not None)
     with watch.time("evaluate"):
         rows, interrupted = measure(model.gaussians, scene.test, dials, console, metrics=perceptual)
     if interrupted and not rows:

@@ -13,6 +13,7 @@ from typing import Any
 from clod_adapter.cameras import Camera
 from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console, duration
+from clod_adapter.cli.devices import on_device, pick_device
 from clod_adapter.cli.dials import opens_at
 from clod_adapter.cli.evaluate import choose_dials
 from clod_adapter.cli.export_formats import LOD_META, PACKED, PAGE, level_paths, suffix_of
@@ -177,6 +178,8 @@ def dial_values(
     args: argparse.Namespace, model: Checkpoint, camera: Camera | None, console: Console
 ) -> tuple[list[float] | None, list[str]]:
     """The dial values to bake, for a page where it opens, None where the dial is to stay; and notes on them."""
+    if camera and getattr(args, "fps", None):  # frames are timed
+        model = on_device(model, pick_device(args.device, console))
     solved, notes = (args.levels, []) if args.levels else solve_dials(args, model, [camera] if camera else (), console)
     if solved is None:
         return None, notes

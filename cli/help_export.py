@@ -9,7 +9,7 @@ from math import inf
 from clod_adapter.cli.commands import Command
 from clod_adapter.cli.dials import add_dial_options
 from clod_adapter.cli.export_formats import format_table
-from clod_adapter.cli.options import add_activated
+from clod_adapter.cli.options import add_activated, add_device
 
 DIGITS = 6  # significant ones of a level, all of which its file's name has
 
@@ -47,6 +47,7 @@ def export_options(parser: ArgumentParser) -> None:
         "--order", choices=["extinction"],
         help="put the rows in the order in which the dial keeps them longest, for renderers that draw a prefix",
     )  # fmt: skip
+    add_device(parser, "time frames, for --fps with --camera")
     add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
 

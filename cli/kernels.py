@@ -16,21 +16,22 @@ from clod_adapter.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.train import adapt
 
+CPU = torch.device("cpu")
 OTHER = ""
 # What a kernel takes of the time that all of them take to compile; only the time left that is shown depends on it.
 SHARES = {"project": 0.2, "project_gradient": 0.42, OTHER: 0.035}
 
 
-def prepare_kernels(console: Console, *, training: bool = True) -> None:
-    """Adapts and evaluates a miniature, so that all kernels that this takes are there."""
+def prepare_kernels(console: Console, device: torch.device = CPU, *, training: bool = True) -> None:
+    """Adapts and evaluates a miniature on the device, so that all kernels that this takes are there."""
     one = Gaussians(
         torch.zeros(1, 3), torch.ones(1, 4), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3),
         torch.zeros(1, 3, 3),
-    )  # fmt: skip
+    ).to(device)  # fmt: skip
     viewmat, K = torch.eye(4), torch.eye(3)
     viewmat[2, 3] = 2.0
     view = View(Camera(viewmat, K, 4, 4), torch.zeros(4, 4, 3, dtype=torch.uint8))
-    with announced_compiling(console, SHARES), _one_thread():
+    with announced_compiling(console, SHARES), one_thread():
         evaluate(one, [view], [1.0])
         if training:
             adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0))
@@ -39,7 +40,7 @@ def prepare_kernels(console: Console, *, training: bool = True) -> None:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """Of several, each would compile on its own once a Ctrl-C has ended that of the first."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -13,10 +13,12 @@ from importlib import import_module
 from typing import Any
 
 from clod_adapter.cli.commands import ADAPT, APPLY, DEMO, EVALUATE, RENDER, ROBUSTNESS, Command
+from clod_adapter.cli.help_doctor import DOCTOR
 from clod_adapter.cli.help_export import EXPORT
 from clod_adapter.cli.help_inspect import INSPECT
 from clod_adapter.cli.help_view import VIEW
 from clod_adapter.cli.interrupts import sigterm_as_interrupt
+from clod_adapter.cli.launch import launched, silence_but_first
 from clod_adapter.cli.parser import Parser, make_parser
 from clod_adapter.errors import ClodError
 from clod_adapter.io.version import package_version
@@ -26,17 +28,25 @@ PROG = "clod-adapt"
 # Adapting is the main job and needs no word.
 COMMANDS: dict[str, Command] = {
     "view": VIEW, "inspect": INSPECT, "eval": EVALUATE, "render": RENDER, "export": EXPORT, "apply": APPLY,
-    "robustness": ROBUSTNESS, "demo": DEMO,
+    "robustness": ROBUSTNESS, "demo": DEMO, "doctor": DOCTOR,
 }  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs a command line; returns its exit code: 0, 2 for bad input, 130 when interrupted with nothing written."""
+    """Runs a command line; returns its exit code: 0, 2 for bad input, 130 when interrupted with nothing written.
+
+    A report that has an exit_code of its own ends with that.
+    """
+    with silence_but_first():
+        return _main(argv)
+
+
+def _main(argv: list[str] | None) -> int:
     words = sys.argv[1:] if argv is None else argv
     name = words[0] if words and words[0] in COMMANDS else ""
     try:
         args = build_parser(name).parse_args(words[1:] if name else words)
-        run(COMMANDS.get(name, ADAPT), args)
+        code = run_here(COMMANDS.get(name, ADAPT), args)
         sys.stdout.flush()
     except ClodError as error:
         print(f"{PROG}: error: {' '.join(str(error).splitlines())}", file=sys.stderr)
@@ -58,11 +68,32 @@ def main(argv: list[str] | None = None) -> int:
         name = f"{error.filename}: " if error.filename is not None else ""
         print(f"{PROG}: error: {name}{error.strerror or error}; check the path and its permissions", file=sys.stderr)
         return 2
-    return 0
+    return code
 
 
-def run(command: Command, args: argparse.Namespace) -> None:
-    """Runs a command and prints its report where --json asks for it; a command without one has printed its own."""
+def run_here(command: Command, args: argparse.Namespace) -> int:
+    """Runs a command, and returns its exit code; of several processes the first does, and the others help it adapt."""
+    launch = launched()
+    if launch.size == 1:
+        return run(command, args)
+    if command is not ADAPT:
+        raise ClodError("only adapting takes several processes; run this command without torchrun")
+    from clod_adapter.cli.processes import leading, take_part
+
+    if launch.rank > 0:
+        with sigterm_as_interrupt():
+            take_part()
+        return 0
+    with leading():
+        return run(command, args)
+
+
+def run(command: Command, args: argparse.Namespace) -> int:
+    """Runs a command and prints its report where --json asks for it; a command without one has printed its own.
+
+    Returns:
+        The exit code that the report has, or 0.
+    """
     from clod_adapter.cli.checks import CHECKS  # here and not above, as --help needs nothing of what it imports
     from clod_adapter.cli.report import jsonable
 
@@ -73,6 +104,7 @@ def run(command: Command, args: argparse.Namespace) -> None:
         report = module.run(args)
     if args.json and report is not None:
         print(json.dumps(jsonable(report), allow_nan=False))
+    return int((report or {}).get("exit_code", 0))
 
 
 def import_command(command: Command, args: argparse.Namespace) -> Any:

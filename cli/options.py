@@ -15,6 +15,11 @@ def add_activated(parser: ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def add_device(parser: ArgumentParser, what: str) -> None:
+    usual = "auto is the NVIDIA GPU where gsplat draws on one, else the CPU (default: auto)"
+    parser.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto", help=f"where to {what}; {usual}")
+
+
 def adapt_options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "ply",
@@ -38,7 +43,7 @@ def adapt_options(parser: ArgumentParser) -> None:
         "command does what is missing, and puts all together",
     )  # fmt: skip
     parser.add_argument("--resume", action="store_true", help="go on with the same command where it was interrupted")
-    parser.add_argument("--device", choices=["auto", "cpu"], default="auto", help="where to train (default: auto)")
+    add_device(parser, "train and measure")
     parser.add_argument(
         "--misaligned-ok", action="store_true", help="train even where a checkpoint does not fit the photographs"
     )
@@ -68,6 +73,7 @@ def evaluate_options(parser: ArgumentParser) -> None:
         "--popping", action="store_true", help="also how evenly the picture changes with the dial and with the camera"
     )
     parser.add_argument("--report", metavar="OUT.html", help="also a page to look at, and beside it its charts")
+    add_device(parser, "render")
     add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
@@ -85,6 +91,7 @@ def render_options(parser: ArgumentParser) -> None:
         help="photographs whose cameras to render, by name, or all, or held-out (default)",
     )  # fmt: skip
     parser.add_argument("--beside", action="store_true", help="put the photograph left of the renderings")
+    add_device(parser, "render")
     add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
@@ -112,6 +119,7 @@ def robustness_options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--misaligned-ok", action="store_true", help="train even where a checkpoint does not fit the photographs"
     )
+    add_device(parser, "train and measure")
     add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 

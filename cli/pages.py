@@ -149,4 +149,4 @@ def _rendered(gaussians: Gaussians, view: View, virtual_scale: float, title: str
     rendering = render(gaussians, view.camera, virtual_scale)
     kept, error = int(rendering.kept.sum()), psnr(rendering.image, view.image)
     detail = f"{error:.2f} dB on this view, {kept:,} Gaussians ({kept / max(len(gaussians), 1):.0%})"
-    return Picture(rendering.image.numpy(), title, detail)
+    return Picture(rendering.image.cpu().numpy(), title, detail)

@@ -16,6 +16,7 @@ from torch import Tensor
 from clod_adapter.cameras import Camera, Scene, View
 from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console
+from clod_adapter.cli.devices import on_device, pick_device
 from clod_adapter.cli.evaluate import choose_dials
 from clod_adapter.cli.inputs import read_checkpoint, read_scene
 from clod_adapter.cli.kernels import prepare_kernels
@@ -40,7 +41,8 @@ class Picture:
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
-    model = read_checkpoint(args.model, console, args.activated)
+    device = pick_device(args.device, console)
+    model = on_device(read_checkpoint(args.model, console, args.activated), device)
     scene = read_scene(args.images, console, model.origin)
     views = pick_views(scene, args.views)
     solved, notes = solve_dials(args, model, [view.camera for view in views], console)
@@ -48,7 +50,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     notes += beyond
     for note in notes:
         console.say(note)
-    prepare_kernels(console, training=False)
+    prepare_kernels(console, device, training=False)
     gaussians, pictures, interrupted = model.gaussians.without_empty_bands(), [], False
     try:
         with console.meter("render") as meter:
@@ -112,7 +114,7 @@ def draw(
     """Writes a picture for each view: the dial values from left to right, behind the photograph with ``beside``."""
     for view, name in zip(views, files(views), strict=True):
         shown = [render(gaussians, view.camera, dial) for dial in dials]
-        panels = [picture.pixels for picture in shown]
+        panels = [picture.pixels.cpu() for picture in shown]
         write_png(out / name, torch.cat([view.image, *panels] if beside else panels, dim=1))
         kept = [int(picture.kept.sum()) for picture in shown]
         yield Picture(view.camera.name, str(out / name), kept, [psnr(p.image, view.image) for p in shown])

@@ -50,7 +50,9 @@ def machine() -> dict[str, Any]:
     import numba
     import torch
 
+    gpu = {"gpu": torch.cuda.get_device_name()} if torch.cuda.is_available() else {}
     return {
+        **gpu,
         "cpu": _cpu_name(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
@@ -60,9 +62,11 @@ def machine() -> dict[str, Any]:
     }
 
 
-def machine_name() -> str:
-    """The machine in a line: what frame times depend on most."""
+def machine_name(device: str = "cpu") -> str:
+    """The machine in a line: what frame times on that kind of device depend on most."""
     about = machine()
+    if device == "cuda":
+        return about["gpu"]
     return f"{about['cpu']}, {about['threads']} threads"
 
 

@@ -107,7 +107,7 @@ class Saver:
             try:
                 follow(progress)
             except KeyboardInterrupt:
-                if self.stop.requests == 1:
+                if self.stop.requests < 2:
                     self._save(progress)
                 raise
             if time.perf_counter() >= self.due and progress.share < 1:

@@ -13,6 +13,7 @@ from clod_adapter.cameras import Scene
 from clod_adapter.cli.alignment import require_alignment
 from clod_adapter.cli.cells import Cell, cells_of
 from clod_adapter.cli.console import Console, Meter, duration
+from clod_adapter.cli.devices import on_device, pick_device
 from clod_adapter.cli.files import check_output, labels, make_folder
 from clod_adapter.cli.inputs import read_checkpoint, read_scene
 from clod_adapter.cli.interrupts import GracefulStop
@@ -48,7 +49,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         console.say(f"{len(found)} of {len(cells)} cells are there already: {', '.join(found)}")
     if missing:
         with watch.time("kernels"):
-            prepare_kernels(console)
+            prepare_kernels(console, checkpoints[0].gaussians.means.device)
         with watch.time("evaluate"):
             for checkpoint in checkpoints:
                 if any(cell.checkpoint is checkpoint for cell in missing):
@@ -73,10 +74,10 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 def read_checkpoints(args: argparse.Namespace, console: Console) -> list[Checkpoint]:
     """All of them, relative to one origin."""
-    found = list[Checkpoint]()
+    found, device = list[Checkpoint](), pick_device(args.device, console)
     for path in args.ply:
         origin = found[0].origin if found else None
-        found.append(read_checkpoint(path, console, args.activated, origin))
+        found.append(on_device(read_checkpoint(path, console, args.activated, origin), device))
         if found[-1].gaussians.sigma_d is not None:
             console.say(f"  note: the dial of {path} plays no part: it is taken as a checkpoint without one")
     return found

@@ -6,12 +6,16 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
+from clod_adapter.cli.launch import launched
 from clod_adapter.config import AdaptConfig, describe
 from clod_adapter.errors import ClodError
 
 OPTIONS: dict[str, Any] = {
-    "max_sv": ("S", float), "iters": ("N", int), "time_budget": ("SEC", float), "seed": ("N", int)
+    "max_sv": ("S", float), "iters": ("N", int), "batch": ("N", int), "time_budget": ("SEC", float),
+    "seed": ("N", int),
 }  # fmt: skip
+# Those whose default another one has a say in: as many views are seen whatever the batch.
+DEFAULTS = {"iters": "1500, divided by the batch", "batch": "1; of several processes, one each"}
 
 
 def add_settings(parser: argparse.ArgumentParser, without: Sequence[str] = ()) -> None:
@@ -20,8 +24,9 @@ def add_settings(parser: argparse.ArgumentParser, without: Sequence[str] = ()) -
     for name, (metavar, kind) in OPTIONS.items():
         if name in without:
             continue
-        default = getattr(defaults, name)
-        shown = "" if default is None else f" (default: {default:g})"
+        default = None if name in DEFAULTS else getattr(defaults, name)
+        shown = f" (default: {DEFAULTS[name]})" if name in DEFAULTS else ""
+        shown = shown if default is None else f" (default: {default:g})"
         parser.add_argument(
             f"--{name.replace('_', '-')}", metavar=metavar, type=kind, default=default, help=helps[name] + shown
         )
@@ -41,11 +46,17 @@ def make_config(args: argparse.Namespace) -> AdaptConfig:
     if args.max_sv >= limit:
         raise ClodError(f"--max-sv is {args.max_sv:g}, it must be below {limit:g}, where nothing survives the cut")
     given = {name: getattr(args, name) for name in OPTIONS}
+    size = launched().size
+    given["batch"] = size if given["batch"] is None else given["batch"]
+    if given["iters"] is None:
+        given["iters"] = max(round(make().iters / max(given["batch"], 1)), 1)
     for name, value in given.items():  # one at a time, which tells the option to name
         try:
             make(**{name: value})
         except ClodError as error:
             raise ClodError(f"--{name.replace('_', '-')}{_without_name(str(error), name)}") from error
+    if given["batch"] < size:
+        raise ClodError(f"--batch is {given['batch']}, it must be at least {size}: a view for each process")
     return make(**given)
 
 

@@ -68,6 +68,9 @@ class Follower:
         steps = f"step {progress.done}" if by_time else f"{progress.done}/{progress.total}"
         error = self.error if progress.phase == "train" else ""
         self.meter.update(progress.share, f"{steps}, {error}".removesuffix(", "))
+        if progress.lost:
+            self.close()
+            raise KeyboardInterrupt  # with which its state is saved
         if self.stop.requests:
             self.close()
             if self.phase == "train":

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
 import sys
-import webbrowser
 from typing import Any
 
 from clod_adapter.cameras import Camera
+from clod_adapter.cli.browsers import open_browser
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.dials import opens_at
 from clod_adapter.cli.inputs import read_checkpoint
@@ -21,7 +19,6 @@ from clod_adapter.viewer.payload import Payload, page_config
 from clod_adapter.viewer.server import Answer, Server
 
 MODEL, BASE = "/files/model", "/files/base"
-IN_TERMINAL = ("lynx", "w3m", "links", "links2", "elinks", "www-browser")  # those would take it over
 
 
 def run(args: argparse.Namespace) -> None:
@@ -61,23 +58,3 @@ def prepare(args: argparse.Namespace, console: Console) -> tuple[dict[str, Answe
         "command": "view", "version": package_version(), "model": args.model, "base": args.base, "scene": args.images,
         "base_count": len(model.gaussians), "cameras": len(cameras), "notes": [*model.notes, *notes],
     }  # fmt: skip
-
-
-def open_browser(url: str) -> bool:
-    """Whether a browser was opened in a window of its own; one that runs in the terminal is none."""
-    try:
-        browser = webbrowser.get()
-    except webbrowser.Error:
-        return False
-    if type(browser) is not webbrowser.GenericBrowser:
-        return browser.open(url)
-    if "BROWSER" not in os.environ or browser.basename in IN_TERMINAL:
-        return False
-    # A program of the user's, or of an editor that shows the page where its window is. Its open() would wait for it.
-    command = [browser.name, *(word.replace("%s", url) for word in browser.args)]
-    nowhere = subprocess.DEVNULL
-    try:
-        subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere, start_new_session=True)
-    except OSError:
-        return False
-    return True

@@ -27,6 +27,7 @@ from clod_adapter.cameras import View
 from clod_adapter.config import require
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import spread
+from clod_adapter.losses import unit
 from clod_adapter.render import render
 
 MOST_VIEWS = 8
@@ -122,7 +123,7 @@ def compare(gaussians: Gaussians, view: View) -> Tensor | None:
     The squared error of the render over black, over white, and of the photograph's mean colour (its variance); the
     render's variance, and the covariance of the two.
     """
-    photograph = view.image.to(gaussians.means) / 255
+    photograph = unit(view.image, gaussians.means)
     about = photograph - photograph.mean((0, 1))
     if float(about.square().mean().sqrt()) < FLAT:
         return None

@@ -80,7 +80,7 @@ class _Stage:
         chosen = spread(range(len(views)), VIEWS)
         self.index = torch.tensor(list(chosen))
         self.views = [_shrunk(views[k], width) for k in chosen]
-        self.middle = gaussians.means.double().median(dim=0).values
+        self.middle = gaussians.means.double().median(dim=0).values.cpu()  # where cameras are
         if len(gaussians) > MOST_GAUSSIANS:
             cover = F.logsigmoid(gaussians.opacity_logits) + gaussians.log_scales.topk(2, dim=1).values.sum(1)
             gaussians = gaussians.select(cover.topk(MOST_GAUSSIANS).indices)

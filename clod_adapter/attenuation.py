@@ -39,6 +39,7 @@ from torch.autograd.function import once_differentiable
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, require
 from clod_adapter.errors import ClodError
+from clod_adapter.fusing import Fused, Number
 
 SIGMA_MAX = 1e9
 """Stands for an infinite sigma_d. The factor is exactly 1 for d s < 2e5 in float32, d s < 10 in float64."""
@@ -73,9 +74,13 @@ def normalized_distances(means: Tensor, camera: Camera, config: AttenuationConfi
     """
     means = means.to(torch.promote_types(means.dtype, torch.float32))  # float16's square overflows from 256 on
     with torch.autocast(means.device.type, enabled=False):  # it would round the camera's place to 3 digits
-        x, y, z = (means - camera.position.to(means)).unbind(1)  # three times as fast as a norm over rows of 3
-        distances = x.square().addcmul_(y, y).addcmul_(z, z).sqrt_()
+        distances = _distances(means, camera.position.to(means))
         return distances.div_(normalizing_distance(distances, means, camera, config))
+
+
+def _distances(means: Tensor, position: Tensor) -> Tensor:
+    x, y, z = (means - position).unbind(1)  # three times as fast as a norm over rows of 3
+    return x.square().addcmul_(y, y).addcmul_(z, z).sqrt_()
 
 
 @torch.no_grad()
@@ -151,9 +156,36 @@ def attenuate(
         ClodError: the dial is below 1 or not finite, or the shapes differ.
     """
     check_dial(virtual_scale)
-    opacity_logits, sigma_d, d = conform(opacity_logits=opacity_logits, sigma_d=sigma_d, d=d)
-    opacities, log_opacities = _Attenuate.apply(opacity_logits, sigma_d, d.detach(), float(virtual_scale), config.eps)
-    return _cut(opacities, log_opacities, virtual_scale, config)
+    tensors = conform(opacity_logits=opacity_logits, sigma_d=sigma_d, d=d.detach())
+    numbers = float(virtual_scale), log_threshold(config.tau, virtual_scale)
+    return Attenuated(*_attenuated(*tensors, *numbers, eps=config.eps, cut=config.cut))
+
+
+def attenuate_seen(
+    means: Tensor, opacity_logits: Tensor, sigma_d: Tensor, camera: Camera, virtual_scale: float,
+    config: AttenuationConfig,
+) -> Attenuated:  # fmt: skip
+    """``attenuate`` of ``normalized_distances``.
+
+    On a GPU, of many Gaussians, compiled to one pass (``fusing``): of a float32 Gaussian it reads 20 bytes (centre,
+    logit, sigma) and writes the 13 of the results. The plain passes move 340 to 370.
+
+    Raises:
+        ClodError: the dial is below 1 or not finite, or the shapes differ.
+    """
+    if not _seen.compiles(means):
+        distances = normalized_distances(means, camera, config)
+        return attenuate(opacity_logits, sigma_d, distances, virtual_scale, config)
+    check_dial(virtual_scale)
+    with torch.no_grad(), torch.autocast(means.device.type, enabled=False):
+        means = means.detach().to(torch.promote_types(means.dtype, torch.float32))
+        position = camera.position.to(means)
+        unit: Number = config.scene_distance
+        if config.normalizer != "scene":
+            unit = normalizing_distance(_distances(means, position), means, camera, config)
+    logits, sigma, _ = conform(opacity_logits=opacity_logits, sigma_d=sigma_d, x=means[:, 0])
+    numbers = float(virtual_scale), log_threshold(config.tau, virtual_scale)
+    return Attenuated(*_seen(means, position, unit, logits, sigma, *numbers, eps=config.eps, cut=config.cut))
 
 
 def attenuate_activated(
@@ -169,21 +201,48 @@ def attenuate_activated(
         ClodError: the dial is below 1 or not finite, or the shapes differ.
     """
     check_dial(virtual_scale)
-    opacities, sigma_d, d = conform(opacities=opacities, sigma_d=sigma_d, d=d)
+    tensors = conform(opacities=opacities, sigma_d=sigma_d, d=d.detach())
+    numbers = float(virtual_scale), log_threshold(config.tau, virtual_scale)
+    return Attenuated(*_activated(*tensors, *numbers, eps=config.eps, cut=config.cut))
+
+
+Fields = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+def _from_logits(
+    logits: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, threshold: Number, *, eps: float, cut: str
+) -> Fields:
+    opacities, log_opacities = _Attenuate.apply(logits, sigma, d, virtual_scale, eps)
+    return _cut(opacities, log_opacities, threshold, cut)
+
+
+def _from_centres(
+    means: Tensor, position: Tensor, unit: Number, logits: Tensor, sigma: Tensor, virtual_scale: Number,
+    threshold: Number, *, eps: float, cut: str,
+) -> Fields:  # fmt: skip
+    d = _distances(means, position).div_(unit)
+    return _from_logits(logits, sigma, d, virtual_scale, threshold, eps=eps, cut=cut)
+
+
+def _from_opacities(
+    opacities: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, threshold: Number, *, eps: float, cut: str
+) -> Fields:
     opaque = torch.full_like(opacities, math.inf)
-    factor, log_factor = _Attenuate.apply(opaque, sigma_d, d.detach(), float(virtual_scale), config.eps)
+    factor, log_factor = _Attenuate.apply(opaque, sigma, d, virtual_scale, eps)
     nothing = opacities <= 0
     logs = opacities.masked_fill(nothing, 1).log().masked_fill(nothing, -math.inf)  # no slope, rather than 1 / 0
-    return _cut(opacities * factor, logs + log_factor, virtual_scale, config)
+    return _cut(opacities * factor, logs + log_factor, threshold, cut)
 
 
-def _cut(opacities: Tensor, log_opacities: Tensor, virtual_scale: float, config: AttenuationConfig) -> Attenuated:
-    """Who stays of the faded opacities, and what is drawn of them."""
-    threshold = log_threshold(config.tau, virtual_scale)
+_attenuated, _seen, _activated = Fused(_from_logits), Fused(_from_centres), Fused(_from_opacities)
+
+
+def _cut(opacities: Tensor, log_opacities: Tensor, threshold: Number, cut: str) -> Fields:
+    """The fields of ``Attenuated``: the faded opacities, who stays of them, and what is drawn."""
     keep = log_opacities.detach() > threshold
     # The hard cut's product is five times as fast as where.
-    drawn = opacities * keep.to(opacities) if config.cut == "hard" else _Fade.apply(opacities, log_opacities, threshold)
-    return Attenuated(opacities, log_opacities, keep, drawn)
+    drawn = opacities * keep.to(opacities) if cut == "hard" else _Fade.apply(opacities, log_opacities, threshold)
+    return opacities, log_opacities, keep, drawn
 
 
 class _Attenuate(Function):
@@ -194,7 +253,7 @@ class _Attenuate(Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, logits: Tensor, sigma: Tensor, d: Tensor, virtual_scale: float, eps: float) -> Any:
+    def forward(ctx: Any, logits: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, eps: float) -> Any:
         dtype, variance = logits.dtype, twice_variance(sigma, eps)
         u = d.double().mul(virtual_scale).square_().div_(variance)
         if eps == 0:  # then the variance may be 0, and 0/0 is to be 0
@@ -228,7 +287,7 @@ class _Fade(Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, opacities: Tensor, log_opacities: Tensor, threshold: float) -> Tensor:
+    def forward(ctx: Any, opacities: Tensor, log_opacities: Tensor, threshold: Number) -> Tensor:
         share = (log_opacities - threshold).clamp_(max=1).expm1_().mul_(2).clamp_(0, 1)
         ctx.save_for_backward(opacities, share)
         return opacities * share

@@ -31,6 +31,7 @@ from clod_adapter.config import AttenuationConfig, require
 from clod_adapter.errors import ClodError
 from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.rasterizers import wait_for
 from clod_adapter.render import render
 
 TIMED_VIEWS, TIMED_DIALS, TIMED_REPEATS = 4, 6, 2
@@ -142,8 +143,10 @@ def frame_times(
     render(gaussians, seen[0], max_sv)  # compiled and warm before the clock starts
     for done in range(TIMED_REPEATS * len(seen)):
         for taken, virtual_scale in zip(times, virtual_scales, strict=True):  # in turn: a machine's pace drifts
+            wait_for(gaussians.means.device)
             began = time.perf_counter()
             render(gaussians, seen[done % len(seen)], virtual_scale)
+            wait_for(gaussians.means.device)
             taken.append((time.perf_counter() - began) * 1e3)
         if progress:
             progress((done + 1) * len(times), TIMED_REPEATS * len(seen) * len(times))

@@ -105,11 +105,14 @@ class Scene:
         train: views to learn from.
         test: held-out views.
         notes: what was done to the images on the way in, one line each, for the report.
+        left_out: what of the reading this scene does not need, each with the reason: ``("undistortion", "all 97
+            cameras are pinholes")``. Empty for a scene that was not read.
     """
 
     train: tuple[View, ...]
     test: tuple[View, ...]
     notes: tuple[str, ...] = ()
+    left_out: tuple[tuple[str, str], ...] = ()
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:

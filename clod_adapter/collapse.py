@@ -18,7 +18,8 @@ COLOUR_FLOOR = 0.03  # below this difference of colours (of 1) any two are alike
 APART = 0.05  # what being far apart counts, beside a squared difference of colours
 UNLIKE = 1e12  # for colours or sizes that are not finite
 STUCK = 0.02  # of those left: if fewer leave in a round, the cheapest LEAVING do whoever their heirs are
-ROWS = 1 << 18  # whose neighbours are held at a time
+ROWS = 1 << 17  # whose neighbours are held at a time
+BLOCK = 1 << 13  # of these, whose likeness is worked out at a time: what stays in cache is three times as fast
 CROWD = 64  # Gaussians exactly in one place, from which on they are moved apart,
 JITTER = 1e-6  # by so much of their size: a k-d tree cannot part them, and compares each with all others
 
@@ -82,7 +83,9 @@ def _leaving(cost: np.ndarray, heir: np.ndarray) -> np.ndarray:
     rank[cheapest] = np.arange(len(cost))
     cheapest = cheapest[: max(int(LEAVING * len(cost)), 1)]
     leaving = cheapest[rank[heir[cheapest]] > rank[cheapest]]
-    leaving = leaving[~np.isin(leaving, heir[leaving])]
+    inherits = np.zeros(len(cost), bool)
+    inherits[heir[leaving]] = True
+    leaving = leaving[~inherits[leaving]]
     # Where many are alike and in one place they all have the same heirs, and would leave one by one.
     return leaving if len(leaving) > STUCK * len(cost) else cheapest
 
@@ -91,16 +94,35 @@ def _heirs(centres: np.ndarray, colours: np.ndarray, sizes: np.ndarray) -> tuple
     """The neighbour that is most like each, and how unlike it is."""
     from scipy.spatial import cKDTree  # only here: it takes a fifth of a second to import
 
-    tree, found = cKDTree(centres), []
-    for rows in np.array_split(np.arange(len(centres)), -(-len(centres) // ROWS)):
-        apart, near = tree.query(centres[rows], min(NEIGHBOURS + 1, len(centres)), workers=threads.worker_count())
-        apart, reach = np.square(apart), np.square(sizes[rows, None] + sizes[near])
-        with np.errstate(invalid="ignore"):  # inf - inf
-            colour = np.square(colours[rows, None] - colours[near]).sum(2)
-        unlike = colour + COLOUR_FLOOR**2 + APART * apart / np.maximum(apart + reach, np.finfo(float).tiny)
-        unlike = np.nan_to_num(unlike, nan=UNLIKE, posinf=UNLIKE)
-        unlike[near == rows[:, None]] = np.inf  # itself
-        best = unlike.argmin(1)[:, None]
-        found.append((np.take_along_axis(near, best, 1)[:, 0], np.take_along_axis(unlike, best, 1)[:, 0]))
-    heir, unlike = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    tree, heir, unlike = cKDTree(centres), np.empty(len(centres), np.int64), np.empty(len(centres))
+    channels = np.ascontiguousarray(colours.T)
+    # In the tree's own order, in which what follows on each other lies together: a third of the time where a file's
+    # rows are in none.
+    for part in np.array_split(tree.indices, -(-len(centres) // ROWS)):
+        apart, near = tree.query(centres[part], min(NEIGHBOURS + 1, len(centres)), workers=threads.worker_count())
+        for at in range(0, len(part), BLOCK):
+            rows, these = part[at : at + BLOCK], slice(at, at + BLOCK)
+            heir[rows], unlike[rows] = _most_alike(rows, near[these].T, apart[these].T, channels, sizes)
     return heir, unlike
+
+
+def _most_alike(
+    rows: np.ndarray, near: np.ndarray, apart: np.ndarray, channels: np.ndarray, sizes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of the neighbours ``near [K, n]`` of ``rows [n]``, so far ``apart``: which is most like, and how unlike it is.
+
+    Args:
+        channels: ``[3, N]`` colours.
+    """
+    heir, least = near[0].copy(), np.full(len(rows), np.inf)
+    own, size = channels[:, rows], sizes[rows]
+    with np.errstate(invalid="ignore"):  # inf - inf
+        for other, distance in zip(near, np.square(apart), strict=True):
+            red, green, blue = np.square(own - channels[:, other])
+            reach = np.square(size + sizes[other])
+            unlike = red + green + blue + COLOUR_FLOOR**2
+            unlike += APART * distance / np.maximum(distance + reach, np.finfo(float).tiny)
+            unlike = np.nan_to_num(unlike, nan=UNLIKE, posinf=UNLIKE)
+            better = (unlike < least) & (other != rows)
+            heir[better], least[better] = other[better], unlike[better]
+    return heir, least

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import TypeVar
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.attenuation import SIGMA_MAX, normalized_distances, normalizing_distance
-from clod_adapter.cameras import View
+from clod_adapter.cameras import Camera, View
 from clod_adapter.collapse import leaving_order
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
@@ -34,7 +34,11 @@ FADING = 1.5  # times the threshold: fainter ones are drawn less than they are (
 
 
 def start(
-    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Callable[[str, int, int], None] | None = None
+    base: Gaussians,
+    views: Sequence[View],
+    config: AdaptConfig,
+    progress: Callable[[str, int, int], None] | None = None,
+    each: Callable[..., Iterable[Tensor]] = map,
 ) -> Gaussians:
     """The Gaussians with a sigma_d to train from, by what they do in up to MOST_VIEWS of the views, evenly spread.
 
@@ -44,6 +48,7 @@ def start(
     Args:
         progress: called with "start" and the number of views done, and of those that are looked at in all; then with
             "order" and the number of Gaussians whose place is known, and of all of them.
+        each: as ``removal_error`` takes it.
     """
     if base.sigma_d is not None and base.attenuation is not None and bool((base.sigma_d < SIGMA_MAX).any()):
         return base.replace(attenuation=dataclasses.replace(base.attenuation, max_sv=config.max_sv))
@@ -51,8 +56,9 @@ def start(
     attenuation = config.attenuation(scene_distance(base, views, config.quantile))
     if config.start in ("constant", "identity"):
         value = 1.0 if config.start == "constant" else WIDEST * config.max_sv
-        return base.replace(sigma_d=torch.full((len(base),), value), attenuation=attenuation)
-    error = removal_error(base, views, seed=config.seed, progress=partial(progress, "start") if progress else None)
+        return base.replace(sigma_d=torch.full_like(base.means[:, 0], value), attenuation=attenuation)
+    looked = partial(progress, "start") if progress else None
+    error = removal_error(base, views, seed=config.seed, progress=looked, each=each)
     attenuation = dataclasses.replace(attenuation, tau=fitting_tau(base.opacities, error, config))
     importance = error
     if config.start == "importance":
@@ -113,13 +119,18 @@ def scene_distance(base: Gaussians, views: Sequence[View], quantile: float) -> f
     probe = AttenuationConfig(normalizer="quantile", quantile=quantile)
     total = 0.0
     for view in views:
-        distances = (base.means - view.camera.position).norm(dim=1)
+        distances = (base.means - view.camera.position.to(base.means)).norm(dim=1)
         total += float(normalizing_distance(distances, base.means, view.camera, probe))
     return total / len(views)
 
 
 def removal_error(
-    gaussians: Gaussians, views: Sequence[View], *, seed: int = 0, progress: Callable[[int, int], None] | None = None
+    gaussians: Gaussians,
+    views: Sequence[View],
+    *,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    each: Callable[..., Iterable[Tensor]] = map,
 ) -> Tensor:
     """``[N]`` estimate of the squared picture error that removing each Gaussian alone would cause.
 
@@ -130,15 +141,22 @@ def removal_error(
 
     Args:
         progress: called with the number of views done after each, and of all of them.
+        each: as the built-in ``map``, to share out the views.
     """
     generator = torch.Generator().manual_seed(seed)
-    total = torch.zeros(len(gaussians))
-    for done, view in enumerate(views, 1):
+    cameras = [view.camera for view in views]
+    drawn = ((c, torch.randint(0, 2, (c.height, c.width, 3), generator=generator, dtype=torch.uint8)) for c in cameras)
+
+    def error(drawn: tuple[Camera, Tensor]) -> Tensor:
         opacities = gaussians.opacities.detach().requires_grad_()
-        image, _ = splat(gaussians, opacities, view.camera)
-        signs = torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
+        image, _ = splat(gaussians, opacities, drawn[0])
+        signs = drawn[1].to(image.device).to(image) * 2 - 1
         (gradient,) = torch.autograd.grad((image * signs).sum(), opacities)  # as grad_outputs they would import sympy
-        total += (gradient * opacities.detach()).square()
+        return (gradient * opacities.detach()).square()
+
+    total = torch.zeros_like(gaussians.means[:, 0])
+    for done, of_view in enumerate(each(error, drawn), 1):
+        total += of_view
         if progress:
             progress(done, len(views))
     return total / max(len(views), 1)
@@ -146,7 +164,7 @@ def removal_error(
 
 def typical_distance(gaussians: Gaussians, views: Sequence[View], config: AttenuationConfig) -> Tensor:
     """``[N]`` the geometric mean over views of the normalised distance."""
-    logs = torch.zeros(len(gaussians))
+    logs = torch.zeros_like(gaussians.means[:, 0])
     for view in views:
         logs += normalized_distances(gaussians.means, view.camera, config).clamp(min=1e-6).log()
     return (logs / max(len(views), 1)).exp()
@@ -171,8 +189,8 @@ def sigma_from_importance(
         distances: ``[N]`` normalised distance at which the law is to hold.
         share: of all Gaussians, kept at s = 1; in (0.5, 1].
     """
-    rank = torch.empty(len(importance))
-    rank[importance.argsort(descending=True, stable=True)] = (torch.arange(len(importance)) + 0.5) / len(importance)
+    rank, order = torch.empty_like(distances), importance.argsort(descending=True, stable=True)
+    rank[order] = (torch.arange(len(rank), device=rank.device) + 0.5) / len(rank)
     power = (1 / rank + (rank**-2 - 4 * (1 / share - 1)).clamp(min=0).sqrt()) / 2
     extinction = torch.where(rank <= share, power ** (1 / exponent), share / rank)
     return sigma_for_extinction(gaussians.opacity_logits, distances, extinction, config)

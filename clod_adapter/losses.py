@@ -21,7 +21,7 @@ def ssim(image: Tensor, target: Tensor) -> float:
     """
     if _fusable(image):
         return float(_Fused(image, target).ssim_sum / image.numel())
-    return float(ssim_plain(image.detach(), target.to(image) / 255))
+    return float(ssim_plain(image.detach(), unit(target, image)))
 
 
 def ssim_plain(image: Tensor, target: Tensor) -> Tensor:
@@ -55,8 +55,13 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
 
 def photometric_loss_plain(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
     """The plain twin of ``photometric_loss``."""
-    wanted = target.to(image) / 255
+    wanted = unit(target, image)
     return (1 - ssim_weight) * (image - wanted).abs().mean() + ssim_weight * (1 - ssim_plain(image, wanted))
+
+
+def unit(photograph: Tensor, like: Tensor) -> Tensor:
+    """A uint8 photograph in [0, 1], of the type and on the device of ``like``; as bytes on its way there."""
+    return photograph.to(like.device, non_blocking=True).to(like.dtype) / 255
 
 
 def _fusable(image: Tensor) -> bool:

@@ -6,7 +6,7 @@ import math
 
 from torch import Tensor
 
-from clod_adapter.losses import ssim
+from clod_adapter.losses import ssim, unit
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
@@ -14,7 +14,7 @@ def psnr(image: Tensor, target: Tensor) -> float:
 
     ``-10 log10 mean (image - target)^2``; infinite for equal images.
     """
-    error = float((image.detach().clamp(0, 1) - target.to(image) / 255).double().square().mean())
+    error = float((image.detach().clamp(0, 1) - unit(target, image)).double().square().mean())
     return -10 * math.log10(error) if error > 0 else math.inf
 
 

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from clod_adapter.losses import unit
+
 INSTALL = "pip install 'clod-adapter[eval]'"
 WEIGHTS = """python -c "import torchvision; torchvision.models.alexnet(weights='DEFAULT')\""""
 
@@ -19,7 +21,16 @@ Metric = Callable[[Tensor, Tensor], float]
 
 
 class Unavailable(Exception):
-    """A metric cannot be computed here; says why, and what to run."""
+    """A metric cannot be computed here.
+
+    Args:
+        found: why; without it, because its package is not installed.
+        fix: what to run; empty where ``found`` says all there is to say.
+    """
+
+    def __init__(self, found: str = "", fix: str = "") -> None:
+        super().__init__("; once, online: ".join(each for each in (found, fix) if each))
+        self.found, self.fix = found or "not installed", fix
 
 
 def available_metrics() -> tuple[dict[str, Metric], list[str]]:
@@ -31,7 +42,7 @@ def available_metrics() -> tuple[dict[str, Metric], list[str]]:
     """
     found: dict[str, Metric] = {}
     missing: dict[str, list[str]] = {}
-    for name, make in (("lpips", _make_lpips), ("flip", _make_flip)):
+    for name, make in METRICS.items():
         try:
             found[name] = make()
         except Unavailable as reason:
@@ -45,12 +56,12 @@ def _make_lpips() -> Metric:
         import lpips
         from torchvision.models import AlexNet_Weights
     except ImportError as error:
-        raise Unavailable(INSTALL) from error
+        raise Unavailable(fix=INSTALL) from error
     except RuntimeError as error:  # torchvision's, where it was built for another torch
         raise Unavailable(f"torchvision does not fit this torch: {' '.join(str(error).split())}") from error
     weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(AlexNet_Weights.IMAGENET1K_V1.url).name
     if not weights.is_file():  # lpips would download it
-        raise Unavailable(f"its network's weights are not at {weights}; once, online: {WEIGHTS}")
+        raise Unavailable(f"its network's weights are not at {weights}", WEIGHTS)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # lpips calls torchvision in a way that is deprecated
         return partial(_lpips, lpips.LPIPS(net="alex", verbose=False))
@@ -60,21 +71,25 @@ def _make_flip() -> Metric:
     try:
         import flip_evaluator
     except ImportError as error:
-        raise Unavailable(INSTALL) from error
+        raise Unavailable(fix=INSTALL) from error
     return partial(_flip, flip_evaluator.evaluate)
+
+
+# How each is made; raises Unavailable.
+METRICS: dict[str, Callable[[], Metric]] = {"lpips": _make_lpips, "flip": _make_flip}
 
 
 @torch.no_grad()
 def _lpips(network: Any, image: Tensor, target: Tensor) -> float:
-    ours, theirs = (x.permute(2, 0, 1)[None].contiguous() for x in _unit(image, target))
+    ours, theirs = (x.permute(2, 0, 1)[None].contiguous() for x in _both(image, target))
     return float(network.to(ours.device)(ours, theirs, normalize=True))
 
 
 def _flip(evaluate: Any, image: Tensor, target: Tensor) -> float:
-    ours, theirs = (x.cpu().numpy() for x in _unit(image, target))
+    ours, theirs = (x.cpu().numpy() for x in _both(image, target))
     return float(evaluate(theirs, ours, "LDR", applyMagma=False)[1])
 
 
-def _unit(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+def _both(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     image = image.detach().float().clamp(0, 1).contiguous()
-    return image, target.to(image) / 255
+    return image, unit(target, image)

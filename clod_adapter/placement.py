@@ -109,7 +109,7 @@ def imagine(
     teacher = gaussians.without_empty_bands()
     views = []
     for camera in cameras:
-        views.append(View(camera, render(teacher, camera).pixels))
+        views.append(View(camera, render(teacher, camera).pixels.cpu()))
         if progress:
             progress(len(views), len(cameras))
     held_out = range(0, len(views), TEST_EVERY) if len(views) > 1 else range(0)
@@ -171,9 +171,9 @@ def _anywhere(gaussians: Gaussians, count: int, reach: float, zoom: float, gener
     """Looking at Gaussians drawn by opacity over size, from uniform directions, at half to twice the reach."""
     interest = gaussians.opacities / _size(gaussians).clamp(min=1e-12)
     # Drawn by hand, as torch.multinomial has a limit of 2^24 weights.
-    ends = interest.double().cumsum(0)
+    ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
     drawn = torch.searchsorted(ends, torch.rand(count, generator=generator, dtype=torch.float64) * ends[-1])
-    targets = gaussians.means[drawn.clamp(max=len(gaussians) - 1)]
+    targets = gaussians.means[drawn.clamp(max=len(gaussians) - 1).to(gaussians.means.device)].cpu()
     sides = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     away = reach * 2 ** (2 * torch.rand(count, 1, generator=generator) - 1)
     return [_looking(eye, target, zoom) for eye, target in zip(targets + away * sides, targets, strict=True)]
@@ -210,7 +210,8 @@ def _score(gaussians: Gaussians, camera: Camera) -> float:
     covered = float(alpha.sum())
     if covered < 0.1 * alpha.numel():
         return -math.inf
-    depths = gaussians.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+    row = camera.viewmat[2].to(gaussians.means)
+    depths = gaussians.means @ row[:3] + row[3]
     pixels = _size(gaussians) * WIDTH / camera.width * camera.K[0, 0] / depths.clamp(min=1e-6)
     shade = (pixels.clamp(1e-3, 1e4).log() + 7)[:, None, None].expand(-1, 1, 3)  # positive, as colours are
     sizes, _ = splat(

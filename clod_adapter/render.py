@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import Attenuated, attenuate, normalized_distances
+from clod_adapter.attenuation import Attenuated, attenuate_seen
 from clod_adapter.cameras import Camera
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
@@ -48,10 +48,9 @@ def dial(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Attenuat
         log_opacities = torch.nn.functional.logsigmoid(gaussians.opacity_logits)
         keep = torch.ones(len(gaussians), dtype=torch.bool, device=log_opacities.device)
         return Attenuated(gaussians.opacities, log_opacities, keep, gaussians.opacities)
-    distances = normalized_distances(gaussians.means, camera, gaussians.attenuation)
-    return attenuate(
-        gaussians.opacity_logits, gaussians.sigma_d, distances, virtual_scale, gaussians.attenuation
-    )  # fmt: skip
+    return attenuate_seen(
+        gaussians.means, gaussians.opacity_logits, gaussians.sigma_d, camera, virtual_scale, gaussians.attenuation
+    )
 
 
 def splat(

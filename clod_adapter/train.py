@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,10 +13,12 @@ from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.cameras import Scene, View, camera_extent
 from clod_adapter.config import AdaptConfig
+from clod_adapter.distributed import PeerLost, Peers
+from clod_adapter.drawing import Draws
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import seeing, start
-from clod_adapter.objective import Objective, Part
+from clod_adapter.objective import Objective, Part, Pull
 from clod_adapter.optimizer import RowAdam
 from clod_adapter.training_state import Adapted, Progress, TrainingState
 
@@ -36,6 +37,7 @@ def adapt(
     resume: TrainingState | None = None,
     *,
     part: Part | None = None,
+    peers: Peers | None = None,
 ) -> Adapted:
     """Learns sigma_d for ``base`` on the training views of ``scene``, and updates the rest lightly.
 
@@ -49,23 +51,29 @@ def adapt(
     ``AdaptConfig.paper`` gives CLoD-GS's own objective instead (section 3.3): one s a step and
     ``w_s (L_render + reg_weight L_reg)`` with ``L_reg = (s - 1)^2 relu(eta - s^-exponent)^2``, eta the share kept.
 
-    A KeyboardInterrupt ends training and returns what there is: before the last ``average`` of the steps, no mean.
+    A KeyboardInterrupt ends training and returns what there is: before the last ``average`` of the steps, no mean. So
+    does the loss of a process that trains along, after a last call of ``progress``; of several processes that were
+    given the same, a KeyboardInterrupt that ``progress`` raises in one ends all of them after the same step.
 
     Args:
         resume: goes on from here (``Progress.state`` of an earlier call with the same base, views and config) and
-            ends, on as many threads, with the same bits as an undisturbed run; a time budget counts from the first
-            beginning.
+            ends, on as many threads and processes, with the same bits as an undisturbed run; a time budget counts from
+            the first beginning.
         part: only some Gaussians are trained, and the others drawn beside them. All by default.
+        peers: the processes that train along, with the same arguments but ``progress``. Each takes its part of a
+            step's views, and all have the same outcome: but for rounding, that of one process.
 
     Raises:
-        ClodError: no training views, none that has a Gaussian before it, no Gaussians, or ``resume`` is of something
-            else.
+        ClodError: no training views, none that has a Gaussian before it, no Gaussians, ``resume`` is of something
+            else, fewer views a step than processes, or one of these was lost before the first step.
     """
     config = config or AdaptConfig()
     if not scene.train:
         raise ClodError("the scene has no training views: give at least one photograph that is not held out")
     if len(base) == 0:
         raise ClodError("the checkpoint has no Gaussians, so there is nothing to adapt")
+    if peers and config.batch < peers.size:
+        raise ClodError(f"batch is {config.batch}, it must be at least {peers.size}, a view for each of the processes")
     began = time.perf_counter()
 
     def report(phase: str, done: int, total: int) -> None:
@@ -77,11 +85,14 @@ def adapt(
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
     views = seeing(base, scene.train)
     if resume is None:
-        begun = start(lean, views, config, report)
+        begun = start(lean, views, config, report, peers.map if peers else map)
+        if peers:  # the same bits in all of them
+            own = {"sigma_d": begun.sigma_d, "attenuation": begun.attenuation}
+            begun = begun.replace(**peers.broadcast(own)).to(begun.means.device)
     else:
         unset = torch.ones_like(base.opacity_logits)  # what is trained is in the state
         begun = lean.replace(sigma_d=unset if base.sigma_d is None else base.sigma_d, attenuation=resume.attenuation)
-    run = _Run(begun, views, config, progress, part)
+    run = _Run(begun, views, config, progress, part, peers)
     run.empty_bands = None if lean is base else base.shN.clone()
     run.start_seconds = time.perf_counter() - began
     if resume is not None:
@@ -99,8 +110,9 @@ class _Run:
         config: AdaptConfig,
         progress: Callable[[Progress], None] | None,
         part: Part | None = None,
+        peers: Peers | None = None,
     ):
-        self.config, self.views, self.progress = config, views, progress
+        self.config, self.progress, self.peers, self.draws = config, progress, peers, Draws(views, config)
         part = part or Part(len(start))
         assert start.sigma_d is not None and start.attenuation is not None
         # Cameras all in one place say nothing of the scene's unit; the distances in their pictures do.
@@ -123,8 +135,6 @@ class _Run:
         self.optimizer = RowAdam(self._trained(), beta1=BETA1**config.batch, beta2=BETA2**config.batch)
         self.empty_bands: Tensor | None = None  # the base's whole shN, where what was left out of it comes back
         self.all_rows = torch.ones(part.trained, dtype=torch.bool, device=start.means.device)
-        self.random = np.random.default_rng(config.seed)
-        self.order: list[int] = []
         self.done, self.seconds, self.start_seconds = 0, 0.0, 0.0
         self.loss = math.nan
         self.mean: dict[str, Tensor] = {}  # of the parameters over the last ``average`` of the steps
@@ -135,26 +145,48 @@ class _Run:
         return {name: self.parameters[name][: self.objective.trained] for name in self.stepped}
 
     def run(self) -> Adapted:
-        began, interrupted = time.perf_counter() - self.seconds, False
+        began, going, lost = time.perf_counter() - self.seconds, True, None
+        before = self._with_peers()
         try:
-            while (share := self._share_done(self.done, time.perf_counter() - began)) < 1:
+            while True:
+                share = self._share_done(self.done, time.perf_counter() - began)
+                if self.peers:  # all of them end after the same step, by the first one's clock
+                    share, going = self.peers.agree(share, going)
+                if share >= 1 or not going:
+                    break
                 self.step(share)
                 self.done += 1
                 self.seconds = time.perf_counter() - began
-                if self.progress:
-                    share = self._share_done(self.done, self.seconds)
-                    told = ("train", self.done, self.config.iters, self.seconds, share, self.loss)
-                    self.progress(Progress(*told, self.gaussians, self.state))
+                going = self._tell()
         except KeyboardInterrupt:
-            interrupted = True
+            going = False
+        except PeerLost as error:
+            going, lost = False, str(error)
+            self._tell(lost)
         self.seconds = time.perf_counter() - began
-        return Adapted(self.gaussians(), self.done, self.seconds, self.start_seconds, interrupted)
+        spent = [now - then for now, then in zip(self._with_peers(), before, strict=True)]
+        return Adapted(self.gaussians(), self.done, self.seconds, self.start_seconds, not going, lost, *spent)
+
+    def _with_peers(self) -> tuple[float, float]:
+        return (self.peers.waiting, self.peers.exchanging) if self.peers else (0.0, 0.0)
+
+    def _tell(self, lost: str | None = None) -> bool:
+        """Says how far it is; whether to go on."""
+        if self.progress:
+            share = self._share_done(self.done, self.seconds)
+            told = ("train", self.done, self.config.iters, self.seconds, share, self.loss)
+            try:
+                self.progress(Progress(*told, self.gaussians, self.state, lost))
+            except KeyboardInterrupt:
+                return False
+        return True
 
     def state(self) -> TrainingState:
+        random, order = self.draws.state()
         return TrainingState(
-            tensors=self._changing(), attenuation=self.objective.attenuation,
-            random=dict(self.random.bit_generator.state), order=tuple(self.order), loss=self.loss,
-            averaged=self.averaged, steps=self.done, seconds=self.seconds, start_seconds=self.start_seconds,
+            tensors=self._changing(), attenuation=self.objective.attenuation, random=random, order=order,
+            loss=self.loss, averaged=self.averaged, steps=self.done, seconds=self.seconds,
+            start_seconds=self.start_seconds,
         )  # fmt: skip
 
     def restore(self, state: TrainingState) -> None:
@@ -162,21 +194,11 @@ class _Run:
         if state.averaged:
             self.mean = {name: torch.empty_like(value) for name, value in self._trained().items()}
         own = self._changing()
-        shapes = [{name: (t.shape, t.dtype) for name, t in tensors.items()} for tensors in (own, state.tensors)]
-        if shapes[0] != shapes[1] or not all(0 <= view < len(self.views) for view in state.order):
-            raise ClodError("the training state is of other Gaussians, views or settings; give those it was saved with")
-        # A row's steps are an index in compiled code, which checks none.
-        counts = [steps for name, steps in state.tensors.items() if name.startswith("steps.")]
-        possible = all(bool(((steps >= 0) & (steps <= state.steps)).all()) for steps in counts)
-        if not possible or not 0 <= state.averaged <= state.steps or not 0 <= state.seconds < math.inf:
-            raise ClodError("the training state counts steps or seconds that cannot be; start afresh")
+        state.check(own)
+        self.draws.restore(state.random, state.order)
         for name, tensor in own.items():
             tensor.copy_(state.tensors[name])
-        try:
-            self.random.bit_generator.state = state.random
-        except (KeyError, OverflowError, TypeError, ValueError) as error:
-            raise ClodError(f"the training state's random state is damaged ({error!r}); start afresh") from error
-        self.order, self.loss, self.averaged = list(state.order), state.loss, state.averaged
+        self.loss, self.averaged = state.loss, state.averaged
         self.done, self.seconds, self.start_seconds = state.steps, state.seconds, state.start_seconds
 
     def _changing(self) -> dict[str, Tensor]:
@@ -210,21 +232,22 @@ class _Run:
         for name, mean in self.mean.items():
             mean.lerp_(now[name], 1 / self.averaged)
 
-    def _draw(self) -> tuple[View, list[float]]:
-        """A view (each once per round, in random order) and the dial values it is rendered at."""
-        if not self.order:
-            self.order = self.random.permutation(len(self.views)).tolist()
-        view, config = self.views[self.order.pop()], self.config
-        uniform, full = self.random.random(), self.random.random() < config.full_share
-        drawn = 1 + (config.max_sv - 1) * uniform if config.sampling == "uniform" else config.max_sv**uniform
-        if config.sampling == "pair":
-            return view, [1.0, drawn] if config.max_sv > 1 else [1.0]
-        return view, [1.0 if full else drawn]
+    def _pull(self) -> Pull:
+        """Of the next views; those of a batch that other processes have are pulled by them."""
+        before = self.draws.state()
+        draws = [self.draws.draw() for _ in range(self.config.batch)]
+        if self.peers is None:
+            return self.objective.pull(self.parameters, draws)
+        try:
+            return self.peers.sum(self.objective.pull(self.parameters, self.peers.share(draws)))
+        except PeerLost:  # these views are still to come for whoever goes on from here
+            self.draws.restore(*before)
+            raise
 
     @torch_on_one_thread()
     def step(self, share_done: float) -> None:
         """Some views, their dial values, one update."""
-        pull = self.objective.pull(self.parameters, [self._draw() for _ in range(self.config.batch)])
+        pull = self._pull()
         now = pull.loss / self.config.batch
         self.loss = now if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * now
         rates = {name: rate * self.config.lr_final**share_done for name, rate in self.rates.items()}

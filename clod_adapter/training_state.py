@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -9,14 +10,18 @@ from typing import Any
 from torch import Tensor
 
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+
+OTHER_RUN = "the training state is of other Gaussians, views or settings; give those it was saved with"
 
 
 @dataclass(frozen=True)
 class TrainingState:
     """All that the steps to come depend on, besides the base, the views and the config.
 
-    ``adapt`` goes on from it and ends with the bits that it would have ended with undisturbed, on as many threads.
+    ``adapt`` goes on from it and ends with the bits that it would have ended with undisturbed, on as many threads and
+    processes.
 
     Attributes:
         tensors: by kind and name, as in ``parameter.means``: of each attribute that changes (what does not is the
@@ -38,6 +43,21 @@ class TrainingState:
     seconds: float
     start_seconds: float
 
+    def check(self, own: dict[str, Tensor]) -> None:
+        """Refuses a state whose tensors are not like a run's ``own``, or that cannot be.
+
+        Raises:
+            ClodError: it is of another run, or damaged.
+        """
+        shapes = [{name: (t.shape, t.dtype) for name, t in tensors.items()} for tensors in (own, self.tensors)]
+        if shapes[0] != shapes[1]:
+            raise ClodError(OTHER_RUN)
+        # A row's steps are an index in compiled code, which checks none.
+        counts = [steps for name, steps in self.tensors.items() if name.startswith("steps.")]
+        possible = all(bool(((steps >= 0) & (steps <= self.steps)).all()) for steps in counts)
+        if not possible or not 0 <= self.averaged <= self.steps or not 0 <= self.seconds < math.inf:
+            raise ClodError("the training state counts steps or seconds that cannot be; start afresh")
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -52,6 +72,7 @@ class Progress:
         gaussians: gives the state now (before training, the base; within the last ``average`` of it, the mean so
             far); it shares memory with what is being trained, so use it within the callback.
         state: gives what training can be resumed from, likewise; None before training.
+        lost: why training ends here, where a process that trained along is gone.
     """
 
     phase: str
@@ -62,6 +83,7 @@ class Progress:
     loss: float
     gaussians: Callable[[], Gaussians]
     state: Callable[[], TrainingState] | None = None
+    lost: str | None = None
 
 
 @dataclass(frozen=True)
@@ -73,7 +95,9 @@ class Adapted:
         steps: training steps done.
         seconds: wall time of the training loop; start_seconds: of what comes before it. Of a resumed training both
             count from its first beginning.
-        interrupted: a KeyboardInterrupt ended it early.
+        interrupted: a KeyboardInterrupt, or the loss of a process, ended it early.
+        lost: which loss.
+        waiting, exchanging: of these seconds, in this call, those spent on other processes (``distributed.Peers``).
     """
 
     gaussians: Gaussians
@@ -81,3 +105,6 @@ class Adapted:
     seconds: float
     start_seconds: float
     interrupted: bool
+    lost: str | None = None
+    waiting: float = 0.0
+    exchanging: float = 0.0

@@ -31,8 +31,8 @@ values that make no sense.
 ## AdaptConfig
 
 How an adaptation is run: `clod.adapt(gaussians, scene, clod.AdaptConfig(max_sv=5, iters=400))`. On the
-command line there are `--max-sv`, `--iters`, `--time-budget`, `--seed` and `--form`; the rest is for
-experiments, and [Method](method.md) says what each was measured to do. `AdaptConfig.paper()` is the paper's
+command line there are `--max-sv`, `--iters`, `--batch`, `--time-budget`, `--seed` and `--form`; the rest is
+for experiments, and [Method](method.md) says what each was measured to do. `AdaptConfig.paper()` is the paper's
 own form.
 
 | field | default | paper | what |

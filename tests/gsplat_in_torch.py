@@ -19,16 +19,18 @@ ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN = 1 / 255, 0.999, 1e-4
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Has gsplat find these where it looks for its kernels."""
+    """Has gsplat, and who calls its kernels by themselves, find these where they look for them."""
+    import gsplat
     from gsplat import rendering
     from gsplat.cuda import _torch_impl
 
-    def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor) -> Tensor:
+    def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
         return _torch_impl._spherical_harmonics(degree, dirs, coeffs)
 
-    for function in (fully_fused_projection, isect_tiles, rasterize_to_pixels, spherical_harmonics):
-        monkeypatch.setattr(rendering, function.__name__, function)
-    monkeypatch.setattr(rendering, "isect_offset_encode", _torch_impl._isect_offset_encode)
+    for module in (rendering, gsplat):
+        for function in (fully_fused_projection, isect_tiles, rasterize_to_pixels, spherical_harmonics):
+            monkeypatch.setattr(module, function.__name__, function)
+        monkeypatch.setattr(module, "isect_offset_encode", _torch_impl._isect_offset_encode)
 
 
 def fully_fused_projection(
@@ -38,6 +40,7 @@ def fully_fused_projection(
 ) -> tuple[Any, ...]:  # fmt: skip
     from gsplat.cuda import _torch_impl
 
+    quats = quats / quats.norm(dim=-1, keepdim=True)  # as the kernel: of any length, and NaN where it is 0
     covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
     radii, *values, compensations = _torch_impl._fully_fused_projection(
         means, covars, viewmats, Ks, width, height, eps2d, near_plane, far_plane, calc_compensations, camera_model
@@ -59,14 +62,14 @@ def isect_tiles(
     segmented: bool, packed: bool, n_images: int, image_ids: Tensor | None, gaussian_ids: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     if image_ids is None:
-        image_ids = torch.arange(n_images).repeat_interleave(means2d.shape[-2])
+        image_ids = torch.arange(n_images, device=depths.device).repeat_interleave(means2d.shape[-2])
     centre, reach, depth = means2d.reshape(-1, 2) / tile_size, radii.reshape(-1, 2) / tile_size, depths.flatten()
-    most = torch.tensor([tile_width, tile_height])
-    low = torch.floor(centre - reach).long().clamp(min=torch.zeros(2).long(), max=most)
-    high = torch.ceil(centre + reach).long().clamp(min=torch.zeros(2).long(), max=most)
+    most = torch.tensor([tile_width, tile_height], device=depths.device)
+    low = torch.floor(centre - reach).long().clamp(min=torch.zeros_like(most), max=most)
+    high = torch.ceil(centre + reach).long().clamp(min=torch.zeros_like(most), max=most)
     counts = (high - low).prod(-1) * (reach > 0).all(-1)
     ids = torch.repeat_interleave(counts)
-    nth, across = torch.arange(len(ids)) - (counts.cumsum(0) - counts)[ids], (high - low)[ids, 0]
+    nth, across = torch.arange(len(ids), device=depths.device) - (counts.cumsum(0) - counts)[ids], (high - low)[ids, 0]
     tiles = (low[ids, 1] + nth // across) * tile_width + low[ids, 0] + nth % across
     bits = (tile_width * tile_height).bit_length()
     keys = (image_ids[ids] << 32 + bits) | (tiles << 32) | depth[ids].float().view(torch.int32).long()

@@ -101,6 +101,41 @@ def test_other_rows_keep_every_bit(kind: type[RowAdam], n: int = 40) -> None:
 
 
 @pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
+def test_the_leading_rows_of_larger_tensors(kind: type[RowAdam], n: int = 30) -> None:
+    """They are stepped as on their own, and what lies behind them keeps every bit."""
+    larger, own = parameters(n + 11), parameters(n + 11)
+    behind = {name: value[n:].clone() for name, value in larger.items()}
+    optimizers = (
+        kind({name: value[:n] for name, value in larger.items()}),
+        kind({k: v[:n].clone() for k, v in own.items()}),
+    )
+    for step in range(3):
+        rows = torch.arange(n) % (step + 2) == 0
+        for optimizer in optimizers:
+            optimizer.step(gradients(n, step), rows, rates(0.05))
+    for name, value in larger.items():
+        assert torch.equal(value[:n], optimizers[1].parameters[name]) and torch.equal(value[n:], behind[name])
+        assert not torch.equal(value[:n], own[name][:n])
+
+
+@pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
+def test_what_a_gradient_holds_in_other_rows_does_not_matter(kind: type[RowAdam], n: int = 30) -> None:
+    rows, results = torch.arange(n) % 3 == 0, []
+    for filler in (0.0, torch.nan, torch.inf):
+        optimizer = kind(parameters(n))
+        for step in range(2):
+            given = {
+                k: v.masked_fill(~rows.view(-1, *[1] * (v.dim() - 1)), filler) for k, v in gradients(n, step).items()
+            }
+            optimizer.step(given, rows, rates(0.05))
+        results.append(optimizer)
+    for other in results[1:]:
+        for mine, want in zip(other.state().values(), results[0].state().values(), strict=True):
+            assert all(torch.equal(mine[name], want[name]) for name in want)
+        assert all(torch.equal(other.parameters[name], results[0].parameters[name]) for name in SHAPES)
+
+
+@pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
 @pytest.mark.parametrize("size", [1e-8, 1e-3, 1.0, 1e6])
 def test_a_first_step_is_as_long_as_the_rate(kind: type[RowAdam], size: float) -> None:
     """Whatever the gradient's size, and however many steps other rows have had."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import socket
+import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -74,3 +77,26 @@ def test_lpips_is_left_out_without_weights(tmp_path: Path) -> None:
         torch.hub.set_dir(before)
     photo = torch.randint(0, 256, (64, 80, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     assert lpips(photo / 255, photo) == 0 < lpips(1 - photo / 255, photo)
+
+
+def test_only_evaluating_loads_the_networks(capture: Any, tmp_path: Path) -> None:
+    """Packages of these names, which are there to be imported, are not by adapting and rendering."""
+    for name in ("lpips", "torchvision", "flip_evaluator"):
+        (tmp_path / f"{name}.py").write_text("evaluate = lambda *_, **__: (None, 0.5)\n")
+    code = (
+        "import sys\n"
+        "from clod_adapter.cli.main import main\n"
+        "def run(*words): main([*words, '--images', sys.argv[2], '--quiet'])\n"
+        "run(sys.argv[1], '--iters', '1', '--out', 'dial.ply')\n"
+        "run('render', 'dial.ply', '--out', 'pictures')\n"
+        "print([name for name in ('lpips', 'torchvision', 'flip_evaluator') if name in sys.modules], file=sys.stderr)\n"
+        "run('eval', 'dial.ply', '--sv', '1')\n"
+        "print([name for name in ('lpips', 'flip_evaluator') if name in sys.modules], file=sys.stderr)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(capture.ply), str(capture.scene)], cwd=tmp_path, capture_output=True,
+        text=True, env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"},
+        check=False,
+    )  # fmt: skip
+    assert done.stderr.splitlines()[-2:] == ["[]", "['lpips', 'flip_evaluator']"], done.stderr
+    assert (tmp_path / "dial.ply").exists() and list((tmp_path / "pictures").iterdir())

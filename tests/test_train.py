@@ -283,7 +283,7 @@ def test_a_batch_sums_what_its_views_ask(captured: tuple[Gaussians, Scene]) -> N
     before = run.parameters["sh0"].clone()
     run.step(0.0)
     longest = (run.parameters["sh0"] - before).abs().max()
-    assert longest == pytest.approx(2**0.5 * config.lr_sh0, rel=1e-2) and run.order == []
+    assert longest == pytest.approx(2**0.5 * config.lr_sh0, rel=1e-2) and run.draws.order == []
 
 
 def test_only_the_first_rows_are_trained(captured: tuple[Gaussians, Scene]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
@@ -14,6 +14,25 @@ from clod_adapter.errors import ClodError
 
 Note = tuple[str, str]
 """What was done to a photograph, with {} for what differs between photographs, and that: a size, say."""
+
+
+class Photograph(NamedTuple):
+    """A photograph as a pinhole camera has it.
+
+    Attributes:
+        pixels: 8-bit RGB, at the size that is used.
+        K: ``[3, 3]`` the intrinsics of that camera.
+        source: width and height in the file.
+        notes: on what it took.
+    """
+
+    pixels: Image.Image
+    K: np.ndarray
+    source: tuple[int, int]
+    notes: list[Note]
+
+
+TRANSPARENT: Note = ("have transparency: laid over black", "")
 
 _TURNS = {
     5: Image.Transpose.TRANSPOSE,
@@ -92,9 +111,12 @@ def _rgb(path: Path, source: Image.Image, notes: list[Note]) -> Image.Image:
     if source.mode == "CMYK":
         notes.append(("are CMYK: brought to RGB without their colour profile", ""))
     if "A" not in source.getbands() and "transparency" not in source.info:
-        return source.convert("RGB")
+        if source.mode != "RGB":
+            return source.convert("RGB")
+        source.load()  # convert would copy it, a second photograph of full size in memory
+        return source
     rgba = source.convert("RGBA")
     if rgba.getchannel("A").getextrema() == (255, 255):
         return rgba.convert("RGB")
-    notes.append(("have transparency: laid over black", ""))
+    notes.append(TRANSPARENT)
     return Image.alpha_composite(Image.new("RGBA", rgba.size, (0, 0, 0, 255)), rgba).convert("RGB")

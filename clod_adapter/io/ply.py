@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement
 
 from clod_adapter.calibration import Calibration
 from clod_adapter.errors import ClodError
@@ -19,6 +18,7 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.origin import AXES, NOWHERE, Origin, origin_of, relative
 from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, inria_dtype, read_table
 from clod_adapter.io.ply_header import read_attenuation, read_calibration, write_comments
+from clod_adapter.io.ply_merge import ROWS, write_rows
 from clod_adapter.io.ply_values import Activated, as_stored_by_inria
 from clod_adapter.io.readers import read_rows
 from clod_adapter.io.usable import row_rules
@@ -83,24 +83,18 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
     path = Path(path)
     rows = read_rows(path)
     vertex, was, changes = as_stored_by_inria(path, rows.vertex, "none" if rows.settled else activated)
-    columns = column_map(rows.sh_degree)
-    names = [name for group in columns.values() for name in group]
-    extras = [name for name in (SIGMA, *MASKS) if name in (vertex.dtype.names or ())]
-    table = read_table(vertex, names + extras)
     if origin is None:
         origin = origin_of(vertex) if rows.origin is None else rows.origin
-    if any(origin):
-        table[:, :3] = relative(vertex, origin)
-    keep, notes = _usable_rows(path, table, names + extras)
+    values, keep, notes = _gather(path, vertex, rows.sh_degree, origin)
     if any(origin):
         where = ", ".join(f"{value:.10g}" for value in origin)
         notes.append(f"far from 0: read relative to ({where}); outputs have x, y, z as double")
     if not keep.all():
-        vertex, table = vertex[keep], table[keep]
-    gaussians, calibration = _gaussians(table, columns), None
-    if SIGMA in extras:
+        vertex = vertex[keep]
+    gaussians, calibration = _gaussians(values), None
+    if SIGMA in values:
         attenuation, remarks = read_attenuation(path, rows.comments)
-        sigma_d = torch.from_numpy(table[:, len(names)].copy())
+        sigma_d = torch.from_numpy(values[SIGMA][:, 0])
         gaussians = gaussians.replace(sigma_d=sigma_d, attenuation=attenuation)
         calibration, doubts = read_calibration(rows.comments, len(gaussians))
         notes += remarks + doubts
@@ -148,81 +142,61 @@ def save(
             f"({len(base.vertex)} of degree {base.gaussians.sh_degree}); save with the checkpoint they came from"
         )
     comments = write_comments(gaussians.attenuation, base.comments, version, calibration)
-    element = PlyElement.describe(_merged(path, gaussians, base), "vertex", comments=comments)
-    with atomic_path(path) as temporary:
-        PlyData([element], byte_order="<").write(str(temporary))
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        write_rows(file, path, gaussians, base.vertex, base.origin, comments)
 
 
 def blank(count: int, sh_degree: int, origin: Origin = NOWHERE) -> Checkpoint:
     """A base of zeros in Inria's layout (normals included), for Gaussians that come from no file, or not as rows."""
+    kinds = [(name, "f8" if any(origin) and name in AXES else "f4") for name in inria_dtype(sh_degree).names or ()]
+    vertex = np.zeros(count, kinds)
     groups = column_map(sh_degree)
-    vertex = _with_doubles(np.zeros(count, inria_dtype(sh_degree)), origin)
-    gaussians = _gaussians(np.zeros((count, sum(map(len, groups.values()))), np.float32), groups)
+    gaussians = _gaussians({name: np.zeros((count, len(group)), np.float32) for name, group in groups.items()})
     for axis, value in zip(AXES, origin, strict=True):
         vertex[axis] = value
     return Checkpoint(gaussians, vertex, (), (), "", Path(), origin=origin)
 
 
-def _usable_rows(path: Path, table: np.ndarray, names: list[str]) -> tuple[np.ndarray, list[str]]:
-    """``[N]`` bool, which rows to keep, and a note for every reason by which some went."""
-    total, opacity = len(table), table[:, names.index("opacity")]
-    notes, keep = [], np.ones(total, bool)
-    for rule, reason in row_rules(table, names):
-        gone = int((keep & ~rule).sum())
-        keep = keep & rule
-        if gone:
-            notes.append(f"{gone} of {total} Gaussians dropped: {reason}")
+def _gather(
+    path: Path, vertex: np.ndarray, sh_degree: int, origin: Origin
+) -> tuple[dict[str, np.ndarray], np.ndarray, list[str]]:
+    """The usable rows' attributes ``[M, P]`` float32, and sigma_d; ``[N]`` which they are; why others are not."""
+    there = [name for name in (SIGMA, *MASKS) if name in (vertex.dtype.names or ())]
+    groups = column_map(sh_degree) | ({SIGMA: (SIGMA,)} if SIGMA in there else {})
+    names = [name for group in column_map(sh_degree).values() for name in group] + there
+    values = {key: np.empty((len(vertex), len(group)), np.float32) for key, group in groups.items()}
+    keep, gone, opaque = np.ones(len(vertex), bool), dict[str, int](), 0
+    for start in range(0, len(vertex), ROWS):
+        rows = slice(start, start + ROWS)
+        table, usable, at = read_table(vertex[rows], names), keep[rows], 0
+        if any(origin):
+            table[:, :3] = relative(vertex[rows], origin)
+        for rule, reason in row_rules(table, names):
+            gone[reason] = gone.get(reason, 0) + int((usable & ~rule).sum())
+            usable &= rule
+        opaque += int((table[usable, names.index("opacity")] == np.inf).sum())
+        for key, group in groups.items():
+            values[key][rows] = table[:, at : at + len(group)]
+            at += len(group)
+    notes = [f"{lost} of {len(vertex)} Gaussians dropped: {reason}" for reason, lost in gone.items() if lost]
     if not keep.any():
         raise ClodError(f"{path}: no usable Gaussian in it ({'; '.join(notes) or 'it has 0 rows'}); export it again")
-    opaque = int((opacity[keep] == np.inf).sum())
-    return keep, notes + ([f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque"] if opaque else [])
+    if not keep.all():
+        values = {key: array[keep] for key, array in values.items()}
+    return (
+        values,
+        keep,
+        notes + ([f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque"] * (opaque > 0)),
+    )
 
 
-def _gaussians(table: np.ndarray, columns: dict[str, tuple[str, ...]]) -> Gaussians:
-    tensors: dict[str, Any] = {}
-    start = 0
-    for name, group in columns.items():
-        shape = {"opacity_logits": (), "sh0": (1, 3), "shN": (len(group) // 3, 3)}.get(name, (len(group),))
-        values = table[:, start : start + len(group)].copy()
-        tensors[name] = torch.from_numpy(values.reshape(len(table), *shape))
-        start += len(group)
+def _gaussians(values: dict[str, np.ndarray]) -> Gaussians:
+    """Of the attributes' columns ``[N, P]``, whose memory they use."""
+    tensors: dict[str, Any] = {name: torch.from_numpy(values[name]) for name in column_map(0)}
+    tensors["opacity_logits"] = tensors["opacity_logits"][:, 0]
+    for name in ("sh0", "shN"):
+        tensors[name] = tensors[name].unflatten(1, (values[name].shape[1] // 3, 3))
     return Gaussians(**tensors)
-
-
-def _merged(path: Path, gaussians: Gaussians, base: Checkpoint) -> np.ndarray:
-    """The base's rows with changed values written in and sigma_d as the last column."""
-    vertex = _with_doubles(base.vertex, base.origin)
-    names = [name for name in vertex.dtype.names or () if name != SIGMA]
-    dtype = [(name, vertex.dtype[name]) for name in names]
-    merged = np.empty(len(vertex), dtype + ([(SIGMA, np.dtype("f4"))] if gaussians.sigma_d is not None else []))
-    for name in names:
-        merged[name] = vertex[name]
-    for attribute, group in column_map(gaussians.sh_degree).items():
-        new = _numpy(getattr(gaussians, attribute)).reshape(len(vertex), -1)
-        old = relative(vertex, base.origin) if attribute == "means" else read_table(vertex, group)
-        changed = new.view(np.uint32) != old.view(np.uint32)
-        if not np.isfinite(new[changed]).all():
-            raise ClodError(f"{path}: {attribute} holds a new value that is not finite; the tuning has diverged")
-        for column in np.flatnonzero(changed.any(0)):
-            rows = changed[:, column]
-            shift = base.origin[column] if attribute == "means" else 0.0
-            merged[group[column]][rows] = new[rows, column].astype(np.float64) + shift if shift else new[rows, column]
-    if gaussians.sigma_d is not None:
-        merged[SIGMA] = _numpy(gaussians.sigma_d)
-        if not np.isfinite(merged[SIGMA]).all():
-            raise ClodError(f"{path}: {SIGMA} holds a value that is not finite; use a large number for no decay")
-    return merged
-
-
-def _with_doubles(vertex: np.ndarray, origin: Origin) -> np.ndarray:
-    """The rows with coordinates that have digits for what is far from 0, where the origin is."""
-    names = vertex.dtype.names or ()
-    wider = [(name, np.dtype("f8") if name in AXES else vertex.dtype[name]) for name in names]
-    return vertex.astype(wider) if any(origin) else vertex
-
-
-def _numpy(tensor: torch.Tensor) -> np.ndarray:
-    return np.ascontiguousarray(tensor.detach().float().cpu().numpy())
 
 
 def _sha256(path: Path) -> str:

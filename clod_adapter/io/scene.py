@@ -19,12 +19,13 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.colmap_model import read_model
 from clod_adapter.io.dataparser import trained_frame
 from clod_adapter.io.image_cache import ImageCache
-from clod_adapter.io.images import Note, read_image
+from clod_adapter.io.images import TRANSPARENT, Note, Photograph, read_image
 from clod_adapter.io.origin import NOWHERE
 from clod_adapter.io.posed import HUGE, PosedImage
 from clod_adapter.io.scene_folder import find_cameras, find_photographs
-from clod_adapter.io.transforms import read_transforms
-from clod_adapter.io.undistort import Photograph, cache_folder, kept, undistort
+from clod_adapter.io.transforms import MASKS, read_transforms
+
+MOST_AT_ONCE = 8  # photographs of full size in memory
 
 
 def load_scene(
@@ -83,10 +84,12 @@ def load_scene(
     if not any(image.name not in held_out for image, _ in present):
         raise ClodError(f"{folder}: has no photograph to train on, as all that are there are held out; add more")
     present = [(image.relative_to(origin), path) for image, path in present]
-    views, more = _load(present, folder, max_width, progress, cache)
+    views, sizes, done = _load(present, folder, max_width, progress, cache)
     train = tuple(view for view in views if view.camera.name not in held_out)
     test = tuple(view for view in views if view.camera.name in held_out)
-    return in_its_unit(Scene(train, test, (*notes, *more)))
+    pinhole = all(image.is_pinhole for image, _ in present)
+    spared = _left_out(views, sizes, done, pinhole, any(note.startswith(MASKS) for note in notes))
+    return in_its_unit(Scene(train, test, (*notes, *_summary(done, len(views))), spared))
 
 
 def _held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:
@@ -101,23 +104,56 @@ def _load(
     max_width: int,
     progress: Callable[[int, int], None] | None,
     keep: ImageCache | None,
-) -> tuple[list[View], list[str]]:
-    """The views of the images, decoded two at a time, and notes."""
-    cache = None if all(image.is_pinhole for image, _ in present) else cache_folder(folder)
-    views, notes = [], []
-    with warnings.catch_warnings(), ThreadPoolExecutor(2) as pool:
+) -> tuple[list[View], list[tuple[int, int]], list[Note]]:
+    """The views of the images, their sizes in the files, and notes. Each worker holds one of full size at a time."""
+    cache = None if all(image.is_pinhole for image, _ in present) else _cache_folder(folder)
+    views, sizes, notes = list[View](), list[tuple[int, int]](), list[Note]()
+    workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
+    with warnings.catch_warnings(), ThreadPoolExecutor(workers) as pool:
         # Large, but below the size at which it is refused: photographs are no attack.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         loads = [partial(_load_view, image, path, cache, max_width) for image, path in present]
-        for (view, remarks), load in zip(pool.map(lambda load: load(), loads), loads, strict=True):
+        for (view, size, remarks), load in zip(pool.map(lambda load: load(), loads), loads, strict=True):
             views.append(keep.store(view, partial(_again, load)) if keep else view)
+            sizes.append(size)
             notes += remarks
             if progress:
                 progress(len(views), len(present))
-    return views, _summary(notes, len(views))
+    return views, sizes, notes
 
 
-def _again(load: Callable[[], tuple[View, list[Note]]]) -> torch.Tensor:
+def _left_out(
+    views: Sequence[View], sizes: Sequence[tuple[int, int]], notes: Sequence[Note], pinhole: bool, masked: bool
+) -> tuple[tuple[str, str], ...]:
+    """What of the reading these photographs do not need, and why: ``Scene.left_out``.
+
+    Args:
+        sizes: of the photographs in their files.
+        pinhole, masked: whether all cameras are pinholes, and whether the scene has masks.
+    """
+    whole, used = sum(3 * w * h for w, h in sizes), sum(3 * view.camera.width * view.camera.height for view in views)
+    found = [("exposure", "each photograph counts as it is: no light is balanced between them")]
+    if pinhole:
+        found.append(("undistortion", f"all {len(views)} cameras are pinholes"))
+    if TRANSPARENT not in notes:
+        found.append(("alpha", f"none of {len(views)} photographs has transparency"))
+    if not masked:
+        found.append(("masks", "the scene has none"))
+    if used < whole:
+        kept = f"{used / 1e6:,.3g} MB are kept of the {whole / 1e6:,.3g} MB in the files"
+        found.append(("pixels", f"{kept}: photographs are scaled to the size used as they are decoded"))
+    else:
+        found.append(("scaling", f"all {len(views)} photographs are used at the size they have"))
+    return tuple(found)
+
+
+def _cache_folder(folder: Path) -> Path:
+    from clod_adapter.io.undistort import cache_folder  # only where there is something to undistort
+
+    return cache_folder(folder)
+
+
+def _again(load: Callable[[], tuple[View, tuple[int, int], list[Note]]]) -> torch.Tensor:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         return load()[0].image
@@ -133,28 +169,35 @@ def _summary(notes: Sequence[Note], total: int) -> list[str]:
     return lines
 
 
-def _load_view(image: PosedImage, path: Path, cache: Path | None, max_width: int) -> tuple[View, list[Note]]:
+def _load_view(
+    image: PosedImage, path: Path, cache: Path | None, max_width: int
+) -> tuple[View, tuple[int, int], list[Note]]:
     if cache is None or image.is_pinhole:
-        pixels, K, notes = _photograph(image, path, max_width)
+        pixels, K, source, notes = _photograph(image, path, max_width)
     else:
-        pixels, K, notes = kept(cache, image, path, max_width, lambda: _photograph(image, path, max_width))
+        from clod_adapter.io.undistort import kept
+
+        pixels, K, source, notes = kept(cache, image, path, max_width, lambda: _photograph(image, path, max_width))
         lens = f"from {image.camera.model_name} into {cache}"
         notes = [*notes, ("undistorted {}, which may be deleted; the sources are untouched", lens)]
     viewmat = torch.from_numpy(image.viewmat).float()
     camera = Camera(viewmat, torch.from_numpy(K).float(), pixels.width, pixels.height, image.name)
-    return View(camera, torch.from_numpy(np.array(pixels))), notes
+    return View(camera, torch.from_numpy(np.array(pixels))), source, notes
 
 
 def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
     """The photograph as a pinhole camera has it, no wider than ``max_width``."""
     camera = copy(image.camera)
     pixels, notes = read_image(path, camera.width, camera.height)
+    source = pixels.size
     if pixels.size != (camera.width, camera.height):
         sizes = f"{pixels.width}x{pixels.height} where the model says {camera.width}x{camera.height}"
         notes.append(("are {}: intrinsics scaled", sizes))
         # With pixel centres at +0.5, in COLMAP as here, the principal point scales like the focal length.
         camera.rescale(*pixels.size)
     if not image.is_pinhole:
+        from clod_adapter.io.undistort import undistort
+
         pixels, camera = undistort(path, pixels, camera)
     width, height = pixels.size
     if width > max_width:
@@ -165,4 +208,4 @@ def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
     K = np.array([[pixels.width / width], [pixels.height / height], [1.0]]) * camera.calibration_matrix()
     if not 0 < min(K[0, 0], K[1, 1]) <= np.abs(K).max() < HUGE:
         raise ClodError(f"{path}: its camera is not usable once undistorted; check the camera's parameters")
-    return Photograph(pixels, K, notes)
+    return Photograph(pixels, K, source, notes)

@@ -5,11 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import PIL
@@ -18,18 +16,11 @@ from PIL import Image, PngImagePlugin
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.images import Note
+from clod_adapter.io.caches import user_caches
+from clod_adapter.io.images import Photograph
 from clod_adapter.io.posed import PosedImage
 
 _KEY = "clod-adapter"  # of what a kept picture says of itself
-
-
-class Photograph(NamedTuple):
-    """Pixels, the ``[3, 3]`` intrinsics of their pinhole camera, and notes on what it took."""
-
-    pixels: Image.Image
-    K: np.ndarray
-    notes: list[Note]
 
 
 def undistort(path: Path, pixels: Image.Image, camera: pycolmap.Camera) -> tuple[Image.Image, pycolmap.Camera]:
@@ -62,7 +53,7 @@ def cache_folder(scene: Path) -> Path:
     """
     scene = scene.resolve()
     name = f"{scene.name}-{hashlib.sha256(str(scene).encode(errors='surrogateescape')).hexdigest()[:8]}"
-    folder = _caches() / "clod-adapter" / "undistorted" / name
+    folder = user_caches() / "clod-adapter" / "undistorted" / name
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK | os.X_OK):
@@ -73,18 +64,6 @@ def cache_folder(scene: Path) -> Path:
             "to a folder that can be written to"
         ) from error
     return folder
-
-
-def _caches() -> Path:
-    if chosen := os.environ.get("XDG_CACHE_HOME"):
-        return Path(chosen)
-    try:
-        home = Path.home()
-    except RuntimeError as error:
-        raise ClodError("no home folder to keep undistorted photographs in; set XDG_CACHE_HOME to a folder") from error
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", home / "AppData" / "Local"))
-    return home / "Library" / "Caches" if sys.platform == "darwin" else home / ".cache"
 
 
 def kept(folder: Path, image: PosedImage, path: Path, max_width: int, make: Callable[[], Photograph]) -> Photograph:
@@ -102,10 +81,12 @@ def kept(folder: Path, image: PosedImage, path: Path, max_width: int, make: Call
     file = folder / f"{hashlib.sha256(repr(made_of).encode()).hexdigest()[:32]}.png"
     with suppress(Exception), Image.open(file) as source:  # absent, or damaged: Pillow raises many kinds
         about = json.loads(source.info[_KEY])
-        return Photograph(source.convert("RGB"), np.array(about["K"]), [(what, each) for what, each in about["notes"]])
+        notes = [(what, each) for what, each in about["notes"]]
+        return Photograph(source.convert("RGB"), np.array(about["K"]), tuple(about["source"]), notes)
     photograph = make()
     about = PngImagePlugin.PngInfo()
-    about.add_text(_KEY, json.dumps({"K": photograph.K.tolist(), "notes": photograph.notes}))
+    says = {"K": photograph.K.tolist(), "source": photograph.source, "notes": photograph.notes}
+    about.add_text(_KEY, json.dumps(says))
     with atomic_path(file) as temporary:
         photograph.pixels.save(temporary, pnginfo=about, compress_level=1)
     return photograph

@@ -34,14 +34,25 @@ class Rasterizer(Protocol):
     ) -> tuple[Tensor, Tensor]: ...  # fmt: skip
 
 
+def wait_for(device: torch.device) -> None:
+    """Returns when the device has done what it was given, so that a clock may be read; the CPU always has."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
 def for_device(device: torch.device) -> Rasterizer:
     """The fastest rasterizer for tensors on ``device``, imported on first use.
 
     Raises:
-        ClodError: there is none for that kind of device.
+        ClodError: there is none for that kind of device, or what it is made of is not installed.
     """
     if device.type == "cpu":
         from clod_adapter.rasterizers import cpu
 
         return cpu.rasterize
+    if device.type == "cuda":
+        from clod_adapter.rasterizers import cuda
+
+        cuda.require_gsplat()
+        return cuda.rasterize
     raise ClodError(f"no rasterizer for device {device}: move the Gaussians to the CPU with .to('cpu')")

@@ -212,7 +212,7 @@ def test_bad_input_exits_with_2(spawn: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", ["", *COMMANDS])
 def test_out_has_a_short_form_wherever_there_is_one(clod: Any, command: str) -> None:
     text = clod(*command.split(), "--help").out
-    assert ("--out " in text) == ("\n  -o " in text) == (command not in ("eval", "inspect", "view"))
+    assert ("--out " in text) == ("\n  -o " in text) == (command not in ("eval", "inspect", "view", "doctor"))
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])

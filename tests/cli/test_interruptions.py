@@ -449,7 +449,7 @@ def test_a_frame_outlives_an_interrupt(capture: Any, monkeypatch: pytest.MonkeyP
 
 
 def test_sigterm_before_training(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(adapt_command, "prepare_kernels", lambda _: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.setattr(adapt_command, "prepare_kernels", lambda *_: signal.raise_signal(signal.SIGTERM))
     done = clod(capture.ply, "--images", capture.scene, *TINY)
     assert done.code == 130 and done.err.splitlines()[-1] == "clod-adapt: interrupted" and names(tmp_path) == []
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL

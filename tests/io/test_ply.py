@@ -392,7 +392,7 @@ def test_no_gaussians_are_not_written(tmp_path: Path) -> None:
 
 def test_a_file_that_goes_away_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "in.ply", make(1, needed(0)))
-    monkeypatch.setattr(ply, "_usable_rows", lambda *args, real=ply._usable_rows: (path.unlink(), real(*args))[1])
+    monkeypatch.setattr(ply, "_gather", lambda *args, real=ply._gather: (path.unlink(), real(*args))[1])
     with pytest.raises(ClodError, match="in.ply: cannot be read"):
         ply.load(path)
 

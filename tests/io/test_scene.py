@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -163,3 +166,72 @@ def test_split_and_single_image(tmp_path: Path) -> None:
     assert (len(loaded.train), len(loaded.test)) == (1, 0)
     with pytest.raises(ClodError, match="test_every is 1"):
         load_scene(tmp_path / "one", test_every=1)
+
+
+def test_what_the_scene_does_not_need(tmp_path: Path) -> None:
+    """Of each the reason, and none that the scene does need."""
+    (tmp_path / "plain").mkdir()
+    write_scene(tmp_path / "plain", 3)
+    spared = dict(load_scene(tmp_path / "plain").left_out)
+    assert set(spared) == {"undistortion", "alpha", "masks", "exposure", "scaling"}
+    assert spared["undistortion"] == "all 3 cameras are pinholes"
+    assert spared["alpha"] == "none of 3 photographs has transparency"
+    assert spared["scaling"] == "all 3 photographs are used at the size they have"
+    scaled = dict(load_scene(tmp_path / "plain", max_width=20).left_out)
+    assert "scaling" not in scaled
+    assert scaled["pixels"].startswith("0.0027 MB are kept of the 0.0108 MB in the files")  # 3 x 20x15 and 40x30, RGB
+    (see_through := Image.fromarray(pixels(0))).putalpha(99)
+    see_through.save(tmp_path / "plain" / "images" / "sub" / "002.png")
+    assert "alpha" not in dict(load_scene(tmp_path / "plain").left_out)
+
+
+def test_undistortion_is_not_even_imported_for_pinholes(tmp_path: Path) -> None:
+    (tmp_path / "pinhole").mkdir()
+    write_scene(tmp_path / "pinhole", 2)
+    model_of(tmp_path / "lens", "SIMPLE_RADIAL", [33, 20, 15, -0.1])
+    Image.fromarray(pixels(0)).save(tmp_path / "lens" / "a.png")
+    code = (
+        "import os, sys\n"
+        "from clod_adapter import load_scene\n"
+        "for name in ('pinhole', 'lens'):\n"
+        "    spared = dict(load_scene(name).left_out)\n"
+        "    print(name, 'clod_adapter.io.undistort' in sys.modules, 'undistortion' in spared, os.path.exists('cache'))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.split("\n")[:2] == ["pinhole False True False", "lens True False True"]
+
+
+def test_a_photograph_in_colour_is_in_memory_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Converting what is RGB already copies it, as large as it is in the file."""
+    Image.fromarray(pixels(0, 64, 48)).save(tmp_path / "a.jpg")
+    monkeypatch.setattr(Image.Image, "convert", lambda *_, **__: pytest.fail("copies"))
+    read, _ = read_image(tmp_path / "a.jpg", 64, 48)
+    assert read.mode == "RGB" and np.asarray(read).shape == (48, 64, 3)
+
+
+def test_only_so_many_photographs_are_decoded_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many as torch has threads, at least two; what comes out does not depend on it."""
+    write_scene(tmp_path, 12)
+    now, most = [0], [0]
+
+    def counted(path: Path, width: int, height: int) -> object:
+        now[0] += 1
+        most[0] = max(most[0], now[0])
+        time.sleep(0.01)
+        now[0] -= 1
+        return read_image(path, width, height)
+
+    monkeypatch.setattr("clod_adapter.io.scene.read_image", counted)
+    found = []
+    for threads, limit in ((1, 2), (5, 5), (99, 8)):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        most[0] = 0
+        found.append(load_scene(tmp_path))
+        assert 1 <= most[0] <= limit
+    assert most[0] > 2
+    for other in found[1:]:
+        pairs = zip((*found[0].train, *found[0].test), (*other.train, *other.test), strict=True)
+        assert all(a.image.equal(b.image) and a.camera.name == b.camera.name for a, b in pairs)

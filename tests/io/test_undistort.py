@@ -117,7 +117,7 @@ def test_distorted_and_other_cameras_in_one_model(tmp_path: Path) -> None:
 def same(one: Scene, other: Scene) -> bool:
     pairs = list(zip((*one.train, *one.test), (*other.train, *other.test), strict=True))
     equal = all(a.image.equal(b.image) and a.camera.K.equal(b.camera.K) for a, b in pairs)
-    return equal and one.notes == other.notes
+    return equal and one.notes == other.notes and one.left_out == other.left_out
 
 
 def test_a_second_run_finds_the_first_ones(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,6 +123,8 @@ def test_axis_ratio_of_a_million(rasterize: Rasterizer, scales: tuple[float, flo
 @pytest.mark.parametrize("length", [1e-8, 0.0, 1e2, 1e3, 1e4])
 @pytest.mark.parametrize("axes", [1, 3])
 def test_extreme_scales(rasterize: Rasterizer, axes: int, length: float) -> None:
+    if axes == 1 and length >= 100 and getattr(rasterize, "looser", 1.0) > 1:
+        pytest.skip("gsplat takes the determinant in float32, where that of such a needle cancels")
     some = scene(100, 1, 5)
     some["scales"][::30, :axes] = length
     assert_agrees(rasterize, some, camera(), image=IMAGE if axes == 3 or length < 1 else 1e-4)

@@ -1,0 +1,279 @@
+"""All that is to be checked where there is an NVIDIA GPU, by one command; and, small, on the CPU, so that it can be.
+
+    python benchmarks/gpu.py                         # needs torch with CUDA, gsplat 1.5.3 and the shared data
+    python benchmarks/gpu.py --device cpu --small    # the same code, in seconds
+    python benchmarks/gpu.py --only city --count 2000000
+
+``tests``: the contract of every backend, the integration with gsplat, the optimiser and the compiled formula.
+``plush``: plush_half adapted on the GPU and on the CPU with the same settings: seconds, and quality on held-out views.
+``city``: a synthetic city adapted (peak memory), then frames near and far at s = 1, 3, 7 beside plain gsplat, packed
+and not, on the same file in the same run, in turn: their times, the share that the dial takes (attenuation, cut and
+compaction), and PSNR against the full picture and against the truth.
+
+Each adds rows to ``results/gpu.jsonl``. Where there is no GPU, plain is this package's CPU rasterizer without the dial.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import xml.etree.ElementTree as xml
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
+
+import torch
+from city import city, city_cameras, perturb
+from common import ROOT, append, capture
+from torch import Tensor
+
+import clod_adapter as clod
+from clod_adapter.attenuation import attenuate, attenuate_seen, normalized_distances
+from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.metrics import psnr
+from clod_adapter.rasterizers import cuda, wait_for
+from clod_adapter.render import dial, splat
+
+CHECKS = ("tests", "plush", "city")
+DIALS = (1.0, 3.0, 7.0)
+TESTS = (
+    "tests/rasterizers", "tests/integrations/test_gsplat.py", "tests/test_devices.py", "tests/test_optimizer.py",
+    "tests/test_fusing.py",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large everything is.
+
+    Attributes:
+        count: Gaussians of the city; width, height: of its pictures; views: to train on, as many again in each test.
+        steps: of the city's adaptation; plush_steps: of plush_half's, None for the default.
+        repeats: of each timed frame.
+    """
+
+    count: int = 6_000_000
+    width: int = 1600
+    height: int = 1066
+    views: int = 24
+    steps: int = 300
+    plush_steps: int | None = None
+    repeats: int = 30
+
+
+SMALL = Size(count=3000, width=64, height=48, views=4, steps=3, plush_steps=3, repeats=2)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", choices=["cuda", "cpu"], default="cuda")
+    parser.add_argument("--small", action="store_true", help="a tiny city, also in place of plush_half, and few tests")
+    parser.add_argument("--only", nargs="+", choices=CHECKS, default=CHECKS)
+    parser.add_argument("--count", type=int, help="Gaussians of the city")
+    parser.add_argument("--results", default="gpu.jsonl", help="the file, in results/ or anywhere")
+    args = parser.parse_args()
+    if args.device == "cuda":
+        if not torch.cuda.is_available():
+            sys.exit("torch sees no GPU here: give --device cpu --small to try the script")
+        cuda.require_gsplat()
+    size = SMALL if args.small else Size()
+    size = Size(**{**asdict(size), **({"count": args.count} if args.count else {})})
+    device = torch.device(args.device)
+    checks: dict[str, Callable[[], list[dict[str, Any]]]] = {
+        "tests": lambda: [run_tests(args.small)],
+        "plush": lambda: adapt_plush(device, size, args.small),
+        "city": lambda: measure_city(device, size),
+    }
+    for name in args.only:
+        for row in checks[name]():
+            append(args.results, {"benchmark": f"gpu {name}", "device": args.device, "size": asdict(size), **row})
+
+
+def run_tests(small: bool) -> dict[str, Any]:
+    """Counts of pytest's outcomes, and the names of what failed."""
+    few = ["-k", "test_for_device or test_no_gaussians"] if small else []
+    with tempfile.TemporaryDirectory() as folder:
+        report, began = Path(folder) / "report.xml", time.perf_counter()
+        command = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-q", f"--junitxml={report}", *TESTS, *few]
+        subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)})
+        cases = list(xml.parse(report).getroot().iter("testcase"))
+        kinds = {"failed": ("failure", "error"), "skipped": ("skipped",)}
+        found = {k: [c for c in cases if any(c.find(tag) is not None for tag in tags)] for k, tags in kinds.items()}
+    bad = [f"{case.get('classname')}::{case.get('name')}" for case in found["failed"]]
+    counts = {kind: len(listed) for kind, listed in found.items()}
+    return {"cases": len(cases), **counts, "failures": bad, "seconds": round(time.perf_counter() - began, 1)}
+
+
+def adapt_plush(device: torch.device, size: Size, small: bool) -> list[dict[str, Any]]:
+    """A row a device."""
+    if small:
+        base, scene = synthetic(size, torch.device("cpu"))
+    else:
+        folder = capture("plush_half")
+        base, scene = clod.load(folder / "pretrained.ply").gaussians, clod.load_scene(folder)
+    config = clod.AdaptConfig(**({"iters": size.plush_steps} if size.plush_steps else {}))
+    rows = []
+    for place in dict.fromkeys([device, torch.device("cpu")]):
+        own = base.to(place)
+        warm = clod.AdaptConfig(iters=1)  # kernels compiled and loaded before the clock starts; its seconds are told
+        began = time.perf_counter()
+        clod.adapt(own, Scene(scene.train[:1], ()), warm)
+        warm_seconds = time.perf_counter() - began
+        reset_peak(place)
+        adapted = clod.adapt(own, scene, config)
+        wait_for(place)
+        base_row = clod.evaluate(own, scene.test, [1.0])[0]
+        found = clod.evaluate(adapted.gaussians, scene.test, [1.0, 3.0, config.max_sv])
+        rows.append({
+            "on": place.type, "scene": "synthetic" if small else "plush_half", "config": asdict(config),
+            "count": len(own), "warm_seconds": round(warm_seconds, 2), "start_seconds": round(adapted.start_seconds, 2),
+            "train_seconds": round(adapted.seconds, 2), "peak_bytes": peak(place), "base": base_row.as_dict(),
+            "rows": [row.as_dict() for row in found],
+        })  # fmt: skip
+    return rows
+
+
+def measure_city(device: torch.device, size: Size) -> list[dict[str, Any]]:
+    """A row for the adaptation, and one for each of near and far at each dial value."""
+    base, scene = synthetic(size, device)
+    base, config = base.to(device), clod.AdaptConfig(iters=size.steps, max_sv=DIALS[-1])
+    reset_peak(device)
+    adapted = clod.adapt(base, scene, config)
+    wait_for(device)
+    rows: list[dict[str, Any]] = [{
+        "what": "adapt", "config": asdict(config), "start_seconds": round(adapted.start_seconds, 2),
+        "train_seconds": round(adapted.seconds, 2), "peak_bytes": peak(device), "base_bytes": weight(base),
+    }]  # fmt: skip
+    del base
+    model, truth = adapted.gaussians, city(size.count)
+    for where in ("near", "far"):
+        cameras = city_cameras(4, size.width, size.height, where=where, count=size.count, seed=9)
+        targets = photograph(truth, cameras, device)
+        rows += [frames(model, targets, where, s, size.repeats) for s in DIALS]
+    return rows
+
+
+@torch.no_grad()
+def frames(model: clod.Gaussians, views: list[View], where: str, s: float, repeats: int) -> dict[str, Any]:
+    """Medians in milliseconds, ours and plain in turn, over the views; and what each picture is worth."""
+    device, plain = model.means.device, plain_frames(model)
+    jobs: dict[str, Callable[[Camera], Any]] = {
+        "ours": lambda camera: clod.render(model, camera, s).image,
+        **plain,
+        "dial": lambda camera: dial(model, camera, s),
+        "compact": compaction(model, s),
+    }
+    times: dict[str, list[float]] = {name: [] for name in jobs}
+    for job in jobs.values():
+        job(views[0].camera)  # compiled and warm
+    for k in range(repeats):
+        camera = views[k % len(views)].camera
+        for name, job in jobs.items():
+            wait_for(device)
+            began = time.perf_counter()
+            job(camera)
+            wait_for(device)
+            times[name].append((time.perf_counter() - began) * 1e3)
+    ms = {name: median(taken) for name, taken in times.items()}
+    shown = [clod.render(model, view.camera, s) for view in views]
+    full = [next(iter(plain.values()))(view.camera) for view in views]
+    pixels = [(picture.clamp(0, 1) * 255).round().to(torch.uint8).cpu() for picture in full]
+    return {
+        "what": "frames", "where": where, "virtual_scale": s, "kept": fmean(int(p.kept.sum()) for p in shown), "ms": ms,
+        "faster": {name: ms[name] / ms["ours"] for name in plain},
+        "dial_share": (ms["dial"] + ms["compact"]) / ms["ours"],
+        "dial_share_of_plain": {name: (ms["dial"] + ms["compact"]) / ms[name] for name in plain},
+        "psnr_full": fmean(psnr(p.image, f) for p, f in zip(shown, pixels, strict=True)),
+        "psnr_truth": fmean(psnr(p.image, view.image) for p, view in zip(shown, views, strict=True)),
+        "plain_psnr_truth": fmean(psnr(f, view.image) for f, view in zip(full, views, strict=True)),
+        "one_pass_differs": one_pass_differs(model, views[0].camera, s),
+    }  # fmt: skip
+
+
+def plain_frames(model: clod.Gaussians) -> dict[str, Callable[[Camera], Tensor]]:
+    """The file without its dial, activated beforehand, as a viewer that does not know the dial draws it."""
+    scales, opacities = model.scales, model.opacities
+    if model.means.device.type == "cpu":
+        return {"plain": lambda camera: splat(model, opacities, camera)[0]}
+    import gsplat
+
+    colors = torch.cat([model.sh0, model.shN], 1)
+
+    def draw(packed: bool) -> Callable[[Camera], Tensor]:
+        def picture(camera: Camera) -> Tensor:
+            return gsplat.rasterization(
+                model.means, model.quats, scales, opacities, colors, camera.viewmat.to(scales)[None],
+                camera.K.to(scales)[None], camera.width, camera.height, near_plane=camera.near,
+                sh_degree=model.sh_degree, packed=packed,
+            )[0][0]  # fmt: skip
+
+        return picture
+
+    return {"plain packed": draw(True), "plain unpacked": draw(False)}
+
+
+def compaction(model: clod.Gaussians, s: float) -> Callable[[Camera], Any]:
+    """What leaving the cut rows out takes, of opacities that are there."""
+    scales = model.scales
+    drawn: dict[str, Tensor] = {}
+
+    def run(camera: Camera) -> Any:
+        if camera.name not in drawn:
+            drawn[camera.name] = dial(model, camera, s).drawn
+        return cuda.compact(model.means, model.quats, scales, drawn[camera.name])
+
+    return run
+
+
+def one_pass_differs(model: clod.Gaussians, camera: Camera, s: float) -> dict[str, float]:
+    """Compiled formula and plain one: the largest difference of what is drawn, and Gaussians that only one keeps."""
+    assert model.sigma_d is not None and model.attenuation is not None
+    fused = attenuate_seen(model.means, model.opacity_logits, model.sigma_d, camera, s, model.attenuation)
+    on_cpu = model.to("cpu")
+    assert on_cpu.sigma_d is not None
+    d = normalized_distances(on_cpu.means, camera, model.attenuation)
+    plain = attenuate(on_cpu.opacity_logits, on_cpu.sigma_d, d, s, model.attenuation)
+    apart = (fused.drawn.cpu() - plain.drawn).abs()
+    return {"drawn": float(apart.max()), "kept_by_one": int((fused.keep.cpu() != plain.keep).sum())}
+
+
+def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, Scene]:
+    """A city as training might have left it, and photographs of what it should be."""
+    truth = city(size.count)
+    cameras = city_cameras(2 * size.views, size.width, size.height, where="mixed", count=size.count)
+    views = photograph(truth, cameras, device)
+    return perturb(truth), Scene(tuple(views[: size.views]), tuple(views[size.views :]))
+
+
+@torch.no_grad()
+def photograph(truth: clod.Gaussians, cameras: list[Camera], device: torch.device) -> list[View]:
+    there = truth.to(device)
+    return [View(camera, clod.render(there, camera).pixels.cpu()) for camera in cameras]
+
+
+def weight(gaussians: clod.Gaussians) -> int:
+    """Bytes of the tensors."""
+    return sum(x.numel() * x.element_size() for x in gaussians.tensors().values())
+
+
+def reset_peak(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def peak(device: torch.device) -> int:
+    """Bytes: of torch's allocations on a GPU since ``reset_peak``; on the CPU of the process, ever."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+if __name__ == "__main__":
+    main()

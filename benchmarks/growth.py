@@ -1,0 +1,394 @@
+"""Time and memory of the commands against the number of Gaussians, and of adapting against photographs.
+
+    python benchmarks/growth.py                            # all of it: some 15 minutes, 12 GB of memory, 8 GB of disk
+    python benchmarks/growth.py --sizes 10000 100000       # some sizes
+    python benchmarks/growth.py --only inspect view        # some commands
+    python benchmarks/growth.py --plot                     # nothing is run: the picture and the tables of the rows
+
+Each command is run as a user runs it, in a process of its own, on cities (``city.py``) that are made once and kept in
+benchmarks/cache. From outside come wall and CPU seconds and the resident memory, every 20 ms; from what the command
+says on stderr and in its report, the phases that they belong to. A run on a city of 1000 Gaussians is the floor: what
+starting up costs. Rows go to results/growth.jsonl; the last one of a kind counts, and docs/images/growth.png shows
+them. Exponents are least squares in logarithms, of the seconds above the floor, from 100k Gaussians on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import numpy as np
+from common import RESULTS, ROOT, append
+
+from clod_adapter.report.style import QUIET, SERIES, label_log, new_figure, save, tidy
+
+FILE, PICTURE = "growth.jsonl", ROOT / "docs" / "images" / "growth.png"
+CACHE = ROOT / "benchmarks" / "cache" / "growth"
+COMMAND = (sys.executable, "-m", "clod_adapter.cli.main")
+FLOOR, SIZES = 1000, (10_000, 100_000, 1_000_000, 5_000_000)
+FROM = 100_000  # Gaussians from which on exponents are fitted: below, seconds are all start-up
+COMMANDS = ("adapt", "eval", "export", "inspect", "view")
+IMAGES, WIDTH, HEIGHT, STEPS, MAX_SV = 10, 640, 400, 8, 3
+SERIES_COUNT = 100_000  # Gaussians of the series over photographs
+MANY, SMALL = (16, 64, 256), (320, 200)  # photographs, of this size
+SHAPES, FEW = ((320, 200), (640, 400), (1280, 800), (1600, 1000)), 16  # sizes, of so many photographs
+SAID = {
+    "load": r": \d+ photographs to train on",
+    "base": r"^base: ",
+    "train": r"^trained ",
+    "write": r"^wrote ",
+}
+# The order of leaving by itself, on the model as adapting has it: within the report it is a part of "start".
+ORDER = """
+import sys, time, torch
+from clod_adapter.collapse import leaving_order
+from clod_adapter.io.ply import load
+g = load(sys.argv[1]).gaussians
+worth = torch.rand(len(g), generator=torch.Generator().manual_seed(0)) ** 4
+leaving_order(g.select(torch.arange(min(len(g), 1000))), worth[:1000])
+began = time.perf_counter()
+leaving_order(g, worth)
+print(time.perf_counter() - began)
+"""
+
+
+class Run:
+    """A process: the moments at which it said things, its memory over time, what it cost."""
+
+    def __init__(self, words: Sequence[object], *, until: str = "") -> None:
+        """Waits for its end; or with ``until`` for that text in a line on stdout, which becomes ``line``."""
+        self.began = time.perf_counter()
+        self.process = subprocess.Popen(
+            [str(word) for word in words], text=True, cwd=tempfile.gettempdir(), stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+        self.out, self.lines, self.moments, self.memory = "", list[str](), dict[str, float](), list[tuple[float, int]]()
+        self.ended = False
+        self.threads = [Thread(target=each, daemon=True) for each in (self._follow, self._sample)]
+        for thread in self.threads:
+            thread.start()
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.out += line
+            if until and until in line:
+                self.line = line
+                return
+        self.finish()
+
+    def now(self) -> float:
+        return time.perf_counter() - self.began
+
+    def _follow(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self.lines.append(line.rstrip())
+            for name, pattern in SAID.items():
+                if name not in self.moments and re.search(pattern, line):
+                    self.moments[name] = self.now()
+
+    def _sample(self) -> None:
+        statm = Path(f"/proc/{self.process.pid}/statm")
+        while not self.ended:
+            try:
+                pages = int(statm.read_text(encoding="utf-8").split()[1])
+            except (OSError, IndexError):
+                return
+            self.memory.append((self.now(), pages * os.sysconf("SC_PAGE_SIZE")))
+            time.sleep(0.02)
+
+    def finish(self) -> None:
+        _, status, usage = os.wait4(self.process.pid, 0)
+        self.seconds, self.ended = self.now(), True
+        self.process.returncode = os.waitstatus_to_exitcode(status)
+        for thread in self.threads:
+            thread.join()
+        self.cpu_seconds = usage.ru_utime + usage.ru_stime
+        self.peak_bytes = usage.ru_maxrss * 1024
+        if self.process.returncode != 0:
+            sys.exit("\n".join([f"exit code {self.process.returncode}: {self.process.args}", *self.lines]))
+
+    def cost(self) -> dict[str, Any]:
+        return {
+            "seconds": round(self.seconds, 3),
+            "cpu_seconds": round(self.cpu_seconds, 3),
+            "peak_bytes": self.peak_bytes,
+        }
+
+    def peaks(self, ends: Iterable[tuple[str, float]]) -> dict[str, int]:
+        """The most memory in each of the phases, which follow one another and end at these moments."""
+        found, start = {}, 0.0
+        for name, end in ends:
+            found[name] = max((size for at, size in self.memory if start <= at < end), default=0)
+            start = end
+        return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, metavar="N", help="Gaussians (default: all)")
+    parser.add_argument(
+        "--only", nargs="+", default=(*COMMANDS, "images", "shapes"), choices=(*COMMANDS, "images", "shapes"),
+        help="commands, and the series of adapt over the number and the size of photographs (default: all)",
+    )  # fmt: skip
+    parser.add_argument("--plot", action="store_true", help="run nothing")
+    args = parser.parse_args()
+    if not args.plot:
+        measure(args.sizes, args.only)
+    rows = latest()
+    draw(rows)
+    print(tables(rows))
+
+
+def measure(sizes: Sequence[int], only: Sequence[str]) -> None:
+    """Runs, and appends the rows."""
+    CACHE.mkdir(parents=True, exist_ok=True)
+    run_adapt(scene(FLOOR, IMAGES, WIDTH, HEIGHT))  # compiles what is not yet compiled
+    for count in sorted({FLOOR, *sizes}):
+        folder = scene(count, IMAGES, WIDTH, HEIGHT)
+        if "adapt" in only or not dial_of(folder).exists():
+            record("count", "adapt", folder, count, IMAGES, WIDTH, HEIGHT, run_adapt(folder) | order_seconds(folder))
+        for command in COMMANDS[1:]:
+            if command in only:
+                record("count", command, folder, count, IMAGES, WIDTH, HEIGHT, RUNS[command](folder))
+    for images in MANY if "images" in only else ():
+        folder = scene(SERIES_COUNT, images, *SMALL)
+        record("images", "adapt", folder, SERIES_COUNT, images, *SMALL, run_adapt(folder))
+    for width, height in SHAPES if "shapes" in only else ():
+        folder = scene(SERIES_COUNT, FEW, width, height)
+        record("shapes", "adapt", folder, SERIES_COUNT, FEW, width, height, run_adapt(folder))
+
+
+def scene(count: int, images: int, width: int, height: int) -> Path:
+    """A city, made where it is not there."""
+    folder = CACHE / f"city-{count}-{images}-{width}x{height}"
+    if not folder.exists():
+        # In a process of its own, so that its memory is given back.
+        words = [sys.executable, Path(__file__).parent / "city.py", folder, "--count", count, "--images", images]
+        subprocess.run([*map(str, words), "--size", str(width), str(height)], check=True)
+    return folder
+
+
+def dial_of(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}-dial.ply")
+
+
+def record(
+    series: str, command: str, folder: Path, count: int, images: int, width: int, height: int, found: dict[str, Any]
+) -> None:
+    append(FILE, {
+        "series": series, "command": command, "gaussians": count, "images": images, "width": width, "height": height,
+        "file_bytes": (folder / "city.ply").stat().st_size, "busy": round(os.getloadavg()[0], 2), **found,
+    })  # fmt: skip
+
+
+def run_adapt(folder: Path) -> dict[str, Any]:
+    """A few steps: seconds and memory by phase."""
+    out = dial_of(folder)
+    run = Run([
+        *COMMAND, folder / "city.ply", "--images", folder, "--iters", STEPS, "--max-sv", MAX_SV, "--out", out
+    ])  # fmt: skip
+    report, at = json.loads(out.with_suffix(".json").read_text(encoding="utf-8")), run.moments
+    seconds = report["seconds"]
+    moments = [
+        ("load", at["load"]), ("base", at["base"]), ("start", at["train"] - seconds["train"]), ("train", at["train"]),
+        ("write", at["write"]), ("measure and write again", run.seconds),
+    ]  # fmt: skip
+    phases = {
+        "load": seconds["load"], "start": seconds["start"], "step": seconds["train"] / STEPS,
+        "write": at["write"] - at["train"], "evaluate": seconds["evaluate"],
+    }  # fmt: skip
+    return {
+        **run.cost(), "steps": STEPS, "phases": {name: round(value, 4) for name, value in phases.items()},
+        "phase_peaks": run.peaks(moments), "psnr": report["base_rows"][0]["psnr"],
+    }  # fmt: skip
+
+
+def order_seconds(folder: Path) -> dict[str, Any]:
+    return {"order_seconds": round(float(Run([sys.executable, "-c", ORDER, folder / "city.ply"]).out), 3)}
+
+
+def run_eval(folder: Path) -> dict[str, Any]:
+    return Run([*COMMAND, "eval", dial_of(folder), "--images", folder, "--sv", 1, MAX_SV]).cost()
+
+
+def run_export(folder: Path) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory(dir=CACHE) as out:
+        return Run([*COMMAND, "export", dial_of(folder), "-o", Path(out) / "plain.ply", "--sv", 1.5]).cost()
+
+
+def run_inspect(folder: Path) -> dict[str, Any]:
+    return Run([*COMMAND, "inspect", dial_of(folder)]).cost()
+
+
+def run_view(folder: Path) -> dict[str, Any]:
+    """Until the address is printed, and until a page would have all of the model; no browser."""
+    run = Run([*COMMAND, "view", dial_of(folder), "--images", folder, "--no-browser"], until="http://")
+    address, size = run.now(), 0
+    with urllib.request.urlopen(run.line.split()[0] + "files/model") as answer:
+        while block := answer.read(1 << 20):
+            size += len(block)
+    served = run.now()
+    run.process.send_signal(signal.SIGINT)
+    run.finish()
+    return run.cost() | {"seconds": round(served, 3), "address_seconds": round(address, 3), "served_bytes": size}
+
+
+RUNS = {"eval": run_eval, "export": run_export, "inspect": run_inspect, "view": run_view}
+
+
+def latest() -> list[dict[str, Any]]:
+    """The last row of each kind."""
+    found = {}
+    for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
+        row = json.loads(line)
+        found[tuple(row[key] for key in ("series", "command", "gaussians", "images", "width", "height"))] = row
+    return [found[key] for key in sorted(found)]
+
+
+def exponent(points: Sequence[tuple[float, float]]) -> float:
+    """Of the power of x that y follows, by least squares in logarithms; NaN of fewer than two points."""
+    x, y = np.log([point for point in points if point[1] > 0]).T if len(points) > 1 else ((), ())
+    return float(np.polyfit(x, y, 1)[0]) if len(x) > 1 else math.nan
+
+
+def over_count(rows: Sequence[dict[str, Any]], command: str) -> list[dict[str, Any]]:
+    return [row for row in rows if row["series"] == "count" and row["command"] == command]
+
+
+def seconds_of(rows: Sequence[dict[str, Any]], command: str, phase: str = "") -> list[tuple[float, float]]:
+    """(Gaussians, seconds) of a command, or of a phase of adapting."""
+    return [(row["gaussians"], phase_of(row, phase)) for row in over_count(rows, command)]
+
+
+def phase_of(row: dict[str, Any], phase: str) -> float:
+    if not phase:
+        return row["seconds"]
+    if phase == "importance":
+        return row["phases"]["start"] - row["order_seconds"]
+    return row["order_seconds"] if phase == "order" else row["phases"][phase]
+
+
+PHASES = ("load", "importance", "order", "step", "evaluate", "write")
+
+
+def growth(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """The exponent above the floor from FROM on, and that of the last two sizes with the floor in it."""
+    floor = dict(points).get(FLOOR, 0.0)
+    fitted = exponent([(x, y - floor) for x, y in points if x >= FROM])
+    return fitted, exponent(points[-2:])
+
+
+def bytes_a_gaussian(rows: Sequence[dict[str, Any]], command: str) -> tuple[float, float]:
+    """What each Gaussian adds to the peak, and the peak without any: a line through the largest two sizes."""
+    points = [(row["gaussians"], row["peak_bytes"]) for row in over_count(rows, command)][-2:]
+    if len(points) < 2:
+        return math.nan, math.nan
+    (n, low), (m, high) = points
+    each = (high - low) / (m - n)
+    return each, low - each * n
+
+
+def tables(rows: Sequence[dict[str, Any]]) -> str:
+    """Markdown for docs/growth.md."""
+    sizes = sorted({row["gaussians"] for row in rows if row["series"] == "count"})
+    head = "| | " + " | ".join(f"{size:,}" for size in sizes) + " | exponent | last two |"
+    lines = [head, "|---" * (len(sizes) + 3) + "|"]
+    cases = [(command, "") for command in COMMANDS] + [("adapt", phase) for phase in PHASES]
+    for command, phase in cases:
+        points = seconds_of(rows, command, phase)
+        fitted, last = growth(points)
+        cells = [f"{dict(points)[size]:.3g}" if size in dict(points) else "" for size in sizes]
+        lines.append(f"| {phase or command} | {' | '.join(cells)} | {fitted:.2f} | {last:.2f} |")
+    lines += ["", "| | peak, GB | | bytes a Gaussian | besides, MB |", "|---|---|---|---|---|"]
+    for command in COMMANDS:
+        each, rest = bytes_a_gaussian(rows, command)
+        peaks = [f"{row['gaussians']:,}: {row['peak_bytes'] / 1e9:.2f}" for row in over_count(rows, command)[-2:]]
+        lines.append(f"| {command} | {' | '.join(peaks or ['', ''])} | {each:,.0f} | {rest / 1e6:,.0f} |")
+    for row in over_count(rows, "adapt")[-1:]:
+        per = {name: f"{peak / row['gaussians']:,.0f}" for name, peak in row["phase_peaks"].items()}
+        lines += ["", f"resident bytes a Gaussian at {row['gaussians']:,}, by phase of adapt: {per}"]
+    for series, name, x in (("images", "photographs", photographs), ("shapes", "megapixels", megapixels)):
+        chosen = sorted((row for row in rows if row["series"] == series), key=x)
+        lines += ["", f"| adapt over {name} | seconds | start | step | evaluate | load | peak, GB |", "|---" * 7 + "|"]
+        for row in chosen:
+            times = " | ".join(f"{row['phases'][key]:.3g}" for key in ("start", "step", "evaluate", "load"))
+            lines.append(f"| {x(row):.3g} | {row['seconds']:.3g} | {times} | {row['peak_bytes'] / 1e9:.2f} |")
+        powers = [exponent([(x(row), row["phases"][key]) for row in chosen]) for key in ("start", "step", "evaluate")]
+        lines.append(f"exponents of start, step, evaluate: {', '.join(f'{power:.2f}' for power in powers)}")
+    return "\n".join(lines)
+
+
+def photographs(row: dict[str, Any]) -> float:
+    return row["images"]
+
+
+def megapixels(row: dict[str, Any]) -> float:
+    return row["width"] * row["height"] / 1e6
+
+
+def draw(rows: Sequence[dict[str, Any]]) -> None:
+    """Four panels: seconds and memory of the commands, phases of adapting, adapting over photographs."""
+    with new_figure((9.6, 7.2), layout="constrained") as figure:
+        (a, b), (c, d) = figure.subplots(2, 2)
+        for command, colour in zip(COMMANDS, SERIES, strict=True):
+            points = seconds_of(rows, command)
+            line(a, points, colour, f"{command}  {growth(points)[0]:.2f}")
+            memory = [(row["gaussians"], row["peak_bytes"] / 1e9) for row in over_count(rows, command)]
+            line(b, memory, colour, f"{command}  {bytes_a_gaussian(rows, command)[0]:,.0f} B")
+        for phase, colour in zip(PHASES, (*SERIES, "#b8860b"), strict=True):
+            points = seconds_of(rows, "adapt", phase)
+            line(c, points, colour, f"{phase}  {growth(points)[0]:.2f}")
+        guide(c, rows)
+        for series, x, colour in (("images", photographs, SERIES[0]), ("shapes", megapixels, SERIES[1])):
+            chosen = sorted((row for row in rows if row["series"] == series), key=x)
+            name = "photographs" if series == "images" else "size of each"
+            for key, style in (("start", "-"), ("step", "--"), ("evaluate", ":")):
+                points = [(row["images"] * megapixels(row), row["phases"][key]) for row in chosen]
+                line(d, points, colour, f"{key}, {name}  {exponent(points):.2f}", style)
+        finish(a, "Seconds of a command, and exponent", "Gaussians", "seconds")
+        finish(b, "Peak memory, and bytes a Gaussian", "Gaussians", "GB")
+        finish(c, "Phases of adapting, and exponent", "Gaussians", "seconds; of one step")
+        finish(d, f"Adapting {SERIES_COUNT:,} Gaussians", "megapixels of all photographs", "seconds; of one step")
+        PICTURE.parent.mkdir(exist_ok=True)
+        save(figure, PICTURE)
+
+
+def line(axes: Any, points: Sequence[tuple[float, float]], colour: str, label: str, style: str = "-") -> None:
+    shown = [(x, y) for x, y in points if y > 0 and x != FLOOR]
+    if shown:
+        axes.plot(*zip(*shown, strict=True), style, color=colour, marker="o", markersize=4, linewidth=1.6, label=label)
+
+
+def guide(axes: Any, rows: Sequence[dict[str, Any]]) -> None:
+    """What n log n would be, through the last point of the order of leaving."""
+    points = seconds_of(rows, "adapt", "order")
+    if points:
+        n, seconds = points[-1]
+        x = np.array([size for size, _ in points if size != FLOOR], float)
+        axes.plot(x, seconds * x * np.log(x) / (n * math.log(n)), color=QUIET, linewidth=0.8, label="n log n")
+
+
+def finish(axes: Any, title: str, x: str, y: str) -> None:
+    axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
+    axes.set_title(title, loc="left", fontsize=10, weight="bold")
+    tidy(axes)
+    label_log(axes.xaxis, "{:,g}", subs=(1,))
+    label_log(axes.yaxis, "{:,g}", subs=(1,))
+    axes.legend(frameon=False, fontsize=7.5)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,163 @@
+"""Splatting on an NVIDIA GPU by gsplat 1.5.3's kernels, of the rows that are drawn and of no others.
+
+gsplat's projection looks at an opacity last, after all the work on a row, and packed it does that work twice. So rows
+below 1/255, those that a dial has cut among them, are left out beforehand: their 4 bytes of opacity are read, and
+nothing else of them, here or later. Of the rows that stay, the geometry (40 bytes) is gathered once and projected,
+packed; the spherical harmonics (up to 300 bytes) are gathered only of those that the projection finds in the picture,
+by their row in the whole tensor. Unpacked, gsplat would want them of every row that it is given.
+
+Backward, a row that was gathered is written to one place, so that nothing is added up and the gradients of rows that
+were left out are 0. What gsplat sums over pixels it sums in no fixed order: results repeat but for rounding.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import sys
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from clod_adapter.cameras import Camera
+from clod_adapter.errors import ClodError
+
+ALPHA_MIN, BLUR, TILE = 1 / 255, 0.3, 16
+INSTALL = "pip install gsplat==1.5.3"
+
+
+@lru_cache(maxsize=1)
+def unusable() -> str | None:
+    """Why gsplat cannot draw on a GPU here, with the line that mends it; None where it can.
+
+    The first call on a machine may compile gsplat's kernels, which takes minutes; gsplat says so.
+    """
+    try:
+        with contextlib.redirect_stdout(sys.stderr):  # it speaks to stdout, which is our results'
+            import gsplat
+            from gsplat.cuda import _backend
+    except Exception as error:  # a failed compilation is a RuntimeError, a missing library an OSError or ImportError
+        what = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        return f"gsplat cannot be imported ({what}): {INSTALL}"
+    if _backend._C is None:
+        return (
+            f"gsplat {gsplat.__version__} has no CUDA kernels, and there is no CUDA toolkit to compile them with: "
+            f"install nvcc, or a build for your torch, as in {INSTALL} --index-url "
+            "https://docs.gsplat.studio/whl/pt24cu124"
+        )
+    return None
+
+
+def require_gsplat() -> None:
+    """Raises ClodError where gsplat cannot draw."""
+    if reason := unusable():
+        raise ClodError(f"no rasterizer for the GPU: {reason}; or use the CPU (--device cpu)")
+
+
+def rasterize(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor, camera: Camera,
+    background: Tensor,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """See ``clod_adapter.rasterizers.Rasterizer``.
+
+    Raises:
+        ClodError: a tensor is not float32.
+    """
+    for name, tensor in locals().items():
+        if isinstance(tensor, Tensor) and tensor.is_cuda and tensor.dtype != torch.float32:
+            raise ClodError(f"the CUDA rasterizer takes float32 only, and {name} is {tensor.dtype}: use .float()")
+    rows, geometry = compact(means, quats, scales, opacities)
+    drawn = _project(geometry, sh0, shN, rows, camera) if len(rows) else None
+    if drawn is None or len(drawn["means2d"]) == 0:
+        # Nothing to draw, but the inputs have gradients: 0.
+        nothing = sum(_Rows.apply(rows[:0], x).sum() for x in (means, quats, scales, opacities, sh0, shN))
+        empty = nothing + means.new_zeros(camera.height, camera.width)
+        return background + empty[..., None], empty
+    image, alpha = _blend(drawn, camera)
+    return image + (1 - alpha)[..., None] * background, alpha
+
+
+def compact(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """The numbers of the rows that are drawn, and the geometry and opacity of these alone."""
+    rows = (opacities.detach() >= ALPHA_MIN).nonzero()[:, 0]
+    return rows, [_Rows.apply(rows, x) for x in (means, quats, scales, opacities)]
+
+
+def _project(geometry: list[Tensor], sh0: Tensor, shN: Tensor, rows: Tensor, camera: Camera) -> dict[str, Tensor]:
+    """What gsplat's tiles and pixels take of the Gaussians that are in the picture: a row each, in the rows' order."""
+    import gsplat
+
+    means, quats, scales, opacities = geometry
+    viewmat, K, eye = _camera(camera, means)
+    _, _, ids, radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
+        means, None, quats, scales, viewmat, K, camera.width, camera.height, eps2d=BLUR, packed=True,
+        near_plane=camera.near, far_plane=math.inf, radius_clip=0.0, sparse_grad=False, calc_compensations=False,
+        camera_model="pinhole", opacities=opacities.detach(),
+    )  # fmt: skip
+    coefficients = _Rows.apply(rows[ids], sh0, shN)
+    degree = math.isqrt(coefficients.shape[1]) - 1
+    colors = 0.5 + gsplat.spherical_harmonics(degree, _Rows.apply(ids, means) - eye, coefficients)
+    shown = _Rows.apply(ids, opacities)
+    # A row that has a number which is not finite, or projects to one, is not drawn; in the kernels it would be opaque.
+    sound = (means2d.sum(1) + conics.sum(1) + colors.sum(1) + shown).detach().isfinite()
+    rows_of = sound[:, None]
+    return {
+        "means2d": means2d.where(rows_of, 0), "conics": conics.where(rows_of, 0), "radii": radii, "depths": depths,
+        "colors": colors.where(rows_of, 0).clamp(min=0), "opacities": shown.where(sound, 0),
+    }  # fmt: skip
+
+
+def _blend(drawn: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor]:
+    """Image ``[H, W, 3]`` before nothing, and alpha ``[H, W]``: tiles, their lists by depth, and the pixels."""
+    import gsplat
+
+    across, down = -(-camera.width // TILE), -(-camera.height // TILE)
+    depths, means2d = drawn["depths"], drawn["means2d"]
+    ids = torch.zeros(len(depths), dtype=torch.int64, device=depths.device)  # all of one image
+    _, keys, order = gsplat.isect_tiles(
+        means2d, drawn["radii"], depths, TILE, across, down, segmented=False, packed=True, n_images=1, image_ids=ids,
+        gaussian_ids=ids,
+    )  # fmt: skip
+    offsets = gsplat.isect_offset_encode(keys, 1, across, down)
+    image, alpha = gsplat.rasterize_to_pixels(
+        means2d, drawn["conics"], drawn["colors"], drawn["opacities"], camera.width, camera.height, TILE, offsets,
+        order, backgrounds=None, packed=True, absgrad=False,
+    )  # fmt: skip
+    return image[0], alpha[0, ..., 0]
+
+
+def _camera(camera: Camera, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """``[1, 4, 4]``, ``[1, 3, 3]`` and the centre ``[3]`` where the Gaussians are, in one transfer."""
+    parts = (camera.viewmat.flatten(), camera.K.flatten(), camera.position)
+    flat = torch.cat([part.detach().to(like.dtype) for part in parts]).to(like.device, non_blocking=True)
+    return flat[:16].view(1, 4, 4), flat[16:25].view(1, 3, 3), flat[25:]
+
+
+class _Rows(Function):
+    """The rows of one tensor, or of several side by side along the second dimension; each row at most once.
+
+    Backward, what is not finite counts as 0: it comes of rows that are not drawn, as 0 times what they projected to.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, *tensors: Tensor) -> Tensor:
+        ctx.save_for_backward(rows)
+        ctx.shapes = [x.shape for x in tensors]
+        if len(tensors) == 1:
+            return tensors[0].index_select(0, rows)
+        return torch.cat([x.index_select(0, rows) for x in tensors if x.shape[1]], 1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        (rows,), found, at = ctx.saved_tensors, [], 0
+        for shape, wanted in zip(ctx.shapes, ctx.needs_input_grad[1:], strict=True):
+            part = grad if len(ctx.shapes) == 1 else grad[:, at : at + shape[1]]
+            at += shape[1] if len(ctx.shapes) > 1 else 0
+            whole = grad.new_zeros(shape)
+            found.append(whole.index_copy_(0, rows, part.nan_to_num(0.0, 0.0, 0.0)) if wanted else None)
+        return None, *found

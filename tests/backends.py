@@ -1,0 +1,50 @@
+"""The rasterizers under contract. A new backend is a line in BACKENDS."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A rasterizer as the tests call it: with CPU tensors in and out, wherever and in whatever type it works.
+
+    Attributes:
+        module: below ``clod_adapter.rasterizers``.
+        device: that it works on.
+        dtype: what its inputs are brought to.
+        repeats: the same input gives the same bits; else the same but for the rounding of sums in no fixed order.
+        looser: how many times as far off as the CPU's it may be: 1 but for kernels in float32 with fast intrinsics.
+    """
+
+    module: str
+    device: str = "cpu"
+    dtype: torch.dtype = torch.float32
+    repeats: bool = True
+    looser: float = 1.0
+
+    def __call__(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
+        def place(x: Any) -> Any:
+            return x.to(self.device, self.dtype) if isinstance(x, Tensor) else x
+
+        rasterize = importlib.import_module(f"clod_adapter.rasterizers.{self.module}").rasterize
+        image, alpha = rasterize(*map(place, args), **{name: place(value) for name, value in kwargs.items()})
+        return image.cpu().float(), alpha.cpu().float()
+
+    @property
+    def rounding(self) -> dict[str, float]:
+        """What the results of one input may differ by from run to run, for ``assert_same`` and ``assert_close``."""
+        return {"rtol": 0.0, "atol": 0.0} if self.repeats else {"rtol": 1e-3, "atol": 1e-3}
+
+
+# gsplat's kernels are CUDA's alone. In torch, in float64, what is around them answers for every digit.
+BACKENDS = {
+    "cpu": Backend("cpu"),
+    "cuda, gsplat in torch": Backend("cuda", dtype=torch.float64),
+    "cuda": Backend("cuda", "cuda", repeats=False, looser=50.0),
+}

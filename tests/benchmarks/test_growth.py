@@ -1,0 +1,38 @@
+"""The exponents that are fitted are those that the rows have."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+import growth as measured  # noqa: E402
+
+SIZES = (measured.FLOOR, *measured.SIZES)
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
+def test_exponent_of_a_power(power: float) -> None:
+    assert measured.exponent([(n, 3 * n**power) for n in SIZES]) == pytest.approx(power)
+    assert math.isnan(measured.exponent([(1.0, 1.0)]))
+
+
+def test_the_floor_is_taken_off_before_the_fit() -> None:
+    points = [(n, 2.0 + 1e-6 * n) for n in SIZES]
+    fitted, last = measured.growth(points)
+    assert fitted == pytest.approx(1, abs=0.01)
+    assert 0.5 < last < 0.9  # which still has the floor in it
+
+
+def row(count: int) -> dict[str, Any]:
+    return {"series": "count", "command": "eval", "gaussians": count, "seconds": 1.0, "peak_bytes": 4e8 + 500 * count}
+
+
+def test_bytes_a_gaussian_are_the_slope_between_the_largest_sizes() -> None:
+    each, rest = measured.bytes_a_gaussian([row(n) for n in SIZES], "eval")
+    assert each == pytest.approx(500)
+    assert rest == pytest.approx(4e8)

@@ -1,0 +1,106 @@
+"""A device that is none: its tensors are CPU tensors behind a wall, and what would fail on a GPU fails on it.
+
+Mixing its tensors with the CPU's in one operation, ``.numpy()``, and indexing the CPU's with its own are refused; 0-d
+CPU tensors mix, as on CUDA. It is torch's private backend under the name ``gpu``, which is neither "cpu" nor "cuda".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map
+
+MOVES = ("aten._to_copy.default", "aten.copy_.default")  # what may see tensors of both
+
+
+class Walled(Tensor):
+    """A tensor of the device; ``inner`` is where its numbers are."""
+
+    inner: Tensor
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+
+    @staticmethod
+    def __new__(cls, real: Tensor) -> Walled:
+        made = Tensor._make_wrapper_subclass(
+            cls, real.shape, strides=real.stride(), storage_offset=real.storage_offset(), dtype=real.dtype,
+            device=torch.device("gpu", 0),
+        )  # fmt: skip
+        made.inner = real
+        return made
+
+    def __repr__(self) -> str:  # type: ignore[override]
+        return f"Walled({self.inner!r})"
+
+    @classmethod
+    def __torch_dispatch__(cls, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return _run(function, args, kwargs or {})
+
+
+def _run(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
+    walled = [x for x in tensors if isinstance(x, Walled)]
+    outside = [x for x in tensors if not isinstance(x, Walled) and x.dim()]
+    if walled and outside and str(function) not in MOVES:
+        raise RuntimeError(f"{function}: tensors of the fake GPU and of the CPU, {[tuple(x.shape) for x in outside]}")
+    device = kwargs.get("device")
+    inside = bool(walled) if device is None else torch.device(device).type == "gpu"
+    if device is not None:
+        kwargs = {**kwargs, "device": torch.device("cpu")}
+    args, kwargs = tree_map(lambda x: x.inner if isinstance(x, Walled) else x, (args, kwargs))
+    own = {id(x.inner): x for x in walled}  # an operation in place returns what it was given
+    out = function(*args, **kwargs)
+    return tree_map(lambda x: own[id(x)] if id(x) in own else _wall(x), out) if inside else out
+
+
+def _wall(value: Any) -> Any:
+    return Walled(value) if isinstance(value, Tensor) else value
+
+
+class _Dispatch(TorchDispatchMode):
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return _run(function, args, kwargs or {})
+
+
+class _Functions(TorchFunctionMode):
+    """What torch does below where it can be seen: ``torch.tensor`` moves its data, and ``tolist`` reads its own."""
+
+    def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if function is torch.tensor and kwargs.get("device") is not None:
+            device = kwargs.pop("device")
+            return function(*args, **kwargs).to(device)
+        if function is Tensor.tolist:
+            return args[0].cpu().tolist()
+        return function(*args, **kwargs)
+
+
+@lru_cache(maxsize=1)
+def register() -> None:
+    """To be called before the process's first backward pass, when autograd makes a thread for each device there is.
+
+    Not where there is a GPU: autograd would take this one for the accelerator.
+    """
+    if torch.cuda.is_available():
+        return
+    from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
+
+    class Module(_DummyBackendModule):
+        def get_amp_supported_dtype(self) -> list[torch.dtype]:  # torch.autocast asks for it, to be disabled too
+            return [torch.float16, torch.bfloat16]
+
+    _setup_privateuseone_for_python_backend("gpu", Module())
+
+
+@contextmanager
+def fake_gpu() -> Iterator[torch.device]:
+    """While it lasts there is the device."""
+    register()
+    with _Dispatch(), _Functions():
+        yield torch.device("gpu", 0)

@@ -1,0 +1,191 @@
+"""Everything on the way from a checkpoint to its pictures and numbers works on another device than the CPU.
+
+On a GPU where there is one; else on a fake one, on which what would fail on a real one fails, with gsplat's Python and
+torch in place of its kernels.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import gsplat_in_torch
+from clod_adapter import Gaussians, evaluate, render
+from clod_adapter.alignment import check_alignment
+from clod_adapter.budget import dial_for, frame_times
+from clod_adapter.cameras import Camera, Scene
+from clod_adapter.compare import matching_dial, mean_kept, rankings
+from clod_adapter.config import AdaptConfig
+from clod_adapter.counting import count_gradient, paper_count
+from clod_adapter.export import bake, order_by_extinction
+from clod_adapter.importance import seeing, start
+from clod_adapter.losses import photometric_loss
+from clod_adapter.metrics import psnr_ssim
+from clod_adapter.optimizer import RowAdam
+from clod_adapter.placement import imagine, place
+from clod_adapter.popping import dial_popping, path_popping
+from clod_adapter.rasterizers import cpu, cuda
+from fake_gpu import fake_gpu
+from scenes import capture, gaussians, ring
+
+CONFIG = AdaptConfig(iters=2, max_sv=4.0)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The same Gaussians on both, and photographs, which are on the CPU."""
+
+    device: torch.device
+    own: Gaussians
+    there: Gaussians
+    scene: Scene
+
+    @property
+    def cameras(self) -> list[Camera]:
+        return [view.camera for view in self.scene.train]
+
+
+@pytest.fixture
+def setup(monkeypatch: pytest.MonkeyPatch) -> Iterator[Setup]:
+    pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
+    base, scene = capture(50, 4, 20, 14)
+    own = start(base, scene.train, CONFIG)
+    module = importlib.import_module("clod_adapter.render")
+    if torch.cuda.is_available():
+        yield Setup(torch.device("cuda", 0), own, own.to("cuda"), scene)
+        return
+    gsplat_in_torch.install(monkeypatch)
+    monkeypatch.setattr(module, "for_device", lambda d: cpu.rasterize if d.type == "cpu" else cuda.rasterize)
+    with fake_gpu() as device:
+        yield Setup(device, own, own.to(device), scene)
+
+
+def on_both(setup: Setup, run: Callable[[Gaussians], Any]) -> tuple[Any, Any]:
+    return run(setup.there), run(setup.own)
+
+
+def test_the_fake_gpu_refuses_what_a_gpu_would(setup: Setup) -> None:
+    there = setup.there.means
+    for wrong in (lambda: there + setup.own.means, lambda: there.numpy(), lambda: setup.own.means[there[:, 0] > 0]):
+        with pytest.raises((RuntimeError, TypeError)):
+            wrong()
+    assert torch.equal((there * torch.tensor(2.0)).cpu(), setup.own.means * 2) and there.device == setup.device
+
+
+def test_render_and_its_gradients(setup: Setup) -> None:
+    view, slopes, images = setup.scene.train[0], [], []
+    for model in (setup.there, setup.own):
+        leaves = {name: value.clone().requires_grad_() for name, value in model.tensors().items()}
+        drawn = render(model.replace(**leaves), view.camera, 2.0)
+        loss = photometric_loss(drawn.image, view.image)
+        found = torch.autograd.grad(loss, list(leaves.values()))
+        assert all(slope.device == model.means.device for slope in found)
+        images.append(drawn.pixels.cpu().float())
+        slopes.append(dict(zip(leaves, (slope.cpu() for slope in found), strict=True)))
+    assert (images[0] - images[1]).abs().max() <= 1
+    for name, mine in slopes[0].items():
+        assert float((mine - slopes[1][name]).norm()) <= 2e-2 * float(slopes[1][name].norm()) + 1e-7, name
+
+
+def test_the_start_and_what_it_goes_by(setup: Setup) -> None:
+    assert len(seeing(setup.there, setup.scene.train)) == len(setup.scene.train)
+    for kind in ("importance", "error", "constant", "identity"):
+        config = replace(CONFIG, start=kind)
+
+        def begun(model: Gaussians, config: AdaptConfig = config) -> Tensor:
+            plain = model.replace(sigma_d=None, attenuation=None)
+            return start(plain, setup.scene.train, config).sigma_d
+
+        mine, want = on_both(setup, begun)
+        assert mine.device == setup.device
+        torch.testing.assert_close(mine.cpu().log(), want.log(), rtol=0.02, atol=0.02)
+
+
+def test_numbers(setup: Setup) -> None:
+    """Rows, counts, dial values, popping, alignment, orders: the CPU's, within what two rasterizers differ by."""
+    cameras, test = setup.cameras, setup.scene.test
+    rows, want = on_both(setup, lambda model: evaluate(model, test, [1.0, 3.0]))
+    for mine, own in zip(rows, want, strict=True):
+        assert (mine.kept, mine.in_view) == (own.kept, own.in_view)
+        assert mine.psnr == pytest.approx(own.psnr, abs=0.05) and mine.ssim == pytest.approx(own.ssim, abs=2e-3)
+    shown = render(setup.there, test[0].camera).image
+    assert psnr_ssim(shown, test[0].image)[0] == pytest.approx(evaluate(setup.own, test[:1], [1.0])[0].psnr, abs=0.05)
+    for run in (
+        lambda model: mean_kept(model, cameras, 2.0),
+        lambda model: matching_dial(model, cameras, 20),
+        lambda model: dial_for(model, keep=20, cameras=cameras).virtual_scale,
+        lambda model: dial_popping(model, cameras[0], 3.0, steps=2).mean,
+        lambda model: path_popping(model, cameras[:2], 2.0, steps=2).mean,
+        lambda model: check_alignment(model, test).psnr,
+        lambda model: float(bake(model, 2.0).opacities.sum()),
+        lambda model: order_by_extinction(model, cameras).cpu().double() @ torch.arange(50).double(),
+        lambda model: rankings(model, setup.scene.train[:1])["opacity"].cpu().double() @ torch.arange(50).double(),
+    ):
+        mine, own = on_both(setup, run)
+        assert float(mine) == pytest.approx(float(own), rel=5e-3)
+
+
+def test_frame_times(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.import_module("clod_adapter.budget"), "TIMED_REPEATS", 1)
+    assert all(taken > 0 for _, taken in frame_times(setup.there, setup.cameras[:1]))
+
+
+def test_placed_cameras_are_those_of_the_cpu(setup: Setup) -> None:
+    placed = [place(model, views=1) for model in (setup.there, setup.own)]
+    torch.testing.assert_close(placed[0][0].viewmat, placed[1][0].viewmat, rtol=1e-3, atol=1e-3)
+    assert placed[0][0].viewmat.device.type == "cpu"
+    small = replace(placed[0][0], K=placed[0][0].K / 31, width=16, height=12)
+    pictures = imagine(setup.there, [small]).train
+    assert all(view.image.device.type == "cpu" for view in pictures)
+
+
+def test_a_step_of_training(setup: Setup) -> None:
+    """Count terms and Adam, as the trainer uses them."""
+    results = []
+    for model in (setup.there, setup.own):
+        camera, sigma = setup.cameras[0], model.sigma_d.log()
+        dialled = importlib.import_module("clod_adapter.render").dial(model, camera, 2.0)
+        pull = count_gradient(dialled, model.opacity_logits, 2.0, model.attenuation.tau, 0.1, CONFIG)
+        paper = paper_count(dialled, 2.0, model.attenuation.tau, CONFIG)
+        assert paper.device == pull.device == model.means.device
+        parameters = {"sigma": sigma.clone(), "means": model.means.clone()}
+        optimizer = RowAdam(parameters)
+        for _ in range(2):
+            optimizer.step({"sigma": pull, "means": model.means}, dialled.keep, {"sigma": 0.1, "means": 0.01})
+        results.append({name: value.cpu() for name, value in parameters.items()})
+    for name, mine in results[0].items():
+        torch.testing.assert_close(mine, results[1][name], rtol=1e-5, atol=1e-5)
+
+
+def test_neither_the_dial_nor_adam_asks_the_device_for_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each answer would have the CPU wait until the GPU is done, every step."""
+    from torch.utils._python_dispatch import TorchDispatchMode
+
+    class Silent(TorchDispatchMode):
+        def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            name = str(function)
+            masked = "aten.index" in name and any(
+                isinstance(i, Tensor) and i.dtype == torch.bool for i in args[1] if "aten.index" in name
+            )
+            if masked or any(part in name for part in ("_local_scalar_dense", "nonzero", "masked_select", "item")):
+                raise AssertionError(f"{function} waits for the device")
+            return function(*args, **(kwargs or {}))
+
+    own = gaussians(30, 1, 0)
+    model = own.replace(sigma_d=torch.ones(30), attenuation=CONFIG.attenuation(3.0))
+    optimizer = RowAdam({"means": own.means.clone(), "sigma": torch.ones(30)})
+    dial = importlib.import_module("clod_adapter.render").dial
+    camera = ring(1, 20, 14)[0]
+    optimizer._step_plain({"means": own.means}, torch.ones(30, dtype=torch.bool), {"means": 0.1})  # its table is there
+    with Silent():
+        dialled = dial(model, camera, 2.0)
+        gradients = {"means": own.means, "sigma": dialled.drawn}
+        optimizer._step_plain(gradients, dialled.keep, {"means": 0.1, "sigma": 0.1})
+    with pytest.raises(AssertionError, match="waits"), Silent():
+        own.means[dialled.keep]
