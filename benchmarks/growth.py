@@ -493,8 +493,8 @@ def finish(axes: Any, title: str, x: str, y: str) -> None:
     axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
     axes.set_title(title, loc="left", fontsize=10, weight="bold")
     tidy(axes)
-    label_log(axes.xaxis, "{:,g}", subs=(1,))
-    label_log(axes.yaxis, "{:,g}", subs=(1,))
+    label_log(axes.xaxis, "{:,.10g}", subs=(1,))
+    label_log(axes.yaxis, "{:,.10g}", subs=(1,))
     if axes.get_legend_handles_labels()[0]:
         axes.legend(frameon=False, fontsize=7.5)
 
