@@ -33,6 +33,7 @@ from typing import Any
 
 import numpy as np
 from common import RESULTS, ROOT, append
+from PIL import Image
 
 from clod_adapter.report.style import QUIET, SERIES, label_log, new_figure, save, tidy
 
@@ -43,6 +44,7 @@ FLOOR, SIZES = 1000, (10_000, 100_000, 1_000_000, 5_000_000)
 FROM = 100_000  # Gaussians from which on exponents are fitted: below, seconds are all start-up
 COMMANDS = ("adapt", "eval", "export", "inspect", "view")
 IMAGES, WIDTH, HEIGHT, STEPS, MAX_SV = 10, 640, 400, 8, 3
+BUSY = 3.0  # a load of the machine from which on somebody else was at work too
 SERIES_COUNT = 100_000  # Gaussians of the series over photographs
 MANY, SMALL = (16, 64, 256), (320, 200)  # photographs, of this size
 SHAPES, FEW = ((320, 200), (640, 400), (1280, 800), (1600, 1000)), 16  # sizes, of so many photographs
@@ -273,8 +275,8 @@ def latest() -> list[dict[str, Any]]:
 
 def exponent(points: Sequence[tuple[float, float]]) -> float:
     """Of the power of x that y follows, by least squares in logarithms; NaN of fewer than two points."""
-    x, y = np.log([point for point in points if point[1] > 0]).T if len(points) > 1 else ((), ())
-    return float(np.polyfit(x, y, 1)[0]) if len(x) > 1 else math.nan
+    usable = [point for point in points if point[1] > 0]
+    return float(np.polyfit(*np.log(usable).T, 1)[0]) if len(usable) > 1 else math.nan
 
 
 def over_count(rows: Sequence[dict[str, Any]], command: str) -> list[dict[str, Any]]:
@@ -337,7 +339,10 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
     """Markdown for docs/growth.md."""
     sizes = sorted({row["gaussians"] for row in rows if row["series"] == "count"})
     head = "| | " + " | ".join(f"{size:,}" for size in sizes) + " | exponent | last two | exponent of CPU |"
-    lines = [head, "|---" * (len(sizes) + 4) + "|"]
+    busy = max(row["busy"] for row in rows)
+    lines = [f"**Preliminary**: the machine's load was up to {busy:.0f} while these rows were taken, so wall times are "
+             "several times too long; the CPU's and memory stand.", ""] if busy > BUSY else []  # fmt: skip
+    lines += [head, "|---" * (len(sizes) + 4) + "|"]
     cases = [(command, "") for command in COMMANDS] + [("adapt", phase) for phase in PHASES]
     for command, phase in cases:
         points = seconds_of(rows, command, phase)
@@ -466,6 +471,7 @@ def draw(rows: Sequence[dict[str, Any]]) -> None:
         finish(d, f"Adapting {SERIES_COUNT:,} Gaussians", "megapixels of all photographs", "seconds; of one step")
         PICTURE.parent.mkdir(exist_ok=True)
         save(figure, PICTURE)
+    Image.open(PICTURE).convert("RGB").quantize(128).save(PICTURE, optimize=True)  # a third of the bytes
 
 
 def line(axes: Any, points: Sequence[tuple[float, float]], colour: str, label: str, style: str = "-") -> None:
@@ -487,8 +493,8 @@ def finish(axes: Any, title: str, x: str, y: str) -> None:
     axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
     axes.set_title(title, loc="left", fontsize=10, weight="bold")
     tidy(axes)
-    label_log(axes.xaxis, "{:,g}", subs=(1,))
-    label_log(axes.yaxis, "{:,g}", subs=(1,))
+    label_log(axes.xaxis, "{:,.10g}", subs=(1,))
+    label_log(axes.yaxis, "{:,.10g}", subs=(1,))
     if axes.get_legend_handles_labels()[0]:
         axes.legend(frameon=False, fontsize=7.5)
 
