@@ -104,9 +104,6 @@ def take_part() -> None:
                 _train_along(number, launch, stop)
             except PeerLost:
                 continue  # the first one says so; where it is the one that is gone, the launcher does
-            except Exception as error:
-                store.set(_reason(launch.rank), f"process {launch.rank}: {error or type(error).__name__}")
-                raise
 
 
 def explain(lost: str) -> str:
@@ -135,7 +132,7 @@ def _train_along(number: int, launch: Launch, stop: GracefulStop) -> None:
         if stop.requests:
             raise KeyboardInterrupt
 
-    with joined(_of_job(number), launch.rank, launch.size) as peers:
+    with joined(_of_job(number), launch.rank, launch.size) as peers, _giving_reasons(launch.rank):
         job: Any = peers.broadcast(None)
         if job.device == "cuda":
             _take_gpu(launch)
@@ -148,6 +145,18 @@ def _take_gpu(launch: Launch) -> None:
     if (gpus := torch.cuda.device_count()) < launch.local_size:
         raise ClodError(f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as there are")
     torch.cuda.set_device(launch.local_rank)
+
+
+@contextmanager
+def _giving_reasons(rank: int) -> Iterator[None]:
+    """Leaves word of what ends this process; to be left before the others notice that it does."""
+    try:
+        yield
+    except PeerLost:
+        raise
+    except Exception as error:
+        _store().set(_reason(rank), f"process {rank}: {str(error) or type(error).__name__}")
+        raise
 
 
 def _is_called(store: Store, number: int, stop: GracefulStop) -> bool:
