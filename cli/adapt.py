@@ -11,6 +11,7 @@ from typing import Any
 from clod_adapter.adapter import Adapter, detach, extract, trim
 from clod_adapter.cameras import Scene
 from clod_adapter.cli.alignment import require_alignment
+from clod_adapter.cli.chunked import Chunked
 from clod_adapter.cli.console import Console, duration
 from clod_adapter.cli.devices import on_device, pick_device
 from clod_adapter.cli.evaluate import measure
@@ -18,6 +19,7 @@ from clod_adapter.cli.files import Outputs, size
 from clod_adapter.cli.inputs import complement_scene, place_scene, read_checkpoint, read_scene
 from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.kernels import prepare_kernels
+from clod_adapter.cli.memory_plan import image_cache, plan_memory, with_rows, without_rows
 from clod_adapter.cli.pages import AdaptPage
 from clod_adapter.cli.plan import decide
 from clod_adapter.cli.processes import Job, describe_processes, explain, hurried, together
@@ -35,6 +37,7 @@ from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.trimming import trimmed
 from clod_adapter.io.version import package_version
 from clod_adapter.plan import Plan
+from clod_adapter.rasterizers.cpu import release_memory
 from clod_adapter.train import Adapted, Progress
 
 
@@ -61,22 +64,31 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     check_config(asdict(config))
     for path in vars(outputs).values():
         remove_leftovers(path)
-    saver = Saver(outputs.state, args.resume, config, console, stop)
+    resume = args.resume and (not args.memory or outputs.state.exists())  # chunks have files of their own
+    saver = Saver(outputs.state, resume, config, console, stop)
     inputs = read_inputs(args, config, console, watch)
     base, scene, config = inputs.base, inputs.scene, inputs.config
+    memory = plan_memory(args, base, scene, console)
+    chunked = Chunked.of(args, outputs, memory, base, scene, config, console, stop)
+    if chunked:
+        base = without_rows(base)
+        inputs = replace(inputs, base=base)
     gaussians = base.gaussians
-    saver.belong(gaussians, scene, args.ply, args.images or "those placed for it")
+    if chunked and args.chunk:
+        return chunked.alone(gaussians, scene, config)
+    if not chunked:
+        saver.belong(gaussians, scene, args.ply, args.images or "those placed for it")
     with watch.time("evaluate"):
         base_rows, notes = look_at_base(gaussians, scene, args, console)
     notes = [*inputs.notes, *notes]
     with stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
         page = AdaptPage(gaussians, scene, config, console) if args.report else None
         follower = Follower(console, stop, gaussians, scene.test, config.max_sv, base_rows[0] if base_rows else None)
-        plan = decide(args, gaussians, scene, config, follower, saver)
-        adapted = train(gaussians, scene, plan, follower, saver, page)
-        planning = sum(plan.seconds.values()) - plan.seconds["start"]
-        watch.seconds |= {"plan": planning, "start": adapted.start_seconds, "train": adapted.seconds}
-        kept, degree = (plan.kept, plan.sh_degree) if args.trim and plan.trims(gaussians) else (None, None)
+        plan, adapted = learn(args, gaussians, scene, config, chunked, follower, saver, page)
+        if plan:
+            watch.seconds["plan"] = sum(plan.seconds.values()) - plan.seconds["start"]
+        watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
+        kept, degree = (plan.kept, plan.sh_degree) if plan and args.trim and plan.trims(gaussians) else (None, None)
         base = trimmed(base, kept, degree)
         adapter = extract(
             trim(gaussians, kept, degree), trim(adapted.gaussians, kept, degree), fingerprint=base.fingerprint,
@@ -90,11 +102,13 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             notes.append(f"training ended at step {adapted.steps}: {explain(adapted.lost)}")
             console.say(notes[-1])
         result = adapter.apply(gaussians)
+        base = with_rows(base, args) if chunked else base
         report = describe_run(args, outputs, adapter, adapted) | {
             "sh_degree": result.sh_degree, "device": str(result.means.device), "seconds": watch.report(),
-            "resumed_from": saver.state and saver.state.steps, "alignment": inputs.alignment, "plan": plan.as_dict(),
+            "resumed_from": saver.state and saver.state.steps, "alignment": inputs.alignment,
             "notes": [*base.notes, *scene.notes, *notes, "the result was not measured"],
             "base_rows": [row.as_dict() for row in base_rows], "rows": [], "detached_row": None,
+            "plan": plan and plan.as_dict(), "memory": memory and asdict(memory),
         }  # fmt: skip
         with console.status(f"writing {outputs.ply} ..."):
             write(base, adapter, result, outputs, report)
@@ -115,6 +129,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     else:
         write_report(outputs.report, report)
     saver.close(finished=not adapted.interrupted and not cut_short)
+    if chunked and not cut_short:
+        chunked.remove()
     if page and not cut_short and not late.requests:  # after the report, which no failure of the page is to cost
         with watch.time("page"):
             written = page.write(outputs.ply.with_suffix(".html"), report, result, adapted.start_seconds)
@@ -132,7 +148,8 @@ def read_inputs(args: argparse.Namespace, config: AdaptConfig, console: Console,
     """
     with watch.time("load"):
         base = on_device(read_checkpoint(args.ply, console, args.activated), pick_device(args.device, console))
-        photographs = read_scene(args.images, console, base.origin) if args.images is not None else None
+        folder, cache = args.images, image_cache(args)
+        photographs = read_scene(folder, console, base.origin, cache) if folder is not None else None
     with watch.time("kernels"):
         prepare_kernels(console, base.gaussians.means.device)
     if photographs is None:
@@ -174,6 +191,20 @@ def look_at_base(
     for note in notes:
         console.say(note)
     return rows, notes
+
+
+def learn(
+    args: argparse.Namespace, gaussians: Gaussians, scene: Scene, config: AdaptConfig, chunked: Chunked | None,
+    follower: Follower, saver: Saver, page: AdaptPage | None,
+) -> tuple[Plan | None, Adapted]:  # fmt: skip
+    """Plans and trains; in chunks without a plan, which looks at all Gaussians at once."""
+    if chunked:
+        plan, adapted = None, chunked.all(gaussians, scene, config)
+    else:
+        plan = decide(args, gaussians, scene, config, follower, saver)
+        adapted = train(gaussians, scene, plan, follower, saver, page)
+    release_memory()  # of the training, before its outcome is copied and written
+    return plan, adapted
 
 
 def train(

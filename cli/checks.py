@@ -10,6 +10,7 @@ from pathlib import Path
 
 from clod_adapter.cli.checks_export import check_export
 from clod_adapter.cli.checks_inspect import check_inspect
+from clod_adapter.cli.checks_memory import check_memory
 from clod_adapter.cli.checks_plan import check_plan
 from clod_adapter.cli.checks_view import check_view
 from clod_adapter.cli.dials import given_budget
@@ -26,6 +27,7 @@ from clod_adapter.report.style import check_matplotlib
 def check_adapt(args: Namespace) -> None:
     make_config(args)
     check_plan(args)
+    check_memory(args)
     Outputs.of(args.ply, args.out).check([args.ply])
     if args.report:
         check_page(Outputs.of(args.ply, args.out).ply.with_suffix(".html"), ["rendering", "adapting"], [args.ply])

@@ -82,6 +82,12 @@ undisturbed (on as many threads). Without such a file it starts from the
 beginning, and says so; the finished run removes it. No file has its final name
 before it is whole.
 
+--memory 8GB plans what every phase takes, prints it, and adapts in chunks what
+does not fit: blocks of the scene, each with the views that see it, in two
+passes. Chunks can be jobs: with --chunk start, and then --chunk 1 and so on
+(once for each pass), in any order; the same command without --chunk does what
+is missing and writes the outputs, the same ones. Killed, it is repeated.
+
 torchrun starts several processes, on one machine or many, which train together:
 each takes its part of a step's views, one by default. The outcome is that of
 one process with the same --batch, but for rounding. docs/many_processes.md.

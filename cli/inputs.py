@@ -9,6 +9,7 @@ from clod_adapter.cli.console import Console
 from clod_adapter.cli.files import size
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.image_cache import ImageCache
 from clod_adapter.io.origin import Origin
 from clod_adapter.io.ply import Checkpoint, load
 from clod_adapter.io.ply_values import Activated
@@ -30,12 +31,13 @@ def read_checkpoint(
     return checkpoint
 
 
-def read_scene(folder: str, console: Console, origin: Origin) -> Scene:
+def read_scene(folder: str, console: Console, origin: Origin, cache: ImageCache | None = None) -> Scene:
     """Reads the photographs and says how they are used."""
     with console.meter("photographs") as meter:
         scene = load_scene(
-            folder, origin=origin, progress=lambda done, total: meter.update(done / total, f"{done}/{total}")
-        )
+            folder, origin=origin, progress=lambda done, total: meter.update(done / total, f"{done}/{total}"),
+            cache=cache,
+        )  # fmt: skip
     camera = scene.train[0].camera
     size = f"{camera.width}x{camera.height}"
     console.say(f"{folder}: {len(scene.train)} photographs to train on, {len(scene.test)} held out, {size}")

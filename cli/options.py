@@ -37,6 +37,13 @@ def adapt_options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--out", metavar="OUT.ply", help="output (default: PLY's name with _clod, in this folder)"
     )
+    parser.add_argument(
+        "--memory", metavar="SIZE", help="stay below this, as in 8GB: where the whole does not fit, train it in chunks"
+    )
+    parser.add_argument(
+        "--chunk", metavar="N", help="do only the start, or only chunk N, of a run with --memory; without it the same "
+        "command does what is missing, and puts all together",
+    )  # fmt: skip
     parser.add_argument("--resume", action="store_true", help="go on with the same command where it was interrupted")
     add_device(parser, "train and measure")
     parser.add_argument(

@@ -22,9 +22,10 @@ from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.launch import Launch, launched
 from clod_adapter.cli.training import Follower
 from clod_adapter.config import AdaptConfig
-from clod_adapter.distributed import PeerLost, Peers, joined
+from clod_adapter.distributed import PATIENCE, PeerLost, Peers, joined
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.objective import Part
 from clod_adapter.plan import Plan
 from clod_adapter.train import adapt
 from clod_adapter.training_state import Adapted, Progress, TrainingState
@@ -45,15 +46,15 @@ class Job:
     views: tuple[View, ...]
     config: AdaptConfig
     state: TrainingState | None
+    part: Part
     device: str
-    total: int
 
     @classmethod
     def of(cls, plan: Plan, scene: Scene, state: TrainingState | None) -> Job:
         """What ``plan.adapt`` does, from ``state`` or where the plan has begun."""
         state = next(iter(plan.begun), None) if state is None else state
         lean = plan.lean
-        return cls(lean, scene.train, plan.config, state, lean.means.device.type, len(plan.start))
+        return cls(lean, scene.train, plan.config, state, plan.part, lean.means.device.type)
 
 
 @contextmanager
@@ -137,9 +138,16 @@ def _train_along(number: int, launch: Launch, stop: GracefulStop) -> None:
     with joined(_of_job(number), launch.rank, launch.size) as peers:
         job: Any = peers.broadcast(None)
         if job.device == "cuda":
-            torch.cuda.set_device(launch.local_rank)
+            _take_gpu(launch)
         base = job.base.to(job.device)
-        adapt(base, Scene(job.views, ()), job.config, follow, job.state, total=job.total, peers=peers)
+        adapt(base, Scene(job.views, ()), job.config, follow, job.state, part=job.part, peers=peers)
+
+
+def _take_gpu(launch: Launch) -> None:
+    """A GPU for each process on this machine."""
+    if (gpus := torch.cuda.device_count()) < launch.local_size:
+        raise ClodError(f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as there are")
+    torch.cuda.set_device(launch.local_rank)
 
 
 def _is_called(store: Store, number: int, stop: GracefulStop) -> bool:
@@ -162,7 +170,7 @@ def _store() -> Store:
     from torch.distributed.rendezvous import rendezvous
 
     try:
-        store, _, _ = next(iter(rendezvous("env://")))
+        store, _, _ = next(iter(rendezvous("env://", timeout=PATIENCE)))
     except (RuntimeError, ValueError) as error:
         raise ClodError(f"the processes cannot meet ({str(error).partition('. ')[0]}); use torchrun") from error
     return store

@@ -73,7 +73,11 @@ class Saver:
         Args:
             checkpoint, source: where ``base`` and the views are from, for the messages.
         """
-        self.belongs |= {"base_sha256": _fingerprint(base), "views_sha256": scene_fingerprint(scene)}
+        self.claim(_fingerprint(base), scene_fingerprint(scene), checkpoint, source)
+
+    def claim(self, base: str, views: str, checkpoint: str, source: str) -> None:
+        """``belong`` by the fingerprints of base and views."""
+        self.belongs |= {"base_sha256": base, "views_sha256": views}
         if self.state is None:
             return
         for key, what in (

@@ -21,7 +21,7 @@ CHECK_COST = 0.03  # share of the time that they may take, at most
 CHECK_VIEWS = 4
 LABELS = {
     "bands": "SH bands", "start": "importance", "order": "order of leaving", "probe": "first steps",
-    "train": "training",
+    "blocks": "what views see", "beside": "what is beside", "train": "training",
 }  # fmt: skip
 
 
@@ -29,7 +29,7 @@ class Follower:
     """The progress callback of ``adapt``.
 
     Args:
-        base: what the error so far is compared with.
+        base: what the error so far is compared with; None where there are no views.
         views: held out; at most four of them, spread evenly, are looked at.
         max_sv: the error is shown at dial 1 and here.
         base_row: how the base was measured: the error shown until there is a newer one, and a guess of a frame's time.
@@ -39,12 +39,12 @@ class Follower:
         self,
         console: Console,
         stop: GracefulStop,
-        base: Gaussians,
+        base: Gaussians | None,
         views: tuple[View, ...],
         max_sv: float,
         base_row: Row | None,
     ) -> None:
-        self.console, self.stop = console, stop
+        self.console, self.stop, self.labels = console, stop, LABELS
         self.views = views[:: -(-len(views) // CHECK_VIEWS)] if views else ()
         self.dials = [1.0, max_sv] if max_sv > 1 else [1.0]
         seconds_a_frame = base_row.frame_ms / 1e3 if base_row else 0.0
@@ -58,7 +58,7 @@ class Follower:
         if self.meter is None or progress.phase != self.phase:
             self.close()
             before = progress.share if progress.done > 1 else 0.0  # a resumed training's
-            self.phase, self.meter = progress.phase, Meter(self.console, LABELS[progress.phase], initial=before)
+            self.phase, self.meter = progress.phase, Meter(self.console, self.labels[progress.phase], initial=before)
         if progress.phase == "train" and progress.share < 1 and not self.stop.requests:
             self._check(progress)
         by_time = progress.share > progress.done / max(progress.total, 1)
@@ -86,7 +86,7 @@ class Follower:
         if self.check_cost > CHECK_COST * progress.seconds / progress.share:
             return  # even one look would be too many for so short a run
         began = time.perf_counter()
-        if not self.base_error:  # of the same views: some are harder than others
+        if not self.base_error and self.base is not None:  # of the same views: some are harder than others
             self.base_error = f"base {self._look(self.base, 1.0)[0]:.2f} dB on these {len(self.views)} views"
         looks = [(dial, *self._look(progress.gaussians(), dial)) for dial in self.dials]
         shown = [f"s={dial:g} {error:.2f} dB {share:.0%}" for dial, error, share in looks]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -63,9 +63,38 @@ class View:
     image: Tensor
 
     def __post_init__(self) -> None:
-        expected = (self.camera.height, self.camera.width, 3)
-        if tuple(self.image.shape) != expected or self.image.dtype != torch.uint8:
-            raise ClodError(f"view {self.camera.name!r}: image must be uint8 of shape {expected}")
+        _check_image(self.camera, self.image)
+
+    def at(self, camera: Camera) -> View:
+        """The same photograph with another camera of its size."""
+        return View(camera, self.image)
+
+
+class StoredView(View):
+    """A view that does not hold its photograph: it is read whenever it is looked at.
+
+    Args:
+        read: gives the pixels, as ``View.image`` has them.
+    """
+
+    def __init__(self, camera: Camera, read: Callable[[], Tensor]) -> None:
+        object.__setattr__(self, "camera", camera)
+        object.__setattr__(self, "_read", read)
+
+    @property
+    def image(self) -> Tensor:  # type: ignore[override]
+        found: Tensor = self._read()  # type: ignore[attr-defined]
+        _check_image(self.camera, found)
+        return found
+
+    def at(self, camera: Camera) -> View:
+        return StoredView(camera, self._read)  # type: ignore[attr-defined]
+
+
+def _check_image(camera: Camera, image: Tensor) -> None:
+    expected = (camera.height, camera.width, 3)
+    if tuple(image.shape) != expected or image.dtype != torch.uint8:
+        raise ClodError(f"view {camera.name!r}: image must be uint8 of shape {expected}")
 
 
 @dataclass(frozen=True)
@@ -115,6 +144,6 @@ def in_its_unit(scene: Scene) -> Scene:
         return scene
 
     def nearer(views: tuple[View, ...]) -> tuple[View, ...]:
-        return tuple(replace(view, camera=replace(view.camera, near=near_plane(extent))) for view in views)
+        return tuple(view.at(replace(view.camera, near=near_plane(extent))) for view in views)
 
     return replace(scene, train=nearer(scene.train), test=nearer(scene.test))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -18,6 +18,18 @@ from clod_adapter.config import AdaptConfig
 LIFT = 1e-3
 
 
+class Quota(NamedTuple):
+    """What the count term asks of some Gaussians at one dial value.
+
+    Attributes:
+        share: of them, to be kept, above 0.
+        weight: how much being off it by ``share`` counts; ``1 / share`` where they are all that there are.
+    """
+
+    share: float
+    weight: float
+
+
 def count_law(virtual_scale: float, share: float, exponent: float) -> float:
     """The share of all Gaussians to keep at a dial value s: ``1 / (s^p + (1/share - 1) s^-p)``.
 
@@ -28,9 +40,21 @@ def count_law(virtual_scale: float, share: float, exponent: float) -> float:
     return 1 / (power + (1 / share - 1) / power)
 
 
+def law_quota(virtual_scale: float, count: int, config: AdaptConfig, total: int | None = None) -> Quota:
+    """What the count law asks of ``count`` Gaussians: ``count_law``, and never that the last one goes.
+
+    Args:
+        total: what the law is a share of, also Gaussians that are not here because no view sees them: more than the
+            ``count`` there are may be asked for. By default ``count``.
+    """
+    total = total or max(count, 1)
+    law = max(count_law(virtual_scale, config.start_share, config.exponent), 1 / total) * (total / max(count, 1))
+    return Quota(law, 1 / law)
+
+
 def count_gradient(
     dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, loss: float, config: AdaptConfig,
-    total: int | None = None,
+    quota: Quota | None = None,
 ) -> Tensor:  # fmt: skip
     """``[N]`` what the count term adds to the gradient of log sigma_d at one dial value; opacities are held.
 
@@ -42,16 +66,15 @@ def count_gradient(
     at least ``LIFT / (temperature N)``.
 
     Args:
-        total: what shares are of, at least N: also Gaussians that are not here because no view sees them. N by default.
+        quota: what is asked of them in place of the law, where they are not all that there are.
     """
-    total = total or len(opacity_logits)
-    law = max(count_law(virtual_scale, config.start_share, config.exponent), 1 / total)
-    eta = float(dialled.keep.sum()) / total
-    pressure = 2 * loss * config.reg_weight * (eta / law - 1) / law
+    quota = quota or law_quota(virtual_scale, len(opacity_logits), config)
+    eta = float(dialled.keep.sum()) / len(opacity_logits)
+    pressure = 2 * loss * config.reg_weight * (eta / quota.share - 1) * quota.weight
     slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, config.temperature)
     if pressure < 0:
         slope = torch.where(dialled.keep, slope, slope.clamp(min=LIFT / (config.temperature * len(slope))))
-    return slope.mul_(pressure * (len(slope) / total))
+    return slope.mul_(pressure)
 
 
 def paper_count(
@@ -60,7 +83,7 @@ def paper_count(
     """0-d, the paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2`` (section 3.3); eta is ``soft_count``.
 
     Args:
-        total: as in ``count_gradient``.
+        total: what eta is a share of, as in ``law_quota``.
     """
     count = soft_count(dialled.log_opacities, virtual_scale, tau, config.temperature)
     count = count * (len(dialled.log_opacities) / (total or len(dialled.log_opacities)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -15,13 +15,33 @@ from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.counting import count_gradient, paper_count
+from clod_adapter.counting import Quota, count_gradient, law_quota, paper_count
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import splat
 
 # Sigma stays where the equation still tells values apart; below, a Gaussian would be gone for good.
 SIGMA_RANGE = (1e-4, SIGMA_MAX)
+
+
+@dataclass(frozen=True)
+class Part:
+    """What is trained of a scene, where that is not all of it.
+
+    Attributes:
+        trained: how many of the first rows are; the others are only drawn.
+        extent: of the whole scene's cameras, world units: the unit of position steps. By default that of the views.
+        quota: gives, for a view, a dial value and the loss there, what the count term asks of the trained rows; by
+            default the law.
+        rest_in_full: the others are drawn as if they had no dial, and not at the dial too.
+        total: what the law is a share of, where there are more than those trained (``counting.law_quota``).
+    """
+
+    trained: int
+    extent: float | None = None
+    quota: Callable[[View, float, float], Quota] | None = None
+    rest_in_full: bool = False
+    total: int | None = None
 
 
 @dataclass
@@ -49,15 +69,18 @@ class Objective:
 
     Attributes:
         tuned: the attributes that are trained, beside ``opacity_logits`` and the decay, which always are.
-        trained: how many of the first rows are; the others are drawn as they are.
-        total: how many Gaussians the count is a share of; by default those that are trained.
+        part: which rows are, and what is asked of them.
     """
 
     config: AdaptConfig
     attenuation: AttenuationConfig
     tuned: tuple[str, ...]
-    trained: int
-    total: int | None = None
+    part: Part
+
+    @property
+    def trained(self) -> int:
+        """How many of the first rows are trained."""
+        return self.part.trained
 
     @property
     def decay(self) -> str:
@@ -94,34 +117,43 @@ class Objective:
 
     def _pull_of(self, parameters: dict[str, Tensor], view: View, dials: list[float]) -> Pull:
         config, tau, first = self.config, self.attenuation.tau, slice(self.trained)
+        dialled_rows = first if self.part.rest_in_full else slice(None)
         leaves = {name: parameters[name].detach().requires_grad_(name in self.stepped) for name in parameters}
         logits, decay = leaves["opacity_logits"], leaves[self.decay]
-        sigma = self.sigma(decay)
-        distances = normalized_distances(parameters["means"], view.camera, self.attenuation)
+        sigma = self.sigma(decay[dialled_rows])
+        distances = normalized_distances(parameters["means"], view.camera, self.attenuation)[dialled_rows]
         of_attributes: dict[str, Any] = {name: leaves[name] for name in ATTRIBUTES}
         photograph = view.image.to(decay.device)
         total, count = decay.new_zeros(()), torch.zeros_like(decay[first])
         kept = torch.zeros_like(count, dtype=torch.bool)
         losses = []
         for s in dials:
-            dialled = attenuate(logits, sigma, distances, s, self.attenuation)
+            dialled = attenuate(logits[dialled_rows], sigma, distances, s, self.attenuation)
+            drawn = dialled.drawn
+            if self.part.rest_in_full:
+                drawn = torch.cat([drawn, parameters["opacity_logits"][self.trained :].sigmoid()])
             # Dropped rows have opacity 0: the rasterizer leaves them out, and they get no gradient.
-            image, _ = splat(Gaussians(**of_attributes), dialled.drawn, view.camera)
+            image, _ = splat(Gaussians(**of_attributes), drawn, view.camera)
             loss = photometric_loss(image, photograph, config.ssim_weight)
             losses.append(float(loss.detach()))
             weight = self._weight(s, alone=len(dials) == 1)
             if config.count_term == "paper" and config.reg_weight > 0:
-                loss = loss + paper_count(dialled, s, tau, config, self.total)
+                loss = loss + paper_count(dialled, s, tau, config, self.part.total)
             total = total + weight * loss
             if self.has_law:
                 own = type(dialled)(*(tensor[first] for tensor in dialled))
-                logits_now, pull = parameters["opacity_logits"][first], weight * losses[-1]
-                count += count_gradient(own, logits_now, s, tau, pull, config, self.total)
+                quota = self._quota(view, s, losses[-1])
+                asked = (s, tau, weight * losses[-1], config, quota)
+                count += count_gradient(own, parameters["opacity_logits"][first], *asked)
             kept |= dialled.keep[first]
         found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
         gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}
         count = count if config.parameter == "log" else count / decay.detach()[first]
         return Pull(gradients | {self.decay: gradients[self.decay] + count}, kept, losses[0])
+
+    def _quota(self, view: View, s: float, loss: float) -> Quota:
+        part = self.part
+        return part.quota(view, s, loss) if part.quota else law_quota(s, self.trained, self.config, part.total)
 
     def _weight(self, s: float, *, alone: bool) -> float:
         """w_s, times ``full_weight`` at the s = 1 that goes with another dial value."""

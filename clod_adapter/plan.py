@@ -16,6 +16,7 @@ from clod_adapter.distributed import Peers
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.needs import largest_change
+from clod_adapter.objective import Part
 from clod_adapter.train import Adapted, adapt
 from clod_adapter.training_state import Progress, TrainingState
 
@@ -103,6 +104,11 @@ class Plan:
         """What is to be trained."""
         return trim(self.start, self.kept, None)
 
+    @property
+    def part(self) -> Part:
+        """For ``train.adapt`` of ``lean``: the count law remains a share of all Gaussians."""
+        return Part(len(self.start) if self.kept is None else int(self.kept.sum()), total=len(self.start))
+
     def adapt(
         self,
         scene: Scene,
@@ -111,10 +117,9 @@ class Plan:
         peers: Peers | None = None,
     ) -> Adapted:
         """``train.adapt`` of what is to be trained; the count law remains a share of all Gaussians."""
-        total = len(self.start)
         if resume is None and self.begun:  # and let go of it, which is as large as all that is trained
-            return adapt(self.lean, scene, self.config, progress, self.begun.pop(), total=total, peers=peers)
-        return adapt(self.lean, scene, self.config, progress, resume, total=total, peers=peers)
+            return adapt(self.lean, scene, self.config, progress, self.begun.pop(), part=self.part, peers=peers)
+        return adapt(self.lean, scene, self.config, progress, resume, part=self.part, peers=peers)
 
     def whole(self, base: Gaussians, lean: Gaussians) -> Gaussians:
         """``lean``, trained, with what was left out put back: rows with the base's values and their start's sigma_d.

@@ -18,7 +18,7 @@ from clod_adapter.drawing import Draws
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import seeing, start
-from clod_adapter.objective import Objective, Pull
+from clod_adapter.objective import Objective, Part, Pull
 from clod_adapter.optimizer import RowAdam
 from clod_adapter.training_state import Adapted, Progress, TrainingState
 
@@ -36,8 +36,7 @@ def adapt(
     progress: Callable[[Progress], None] | None = None,
     resume: TrainingState | None = None,
     *,
-    trained: int | None = None,
-    total: int | None = None,
+    part: Part | None = None,
     peers: Peers | None = None,
 ) -> Adapted:
     """Learns sigma_d for ``base`` on the training views of ``scene``, and updates the rest lightly.
@@ -60,8 +59,7 @@ def adapt(
         resume: goes on from here (``Progress.state`` of an earlier call with the same base, views and config) and
             ends, on as many threads and processes, with the same bits as an undisturbed run; a time budget counts from
             the first beginning.
-        trained: only the first so many Gaussians are trained; the others are drawn as they are. All by default.
-        total: how many Gaussians the count law is a share of, where ``base`` is not all of them (``plan``).
+        part: what is trained, where ``base`` is not all that there is, or not all of it is trained.
         peers: the processes that train along, with the same arguments but ``progress``. Each takes its part of a
             step's views, and all have the same outcome: but for rounding, that of one process.
 
@@ -87,14 +85,14 @@ def adapt(
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
     views = seeing(base, scene.train)
     if resume is None:
-        begun = start(lean, views, config, report, peers.map if peers else map)
+        begun = start(lean, views, config, report)
         if peers:  # the same bits in all of them
             own = {"sigma_d": begun.sigma_d, "attenuation": begun.attenuation}
             begun = begun.replace(**peers.broadcast(own)).to(begun.means.device)
     else:
         unset = torch.ones_like(base.opacity_logits)  # what is trained is in the state
         begun = lean.replace(sigma_d=unset if base.sigma_d is None else base.sigma_d, attenuation=resume.attenuation)
-    run = _Run(begun, views, config, progress, trained, total, peers)
+    run = _Run(begun, views, config, progress, part, peers)
     run.empty_bands = None if lean is base else base.shN.clone()
     run.start_seconds = time.perf_counter() - began
     if resume is not None:
@@ -112,22 +110,21 @@ class _Run:
         views: tuple[View, ...],
         config: AdaptConfig,
         progress: Callable[[Progress], None] | None,
-        trained: int | None = None,
-        total: int | None = None,
+        part: Part | None = None,
         peers: Peers | None = None,
     ):
         self.config, self.progress, self.peers, self.draws = config, progress, peers, Draws(views, config)
-        trained = len(start) if trained is None else trained
+        part = part or Part(len(start))
         assert start.sigma_d is not None and start.attenuation is not None
         # Cameras all in one place say nothing of the scene's unit; the distances in their pictures do.
-        extent = camera_extent([view.camera for view in views]) or start.attenuation.scene_distance
+        extent = part.extent or camera_extent([view.camera for view in views]) or start.attenuation.scene_distance
         rates = {
             "means": config.lr_means * extent, "quats": config.lr_quats, "log_scales": config.lr_scales,
             "opacity_logits": config.lr_opacities, "sh0": config.lr_sh0, "shN": config.lr_shN,
         }  # fmt: skip
         # What is stepped by row; a frozen attribute asks the rasterizer for no gradient.
         tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
-        self.objective = Objective(config, start.attenuation, tuple(tuned), trained, total)
+        self.objective = Objective(config, start.attenuation, tuple(tuned), part)
         self.decay, self.stepped, self.range = self.objective.decay, self.objective.stepped, self.objective.decay_range
         self.rates = {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
         self.rates[self.decay] = config.lr_sigma * math.sqrt(config.batch)
@@ -138,7 +135,7 @@ class _Run:
         self.parameters[self.decay] = self.objective.parameter(start.sigma_d)
         self.optimizer = RowAdam(self._trained(), beta1=BETA1**config.batch, beta2=BETA2**config.batch)
         self.empty_bands: Tensor | None = None  # the base's whole shN, where what was left out of it comes back
-        self.all_rows = torch.ones(trained, dtype=torch.bool, device=start.means.device)
+        self.all_rows = torch.ones(part.trained, dtype=torch.bool, device=start.means.device)
         self.done, self.seconds, self.start_seconds = 0, 0.0, 0.0
         self.loss = math.nan
         self.mean: dict[str, Tensor] = {}  # of the parameters over the last ``average`` of the steps

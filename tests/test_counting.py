@@ -13,7 +13,7 @@ from torch import Tensor
 
 from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.counting import count_gradient, count_law, count_slope, paper_count, soft_count
+from clod_adapter.counting import count_gradient, count_law, count_slope, law_quota, paper_count, soft_count
 from clod_adapter.optimizer import RowAdam
 
 CONFIG = AdaptConfig(max_sv=6.0)
@@ -204,6 +204,7 @@ def test_shares_of_more_than_are_here(form: str, s: float) -> None:
             paper_count(dialled, s, 0.02, config, total).backward()
             found.append(sigma.grad[:40])
         else:
-            found.append(count_gradient(dialled, logits[:count], s, 0.02, 0.3, config, total)[:40])
+            quota = law_quota(s, count, config, total)
+            found.append(count_gradient(dialled, logits[:count], s, 0.02, 0.3, config, quota)[:40])
     assert found[0].abs().max() > 0 or (form, s) == ("paper", 1.0)
     assert torch.allclose(*found, rtol=1e-5, atol=0)

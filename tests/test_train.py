@@ -21,6 +21,7 @@ from clod_adapter.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import scene_distance, start
 from clod_adapter.losses import photometric_loss
+from clod_adapter.objective import Part
 from clod_adapter.render import render, splat
 from clod_adapter.train import Adapted, Progress, TrainingState, adapt
 from scenes import capture, gaussians, photograph, ring
@@ -296,13 +297,13 @@ def test_only_the_first_rows_are_trained(captured: tuple[Gaussians, Scene]) -> N
             states.append(copy.deepcopy(progress.state()))
 
     config = config_of(iters=20, average=0.5)
-    found = adapt(begun, scene, config, keep, trained=few).gaussians
+    found = adapt(begun, scene, config, keep, part=Part(few)).gaussians
     for name, value in found.tensors().items():
         rounding = 1e-6 if name == "sigma_d" else 0.0  # its logarithm is what training holds
         torch.testing.assert_close(value[few:], begun.tensors()[name][few:], rtol=rounding, atol=0.0)
         assert not torch.equal(value[:few], begun.tensors()[name][:few]), name
-    assert_equal(adapt(begun, scene, config, None, states[0], trained=few).gaussians, found)
-    without = adapt(begun.select(torch.arange(few)), scene, config, trained=few).gaussians
+    assert_equal(adapt(begun, scene, config, None, states[0], part=Part(few)).gaussians, found)
+    without = adapt(begun.select(torch.arange(few)), scene, config, part=Part(few)).gaussians
     assert not torch.equal(without.sh0, found.sh0[:few])
 
 

@@ -52,3 +52,9 @@ def _give_back(whole: np.ndarray) -> None:
     if len(_recent) > IDLE:
         with contextlib.suppress(IndexError):  # it is in use again
             _idle[_recent.popleft()].pop(0)
+
+
+def release() -> None:
+    """Gives the memory of arrays that wait for their next use back to the system."""
+    _recent.clear()
+    _idle.clear()

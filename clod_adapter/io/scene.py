@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from clod_adapter.cameras import Camera, Scene, View, in_its_unit
 from clod_adapter.errors import ClodError
 from clod_adapter.io.colmap_model import read_model
 from clod_adapter.io.dataparser import trained_frame
+from clod_adapter.io.image_cache import ImageCache
 from clod_adapter.io.images import TRANSPARENT, Note, Photograph, read_image
 from clod_adapter.io.origin import NOWHERE
 from clod_adapter.io.posed import HUGE, PosedImage
@@ -33,6 +35,7 @@ def load_scene(
     max_width: int = 1600,
     origin: Sequence[float] = NOWHERE,
     progress: Callable[[int, int], None] | None = None,
+    cache: ImageCache | None = None,
 ) -> Scene:
     """Reads posed photographs: a COLMAP model (binary or text, any version) or a transforms.json, and its images.
 
@@ -58,6 +61,7 @@ def load_scene(
             in Inria's code; the intrinsics follow, and a note says so.
         origin: ``[3]`` what the cameras' world is to be relative to, in its units: ``Checkpoint.origin``.
         progress: called with (images loaded, images in all).
+        cache: keeps the photographs, where not all are to be in memory; they are then read again when looked at.
 
     Raises:
         ClodError: no usable cameras; images that are damaged, of another shape than their camera, or named outside
@@ -80,7 +84,7 @@ def load_scene(
     if not any(image.name not in held_out for image, _ in present):
         raise ClodError(f"{folder}: has no photograph to train on, as all that are there are held out; add more")
     present = [(image.relative_to(origin), path) for image, path in present]
-    views, sizes, done = _load(present, folder, max_width, progress)
+    views, sizes, done = _load(present, folder, max_width, progress, cache)
     train = tuple(view for view in views if view.camera.name not in held_out)
     test = tuple(view for view in views if view.camera.name in held_out)
     pinhole = all(image.is_pinhole for image, _ in present)
@@ -99,6 +103,7 @@ def _load(
     folder: Path,
     max_width: int,
     progress: Callable[[int, int], None] | None,
+    keep: ImageCache | None,
 ) -> tuple[list[View], list[tuple[int, int]], list[Note]]:
     """The views of the images, their sizes in the files, and notes. Each worker holds one of full size at a time."""
     cache = None if all(image.is_pinhole for image, _ in present) else _cache_folder(folder)
@@ -107,8 +112,9 @@ def _load(
     with warnings.catch_warnings(), ThreadPoolExecutor(workers) as pool:
         # Large, but below the size at which it is refused: photographs are no attack.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        for view, size, remarks in pool.map(lambda each: _load_view(each[0], each[1], cache, max_width), present):
-            views.append(view)
+        loads = [partial(_load_view, image, path, cache, max_width) for image, path in present]
+        for (view, size, remarks), load in zip(pool.map(lambda load: load(), loads), loads, strict=True):
+            views.append(keep.store(view, partial(_again, load)) if keep else view)
             sizes.append(size)
             notes += remarks
             if progress:
@@ -125,7 +131,7 @@ def _left_out(
         sizes: of the photographs in their files.
         pinhole, masked: whether all cameras are pinholes, and whether the scene has masks.
     """
-    whole, used = sum(3 * w * h for w, h in sizes), sum(view.image.numel() for view in views)
+    whole, used = sum(3 * w * h for w, h in sizes), sum(3 * view.camera.width * view.camera.height for view in views)
     found = [("exposure", "each photograph counts as it is: no light is balanced between them")]
     if pinhole:
         found.append(("undistortion", f"all {len(views)} cameras are pinholes"))
@@ -145,6 +151,12 @@ def _cache_folder(folder: Path) -> Path:
     from clod_adapter.io.undistort import cache_folder  # only where there is something to undistort
 
     return cache_folder(folder)
+
+
+def _again(load: Callable[[], tuple[View, tuple[int, int], list[Note]]]) -> torch.Tensor:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        return load()[0].image
 
 
 def _summary(notes: Sequence[Note], total: int) -> list[str]:

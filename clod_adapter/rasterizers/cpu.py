@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from clod_adapter._kernels import blend, blocks, conventions, project, project_gradient, threads, tiles
-from clod_adapter._kernels.memory import aligned, recycled
+from clod_adapter._kernels.memory import aligned, recycled, release
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
 
@@ -45,6 +45,12 @@ def _give(buffers: _Buffers) -> None:
     # No lock: this runs as a finalizer, perhaps within _take of the same thread. List operations are atomic.
     if len(_idle) < 4:
         _idle.append(buffers)
+
+
+def release_memory() -> None:
+    """Frees the scratch memory of earlier pictures, between one set of Gaussians and the next."""
+    _idle.clear()
+    release()
 
 
 @dataclass

@@ -1,0 +1,165 @@
+"""Adapting in chunks: do its pictures have seams, and does it stay within its memory?
+
+Seams: a capture adapted whole, whole with another seed, and in chunks of forced number; each against the photographs
+and against the first, at s = 1, 3, 5, on the held-out views, on all of their pixels and on those across a border
+between blocks (where no block has SOLE of the pixel). Memory: the command on a synthetic city, with and without
+--memory, in a process of its own whose largest resident size the system tells.
+
+    python benchmarks/chunks.py seams                  # hours on two cores; --iters 300 for a quick look
+    python benchmarks/chunks.py memory                 # 2 million Gaussians, 60 photographs of 960x540
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from city import write_city
+from common import append, capture
+
+from clod_adapter.cameras import View
+from clod_adapter.chunks import Division, adapt_chunk, divide, merge, target
+from clod_adapter.config import AdaptConfig
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.importance import seeing
+from clod_adapter.io.ply import load
+from clod_adapter.io.scene import load_scene
+from clod_adapter.render import render
+from clod_adapter.train import adapt
+
+DIALS = (1.0, 3.0, 5.0)
+SOLE = 0.9
+
+
+def db(error: float) -> float:
+    return -10 * math.log10(max(error, 1e-10))
+
+
+@torch.no_grad()
+def borders(division: Division, views: tuple[View, ...]) -> list[torch.Tensor]:
+    """For each view ``[H, W]`` bool: no block has SOLE of the pixel. By ``target`` of a white photograph on black."""
+    black = division.begun.replace(sh0=torch.full_like(division.begun.sh0, -10), shN=division.begun.shN[:, :0])
+    found = []
+    for view in views:
+        white, largest = View(view.camera, torch.full_like(view.image, 255)), torch.zeros(view.image.shape[:2])
+        for block in range(division.count):
+            rows = division.rows(block)
+            ordered = black.select(torch.cat([rows, (division.block != block).nonzero()[:, 0]]))
+            largest = largest.maximum(target(ordered, len(rows), white)[..., 0] / 255)
+        found.append(largest < SOLE)
+    return found
+
+
+@torch.no_grad()
+def compare(
+    some: Gaussians, whole: Gaussians, views: tuple[View, ...], masks: list[torch.Tensor]
+) -> list[dict[str, Any]]:
+    """A row a dial value; PSNR as the mean over views, of border pixels over all of them together."""
+    rows = []
+    for s in DIALS:
+        ours, theirs, between, kept = [], [], [], []
+        border = torch.zeros(4, dtype=torch.float64)
+        for view, mask in zip(views, masks, strict=True):
+            one, other = render(some, view.camera, s), render(whole, view.camera, s)
+            a, b, photograph = one.image.clamp(0, 1), other.image.clamp(0, 1), view.image / 255
+            errors = [(x - y).square().mean(2) for x, y in ((a, photograph), (b, photograph), (a, b))]
+            ours.append(db(float(errors[0].mean())))
+            theirs.append(db(float(errors[1].mean())))
+            between.append(db(float(errors[2].mean())))
+            kept.append((float(one.kept.float().mean()), float(other.kept.float().mean())))
+            border += torch.tensor([*(float(e[mask].double().sum()) for e in errors), float(mask.sum())])
+        difference = [a - b for a, b in zip(ours, theirs, strict=True)]
+        at_border = [db(float(border[k] / border[3].clamp(min=1))) for k in range(3)]
+        mean = [sum(values) / len(values) for values in (ours, difference, between)]
+        rows.append({
+            "virtual_scale": s, "psnr": mean[0], "difference": mean[1], "worst": min(difference), "between": mean[2],
+            "border_psnr": at_border[0], "border_difference": at_border[0] - at_border[1],
+            "border_between": at_border[2],
+            "kept_share": sum(k for k, _ in kept) / len(kept), "whole_kept_share": sum(k for _, k in kept) / len(kept),
+        })  # fmt: skip
+    return rows
+
+
+def seams(args: argparse.Namespace) -> None:
+    for name in args.scenes:
+        folder = capture(name)
+        base = load(folder / "pretrained.ply")
+        scene = load_scene(folder, origin=base.origin)
+        config, views = AdaptConfig(iters=args.iters), seeing(base.gaussians, scene.train)
+        began = time.perf_counter()
+        whole = adapt(base.gaussians, scene, config).gaussians
+        seconds = time.perf_counter() - began
+        again = adapt(base.gaussians, scene, replace(config, seed=1)).gaussians
+        for count in args.chunks:
+            division = divide(base.gaussians, views, config, count)
+            masks = borders(division, scene.test)
+            share = float(torch.stack([mask.float().mean() for mask in masks]).mean())
+            about = {"what": "seams", "scene": name, "iters": args.iters, "chunks": count, "border_pixels": share}
+            if count == args.chunks[0]:
+                row = {"label": "whole, another seed", "seconds": seconds}
+                append("chunks.jsonl", {**about, **row, "rows": compare(again, whole, scene.test, masks)})
+            after = None
+            for number in (1, 2):
+                began = time.perf_counter()
+                parts = [adapt_chunk(division, views, config, k, after=after)[0] for k in range(count)]
+                after = merge(division, parts)
+                row = {"label": f"pass {number}", "seconds": time.perf_counter() - began}
+                row |= {"steps": [part.steps for part in parts]}
+                append("chunks.jsonl", {**about, **row, "rows": compare(after, whole, scene.test, masks)})
+
+
+def memory(args: argparse.Namespace) -> None:
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(args.city or Path(temporary) / "city")
+        if not (folder / "city.ply").exists():
+            write_city(folder, args.count, args.images, 960, 540)
+        for limit in args.memory:
+            words = [str(folder / "city.ply"), "--images", str(folder), "--iters", str(args.iters), "--quiet"]
+            words += [] if limit == "none" else ["--memory", limit]
+            words += ["--out", str(Path(temporary) / "out.ply")]
+            code = "import sys; from clod_adapter.cli.main import main; sys.exit(main(sys.argv[1:]))"
+            began = time.perf_counter()
+            process = subprocess.Popen([sys.executable, "-c", code, *words, "--json"], stdout=subprocess.PIPE)
+            assert process.stdout is not None
+            report = process.stdout.read()
+            _, status, usage = os.wait4(process.pid, 0)
+            if status:
+                sys.exit(f"--memory {limit} failed")
+            found = json.loads(report)
+            row = {"what": "memory", "count": args.count, "images": args.images, "memory": limit, "iters": args.iters}
+            row |= {"peak_bytes": usage.ru_maxrss * 1024, "seconds": time.perf_counter() - began}
+            row |= {"plan": found.get("memory"), "steps": found["steps"], "rows": found["rows"]}
+            append("chunks.jsonl", row | {"times": found["seconds"]})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    one = commands.add_parser("seams")
+    one.add_argument("--scenes", nargs="+", default=["plush_half", "bonsai146"])
+    one.add_argument("--chunks", type=int, nargs="+", default=[4, 8])
+    one.add_argument("--iters", type=int, default=AdaptConfig().iters)
+    one.set_defaults(run=seams)
+    other = commands.add_parser("memory")
+    other.add_argument("--count", type=int, default=2_000_000)
+    other.add_argument("--images", type=int, default=60)
+    other.add_argument("--iters", type=int, default=40)
+    other.add_argument("--memory", nargs="+", default=["none", "8GB", "3.5GB"], help="limits, none for without one")
+    other.add_argument("--city", help="a folder that benchmarks/city.py made (default: made, and removed)")
+    other.set_defaults(run=memory)
+    args = parser.parse_args()
+    args.run(args)
+
+
+if __name__ == "__main__":
+    main()

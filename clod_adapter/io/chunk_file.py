@@ -1,0 +1,70 @@
+"""What jobs on one scene hand to each other, as safetensors files: the division they begin from, and what each learned.
+
+One JSON document under the metadata key ``clod_adapter_chunk`` says which run a file is of.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save
+from torch import Tensor
+
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.regular import refuse_irregular
+from clod_adapter.io.tensor_file import read_tensors
+
+KEY = "clod_adapter_chunk"
+
+
+def save_chunk(path: Path, tensors: dict[str, Tensor], about: dict[str, Any], belongs: dict[str, Any]) -> None:
+    """Writes tensors and what is said of them; loading gives the same bits.
+
+    Args:
+        about: plain JSON, of this file; an ``AttenuationConfig`` in it is written as its fields.
+        belongs: plain JSON: which run it is of.
+
+    Raises:
+        ClodError: the file cannot be written.
+    """
+    plain = {name: asdict(value) if isinstance(value, AttenuationConfig) else value for name, value in about.items()}
+    metadata = {KEY: json.dumps({"about": plain, "belongs": belongs}, sort_keys=True)}
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(save({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, metadata))
+
+
+def load_chunk(path: Path, belongs: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The tensors and what is said of them.
+
+    Raises:
+        ClodError: the file cannot be read, is damaged, or of another run than ``belongs`` says.
+    """
+    refuse_irregular(path, "remove it")
+    try:
+        tensors, metadata = read_tensors(path)
+        found = json.loads(metadata[KEY])
+        about, theirs = dict(found["about"]), dict(found["belongs"])
+    except OSError as error:
+        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    except Exception as error:  # SafetensorError, and whatever a crafted file provokes
+        raise ClodError(f"{path}: is no chunk or damaged ({error}); remove it to have it made anew") from error
+    different = [name for name in belongs if theirs.get(name) != belongs[name]]
+    if different:
+        raise ClodError(f"{path}: is of a run with another {different[0]}; remove it, or give --out another name")
+    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
+        raise ClodError(f"{path}: holds a value that is not finite; remove it to have it made anew")
+    return tensors, about
+
+
+def checked(path: Path, tensors: dict[str, Tensor], shapes: dict[str, tuple[torch.dtype, tuple[int, ...]]]) -> None:
+    """Refuses a file whose tensors are not those of ``shapes``; raises ClodError."""
+    found = {name: (tensor.dtype, tuple(tensor.shape)) for name, tensor in tensors.items()}
+    wrong = [name for name in {**found, **shapes} if found.get(name) != shapes.get(name)]
+    if wrong:
+        raise ClodError(f"{path}: its {wrong[0]} is not that of this scene; remove it to have it made anew")

@@ -1,0 +1,128 @@
+"""What an adaptation takes in memory, and in how many chunks it stays below a limit.
+
+The bytes a Gaussian are measured ones (docs/chunks.md), for the CPU rasterizer and float32 throughout; each is the
+largest that the phase had at once. What is drawn beside a block depends on where the cameras are; a plan takes it to be
+everything.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+from clod_adapter.errors import ClodError
+
+PROCESS = 420e6  # the interpreter, torch, compiled kernels
+PIXEL = 260  # a pixel: picture, photograph, their maps and gradients, lists of tiles
+DRAWN = 640  # a Gaussian that is drawn, beside its attributes: scratch of the rasterizer, gradients
+TRAINED = 640  # one that is trained, on top: its copy, moments, mean, and the saving of all that
+ORDERED = 840  # one whose place in the order of leaving is looked for
+MERGED = 130  # one, while chunks are trained: what the pass before has made of it, and what this one has so far
+WRITTEN = 560  # one that is written: what changed, and the rows of the file
+IMAGES = 1 / 8  # of the limit, the share that photographs may take
+MOST_CHUNKS = 1024
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a scene is, as far as memory goes.
+
+    Attributes:
+        count: Gaussians; attributes: bytes of one in memory; row: its bytes in the file.
+        images: bytes of all photographs; pixels: of the largest.
+    """
+
+    count: int
+    attributes: int
+    row: int
+    images: int
+    pixels: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a scene is adapted below a limit; all in bytes.
+
+    Attributes:
+        chunks: 1 where the whole fits.
+        cache: what photographs may take.
+        base, start, train, write: the most that is in memory at a time, in all: when the checkpoint is read, while it
+            is ranked, in training, and when it is written.
+    """
+
+    limit: int
+    chunks: int
+    cache: int
+    base: int
+    start: int
+    train: int
+    write: int
+
+    @property
+    def peak(self) -> int:
+        return max(self.base, self.start, self.train, self.write)
+
+
+def make_plan(needs: Needs, limit: int) -> Plan:
+    """The fewest chunks with which nothing takes more than ``limit`` bytes.
+
+    Raises:
+        ClodError: however many chunks, it takes more; says how much.
+    """
+    most = min(MOST_CHUNKS, max(needs.count, 1))
+    plans = (_plan(needs, limit, chunks) for chunks in range(1, most + 1))
+    plan = next((plan for plan in plans if plan.peak <= limit), _plan(needs, limit, 1))
+    if plan.peak > limit:
+        raise ClodError(
+            f"--memory is {in_words(limit)}, and {needs.count:,} Gaussians take at least {in_words(least(needs))}, "
+            "however small the chunks; give that"
+        )
+    return plan
+
+
+def least(needs: Needs) -> int:
+    """The smallest limit that there is a plan for, bytes, rounded up to a tenth of a gigabyte."""
+    limit, most = 100_000_000, min(MOST_CHUNKS, max(needs.count, 1))
+    while min(_plan(needs, limit, chunks).peak for chunks in (1, most)) > limit:
+        limit += 100_000_000
+    return limit
+
+
+def _plan(needs: Needs, limit: int, chunks: int) -> Plan:
+    count, cache = needs.count, min(needs.images, int(IMAGES * limit))
+    always = PROCESS + (cache if chunks == 1 else 2 * cache) + PIXEL * needs.pixels  # a chunk's pictures are its own
+    if chunks == 1:  # the file's rows stay in memory
+        held = needs.row + needs.attributes
+        train = always + count * (held + DRAWN + TRAINED)
+    else:
+        held = needs.attributes + 8
+        train = always + count * (held + MERGED + needs.attributes + DRAWN) + math.ceil(count / chunks) * TRAINED
+    base = PROCESS + count * (needs.row + 2 * needs.attributes)
+    start = always + count * (held + max(DRAWN, ORDERED))
+    write = always + count * (needs.attributes + needs.row + WRITTEN)
+    return Plan(limit, chunks, cache, *(math.ceil(bytes) for bytes in (base, start, train, write)))
+
+
+def in_words(count: float) -> str:
+    """``3.1 GB``, ``500 MB``."""
+    return f"{count / 1e9:.3g} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
+
+
+UNITS = {"K": 1, "M": 2, "G": 3, "T": 4}
+
+
+def parse_size(text: str) -> int:
+    """Bytes of a size as people write it: ``8GB``, ``500 MB``, ``7.5GiB``, ``16G``.
+
+    Raises:
+        ClodError: it is none, or has no unit.
+    """
+    found = re.fullmatch(r"\s*([0-9]+\.?[0-9]*|\.[0-9]+)\s*([KMGT])(i?)B?\s*", text, re.IGNORECASE)
+    if found is None:
+        raise ClodError(f"--memory is {text!r}; give a number and its unit, as in 8GB, 500MB or 7.5GiB")
+    number, unit, binary = float(found[1]), found[2].upper(), bool(found[3])
+    size = int(number * (1024 if binary else 1000) ** UNITS[unit])
+    if not 0 < size < 2**60:
+        raise ClodError(f"--memory is {text!r}; give a size above 0, as in 8GB")
+    return size
