@@ -3,13 +3,14 @@
     python benchmarks/growth.py                            # all of it: some 15 minutes, 12 GB of memory, 8 GB of disk
     python benchmarks/growth.py --sizes 10000 100000       # some sizes
     python benchmarks/growth.py --only inspect view        # some commands
-    python benchmarks/growth.py --plot                     # nothing is run: the picture and the tables of the rows
+    python benchmarks/growth.py --plot                     # nothing is run: the picture and the page of the rows
 
 Each command is run as a user runs it, in a process of its own, on cities (``city.py``) that are made once and kept in
 benchmarks/cache. From outside come wall and CPU seconds and the resident memory, every 20 ms; from what the command
 says on stderr and in its report, the phases that they belong to. A run on a city of 1000 Gaussians is the floor: what
-starting up costs. Rows go to results/growth.jsonl; the last one of a kind counts, and docs/images/growth.png shows
-them. Exponents are least squares in logarithms, of the seconds above the floor, from 100k Gaussians on.
+starting up costs. Rows go to results/growth.jsonl; the last one of a kind counts. docs/images/growth.png shows them,
+and docs/growth.md has them as tables, with what follows for a city of 100 million. Exponents are least squares in
+logarithms, of the seconds above the floor, from 100k Gaussians on.
 """
 
 from __future__ import annotations
@@ -32,16 +33,18 @@ from typing import Any
 
 import numpy as np
 from common import RESULTS, ROOT, append
+from PIL import Image
 
 from clod_adapter.report.style import QUIET, SERIES, label_log, new_figure, save, tidy
 
-FILE, PICTURE = "growth.jsonl", ROOT / "docs" / "images" / "growth.png"
+FILE, PICTURE, PAGE = "growth.jsonl", ROOT / "docs" / "images" / "growth.png", ROOT / "docs" / "growth.md"
 CACHE = ROOT / "benchmarks" / "cache" / "growth"
 COMMAND = (sys.executable, "-m", "clod_adapter.cli.main")
 FLOOR, SIZES = 1000, (10_000, 100_000, 1_000_000, 5_000_000)
 FROM = 100_000  # Gaussians from which on exponents are fitted: below, seconds are all start-up
 COMMANDS = ("adapt", "eval", "export", "inspect", "view")
 IMAGES, WIDTH, HEIGHT, STEPS, MAX_SV = 10, 640, 400, 8, 3
+BUSY = 3.0  # a load of the machine from which on somebody else was at work too
 SERIES_COUNT = 100_000  # Gaussians of the series over photographs
 MANY, SMALL = (16, 64, 256), (320, 200)  # photographs, of this size
 SHAPES, FEW = ((320, 200), (640, 400), (1280, 800), (1600, 1000)), 16  # sizes, of so many photographs
@@ -59,9 +62,9 @@ from clod_adapter.io.ply import load
 g = load(sys.argv[1]).gaussians
 worth = torch.rand(len(g), generator=torch.Generator().manual_seed(0)) ** 4
 leaving_order(g.select(torch.arange(min(len(g), 1000))), worth[:1000])
-began = time.perf_counter()
+began, cpu = time.perf_counter(), time.process_time()
 leaving_order(g, worth)
-print(time.perf_counter() - began)
+print(time.perf_counter() - began, time.process_time() - cpu)
 """
 
 
@@ -75,7 +78,12 @@ class Run:
             [str(word) for word in words], text=True, cwd=tempfile.gettempdir(), stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)},
         )  # fmt: skip
-        self.out, self.lines, self.moments, self.memory = "", list[str](), dict[str, float](), list[tuple[float, int]]()
+        self.out, self.lines, self.moments, self.memory = (
+            "",
+            list[str](),
+            dict[str, float](),
+            list[tuple[float, int, float]](),
+        )
         self.ended = False
         self.threads = [Thread(target=each, daemon=True) for each in (self._follow, self._sample)]
         for thread in self.threads:
@@ -100,13 +108,15 @@ class Run:
                     self.moments[name] = self.now()
 
     def _sample(self) -> None:
-        statm = Path(f"/proc/{self.process.pid}/statm")
+        statm, stat = (Path(f"/proc/{self.process.pid}/{name}") for name in ("statm", "stat"))
         while not self.ended:
             try:
                 pages = int(statm.read_text(encoding="utf-8").split()[1])
+                used = stat.read_text(encoding="utf-8").rpartition(")")[2].split()
             except (OSError, IndexError):
                 return
-            self.memory.append((self.now(), pages * os.sysconf("SC_PAGE_SIZE")))
+            cpu = (int(used[11]) + int(used[12])) / os.sysconf("SC_CLK_TCK")
+            self.memory.append((self.now(), pages * os.sysconf("SC_PAGE_SIZE"), cpu))
             time.sleep(0.02)
 
     def finish(self) -> None:
@@ -127,13 +137,15 @@ class Run:
             "peak_bytes": self.peak_bytes,
         }
 
-    def peaks(self, ends: Iterable[tuple[str, float]]) -> dict[str, int]:
-        """The most memory in each of the phases, which follow one another and end at these moments."""
-        found, start = {}, 0.0
+    def by_phase(self, ends: Iterable[tuple[str, float]]) -> tuple[dict[str, int], dict[str, float]]:
+        """The most memory, and the CPU seconds, in phases that follow one another and end at these moments."""
+        peaks, seconds, start, before = dict[str, int](), dict[str, float](), 0.0, 0.0
         for name, end in ends:
-            found[name] = max((size for at, size in self.memory if start <= at < end), default=0)
-            start = end
-        return found
+            samples = [(size, cpu) for at, size, cpu in self.memory if start <= at < end]
+            peaks[name] = max((size for size, _ in samples), default=0)
+            now = max((cpu for _, cpu in samples), default=before)
+            seconds[name], start, before = round(now - before, 2), end, now
+        return peaks, seconds
 
 
 def main() -> None:
@@ -149,7 +161,8 @@ def main() -> None:
         measure(args.sizes, args.only)
     rows = latest()
     draw(rows)
-    print(tables(rows))
+    fill_in("figures", tables(rows))
+    fill_in("paper", on_paper(rows))
 
 
 def measure(sizes: Sequence[int], only: Sequence[str]) -> None:
@@ -210,14 +223,16 @@ def run_adapt(folder: Path) -> dict[str, Any]:
         "load": seconds["load"], "start": seconds["start"], "step": seconds["train"] / STEPS,
         "write": at["write"] - at["train"], "evaluate": seconds["evaluate"],
     }  # fmt: skip
+    peaks, cpu = run.by_phase(moments)
     return {
         **run.cost(), "steps": STEPS, "phases": {name: round(value, 4) for name, value in phases.items()},
-        "phase_peaks": run.peaks(moments), "psnr": report["base_rows"][0]["psnr"],
+        "phase_peaks": peaks, "phase_cpu": cpu, "psnr": report["base_rows"][0]["psnr"],
     }  # fmt: skip
 
 
 def order_seconds(folder: Path) -> dict[str, Any]:
-    return {"order_seconds": round(float(Run([sys.executable, "-c", ORDER, folder / "city.ply"]).out), 3)}
+    wall, cpu = (round(float(word), 3) for word in Run([sys.executable, "-c", ORDER, folder / "city.ply"]).out.split())
+    return {"order_seconds": wall, "order_cpu": cpu}
 
 
 def run_eval(folder: Path) -> dict[str, Any]:
@@ -260,8 +275,8 @@ def latest() -> list[dict[str, Any]]:
 
 def exponent(points: Sequence[tuple[float, float]]) -> float:
     """Of the power of x that y follows, by least squares in logarithms; NaN of fewer than two points."""
-    x, y = np.log([point for point in points if point[1] > 0]).T if len(points) > 1 else ((), ())
-    return float(np.polyfit(x, y, 1)[0]) if len(x) > 1 else math.nan
+    usable = [point for point in points if point[1] > 0]
+    return float(np.polyfit(*np.log(usable).T, 1)[0]) if len(usable) > 1 else math.nan
 
 
 def over_count(rows: Sequence[dict[str, Any]], command: str) -> list[dict[str, Any]]:
@@ -284,6 +299,25 @@ def phase_of(row: dict[str, Any], phase: str) -> float:
 PHASES = ("load", "importance", "order", "step", "evaluate", "write")
 
 
+def cpu_of(rows: Sequence[dict[str, Any]], command: str, phase: str = "") -> list[tuple[float, float]]:
+    """(Gaussians, CPU seconds) of a command, or of a phase of adapting: these hardly know who else is at work."""
+    return [
+        (row["gaussians"], phase_cpu(row, phase))
+        for row in over_count(rows, command)
+        if "phase_cpu" in row or not phase
+    ]
+
+
+def phase_cpu(row: dict[str, Any], phase: str) -> float:
+    if not phase or phase == "order":
+        return row["order_cpu"] if phase else row["cpu_seconds"]
+    of = row["phase_cpu"]
+    return {
+        "load": of["load"], "importance": of["start"] - row["order_cpu"], "step": of["train"] / row["steps"],
+        "evaluate": of["base"] + of["measure and write again"] - of["write"], "write": of["write"],
+    }[phase]  # fmt: skip
+
+
 def growth(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
     """The exponent above the floor from FROM on, and that of the last two sizes with the floor in it."""
     floor = dict(points).get(FLOOR, 0.0)
@@ -304,14 +338,18 @@ def bytes_a_gaussian(rows: Sequence[dict[str, Any]], command: str) -> tuple[floa
 def tables(rows: Sequence[dict[str, Any]]) -> str:
     """Markdown for docs/growth.md."""
     sizes = sorted({row["gaussians"] for row in rows if row["series"] == "count"})
-    head = "| | " + " | ".join(f"{size:,}" for size in sizes) + " | exponent | last two |"
-    lines = [head, "|---" * (len(sizes) + 3) + "|"]
+    head = "| | " + " | ".join(f"{size:,}" for size in sizes) + " | exponent | last two | exponent of CPU |"
+    busy = max(row["busy"] for row in rows)
+    lines = [f"**Preliminary**: the machine's load was up to {busy:.0f} while these rows were taken, so wall times are "
+             "several times too long; the CPU's and memory stand.", ""] if busy > BUSY else []  # fmt: skip
+    lines += [head, "|---" * (len(sizes) + 4) + "|"]
     cases = [(command, "") for command in COMMANDS] + [("adapt", phase) for phase in PHASES]
     for command, phase in cases:
         points = seconds_of(rows, command, phase)
         fitted, last = growth(points)
         cells = [f"{dict(points)[size]:.3g}" if size in dict(points) else "" for size in sizes]
-        lines.append(f"| {phase or command} | {' | '.join(cells)} | {fitted:.2f} | {last:.2f} |")
+        powers = " | ".join(f"{power:.2f}" for power in (fitted, last, growth(cpu_of(rows, command, phase))[0]))
+        lines.append(f"| {phase or command} | {' | '.join(cells)} | {powers} |")
     lines += ["", "| | peak, GB | | bytes a Gaussian | besides, MB |", "|---|---|---|---|---|"]
     for command in COMMANDS:
         each, rest = bytes_a_gaussian(rows, command)
@@ -329,6 +367,75 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
         powers = [exponent([(x(row), row["phases"][key]) for row in chosen]) for key in ("start", "step", "evaluate")]
         lines.append(f"exponents of start, step, evaluate: {', '.join(f'{power:.2f}' for power in powers)}")
     return "\n".join(lines)
+
+
+def fill_in(name: str, text: str) -> None:
+    """Puts the text between the page's comments of this name, and prints it."""
+    begin, end = f"<!-- {name}: written by benchmarks/growth.py -->", f"<!-- end of {name} -->"
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(begin)
+    PAGE.write_text(f"{before}{begin}\n\n{text}\n\n{end}{rest.partition(end)[2]}", encoding="utf-8")
+    print(text)
+
+
+# What is assumed of the city on paper, and of machines; the rest is measured.
+CITY, PHOTOGRAPHS, SIZE = 100_000_000, 20_000, 1600 * 1000 / 1e6  # Gaussians; how many, of so many megapixels
+BORDER = 0.2  # Gaussians around a chunk that go along frozen, of its own
+CHUNK_STEPS, LOOKED_AT, HELD_OUT = 1500, 64, 64  # of a chunk; photographs for its start, and to measure it on
+FOR_IMAGES = 0.25  # of the memory, as decoded photographs
+CORES_OF_A_JOB, CORE_HOUR = 2, 0.05  # as measured; dollars
+GPU_TIMES, GPU_HOUR = 30, 3.0  # times as fast as the two cores, all told; dollars
+MEMORIES = (8, 16, 32, 64)  # GB for a job
+
+
+def on_paper(rows: Sequence[dict[str, Any]]) -> str:
+    """The city in chunks, for jobs of some memory: how many, how long, at what price. Markdown."""
+    each, rest = bytes_a_gaussian(rows, "adapt")
+    lines = ["| a job's memory, GB | Gaussians in a chunk | chunks | hours a chunk, of them training | core-hours | "
+             "hours on 64 cores | dollars | on one assumed GPU: hours | dollars |", "|---" * 9 + "|"]  # fmt: skip
+    for memory in MEMORIES:
+        room = int(((1 - FOR_IMAGES) * memory * 1e9 - rest) / each)
+        chunks = math.ceil(CITY * (1 + BORDER) / room)
+        training, other = chunk_seconds(rows, room)
+        hours = (training + other) / 3600
+        core_hours, gpu_hours = chunks * hours * CORES_OF_A_JOB, chunks * hours / GPU_TIMES
+        lines.append(
+            f"| {memory} | {room / 1e6:.1f} million | {chunks} | {hours:.2f}, {training / 3600:.2f} | {core_hours:.0f} "
+            f"| {core_hours / 64:.1f} | {core_hours * CORE_HOUR:.1f} | {gpu_hours:.1f} | {gpu_hours * GPU_HOUR:.1f} |"
+        )
+    return "\n".join(lines)
+
+
+def chunk_seconds(rows: Sequence[dict[str, Any]], count: int) -> tuple[float, float]:
+    """Training, and everything else, for a chunk of so many Gaussians on the machine of the rows.
+
+    In proportion from the largest city that was measured, the order of leaving by n log n; a megapixel more of a
+    photograph adds to each view what it does in the series over sizes.
+    """
+    row = over_count(rows, "adapt")[-1]
+    n, share = row["gaussians"], count / row["gaussians"]
+    shapes = sorted((each for each in rows if each["series"] == "shapes"), key=megapixels)[-2:]
+
+    def a_megapixel(phase: str, views: int) -> float:
+        """Seconds that it adds to a phase, for each of the views that were rendered."""
+        if len(shapes) < 2:
+            return 0.0
+        more = shapes[1]["phases"][phase] - shapes[0]["phases"][phase]
+        return max(more / (megapixels(shapes[1]) - megapixels(shapes[0])) / views, 0.0)
+
+    trained, held_out = split(row["images"])
+    larger = SIZE - megapixels(row)
+    step = phase_of(row, "step") * share + larger * a_megapixel("step", 1)
+    importance = phase_of(row, "importance") / trained * share + larger * a_megapixel("start", split(FEW)[0])
+    evaluate = phase_of(row, "evaluate") / held_out * share + larger * a_megapixel("evaluate", split(FEW)[1])
+    order = phase_of(row, "order") * share * math.log(count) / math.log(n)
+    fixed = (phase_of(row, "load") + 2 * phase_of(row, "write")) * share
+    return CHUNK_STEPS * step, LOOKED_AT * importance + HELD_OUT * evaluate + order + fixed
+
+
+def split(images: int) -> tuple[int, int]:
+    """Photographs to train on, and held out: every eighth."""
+    held_out = -(-images // 8)
+    return images - held_out, held_out
 
 
 def photographs(row: dict[str, Any]) -> float:
@@ -364,6 +471,7 @@ def draw(rows: Sequence[dict[str, Any]]) -> None:
         finish(d, f"Adapting {SERIES_COUNT:,} Gaussians", "megapixels of all photographs", "seconds; of one step")
         PICTURE.parent.mkdir(exist_ok=True)
         save(figure, PICTURE)
+    Image.open(PICTURE).convert("RGB").quantize(128).save(PICTURE, optimize=True)  # a third of the bytes
 
 
 def line(axes: Any, points: Sequence[tuple[float, float]], colour: str, label: str, style: str = "-") -> None:
@@ -385,9 +493,10 @@ def finish(axes: Any, title: str, x: str, y: str) -> None:
     axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
     axes.set_title(title, loc="left", fontsize=10, weight="bold")
     tidy(axes)
-    label_log(axes.xaxis, "{:,g}", subs=(1,))
-    label_log(axes.yaxis, "{:,g}", subs=(1,))
-    axes.legend(frameon=False, fontsize=7.5)
+    label_log(axes.xaxis, "{:,.10g}", subs=(1,))
+    label_log(axes.yaxis, "{:,.10g}", subs=(1,))
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(frameon=False, fontsize=7.5)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from clod_adapter.adapter import Adapter, detach, extract
+from clod_adapter.adapter import Adapter, detach, extract, trim
 from clod_adapter.cameras import Scene
 from clod_adapter.cli.alignment import require_alignment
 from clod_adapter.cli.chunked import Chunked
@@ -21,7 +21,8 @@ from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.memory_plan import image_cache, plan_memory, with_rows, without_rows
 from clod_adapter.cli.pages import AdaptPage
-from clod_adapter.cli.processes import describe_processes, explain, hurried, together
+from clod_adapter.cli.plan import decide
+from clod_adapter.cli.processes import Job, describe_processes, explain, hurried, together
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, table, write_report
 from clod_adapter.cli.results import write, write_measured
 from clod_adapter.cli.resume import Saver
@@ -33,9 +34,11 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import check_config
 from clod_adapter.io.atomic import remove_leftovers
 from clod_adapter.io.ply import Checkpoint
+from clod_adapter.io.trimming import trimmed
 from clod_adapter.io.version import package_version
+from clod_adapter.plan import Plan
 from clod_adapter.rasterizers.cpu import release_memory
-from clod_adapter.train import Adapted, adapt
+from clod_adapter.train import Adapted, Progress
 
 
 @dataclass(frozen=True)
@@ -65,8 +68,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     saver = Saver(outputs.state, resume, config, console, stop)
     inputs = read_inputs(args, config, console, watch)
     base, scene, config = inputs.base, inputs.scene, inputs.config
-    plan = plan_memory(args, base, scene, console)
-    chunked = Chunked.of(args, outputs, plan, base, scene, config, console, stop)
+    memory = plan_memory(args, base, scene, console)
+    chunked = Chunked.of(args, outputs, memory, base, scene, config, console, stop)
     if chunked:
         base = without_rows(base)
         inputs = replace(inputs, base=base)
@@ -81,15 +84,17 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     with stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
         page = AdaptPage(gaussians, scene, config, console) if args.report else None
         follower = Follower(console, stop, gaussians, scene.test, config.max_sv, base_rows[0] if base_rows else None)
-        if chunked:
-            adapted = chunked.all(gaussians, scene, config)
-        else:
-            adapted = train(gaussians, scene, config, follower, saver, page)
-        release_memory()  # of the training, before its outcome is copied and written
+        plan, adapted = learn(args, gaussians, scene, config, chunked, follower, saver, page)
+        if plan:
+            watch.seconds["plan"] = sum(plan.seconds.values()) - plan.seconds["start"]
         watch.seconds |= {"start": adapted.start_seconds, "train": adapted.seconds}
+        kept, degree = (plan.kept, plan.sh_degree) if plan and args.trim and plan.trims(gaussians) else (None, None)
+        base = trimmed(base, kept, degree)
         adapter = extract(
-            gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config), origin=base.origin
-        )
+            trim(gaussians, kept, degree), trim(adapted.gaussians, kept, degree), fingerprint=base.fingerprint,
+            config=asdict(config), origin=base.origin,
+        )  # fmt: skip
+        adapter = replace(adapter, kept=kept, sh_degree=degree)
         if gaussians.sigma_d is None and adapter.attenuation.tau < config.tau:
             notes.append(f"tau is {adapter.attenuation.tau:.2g} and not {config.tau:g}: the Gaussians are faint")
             console.say(notes[-1])
@@ -103,7 +108,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             "resumed_from": saver.state and saver.state.steps, "alignment": inputs.alignment,
             "notes": [*base.notes, *scene.notes, *notes, "the result was not measured"],
             "base_rows": [row.as_dict() for row in base_rows], "rows": [], "detached_row": None,
-            **({"memory": asdict(plan)} if plan else {}),
+            "plan": plan and plan.as_dict(), "memory": memory and asdict(memory),
         }  # fmt: skip
         with console.status(f"writing {outputs.ply} ..."):
             write(base, adapter, result, outputs, report)
@@ -161,7 +166,7 @@ def describe_run(args: argparse.Namespace, outputs: Outputs, adapter: Adapter, a
     return {
         "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
         "teacher": "checkpoint" if args.images is None else "photographs",
-        "base_count": len(adapter.sigma_d), "config": adapter.config, "attenuation": asdict(adapter.attenuation),
+        "base_count": adapter.base_count, "config": adapter.config, "attenuation": asdict(adapter.attenuation),
         "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
         "processes": describe_processes(adapted, adapter.config["batch"]), "outputs": outputs.names(),
     }  # fmt: skip
@@ -188,13 +193,35 @@ def look_at_base(
     return rows, notes
 
 
+def learn(
+    args: argparse.Namespace, gaussians: Gaussians, scene: Scene, config: AdaptConfig, chunked: Chunked | None,
+    follower: Follower, saver: Saver, page: AdaptPage | None,
+) -> tuple[Plan | None, Adapted]:  # fmt: skip
+    """Plans and trains; in chunks without a plan, which looks at all Gaussians at once."""
+    if chunked:
+        plan, adapted = None, chunked.all(gaussians, scene, config)
+    else:
+        plan = decide(args, gaussians, scene, config, follower, saver)
+        adapted = train(gaussians, scene, plan, follower, saver, page)
+    release_memory()  # of the training, before its outcome is copied and written
+    return plan, adapted
+
+
 def train(
-    base: Gaussians, scene: Scene, config: AdaptConfig, follower: Follower, saver: Saver, page: AdaptPage | None = None
+    base: Gaussians, scene: Scene, plan: Plan, follower: Follower, saver: Saver, page: AdaptPage | None = None
 ) -> Adapted:
-    """Adapts while the user watches. Raises KeyboardInterrupt when there is nothing worth writing."""
-    console, follow = follower.console, saver.watching(page.watching(follower) if page else follower)
-    with closing(follower), together(base, scene, config, saver.state, follower) as peers:
-        adapted = adapt(base, scene, config, follow, saver.state, peers=peers)
+    """Adapts as planned while the user watches. Raises KeyboardInterrupt when there is nothing worth writing."""
+    console, watching = follower.console, page.watching(follower) if page else follower
+
+    def whole(now: Progress) -> None:
+        watching(replace(now, gaussians=lambda: plan.whole(base, now.gaussians())))
+
+    with closing(follower), together(lambda: Job.of(plan, scene, saver.state), follower) as peers:
+        adapted = plan.adapt(scene, saver.watching(whole), saver.state, peers)
+    adapted = replace(
+        adapted, gaussians=plan.whole(base, adapted.gaussians),
+        start_seconds=adapted.start_seconds + plan.seconds["start"],
+    )  # fmt: skip
     if follower.stop.requests > 1:
         raise KeyboardInterrupt
     how = "interrupted after" if adapted.interrupted else "trained"

@@ -12,6 +12,7 @@ from clod_adapter.cli.inputs import read_checkpoint
 from clod_adapter.errors import ClodError
 from clod_adapter.io.adapter_file import load_adapter
 from clod_adapter.io.ply import save
+from clod_adapter.io.trimming import trimmed
 from clod_adapter.io.version import package_version
 
 
@@ -22,10 +23,11 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         adapted = adapter.apply(base.gaussians, base.fingerprint)
     except ClodError as error:
         raise ClodError(f"{args.base}: {error}") from error
-    save(args.out, adapted, base, version=adapter.version, calibration=adapter.calibration)
+    rows = trimmed(base, adapter.kept, adapter.sh_degree)
+    save(args.out, adapted, rows, version=adapter.version, calibration=adapter.calibration)
     print(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with their dial")
     return {
         "command": "apply", "version": package_version(), "base": args.base, "adapter": args.adapter,
-        "base_count": len(adapted), "changed": sorted(adapter.updates), "notes": base.notes,
+        "base_count": adapter.base_count, "changed": sorted(adapter.updates), "notes": base.notes,
         "outputs": {"ply": args.out},
     }  # fmt: skip

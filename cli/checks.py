@@ -11,6 +11,7 @@ from pathlib import Path
 from clod_adapter.cli.checks_export import check_export
 from clod_adapter.cli.checks_inspect import check_inspect
 from clod_adapter.cli.checks_memory import check_memory
+from clod_adapter.cli.checks_plan import check_plan
 from clod_adapter.cli.checks_view import check_view
 from clod_adapter.cli.dials import given_budget
 from clod_adapter.cli.files import Outputs, check_output, check_ply_name, labels
@@ -25,6 +26,7 @@ from clod_adapter.report.style import check_matplotlib
 
 def check_adapt(args: Namespace) -> None:
     make_config(args)
+    check_plan(args)
     check_memory(args)
     Outputs.of(args.ply, args.out).check([args.ply])
     if args.report:

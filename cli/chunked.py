@@ -59,6 +59,12 @@ class Chunked:
         if plan is None or (plan.chunks == 1 and not args.chunk):
             return None
         check_divisible(config)
+        if args.trim or args.keep_in or args.leave_out:
+            raise ClodError(
+                "--trim, --with and --without are of a plan that looks at all Gaussians at once, which does not fit; "
+                "leave them out, or give more --memory"
+            )
+        console.say("plan: none is made of chunks; all bands and Gaussians stay, and every attribute is trained")
         belongs = {
             "version": package_version(), "settings": asdict(config), "checkpoint": base.fingerprint,
             "photographs": scene_fingerprint(scene),

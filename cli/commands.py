@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from clod_adapter.cli.dials import BUDGETS
+from clod_adapter.cli.help_plan import PLAN
 from clod_adapter.cli.options import (
     adapt_options,
     apply_options,
@@ -45,7 +46,7 @@ smoothly with distance, and tunes the rest lightly. The dial s is set when
 rendering: 1 is full quality, at s roughly s^-1.5 of the Gaussians are drawn.
 """,
     usage="PLY [--images DIR] [--max-sv S] [--out OUT.ply] [options]",
-    epilog="""\
+    epilog=f"""\
 outputs, side by side; a file of that name is replaced:
   OUT.ply          the splat with one more property, sigma_d
   OUT.safetensors  the adapter: only what changed; "clod-adapt apply" makes
@@ -66,6 +67,7 @@ the pictures are its own, at full detail: it is its own teacher. The numbers are
 then against the checkpoint, on placed views held out. With the photographs the
 result is better; give them where there are any.
 
+{PLAN}
 Before training eight of the photographs are compared with what the checkpoint
 shows there. Where that is worse than their own mean colours, or another frame
 fits clearly better, it stops, with what was found: other axes, scale or offset,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser
 
 from clod_adapter.cli.dials import add_dial_options
+from clod_adapter.cli.help_plan import add_plan_options
 from clod_adapter.cli.settings import add_settings
 
 
@@ -32,6 +33,7 @@ def adapt_options(parser: ArgumentParser) -> None:
         "instant-ngp's DIR/transforms.json (default: none, see below)",
     )  # fmt: skip
     add_settings(parser)
+    add_plan_options(parser)
     parser.add_argument(
         "-o", "--out", metavar="OUT.ply", help="output (default: PLY's name with _clod, in this folder)"
     )

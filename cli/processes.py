@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -22,9 +22,11 @@ from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.launch import Launch, launched
 from clod_adapter.cli.training import Follower
 from clod_adapter.config import AdaptConfig
-from clod_adapter.distributed import PeerLost, Peers, joined
+from clod_adapter.distributed import PATIENCE, PeerLost, Peers, joined
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.objective import Part
+from clod_adapter.plan import Plan
 from clod_adapter.train import adapt
 from clod_adapter.training_state import Adapted, Progress, TrainingState
 
@@ -44,7 +46,15 @@ class Job:
     views: tuple[View, ...]
     config: AdaptConfig
     state: TrainingState | None
+    part: Part
     device: str
+
+    @classmethod
+    def of(cls, plan: Plan, scene: Scene, state: TrainingState | None) -> Job:
+        """What ``plan.adapt`` does, from ``state`` or where the plan has begun."""
+        state = next(iter(plan.begun), None) if state is None else state
+        lean = plan.lean
+        return cls(lean, scene.train, plan.config, state, plan.part, lean.means.device.type)
 
 
 @contextmanager
@@ -59,10 +69,8 @@ def leading() -> Iterator[None]:
 
 
 @contextmanager
-def together(
-    base: Gaussians, scene: Scene, config: AdaptConfig, state: TrainingState | None, follower: Follower
-) -> Iterator[Peers | None]:
-    """The processes to train with, which then do so too; None where this one is alone.
+def together(make_job: Callable[[], Job], follower: Follower) -> Iterator[Peers | None]:
+    """The processes to train with, which then do so too; None where this one is alone, and no job is made.
 
     Raises:
         ClodError: within, what ended one of them, where the loss of a process is what ended this.
@@ -71,11 +79,13 @@ def together(
     if launch.size == 1:
         yield None
         return
-    follower.console.say(_describe(launch, config, base.means.device.type))
+    job = make_job()
+    follower.console.say(_describe(launch, job.config, job.device))
     number = _store().add(JOBS, 1)
     try:
         with _threads(launch), joined(_of_job(number), launch.rank, launch.size) as peers:
-            peers.broadcast(Job(base, scene.train, config, state, base.means.device.type))
+            peers.broadcast(job)
+            del job
             yield peers
     except PeerLost as error:
         if follower.stop.requests:  # which the others have heard of too
@@ -94,9 +104,6 @@ def take_part() -> None:
                 _train_along(number, launch, stop)
             except PeerLost:
                 continue  # the first one says so; where it is the one that is gone, the launcher does
-            except Exception as error:
-                store.set(_reason(launch.rank), f"process {launch.rank}: {error or type(error).__name__}")
-                raise
 
 
 def explain(lost: str) -> str:
@@ -125,12 +132,31 @@ def _train_along(number: int, launch: Launch, stop: GracefulStop) -> None:
         if stop.requests:
             raise KeyboardInterrupt
 
-    with joined(_of_job(number), launch.rank, launch.size) as peers:
+    with joined(_of_job(number), launch.rank, launch.size) as peers, _giving_reasons(launch.rank):
         job: Any = peers.broadcast(None)
         if job.device == "cuda":
-            torch.cuda.set_device(launch.local_rank)
+            _take_gpu(launch)
         base = job.base.to(job.device)
-        adapt(base, Scene(job.views, ()), job.config, follow, job.state, peers=peers)
+        adapt(base, Scene(job.views, ()), job.config, follow, job.state, part=job.part, peers=peers)
+
+
+def _take_gpu(launch: Launch) -> None:
+    """A GPU for each process on this machine."""
+    if (gpus := torch.cuda.device_count()) < launch.local_size:
+        raise ClodError(f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as there are")
+    torch.cuda.set_device(launch.local_rank)
+
+
+@contextmanager
+def _giving_reasons(rank: int) -> Iterator[None]:
+    """Leaves word of what ends this process; to be left before the others notice that it does."""
+    try:
+        yield
+    except PeerLost:
+        raise
+    except Exception as error:
+        _store().set(_reason(rank), f"process {rank}: {str(error) or type(error).__name__}")
+        raise
 
 
 def _is_called(store: Store, number: int, stop: GracefulStop) -> bool:
@@ -153,7 +179,7 @@ def _store() -> Store:
     from torch.distributed.rendezvous import rendezvous
 
     try:
-        store, _, _ = next(iter(rendezvous("env://")))
+        store, _, _ = next(iter(rendezvous("env://", timeout=PATIENCE)))
     except (RuntimeError, ValueError) as error:
         raise ClodError(f"the processes cannot meet ({str(error).partition('. ')[0]}); use torchrun") from error
     return store

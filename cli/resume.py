@@ -100,6 +100,11 @@ class Saver:
             what = ", ".join(options) or f"another --form ({different[0]} {then[different[0]]})"
             raise ClodError(f"{self.path}: is of a run with {what}; {BEGUN}")
 
+    @property
+    def frozen(self) -> list[str] | None:
+        """The attributes that the run to go on with froze; None where there is none."""
+        return [str(name) for name in self.found.get("frozen", [])] if self.state is not None else None
+
     def watching(self, follow: Callable[[Progress], None]) -> Callable[[Progress], None]:
         """The progress callback that also saves: after the first step, now and then, and when training is stopped."""
 

@@ -20,12 +20,9 @@ CHECK_EVERY = 10.0  # seconds between looks at the held-out views, at least
 CHECK_COST = 0.03  # share of the time that they may take, at most
 CHECK_VIEWS = 4
 LABELS = {
-    "start": "importance",
-    "order": "order of leaving",
-    "blocks": "what views see",
-    "beside": "what is beside",
-    "train": "training",
-}
+    "bands": "SH bands", "start": "importance", "order": "order of leaving", "probe": "first steps",
+    "blocks": "what views see", "beside": "what is beside", "train": "training",
+}  # fmt: skip
 
 
 class Follower:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from clod_adapter.attenuation import SIGMA_MAX
 from clod_adapter.calibration import Calibration
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import SH_COUNTS, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.origin import NOWHERE, Origin
@@ -38,6 +38,8 @@ class Adapter:
         version: of the package that made it; it stands in the header of the PLY, which is so the same again.
         calibration: what the result's dial values keep, cost and take, where that was measured; in the header too.
         origin: ``[3]`` what the base's means were relative to, world units (``Checkpoint.origin``).
+        kept: of a result with fewer rows than its base, ``[base_count]`` bool: the rows that it has. None for all.
+        sh_degree: of a result with fewer SH bands than its base. None for the base's.
 
     Raises:
         ClodError: a tensor has the wrong type or shape, sigma_d is not finite, or version is no plain text.
@@ -51,6 +53,8 @@ class Adapter:
     version: str = field(default_factory=package_version)
     calibration: Calibration | None = None
     origin: Origin = NOWHERE
+    kept: Tensor | None = None
+    sh_degree: int | None = None
 
     def __post_init__(self) -> None:
         if self.sigma_d.dim() != 1 or self.sigma_d.dtype != torch.float32:
@@ -65,6 +69,19 @@ class Adapter:
             if update.dtype not in (torch.float16, torch.float32) or update.shape[:1] != self.sigma_d.shape:
                 wanted = f"float16 or float32 of {len(self.sigma_d)} rows"
                 raise ClodError(f"Adapter.updates[{name!r}] is {_kind(update)}, it must be {wanted}")
+        if self.kept is not None and (
+            self.kept.dim() != 1 or self.kept.dtype != torch.bool or int(self.kept.sum()) != len(self.sigma_d)
+        ):
+            raise ClodError(f"Adapter.kept is {_kind(self.kept)}, it must be bool with {len(self.sigma_d)} set")
+        if self.sh_degree is not None and self.sh_degree not in SH_COUNTS:
+            raise ClodError(
+                f"Adapter.sh_degree is {self.sh_degree!r}, it must be one of {', '.join(map(str, SH_COUNTS))}"
+            )
+
+    @property
+    def base_count(self) -> int:
+        """How many Gaussians the base has."""
+        return len(self.sigma_d if self.kept is None else self.kept)
 
     def apply(self, base: Gaussians, fingerprint: str | None = None) -> Gaussians:
         """The adapted Gaussians: the base plus the differences in float32, and the dial.
@@ -82,11 +99,17 @@ class Adapter:
                 f"a different base was given: its SHA-256 is {fingerprint[:12]}..., the adapter was trained on "
                 f"{self.base_fingerprint[:12]}...; give that checkpoint"
             )
-        if len(base) != len(self.sigma_d):
+        if len(base) != self.base_count:
             raise ClodError(
-                f"a different base was given: it has {len(base)} Gaussians, the adapter {len(self.sigma_d)}; "
+                f"a different base was given: it has {len(base)} Gaussians, the adapter {self.base_count}; "
                 "give the checkpoint it was trained on"
             )
+        if self.sh_degree is not None and base.sh_degree < self.sh_degree:
+            raise ClodError(
+                f"a different base was given: it has SH degree {base.sh_degree}, the adapter {self.sh_degree}; "
+                "give the checkpoint it was trained on"
+            )
+        base = trim(base, self.kept, self.sh_degree)
         changes: dict[str, Tensor] = {}
         for name, update in self.updates.items():
             old = getattr(base, name)
@@ -97,6 +120,12 @@ class Adapter:
                 update = torch.where(update == 0, old, old + update.float())
             changes[name] = update
         return base.replace(**changes, sigma_d=self.sigma_d.to(base.means.device), attenuation=self.attenuation)
+
+
+def trim(gaussians: Gaussians, kept: Tensor | None, sh_degree: int | None) -> Gaussians:
+    """Only the rows that are ``kept`` (bool ``[N]``) and the SH bands up to ``sh_degree``; None leaves all."""
+    rows = gaussians if kept is None else gaussians.select(kept.to(gaussians.means.device))
+    return rows if sh_degree is None else rows.without_bands(sh_degree)
 
 
 def extract(

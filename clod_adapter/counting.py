@@ -40,9 +40,15 @@ def count_law(virtual_scale: float, share: float, exponent: float) -> float:
     return 1 / (power + (1 / share - 1) / power)
 
 
-def law_quota(virtual_scale: float, count: int, config: AdaptConfig) -> Quota:
-    """What the count law asks of all ``count`` Gaussians: ``count_law``, and never that the last one goes."""
-    law = max(count_law(virtual_scale, config.start_share, config.exponent), 1 / max(count, 1))
+def law_quota(virtual_scale: float, count: int, config: AdaptConfig, total: int | None = None) -> Quota:
+    """What the count law asks of ``count`` Gaussians: ``count_law``, and never that the last one goes.
+
+    Args:
+        total: what the law is a share of, also Gaussians that are not here because no view sees them: more than the
+            ``count`` there are may be asked for. By default ``count``.
+    """
+    total = total or max(count, 1)
+    law = max(count_law(virtual_scale, config.start_share, config.exponent), 1 / total) * (total / max(count, 1))
     return Quota(law, 1 / law)
 
 
@@ -71,9 +77,16 @@ def count_gradient(
     return slope.mul_(pressure)
 
 
-def paper_count(dialled: Attenuated, virtual_scale: float, tau: float, config: AdaptConfig) -> Tensor:
-    """0-d, the paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2`` (section 3.3); eta is ``soft_count``."""
+def paper_count(
+    dialled: Attenuated, virtual_scale: float, tau: float, config: AdaptConfig, total: int | None = None
+) -> Tensor:
+    """0-d, the paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2`` (section 3.3); eta is ``soft_count``.
+
+    Args:
+        total: what eta is a share of, as in ``law_quota``.
+    """
     count = soft_count(dialled.log_opacities, virtual_scale, tau, config.temperature)
+    count = count * (len(dialled.log_opacities) / (total or len(dialled.log_opacities)))
     excess = (count - virtual_scale**-config.exponent).clamp(min=0)
     return config.reg_weight * (virtual_scale - 1) ** 2 * excess**2
 

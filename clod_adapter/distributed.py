@@ -12,10 +12,9 @@ import math
 import pickle
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
-from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
@@ -79,17 +78,6 @@ class Peers:
             if kept.is_cuda:
                 torch.cuda.synchronize()  # NCCL's own wait returns at once, and its time would be another's
         return Pull(gradients, kept.bool(), float(loss))
-
-    def map(self, function: Callable[[T], Tensor], items: Iterable[T]) -> Iterator[Tensor]:
-        """As the built-in, of tensors of one shape, each worked out by one process and given to all, in order."""
-        waiting = iter(items)
-        while batch := list(islice(waiting, self.size)):
-            own = function(batch[min(self.rank, len(batch) - 1)]).contiguous()
-            self._meet()
-            with self._exchange():
-                found = [torch.empty_like(own) for _ in range(self.size)]
-                dist.all_gather(found, own)
-            yield from found[: len(batch)]
 
     def broadcast(self, value: T) -> T:
         """The first process's value, with its tensors on the CPU; what the others give is not looked at."""

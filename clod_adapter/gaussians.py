@@ -96,7 +96,12 @@ class Gaussians:
         degree = self.sh_degree
         while degree > 0 and not self.shN[:, SH_COUNTS[degree - 1] - 1 : SH_COUNTS[degree] - 1].any():
             degree -= 1
-        return self if degree == self.sh_degree else self.replace(shN=self.shN[:, : SH_COUNTS[degree] - 1].contiguous())
+        return self.without_bands(degree)
+
+    def without_bands(self, degree: int) -> Gaussians:
+        """The same without the SH bands above ``degree``; one that has none above it as it is."""
+        above = degree < self.sh_degree
+        return self.replace(shN=self.shN[:, : SH_COUNTS[degree] - 1].contiguous()) if above else self
 
     def to(self, device: torch.device | str) -> Gaussians:
         """A copy on another device."""

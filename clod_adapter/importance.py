@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypeVar
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.attenuation import SIGMA_MAX, normalized_distances, normalizing_distance
-from clod_adapter.cameras import Camera, View
+from clod_adapter.cameras import View
 from clod_adapter.collapse import leaving_order
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
@@ -38,7 +38,7 @@ def start(
     views: Sequence[View],
     config: AdaptConfig,
     progress: Callable[[str, int, int], None] | None = None,
-    each: Callable[..., Iterable[Tensor]] = map,
+    error: Tensor | None = None,
 ) -> Gaussians:
     """The Gaussians with a sigma_d to train from, by what they do in up to MOST_VIEWS of the views, evenly spread.
 
@@ -48,17 +48,18 @@ def start(
     Args:
         progress: called with "start" and the number of views done, and of those that are looked at in all; then with
             "order" and the number of Gaussians whose place is known, and of all of them.
-        each: as ``removal_error`` takes it.
+        error: ``[N]`` from ``removal_error``, of these views and seed, where it is known already.
     """
-    if base.sigma_d is not None and base.attenuation is not None and bool((base.sigma_d < SIGMA_MAX).any()):
+    if base.attenuation is not None and has_dial(base):
         return base.replace(attenuation=dataclasses.replace(base.attenuation, max_sv=config.max_sv))
     views = spread(views, MOST_VIEWS)
     attenuation = config.attenuation(scene_distance(base, views, config.quantile))
     if config.start in ("constant", "identity"):
         value = 1.0 if config.start == "constant" else WIDEST * config.max_sv
         return base.replace(sigma_d=torch.full_like(base.means[:, 0], value), attenuation=attenuation)
-    looked = partial(progress, "start") if progress else None
-    error = removal_error(base, views, seed=config.seed, progress=looked, each=each)
+    if error is None:
+        looked = partial(progress, "start") if progress else None
+        error = removal_error(base, views, seed=config.seed, progress=looked)
     attenuation = dataclasses.replace(attenuation, tau=fitting_tau(base.opacities, error, config))
     importance = error
     if config.start == "importance":
@@ -69,6 +70,11 @@ def start(
         base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent
     )
     return base.replace(sigma_d=sigma.minimum(WIDEST * config.max_sv * distances), attenuation=attenuation)
+
+
+def has_dial(base: Gaussians) -> bool:
+    """Whether there is a sigma_d that does anything."""
+    return base.sigma_d is not None and bool((base.sigma_d < SIGMA_MAX).any())
 
 
 def seeing(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
@@ -125,12 +131,7 @@ def scene_distance(base: Gaussians, views: Sequence[View], quantile: float) -> f
 
 
 def removal_error(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    *,
-    seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
-    each: Callable[..., Iterable[Tensor]] = map,
+    gaussians: Gaussians, views: Sequence[View], *, seed: int = 0, progress: Callable[[int, int], None] | None = None
 ) -> Tensor:
     """``[N]`` estimate of the squared picture error that removing each Gaussian alone would cause.
 
@@ -141,22 +142,16 @@ def removal_error(
 
     Args:
         progress: called with the number of views done after each, and of all of them.
-        each: as the built-in ``map``, to share out the views.
     """
     generator = torch.Generator().manual_seed(seed)
-    cameras = [view.camera for view in views]
-    drawn = ((c, torch.randint(0, 2, (c.height, c.width, 3), generator=generator, dtype=torch.uint8)) for c in cameras)
-
-    def error(drawn: tuple[Camera, Tensor]) -> Tensor:
-        opacities = gaussians.opacities.detach().requires_grad_()
-        image, _ = splat(gaussians, opacities, drawn[0])
-        signs = drawn[1].to(image.device).to(image) * 2 - 1
-        (gradient,) = torch.autograd.grad((image * signs).sum(), opacities)  # as grad_outputs they would import sympy
-        return (gradient * opacities.detach()).square()
-
     total = torch.zeros_like(gaussians.means[:, 0])
-    for done, of_view in enumerate(each(error, drawn), 1):
-        total += of_view
+    for done, view in enumerate(views, 1):
+        opacities = gaussians.opacities.detach().requires_grad_()
+        image, _ = splat(gaussians, opacities, view.camera)
+        drawn = torch.randint(0, 2, image.shape, generator=generator, dtype=torch.uint8)
+        signs = drawn.to(image.device).to(image) * 2 - 1
+        (gradient,) = torch.autograd.grad((image * signs).sum(), opacities)  # as grad_outputs they would import sympy
+        total += (gradient * opacities.detach()).square()
         if progress:
             progress(done, len(views))
     return total / max(len(views), 1)

@@ -15,7 +15,7 @@ from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.counting import Quota, count_gradient, paper_count
+from clod_adapter.counting import Quota, count_gradient, law_quota, paper_count
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import splat
@@ -34,12 +34,14 @@ class Part:
         quota: gives, for a view, a dial value and the loss there, what the count term asks of the trained rows; by
             default the law.
         rest_in_full: the others are drawn as if they had no dial, and not at the dial too.
+        total: what the law is a share of, where there are more than those trained (``counting.law_quota``).
     """
 
     trained: int
     extent: float | None = None
     quota: Callable[[View, float, float], Quota] | None = None
     rest_in_full: bool = False
+    total: int | None = None
 
 
 @dataclass
@@ -136,11 +138,11 @@ class Objective:
             losses.append(float(loss.detach()))
             weight = self._weight(s, alone=len(dials) == 1)
             if config.count_term == "paper" and config.reg_weight > 0:
-                loss = loss + paper_count(dialled, s, tau, config)
+                loss = loss + paper_count(dialled, s, tau, config, self.part.total)
             total = total + weight * loss
             if self.has_law:
                 own = type(dialled)(*(tensor[first] for tensor in dialled))
-                quota = self.part.quota(view, s, losses[-1]) if self.part.quota else None
+                quota = self._quota(view, s, losses[-1])
                 asked = (s, tau, weight * losses[-1], config, quota)
                 count += count_gradient(own, parameters["opacity_logits"][first], *asked)
             kept |= dialled.keep[first]
@@ -148,6 +150,10 @@ class Objective:
         gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}
         count = count if config.parameter == "log" else count / decay.detach()[first]
         return Pull(gradients | {self.decay: gradients[self.decay] + count}, kept, losses[0])
+
+    def _quota(self, view: View, s: float, loss: float) -> Quota:
+        part = self.part
+        return part.quota(view, s, loss) if part.quota else law_quota(s, self.trained, self.config, part.total)
 
     def _weight(self, s: float, *, alone: bool) -> float:
         """w_s, times ``full_weight`` at the s = 1 that goes with another dial value."""

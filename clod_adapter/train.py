@@ -59,7 +59,7 @@ def adapt(
         resume: goes on from here (``Progress.state`` of an earlier call with the same base, views and config) and
             ends, on as many threads and processes, with the same bits as an undisturbed run; a time budget counts from
             the first beginning.
-        part: only some Gaussians are trained, and the others drawn beside them. All by default.
+        part: what is trained, where ``base`` is not all that there is, or not all of it is trained.
         peers: the processes that train along, with the same arguments but ``progress``. Each takes its part of a
             step's views, and all have the same outcome: but for rounding, that of one process.
 
@@ -85,7 +85,7 @@ def adapt(
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
     views = seeing(base, scene.train)
     if resume is None:
-        begun = start(lean, views, config, report, peers.map if peers else map)
+        begun = start(lean, views, config, report)
         if peers:  # the same bits in all of them
             own = {"sigma_d": begun.sigma_d, "attenuation": begun.attenuation}
             begun = begun.replace(**peers.broadcast(own)).to(begun.means.device)
@@ -97,6 +97,7 @@ def adapt(
     run.start_seconds = time.perf_counter() - began
     if resume is not None:
         run.restore(resume)
+    del resume  # by now a copy of what is in the run
     return run.run()
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clod_adapter.adapter import ATTRIBUTES, SIGMA_MAX, Adapter, attach, detach, extract
+from clod_adapter.adapter import ATTRIBUTES, SIGMA_MAX, Adapter, attach, detach, extract, trim
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
@@ -173,3 +175,28 @@ def test_adapter_checks_its_tensors() -> None:
     for bad in ("1.0\nproperty float x", "1.0ä"):
         with pytest.raises(ClodError, match="version"):
             Adapter(torch.ones(3), CONFIG, {}, "f", {}, bad)
+
+
+@pytest.mark.parametrize("degree", [None, 1, 0])
+def test_a_trimmed_result(degree: int | None) -> None:
+    base = gaussians(7, bands=8)
+    kept = torch.arange(7) % 2 == 0
+    less = trim(base, kept, degree)
+    assert len(less) == 4 and less.sh_degree == (2 if degree is None else degree)
+    adapted = adapt(less, ["means", "shN"] if degree else ["means"])
+    adapter = replace(extract(less, adapted, fingerprint="f", config={}), kept=kept, sh_degree=degree)
+    assert bits(adapter.apply(base)) == bits(replace(adapter, kept=None, sh_degree=None).apply(less))
+    with pytest.raises(ClodError, match="it has 4 Gaussians, the adapter 7"):
+        adapter.apply(less)
+    if degree == 1:
+        with pytest.raises(ClodError, match="it has SH degree 0, the adapter 1"):
+            adapter.apply(base.without_bands(0))
+
+
+def test_rows_that_do_not_fit() -> None:
+    adapter = extract(gaussians(3), attach(gaussians(3)), fingerprint="f", config={})
+    for kept in (torch.ones(4, dtype=torch.bool), torch.ones(3), torch.ones(3, 1, dtype=torch.bool)):
+        with pytest.raises(ClodError, match="Adapter.kept is .* it must be bool with 3 set"):
+            replace(adapter, kept=kept)
+    with pytest.raises(ClodError, match="Adapter.sh_degree is 7"):
+        replace(adapter, sh_degree=7)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.counting import count_gradient, count_law, count_slope, soft_count
+from clod_adapter.counting import count_gradient, count_law, count_slope, law_quota, paper_count, soft_count
 from clod_adapter.optimizer import RowAdam
 
 CONFIG = AdaptConfig(max_sv=6.0)
@@ -187,3 +187,24 @@ def test_from_nobody_the_counts_come_to_the_law() -> None:
     kept = float(attenuate(logits, log_sigma.exp(), d, 1.0, ATTENUATION).keep.float().mean())
     assert kept == pytest.approx(CONFIG.start_share, rel=0.1)
     assert (log_sigma > math.log(1e-4) + 2).all()
+
+
+@pytest.mark.parametrize("form", ["law", "paper"])
+@pytest.mark.parametrize("s", [1.0, 3.0])
+def test_shares_of_more_than_are_here(form: str, s: float) -> None:
+    """Gaussians that are left out because they are never drawn count as if they were here and gone."""
+    config = AdaptConfig(count_term=form)
+    random = torch.Generator().manual_seed(1)
+    logits = torch.cat([torch.randn(40, generator=random), torch.full((25,), -40.0)])
+    found = []
+    for count, total in ((65, None), (40, 65)):
+        sigma = (0.5 + torch.rand(65, generator=torch.Generator().manual_seed(2)))[:count].requires_grad_()
+        dialled = attenuate(logits[:count], sigma, torch.full((count,), 0.1), s, AttenuationConfig(tau=0.02))
+        if form == "paper":
+            paper_count(dialled, s, 0.02, config, total).backward()
+            found.append(sigma.grad[:40])
+        else:
+            quota = law_quota(s, count, config, total)
+            found.append(count_gradient(dialled, logits[:count], s, 0.02, 0.3, config, quota)[:40])
+    assert found[0].abs().max() > 0 or (form, s) == ("paper", 1.0)
+    assert torch.allclose(*found, rtol=1e-5, atol=0)

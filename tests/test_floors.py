@@ -38,9 +38,9 @@ FLOORS = [
     {"io", "rasterizers", "adapter"},
     {"render"},
     {"importance", "popping", "budget", "placement", "alignment", "alignment_frames", "alignment_guess"},
-    {"inspection", "inspection_tensors", "inspection_values", "objective", "distributed", "drawing"},
+    {"inspection", "inspection_tensors", "inspection_values", "objective", "distributed", "drawing", "needs"},
     {"train", "evaluate", "export", "viewer", "compare"},
-    {"report", "robustness", "integrations", "chunks", "memory"},
+    {"report", "robustness", "integrations", "plan", "planning", "chunks", "memory"},
     {"demo"},
     {""},  # the package itself, whose __init__ re-exports from all of the above
     {"cli", "__main__"},

@@ -2,7 +2,8 @@
 
 Tensors: ``sigma_d`` float32, and under its attribute's name each update, whose type tells what it is:
 float16 a difference from the base, float32 the new values. The JSON stands under the metadata key
-``clod_adapter``; being one key it is written in one order, so equal adapters give equal files.
+``clod_adapter``; being one key it is written in one order, so equal adapters give equal files. Where the result has
+fewer rows than the base there is ``kept`` too, uint8: a bit a row of the base, the first row the highest bit.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from safetensors.torch import save
 
 from clod_adapter.adapter import Adapter
@@ -25,7 +28,8 @@ from clod_adapter.io.tensor_file import load_tensors
 
 KEY = "clod_adapter"
 FORMAT = "clod-adapter"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+UNTRIMMED = 1  # what is not trimmed is written as before, for earlier versions of this package
 
 
 def save_adapter(path: str | Path, adapter: Adapter) -> None:
@@ -34,9 +38,10 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
     Raises:
         ClodError: its config is not plain JSON, or the file cannot be written.
     """
+    trimmed = adapter.kept is not None or adapter.sh_degree is not None
     about = {
         "format": FORMAT,
-        "format_version": FORMAT_VERSION,
+        "format_version": FORMAT_VERSION if trimmed else UNTRIMMED,
         "package_version": adapter.version,
         "base_sha256": adapter.base_fingerprint,
         "attenuation": asdict(adapter.attenuation),
@@ -46,9 +51,13 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
         about["origin"] = adapter.origin
     if adapter.calibration is not None:
         about["calibration"] = adapter.calibration.as_dict()
+    if trimmed:
+        about["trimmed"] = {"base_count": adapter.base_count, "sh_degree": adapter.sh_degree}
     check_config(adapter.config)
     metadata = {KEY: json.dumps(about, sort_keys=True, allow_nan=False)}
     tensors = {"sigma_d": adapter.sigma_d, **adapter.updates}
+    if adapter.kept is not None:
+        tensors["kept"] = torch.from_numpy(np.packbits(adapter.kept.cpu().numpy()))
     with atomic_path(path) as temporary:
         # Not save_file, which makes files that only their owner can read.
         temporary.write_bytes(save({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, metadata))
@@ -84,6 +93,8 @@ def load_adapter(path: str | Path) -> Adapter:
                 raise TypeError(f"{name} is {about[name]!r}, not a string")
         if not isinstance(about["config"], dict):
             raise TypeError(f"config is {about['config']!r:.40}, not an object")
+        trimmed = about.get("trimmed", {})
+        kept = _rows(tensors.pop("kept"), trimmed["base_count"]) if "kept" in tensors else None
         return Adapter(
             sigma_d=tensors.pop("sigma_d"),
             attenuation=AttenuationConfig(**about["attenuation"]),
@@ -93,8 +104,17 @@ def load_adapter(path: str | Path) -> Adapter:
             version=about["package_version"],
             calibration=Calibration.from_dict(about["calibration"]) if "calibration" in about else None,
             origin=parse_origin(about.get("origin", NOWHERE)),
+            kept=kept,
+            sh_degree=trimmed.get("sh_degree"),
         )
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ClodError(f"{path}: its description is damaged ({error!r}); copy or export the adapter again") from error
     except ClodError as error:
         raise ClodError(f"{path}: {error}") from error
+
+
+def _rows(packed: torch.Tensor, count: int) -> torch.Tensor:
+    """``[count]`` bool of a bit a row."""
+    if packed.dtype != torch.uint8 or len(packed) != -(-count // 8):
+        raise ValueError(f"kept has {len(packed)} bytes for {count} rows")
+    return torch.from_numpy(np.unpackbits(packed.numpy(), count=count).astype(bool))

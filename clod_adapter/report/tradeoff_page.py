@@ -70,7 +70,8 @@ def write_tradeoff_report(
         )
         body.append(page.section("Error against the time of adapting", page.chart(svg, caption)))
     reading = [text.format(truth=OWN_PICTURES if own else PHOTOGRAPHS) for text in READING]
-    body += [_rows(series), page.section("How to read this", *map(page.paragraph, reading)), _settings(report)]
+    body += [_rows(series), page.section("How to read this", *map(page.paragraph, reading))]
+    body += [_plan(report), _settings(report)]
     kicker = f"clod-adapter {report['version']}, {'evaluation' if report['command'] == 'eval' else 'adaptation'} report"
     page.write_page(path, _title(report), kicker, body, {"report": report, "training": training})
     return {"page": path, **outputs}
@@ -96,7 +97,7 @@ def _lead(report: Mapping[str, Any], series: Sequence[Series]) -> list[str]:
     if report["command"] == "eval":
         first = f"{report['model']} holds {count:,} Gaussians. It was measured on held-out photographs of {scene}."
     else:
-        seconds = report["seconds"].get("start", 0) + report["seconds"].get("train", 0)
+        seconds = sum(report["seconds"].get(phase, 0) for phase in ("plan", "start", "train"))
         seen = "its own pictures from placed cameras" if own else f"the photographs of {scene}"
         first = (
             f"{PurePath(report['model']).name}, a trained splat of {count:,} Gaussians, was given a quality dial: "
@@ -176,6 +177,13 @@ def _rows(series: Sequence[Series]) -> str:
         ]  # fmt: skip
         groups.append((one.label, rows))
     return page.section("All rows", page.table(head, groups)) if groups else ""
+
+
+def _plan(report: Mapping[str, Any]) -> str:
+    """What of the checkpoint the scene did not need."""
+    decisions = report.get("plan", {}).get("decisions", ())
+    rows = [[made[name] for name in ("what", "verdict", "measured", "why")] for made in decisions]
+    return page.section("Plan", page.table(("what", "decision", "by", "which"), [("", rows)])) if rows else ""
 
 
 def _settings(report: Mapping[str, Any]) -> str:

@@ -53,7 +53,7 @@ def test_writes_three_files(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert set(report["config"]) == set(AdaptConfig.__dataclass_fields__) and report["config"]["max_sv"] == 4
     assert report["attenuation"]["max_sv"] == 4
     assert set(report["machine"]) >= {"cpu", "cores", "python", "torch", "numba"}
-    assert set(report["seconds"]) == {"load", "kernels", "start", "train", "evaluate", "total"}
+    assert set(report["seconds"]) == {"load", "kernels", "plan", "start", "train", "evaluate", "total"}
     assert report["adapter_bytes"] == (tmp_path / "dial.safetensors").stat().st_size
     assert report["outputs"] == {"ply": "dial.ply", "adapter": "dial.safetensors", "report": "dial.json"}
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.25, 1.5, 2, 2.5, 3, 4]
@@ -196,14 +196,14 @@ def test_interrupt_with_nothing_to_write(
 ) -> None:
     """One press before training, or two while it runs."""
 
-    def adapt(base: Any, scene: Any, config: Any, progress: Any, resume: Any) -> Any:
+    def adapt(base: Any, scene: Any, config: Any, progress: Any, resume: Any, **rest: Any) -> Any:
         for _ in range(presses):
             signal.raise_signal(signal.SIGINT)
         if presses == 1:
             progress(Progress("start", 1, 8, 0.1, 0.1, 0.0, lambda: base))
         pytest.fail("went on")
 
-    monkeypatch.setattr("clod_adapter.cli.adapt.adapt", adapt)
+    monkeypatch.setattr("clod_adapter.plan.adapt", adapt)
     done = clod(capture.ply, "--images", capture.scene, *TINY)
     assert done.code == 130 and done.err.splitlines()[-1] == "clod-adapt: interrupted"
     assert names(tmp_path) == [] and signal.getsignal(signal.SIGINT) is signal.default_int_handler

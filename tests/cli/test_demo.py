@@ -32,8 +32,8 @@ def short(monkeypatch: pytest.MonkeyPatch, capture: Any) -> None:
 
     monkeypatch.setattr(demo, "prepare", prepare)
     monkeypatch.setattr(demo, "draw", draw)
-    real, few = adapt.adapt, partial(replace, iters=2)
-    monkeypatch.setattr(adapt, "adapt", lambda base, scene, config, *a, **k: real(base, scene, few(config), *a, **k))
+    real, few = adapt.decide, partial(replace, iters=2)
+    monkeypatch.setattr(adapt, "decide", lambda args, base, scene, config, *a: real(args, base, scene, few(config), *a))
 
 
 def test_says_where_things_are_and_what_is_next(clod: Any, short: None, tmp_path: Path) -> None:

@@ -223,6 +223,22 @@ def test_a_loss_within_a_step_loses_none(server: Server, words: list[Any], alone
     assert_close(run.folder, alone)
 
 
+def test_a_loss_before_the_first_step(server: Server, words: list[Any], tmp_path: Path) -> None:
+    """There is nothing to write then; here for want of a second GPU."""
+    on_gpus = (
+        "real = processes.Peers.broadcast\n"
+        "def broadcast(*arguments):\n"
+        "    job = real(*arguments)\n"
+        "    object.__setattr__(job, 'device', 'cuda')\n"
+        "    return job\n"
+        "processes.Peers.broadcast = broadcast; torch.cuda.device_count = lambda: 1"
+    )
+    run = server.start(tmp_path / "run", *words, *TINY, before={1: on_gpus})
+    assert run.wait() == [2, 2] and run.log(1) == "" and list(run.folder.iterdir()) == [], run.log(0)
+    why = "process 1: 2 processes on a machine with 1 GPUs; start as many as there are"
+    assert run.log(0).count("error:") == 1 and f"; {why}; nothing was learned by then, so start again\n" in run.log(0)
+
+
 def test_the_first_is_killed(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
     """The state that it saved last is there, for any number of processes; the others wait for the launcher's signal."""
     slowly = "from clod_adapter.train import _Run; real = _Run.step\n"

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,33 @@ def test_the_file_says_what_it_is(tmp_path: Path) -> None:
         about = json.loads(file.metadata()["clod_adapter"])
     assert about["format"] == "clod-adapter" and about["format_version"] == 1 and "package_version" in about
     assert about["base_sha256"] == "ab" * 32 and about["attenuation"]["tau"] == 0.1 / 3
+
+
+@pytest.mark.parametrize(("count", "degree"), [(1, None), (8, 1), (9, 0), (100, None)])
+def test_what_a_trimmed_result_has_is_kept(tmp_path: Path, count: int, degree: int | None) -> None:
+    kept = torch.arange(count) % 3 != 1
+    saved = replace(adapter(int(kept.sum())), kept=kept, sh_degree=degree)
+    save_adapter(tmp_path / "a", saved)
+    loaded = load_adapter(tmp_path / "a")
+    assert loaded.kept is not None and torch.equal(loaded.kept, kept) and loaded.sh_degree == degree
+    assert loaded.base_count == count
+    with safe_open(tmp_path / "a", framework="pt") as file:
+        about = json.loads(file.metadata()["clod_adapter"])
+        assert about["format_version"] == 2  # what an earlier version of the package refuses
+        assert len(file.get_tensor("kept")) == -(-count // 8)
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    for change in ({"base_count": count + 8}, {"base_count": -1}, {"base_count": "9"}, {}):
+        text = json.dumps(about | {"trimmed": change})
+        save_file(tensors, tmp_path / "b", {"clod_adapter": text})
+        with pytest.raises(ClodError, match="description is damaged"):
+            load_adapter(tmp_path / "b")
+    more = {"kept": torch.full_like(tensors["kept"], 255)}
+    save_file(tensors | more, tmp_path / "b", {"clod_adapter": json.dumps(about)})
+    if kept.all():
+        assert load_adapter(tmp_path / "b").base_count == count
+    else:
+        with pytest.raises(ClodError, match=r"Adapter.kept is bool \[\d+\], it must be bool with \d+ set"):
+            load_adapter(tmp_path / "b")
 
 
 @pytest.mark.parametrize("value", [{1, 2}, torch.ones(1), float("nan"), object()])
@@ -112,7 +140,7 @@ def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject) 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format_version": 2}, "upgrade"),
+        ({"format_version": 3}, "upgrade"),
         ({"format": "other"}, "not a clod-adapter file but 'other'"),
         ({"format": "other", "format_version": 2}, "not a clod-adapter file"),
         ({"format": None}, "not a clod-adapter file"),
@@ -125,6 +153,8 @@ def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject) 
         ({"attenuation": {"new_field": 1}}, "new_field"),
         ({"attenuation": 3}, "description is damaged"),
         ({"config": [1]}, "config is .1., not an object"),
+        ({"trimmed": {"sh_degree": "3"}}, "sh_degree is '3', it must be one of 0, 1, 2, 3, 4"),
+        ({"trimmed": [1]}, "description is damaged"),
     ],
 )
 def test_other_descriptions(tmp_path: Path, change: dict[str, object], message: str) -> None:

@@ -1,0 +1,115 @@
+"""What the plan saves and costs: the same command with everything in, with the plan, and with --trim.
+
+    python benchmarks/plan.py                               # every scene of the shared data: one row a run
+    python benchmarks/plan.py ci_banana --iters 300 --label short
+    python benchmarks/plan.py plush_half ci_banana --attributes  # what each attribute buys, and what the plan said
+    python benchmarks/plan.py --table                       # the last rows as Markdown, for docs/plan.md
+
+A scene is a folder of the shared data, with a checkpoint's name where it is not ``pretrained``, or a file without
+photographs. Each run is a process of its own, so that its peak of memory is. Rows go to ``results/plan.jsonl``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from common import RESULTS, SHARED, append
+
+from clod_adapter.cli.help_plan import NAMES
+
+FILE = "plan.jsonl"
+SCENES = (
+    "plush_half", "plush_half/pretrained_mask", "bonsai146", "ci_banana", "splats/lod_tiles/lod1_tile_0_0.5x.ply",
+    "splats/playbot_lod4_from_sog.ply",
+)  # fmt: skip
+DIALS = (1.0, 3.0, 5.0)
+WAYS = {"everything": ["--with", *NAMES], "plan": [], "plan, trimmed": ["--trim"]}
+SHORT = 300  # steps of the runs that judge attributes
+ATTRIBUTES = NAMES[2:]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*", default=SCENES)
+    parser.add_argument("--iters", type=int, default=1500)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--attributes", action="store_true", help=f"one attribute frozen at a time, {SHORT} steps")
+    parser.add_argument("--label", default="default", help="what the rows are for")
+    parser.add_argument("--table", action="store_true", help="print the rows there are")
+    args = parser.parse_args()
+    if args.table:
+        print_table()
+        return
+    ways, iters = WAYS, args.iters
+    if args.attributes:
+        ways = {"plan": ["--with", "unseen", "bands"]}
+        ways |= {f"without {name}": ["--with", "unseen", "bands", "--without", name] for name in ATTRIBUTES}
+        iters = SHORT
+    for scene in args.scenes:
+        for way, options in ways.items():
+            for seed in args.seeds:
+                words = ["--iters", str(iters), "--seed", str(seed), *options]
+                append(
+                    FILE, {"benchmark": "plan", "scene": scene, "way": way, "label": args.label, **run(scene, words)}
+                )
+
+
+def run(scene: str, options: list[str]) -> dict[str, Any]:
+    """One ``clod-adapt`` in a process of its own: times, sizes, peak of memory, and the dial's rows."""
+    if not (SHARED / scene.partition("/")[0]).exists():
+        sys.exit(f"{SHARED / scene} is absent: set CLOD_SHARED_DATA to the folder that holds it")
+    words, source = [], SHARED / scene
+    if source.suffix != ".ply":
+        folder, _, checkpoint = scene.partition("/")
+        source, words = SHARED / folder / f"{checkpoint or 'pretrained'}.ply", ["--images", str(SHARED / folder)]
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "dial.ply"
+        code = "import sys; from clod_adapter.cli.main import main; sys.exit(main())"
+        command = [sys.executable, "-c", code, str(source), *words, *options, "--out", str(out), "--quiet"]
+        began = time.perf_counter()
+        nowhere = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
+        child = os.posix_spawn(sys.executable, command, os.environ, file_actions=nowhere)
+        _, status, used = os.wait4(child, 0)
+        seconds = time.perf_counter() - began
+        if status:
+            sys.exit(f"{' '.join(command)} failed")
+        report = json.loads(out.with_suffix(".json").read_text())
+    return {
+        "steps": report["steps"], "seed": report["config"]["seed"], "base_count": report["base_count"],
+        "wall_seconds": round(seconds, 2), "seconds": report["seconds"], "plan": report["plan"],
+        "ply_mb": report["ply_bytes"] / 1e6, "adapter_mb": report["adapter_bytes"] / 1e6,
+        "peak_mb": used.ru_maxrss / 1e3, "base_psnr": report["base_rows"][0]["psnr"] if report["base_rows"] else None,
+        "rows": [row for row in report["rows"] if row["virtual_scale"] in DIALS],
+    }  # fmt: skip
+
+
+def print_table() -> None:
+    """The last row of each scene, way and number of steps."""
+    last: dict[tuple[str, int, str], dict[str, Any]] = {}
+    for row in map(json.loads, (RESULTS / FILE).read_text(encoding="utf-8").splitlines()):
+        if row["label"] == "default":
+            last[row["scene"], row["steps"], row["way"]] = row
+    heads = ["scene", "steps", "way", "plan s", "start s", "train s", "PLY MB", "adapter MB", "peak MB"]
+    heads += [f"dB at {s:g} (kept)" for s in DIALS]
+    print(f"| {' | '.join(heads)} |\n|---|---:|---|{'---:|' * (len(heads) - 3)}")
+    for (scene, steps, way), row in last.items():
+        times = [row["seconds"][phase] for phase in ("plan", "start", "train")]
+        cells = [scene, str(steps), way, *(f"{t:.1f}" for t in times)]
+        cells += [f"{row['ply_mb']:.1f}", f"{row['adapter_mb']:.2f}", f"{row['peak_mb']:.0f}"]
+        cells += [f"{r['psnr']:.2f} ({r['kept']:,.0f})" for r in row["rows"]]
+        print("| " + " | ".join(cells) + " |")
+    print("\n| scene | what | decision | number |\n|---|---|---|---:|")
+    for (scene, _, way), row in last.items():
+        for made in row["plan"]["decisions"] if way == "plan, trimmed" else ():
+            print(f"| {scene} | {made['what']} | {made['verdict']} | {made['measured']} {made['why']} |")
+
+
+if __name__ == "__main__":
+    main()
