@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 from clod_adapter.errors import ClodError
 
-PROCESS = 420e6  # the interpreter, torch, compiled kernels
+PROCESS = 450e6  # the interpreter, torch, compiled kernels
 PIXEL = 260  # a pixel: picture, photograph, their maps and gradients, lists of tiles
 DRAWN = 640  # a Gaussian that is drawn, beside its attributes: scratch of the rasterizer, gradients
 TRAINED = 640  # one that is trained, on top: its copy, moments, mean, and the saving of all that
-ORDERED = 840  # one whose place in the order of leaving is looked for
+ORDERED = 560  # one whose place in the order of leaving is looked for
 MERGED = 130  # one, while chunks are trained: what the pass before has made of it, and what this one has so far
 WRITTEN = 560  # one that is written: what changed, and the rows of the file
 IMAGES = 1 / 8  # of the limit, the share that photographs may take

@@ -324,3 +324,11 @@ def test_let_go_by_another_thread() -> None:
     for thread in others:
         thread.join()
     assert not wrong and idle() <= IDLE
+
+
+def test_what_waits_can_be_given_back() -> None:
+    array = recycled((3, 50_001))
+    del array
+    assert memory._idle and memory._recent
+    memory.release()
+    assert not memory._idle and not memory._recent
