@@ -28,7 +28,7 @@ from clod_adapter.io.chunk_file import checked, load_chunk, save_chunk
 from clod_adapter.io.image_cache import ImageCache
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.version import package_version
-from clod_adapter.memory import Plan
+from clod_adapter.memory import MemoryPlan
 from clod_adapter.rasterizers.cpu import release_memory
 from clod_adapter.robustness import scene_fingerprint
 from clod_adapter.train import Adapted
@@ -45,14 +45,14 @@ class Chunked:
 
     args: argparse.Namespace
     outputs: Outputs
-    plan: Plan
+    plan: MemoryPlan
     console: Console
     stop: GracefulStop
     belongs: dict[str, Any]
 
     @classmethod
     def of(
-        cls, args: argparse.Namespace, outputs: Outputs, plan: Plan | None, base: Checkpoint, scene: Scene,
+        cls, args: argparse.Namespace, outputs: Outputs, plan: MemoryPlan | None, base: Checkpoint, scene: Scene,
         config: AdaptConfig, console: Console, stop: GracefulStop,
     ) -> Chunked | None:  # fmt: skip
         """None where the whole is trained at once."""

@@ -13,7 +13,7 @@ import pytest
 from clod_adapter import memory
 from clod_adapter.cli import memory_plan, resume, training
 from clod_adapter.io.chunk_file import load_chunk
-from clod_adapter.memory import Plan, make_plan
+from clod_adapter.memory import MemoryPlan, make_plan
 from clod_adapter.training_state import Progress
 from scenes import stripped
 
@@ -24,7 +24,7 @@ CHUNKS = 3
 def forced(monkeypatch: pytest.MonkeyPatch) -> None:
     """What fits is adapted in chunks all the same."""
 
-    def plan(*args: Any) -> Plan:
+    def plan(*args: Any) -> MemoryPlan:
         return replace(make_plan(*args), chunks=CHUNKS)
 
     monkeypatch.setattr(memory_plan, "make_plan", plan)
