@@ -6,6 +6,7 @@ One JSON document under the metadata key ``clod_adapter_chunk`` says which run a
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -55,7 +56,10 @@ def load_chunk(path: Path, belongs: dict[str, Any]) -> tuple[dict[str, Tensor], 
     different = [name for name in belongs if theirs.get(name) != belongs[name]]
     if different:
         raise ClodError(f"{path}: is of a run with another {different[0]}; remove it, or give --out another name")
-    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
+    possible = {name: tensor.isfinite() for name, tensor in tensors.items()}
+    if (logits := tensors.get("opacity_logits")) is not None:  # files in the wild have +inf: fully opaque
+        possible["opacity_logits"] |= logits == math.inf
+    if not all(bool(each.all()) for each in possible.values()):
         raise ClodError(f"{path}: holds a value that is not finite; remove it to have it made anew")
     return tensors, about
 

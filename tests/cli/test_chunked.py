@@ -225,6 +225,17 @@ def test_a_start_that_was_tampered_with(adapt: Callable[..., Any], tmp_path: Pat
     assert memory.MOST_CHUNKS > CHUNKS
 
 
+def test_opaque_gaussians_are_handed_on(clod: Callable[..., Any], capture: Any, forced: None, tmp_path: Path) -> None:
+    """Opacity +inf, as files in the wild have it, is a value that a job's file may hold."""
+    logits = capture.gaussians.opacity_logits.clone()
+    logits[::7] = float("inf")
+    ply = capture.write(tmp_path / "opaque.ply", capture.gaussians.replace(opacity_logits=logits))
+    given = [ply, "--images", capture.scene, "--iters", 4, "--max-sv", 3, "--memory", "8GB", "--out", "a.ply"]
+    assert clod(*given, "--chunk", 1).code == 0
+    done = clod(*given)
+    assert done.code == 0, done
+
+
 def test_ctrl_c_leaves_what_is_finished(
     adapt: Callable[..., Any], whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
