@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from clod_adapter.errors import ClodError
 
-PROCESS = 450e6  # the interpreter, torch, compiled kernels
+PROCESS = 520e6  # the interpreter, torch, compiled kernels
 PIXEL = 260  # a pixel: picture, photograph, their maps and gradients, lists of tiles
 DRAWN = 640  # a Gaussian that is drawn, beside its attributes: scratch of the rasterizer, gradients
 TRAINED = 640  # one that is trained, on top: its copy, moments, mean, and the saving of all that

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
+import city as made
 import numpy as np
 import pytest
 import torch
@@ -13,9 +13,6 @@ from clod_adapter.io.ply import load
 from clod_adapter.io.scene import load_scene
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-import city as made  # noqa: E402
 
 
 @pytest.mark.parametrize("count", [1000, 12_345, 70_000])

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import math
-import sys
-from pathlib import Path
 from typing import Any
 
+import growth as measured
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-import growth as measured  # noqa: E402
 
 SIZES = (measured.FLOOR, *measured.SIZES)
 
