@@ -356,8 +356,10 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
         peaks = [f"{row['gaussians']:,}: {row['peak_bytes'] / 1e9:.2f}" for row in over_count(rows, command)[-2:]]
         lines.append(f"| {command} | {' | '.join(peaks or ['', ''])} | {each:,.0f} | {rest / 1e6:,.0f} |")
     for row in over_count(rows, "adapt")[-1:]:
-        per = {name: f"{peak / row['gaussians']:,.0f}" for name, peak in row["phase_peaks"].items()}
-        lines += ["", f"resident bytes a Gaussian at {row['gaussians']:,}, by phase of adapt: {per}"]
+        peaks = row["phase_peaks"]
+        lines += ["", f"| adapt, {row['gaussians']:,}: up to | {' | '.join(peaks)} |", "|---" * (len(peaks) + 1) + "|"]
+        per = " | ".join(f"{peak / row['gaussians']:,.0f}" for peak in peaks.values())
+        lines.append(f"| resident bytes a Gaussian | {per} |")
     for series, name, x in (("images", "photographs", photographs), ("shapes", "megapixels", megapixels)):
         chosen = sorted((row for row in rows if row["series"] == series), key=x)
         lines += ["", f"| adapt over {name} | seconds | start | step | evaluate | load | peak, GB |", "|---" * 7 + "|"]
@@ -365,7 +367,7 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
             times = " | ".join(f"{row['phases'][key]:.3g}" for key in ("start", "step", "evaluate", "load"))
             lines.append(f"| {x(row):.3g} | {row['seconds']:.3g} | {times} | {row['peak_bytes'] / 1e9:.2f} |")
         powers = [exponent([(x(row), row["phases"][key]) for row in chosen]) for key in ("start", "step", "evaluate")]
-        lines.append(f"exponents of start, step, evaluate: {', '.join(f'{power:.2f}' for power in powers)}")
+        lines.append(f"| exponent | | {' | '.join(f'{power:.2f}' for power in powers)} | | |")
     return "\n".join(lines)
 
 

@@ -25,5 +25,7 @@ def add_plan_options(parser: ArgumentParser) -> None:
         ("--without", "leave_out", "leave these out or frozen, likewise"),
     ):
         names = ", ".join(NAMES) if dest == "keep_in" else ""
-        parser.add_argument(option, dest=dest, metavar="NAME", nargs="+", choices=NAMES, default=[], help=what + names)
+        parser.add_argument(
+            option, dest=dest, metavar="NAME", nargs="+", action="extend", choices=NAMES, default=[], help=what + names
+        )
     parser.add_argument("--trim", action="store_true", help="do not write the bands and Gaussians that were left out")

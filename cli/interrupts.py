@@ -11,10 +11,19 @@ from typing import Any
 
 
 class GracefulStop:
-    """Counts Ctrl-C. The first is a request, which the step under way outlives; a second one interrupts at once."""
+    """Counts Ctrl-C. The first is a request, which the step under way outlives; a second one interrupts at once.
 
-    def __init__(self) -> None:
-        self.requests = 0
+    Args:
+        aborts: whether it does. Launchers and schedulers repeat their signals: what they start does not abort.
+    """
+
+    def __init__(self, aborts: bool = True) -> None:
+        self.requests, self.aborts = 0, aborts
+
+    @property
+    def aborted(self) -> bool:
+        """Whether nothing is to be written any more."""
+        return self.aborts and self.requests > 1
 
     @contextmanager
     def listening(self) -> Iterator[None]:
@@ -23,7 +32,7 @@ class GracefulStop:
 
     def _request(self, number: int, frame: FrameType | None) -> None:
         self.requests += 1
-        if self.requests > 1:
+        if self.aborted:
             raise KeyboardInterrupt
 
 
@@ -32,6 +41,12 @@ def sigterm_as_interrupt() -> Iterator[None]:
     """Within, SIGTERM raises KeyboardInterrupt. To be entered after pycolmap's import, which installs a handler."""
     with _handled_by(signal.default_int_handler, signal.SIGTERM):
         yield
+
+
+def listen_no_more() -> None:
+    """From here to the end of the process, past the blocks above, neither Ctrl-C nor SIGTERM is heard."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 @contextmanager
@@ -44,4 +59,5 @@ def _handled_by(handler: Callable[[int, FrameType | None], Any], *numbers: signa
         yield
     finally:
         for number, earlier in before.items():
-            signal.signal(number, earlier)
+            if signal.getsignal(number) is handler:  # and not listen_no_more
+                signal.signal(number, earlier)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import count
@@ -65,7 +65,8 @@ def leading() -> Iterator[None]:
         with _threads(Launch()):
             yield
     finally:
-        store.set(OVER, "1")
+        with suppress(RuntimeError):  # the launcher is gone, and the others know of it by that
+            store.set(OVER, "1")
 
 
 @contextmanager
@@ -95,7 +96,7 @@ def together(make_job: Callable[[], Job], follower: Follower) -> Iterator[Peers 
 
 def take_part() -> None:
     """What a process that is not the first does: trains along, silently, until there is no more to do."""
-    launch, store, stop = launched(), _store(), GracefulStop()
+    launch, store, stop = launched(), _store(), GracefulStop(aborts=False)
     with stop.listening(), _threads(launch):
         for number in count(1):
             if not _is_called(store, number, stop):
@@ -108,8 +109,10 @@ def take_part() -> None:
 
 def explain(lost: str) -> str:
     """Why a process was lost, with what it said itself, if it could."""
-    keys = [_reason(rank) for rank in range(1, launched().size)]
-    said = [_store().get(key).decode() for key in keys if _store().check([key])]
+    said = []
+    with suppress(RuntimeError):  # without the launcher's store nobody could say anything
+        for key in map(_reason, range(1, launched().size)):
+            said += [_store().get(key).decode()] if _store().check([key]) else []
     return "; ".join([lost, *said])
 
 
@@ -136,8 +139,10 @@ def _train_along(number: int, launch: Launch, stop: GracefulStop) -> None:
         job: Any = peers.broadcast(None)
         if job.device == "cuda":
             _take_gpu(launch)
-        base = job.base.to(job.device)
-        adapt(base, Scene(job.views, ()), job.config, follow, job.state, part=job.part, peers=peers)
+        base, scene, begun = job.base.to(job.device), Scene(job.views, ()), [job.state]
+        config, part = job.config, job.part
+        del job  # so that the state, as large as all that is trained, goes as soon as it is restored
+        adapt(base, scene, config, follow, begun.pop(), part=part, peers=peers)
 
 
 def _take_gpu(launch: Launch) -> None:
@@ -155,7 +160,8 @@ def _giving_reasons(rank: int) -> Iterator[None]:
     except PeerLost:
         raise
     except Exception as error:
-        _store().set(_reason(rank), f"process {rank}: {str(error) or type(error).__name__}")
+        with suppress(RuntimeError):
+            _store().set(_reason(rank), f"process {rank}: {str(error) or type(error).__name__}")
         raise
 
 

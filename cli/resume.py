@@ -112,7 +112,7 @@ class Saver:
             try:
                 follow(progress)
             except KeyboardInterrupt:
-                if self.stop.requests < 2:
+                if not self.stop.aborted:
                     self._save(progress)
                 raise
             if time.perf_counter() >= self.due and progress.share < 1:

@@ -72,7 +72,8 @@ class Follower:
         if self.stop.requests:
             self.close()
             if self.phase == "train":
-                self.console.say("stopping (Ctrl-C again aborts without writing)")
+                again = " (Ctrl-C again aborts without writing)" if self.stop.aborts else ""
+                self.console.say(f"stopping{again}")
             raise KeyboardInterrupt
 
     def close(self) -> None:

@@ -35,7 +35,10 @@ if TYPE_CHECKING:
     from clod_adapter.io.adapter_file import load_adapter, save_adapter
     from clod_adapter.io.ply import Checkpoint, load, save
     from clod_adapter.io.scene import load_scene
+    from clod_adapter.objective import Part
     from clod_adapter.placement import imagine, place
+    from clod_adapter.plan import Decision, Overrule, Plan
+    from clod_adapter.planning import make_plan
     from clod_adapter.render import Rendering, render
     from clod_adapter.train import Adapted, adapt
 
@@ -54,14 +57,17 @@ on_first_use(__name__, {
     "io.adapter_file": ("load_adapter", "save_adapter"),
     "io.scene": ("load_scene",),
     "io.ply": ("Checkpoint", "load", "save"),
+    "objective": ("Part",),
     "placement": ("imagine", "place"),
+    "plan": ("Decision", "Overrule", "Plan"),
+    "planning": ("make_plan",),
     "render": ("Rendering", "render"),
     "train": ("Adapted", "adapt"),
 })  # fmt: skip
 
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
-    "DialValue", "Gaussians", "Hook", "Rendering", "Scene", "View", "adapt", "attach", "bake", "detach", "dial_for",
-    "evaluate", "extract", "imagine", "load", "load_adapter", "load_scene", "order_by_extinction", "place", "render",
-    "save", "save_adapter",
+    "Decision", "DialValue", "Gaussians", "Hook", "Overrule", "Part", "Plan", "Rendering", "Scene", "View", "adapt",
+    "attach", "bake", "detach", "dial_for", "evaluate", "extract", "imagine", "load", "load_adapter", "load_scene",
+    "make_plan", "order_by_extinction", "place", "render", "save", "save_adapter",
 ]  # fmt: skip

@@ -12,15 +12,17 @@ from clod_adapter.cameras import View
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import MOST_VIEWS, removal_error, spread
 from clod_adapter.metrics import psnr
+from clod_adapter.rasterizers.reference import ALPHA_MAX
 from clod_adapter.render import render
 
 
 @torch.no_grad()
 def band_losses(base: Gaussians, views: Sequence[View], limit: float) -> Iterator[tuple[int, float]]:
-    """What the highest SH bands are worth: from the highest one down, (degree, dB lost without it and those above).
+    """What the highest SH bands are worth: from the highest one down, (degree, dB without it and those above).
 
-    PSNR against the photographs at full detail, mean over ``views``. Ends after the first loss, or gain, that is not
-    below ``limit``. Bands that are 0 throughout are not rendered for.
+    By how much PSNR against the photographs at full detail changes in either direction, mean over ``views``: one's
+    gain makes up for no other's loss. Ends after the first that is not below ``limit``. Bands that are 0 throughout
+    are not rendered for.
     """
     used = base.without_empty_bands().sh_degree
     yield from ((degree, 0.0) for degree in range(base.sh_degree, used, -1))
@@ -29,9 +31,9 @@ def band_losses(base: Gaussians, views: Sequence[View], limit: float) -> Iterato
     for degree in range(used, 0, -1):
         less = base.without_bands(degree - 1)
         without = [psnr(render(less, view.camera).image, view.image) for view in views]
-        loss = fmean(map(_difference, with_all, without))
-        yield degree, loss
-        if not abs(loss) < limit:
+        change = _mean_change(with_all, without)
+        yield degree, change
+        if not change < limit:
             return
 
 
@@ -43,7 +45,8 @@ def seen(
     A picture is linear in each opacity, so a Gaussian by whose opacity no pixel's derivative differs from 0 changes
     nothing when it goes. The backward pass of ``removal_error`` has the derivatives with random signs: that those of a
     Gaussian cancel to exactly 0 in all pixels and views of it has no weight in practice, and ``largest_change`` bounds
-    what it would do. Views that have made ``error`` are not looked at again.
+    what it would do. Rasterizers clamp alpha, above which it has no derivative: Gaussians that opaque count as seen.
+    Views that have made ``error`` are not looked at again.
 
     Args:
         error: ``[N]`` the ``removal_error`` of ``spread(views, MOST_VIEWS)``, as ``importance.start`` takes it.
@@ -52,7 +55,8 @@ def seen(
     """
     chosen = {id(view) for view in spread(views, MOST_VIEWS)}
     others = [view for view in views if id(view) not in chosen]
-    return (error > 0) | (removal_error(base, others, seed=seed, progress=progress) > 0)
+    moves = (error > 0) | (removal_error(base, others, seed=seed, progress=progress) > 0)
+    return moves | (base.opacities > ALPHA_MAX)
 
 
 @torch.no_grad()
@@ -77,8 +81,8 @@ def effect(
     """What the move of one attribute from ``before`` to ``after`` does: (dB, the dial value that it was found at).
 
     By how much PSNR against the photographs, mean over ``views``, changes where the attribute is put back and the
-    others are as in ``after``, in either direction: early in a training steps are long, and even what will be useful
-    may do harm. At each of ``dials`` in turn, until one is at least ``limit``; else the largest.
+    others are as in ``after``, in either direction view by view: early in a training steps are long, and even what
+    will be useful may do harm. At each of ``dials`` in turn, until one is at least ``limit``; else the largest.
     """
     old, new = getattr(before, name), getattr(after, name)
     most = (0.0, dials[0])
@@ -86,8 +90,7 @@ def effect(
         return most
     back = after.replace(**{name: old})
     for s in dials:
-        change = fmean(map(_difference, _errors(after, views, s), _errors(back, views, s)))
-        most = max(most, (abs(change), s))
+        most = max(most, (_mean_change(_errors(after, views, s), _errors(back, views, s)), s))
         if most[0] >= limit:
             break
     return most
@@ -95,6 +98,10 @@ def effect(
 
 def _errors(gaussians: Gaussians, views: Sequence[View], s: float) -> list[float]:
     return [psnr(render(gaussians, view.camera, s).image, view.image) for view in views]
+
+
+def _mean_change(these: Sequence[float], those: Sequence[float]) -> float:
+    return fmean(abs(_difference(a, b)) for a, b in zip(these, those, strict=True))
 
 
 def _difference(this: float, that: float) -> float:

@@ -152,9 +152,9 @@ class Plan:
 
         seen_at, lost = largest_change(base, less, scene.train, report(0))
         new_at, more = largest_change(base, less, scene.test, report(len(scene.train)))
-        why = f"lost on all training views, no pixel changes by more than {seen_at:.2g} of 1"
+        why = f"lost on all training views, a pixel at most {seen_at:.2g}"
         if scene.test:
-            why += f"; {more:+.3f} dB and {new_at:.2g} on those held out"
+            why += f"; held out {more:.3f} dB, {new_at:.2g}"
         return Decision("what is left out", "trimmed", lost, "dB", why)
 
     def as_dict(self) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def make_plan(
     The same Gaussians, views and settings give the same plan.
 
     Args:
-        overrule: what is settled; for that nothing is measured.
+        overrule: what is settled; for that nothing is measured, but which Gaussians are unseen.
         progress: called in the phases "bands", "start", "order" and "probe".
         resumed: of a training that goes on from a state, the attributes that it froze (``Plan.frozen``).
 
@@ -85,18 +85,18 @@ class _Planner:
         base, views = self.base, spread(self.views, VIEWS)
         degree = base.sh_degree
         if degree == 0 or "bands" in self.overrule.keep:
-            self._settled("SH bands", "bands", base.sh_degree > 0)
+            self._settled("SH bands", "bands" if degree else "", degree > 0)
             return degree
         if "bands" in self.overrule.leave_out:
             self._settled("SH bands", "bands", False)
             return 0
         for band, loss in band_losses(base, views, LIMIT):
-            gone = abs(loss) < LIMIT
+            gone = loss < LIMIT
             if gone and degree < base.sh_degree:
                 self.decisions.pop()  # of fewer of them
             degree = band - 1 if gone else degree
             above = f"{band}" if band == base.sh_degree else f"{band} to {base.sh_degree}"
-            why = f"lost without {'it' if band == base.sh_degree else 'them'}, {len(views)} training views"
+            why = f"change without {'it' if band == base.sh_degree else 'them'}, {_counted(len(views))}"
             self._decide(f"SH band {above}", "left out" if gone else "kept", loss, "dB", why, "bands")
             self._report("bands", base.sh_degree - band + 1, base.sh_degree)
         return degree
@@ -106,9 +106,8 @@ class _Planner:
         if "unseen" in self.overrule.keep:
             self._settled("unseen Gaussians", "unseen", True)
             return None, None
-        if has_dial(few):
-            why = "not looked for: with the dial that it has other ones show"
-            self._decide("unseen Gaussians", "kept", None, "", why)
+        if (why := self._others_show()) and "unseen" not in self.overrule.leave_out:
+            self._decide("unseen Gaussians", "kept", None, "", f"not looked for: {why}", "unseen")
             return None, None
         views, seed = spread(self.views, MOST_VIEWS), self.config.seed
         with self._time("start"):
@@ -116,11 +115,19 @@ class _Planner:
         with self._time("unseen"):
             kept = seen(few, self.views, error, seed, lambda done, _: self._look(len(views) + done))
         gone = len(few) - int(kept.sum())
-        of = f"of {len(few):,} move no pixel of {len(self.views)} training views"
+        of = f"of {len(few):,} move no pixel of {_counted(len(self.views))}"
         if gone == len(few):  # a checkpoint that shows nothing; nothing says which rows it needs
             gone = 0
         self._decide("unseen Gaussians", "left out" if gone else "kept", float(gone), "", of, "unseen" if gone else "")
         return kept if gone else None, error
+
+    def _others_show(self) -> str:
+        """Why Gaussians that no view sees at s = 1 may show at another dial value untrained; empty where none does."""
+        if has_dial(self.base):
+            return "with the dial that it has other ones show"
+        if self.config.start in ("constant", "identity"):
+            return f"from a start that is {self.config.start} they never leave"
+        return ""
 
     def _attributes(self, plan: Plan, resumed: Collection[str] | None) -> Plan:
         """Freezes what can do too little, and does the first steps of the training to find out."""
@@ -160,7 +167,7 @@ class _Planner:
         views, longer = spread(self.views, VIEWS // 2), math.sqrt(self.config.iters / PROBE)
         most, s = effect(FIELDS.get(name, name), before, after, views, dials, LIMIT / longer)
         gone = most < LIMIT / longer
-        why = f"is what {PROBE} steps of it do at s = {s:.3g}; it is worth tuning from {LIMIT / longer:.2g} on"
+        why = f"change by its first {PROBE} steps, at s = {s:.3g}; frozen below {LIMIT / longer:.2g}"
         self._decide(name, "frozen" if gone else "trained", most, "dB", why, name)
         return gone
 
@@ -184,9 +191,8 @@ class _Planner:
         self.decisions.append(Decision(*of))
 
     def _settled(self, what: str, name: str, kept: bool, words: tuple[str, str] = ("kept", "left out")) -> None:
-        overruled = name in self.overrule.keep | self.overrule.leave_out
-        why = "as asked, whatever it is worth" if overruled else "there are none"
-        self._decide(what, words[0] if kept else words[1], None, "", why, name if overruled else "")
+        why = "as asked, whatever it is worth" if name else "there are none"
+        self._decide(what, words[0] if kept else words[1], None, "", why, name)
 
     def _look(self, done: int) -> None:
         """At so many of the views, to find out what each Gaussian does in them."""
@@ -202,3 +208,7 @@ class _Planner:
         began = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+
+
+def _counted(views: int) -> str:
+    return f"{views:,} training view{'s' if views > 1 else ''}"

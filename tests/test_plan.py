@@ -134,6 +134,13 @@ def test_empty_bands_are_one_line(captured: tuple[Gaussians, Scene]) -> None:
     assert not any("SH" in decision.what for decision in plan.decisions[1:])
 
 
+@pytest.mark.parametrize("overrule", [Overrule(), Overrule(keep=ALL), Overrule(leave_out=frozenset({"bands"}))])
+def test_no_bands_are_neither_kept_nor_left_out_as_asked(captured: tuple[Gaussians, Scene], overrule: Overrule) -> None:
+    base, scene = captured
+    plan = make_plan(base.without_bands(0), scene, CONFIG, overrule)
+    assert plan.decisions[0] == Decision("SH bands", "left out", None, "", "there are none")
+
+
 def test_tuned_bands_come_back_in_their_place(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     base = base.replace(shN=torch.cat([base.shN, 1e-6 * torch.ones(len(base), 5, 3)], 1))
@@ -205,6 +212,18 @@ def test_a_base_with_a_dial_is_not_searched(captured: tuple[Gaussians, Scene]) -
     adapted = adapt(base, scene, replace(CONFIG, iters=5)).gaussians
     assert make_plan(adapted, scene, CONFIG, Overrule(keep=ALL - {"unseen"})).kept is None
     assert make_plan(attach(base), scene, CONFIG, Overrule(keep=ALL - {"unseen"})).kept is not None
+    assert make_plan(adapted, scene, CONFIG, Overrule(ALL - {"unseen"}, frozenset({"unseen"}))).kept is not None
+
+
+@pytest.mark.parametrize("begin", ["constant", "identity"])
+def test_a_start_with_which_none_leave_leaves_none_out(captured: tuple[Gaussians, Scene], begin: str) -> None:
+    """At s > 1 they would show as they were, what hid them having left."""
+    base, before = with_unseen(captured[0])
+    config = replace(CONFIG, start=begin)
+    plan = make_plan(base, captured[1], config, Overrule(keep=ALL - {"unseen"}))
+    assert plan.kept is None and plan.decisions[1].name == "unseen" and "not looked for" in plan.decisions[1].why
+    asked = make_plan(base, captured[1], config, Overrule(ALL - {"unseen"}, frozenset({"unseen"})))
+    assert asked.kept is not None and not asked.kept[~before].any()
 
 
 def test_a_checkpoint_that_shows_nothing(captured: tuple[Gaussians, Scene]) -> None:

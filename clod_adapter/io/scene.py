@@ -140,8 +140,8 @@ def _left_out(
     if not masked:
         found.append(("masks", "the scene has none"))
     if used < whole:
-        kept = f"{used / 1e6:,.3g} MB are kept of the {whole / 1e6:,.3g} MB in the files"
-        found.append(("pixels", f"{kept}: photographs are scaled to the size used as they are decoded"))
+        kept = f"{used / 1e6:,.3g} MB of the {whole / 1e6:,.3g} MB in the files"
+        found.append(("pixels", f"kept are {kept}: photographs are scaled as they are decoded"))
     else:
         found.append(("scaling", f"all {len(views)} photographs are used at the size they have"))
     return tuple(found)

@@ -18,7 +18,7 @@ from plyfile import PlyData
 import clod_adapter
 from clod_adapter.cli import adapt as adapt_command
 from clod_adapter.cli import evaluate as eval_command
-from clod_adapter.cli import results
+from clod_adapter.cli import outcome, results
 from clod_adapter.cli.report import machine_name, report_dials
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
@@ -252,7 +252,7 @@ def test_a_second_interrupt_aborts_the_writing(
 
 def press_during(monkeypatch: pytest.MonkeyPatch, step: str, presses: int) -> None:
     """Ctrl-C at the beginning of a step of the command."""
-    module = adapt_command if step == "extract" else results
+    module = outcome if step == "extract" else results
     real = getattr(module, step)
 
     def interrupted(*args: Any, **rest: Any) -> Any:
@@ -279,7 +279,7 @@ def test_a_report_is_of_the_files_beside_it(
         raise SystemExit(9)
 
     monkeypatch.setattr(results, "save", watched)
-    monkeypatch.setattr(adapt_command, "measure_result", killed)
+    monkeypatch.setattr(outcome, "measure_result", killed)
     assert clod(capture.ply, "--images", capture.scene, *TINY).code == 9
     report = json.loads((tmp_path / "dial.json").read_text())
     assert seen == [{EARLIER}] and names(tmp_path) == sorted([*THREE, STATE])
@@ -394,7 +394,7 @@ def test_the_calibration_is_in_all_three_files(clod: Any, capture: Any, tmp_path
 def test_without_measurements_there_is_no_calibration(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(adapt_command, "measure_result", lambda *_: ([], [], True))
+    monkeypatch.setattr(outcome, "measure_result", lambda *_: ([], [], True))
     report = json.loads(clod(capture.ply, "--images", capture.scene, *TINY, "--json").out)
     assert report["calibration"] is None and clod_adapter.load(tmp_path / "dial.ply").calibration is None
     done = clod("eval", "dial.ply", "--images", capture.scene, "--psnr-drop", 1)

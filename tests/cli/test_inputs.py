@@ -72,7 +72,7 @@ def test_values_that_look_activated_are_asked_about(clod: Any, capture: Any, tmp
 def test_every_command_that_reads_a_checkpoint_takes_the_answer() -> None:
     for name in ("", *COMMANDS):
         options = {option for action in build_parser(name)._actions for option in action.option_strings}
-        assert ("--activated" in options) == (name not in ("demo", "inspect")), name
+        assert ("--activated" in options) == (name not in ("demo", "inspect", "doctor")), name
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from PIL import Image
 import clod_adapter
 from clod_adapter.cli import adapt as adapt_command
 from clod_adapter.cli import evaluate as evaluate_command
-from clod_adapter.cli import inputs, results, resume
+from clod_adapter.cli import inputs, outcome, results, resume
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.config import AdaptConfig
@@ -279,7 +279,7 @@ def broken_off(clod: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr(adapt_command, "write", stop)
+            patch.setattr(outcome, "write", stop)
             assert clod(*words).code == 130
 
     return run

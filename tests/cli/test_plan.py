@@ -53,11 +53,12 @@ def test_the_plan_is_printed_before_training_and_stored(
     done = clod(wasteful, "--images", capture.scene, *TINY)
     assert done.code == 0, done
     lines = done.err.splitlines()
-    first = lines.index("plan:")
+    (first,) = (k for k, line in enumerate(lines) if line.startswith("plan: "))
+    assert max(map(len, lines[first:])) <= 120
     assert re.search(r"^trained 24 steps", "\n".join(lines[first:]), re.M)
     table = {line[2:].split("  ")[0]: line for line in lines[first + 1 :] if line.startswith("  ")}
-    assert re.search(r"left out +-?0\.0\d\d dB +lost without it, 8 training views +--with bands$", table["SH band 2"])
-    assert re.search(r"kept +\d+\.\d+ dB +lost without them, .* --without bands$", table["SH band 1 to 2"])
+    assert re.search(r"left out +0\.0\d\d dB +change without it, 8 training views +--with bands$", table["SH band 2"])
+    assert re.search(r"kept +\d+\.\d+ dB +change without them, .* --without bands$", table["SH band 1 to 2"])
     assert re.search(r"left out +\d+ +of 350 move no pixel of 8 .* --with unseen$", table["unseen Gaussians"])
     assert re.search(r"left out +- +all 10 cameras are pinholes$", table["undistortion"])  # what reading them spared
     for name in ("means", "quats", "scales", "opacities", "sh0"):
@@ -84,7 +85,7 @@ def test_trimmed_files_are_made_again_bit_for_bit(clod: Any, capture: Any, waste
     gone = int(stored["unseen Gaussians"]["number"])
     assert (len(trimmed), trimmed.sh_degree, report["base_count"]) == (350 - gone, 1, 350)
     assert report["rows"][0]["kept"] <= len(trimmed) and (tmp_path / "dial.ply").stat().st_size < 0.7 * large
-    assert "on those held out" in stored["what is left out"]["why"] and stored["what is left out"]["number"] < 0.02
+    assert "held out" in stored["what is left out"]["why"] and stored["what is left out"]["number"] < 0.02
     adapter = clod_adapter.load_adapter(tmp_path / "dial.safetensors")
     assert adapter.kept is not None and int((~adapter.kept).sum()) == gone and not adapter.kept[:50].any()
     # The same training: only what was left out is missing, but for the rounding of differences to what stays.
@@ -96,6 +97,17 @@ def test_trimmed_files_are_made_again_bit_for_bit(clod: Any, capture: Any, waste
     assert json.loads(done.out)["base_count"] == 350
     refused = clod("apply", capture.ply, "dial.safetensors", "-o", "again.ply")
     assert refused.code == 2 and "a different base was given" in refused.err
+
+
+def test_trimming_by_placed_cameras_warns(
+    clod: Any, capture: Any, wasteful: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What they do not see others may."""
+    scene = clod_adapter.load_scene(capture.scene)
+    monkeypatch.setattr("clod_adapter.cli.adapt.place_scene", lambda *_: scene)
+    settled = ("--iters", 2, "--with", "bands", "--trim")
+    assert "no placed camera sees; others may" in clod(wasteful, *settled, "--out", "dial.ply").err
+    assert "no placed camera" not in clod(wasteful, *settled, "--images", capture.scene, "--out", "dial.ply").err
 
 
 def test_nothing_to_trim(clod: Any, capture: Any, tmp_path: Path) -> None:
@@ -110,7 +122,7 @@ def test_nothing_to_trim(clod: Any, capture: Any, tmp_path: Path) -> None:
 
 
 def test_overruled(clod: Any, capture: Any, wasteful: Path, tmp_path: Path) -> None:
-    options = ("--with", "bands", "unseen", "sh0", "--without", "quats", "means")
+    options = ("--with", "bands", "unseen", "--without", "quats", "--with", "sh0", "--without", "means")
     done = clod(wasteful, "--images", capture.scene, *TINY, *options)
     assert done.code == 0, done
     stored = decisions(tmp_path)
@@ -180,6 +192,10 @@ def test_resuming_what_the_plan_froze(clod: Any, capture: Any, tmp_path: Path, m
         patch.setattr(Follower, "__call__", interrupted)
         assert "--resume goes on from step 12" in clod(*words).err
     monkeypatch.setattr(planning, "effect", lambda *_: pytest.fail("judged again"))
+    with monkeypatch.context() as patch:
+        patch.setattr(planning, "band_losses", lambda *_: pytest.fail("looked at before it was refused"))
+        refused = clod(*words, "--with", "sh0", "bands", "--resume")
+    assert refused.code == 2 and "is of a run with no --with or --without; give what it was" in refused.err, refused
     done = clod(*words, "--resume")
     assert done.code == 0 and "as before the interruption" in done.err, done
     found = clod_adapter.load(tmp_path / "dial.ply").gaussians

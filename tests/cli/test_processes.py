@@ -203,6 +203,34 @@ def test_the_second_is_killed(server: Server, words: list[Any], tmp_path: Path) 
     assert load_state(run.folder / STATE)[0].steps == steps
 
 
+def test_the_launcher_s_signals_end_no_writing(server: Server, words: list[Any], tmp_path: Path) -> None:
+    """It sends one for the loss, and others pass theirs on: while the files are written, and right to the end."""
+    pressed = (
+        "import argparse; from clod_adapter.cli import outcome\n"
+        "def pressing(real):\n"
+        "    def call(*arguments, **more):\n"
+        "        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGTERM): signal.raise_signal(number)\n"
+        "        return real(*arguments, **more)\n"
+        "    return call\n"
+        "for name in ('explain', 'write', 'print_summary'): setattr(outcome, name, pressing(getattr(outcome, name)))\n"
+        "main.json = argparse.Namespace(dumps=pressing(json.dumps))"
+    )
+    run = server.start(tmp_path / "run", *words, *LONG, "--quiet", "--json", before={0: pressed})
+    run.wait_for_state()
+    os.kill(run.pids[1], signal.SIGKILL)
+    assert run.wait() == [0, -signal.SIGKILL], run.log(0)
+    assert json.loads(run.log(0))["steps"] == run.report()["steps"]
+
+
+def test_the_launcher_is_gone_too(server: Server, words: list[Any], tmp_path: Path) -> None:
+    """Its store cannot be asked for the reason, nor be told that all is over."""
+    run = server.start(tmp_path / "run", *words, *LONG)
+    run.wait_for_state()
+    run.store = None
+    os.kill(run.pids[1], signal.SIGKILL)
+    assert run.wait() == [0, -signal.SIGKILL] and run.report()["interrupted"], run.log(0)
+
+
 def test_a_loss_within_a_step_loses_none(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
     """The second fails in its fifth step, and says why by way of the first; going on ends as if it had not."""
     fail = (

@@ -179,7 +179,7 @@ def test_what_the_scene_does_not_need(tmp_path: Path) -> None:
     assert spared["scaling"] == "all 3 photographs are used at the size they have"
     scaled = dict(load_scene(tmp_path / "plain", max_width=20).left_out)
     assert "scaling" not in scaled
-    assert scaled["pixels"].startswith("0.0027 MB are kept of the 0.0108 MB in the files")  # 3 x 20x15 and 40x30, RGB
+    assert scaled["pixels"].startswith("kept are 0.0027 MB of the 0.0108 MB in the files")  # 3 x 20x15 and 40x30, RGB
     (see_through := Image.fromarray(pixels(0))).putalpha(99)
     see_through.save(tmp_path / "plain" / "images" / "sub" / "002.png")
     assert "alpha" not in dict(load_scene(tmp_path / "plain").left_out)
