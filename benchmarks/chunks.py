@@ -28,7 +28,9 @@ from city import write_city
 from common import append, capture
 
 from clod_adapter.cameras import View
-from clod_adapter.chunks import Division, adapt_chunk, divide, merge, target
+from clod_adapter.chunks import adapt_chunk, merge
+from clod_adapter.chunks_aims import target
+from clod_adapter.chunks_division import Division, divide
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import seeing

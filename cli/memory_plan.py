@@ -6,12 +6,12 @@ import argparse
 import math
 from dataclasses import replace
 
-from clod_adapter.cameras import Scene
+from clod_adapter.cameras import Scene, StoredView
 from clod_adapter.cli.console import Console
 from clod_adapter.errors import ClodError
 from clod_adapter.io.image_cache import ImageCache
 from clod_adapter.io.ply import Checkpoint, load
-from clod_adapter.memory import IMAGES, Needs, Plan, in_words, make_plan, parse_size
+from clod_adapter.memory import IMAGES, MemoryPlan, Needs, in_words, make_plan, parse_size
 
 
 def image_cache(args: argparse.Namespace) -> ImageCache | None:
@@ -19,7 +19,7 @@ def image_cache(args: argparse.Namespace) -> ImageCache | None:
     return ImageCache(int(IMAGES * parse_size(args.memory))) if args.memory else None
 
 
-def plan_memory(args: argparse.Namespace, base: Checkpoint, scene: Scene, console: Console) -> Plan | None:
+def plan_memory(args: argparse.Namespace, base: Checkpoint, scene: Scene, console: Console) -> MemoryPlan | None:
     """The plan for ``--memory``, which is printed; None without it.
 
     Raises:
@@ -30,9 +30,11 @@ def plan_memory(args: argparse.Namespace, base: Checkpoint, scene: Scene, consol
     views, gaussians = (*scene.train, *scene.test), base.gaussians
     pixels = [view.camera.width * view.camera.height for view in views]
     attributes = sum(tensor.element_size() * tensor.numel() for tensor in gaussians.tensors().values())
+    made = sum(3 * size for view, size in zip(views, pixels, strict=True) if not isinstance(view, StoredView))
     needs = Needs(
-        len(gaussians), math.ceil(attributes / len(gaussians)), base.vertex.dtype.itemsize, 3 * sum(pixels), max(pixels)
-    )
+        len(gaussians), math.ceil(attributes / len(gaussians)), base.vertex.dtype.itemsize,
+        images=3 * sum(pixels) - made, pixels=max(pixels), pictures=made,
+    )  # fmt: skip
     plan = make_plan(needs, parse_size(args.memory))
     how = "the whole at once" if plan.chunks == 1 else f"in {plan.chunks} chunks"
     console.say(f"memory: {in_words(plan.peak)} of {in_words(plan.limit)}, {how}; at most, with the program's own:")

@@ -26,7 +26,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.trimming import trimmed
 from clod_adapter.io.version import package_version
-from clod_adapter.memory import Plan as MemoryPlan
+from clod_adapter.memory import MemoryPlan
 from clod_adapter.plan import Plan
 from clod_adapter.train import Adapted
 

@@ -21,7 +21,8 @@ CHECK_COST = 0.03  # share of the time that they may take, at most
 CHECK_VIEWS = 4
 LABELS = {
     "bands": "SH bands", "start": "importance", "order": "order of leaving", "probe": "first steps",
-    "blocks": "what views see", "beside": "what is beside", "train": "training",
+    "blocks": "what views see", "beside": "what is beside", "targets": "pictures to be",
+    "quotas": "how many to keep", "train": "training",
 }  # fmt: skip
 
 

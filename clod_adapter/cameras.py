@@ -73,13 +73,21 @@ class View:
 class StoredView(View):
     """A view that does not hold its photograph: it is read whenever it is looked at.
 
+    Equal only to itself, as comparing would read it; a pickle or a deep copy is a plain View, with the photograph.
+
     Args:
-        read: gives the pixels, as ``View.image`` has them.
+        image: gives the pixels, as ``View.image`` has them; or the pixels, with which ``dataclasses.replace`` comes.
     """
 
-    def __init__(self, camera: Camera, read: Callable[[], Tensor]) -> None:
+    def __init__(self, camera: Camera, image: Callable[[], Tensor] | Tensor) -> None:
         object.__setattr__(self, "camera", camera)
-        object.__setattr__(self, "_read", read)
+        object.__setattr__(self, "_read", (lambda: image) if isinstance(image, Tensor) else image)
+
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
+
+    def __reduce__(self) -> tuple[type[View], tuple[Camera, Tensor]]:
+        return View, (self.camera, self.image)
 
     @property
     def image(self) -> Tensor:  # type: ignore[override]

@@ -31,6 +31,7 @@ class Needs:
     Attributes:
         count: Gaussians; attributes: bytes of one in memory; row: its bytes in the file.
         images: bytes of all photographs; pixels: of the largest.
+        pictures: bytes of those that were made, and so cannot be read again: they stay.
     """
 
     count: int
@@ -38,15 +39,16 @@ class Needs:
     row: int
     images: int
     pixels: int
+    pictures: int = 0
 
 
 @dataclass(frozen=True)
-class Plan:
+class MemoryPlan:
     """How a scene is adapted below a limit; all in bytes.
 
     Attributes:
         chunks: 1 where the whole fits.
-        cache: what photographs may take.
+        cache: what photographs may take, and of a chunk its own pictures once more.
         base, start, train, write: the most that is in memory at a time, in all: when the checkpoint is read, while it
             is ranked, in training, and when it is written.
     """
@@ -64,7 +66,7 @@ class Plan:
         return max(self.base, self.start, self.train, self.write)
 
 
-def make_plan(needs: Needs, limit: int) -> Plan:
+def make_plan(needs: Needs, limit: int) -> MemoryPlan:
     """The fewest chunks with which nothing takes more than ``limit`` bytes.
 
     Raises:
@@ -89,9 +91,12 @@ def least(needs: Needs) -> int:
     return limit
 
 
-def _plan(needs: Needs, limit: int, chunks: int) -> Plan:
+def _plan(needs: Needs, limit: int, chunks: int) -> MemoryPlan:
     count, cache = needs.count, min(needs.images, int(IMAGES * limit))
-    always = PROCESS + (cache if chunks == 1 else 2 * cache) + PIXEL * needs.pixels  # a chunk's pictures are its own
+    always = PROCESS + cache + needs.pictures + PIXEL * needs.pixels
+    if chunks > 1:  # a chunk's pictures are its own
+        cache = min(needs.images + needs.pictures, int(IMAGES * limit))
+        always += cache
     if chunks == 1:  # the file's rows stay in memory
         held = needs.row + needs.attributes
         train = always + count * (held + DRAWN + TRAINED)
@@ -101,12 +106,12 @@ def _plan(needs: Needs, limit: int, chunks: int) -> Plan:
     base = PROCESS + count * (needs.row + 2 * needs.attributes)
     start = always + count * (held + max(DRAWN, ORDERED))
     write = always + count * (needs.attributes + needs.row + WRITTEN)
-    return Plan(limit, chunks, cache, *(math.ceil(bytes) for bytes in (base, start, train, write)))
+    return MemoryPlan(limit, chunks, cache, *(math.ceil(bytes) for bytes in (base, start, train, write)))
 
 
 def in_words(count: float) -> str:
-    """``3.1 GB``, ``500 MB``."""
-    return f"{count / 1e9:.3g} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
+    """``3.14 GB``, ``500 MB``, ``1234.5 GB``."""
+    return f"{round(count / 1e9, 2):g} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
 UNITS = {"K": 1, "M": 2, "G": 3, "T": 4}

@@ -121,12 +121,19 @@ def _histogram(values: Tensor, edges: Sequence[float]) -> dict[str, list[float]]
     return {"edges": list(edges), "shares": (counts / max(len(values), 1)).tolist()}
 
 
-def scene_fingerprint(scene: Scene) -> str:
-    """SHA-256, hex, of the photographs' pixels, their cameras and the split: the same capture wherever it lies."""
-    digest = hashlib.sha256()
+def scene_fingerprint(scene: Scene, progress: Callable[[int, int], None] | None = None) -> str:
+    """SHA-256, hex, of the photographs' pixels, their cameras and the split: the same capture wherever it lies.
+
+    Args:
+        progress: called with the number of photographs done after each, and of all of them.
+    """
+    digest, done = hashlib.sha256(), 0
     for views in (scene.train, scene.test):
         digest.update(f"{len(views)};".encode())
         for view in views:
             for tensor in (view.camera.viewmat, view.camera.K, view.image):
                 digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+            done += 1
+            if progress:
+                progress(done, len(scene.train) + len(scene.test))
     return digest.hexdigest()

@@ -64,7 +64,8 @@ class Progress:
     """Where an adaptation stands; handed to the progress callback.
 
     Attributes:
-        phase: "start" (a view a step), "order" (a Gaussian a step: who leaves before whom) or "train".
+        phase: "start" (a view a step), "order" (a Gaussian a step: who leaves before whom) or "train"; of a chunk
+            also "beside", "targets" and "quotas" (a view a step).
         done, total: steps of the phase.
         seconds: since training began; before it, since the adaptation did.
         share: of the phase that is done, by steps or by time budget, whichever is further.

@@ -10,9 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clod_adapter import chunks
 from clod_adapter.cameras import Scene, camera_extent
-from clod_adapter.chunks import Division, Learned, adapt_chunk, beside, config_of, coverage, divide, merge, split
+from clod_adapter.chunks import Learned, adapt_chunk, merge
+from clod_adapter.chunks_aims import LEFT_OUT, Quotas, beside, config_of, target
+from clod_adapter.chunks_division import Division, coverage, divide, split
 from clod_adapter.config import AdaptConfig
 from clod_adapter.counting import count_law
 from clod_adapter.errors import ClodError
@@ -128,7 +129,7 @@ def test_what_is_left_out_is_not_missed(captured: tuple[Gaussians, Scene]) -> No
         assert len(rows) < len(both)
         for view in scene.train[:3]:
             whole, part = (render(g, view.camera).image for g in (both, both.select(rows)))
-            assert float((whole - part).abs().mean()) <= 2 * chunks.LEFT_OUT
+            assert float((whole - part).abs().mean()) <= 2 * LEFT_OUT
 
 
 def test_the_start_is_that_of_the_whole(divided: Division, captured: tuple[Gaussians, Scene]) -> None:
@@ -142,7 +143,7 @@ def test_quotas_add_up_to_the_law(divided: Division, captured: tuple[Gaussians, 
     """And where each block answers for its part of the loss, they press on each Gaussian as the whole's law does."""
     views, count = captured[1].train, len(captured[0])
     for first in (True, False):
-        quotas = [chunks.Quotas(divided, block, views, CONFIG, first=first) for block in range(BLOCKS)]
+        quotas = [Quotas(divided, block, views, CONFIG, first=first) for block in range(BLOCKS)]
         for k, view in enumerate(views[:2]):
             for s in (1.0, 1.7, 3.0, CONFIG.max_sv):
                 asked = [quota(view, s, 0.1) for quota in quotas]
@@ -162,7 +163,7 @@ def test_targets_ask_for_the_whole_error_once(captured: tuple[Gaussians, Scene],
     for block in range(BLOCKS):
         rows = divided.rows(block)
         ordered = base.select(torch.cat([rows, (divided.block != block).nonzero()[:, 0]]))
-        asked = asked + chunks.target(ordered, len(rows), view) / 255 - picture.clamp(0, 1)
+        asked = asked + target(ordered, len(rows), view) / 255 - picture.clamp(0, 1)
     torch.testing.assert_close(asked, view.image / 255 - picture.clamp(0, 1), rtol=0, atol=BLOCKS / 255)
 
 
@@ -224,6 +225,30 @@ def test_chunks_have_seeds_of_their_own(divided: Division) -> None:
     whole = replace(CONFIG, seed=2**63 - 1)
     seeds = {config_of(divided, k, whole, first=first).seed for k in range(BLOCKS) for first in (True, False)}
     assert len(seeds) == 2 * BLOCKS and whole.seed not in seeds
+
+
+@pytest.mark.parametrize("drawn", [True, False])
+def test_a_block_that_no_view_sees_stays(captured: tuple[Gaussians, Scene], drawn: bool) -> None:
+    """Also where nothing at all is drawn, and the block is behind the only camera."""
+    base, scene = captured
+    view = scene.train[0]
+    ahead, right = view.camera.viewmat[2, :3], view.camera.viewmat[0, :3]
+    means = base.means * 0.001 + view.camera.position + 3 * ahead + (0 if drawn else 30) * right
+    means[:100] -= 50 * ahead
+    division = divide(base.replace(means=means), [view], CONFIG, 3)
+    behind = int(division.block[0])
+    assert division.views(behind) == [] and division.steps(behind, CONFIG) == 0
+    part, outcome = adapt_chunk(division, [view], CONFIG, behind)
+    assert (part.steps, outcome.steps, list(part.values)) == (0, 0, ["sigma_d"])
+    assert torch.equal(part.values["sigma_d"], division.begun.sigma_d[division.rows(behind)])
+
+
+def test_every_wait_is_told(captured: tuple[Gaussians, Scene], divided: Division) -> None:
+    told: list[tuple[str, int, int]] = []
+    views = captured[1].train
+    adapt_chunk(divided, views, replace(CONFIG, iters=1), 0, progress=lambda p: told.append((p.phase, p.done, p.total)))
+    for phase in ("beside", "targets", "quotas"):
+        assert [one[1:] for one in told if one[0] == phase] == [(k + 1, len(views)) for k in range(len(views))]
 
 
 def test_what_needs_all_gaussians_at_once_is_refused(captured: tuple[Gaussians, Scene]) -> None:

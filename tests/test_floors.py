@@ -40,7 +40,7 @@ FLOORS = [
     {"importance", "popping", "budget", "placement", "alignment", "alignment_frames", "alignment_guess"},
     {"inspection", "inspection_tensors", "inspection_values", "objective", "distributed", "drawing", "needs"},
     {"train", "evaluate", "export", "viewer", "compare"},
-    {"report", "robustness", "integrations", "plan", "planning", "chunks", "memory"},
+    {"report", "robustness", "integrations", "plan", "planning", "chunks", "chunks_aims", "chunks_division", "memory"},
     {"demo"},
     {""},  # the package itself, whose __init__ re-exports from all of the above
     {"cli", "__main__"},

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -56,3 +58,19 @@ def test_too_little_says_the_least() -> None:
         make_plan(CITY, 10**9)
     assert f"--memory is 1 GB, and 2,000,000 Gaussians take at least {in_words(least(CITY))}" in str(error.value)
     assert make_plan(CITY, parse_size(in_words(least(CITY)).replace(" ", ""))).chunks > 1
+
+
+def test_the_least_in_words_is_enough() -> None:
+    """Also where three digits would say too little: 123.4 GB."""
+    for count in (90_000_000, 91_234_567, 1_000_000_000):
+        needs = replace(CITY, count=count)
+        assert make_plan(needs, parse_size(in_words(least(needs)).replace(" ", ""))).chunks > 1
+
+
+def test_pictures_that_cannot_be_read_again_stay() -> None:
+    """They are in every phase but the first, beside a chunk's own of them."""
+    plan = make_plan(CITY, 8 * 10**9)
+    made = make_plan(replace(CITY, images=0, pictures=CITY.images), 8 * 10**9)
+    assert (made.cache, made.start, made.train) == (0, plan.start, plan.train)
+    tight = least(CITY)
+    assert make_plan(replace(CITY, images=0, pictures=CITY.images), tight + 10**8).cache > 0

@@ -6,6 +6,9 @@ One JSON document under the metadata key ``clod_adapter_chunk`` says which run a
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -46,20 +49,32 @@ def load_chunk(path: Path, belongs: dict[str, Any]) -> tuple[dict[str, Tensor], 
         ClodError: the file cannot be read, is damaged, or of another run than ``belongs`` says.
     """
     refuse_irregular(path, "remove it")
-    try:
+    with damaged(path):
         tensors, metadata = read_tensors(path)
         found = json.loads(metadata[KEY])
         about, theirs = dict(found["about"]), dict(found["belongs"])
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    except Exception as error:  # SafetensorError, and whatever a crafted file provokes
-        raise ClodError(f"{path}: is no chunk or damaged ({error}); remove it to have it made anew") from error
     different = [name for name in belongs if theirs.get(name) != belongs[name]]
     if different:
         raise ClodError(f"{path}: is of a run with another {different[0]}; remove it, or give --out another name")
-    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
+    possible = {name: tensor.isfinite() for name, tensor in tensors.items()}
+    if (logits := tensors.get("opacity_logits")) is not None:  # files in the wild have +inf: fully opaque
+        possible["opacity_logits"] |= logits == math.inf
+    if not all(bool(each.all()) for each in possible.values()):
         raise ClodError(f"{path}: holds a value that is not finite; remove it to have it made anew")
     return tensors, about
+
+
+@contextmanager
+def damaged(path: Path) -> Iterator[None]:
+    """Says of what goes wrong within, in reading a file, that it does: as a ClodError."""
+    try:
+        yield
+    except OSError as error:
+        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    except MemoryError:  # of a file that is whole
+        raise
+    except Exception as error:  # SafetensorError, and whatever a crafted file provokes
+        raise ClodError(f"{path}: is no chunk or damaged ({error!r}); remove it to have it made anew") from error
 
 
 def checked(path: Path, tensors: dict[str, Tensor], shapes: dict[str, tuple[torch.dtype, tuple[int, ...]]]) -> None:

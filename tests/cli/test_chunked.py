@@ -13,7 +13,7 @@ import pytest
 from clod_adapter import memory
 from clod_adapter.cli import memory_plan, resume, training
 from clod_adapter.io.chunk_file import load_chunk
-from clod_adapter.memory import Plan, make_plan
+from clod_adapter.memory import MemoryPlan, make_plan
 from clod_adapter.training_state import Progress
 from scenes import stripped
 
@@ -24,7 +24,7 @@ CHUNKS = 3
 def forced(monkeypatch: pytest.MonkeyPatch) -> None:
     """What fits is adapted in chunks all the same."""
 
-    def plan(*args: Any) -> Plan:
+    def plan(*args: Any) -> MemoryPlan:
         return replace(make_plan(*args), chunks=CHUNKS)
 
     monkeypatch.setattr(memory_plan, "make_plan", plan)
@@ -41,16 +41,26 @@ def adapt(clod: Callable[..., Any], capture: Any, forced: None) -> Callable[...,
     return run
 
 
+WHOLE: dict[str, bytes] = {}
+
+
 @pytest.fixture
 def whole(adapt: Callable[..., Any], tmp_path: Path) -> dict[str, bytes]:
-    """What one process leaves."""
+    """What one process leaves; run once."""
+    if WHOLE:
+        return WHOLE
+    (tmp_path / "one.chunks.safetensors").write_bytes(b"the user's")
     done = adapt("one.ply", "--json")
     assert done.code == 0, done
     report = json.loads(done.out)
     assert report["memory"]["chunks"] == CHUNKS and report["steps"] == 27 and len(report["rows"]) > 2
     assert "in 3 chunks" in done.err and "chunk 3 of 3, pass 1 of 2: 100 Gaussians, 7 steps" in done.err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["one.json", "one.ply", "one.safetensors"]
-    return outputs(tmp_path, "one")
+    assert report["seconds"]["start"] > 0
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert left == ["one.chunks.safetensors", "one.json", "one.ply", "one.safetensors"]
+    (tmp_path / "one.chunks.safetensors").unlink()
+    WHOLE.update(outputs(tmp_path, "one"))
+    return WHOLE
 
 
 def outputs(folder: Path, name: str) -> dict[str, bytes]:
@@ -117,9 +127,9 @@ def test_files_of_another_run_are_refused(adapt: Callable[..., Any], tmp_path: P
     assert adapt("a.ply", "--chunk", 1).code == 0
     done = adapt("a.ply", "--seed", 1)
     assert done.code == 2 and "a.start.safetensors: is of a run with another settings; remove it" in done.err
-    (tmp_path / "a.chunk1.pass1.safetensors").write_bytes((tmp_path / "a.start.safetensors").read_bytes())
+    (tmp_path / "a.chunk2.pass1.safetensors").write_bytes((tmp_path / "a.chunk1.pass1.safetensors").read_bytes())
     done = adapt("a.ply")
-    assert done.code == 2 and "a.chunk1.pass1.safetensors: is of a run with another chunk" in done.err
+    assert done.code == 2 and "a.chunk2.pass1.safetensors: is of a run with another chunk" in done.err
     (tmp_path / "a.chunk1.pass1.safetensors").write_bytes(b"no chunk")
     done = adapt("a.ply")
     assert done.code == 2 and "a.chunk1.pass1.safetensors: is no chunk or damaged" in done.err
@@ -155,6 +165,43 @@ def test_what_fits_is_as_without(clod: Callable[..., Any], capture: Any, tmp_pat
     assert outputs(tmp_path, "a") == outputs(tmp_path, "b")
 
 
+def test_another_limit_goes_on_with_no_other_chunks(
+    adapt: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not with fewer, which would take more than the limit, and not without the work that is there."""
+    assert adapt("a.ply", "--chunk", "start").code == 0
+    for chunks in (1, CHUNKS + 1):
+        monkeypatch.setattr(memory_plan, "make_plan", lambda *args, n=chunks: replace(make_plan(*args), chunks=n))
+        done = adapt("a.ply")
+        assert done.code == 2 and f"is of a run in 3 chunks, and --memory 8GB makes {chunks}; give" in done.err
+    assert not (tmp_path / "a.ply").exists()
+
+
+def test_what_fits_as_one_job(clod: Callable[..., Any], capture: Any, tmp_path: Path) -> None:
+    """The work of the job is in the outputs, and its files are removed, whatever their name's letters mean."""
+    given = [capture.ply, "--images", capture.scene, "--iters", 3, "--max-sv", 3, "--memory", "8GB", "--out", "[a].ply"]
+    assert clod(*given, "--chunk", 1).code == 0
+    done = clod(*given)
+    assert done.code == 0 and "chunk 1 of 1, pass" not in done.err and "start of 1 chunks is there" in done.err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["[a].json", "[a].ply", "[a].safetensors"]
+
+
+def test_jobs_that_began_unlike(adapt: Callable[..., Any], tmp_path: Path) -> None:
+    """Of machines that round unlike: what was learned of one division is put into no other."""
+    assert adapt("a.ply", "--chunk", 1).code == 0
+    path = tmp_path / "a.start.safetensors"
+    from safetensors import safe_open
+
+    from clod_adapter.io.chunk_file import KEY, save_chunk
+
+    with safe_open(path, "pt") as file:
+        belongs = json.loads(file.metadata()[KEY])["belongs"]
+    tensors, about = load_chunk(path, belongs)
+    save_chunk(path, tensors | {"block": tensors["block"].flip(0)}, about, belongs)
+    done = adapt("a.ply")
+    assert done.code == 2 and "a.chunk1.pass1.safetensors: is of a run with another start; remove it" in done.err
+
+
 def test_a_start_that_was_tampered_with(adapt: Callable[..., Any], tmp_path: Path) -> None:
     assert adapt("a.ply", "--chunk", "start").code == 0
     path = tmp_path / "a.start.safetensors"
@@ -165,6 +212,8 @@ def test_a_start_that_was_tampered_with(adapt: Callable[..., Any], tmp_path: Pat
     with safe_open(path, "pt") as file:
         found = json.loads(file.metadata()[KEY])
     tensors, about = load_chunk(path, found["belongs"])
+    save_chunk(path, tensors, {"attenuation": about["attenuation"]}, found["belongs"])
+    assert "damaged (KeyError('extent'))" in adapt("a.ply", "--chunk", 1).err
     for name, worse, message in (
         ("block", tensors["block"].clamp(max=1), "a chunk has no Gaussians"),
         ("sigma_d", tensors["sigma_d"][:-1], "its sigma_d is not that of this scene"),
@@ -174,6 +223,17 @@ def test_a_start_that_was_tampered_with(adapt: Callable[..., Any], tmp_path: Pat
         done = adapt("a.ply", "--chunk", 1)
         assert done.code == 2 and message in done.err, done
     assert memory.MOST_CHUNKS > CHUNKS
+
+
+def test_opaque_gaussians_are_handed_on(clod: Callable[..., Any], capture: Any, forced: None, tmp_path: Path) -> None:
+    """Opacity +inf, as files in the wild have it, is a value that a job's file may hold."""
+    logits = capture.gaussians.opacity_logits.clone()
+    logits[::7] = float("inf")
+    ply = capture.write(tmp_path / "opaque.ply", capture.gaussians.replace(opacity_logits=logits))
+    given = [ply, "--images", capture.scene, "--iters", 4, "--max-sv", 3, "--memory", "8GB", "--out", "a.ply"]
+    assert clod(*given, "--chunk", 1).code == 0
+    done = clod(*given)
+    assert done.code == 0, done
 
 
 def test_ctrl_c_leaves_what_is_finished(

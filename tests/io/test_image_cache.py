@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -74,3 +76,22 @@ def test_a_photograph_that_changes_while_in_use(capture: Any, tmp_path: Path) ->
         Image.new("RGB", (32, 24)).save(path)
     with pytest.raises(ClodError, match=r"view '001.png': image must be uint8 of shape \(48, 64, 3\)"):
         _ = stored.train[0].image
+
+
+def test_a_stored_view_is_a_view_to_python() -> None:
+    """Replaced, compared, hashed and pickled."""
+    cache = ImageCache(0)
+    (view, other), reads = numbered(2, cache)
+    assert view == view and view != other and len({view, other, view}) == 2 and reads == [0, 0]
+    moved = replace(view, camera=replace(view.camera, near=0.5))
+    assert moved.camera.near == 0.5 and torch.equal(moved.image, view.image)
+    again = pickle.loads(pickle.dumps(other))
+    assert type(again) is View and again.camera.name == "1" and torch.equal(again.image, other.image)
+
+
+def test_many_threads_look_at_once() -> None:
+    cache = ImageCache(2 * ONE)
+    views, _ = numbered(5, cache)
+    with ThreadPoolExecutor(8) as pool:
+        looked = list(pool.map(lambda k: int(views[k % 5].image.unique()), range(400)))
+    assert looked == [k % 5 for k in range(400)] and cache.held == 2 * ONE
