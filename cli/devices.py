@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 
 from clod_adapter.cli.console import Console
+from clod_adapter.cli.findings import first_line
 from clod_adapter.errors import ClodError
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.rasterizers.cuda import unusable
@@ -34,10 +35,19 @@ def pick_device(name: str, console: Console) -> torch.device:
 def no_gpu() -> str | None:
     """Why nothing can be drawn on a GPU here, None where it can. The first time gsplat may compile for minutes."""
     if torch.cuda.is_available():
-        return unusable()
+        return _fails() or unusable()
     if torch.version.cuda is None:
         return f"torch {torch.__version__} is built without CUDA: install torch from https://pytorch.org for your CUDA"
     return "torch sees no NVIDIA GPU: nvidia-smi says whether there is one, and whether its driver is as new as CUDA's"
+
+
+def _fails() -> str | None:
+    """Why torch cannot compute on the GPU that it sees: one too old or too new for this torch, or taken."""
+    try:
+        torch.ones(1, device="cuda").add_(1).item()
+    except (RuntimeError, AssertionError) as error:
+        return f"torch cannot compute on it ({first_line(error)}); clod-adapt doctor says what mends that"
+    return None
 
 
 def on_device(checkpoint: Checkpoint, device: torch.device) -> Checkpoint:

@@ -17,6 +17,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.counting import Quota, count_law
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.importance import spread
+from clod_adapter.losses import unit
 from clod_adapter.render import splat
 
 LEFT_OUT = 1e-3  # of a picture, the share that those Gaussians may show that are left out of it
@@ -119,7 +120,8 @@ def target(gaussians: Gaussians, own: int, view: View) -> Tensor:
     marked[:own] = 0.5 / SH_C0
     mine, _ = splat(plain.replace(sh0=marked, shN=gaussians.shN[:, :0]), gaussians.opacities, view.camera)
     part = ((mine[..., :1] + BARE * own / len(gaussians)) / (alpha[..., None] + BARE)).clamp(0, 1)
-    return ((image + part * (view.image.to(image) / 255 - image)).clamp(0, 1) * 255).round().to(torch.uint8)
+    aimed = ((image + part * (unit(view.image, image) - image)).clamp(0, 1) * 255).round().to(torch.uint8)
+    return aimed.cpu()  # where photographs are: a device would fill up with them
 
 
 def config_of(division: Division, block: int, config: AdaptConfig, *, first: bool) -> AdaptConfig:

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-import torch._functorch.config
 from torch import Tensor
 
 ROWS = 1 << 19
@@ -26,7 +25,8 @@ class Fused:
     """A function of tensors and floats that on a GPU runs compiled, and anywhere else as it is written.
 
     Compiled, a float becomes a 0-d float64 tensor (or torch would compile anew for each value); what is named is fixed
-    at compilation. Where torch cannot compile, the plain function runs, and a warning says so once.
+    at compilation. Where torch cannot compile, the plain function runs, and a warning says so once. What is compiled
+    can be gone back through once: for retain_graph=True, TORCH_COMPILE_DISABLE=1 has the plain function run.
 
     Args:
         function: differentiable by autograd, of elementwise operations; its first argument a tensor with a row each.
@@ -48,12 +48,9 @@ class Fused:
         """Compiled wherever the tensors are."""
         if self._compiled is None:
             self._compiled = torch.compile(self.plain, fullgraph=True, dynamic=True)
-            # Or a graph that is kept could not be gone through twice. torch looks at it on the way back: it is global.
-            if hasattr(torch._functorch.config, "donated_buffer"):
-                torch._functorch.config.donated_buffer = False
         try:
             return self._compiled(*_tensors(values), **fixed)
-        except torch.OutOfMemoryError:
+        except torch.cuda.OutOfMemoryError:  # torch's own name for it came after 2.4
             raise
         except Exception as error:  # of a missing compiler, of triton, of dynamo: they share no class
             self._failed = True

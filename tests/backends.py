@@ -37,6 +37,11 @@ class Backend:
         return image.cpu().float(), alpha.cpu().float()
 
     @property
+    def stands_in(self) -> bool:
+        """Whether it is torch in place of kernels, whose pace and threads are not the backend's."""
+        return self.module == "cuda" and self.device == "cpu"
+
+    @property
     def rounding(self) -> dict[str, float]:
         """What the results of one input may differ by from run to run, for ``assert_same`` and ``assert_close``."""
         return {"rtol": 0.0, "atol": 0.0} if self.repeats else {"rtol": 1e-3, "atol": 1e-3}

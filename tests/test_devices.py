@@ -7,6 +7,7 @@ torch in place of its kernels.
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,6 +21,9 @@ from clod_adapter import Gaussians, evaluate, render
 from clod_adapter.alignment import check_alignment
 from clod_adapter.budget import dial_for, frame_times
 from clod_adapter.cameras import Camera, Scene
+from clod_adapter.chunks import adapt_chunk, merge
+from clod_adapter.chunks_aims import target
+from clod_adapter.chunks_division import divide
 from clod_adapter.compare import matching_dial, mean_kept, rankings
 from clod_adapter.config import AdaptConfig
 from clod_adapter.counting import count_gradient, paper_count
@@ -29,8 +33,10 @@ from clod_adapter.losses import photometric_loss
 from clod_adapter.metrics import psnr_ssim
 from clod_adapter.optimizer import RowAdam
 from clod_adapter.placement import imagine, place
+from clod_adapter.planning import make_plan
 from clod_adapter.popping import dial_popping, path_popping
 from clod_adapter.rasterizers import cpu, cuda
+from clod_adapter.train import adapt
 from fake_gpu import fake_gpu
 from scenes import capture, gaussians, ring
 
@@ -161,6 +167,65 @@ def test_a_step_of_training(setup: Setup) -> None:
         results.append({name: value.cpu() for name, value in parameters.items()})
     for name, mine in results[0].items():
         torch.testing.assert_close(mine, results[1][name], rtol=1e-5, atol=1e-5)
+
+
+def test_a_whole_training_after_its_plan(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plan measures, the training goes on from its probe, and what was left out is put back."""
+    monkeypatch.setattr(importlib.import_module("clod_adapter.planning"), "PROBE", 1)
+    plain, scene = setup.there.replace(sigma_d=None, attenuation=None), Scene(setup.scene.train[:2], ())
+    config = AdaptConfig(iters=10, max_sv=4.0)
+    plan = make_plan(plain, scene, config)
+    want = make_plan(plain.to("cpu"), scene, config)
+    assert [d.what for d in plan.decisions] == [d.what for d in want.decisions]
+    for mine, own in zip(plan.decisions, want.decisions, strict=True):
+        assert mine.number == pytest.approx(own.number, rel=0.02, abs=2e-3), mine.what
+    plan = replace(plan, config=replace(plan.config, iters=2))
+    adapted = plan.adapt(scene).gaussians
+    whole = plan.whole(plain, adapted)
+    assert len(whole) == len(plain) and all(x.device == setup.device for x in whole.tensors().values())
+    assert not torch.equal(adapted.means.cpu(), plan.lean.means.cpu()) and bool(adapted.means.isfinite().all())
+
+
+def test_a_training_is_that_of_the_cpu(setup: Setup) -> None:
+    scene, config = Scene(setup.scene.train[:2], ()), replace(CONFIG, batch=2, iters=1)
+    mine, own = on_both(setup, lambda model: adapt(model, scene, config).gaussians)
+    for name, value in own.tensors().items():
+        # Adam's first steps are as long as their rate whichever way: where a slope is rounding, they may differ.
+        assert float((mine.tensors()[name].cpu() - value).abs().median()) <= 1e-4, name
+
+
+def test_a_chunk(setup: Setup) -> None:
+    views, config = setup.scene.train[:2], replace(CONFIG, iters=2)
+    division = divide(setup.there.replace(sigma_d=None, attenuation=None), views, config, 2)
+    aimed = target(division.begun, 25, views[0])
+    assert aimed.device.type == "cpu" and aimed.dtype == torch.uint8  # photographs of a whole chunk
+    learned = [adapt_chunk(division, views, config, block)[0] for block in range(2)]
+    merged = merge(division, learned)
+    assert merged.means.device == setup.device and bool(merged.sigma_d.isfinite().all())
+
+
+def test_what_is_frozen_takes_no_gradient(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor memory for one: harmonics are the largest part of a Gaussian."""
+    if setup.there.means.is_cuda:
+        monkeypatch.setattr(cuda, "unusable", lambda: None)
+    made: list[torch.Size] = []
+    zeros = Tensor.new_zeros
+    monkeypatch.setattr(Tensor, "new_zeros", lambda x, *size, **more: made.append(size[0]) or zeros(x, *size, **more))
+    sh0 = setup.there.sh0.clone().requires_grad_()
+    render(setup.there.replace(sh0=sh0), setup.cameras[0]).image.sum().backward()
+    assert sh0.grad is not None and setup.there.sh0.shape in made and setup.there.shN.shape not in made
+
+
+def test_rasterizing_under_a_debugger(setup: Setup) -> None:
+    def trace(frame: Any, *_: Any) -> Any:
+        return trace if frame.f_code.co_name == "rasterize" and frame.f_locals is not None else None
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        render(setup.there, setup.cameras[0])
+    finally:
+        sys.settrace(before)
 
 
 def test_neither_the_dial_nor_adam_asks_the_device_for_a_number(monkeypatch: pytest.MonkeyPatch) -> None:

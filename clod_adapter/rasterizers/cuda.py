@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 import sys
 from functools import lru_cache
 from typing import Any
@@ -27,7 +28,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
 
 ALPHA_MIN, BLUR, TILE = 1 / 255, 0.3, 16
-INSTALL = "pip install gsplat==1.5.3"
+OLDEST, INSTALL = (1, 5, 3), "pip install gsplat==1.5.3"
 
 
 @lru_cache(maxsize=1)
@@ -39,6 +40,9 @@ def unusable() -> str | None:
     try:
         with contextlib.redirect_stdout(sys.stderr):  # it speaks to stdout, which is our results'
             import gsplat
+
+            if tuple(int(number) for number in re.findall(r"\d+", gsplat.__version__)[:3]) < OLDEST:
+                return f"gsplat {gsplat.__version__} is too old, its functions take other arguments: {INSTALL}"
             from gsplat.cuda import _backend
     except Exception as error:  # a failed compilation is a RuntimeError, a missing library an OSError or ImportError
         what = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
@@ -46,8 +50,7 @@ def unusable() -> str | None:
     if _backend._C is None:
         return (
             f"gsplat {gsplat.__version__} has no CUDA kernels, and there is no CUDA toolkit to compile them with: "
-            f"install nvcc, or a build for your torch, as in {INSTALL} --index-url "
-            "https://docs.gsplat.studio/whl/pt24cu124"
+            f"install nvcc of CUDA {torch.version.cuda}, https://developer.nvidia.com/cuda-toolkit-archive"
         )
     return None
 
@@ -67,8 +70,12 @@ def rasterize(
     Raises:
         ClodError: a tensor is not float32.
     """
-    for name, tensor in locals().items():
-        if isinstance(tensor, Tensor) and tensor.is_cuda and tensor.dtype != torch.float32:
+    given = {
+        "means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0, "shN": shN,
+        "background": background,
+    }  # fmt: skip
+    for name, tensor in given.items():
+        if tensor.is_cuda and tensor.dtype != torch.float32:
             raise ClodError(f"the CUDA rasterizer takes float32 only, and {name} is {tensor.dtype}: use .float()")
     rows, geometry = compact(means, quats, scales, opacities)
     drawn = _project(geometry, sh0, shN, rows, camera) if len(rows) else None
@@ -158,6 +165,6 @@ class _Rows(Function):
         for shape, wanted in zip(ctx.shapes, ctx.needs_input_grad[1:], strict=True):
             part = grad if len(ctx.shapes) == 1 else grad[:, at : at + shape[1]]
             at += shape[1] if len(ctx.shapes) > 1 else 0
-            whole = grad.new_zeros(shape)
-            found.append(whole.index_copy_(0, rows, part.nan_to_num(0.0, 0.0, 0.0)) if wanted else None)
+            sound = part.nan_to_num(0.0, 0.0, 0.0) if wanted else None  # frozen harmonics take no memory here
+            found.append(None if sound is None else grad.new_zeros(shape).index_copy_(0, rows, sound))
         return None, *found

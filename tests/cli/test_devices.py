@@ -24,6 +24,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda *_: "NVIDIA Test 1")
+    monkeypatch.setattr(devices, "_fails", lambda: None)
 
 
 def test_without_a_gpu_auto_is_the_cpu_and_says_nothing(
@@ -56,6 +57,19 @@ def test_a_gpu_without_gsplat_is_named_in_a_line(
         pick_device("cuda", Console())
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="torch computes on the GPU that is here")
+def test_a_gpu_that_torch_cannot_compute_on_is_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a compute capability that this torch has no code for, say: it is seen, and the first operation fails."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(devices, "unusable", lambda: pytest.fail("gsplat would be compiled for nothing"))
+    assert pick_device("auto", Console()) == torch.device("cpu")
+    assert "although there is a GPU: torch cannot compute on it (" in capsys.readouterr().err
+    with pytest.raises(ClodError, match=r"--device cuda: torch cannot compute on it .*doctor.*or use --device cpu"):
+        pick_device("cuda", Console())
+
+
 def test_cuda_without_a_gpu_is_refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], capture: Any
 ) -> None:
@@ -68,7 +82,7 @@ def test_cuda_without_a_gpu_is_refused(
         assert why in last and last.endswith("or use --device cpu")
 
 
-@pytest.mark.parametrize("missing", ["the package", "its kernels", "a library"])
+@pytest.mark.parametrize("missing", ["the package", "its kernels", "a library", "a version"])
 def test_what_gsplat_lacks(monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
     cuda.unusable.cache_clear()
     backend = ModuleType("gsplat.cuda._backend")
@@ -76,7 +90,7 @@ def test_what_gsplat_lacks(monkeypatch: pytest.MonkeyPatch, missing: str) -> Non
     package = ModuleType("gsplat.cuda")
     package._backend = backend
     top = ModuleType("gsplat")
-    top.__version__ = "1.5.3"
+    top.__version__ = "1.4.0" if missing == "a version" else "1.5.3+pt24cu124"
     for name, module in (("gsplat", top), ("gsplat.cuda", package), ("gsplat.cuda._backend", backend)):
         monkeypatch.setitem(sys.modules, name, None if missing == "the package" else module)
     real = builtins.__import__
@@ -91,6 +105,10 @@ def test_what_gsplat_lacks(monkeypatch: pytest.MonkeyPatch, missing: str) -> Non
         reason = cuda.unusable()
     finally:
         cuda.unusable.cache_clear()
-    assert reason is not None and "pip install gsplat==1.5.3" in reason and "\n" not in reason
-    expected = {"the package": "gsplat", "its kernels": "nvcc", "a library": "libcudart.so.12"}
+    assert reason is not None and "\n" not in reason
+    assert ("pip install gsplat==1.5.3" in reason) != (missing == "its kernels")
+    expected = {
+        "the package": "gsplat", "its kernels": "install nvcc", "a library": "libcudart.so.12",
+        "a version": "gsplat 1.4.0 is too old",
+    }  # fmt: skip
     assert expected[missing] in reason

@@ -45,15 +45,15 @@ def test_for_the_gpu_it_is_gsplat_s_or_what_is_missing(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("seed", range(2))
 def test_same_input_same_bits(rasterize: Backend, torch_threads: int, seed: int) -> None:
-    view, some = camera(130, 97), scene(2000, 2, seed)
+    view, some = camera(130, 97), scene(300 if rasterize.stands_in else 2000, 2, seed)
     first = differentiate(rasterize, some, view, weights(view))
-    for _ in range(3):
+    for _ in range(1 if rasterize.stands_in else 3):
         assert_same(differentiate(rasterize, some, view, weights(view)), first, **rasterize.rounding)
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_thread_count_changes_rounding_at_most(rasterize: Backend, seed: int) -> None:
-    view, some = camera(130, 97), scene(2001, 2, seed)
+    view, some = camera(130, 97), scene(301 if rasterize.stands_in else 2001, 2, seed)
     before = torch.get_num_threads()
     results = []
     for count in (1, 2, 3):
@@ -194,7 +194,7 @@ def test_calls_from_two_threads(rasterize: Backend) -> None:
 
     def work(k: int) -> None:
         some, view = cases[k]
-        for _ in range(15):
+        for _ in range(3 if rasterize.stands_in else 15):
             assert_same(differentiate(rasterize, some, view, weights(view)), want[k], **rasterize.rounding)
 
     with ThreadPoolExecutor(2) as pool:
@@ -287,6 +287,8 @@ def test_huge_rows_are_survived(rasterize: Backend, name: str, value: float) -> 
 
 
 def test_thousands_in_one_tile_are_quick(rasterize: Backend) -> None:
+    if rasterize.stands_in:
+        pytest.skip("the kernels' pace is not in torch's")
     view, some = camera(30, 28), scene(20_000, 1, 2, size=0.02)
     some["means"] *= 0.3
     some["opacities"] *= 0.05
