@@ -128,7 +128,7 @@ def _losses() -> Iterator[None]:
     """The backends' errors, which are RuntimeErrors, as PeerLost."""
     try:
         yield
-    except (torch.OutOfMemoryError, PeerLost):
+    except (torch.cuda.OutOfMemoryError, PeerLost):
         raise
     except RuntimeError as error:
         what = re.sub(r"^\[[^]]*\] *", "", str(error).partition("\n")[0]).partition(". ")[0]
