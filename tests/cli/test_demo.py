@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from clod_adapter.cli import adapt, demo, resume
+from clod_adapter.cli import adapt, demo, outcome, resume
 from clod_adapter.cli.main import build_parser
 
 PICTURES = ("dial.png", "curve.png")
@@ -52,7 +52,7 @@ def test_pictures_that_were_not_drawn_are_not_reported(
     clod: Any, short: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr(adapt, "measure_result", lambda *_: ([], [], True))
+    monkeypatch.setattr(outcome, "measure_result", lambda *_: ([], [], True))
     (tmp_path / "demo").mkdir()
     (tmp_path / "demo" / "dial.png").write_text("an earlier run's")
     done = clod("demo", "--json")
@@ -106,7 +106,7 @@ def test_goes_on_with_what_was_interrupted(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(adapt, "write", stop)
+        patch.setattr(outcome, "write", stop)
         assert clod("demo").code == 130
     state = tmp_path / "demo" / "gallery.resume.safetensors"
     with monkeypatch.context() as patch:
