@@ -8,9 +8,11 @@ from elsewhere whose name was made to point here (DNS rebinding) reads nothing.
 from __future__ import annotations
 
 import re
+import socket
 import socketserver
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -51,11 +53,13 @@ class Server(ThreadingHTTPServer):
         ClodError: the port is taken or may not be listened on.
     """
 
-    daemon_threads = True
+    # Waited for when it is closed: one that still held a tensor while the interpreter ends would abort the process.
+    daemon_threads = False
     allow_reuse_address = sys.platform != "win32"  # there it would let two servers share a port
 
     def __init__(self, answers: Mapping[str, Answer], port: int = 0) -> None:
         self.answers = dict(answers)
+        self._requests: set[socket.socket] = set()
         try:
             super().__init__((HOST, port), _Handler)
         except OSError as error:
@@ -75,6 +79,22 @@ class Server(ThreadingHTTPServer):
     def server_bind(self) -> None:
         socketserver.TCPServer.server_bind(self)  # HTTPServer's asks the name service for this machine's name
         self.server_name, self.server_port = HOST, self.port
+
+    def get_request(self) -> tuple[socket.socket, Any]:
+        request, address = super().get_request()
+        self._requests.add(request)
+        return request, address
+
+    def shutdown_request(self, request: Any) -> None:
+        self._requests.discard(request)
+        super().shutdown_request(request)
+
+    def server_close(self) -> None:
+        """Hangs up on whoever is still being answered, and waits for the threads that did."""
+        for request in list(self._requests):
+            with suppress(OSError):
+                request.shutdown(socket.SHUT_RDWR)
+        super().server_close()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Says nothing of a browser that goes away within an answer, as it does when its tab is closed."""
