@@ -111,3 +111,31 @@ def test_a_browser_that_goes_away(server: Server, capfd: pytest.CaptureFixture[s
             thread.join(10)
     assert threading.active_count() <= before and ask(server, "/")[0] == 200
     assert capfd.readouterr() == ("", "")
+
+
+def test_closing_hangs_up_and_waits_for_what_is_being_answered() -> None:
+    """Or a thread that still held a tensor at the end would abort the process."""
+    held: list[int] = []
+
+    def blocks() -> Iterator[bytes]:
+        try:
+            while True:
+                yield bytes(1 << 20)
+        finally:
+            held.append(1)
+
+    before = threading.active_count()
+    with Server({"/": Answer("application/octet-stream", 1 << 40, blocks)}) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
+        with (
+            socket.create_connection(("127.0.0.1", server.port)) as slow,
+            socket.create_connection(("127.0.0.1", server.port)),
+        ):  # the second one asks for nothing
+            slow.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert slow.recv(100)
+            server.shutdown()
+            server.server_close()
+            assert held == [1]
+    thread.join()
+    assert threading.active_count() == before
