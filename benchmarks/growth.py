@@ -470,6 +470,7 @@ def draw(rows: Sequence[dict[str, Any]]) -> None:
         finish(a, "Seconds of a command, and exponent", "Gaussians", "seconds")
         finish(b, "Peak memory, and bytes a Gaussian", "Gaussians", "GB")
         finish(c, "Phases of adapting, and exponent", "Gaussians", "seconds; of one step")
+        d.set_ylim(bottom=d.get_ylim()[0] / 8)  # room for six names
         finish(d, f"Adapting {SERIES_COUNT:,} Gaussians", "megapixels of all photographs", "seconds; of one step")
         PICTURE.parent.mkdir(exist_ok=True)
         save(figure, PICTURE)
