@@ -34,6 +34,13 @@ class Rasterizer(Protocol):
     ) -> tuple[Tensor, Tensor]: ...  # fmt: skip
 
 
+def require_float32(backend: str, **tensors: Tensor) -> None:
+    """Raises the ClodError of a rasterizer that is given a tensor of another type, by the tensor's name."""
+    for name, tensor in tensors.items():
+        if tensor.dtype != torch.float32:
+            raise ClodError(f"the {backend} rasterizer takes float32 only, and {name} is {tensor.dtype}: use .float()")
+
+
 def wait_for(device: torch.device) -> None:
     """Returns when the device has done what it was given, so that a clock may be read; the CPU always has."""
     if device.type == "cuda":

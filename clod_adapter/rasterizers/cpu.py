@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 from clod_adapter._kernels import blend, blocks, conventions, project, project_gradient, threads, tiles
 from clod_adapter._kernels.memory import aligned, recycled, release
 from clod_adapter.cameras import Camera
-from clod_adapter.errors import ClodError
+from clod_adapter.rasterizers import require_float32
 
 
 class _Buffers:
@@ -189,8 +189,8 @@ def rasterize(
     Raises:
         ClodError: a tensor is not float32.
     """
-    for name, tensor in locals().items():
-        if isinstance(tensor, Tensor) and tensor.dtype != torch.float32:
-            raise ClodError(f"the CPU rasterizer takes float32 only, and {name} is {tensor.dtype}: use .float()")
+    require_float32(
+        "CPU", means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN, background=background
+    )
     degree = round((shN.shape[1] + 1) ** 0.5) - 1
     return _Splat.apply(means, quats, scales, opacities, sh0, shN, background, camera, degree)  # type: ignore[no-any-return, no-untyped-call]

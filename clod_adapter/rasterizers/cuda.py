@@ -26,6 +26,7 @@ from torch.autograd.function import once_differentiable
 
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
+from clod_adapter.rasterizers import require_float32
 
 ALPHA_MIN, BLUR, TILE = 1 / 255, 0.3, 16
 OLDEST, INSTALL = (1, 5, 3), "pip install gsplat==1.5.3"
@@ -74,9 +75,7 @@ def rasterize(
         "means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0, "shN": shN,
         "background": background,
     }  # fmt: skip
-    for name, tensor in given.items():
-        if tensor.is_cuda and tensor.dtype != torch.float32:
-            raise ClodError(f"the CUDA rasterizer takes float32 only, and {name} is {tensor.dtype}: use .float()")
+    require_float32("CUDA", **{name: tensor for name, tensor in given.items() if tensor.is_cuda})
     rows, geometry = compact(means, quats, scales, opacities)
     drawn = _project(geometry, sh0, shN, rows, camera) if len(rows) else None
     if drawn is None or len(drawn["means2d"]) == 0:
