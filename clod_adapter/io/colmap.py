@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import torch
 
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.colmap_library import pycolmap
 from clod_adapter.io.origin import NOWHERE
 from clod_adapter.io.scene_folder import find_cameras
 

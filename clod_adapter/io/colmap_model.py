@@ -6,9 +6,9 @@ from copy import copy
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from clod_adapter.errors import ClodError
+from clod_adapter.io.colmap_library import pycolmap
 from clod_adapter.io.colmap_records import check_name, check_records
 from clod_adapter.io.posed import PosedImage, check_posed
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-import pycolmap
-
 from clod_adapter.errors import ClodError
+from clod_adapter.io.colmap_library import pycolmap
 from clod_adapter.io.regular import refuse_irregular
 
 

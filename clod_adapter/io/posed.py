@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from clod_adapter.errors import ClodError
+from clod_adapter.io.colmap_library import pycolmap
 
 HUGE = 1e9  # world units and pixels; what is beyond is damage, and may not fit float32
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 
 from clod_adapter.errors import ClodError
+from clod_adapter.io.colmap_library import pycolmap
 from clod_adapter.io.images import image_size
 from clod_adapter.io.posed import PosedImage, check_posed
 from clod_adapter.io.scene_folder import inside

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import PIL
-import pycolmap
 from PIL import Image, PngImagePlugin
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.caches import user_caches
+from clod_adapter.io.colmap_library import pycolmap
 from clod_adapter.io.images import Photograph
 from clod_adapter.io.posed import PosedImage
 

@@ -14,6 +14,7 @@ from clod_adapter.demo.gallery import HIGH, LOW, Gallery, unlit_room, write_gall
 from clod_adapter.demo.raytrace import camera_rays, trace_rays
 from clod_adapter.demo.textures import photograph
 from clod_adapter.errors import ClodError
+from clod_adapter.io.colmap_library import pycolmap
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +96,6 @@ def test_points_follow_the_seed(gallery: Gallery) -> None:
 
 
 def test_capture_is_written_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
     monkeypatch.setattr(module, "bake", lambda tables: tables)
     seen: list[tuple[int, int]] = []
     folder = tmp_path / "capture"
@@ -105,7 +105,7 @@ def test_capture_is_written_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert sorted(p.name for p in (folder / "images").iterdir()) == names
     image = np.asarray(Image.open(folder / "images" / names[0]))
     assert image.shape == (24, 32, 3) and image.std() > 20
-    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
     assert sorted(image.name for image in model.images.values()) == names and len(model.points3D) == 500
     with pytest.raises(ClodError, match="not empty"):
         write_gallery(folder)

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import pytest
 import torch
 from PIL import Image
 
 from clod_adapter.errors import ClodError
+from clod_adapter.io.colmap_library import pycolmap
 from clod_adapter.io.scene import load_scene
 from photographs import camera, model_of, pixels, pose, psnr_of, seen
 

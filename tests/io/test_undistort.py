@@ -5,12 +5,12 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
 from PIL import Image
 
 from clod_adapter.cameras import Scene, View
 from clod_adapter.errors import ClodError
+from clod_adapter.io.colmap_library import pycolmap
 from clod_adapter.io.scene import load_scene
 from photographs import model_of, psnr_of, seen
 
