@@ -14,7 +14,7 @@ PIP_ARGS ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
-PEERS := $(CURDIR)/$(VENV)/peers
+PEERS := $(VENV)/peers
 
 .PHONY: demo test docs peers clean
 
@@ -25,7 +25,7 @@ test: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	PATH="$(PEERS)/node_modules/.bin:$$PATH" $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+	PATH="$(CURDIR)/$(PEERS)/node_modules/.bin:$$PATH" $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
@@ -43,7 +43,7 @@ $(VENV)/.installed-%: pyproject.toml constraints.txt | $(BIN)/pip
 	touch $@
 
 $(PEERS)/.installed: | $(BIN)/pip
-	npm install --no-fund --no-audit --prefix "$(PEERS)" node@22.23.3 @playcanvas/splat-transform@3.7.0
+	npm install --no-fund --no-audit --prefix $(PEERS) node@22.23.3 @playcanvas/splat-transform@3.7.0
 	touch $@
 
 # pip and not python: it comes last, so a venv that was interrupted is made again.

@@ -96,7 +96,8 @@ Ctrl-C, or SIGTERM, while training stops after the step under way and writes the
 state for --resume and what was learned so far (exit code 0, "interrupted": true
 in the report); once more aborts, and the state last saved stays. While the
 result is written it is finished first; while it is measured the rest is
-skipped. Before training nothing is written.
+skipped. Before training nothing is written. A background job of a
+script ignores Ctrl-C; SIGTERM stops it.
 
 exit codes: 0 written; 2 bad input or a full disk, one line on stderr and no
 output written; 130 interrupted with nothing to write, or aborted

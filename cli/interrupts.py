@@ -1,4 +1,8 @@
-"""Ctrl-C, and SIGTERM, with which schedulers announce the end, as another Ctrl-C."""
+"""Ctrl-C, and SIGTERM, with which schedulers announce the end, as another Ctrl-C.
+
+A SIGINT that is ignored when the command starts stays ignored: shells start a background job of a script so, and the
+Ctrl-C that ends the script is not meant for the job. SIGTERM ends the job in any case.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +58,8 @@ def _handled_by(handler: Callable[[int, FrameType | None], Any], *numbers: signa
     if threading.current_thread() is not threading.main_thread():  # Python allows handlers only there
         yield
         return
-    before = {number: signal.signal(number, handler) for number in numbers}
+    heard = [n for n in numbers if n != signal.SIGINT or signal.getsignal(n) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, handler) for number in heard}
     try:
         yield
     finally:

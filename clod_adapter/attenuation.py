@@ -258,7 +258,10 @@ class _Attenuate(Function):
         u = d.double().mul(virtual_scale).square_().div_(variance)
         if eps == 0:  # then the variance may be 0, and 0/0 is to be 0
             u.masked_fill_(d == 0, 0)
-        opacities = u.neg().exp_().to(dtype).mul_(logits.sigmoid())
+        factor = u.neg().exp_()
+        if dtype == torch.float64:  # some processors' exp gives 1 - 2^-53 here; float32's rounding gives 1
+            factor.masked_fill_(u < 2**-54, 1)
+        opacities = factor.to(dtype).mul_(logits.sigmoid())
         ctx.save_for_backward(logits, sigma, variance, u, opacities)
         ctx.set_materialize_grads(False)
         return opacities, F.logsigmoid(logits).sub_(u.to(dtype))

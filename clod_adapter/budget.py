@@ -3,7 +3,8 @@
 - A count needs no measuring. For one camera, Gaussian i is kept iff s is below its extinction scale
   ``s*_i`` (``extinction.extinction_scale``) and kept sets are nested, so the dial that keeps n lies between the n-th
   and the (n+1)-th largest ``s*``. For a mean over V cameras the same holds of the ``s*`` of all of them pooled,
-  and of n V. Exact up to ties: Gaussians whose ``s*`` cannot be told apart in float32 leave together.
+  and of n V. Exact up to ties: Gaussians whose ``s*`` cannot be told apart in float32 are cut together. So is, in all
+  views at once, a Gaussian whose own distance is the unit in each of them (normalizers ``max`` and ``quantile``).
 - PSNR is read off the calibration table that is stored with the file (``calibration.py``).
 - Frames a second are of a machine, a picture size, and what else runs there. Where there are cameras some frames are
   timed (``frame_times``, a second or two): under load the times of one machine differ by a factor of ten. The

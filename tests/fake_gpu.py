@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
@@ -82,25 +83,33 @@ class _Functions(TorchFunctionMode):
 
 
 @lru_cache(maxsize=1)
-def register() -> None:
+def register() -> bool:
     """To be called before the process's first backward pass, when autograd makes a thread for each device there is.
 
     Not where there is a GPU: autograd would take this one for the accelerator.
+
+    Returns:
+        Whether torch can have devices that are written in Python. Older versions cannot.
     """
     if torch.cuda.is_available():
-        return
-    from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
+        return True
+    try:
+        from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
+    except ImportError:
+        return False
 
     class Module(_DummyBackendModule):
         def get_amp_supported_dtype(self) -> list[torch.dtype]:  # torch.autocast asks for it, to be disabled too
             return [torch.float16, torch.bfloat16]
 
     _setup_privateuseone_for_python_backend("gpu", Module())
+    return True
 
 
 @contextmanager
 def fake_gpu() -> Iterator[torch.device]:
-    """While it lasts there is the device."""
-    register()
+    """While it lasts there is the device; skips where torch cannot have it."""
+    if not register():
+        pytest.skip("this torch has no devices that are written in Python")
     with _Dispatch(), _Functions():
         yield torch.device("gpu", 0)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from clod_adapter.adapter import attach
@@ -37,6 +37,7 @@ def kept(some: Gaussians, cameras: Sequence[Camera], s: float) -> int:
 
 
 @settings(deadline=None, max_examples=30)
+@example(n=2, seed=2, views=5, share=0.25, normalizer="quantile")  # one Gaussian is at distance 1 in three views
 @given(
     n=st.integers(2, 3000), seed=st.integers(0, 10**6), views=st.integers(1, 5), share=st.floats(0, 1),
     normalizer=st.sampled_from(["scene", "quantile", "max"]),
@@ -53,7 +54,9 @@ def test_counts_are_exact_up_to_ties(n: int, seed: int, views: int, share: float
     # At most what was asked for; and where it is less, more would stay at the next smaller dial value in float32.
     assert found <= wanted, (seed, found, wanted)
     assert found == wanted or kept(some, cameras, solved.virtual_scale * (1 - 1e-6)) > wanted, (seed, found, wanted)
-    assert wanted - found <= max(1, 0.001 * wanted), (seed, found, wanted)
+    # The Gaussian whose distance is the unit is at distance 1, and its s* is the same in each view where it is that.
+    ties = 0 if normalizer == "scene" else views - 1
+    assert wanted - found <= max(1, 0.001 * wanted) + ties, (seed, found, wanted)
 
 
 def test_ties_leave_together() -> None:

@@ -66,7 +66,11 @@ def test_too_many_are_pressed_down_and_too_few_lifted() -> None:
 
 @pytest.mark.parametrize("start", [-1.0, 0.7])
 def test_without_any_picture_the_counts_come_to_the_law(start: float) -> None:
-    """From too few, and from too many, in the optimiser's steps: those who are far from the cut feel little."""
+    """From too few, and from too many, in the optimiser's steps: Gaussians far from the cut feel little.
+
+    Steps of constant size end where the last few lead, by up to a quarter from the law, so they shrink, as in training.
+    Ten orders of the dial values then end within 0.07 of it.
+    """
     logits, log_sigma, d = some()
     # Opaque enough that the law can be met: what is fainter than tau s stays nowhere.
     logits, log_sigma = logits.clamp(min=-1.5) + 1, log_sigma + start
@@ -82,9 +86,10 @@ def test_without_any_picture_the_counts_come_to_the_law(start: float) -> None:
 
     assert worst(log_sigma) > 0.3
     optimizer, rows = RowAdam({"log_sigma": log_sigma}), torch.ones(N, dtype=torch.bool)
-    for _ in range(3000):
+    for step in range(1500):
         slope = gradient(logits, log_sigma, d, 6.0 ** random.random())
-        optimizer.step({"log_sigma": slope}, rows, {"log_sigma": 0.01})
+        rate = 0.03 * 0.02 ** (max(step - 1000, 0) / 500)
+        optimizer.step({"log_sigma": slope}, rows, {"log_sigma": rate})
     assert worst(log_sigma) < 0.2
 
 

@@ -133,14 +133,14 @@ def test_package_only_re_exports() -> None:
     assert set(defined) <= {"__getattr__", "__dir__"}, f"{PACKAGE}/__init__.py defines {defined}"
 
 
-def test_import_is_light() -> None:
+def test_import_is_light(tmp_path: Path) -> None:
     heavy = ["torch", "numpy", "numba", "gsplat", "pycolmap", "plyfile", "matplotlib", "skimage"]
     code = f"import sys, {PACKAGE}; print([m for m in {heavy} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
-def test_names_of_the_package() -> None:
+def test_names_of_the_package(tmp_path: Path) -> None:
     """They are imported on first use, and functions stay functions where a submodule has the same name."""
     code = (
         f"import {PACKAGE} as package, {PACKAGE}.render, {PACKAGE}.evaluate\n"
@@ -149,7 +149,7 @@ def test_names_of_the_package() -> None:
         "assert set(package.__all__) <= set(dir(package))\n"
         "assert not hasattr(package, 'nonsense')\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 

@@ -5,12 +5,25 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from clod_adapter.cli.main import main
+
+ENDS = (signal.SIGINT, signal.SIGTERM)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def signals_arrive() -> Iterator[None]:
+    """Ctrl-C and SIGTERM reach the tests and their children, whatever the shell that started them ignores or blocks."""
+    blocked = signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDS)
+    before = [signal.signal(*pair) for pair in zip(ENDS, (signal.default_int_handler, signal.SIG_DFL), strict=True)]
+    yield
+    for number, earlier in zip(ENDS, before, strict=True):
+        signal.signal(number, earlier)
+    signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
 class Outcome:
@@ -46,11 +59,6 @@ def spawn() -> Callable[..., subprocess.Popen[str]]:
     def start(*words: object, cwd: Path, line_every: float = 10) -> subprocess.Popen[str]:
         code = f"import sys; from clod_adapter.cli import console, main; console.LINE_EVERY = {line_every}"
         command = [sys.executable, "-c", f"{code}; sys.exit(main.main())", *map(str, words)]
-        # Where the tests run in the background Ctrl-C may be ignored, and children inherit that.
-        before = signal.signal(signal.SIGINT, signal.default_int_handler)
-        try:
-            return subprocess.Popen(command, cwd=cwd, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-        finally:
-            signal.signal(signal.SIGINT, before)
+        return subprocess.Popen(command, cwd=cwd, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
     return start

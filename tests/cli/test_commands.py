@@ -212,7 +212,8 @@ def test_bad_input_exits_with_2(spawn: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", ["", *COMMANDS])
 def test_out_has_a_short_form_wherever_there_is_one(clod: Any, command: str) -> None:
     text = clod(*command.split(), "--help").out
-    assert ("--out " in text) == ("\n  -o " in text) == (command not in ("eval", "inspect", "view", "doctor"))
+    short = re.search(r"\n  -o[ ,]", text) is not None  # Python 3.13 writes "-o, --out X", 3.12 "-o X, --out X"
+    assert ("--out " in text) == short == (command not in ("eval", "inspect", "view", "doctor"))
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])

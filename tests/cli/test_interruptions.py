@@ -63,7 +63,6 @@ for line in sys.stdin:
         log = os.open(f"{folder}.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         for stream in (1, 2):
             os.dup2(log, stream)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
         torch.set_num_threads(2)
         resume.SAVE_EVERY, resume.SAVE_COST = 0.0, 1e9  # so that kills find states of many ages
         code = main.main(words)
@@ -230,6 +229,29 @@ def test_two_interrupts_abort(
     assert code == 130 and names(tmp_path) == [STATE], log_of(tmp_path)
     assert server.run(tmp_path, *words, "--resume")[0] == 0
     assert_same(tmp_path, undisturbed[0])
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_ignored_interrupt_stays_ignored(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    """As in a script's background job, which SIGTERM ends as any other."""
+    calls, save = [], resume.save_state
+
+    def save_pressed(*words: Any) -> None:
+        calls.append(words)
+        if len(calls) == 1:
+            signal.raise_signal(number)
+        save(*words)
+
+    monkeypatch.setattr(resume, "save_state", save_pressed)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert done.code == 0 and json.loads(done.out)["interrupted"] == (number == signal.SIGTERM), done
 
 
 def wait_for(path: Path, child: int) -> None:

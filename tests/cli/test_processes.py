@@ -51,7 +51,6 @@ for line in sys.stdin:
         log = os.open(about["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         for stream in (1, 2):
             os.dup2(log, stream)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
         resume.SAVE_EVERY, resume.SAVE_COST = 0.0, 1e9
         code = 1
         try:
