@@ -27,7 +27,7 @@ def read_checkpoint(
     dial = ", with sigma_d" if gaussians.sigma_d is not None else ""
     console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{dial}")
     for note in checkpoint.notes:
-        console.say(f"  note: {note}")
+        console.note(note)
     return checkpoint
 
 
@@ -42,7 +42,7 @@ def read_scene(folder: str, console: Console, origin: Origin, cache: ImageCache 
     size = f"{camera.width}x{camera.height}"
     console.say(f"{folder}: {len(scene.train)} photographs to train on, {len(scene.test)} held out, {size}")
     for note in scene.notes:
-        console.say(f"  note: {note}")
+        console.note(note)
     return scene
 
 
@@ -53,7 +53,7 @@ def complement_scene(
     with console.status("looking for places of cameras ..."):
         more, lighter = complement(gaussians, scene, config)
     for note in more.notes[len(scene.notes) :]:
-        console.say(f"  note: {note}")
+        console.note(note)
     return more, lighter
 
 

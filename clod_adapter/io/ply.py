@@ -16,12 +16,15 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.origin import AXES, NOWHERE, Origin, origin_of, relative
+from clod_adapter.io.plausible import judge
 from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, inria_dtype, read_table
-from clod_adapter.io.ply_header import read_attenuation, read_calibration, write_comments
+from clod_adapter.io.ply_constants import dial_constants, read_constants
+from clod_adapter.io.ply_header import has_settings, read_attenuation, read_calibration, write_comments
 from clod_adapter.io.ply_merge import ROWS, write_rows
 from clod_adapter.io.ply_values import Activated, as_stored_by_inria
 from clod_adapter.io.readers import read_rows
 from clod_adapter.io.usable import row_rules
+from clod_adapter.units import in_world_units
 
 
 @dataclass(frozen=True)
@@ -93,9 +96,12 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
         vertex = vertex[keep]
     gaussians, calibration = _gaussians(values), None
     if SIGMA in values:
-        attenuation, remarks = read_attenuation(path, rows.comments)
+        constants = read_constants(path, rows.vertex)
+        attenuation, remarks = read_attenuation(path, rows.comments, constants)
         sigma_d = torch.from_numpy(values[SIGMA][:, 0])
         gaussians = gaussians.replace(sigma_d=sigma_d, attenuation=attenuation)
+        if not has_settings(rows.comments):
+            remarks += judge(gaussians.means, gaussians.opacity_logits, sigma_d, attenuation)
         calibration, doubts = read_calibration(rows.comments, len(gaussians))
         notes += remarks + doubts
     notes = [*changes, *notes, *rows.notes]
@@ -119,8 +125,9 @@ def save(
 
     Row ``i`` of ``gaussians`` is row ``i`` of ``base``. Columns keep name, order and type; a value is
     overwritten only where it differs from the base's float32 reading, so what was not tuned stays
-    byte-equal. Where the base has an origin, x, y and z are written as double. The settings follow the element line
-    as comments. Without a sigma_d a plain file results.
+    byte-equal. Where the base has an origin, x, y and z are written as double. sigma_d is written in world units
+    (``units.in_world_units``). The settings follow the element line as comments, and those that are not the defaults
+    stand in columns too (``ply_constants``). Without a sigma_d a plain file results.
 
     Args:
         version: of the package that made the values, for the header (``Adapter.version``); by default the running one.
@@ -141,9 +148,11 @@ def save(
             f"{path}: {len(gaussians)} Gaussians of SH degree {gaussians.sh_degree} do not fit their base {base.path} "
             f"({len(base.vertex)} of degree {base.gaussians.sh_degree}); save with the checkpoint they came from"
         )
+    gaussians = in_world_units(gaussians)
     comments = write_comments(gaussians.attenuation, base.comments, version, calibration)
+    constants = dial_constants(gaussians.attenuation)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        write_rows(file, path, gaussians, base.vertex, base.origin, comments)
+        write_rows(file, path, gaussians, base.vertex, base.origin, comments, constants)
 
 
 def blank(count: int, sh_degree: int, origin: Origin = NOWHERE) -> Checkpoint:

@@ -14,7 +14,7 @@ const noDial = (name) => `${name} has no sigma_d, so there is no dial to turn; g
 export async function readFile(buffer, name) {
   const gaussians = usable(await readGaussians(new Uint8Array(buffer), name).catch(said));
   const dialled = gaussians.sigma !== null;
-  const settings = dialled ? gaussians.settings ?? readSettings(gaussians.comments) : null;
+  const settings = dialled ? gaussians.settings ?? readSettings(gaussians.comments, gaussians.constants) : null;
   return {
     gaussians,
     about: {
