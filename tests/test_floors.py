@@ -34,6 +34,7 @@ FLOORS = [
         "optimizer",
         "perceptual",
         "training_state",
+        "viewpoints",
     },
     {"io", "rasterizers", "adapter"},
     {"render"},
