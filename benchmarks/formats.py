@@ -51,7 +51,7 @@ def run(scene: str, config: clod.AdaptConfig) -> None:
     photographs = clod.load_scene(capture(scene))
     model = start(base, seeing(base, photographs.train), config, lambda *_: None)
     cameras = [view.camera for view in photographs.test]
-    baked = {s: clod.bake(model, s) for s in DIALS}
+    baked = {s: clod.bake(model, s, cameras=[view.camera for view in photographs.train]) for s in DIALS}
     for suffix, writer in WRITERS.items():
         sources = {s: model if writer.carries_sigma else baked[s] for s in DIALS}
         row: dict[str, Any] = {}

@@ -4,17 +4,17 @@
     python benchmarks/prefix.py --table                    # the rows as a Markdown table
 
 The model is an adapted file of the capture. At each dial value the counts are the mean over the held-out views, and
-what is drawn of that many Gaussians is measured on them. First the dial itself, and a file baked at d' = 1 for that
-count; then prefixes of files whose rows are in an order, drawn as such a renderer draws them, with the opacities that
-stand in the file:
+what is drawn of that many Gaussians is measured on them. First the dial itself, and a file of that count baked for the
+training cameras; then prefixes of files whose rows are in an order, drawn as such a renderer draws them, with the
+opacities that stand in the file:
 
-- ``extinction``: by falling s* at d' = 1, what ``clod-adapt export --order extinction`` writes;
+- ``extinction``: by falling s* for the training cameras, what ``clod-adapt export --order extinction --images`` writes;
 - ``extinction, s = 1 baked``: the same with ``--sv 1``, so faded a little, and shorter;
-- ``extinction, views``: by the mean of log s* over the cameras trained on, about what ``--images`` gives there;
 - ``own``, ``opacity``, ``removal error``: the adapted file as it is, by falling opacity, by falling removal error;
 - ``base, ...``: the untouched checkpoint in the adapted one's order of extinction, by opacity, by removal error.
 
-Each run adds a row to ``results/prefix.jsonl``.
+Rows of commit c0ce1ea have ``extinction`` and ``baked`` at the one distance d' = 1, and as ``extinction, views`` the
+order by the mean of log s* over the training cameras. Each run adds a row to ``results/prefix.jsonl``.
 """
 
 from __future__ import annotations
@@ -59,14 +59,14 @@ def measure(model: str, scene: str, checkpoint: str) -> None:
         console.say(f"{what}: {row.psnr:.2f} dB with {row.kept:,.0f}")
         return row.psnr, row.kept
 
-    ordered = orders(adapted, base, photographs.train)
+    ordered, cameras = orders(adapted, base, photographs.train), [view.camera for view in photographs.train]
     rows = []
     for s in [s for s in DIALS if adapted.attenuation and s <= adapted.attenuation.max_sv]:
         found, kept = psnr(adapted, f"dial {s:g}", s)
         count = round(kept)
         drawn = {"dial": found}
-        at = clod.dial_for(adapted, keep=count).virtual_scale
-        baked = clod.bake(adapted, at)
+        at = clod.dial_for(adapted, keep=count, cameras=cameras, baked=True).virtual_scale
+        baked = clod.bake(adapted, at, cameras=cameras)
         drawn["baked"] = psnr(baked, "baked")[0] if len(baked) == count else None
         for what, gaussians in ordered.items():
             drawn[what] = psnr(head(gaussians, count), what)[0] if count <= len(gaussians) else None
@@ -79,11 +79,11 @@ def measure(model: str, scene: str, checkpoint: str) -> None:
 
 def orders(adapted: clod.Gaussians, base: clod.Gaussians, views: tuple[clod.View, ...]) -> dict[str, clod.Gaussians]:
     """What stands in each file, without a dial, in its order."""
-    plain, rows = clod.detach(adapted), clod.order_by_extinction(adapted)
+    cameras = [view.camera for view in views]
+    plain, rows = clod.detach(adapted), clod.order_by_extinction(adapted, cameras)
     return {
         "extinction": plain.select(rows),
-        "extinction, s = 1 baked": clod.bake(adapted.select(rows), 1.0),
-        "extinction, views": plain.select(clod.order_by_extinction(adapted, [view.camera for view in views])),
+        "extinction, s = 1 baked": clod.bake(adapted.select(rows), 1.0, cameras=cameras),
         "own": plain,
         "opacity": plain.select(falling(plain.opacity_logits)),
         "removal error": plain.select(falling(removal_error(plain, views, seed=0))),

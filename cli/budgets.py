@@ -6,8 +6,8 @@ import argparse
 from collections.abc import Sequence
 
 from clod_adapter.budget import dial_for, dial_for_times, frame_times
-from clod_adapter.calibration import Calibration
-from clod_adapter.cameras import Camera, View
+from clod_adapter.calibration import Calibration, Viewpoint
+from clod_adapter.cameras import Camera, Scene
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.dials import given_budget
 from clod_adapter.cli.kernels import prepare_kernels
@@ -15,23 +15,35 @@ from clod_adapter.cli.report import machine_name
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import Row
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.importance import spread
+from clod_adapter.io.origin import Origin
 from clod_adapter.io.ply import Checkpoint
+from clod_adapter.viewpoints import viewpoint_of
+
+VIEWPOINTS = 16  # training cameras that a calibration stores, at most, evenly spread: all 84 baked 0.006 dB better
 
 
 def solve_dials(
-    args: argparse.Namespace, model: Checkpoint, cameras: Sequence[Camera], console: Console
+    args: argparse.Namespace,
+    model: Checkpoint,
+    cameras: Sequence[Camera | Viewpoint],
+    console: Console,
+    *,
+    baked: bool = False,
 ) -> tuple[list[float] | None, list[str]]:
     """The dial values of --sv or of a budget, None where neither is given; and notes on how they were found.
 
     Args:
-        cameras: those that the command renders; none for one that does not, which judges counts at the normalised
-            distance 1 and frame times by what is stored.
+        cameras: those that the command renders, or bakes for. Where none of them has a picture, as those stored with
+            a file, frame times are what is stored.
+        baked: whether a count is of the file that is baked for the cameras, and not the mean over them.
     """
     budget = given_budget(args)
     if budget is None:
         return args.sv, []
     name, option, values = budget
-    times, notes = time_frames(model, cameras, console) if name == "fps" and cameras else (None, [])
+    seen = [camera for camera in cameras if isinstance(camera, Camera)]
+    times, notes = time_frames(model, seen, console) if name == "fps" and seen else (None, [])
     stored = model.calibration
     if stored is None and times is None and name != "keep":  # what the header has, the reader has found unusable
         why = next((note for note in model.notes if "calibration" in note), "there is no calibration in the header")
@@ -50,7 +62,8 @@ def solve_dials(
             if times:
                 solved = dial_for_times(times, value)
             else:
-                solved = dial_for(model.gaussians, **{name: value}, cameras=cameras, calibration=stored)
+                budgets = {name: value}
+                solved = dial_for(model.gaussians, **budgets, cameras=cameras, calibration=stored, baked=baked)
         except ClodError as error:
             raise ClodError(f"{option} {value:g}: {error}{origin}") from error
         dials.append(solved.virtual_scale)
@@ -71,7 +84,13 @@ def time_frames(
     return times, [f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}"]
 
 
-def calibrate(rows: Sequence[Row], measured: Gaussians, views: Sequence[View], against: str) -> Calibration:
+def calibrate(rows: Sequence[Row], measured: Gaussians, scene: Scene, against: str, origin: Origin) -> Calibration:
     """The table of the rows just measured here, where the Gaussians are; a ClodError where a PSNR is infinite."""
-    size, machine = (views[0].camera.width, views[0].camera.height), machine_name(measured.means.device.type)
-    return Calibration.of(rows, total=len(measured), views=len(views), size=size, machine=machine, against=against)
+    assert measured.attenuation is not None
+    camera, machine = scene.test[0].camera, machine_name(measured.means.device.type)
+    stored = [view.camera for view in spread(scene.train, VIEWPOINTS)]
+    viewpoints = [viewpoint_of(each, measured.means, measured.attenuation).moved(origin) for each in stored]
+    return Calibration.of(
+        rows, total=len(measured), views=len(scene.test), size=(camera.width, camera.height), machine=machine,
+        against=against, viewpoints=viewpoints,
+    )  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from clod_adapter.cli.checks_export import check_export
@@ -90,11 +90,11 @@ def check_page(path: Path, charts: list[str], inputs: list[str]) -> None:
         check_output(file, inputs)
 
 
-def check_dials(args: Namespace, model: str, *, measured: bool = True) -> None:
+def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fps",)) -> None:
     """Refuses values that are none, and budgets that the file's header says nothing can be solved for.
 
     Args:
-        measured: whether the command can time frames where the file has no times.
+        measured: the budgets that the command measures for itself, without a calibration.
     """
     for virtual_scale in args.sv or ():
         if not 1 <= virtual_scale < math.inf:
@@ -108,7 +108,7 @@ def check_dials(args: Namespace, model: str, *, measured: bool = True) -> None:
             raise ClodError(f"{option} has {value:g}, it must be positive and finite")
     if not has_dial(model):
         raise ClodError(f"{model}: has no sigma_d, so no dial for {option}; give it one first: clod-adapt {model} ...")
-    needed = name == "psnr_drop" or (name == "fps" and not measured)
+    needed = name != "keep" and name not in measured
     if needed and reader_of(Path(model)) is PLY and not _has_calibration(model):  # others say so when they are read
         raise ClodError(
             f"{model}: has no calibration in its header, which {option} needs; adapt it again, and let it measure to "

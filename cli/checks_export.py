@@ -18,7 +18,7 @@ def check_export(args: Namespace) -> None:
     bakes = bool(args.levels) or args.sv is not None or given_budget(args) is not None
     check_together(args, bakes)
     check_outputs(args)
-    checks.check_dials(args, args.model, measured=args.camera is not None)
+    checks.check_dials(args, args.model, measured=measured(args))
     checks.check_checkpoint(args.model)
     dial = checks.has_dial(args.model)
     if bakes and not dial:
@@ -33,6 +33,14 @@ def check_export(args: Namespace) -> None:
         SplatTransform.find()
 
 
+def measured(args: Namespace) -> tuple[str, ...]:
+    """The budgets that are measured: frame times from a scene's cameras, the PSNR of a file on its photographs."""
+    if args.images is None:
+        return ()
+    page = Path(args.out).suffix.lower() == PAGE
+    return ("fps",) if page or args.camera is not None else ("fps", "psnr_drop")
+
+
 def check_together(args: Namespace, bakes: bool) -> None:
     """Refuses options that do not go together."""
     if args.levels and (args.sv is not None or given_budget(args) is not None):
@@ -44,12 +52,12 @@ def check_together(args: Namespace, bakes: bool) -> None:
     if args.camera is not None and args.images is None:
         raise ClodError("--camera names a photograph of a scene; give that too, with --images")
     page = Path(args.out).suffix.lower() == PAGE
-    if args.images is not None and args.camera is None and not args.order and not page:
-        raise ClodError(f"--images is for the cameras of --camera, --order and a {PAGE}; give one of them with it")
     if page and (args.levels or args.camera is not None or args.order):
         raise ClodError(f"a {PAGE} shows the whole dial; leave out --levels, --camera and --order")
     if args.camera is not None and not bakes:
         raise ClodError("--camera is where a dial value is baked for; give one, as in --sv 2")
+    if args.images is not None and not (bakes or args.order or page):
+        raise ClodError(f"--images is for baking, --order and a {PAGE}; give one of them with it, as in --sv 2")
 
 
 def check_outputs(args: Namespace) -> None:

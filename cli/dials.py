@@ -9,7 +9,7 @@ from typing import Any
 OPTIONS: tuple[tuple[str, str, type, str], ...] = (
     ("keep", "N", int, "the dial value that keeps N Gaussians {where}"),
     ("fps", "F", float, "the dial value that draws F frames a second, by the frame times {times}"),
-    ("psnr_drop", "DB", float, "the dial value that gives up DB decibels against s = 1, by the stored calibration"),
+    ("psnr_drop", "DB", float, "the dial value that gives up DB decibels against s = 1, {decibels}"),
 )  # fmt: skip
 BUDGETS = """\
 budgets, each solved to the dial value that just keeps within it:
@@ -28,13 +28,15 @@ does not reach is an error that says what is reachable.
 
 def add_dial_options(parser: ArgumentParser, sv_help: str, where: str, *, several: bool, required: bool) -> None:
     """Adds --sv and the budgets, of which one may be given; ``several`` allows more than one value of it."""
-    times = "measured here first" if several else "stored in the file, of the machine that a note names"
+    times = "measured here first" if several else "stored in the file, or with --images measured first"
+    decibels = "by the stored calibration" if several else "by the stored calibration, or with --images as measured"
     group: Any = parser.add_mutually_exclusive_group(required=required)
     count = "+" if several else 1
     group.add_argument("--sv", metavar="S", type=float, nargs=count, help=sv_help)
     for name, metavar, kind, text in OPTIONS:
         option = f"--{name.replace('_', '-')}"
-        group.add_argument(option, metavar=metavar, type=kind, nargs=count, help=text.format(where=where, times=times))
+        shown = text.format(where=where, times=times, decibels=decibels)
+        group.add_argument(option, metavar=metavar, type=kind, nargs=count, help=shown)
 
 
 def opens_at(virtual_scale: float, max_sv: float | None) -> tuple[float, list[str]]:

@@ -40,14 +40,16 @@ def export_options(parser: ArgumentParser) -> None:
         help="the levels as one streaming set in the new folder OUT, for PlayCanvas's viewers (by splat-transform)",
     )  # fmt: skip
     parser.add_argument(
-        "--camera", metavar="PHOTO", help="bake for this photograph's camera; its name, with or without suffix"
+        "--camera", metavar="PHOTO", help="bake for this photograph's camera alone; its name, with or without suffix"
     )
-    parser.add_argument("--images", metavar="DIR", help="the scene: of --camera, to order by, or for a page's views")
+    parser.add_argument(
+        "--images", metavar="DIR", help="the scene: its cameras to bake for, to order by, or for a page's views"
+    )
     parser.add_argument(
         "--order", choices=["extinction"],
         help="put the rows in the order in which the dial keeps them longest, for renderers that draw a prefix",
     )  # fmt: skip
-    add_device(parser, "time frames, for --fps with --camera")
+    add_device(parser, "measure, for --fps and --psnr-drop with --images")
     add_activated(parser)
     parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
 
@@ -67,27 +69,28 @@ by the suffix of OUT:
 Where the dial is kept and no dial value is given, nothing is baked. A plain
 MODEL is converted. Columns that Inria's layout does not have are left out.
 
-Baking keeps the Gaussians of one dial value, faded for good: lossy, and exact
-at one distance only. The dial fades a Gaussian by its distance from the camera,
-and a plain file has no camera: what is written is how it looks from the
-normalised distance 1 (the far end of the scene as the training cameras saw it),
-so that what is nearer comes out fainter than it should. With --camera and
---images it is how it looks from there, exact from that place and near it. Keep
-the adapted file: this cannot be undone.
+Baking keeps the Gaussians of one dial value, with opacities for good: lossy.
+The dial fades a Gaussian by its distance from the camera, and a plain file has
+no camera: each Gaussian has its mean distance from the training cameras, those
+of --images, else up to 16 that adapting stores in MODEL, else 16 that are
+placed where MODEL looks photographed, which is worse. At equal counts such
+files measured 0.05 dB below to 0.6 dB above the dial (benchmarks/bake.py). With
+--camera it is how the dial looks from there, exact from that place and near it.
+Keep the adapted file: this cannot be undone.
 
---keep is exact: OUT has N Gaussians. --fps and --psnr-drop find the dial value
-in the calibration stored in MODEL, which is of the adapted file and, for frame
-times, of the machine that a note names: here they are estimates. With --camera
-frames are timed here first, from there.
+--keep is exact: OUT has N Gaussians. With --images --psnr-drop writes the
+smallest file that, as read back, is at most DB below MODEL at s = 1 on the
+held-out photographs, and --json has its PSNR; what splat-transform rounds is
+measured after. --fps then times frames of MODEL first. Without --images both
+are found in the calibration stored in MODEL, which is of the dial and, for
+frame times, of the machine that a note names.
 
 --levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on. With --lod-meta OUT is
 a folder that must not be there yet (or be empty): lod-meta.json, level 0 the
 finest, and the chunks that a streaming viewer loads.
 
 --order extinction is for renderers that draw the first n rows, whatever n: the
-first n are those that the dial keeps at n at the normalised distance 1 or from
---camera, or with --images those that it keeps longest over all cameras, which
-is better where distances differ much. They are drawn with the opacities that
+first n are those that --keep n writes. They are drawn with the opacities that
 stand in the file: on two captures 0.1 to 0.6 dB below the dial at many rows, up
 to 0.8 above it at few (benchmarks/prefix.py), and they pop where it fades.
 
@@ -107,6 +110,7 @@ Without a GPU, SOG's spherical harmonics take minutes for 100,000 Gaussians.
 examples:
   clod-adapt export garden_clod.ply --sv 2 -o garden_s2.ply
   clod-adapt export garden_clod.ply --keep 200000 -o garden_200k.ply
+  clod-adapt export garden_clod.ply --psnr-drop 0.2 --images garden -o small.ply
   clod-adapt export garden_clod.ply --sv 3 --camera a.jpg --images garden \\
       -o from_a.ply
   clod-adapt export garden_clod.ply -o garden.glb

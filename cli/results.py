@@ -46,7 +46,7 @@ def write_measured(
     """
     try:
         with stop.listening():
-            calibrated = replace(adapter, calibration=calibrate(rows, result, scene.test, report["teacher"]))
+            calibrated = replace(adapter, calibration=calibrate(rows, result, scene, report["teacher"], base.origin))
             write(base, calibrated, result, outputs, report)
     except ClodError as error:
         console.say(f"the files are without the calibration, so --fps and --psnr-drop will not know it: {error}")

@@ -3,8 +3,9 @@
 - A count needs no measuring. For one camera, Gaussian i is kept iff s is below its extinction scale
   ``s*_i`` (``extinction.extinction_scale``) and kept sets are nested, so the dial that keeps n lies between the n-th
   and the (n+1)-th largest ``s*``. For a mean over V cameras the same holds of the ``s*`` of all of them pooled,
-  and of n V. Exact up to ties: Gaussians whose ``s*`` cannot be told apart in float32 are cut together. So is, in all
-  views at once, a Gaussian whose own distance is the unit in each of them (normalizers ``max`` and ``quantile``).
+  and of n V. A baked file has one distance for each Gaussian, which stands for one camera. Exact up to ties:
+  Gaussians whose ``s*`` cannot be told apart in float32 are cut together. So is, in all views at once, a Gaussian
+  whose own distance is the unit in each of them (normalizers ``max`` and ``quantile``).
 - PSNR is read off the calibration table that is stored with the file (``calibration.py``).
 - Frames a second are of a machine, a picture size, and what else runs there. Where there are cameras some frames are
   timed (``frame_times``, a second or two): under load the times of one machine differ by a factor of ten. The
@@ -25,8 +26,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import attenuate, normalized_distances
-from clod_adapter.calibration import Calibration, crossing
+from clod_adapter.attenuation import attenuate
+from clod_adapter.calibration import Calibration, Viewpoint, crossing
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, require
 from clod_adapter.errors import ClodError
@@ -34,7 +35,7 @@ from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import wait_for
 from clod_adapter.render import render
-from clod_adapter.units import nominal_distance
+from clod_adapter.viewpoints import typical_distance
 
 TIMED_VIEWS, TIMED_DIALS, TIMED_REPEATS = 4, 6, 2
 
@@ -58,21 +59,22 @@ def dial_for(
     keep: float | None = None,
     psnr_drop: float | None = None,
     fps: float | None = None,
-    cameras: Sequence[Camera] = (),
+    cameras: Sequence[Camera | Viewpoint] = (),
     calibration: Calibration | None = None,
+    baked: bool = False,
 ) -> DialValue:
     """The smallest dial value that keeps within one budget, so the best picture that it allows.
 
     Args:
         gaussians: with a dial.
-        keep: Gaussians, at most: in the view of the one camera, the mean over several, without any camera at the
-            nominal distance, where ``export.bake`` looks from.
+        keep: Gaussians, at most: in the view of the one camera, the mean over several.
         psnr_drop: dB below what the calibration has at s = 1. Here alone it is the largest dial value: from the first
             point on where the interpolated PSNR falls below, the budget counts as spent.
         fps: frames a second. With a calibration its times are taken as they stand, whatever they were measured on
             (``calibration.machine``, ``width``, ``height``); without one, some frames of ``cameras`` are timed here.
-        cameras: for ``keep`` and ``fps``.
+        cameras: for ``keep`` and ``fps``, which needs whole cameras to time frames from.
         calibration: for ``psnr_drop`` and ``fps``; ``load(path).calibration``.
+        baked: ``keep`` counts what ``export.bake`` keeps for the cameras.
 
     Raises:
         ClodError: not exactly one budget, a budget that is not positive, no dial, nothing to judge the budget by, or
@@ -87,11 +89,12 @@ def dial_for(
     if gaussians.sigma_d is None or gaussians.attenuation is None:
         raise ClodError("the Gaussians have no sigma_d, so no dial value meets a budget; adapt them first")
     if name == "keep":
-        return _for_count(gaussians, cameras, value)
+        return _for_count(_Views(gaussians, cameras, baked), value)
     if name == "psnr_drop":
         return _for_psnr_drop(calibration, value)
     stored = [(row.virtual_scale, row.frame_ms) for row in calibration.rows] if calibration else None
-    return dial_for_times(stored or frame_times(gaussians, cameras), value)
+    whole = [camera for camera in cameras if isinstance(camera, Camera)]
+    return dial_for_times(stored or frame_times(gaussians, whole), value)
 
 
 def dial_for_times(times: Sequence[tuple[float, float]], fps: float) -> DialValue:
@@ -171,13 +174,12 @@ def _for_psnr_drop(calibration: Calibration | None, drop: float) -> DialValue:
 
 
 @torch.no_grad()
-def _for_count(gaussians: Gaussians, cameras: Sequence[Camera], keep: float) -> DialValue:
-    views = _Views(gaussians, cameras)
+def _for_count(views: _Views, keep: float) -> DialValue:
     largest, wanted = views.config.max_sv, math.floor(keep * len(views))
     # What a picture really keeps, and not the roots, is what a count is held against: they differ by rounding.
     most, fewest = views.count(1.0), views.count(largest)
     if wanted >= most:
-        note = f"s = 1 keeps {most / len(views):,.0f} of {len(gaussians):,} already" if wanted > most else ""
+        note = f"s = 1 keeps {most / len(views):,.0f} of {len(views.logits):,} already" if wanted > most else ""
         return DialValue(1.0, note)
     if wanted < fewest:
         raise ClodError(
@@ -207,23 +209,22 @@ def _polished(guess: float, views: _Views, wanted: int) -> float:
 
 
 class _Views:
-    """The Gaussians as some cameras see them; without a camera, all at ``units.nominal_distance``."""
+    """The Gaussians as some cameras see them, or ``baked``: as one file shows them to all of the cameras."""
 
-    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
+    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera | Viewpoint], baked: bool) -> None:
         assert gaussians.sigma_d is not None and gaussians.attenuation is not None
         self.config: AttenuationConfig = gaussians.attenuation
         self.means, self.logits, self.sigma_d = gaussians.means, gaussians.opacity_logits, gaussians.sigma_d
-        self.cameras: Sequence[Camera | None] = cameras or (None,)
+        self.cameras = cameras
+        self.typical = typical_distance(self.means, cameras, self.config) if baked or not cameras else None
 
     def __len__(self) -> int:
-        return len(self.cameras)
+        return len(self.cameras) if self.typical is None else 1
 
     def _distances(self) -> Iterator[Tensor]:
-        for camera in self.cameras:
-            if camera is None:
-                yield torch.full_like(self.logits, nominal_distance(self.means, self.config))
-            else:
-                yield normalized_distances(self.means, camera, self.config)
+        if self.typical is not None:
+            return iter([self.typical])
+        return (typical_distance(self.means, [camera], self.config) for camera in self.cameras)
 
     def extinction_scales(self) -> Iterator[Tensor]:
         """``[N]`` for each view, one at a time: all of them at once are views times Gaussians."""

@@ -1,16 +1,18 @@
 """The calibration table: what each dial value of an adapted file keeps, costs and takes. It travels with the file.
 
 Counts, PSNR and SSIM are of the file; frame times are of the machine and the picture size that the table names.
-Between its rows the table is read by linear interpolation in log s.
+Between its rows the table is read by linear interpolation in log s. Beside the rows stand some of the training
+cameras, so that a dial value can be baked later without the photographs (``export.bake``).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from typing import Any, Protocol
 
+from clod_adapter.config import require
 from clod_adapter.errors import ClodError
 
 AGAINST = ("photographs", "checkpoint")
@@ -50,6 +52,34 @@ class CalibrationRow:
 
 
 @dataclass(frozen=True)
+class Viewpoint:
+    """What the dial needs of a camera.
+
+    Attributes:
+        x, y, z: the camera's centre, world units.
+        unit: D, what the normaliser divides distances from there by, world units, > 0.
+
+    Raises:
+        ClodError: a coordinate is not finite, or the unit is not positive and finite.
+    """
+
+    x: float
+    y: float
+    z: float
+    unit: float
+
+    def __post_init__(self) -> None:
+        centre = (self.x, self.y, self.z)
+        require(all(map(math.isfinite, centre)), "the centre of a viewpoint", centre, "finite")
+        require(0 < self.unit < math.inf, "the unit of a viewpoint", self.unit, "positive and finite")
+
+    def moved(self, by: Sequence[float]) -> Viewpoint:
+        """The same with its centre moved by ``by [3]``, world units."""
+        x, y, z = (value + step for value, step in zip((self.x, self.y, self.z), by, strict=True))
+        return replace(self, x=x, y=y, z=z)
+
+
+@dataclass(frozen=True)
 class Calibration:
     """Rows of ascending dial values, the first at s = 1, and what they were measured on.
 
@@ -61,6 +91,7 @@ class Calibration:
         machine: what the frame times were taken on: one line of printable ASCII.
         against: what PSNR and SSIM are against: ``photographs``, or, where there were none, the ``checkpoint``'s own
             pictures.
+        viewpoints: of some of the training cameras, in the file's own coordinates; none in files of earlier versions.
 
     Raises:
         ClodError: no rows, dial values that do not ascend from 1, a value that is not finite, an unusable machine, or
@@ -74,6 +105,7 @@ class Calibration:
     height: int
     machine: str
     against: str = "photographs"
+    viewpoints: tuple[Viewpoint, ...] = ()
 
     def __post_init__(self) -> None:
         dials = [row.virtual_scale for row in self.rows]
@@ -98,6 +130,7 @@ class Calibration:
         size: tuple[int, int],
         machine: str,
         against: str = "photographs",
+        viewpoints: Sequence[Viewpoint] = (),
     ) -> Calibration:
         """The table of an evaluation's rows, in any order, for pictures of ``size`` (width, height).
 
@@ -110,7 +143,7 @@ class Calibration:
         }
         ascending = tuple(found[s] for s in sorted(found))
         name = _plain(machine.encode("ascii", "replace").decode()) or "unknown"
-        return cls(ascending, total, views, *size, name, against)
+        return cls(ascending, total, views, *size, name, against, tuple(viewpoints))
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Calibration:
@@ -122,11 +155,13 @@ class Calibration:
         rows = tuple(CalibrationRow(**{name: float(value) for name, value in row.items()}) for row in values["rows"])
         counts = {name: int(values[name]) for name in ("total", "views", "width", "height")}
         against = str(values.get("against", AGAINST[0]))  # files that do not say are of before there was another
-        return cls(rows, machine=str(values["machine"]), against=against, **counts)
+        viewpoints = tuple(Viewpoint(**{k: float(v) for k, v in row.items()}) for row in values.get("viewpoints", ()))
+        return cls(rows, machine=str(values["machine"]), against=against, viewpoints=viewpoints, **counts)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain JSON."""
-        return {**vars(self), "rows": [dict(vars(row)) for row in self.rows]}
+        lists = {name: [dict(vars(row)) for row in getattr(self, name)] for name in ("rows", "viewpoints")}
+        return {**vars(self), **lists}
 
 
 def crossing(dials: Sequence[float], values: Sequence[float], target: float) -> float | None:

@@ -10,7 +10,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import SIGMA_MAX, normalized_distances, normalizing_distance
+from clod_adapter.attenuation import SIGMA_MAX, normalizing_distance
 from clod_adapter.cameras import View
 from clod_adapter.collapse import leaving_order
 from clod_adapter.config import AdaptConfig, AttenuationConfig
@@ -19,6 +19,7 @@ from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import splat
 from clod_adapter.units import in_world_units, known_distance, with_distance
+from clod_adapter.viewpoints import typical_distance
 
 T = TypeVar("T")
 
@@ -68,7 +69,7 @@ def start(
     if config.start == "importance":
         order = partial(progress, "order") if progress else None
         importance = leaving_order(base, error.sqrt() * base.opacities, order)
-    distances = typical_distance(base, views, attenuation)
+    distances = typical_distance(base.means, [view.camera for view in views], attenuation)
     sigma = sigma_from_importance(
         base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent
     )
@@ -168,14 +169,6 @@ def removal_error(
         if progress:
             progress(done, len(views))
     return total / max(len(views), 1)
-
-
-def typical_distance(gaussians: Gaussians, views: Sequence[View], config: AttenuationConfig) -> Tensor:
-    """``[N]`` the geometric mean over views of the normalised distance."""
-    logs = torch.zeros_like(gaussians.means[:, 0])
-    for view in views:
-        logs += normalized_distances(gaussians.means, view.camera, config).clamp(min=1e-6).log()
-    return (logs / max(len(views), 1)).exp()
 
 
 def sigma_from_importance(

@@ -16,7 +16,6 @@ from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.export import bake
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import dial
 from scenes import gaussians, ring
@@ -75,13 +74,6 @@ def test_a_mean_need_not_be_whole() -> None:
     some, cameras = adapted(500, 3), ring(4, 48, 36)
     wanted = (kept(some, cameras, 2.0) // 4) + 0.75
     assert kept(some, cameras, dial_for(some, keep=wanted, cameras=cameras).virtual_scale) == 4 * wanted
-
-
-def test_without_cameras_it_is_the_count_of_what_is_baked() -> None:
-    some = adapted(800, 1)
-    few, many = len(bake(some, MAX_SV)), len(bake(some, 1.0))
-    for wanted in {few, (few + many) // 2, many}:
-        assert len(bake(some, dial_for(some, keep=wanted).virtual_scale)) == wanted
 
 
 def test_counts_out_of_reach() -> None:
@@ -200,5 +192,7 @@ def test_bad_calls_are_named() -> None:
         dial_for(gaussians(3, 0, 0), keep=1, cameras=camera)
     with pytest.raises(ClodError, match="needs the calibration table"):
         dial_for(some, psnr_drop=1)
+    with pytest.raises(ClodError, match="no camera is given"):
+        dial_for(some, keep=1)
     with pytest.raises(ClodError, match="a calibration or cameras"):
         dial_for(some, fps=1)

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from clod_adapter.adapter import attach, extract
-from clod_adapter.calibration import Calibration, CalibrationRow
+from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import Row
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
@@ -32,7 +32,10 @@ def tables(draw: st.DrawFn, total: int = 4) -> Calibration:
     found = {values[0]: values for values in [(1.0, *draw(st.tuples(number, number, number)), 2.5), *draw(rows)]}
     machine, against = draw(st.text(min_size=1, max_size=40)), draw(st.sampled_from(["photographs", "checkpoint"]))
     some = [Row(s, psnr, ssim, kept, 0.5, 1.0, ms) for s, kept, psnr, ssim, ms in found.values()]
-    return Calibration.of(some, total=total, views=13, size=(640, 480), machine=machine, against=against)
+    places = draw(st.lists(st.builds(Viewpoint, number, number, number, st.floats(1e-9, 1e6)), max_size=3))
+    return Calibration.of(
+        some, total=total, views=13, size=(640, 480), machine=machine, against=against, viewpoints=places
+    )  # fmt: skip
 
 
 @settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -99,11 +102,15 @@ def edited(path: Path, old: bytes, new: bytes) -> Path:
         (b"8 photographs", b"8 paintings", "unusable and ignored.*against 'paintings'"),
         (b"8 photographs", b"8 photographs 9", "unusable and ignored"),
         (b"calibrated_with 4", b"calibrated_with 5", "of 5 Gaussians and ignored, these are 4"),
+        (b"viewpoint 1.5", b"viewpoint nan", "unusable and ignored.*finite"),
+        (b"viewpoint 1.5 2.5 3.5 4.5", b"viewpoint 1.5 2.5 3.5 0.0", "unusable and ignored.*unit.*positive"),
+        (b"viewpoint 1.5 2.5 3.5 4.5", b"viewpoint 1.5 2.5 3.5", "unusable and ignored"),
     ],
 )
 def test_a_damaged_table_does_not_cost_the_file(tmp_path: Path, old: bytes, new: bytes, said: str) -> None:
-    path = tmp_path / "a.ply"
-    save(path, attach(gaussians(4, 0, 0), torch.ones(4)), calibration=Calibration(**{**GOOD, "total": 4}))
+    path, places = tmp_path / "a.ply", (Viewpoint(1.5, 2.5, 3.5, 4.5),)
+    calibration = Calibration(**{**GOOD, "total": 4, "viewpoints": places})
+    save(path, attach(gaussians(4, 0, 0), torch.ones(4)), calibration=calibration)
     loaded = load(edited(path, old, new))
     assert loaded.calibration is None and loaded.gaussians.sigma_d is not None
     assert any(re.search(said, note) for note in loaded.notes), loaded.notes

@@ -129,7 +129,7 @@ def test_numbers(setup: Setup) -> None:
         lambda model: dial_popping(model, cameras[0], 3.0, steps=2).mean,
         lambda model: path_popping(model, cameras[:2], 2.0, steps=2).mean,
         lambda model: check_alignment(model, test).psnr,
-        lambda model: float(bake(model, 2.0).opacities.sum()),
+        lambda model: float(bake(model, 2.0, cameras=cameras).opacities.sum()),
         lambda model: order_by_extinction(model, cameras).cpu().double() @ torch.arange(50).double(),
         lambda model: rankings(model, setup.scene.train[:1])["opacity"].cpu().double() @ torch.arange(50).double(),
     ):

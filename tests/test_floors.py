@@ -35,6 +35,7 @@ FLOORS = [
         "perceptual",
         "training_state",
         "units",
+        "viewpoints",
     },
     {"io", "rasterizers", "adapter"},
     {"render"},

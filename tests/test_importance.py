@@ -16,8 +16,9 @@ from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.importance import fitting_tau, removal_error, seeing, sigma_from_importance, start, typical_distance
+from clod_adapter.importance import fitting_tau, removal_error, seeing, sigma_from_importance, start
 from clod_adapter.render import splat
+from clod_adapter.viewpoints import typical_distance
 from scenes import gaussians, photograph, ring
 
 CONFIG = AttenuationConfig(tau=1 / 255, cut="hard", scene_distance=4.0)
@@ -91,17 +92,6 @@ def test_what_no_view_shows_counts_nothing() -> None:
     assert torch.equal(removal_error(some, []), torch.zeros(50))
 
 
-def test_typical_distance_is_a_geometric_mean() -> None:
-    some = gaussians(30, 0, 0)
-    views = photograph(some, ring(3, 8, 6))
-    logs = [normalized_distances(some.means, view.camera, CONFIG).log() for view in views]
-    torch.testing.assert_close(typical_distance(some, views, CONFIG), (sum(logs) / 3).exp())
-    on_top = some.replace(means=views[0].camera.position.repeat(30, 1))  # of one camera: that view counts as 1e-6
-    found = typical_distance(on_top, views[:2], CONFIG)
-    apart = (views[0].camera.position - views[1].camera.position).norm() / 4
-    torch.testing.assert_close(found, (1e-6 * apart).sqrt().expand(30))
-
-
 @pytest.mark.parametrize("exponent", [1.0, 1.5, 2.5])
 @pytest.mark.parametrize("share", [0.51, 0.6, 0.8, 1.0])
 def test_shares_kept_follow_the_law(share: float, exponent: float, n: int = 1000) -> None:
@@ -156,7 +146,7 @@ def test_the_orders_of_the_start() -> None:
     by_error, by_default = (importance.start(some, views, AdaptConfig(start=name)) for name in ("error", "importance"))
 
     def leaving(dialled: Gaussians) -> Tensor:
-        d = typical_distance(some, views, dialled.attenuation)
+        d = typical_distance(some.means, [view.camera for view in views], dialled.attenuation)
         return extinction_scale(dialled.opacity_logits, dialled.sigma_d, d, dialled.attenuation).argsort()
 
     assert torch.equal(leaving(by_error)[100:180], error.argsort(stable=True)[100:180])

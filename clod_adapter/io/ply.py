@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from clod_adapter.calibration import Calibration
+from clod_adapter.calibration import Calibration, Viewpoint
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
@@ -52,6 +52,12 @@ class Checkpoint:
     path: Path
     calibration: Calibration | None = None
     origin: Origin = NOWHERE
+
+    @property
+    def viewpoints(self) -> tuple[Viewpoint, ...]:
+        """Those of the calibration, relative to the origin as the Gaussians are; empty where the file has none."""
+        stored = self.calibration.viewpoints if self.calibration else ()
+        return tuple(viewpoint.moved([-value for value in self.origin]) for viewpoint in stored)
 
     def hook(self, virtual_scale: float = 1.0) -> Hook:
         """The dial for a renderer that has these Gaussians: it turns their opacities into what is drawn of them.

@@ -11,7 +11,7 @@ from typing import Any
 
 from plyfile import PlyData
 
-from clod_adapter.calibration import AGAINST, Calibration, CalibrationRow
+from clod_adapter.calibration import AGAINST, Calibration, CalibrationRow, Viewpoint
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.foreign import refuse
@@ -21,9 +21,9 @@ from clod_adapter.io.silence import as_before, with_range
 from clod_adapter.io.version import package_version
 
 PREFIX = "clod_adapter "
-# Comments about the calibration: the machine; total, views, width, height and what it is against; and the rows, one
-# comment each.
-MACHINE, EXTENT, ROW = "calibrated_on", "calibrated_with", "calibrated"
+# Comments about the calibration: the machine; total, views, width, height and what it is against; the rows, one
+# comment each; and the viewpoints, one comment each.
+MACHINE, EXTENT, ROW, VIEWPOINT = "calibrated_on", "calibrated_with", "calibrated", "viewpoint"
 _HEADER_LIMIT = 1 << 20  # bytes; a longer header is no header
 
 
@@ -108,7 +108,8 @@ def write_comments(
         c = calibration
         comments.append(f"{PREFIX}{MACHINE} {c.machine}")
         comments.append(f"{PREFIX}{EXTENT} {c.total} {c.views} {c.width} {c.height} {c.against}")
-        comments += [f"{PREFIX}{ROW} {' '.join(map(repr, astuple(row)))}" for row in c.rows]
+        for name, lines in ((ROW, c.rows), (VIEWPOINT, c.viewpoints)):
+            comments += [f"{PREFIX}{name} {' '.join(map(repr, astuple(line)))}" for line in lines]
     return comments
 
 
@@ -117,7 +118,7 @@ def read_calibration(comments: Iterable[str], total: int) -> tuple[Calibration |
 
     A table that is damaged or of other rows is no reason to refuse the file: the picture does not need it.
     """
-    found: dict[str, list[list[str]]] = {MACHINE: [], EXTENT: [], ROW: []}
+    found: dict[str, list[list[str]]] = {MACHINE: [], EXTENT: [], ROW: [], VIEWPOINT: []}
     for words in (comment[len(PREFIX) :].split() for comment in comments if comment.startswith(PREFIX)):
         if words and words[0] in found:
             found[words[0]].append(words[1:])
@@ -128,7 +129,10 @@ def read_calibration(comments: Iterable[str], total: int) -> tuple[Calibration |
         counts = dict(zip(("total", "views", "width", "height"), map(int, extent[:4]), strict=True))
         rows = tuple(CalibrationRow(*map(float, row)) for row in found[ROW])
         against = " ".join(extent[4:]) or AGAINST[0]  # files that do not say are of before there was another
-        calibration = Calibration(rows, **counts, machine=" ".join(machine), against=against)
+        viewpoints = tuple(Viewpoint(*map(float, place)) for place in found[VIEWPOINT])
+        calibration = Calibration(
+            rows, **counts, machine=" ".join(machine), against=against, viewpoints=viewpoints
+        )  # fmt: skip
     except (TypeError, ValueError, ClodError) as error:
         return None, [f"the calibration in the header is unusable and ignored ({error})"]
     if calibration.total != total:
@@ -154,7 +158,7 @@ def read_attenuation(
     """
     ours = [comment[len(PREFIX) :].split(maxsplit=1) for comment in comments if comment.startswith(PREFIX)]
     stored = {words[0]: words[1].strip() for words in ours if len(words) == 2}
-    for other in ("version", MACHINE, EXTENT, ROW):
+    for other in ("version", MACHINE, EXTENT, ROW, VIEWPOINT):
         stored.pop(other, None)
     kinds = {field.name: type(field.default) for field in fields(AttenuationConfig)}
     try:

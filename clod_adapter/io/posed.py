@@ -11,6 +11,7 @@ import numpy as np
 from clod_adapter.errors import ClodError
 from clod_adapter.io.colmap_library import pycolmap
 
+TEST_EVERY = 8  # one view in this many is held out
 HUGE = 1e9  # world units and pixels; what is beyond is damage, and may not fit float32
 
 
@@ -40,6 +41,16 @@ class PosedImage:
         viewmat = self.viewmat.copy()
         viewmat[:3, 3] += viewmat[:3, :3] @ np.asarray(origin, np.float64)
         return replace(self, viewmat=viewmat)
+
+
+def held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:
+    """Names of the images that are for testing: as the scene says, else the 0th and every ``test_every``-th.
+
+    A single image is for training.
+    """
+    if any(image.held_out is not None for image in images):
+        return {image.name for image in images if image.held_out}
+    return {image.name for image in images[::test_every]} if len(images) > 1 else set()
 
 
 def check_posed(image: PosedImage, source: Path) -> PosedImage:

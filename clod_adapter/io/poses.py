@@ -11,12 +11,16 @@ import torch
 from clod_adapter.cameras import Camera, camera_extent, near_plane
 from clod_adapter.errors import ClodError
 from clod_adapter.io.colmap_model import read_model
+from clod_adapter.io.dataparser import trained_frame
 from clod_adapter.io.origin import NOWHERE
+from clod_adapter.io.posed import TEST_EVERY, held_out
 from clod_adapter.io.scene_folder import find_cameras
 from clod_adapter.io.transforms import read_transforms
 
 
-def load_cameras(folder: str | Path, origin: Sequence[float] = NOWHERE) -> tuple[list[Camera], list[str]]:
+def load_cameras(
+    folder: str | Path, origin: Sequence[float] = NOWHERE, *, training: bool = False
+) -> tuple[list[Camera], list[str]]:
     """The cameras that ``scene.load_scene`` would give photographs to, sorted by name, and notes.
 
     A distorted one is the pinhole of the same focal length and centre, not that of its undistorted photograph. Of a
@@ -25,12 +29,17 @@ def load_cameras(folder: str | Path, origin: Sequence[float] = NOWHERE) -> tuple
     Args:
         folder: the scene's, usually the one with ``sparse/0/`` or ``transforms.json``.
         origin: ``[3]`` what the world is to be relative to, in its units: ``Checkpoint.origin``.
+        training: leaves out those that ``load_scene`` holds out.
 
     Raises:
         ClodError: no cameras there, or none that is usable.
     """
-    source = find_cameras(Path(folder))
+    folder = Path(folder)
+    source = find_cameras(folder)
     images, notes = (read_transforms if source.is_file() else read_model)(source)
+    if frame := trained_frame(folder, source):
+        images, notes = frame.bring(images, source), [*notes, frame.note]
+    testing = held_out(images, TEST_EVERY) if training else set()
     cameras = []
     for image in images:
         pinhole = image.camera
@@ -45,4 +54,5 @@ def load_cameras(folder: str | Path, origin: Sequence[float] = NOWHERE) -> tuple
             f"{source}: says no photograph's size, and none of them is there; put them beside it, or w and h into it"
         )
     extent = camera_extent(cameras)
+    cameras = [camera for camera in cameras if camera.name not in testing]
     return [replace(camera, near=near_plane(extent)) if extent else camera for camera in cameras], notes

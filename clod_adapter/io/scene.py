@@ -21,7 +21,7 @@ from clod_adapter.io.dataparser import trained_frame
 from clod_adapter.io.image_cache import ImageCache
 from clod_adapter.io.images import TRANSPARENT, Note, Photograph, read_image
 from clod_adapter.io.origin import NOWHERE
-from clod_adapter.io.posed import HUGE, PosedImage
+from clod_adapter.io.posed import HUGE, TEST_EVERY, PosedImage, held_out
 from clod_adapter.io.scene_folder import find_cameras, find_photographs
 from clod_adapter.io.transforms import MASKS, read_transforms
 
@@ -31,7 +31,7 @@ MOST_AT_ONCE = 8  # photographs of full size in memory
 def load_scene(
     folder: str | Path,
     *,
-    test_every: int = 8,
+    test_every: int = TEST_EVERY,
     max_width: int = 1600,
     origin: Sequence[float] = NOWHERE,
     progress: Callable[[int, int], None] | None = None,
@@ -80,22 +80,16 @@ def load_scene(
     paths, more = find_photographs(folder, cameras, names, raw=not all(image.is_pinhole for image in images))
     notes += more
     present = [(image, path) for image, path in zip(images, paths, strict=True) if path is not None]
-    held_out = _held_out(images, test_every)
-    if not any(image.name not in held_out for image, _ in present):
+    testing = held_out(images, test_every)
+    if not any(image.name not in testing for image, _ in present):
         raise ClodError(f"{folder}: has no photograph to train on, as all that are there are held out; add more")
     present = [(image.relative_to(origin), path) for image, path in present]
     views, sizes, done = _load(present, folder, max_width, progress, cache)
-    train = tuple(view for view in views if view.camera.name not in held_out)
-    test = tuple(view for view in views if view.camera.name in held_out)
+    train = tuple(view for view in views if view.camera.name not in testing)
+    test = tuple(view for view in views if view.camera.name in testing)
     pinhole = all(image.is_pinhole for image, _ in present)
     spared = _left_out(views, sizes, done, pinhole, any(note.startswith(MASKS) for note in notes))
     return in_its_unit(Scene(train, test, (*notes, *_summary(done, len(views))), spared))
-
-
-def _held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:
-    if any(image.held_out is not None for image in images):
-        return {image.name for image in images if image.held_out}
-    return {image.name for image in images[::test_every]} if len(images) > 1 else set()
 
 
 def _load(

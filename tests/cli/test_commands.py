@@ -154,8 +154,8 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("export DIALLED -o lod-meta.json --lod-meta --levels 1,2", "--out names the folder that lod-meta.json is to"),
         ("export DIALLED -o x.ply --sv 2 --camera 003", "--camera names a photograph of a scene; give that too"),
         (
-            "export DIALLED -o x.ply --sv 2 --images SCENE",
-            "--images is for the cameras of --camera, --order",
+            "export DIALLED -o x.ply --images SCENE",
+            "--images is for baking, --order and a .html",
         ),
         (
             "export DIALLED -o x.ply --camera 003 --images SCENE",

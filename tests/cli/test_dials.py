@@ -183,8 +183,8 @@ def test_baking_to_a_budget(clod: Any, dialled: Path, tmp_path: Path) -> None:
         report = json.loads(clod("export", *words, "--json").out)
         return report, report["outputs"][0]
 
-    gaussians = load(dialled).gaussians
-    n = (len(clod_adapter.bake(gaussians, 1.0)) + len(clod_adapter.bake(gaussians, 4.0))) // 2
+    model = load(dialled)
+    n = sum(len(clod_adapter.bake(model.gaussians, s, cameras=model.viewpoints)) for s in (1.0, 4.0)) // 2
     assert baked(dialled, "--keep", n, "-o", "n.ply")[1]["count"] == n == len(load("n.ply").gaussians)
     there = with_times(dialled, tmp_path / "there.ply", machine="another", width=640, height=480)
     report, output = baked(there, "--fps", 250, "-o", "f.ply")

@@ -8,6 +8,7 @@ import shutil
 import struct
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,13 @@ import torch
 from plyfile import PlyData, PlyElement
 
 import clod_adapter
+from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
 from clod_adapter.cli import budgets
 from clod_adapter.cli.export_formats import FORMATS, PACKED, level_paths, suffix_of
 from clod_adapter.errors import ClodError
 from clod_adapter.io.model_safetensors import read_model_safetensors
 from clod_adapter.io.ply import load, save
+from clod_adapter.io.ply_header import write_comments
 from clod_adapter.io.splat_transform import INSTALL
 from clod_adapter.io.writers import WRITERS
 
@@ -61,11 +64,21 @@ def real_tool() -> None:
         pytest.skip(str(error))
 
 
+def baked(path: Path | str, s: float) -> Any:
+    """What a dial value of a file is to be, for the cameras that the file stores."""
+    model = load(path)
+    assert model.viewpoints
+    return clod_adapter.bake(model.gaussians, s, cameras=model.viewpoints)
+
+
 def test_how_it_came_about_goes_along(clod: Any, dialled: Path, tmp_path: Path) -> None:
     assert clod("export", dialled, "--sv", 2, "-o", "a.spz").code == 0
     for source, out in (("a.spz", "b.safetensors"), ("b.safetensors", "c.ply")):
         assert clod("export", source, "-o", out).code == 0
-    assert sum(comment.startswith("baked at s = 2 and d' = 1") for comment in load("c.ply").comments) == 1
+    assert (
+        sum(comment == "baked at s = 2 by clod-adapter for 8 training cameras" for comment in load("c.ply").comments)
+        == 1
+    )
     assert "says         baked at s = 2" in clod("inspect", "c.ply").out
 
 
@@ -83,18 +96,18 @@ def same(a: Any, b: Any) -> bool:
 def test_baking(clod: Any, dialled: Path, tmp_path: Path) -> None:
     done = clod("export", dialled, "--sv", 2, "-o", "plain.ply", "--json")
     report = json.loads(done.out)
-    baked, want = load(tmp_path / "plain.ply"), clod_adapter.bake(load(dialled).gaussians, 2.0)
-    assert done.code == 0 and "lossy" in done.err and "world units from the camera only" in done.err
+    plain, want = load(tmp_path / "plain.ply"), baked(dialled, 2.0)
+    assert done.code == 0 and "lossy" in done.err and "baked for 8 training cameras" in done.err
     assert f"{len(load('plain.ply').gaussians)} of 300 Gaussians, s = 2\n" in done.err
     (output,) = report["outputs"]
-    assert output["count"] == len(baked.gaussians) == len(want) < report["base_count"] == 300
+    assert output["count"] == len(plain.gaussians) == len(want) < report["base_count"] == 300
     assert output | {"count": 0} == {
         "file": "plain.ply", "virtual_scale": 2, "count": 0, "bytes": (tmp_path / "plain.ply").stat().st_size,
     }  # fmt: skip
-    assert same(baked.gaussians, want) and report["notes"] == []
-    names = list(baked.vertex.dtype.names or ())
+    assert same(plain.gaussians, want) and report["notes"] == []
+    names = list(plain.vertex.dtype.names or ())
     assert names[:6] == ["x", "y", "z", "nx", "ny", "nz"] and "sigma_d" not in names
-    assert any(comment.startswith("baked at s = 2 and d' = 1") for comment in baked.comments)
+    assert any(comment == "baked at s = 2 by clod-adapter for 8 training cameras" for comment in plain.comments)
 
 
 def test_baking_for_a_camera(clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,14 +117,14 @@ def test_baking_for_a_camera(clod: Any, capture: Any, dialled: Path, monkeypatch
     few, many = (int(clod_adapter.render(gaussians, camera, s).kept.sum()) for s in (4.0, 1.0))
     n = (few + many) // 2
     done = clod("export", dialled, "--keep", n, *there, "-o", "from_3.ply", "--json")
-    report, baked = json.loads(done.out), load("from_3.ply")
+    report, plain = json.loads(done.out), load("from_3.ply")
     (output,) = report["outputs"]
-    assert report["camera"] == "003.png" and output["count"] == n == len(baked.gaussians) and few < n < many
+    assert report["camera"] == "003.png" and output["count"] == n == len(plain.gaussians) and few < n < many
     want = clod_adapter.render(gaussians, camera, output["virtual_scale"])
-    shown = clod_adapter.render(baked.gaussians, camera)
+    shown = clod_adapter.render(plain.gaussians, camera)
     torch.testing.assert_close(shown.image, want.image, atol=2e-5, rtol=0)
     assert "exact from the camera of 003.png only" in done.err
-    assert any("and the camera at (" in comment for comment in baked.comments)
+    assert any("for the camera at (" in comment for comment in plain.comments)
     seen = []
 
     def times(_: Any, cameras: Any, progress: Any) -> list[tuple[float, float]]:
@@ -124,13 +137,11 @@ def test_baking_for_a_camera(clod: Any, capture: Any, dialled: Path, monkeypatch
 
 
 def test_a_camera_that_two_photographs_are(clod: Any, capture: Any, dialled: Path, monkeypatch: Any) -> None:
-    from dataclasses import replace
+    from clod_adapter.cli import baking
 
-    from clod_adapter.cli import export
-
-    (first, second, *rest), notes = export.load_cameras(capture.scene)
+    (first, second, *rest), notes = baking.load_cameras(capture.scene)
     twins = [replace(first, name="a.jpg"), replace(second, name="a.png")]
-    monkeypatch.setattr(export, "load_cameras", lambda *_: ([*twins, *rest], notes))
+    monkeypatch.setattr(baking, "load_cameras", lambda *_: ([*twins, *rest], notes))
     words = ("export", dialled, "--sv", 2, "--images", capture.scene, "-o", "x.ply", "--camera")
     done = clod(*words, "a")
     assert done.code == 2 and "--camera has 'a', which a.jpg and a.png are; give the whole name" in done.err
@@ -147,9 +158,8 @@ def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
     report = json.loads(clod("export", dialled, "--levels", "1,2.5,4", "-o", "some.set.ply", "--json").out)
     names = ["some.set_s1.ply", "some.set_s2.5.ply", "some.set_s4.ply"]
     assert files(tmp_path) == names == [output["file"] for output in report["outputs"]]
-    gaussians = load(dialled).gaussians
     for name, s in zip(names, (1.0, 2.5, 4.0), strict=True):
-        assert same(load(name).gaussians, clod_adapter.bake(gaussians, s))
+        assert same(load(name).gaussians, baked(dialled, s))
     clod("export", dialled, "--levels", "2", "-o", "one.glb")
     assert "one_s2.glb" in files(tmp_path)
 
@@ -158,10 +168,10 @@ def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
 def test_levels_appear_together_or_not_at_all(
     clod: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException
 ) -> None:
-    from clod_adapter.cli import export
+    from clod_adapter.cli import export_files
 
     (tmp_path / "x_s1.ply").write_bytes(b"of an earlier run")
-    real, calls = export.write, []
+    real, calls = export_files.write, []
 
     def write(*args: Any, **options: Any) -> Any:
         calls.append(args)
@@ -169,7 +179,7 @@ def test_levels_appear_together_or_not_at_all(
             raise failure
         return real(*args, **options)
 
-    monkeypatch.setattr(export, "write", write)
+    monkeypatch.setattr(export_files, "write", write)
     done = clod("export", dialled, "--levels", "1,2,4", "-o", "x.ply")
     assert done.code == (130 if isinstance(failure, KeyboardInterrupt) else 2) and "Traceback" not in done.err
     assert files(tmp_path) == ["x_s1.ply"] and (tmp_path / "x_s1.ply").read_bytes() == b"of an earlier run"
@@ -200,7 +210,7 @@ def test_every_format_is_written_with_its_dial_where_it_has_room(clod: Any, dial
         assert output["count"] == 300
     plain = clod("export", dialled, "-o", f"y{suffix}", "--sv", 2, "--quiet", "--json")
     assert plain.code == 0 and plain.err == ""
-    assert json.loads(plain.out)["outputs"][0]["count"] == len(clod_adapter.bake(load(dialled).gaussians, 2.0))
+    assert json.loads(plain.out)["outputs"][0]["count"] == len(baked(dialled, 2.0))
 
 
 def test_the_dial_stays_as_it_is(clod: Any, dialled: Path, tmp_path: Path) -> None:
@@ -238,37 +248,44 @@ def test_what_the_file_says_of_itself_goes_along(clod: Any, dialled: Path, tmp_p
     assert clod("export", "mip.ply", "--sv", 2, "-o", f"baked{suffix}").code == 0
     assert clod("export", f"baked{suffix}", "-o", "again.ply").code == 0
     header = (tmp_path / "again.ply").read_bytes().partition(b"end_header")[0].decode()
-    for line in ("baked at s = 2 and d' = 1 by clod-adapter: exact there only", "SplatRenderMode: mip"):
+    for line in ("baked at s = 2 by clod-adapter for 8 training cameras", "SplatRenderMode: mip"):
         assert header.count(f"comment {line}\n") == 1
 
 
 def test_far_from_0_doubles_are_noted(clod: Any, dialled: Path, tmp_path: Path) -> None:
-    model, vertex = load(dialled), PlyData.read(str(dialled), mmap=False)["vertex"]
+    vertex = PlyData.read(str(dialled), mmap=False)["vertex"]
     far = vertex.data.astype([(n, "f8" if n in "xyz" else t) for n, t in vertex.data.dtype.descr])
     far["x"] += 437_000.0
-    PlyData([PlyElement.describe(far, "vertex", comments=vertex.comments)]).write(tmp_path / "far.ply")
+    calibration, config = load(dialled).calibration, load(dialled).gaussians.attenuation
+    assert calibration is not None
+    there = replace(calibration, viewpoints=tuple(v.moved([437_000.0, 0, 0]) for v in calibration.viewpoints))
+    comments = write_comments(config, (), calibration=there)
+    PlyData([PlyElement.describe(far, "vertex", comments=comments)]).write(tmp_path / "far.ply")
     report = json.loads(clod("export", "far.ply", "--sv", 2, "-o", "x.ply", "--json").out)
     assert any("x, y and z are doubles" in note for note in report["notes"])
-    want = clod_adapter.bake(model.gaussians, 2.0)
-    assert len(load("x.ply").gaussians) == len(want) and 436_000 < load("x.ply").vertex["x"].mean() < 438_000
+    want = baked("far.ply", 2.0)
+    assert (
+        len(load("x.ply").gaussians) == len(want) == len(baked(dialled, 2.0))
+        and 436_000 < load("x.ply").vertex["x"].mean() < 438_000
+    )
 
 
 def test_an_order_for_prefixes(clod: Any, dialled: Path) -> None:
     gaussians = load(dialled).gaussians
-    rows = clod_adapter.order_by_extinction(gaussians)
+    rows = clod_adapter.order_by_extinction(gaussians, load(dialled).viewpoints)
     done = clod("export", dialled, "--order", "extinction", "-o", "ordered.ply", "--json")
     assert json.loads(done.out)["order"] == "extinction"
     ordered = load("ordered.ply")
     assert same(ordered.gaussians, gaussians.select(rows)) and ordered.calibration == load(dialled).calibration
     assert any("rows in the order" in comment for comment in ordered.comments)
-    n = len(clod_adapter.bake(gaussians, 3.0))
+    n = len(baked(dialled, 3.0))
     assert n < 300 and clod("export", dialled, "--order", "extinction", "--keep", n, "-o", "first.ply").code == 0
     assert torch.equal(load("first.ply").gaussians.means, gaussians.means[rows[:n]])
 
 
 def test_an_order_over_the_scenes_cameras(clod: Any, capture: Any, dialled: Path) -> None:
     gaussians, scene = load(dialled).gaussians, clod_adapter.load_scene(capture.scene)
-    cameras = [view.camera for view in (*scene.train, *scene.test)]
+    cameras = [view.camera for view in scene.train]
     words = ("export", dialled, "--order", "extinction", "--images", capture.scene)
     assert clod(*words, "-o", "all.ply").code == 0
     assert same(load("all.ply").gaussians, gaussians.select(clod_adapter.order_by_extinction(gaussians, cameras)))
@@ -282,9 +299,11 @@ def saved(path: Path, degree: int) -> Any:
     """A model of that SH degree with a dial at ``path``."""
     from scenes import gaussians
 
-    sigma = torch.linspace(0.3, 3, 50)
+    sigma = torch.linspace(0.9, 9, 50)
     model = clod_adapter.attach(gaussians(50, degree, 4), sigma, clod_adapter.AttenuationConfig(reference_distance=3.0))
-    save(path, model)
+    places = (Viewpoint(0.0, 0.0, -4.0, 1.0), Viewpoint(1.0, 0.0, 4.0, 1.0))
+    row = CalibrationRow(1.0, 40.0, 30.0, 0.9, 5.0)
+    save(path, model, calibration=Calibration((row,), 50, 1, 8, 6, "a machine", viewpoints=places))
     return model
 
 
@@ -295,9 +314,9 @@ def test_baked_files_are_the_structs_that_sibr_reads(clod: Any, tmp_path: Path, 
     Position, three normals, (D + 1)^2 x 3 harmonics (channel after channel behind the first three), opacity, three
     scales, four of the rotation: all float32, and nothing between them. D is cfg_args's, so the file's own has to stay.
     """
-    model = saved(tmp_path / "model.ply", degree)
+    saved(tmp_path / "model.ply", degree)
     assert clod("export", "model.ply", "--sv", 2, "-o", "baked.ply").code == 0
-    want = clod_adapter.bake(model, 2.0)
+    want = baked("model.ply", 2.0)
     data = (tmp_path / "baked.ply").read_bytes()
     lines = data[: data.index(b"end_header\n")].split(b"\n")
     assert lines[:2] == [b"ply", b"format binary_little_endian 1.0"]
@@ -318,10 +337,10 @@ def test_baked_files_are_the_structs_that_sibr_reads(clod: Any, tmp_path: Path, 
 def test_a_foreign_reader_finds_the_same(clod: Any, tmp_path: Path, degree: int) -> None:
     gsply = pytest.importorskip("gsply")
     model = saved(tmp_path / "model.ply", degree)
-    rows = clod_adapter.order_by_extinction(model)
+    rows = clod_adapter.order_by_extinction(model, load("model.ply").viewpoints)
     assert clod("export", "model.ply", "--sv", 2, "-o", "baked.ply").code == 0
     assert clod("export", "model.ply", "--order", "extinction", "-o", "ordered.ply").code == 0
-    for name, want in (("baked.ply", clod_adapter.bake(model, 2.0)), ("ordered.ply", model.select(rows))):
+    for name, want in (("baked.ply", baked("model.ply", 2.0)), ("ordered.ply", model.select(rows))):
         read = gsply.plyread(str(tmp_path / name))
         pairs = [
             (read.means, want.means), (read.scales, want.log_scales), (read.quats, want.quats),
@@ -354,8 +373,7 @@ def test_a_streaming_set(clod: Any, dialled: Path, tmp_path: Path, tool: Any) ->
     (tmp_path / "out").mkdir()  # empty, and so not in the way
     done = clod("export", dialled, "--levels", "1,2,4", "--lod-meta", "-o", "out", "--json")
     (output,) = json.loads(done.out)["outputs"]
-    gaussians = load(dialled).gaussians
-    counts = [len(clod_adapter.bake(gaussians, s)) for s in (1.0, 2.0, 4.0)]
+    counts = [len(baked(dialled, s)) for s in (1.0, 2.0, 4.0)]
     levels = [{"virtual_scale": s, "count": n} for s, n in zip((1, 2, 4), counts, strict=True)]
     assert output["levels"] == levels and output["count"] == sum(counts)
     assert files(tmp_path) == ["out", "out/0_0", "out/0_0/a.webp", "out/lod-meta.json"]
@@ -413,7 +431,7 @@ def test_ctrl_c_ends_the_tool_too(clod: Any, dialled: Path, tmp_path: Path, tool
             raise KeyboardInterrupt
         return ""
 
-    monkeypatch.setattr("clod_adapter.cli.export.duration", enough)
+    monkeypatch.setattr("clod_adapter.cli.export_files.duration", enough)
     done = clod("export", dialled, "--levels", "1,2", "--lod-meta", "-o", "out")
     assert done.code == 130 and files(tmp_path) == []
 
@@ -432,8 +450,7 @@ def test_without_the_tool_it_is_refused_before_any_work(
 
 @pytest.mark.usefixtures("real_tool")
 def test_the_real_tool(clod: Any, dialled: Path, tmp_path: Path) -> None:
-    gaussians = load(dialled).gaussians
-    counts = [len(clod_adapter.bake(gaussians, s)) for s in (1.0, 4.0)]
+    counts = [len(baked(dialled, s)) for s in (1.0, 4.0)]
     assert clod("export", dialled, "--levels", "1,4", "--lod-meta", "-o", "out").code == 0
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     assert meta["counts"] == counts and meta["lodLevels"] == 2

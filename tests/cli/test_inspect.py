@@ -44,7 +44,7 @@ def test_a_dial_and_its_calibration(clod: Any, files: Path) -> None:
 def test_what_a_file_says_of_itself(clod: Any, files: Path, tmp_path: Path) -> None:
     assert clod("export", files / "dial.ply", "--sv", 2, "-o", tmp_path / "baked.ply").code == 0
     out = clod("inspect", tmp_path / "baked.ply").out
-    assert "\nsays         baked at s = 2 and d' = 1 by clod-adapter: exact there only\n" in out
+    assert "\nsays         baked at s = 2 by clod-adapter for 8 training cameras\n" in out
     text = (tmp_path / "baked.ply").read_bytes().replace(b"comment baked", b"comment " + 400 * b"long " + b"baked", 1)
     (tmp_path / "baked.ply").write_bytes(text)
     assert max(map(len, clod("inspect", tmp_path / "baked.ply").out.splitlines())) < 120

@@ -30,6 +30,21 @@ def test_as_with_photographs(capture: Any, origin: tuple[float, float, float]) -
         assert (camera.width, camera.height) == (view.camera.width, view.camera.height)
 
 
+def test_training_cameras_alone(capture: Any) -> None:
+    scene = clod_adapter.load_scene(capture.scene)
+    names = [camera.name for camera in load_cameras(capture.scene, training=True)[0]]
+    assert names == [view.camera.name for view in scene.train] and len(names) == 8
+
+
+def test_the_frame_that_nerfstudio_trained_in(capture: Any, tmp_path: Path) -> None:
+    shutil.copytree(capture.scene, tmp_path / "scene")
+    frame = {"transform": [[0, 1, 0, 1], [-1, 0, 0, 2], [0, 0, 1, 3]], "scale": 0.5}
+    (tmp_path / "scene" / "dataparser_transforms.json").write_text(json.dumps(frame))
+    want = clod_adapter.load_scene(tmp_path / "scene").train[0].camera
+    camera = load_cameras(tmp_path / "scene", training=True)[0][0]
+    assert torch.equal(camera.viewmat, want.viewmat) and camera.near == want.near
+
+
 def test_a_scene_in_a_small_unit_has_a_near_plane_that_fits(tmp_path: Path) -> None:
     size = 1e-3
     cameras = [replace(c, viewmat=_moved(c.viewmat, size)) for c in scenes.ring(4, 20, 10)]

@@ -1,0 +1,121 @@
+"""How good a plain file is beside the dial that it is baked from, at the same count.
+
+    clod-adapt ci_banana/pretrained.ply --images ci_banana --max-sv 5 --iters 400 -o clod.ply
+    python benchmarks/bake.py clod.ply ci_banana
+    python benchmarks/bake.py --table                      # the rows as a Markdown table
+
+The model is an adapted file of the capture. At each dial value the count is the dial's mean over the held-out views,
+and PSNR is on these. Files of that count (or of s = 1, where a file keeps fewer there) are baked for:
+
+- ``d' = 1``: one distance for all Gaussians, ``scene_distance``, with the opacities of the dial value itself, as
+  earlier versions did;
+- ``images``: all training cameras, as ``clod-adapt export --images`` does;
+- ``stored``: those that adapting stores in the file;
+- ``placed``: those that are placed where nothing is known.
+
+``at s`` is a file for all training cameras at the dial value itself, with the count that it then has. Each run adds a
+row to ``results/bake.jsonl``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from common import RESULTS, append, capture
+
+import clod_adapter as clod
+from clod_adapter.attenuation import attenuate
+from clod_adapter.calibration import Viewpoint
+from clod_adapter.cli.baking import PLACED
+from clod_adapter.cli.budgets import VIEWPOINTS
+from clod_adapter.extinction import extinction_scale
+from clod_adapter.importance import spread
+from clod_adapter.viewpoints import viewpoint_of
+
+FILE = "bake.jsonl"
+DIALS = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", nargs="?", help="an adapted PLY")
+    parser.add_argument("scene", nargs="?", help="its capture")
+    parser.add_argument("--label", default="", help="how the model was adapted")
+    parser.add_argument("--table", action="store_true", help="print the rows there are")
+    args = parser.parse_args()
+    if args.model and args.scene:
+        measure(args.model, args.scene, args.label)
+    if args.table:
+        print_table()
+
+
+def measure(model: str, scene: str, label: str) -> None:
+    adapted, photographs = clod.load(model).gaussians, clod.load_scene(capture(scene))
+    config = adapted.attenuation
+    if config is None:
+        raise SystemExit(f"{model} has no sigma_d")
+    training = [view.camera for view in photographs.train]
+    cameras: dict[str, Sequence[clod.Camera | Viewpoint]] = {
+        "images": training,
+        "stored": [viewpoint_of(camera, adapted.means, config) for camera in spread(training, VIEWPOINTS)],
+        "placed": clod.place(adapted, views=PLACED),
+    }
+
+    def psnr(gaussians: clod.Gaussians) -> float:
+        return clod.evaluate(gaussians, photographs.test, [1.0])[0].psnr
+
+    rows = []
+    for s in [s for s in DIALS if s <= config.max_sv]:
+        dial = clod.evaluate(adapted, photographs.test, [s])[0]
+        count = round(dial.kept)
+        counts, found = {"dial": dial.kept}, {"dial": dial.psnr}
+        files = {"d' = 1": at_one_distance(adapted, count)}
+        for name, places in cameras.items():
+            at = clod.dial_for(adapted, keep=count, cameras=places, baked=True).virtual_scale
+            files[name] = clod.bake(adapted, at, cameras=places)
+        files["at s"] = clod.bake(adapted, s, cameras=training)
+        for name, gaussians in files.items():
+            counts[name], found[name] = len(gaussians), psnr(gaussians)
+        rows.append({"virtual_scale": s, "count": counts, "psnr": found})
+    append(FILE, {
+        "benchmark": "bake", "model": Path(model).name, "label": label, "scene": scene, "gaussians": len(adapted),
+        "views": len(photographs.test), "training_views": len(training), "stored": len(cameras["stored"]),
+        "placed": len(cameras["placed"]), "max_sv": config.max_sv, "rows": rows,
+    })  # fmt: skip
+
+
+def at_one_distance(gaussians: clod.Gaussians, count: int) -> clod.Gaussians:
+    """The file of ``count`` rows, fewer where s = 1 keeps fewer, in which all Gaussians are at d' = 1."""
+    assert gaussians.sigma_d is not None and gaussians.attenuation is not None
+    logits, sigma, config = gaussians.opacity_logits, gaussians.sigma_d, gaussians.attenuation
+    ones = torch.ones_like(logits)
+    leaving = extinction_scale(logits, sigma, ones, config).sort(descending=True).values
+    at = attenuate(logits, sigma, ones, max(float(leaving[count]), 1.0), config)
+    opacities = at.drawn.clamp(1e-9, 1 - 1e-7)
+    return clod.detach(gaussians.replace(opacity_logits=opacities.logit())).select(at.keep)
+
+
+def print_table() -> None:
+    """PSNR on the held-out views: the dial's, and by how much each file is above it."""
+    for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
+        row: dict[str, Any] = json.loads(line)
+        print(f"\n{row['scene']}, {row['gaussians']:,} Gaussians, {row['label']}")
+        names = [name for name in row["rows"][0]["psnr"] if name != "dial"]
+        print(f"| s | count | dial | {' | '.join(names)} |")
+        print("|---" * (3 + len(names)) + "|")
+        for point in row["rows"]:
+            dial, counts = point["psnr"]["dial"], point["count"]
+            cells = []
+            for name in names:
+                other = f" @ {counts[name]:,}" if abs(counts[name] - counts["dial"]) > 1 else ""
+                cells.append(f"{point['psnr'][name] - dial:+.2f}{other}")
+            print(f"| {point['virtual_scale']:g} | {counts['dial']:,.0f} | {dial:.2f} | {' | '.join(cells)} |")
+
+
+if __name__ == "__main__":
+    main()
