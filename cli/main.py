@@ -37,8 +37,16 @@ def main(argv: list[str] | None = None) -> int:
 
     A report that has an exit_code of its own ends with that.
     """
+    print_any_name()
     with silence_but_first():
         return _main(argv)
+
+
+def print_any_name() -> None:
+    """Makes stdout and stderr escape what their encoding has no letter for: a file's name may hold it."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _main(argv: list[str] | None) -> int:

@@ -27,6 +27,7 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.version import package_version
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
+from clod_adapter.text import file_name
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ def _shorter(name: str) -> tuple[str, ...]:
 
 def files(views: Sequence[View]) -> list[Path]:
     """For each view the PNG's name: that of its photograph, whose suffix stays where names would else collide."""
-    paths = [Path(*PureWindowsPath(view.camera.name).parts) for view in views]
+    paths = [Path(file_name(str(Path(*PureWindowsPath(view.camera.name).parts)))) for view in views]
     short = [path.with_suffix(".png") for path in paths]
     return short if len(set(short)) == len(short) else [path.with_name(f"{path.name}.png") for path in paths]
 

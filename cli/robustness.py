@@ -26,6 +26,7 @@ from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.version import package_version
 from clod_adapter.report.robustness_figure import robustness_figure
 from clod_adapter.robustness import Outcome, adapt_at_range, baseline, scene_fingerprint
+from clod_adapter.text import as_text
 from clod_adapter.train import Progress
 
 COLUMNS = (
@@ -164,7 +165,7 @@ def describe(
 
 
 def write_outputs(report: dict[str, Any], outputs: dict[str, Path], scene: str) -> None:
-    title = f"{scene}: the dial after the fact, by range; mean of {report['views']} held-out photographs"
+    title = f"{as_text(scene)}: the dial after the fact, by range; mean of {report['views']} held-out photographs"
     robustness_figure(outputs["png"], report["cells"], title)
     with atomic_path(outputs["csv"]) as part, open(part, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS)
