@@ -12,6 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+tqdm.monitor_interval = 0  # its thread would watch bars that are drawn at every step anyway, and may never start
 LINE_EVERY = 10.0  # seconds between progress lines where stderr is no terminal
 BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from functools import partial
 from pathlib import Path
@@ -24,6 +23,7 @@ from clod_adapter.io.origin import NOWHERE
 from clod_adapter.io.posed import HUGE, PosedImage
 from clod_adapter.io.scene_folder import find_cameras, find_photographs
 from clod_adapter.io.transforms import MASKS, read_transforms
+from clod_adapter.workers import in_order
 
 MOST_AT_ONCE = 8  # photographs of full size in memory
 
@@ -109,11 +109,11 @@ def _load(
     cache = None if all(image.is_pinhole for image, _ in present) else _cache_folder(folder)
     views, sizes, notes = list[View](), list[tuple[int, int]](), list[Note]()
     workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
-    with warnings.catch_warnings(), ThreadPoolExecutor(workers) as pool:
+    with warnings.catch_warnings():
         # Large, but below the size at which it is refused: photographs are no attack.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         loads = [partial(_load_view, image, path, cache, max_width) for image, path in present]
-        for (view, size, remarks), load in zip(pool.map(lambda load: load(), loads), loads, strict=True):
+        for (view, size, remarks), load in zip(in_order(loads, workers), loads, strict=True):
             views.append(keep.store(view, partial(_again, load)) if keep else view)
             sizes.append(size)
             notes += remarks
