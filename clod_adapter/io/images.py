@@ -83,7 +83,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     try:
         with Image.open(path) as source:
             yield source
-    except ClodError:
+    except (ClodError, MemoryError):
         raise
     except UnidentifiedImageError as error:
         raise ClodError(

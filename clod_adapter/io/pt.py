@@ -117,6 +117,8 @@ def _load(path: Path) -> Any:
         raise ClodError(
             f"{path}: holds more than tensors, or is damaged, and was not unpickled; export the checkpoint as a PLY"
         ) from error
+    except MemoryError:
+        raise
     except Exception as error:  # torch lets RuntimeError, KeyError, TypeError and more through
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ClodError(f"{path}: is damaged ({reason}); copy or export it again") from error
