@@ -8,7 +8,7 @@ import sys
 from clod_adapter.errors import ClodError
 from clod_adapter.memory import in_words
 
-ADDRESSES = 1_600_000_000  # bytes that the libraries and the smallest run take of a process's address space
+ADDRESSES = 1_800_000_000  # bytes that the libraries and the smallest run take of a process's address space
 # Of RuntimeErrors (torch's allocators, Python's threads) and of ImportErrors (the loader's).
 SAYINGS = (
     "can't allocate memory", "not enough memory", "out of memory", "std::bad_alloc", "can't start new thread",

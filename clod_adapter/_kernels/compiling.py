@@ -13,7 +13,7 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 from clod_adapter.errors import ClodError
 
-if config.DISABLE_JIT:
+if config.DISABLE_JIT:  # type: ignore[attr-defined]
     raise ClodError("NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it")
 
 # A kernel takes constants and functions from other files, so the stamp is of all kernels' sources.

@@ -37,7 +37,7 @@ def test_an_address_space_too_small_for_the_libraries(capture: Any, tmp_path: Pa
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (
         "clod-adapt: error: the address space is limited to 1.23 GB (ulimit -v), and torch and LLVM alone take "
-        "1.6 GB; raise the limit\n"
+        "1.8 GB; raise the limit\n"
     )
     assert list(tmp_path.iterdir()) == []
 
