@@ -14,10 +14,11 @@ from clod_adapter.cli.alignment import require_alignment
 from clod_adapter.cli.cells import Cell, cells_of
 from clod_adapter.cli.console import Console, Meter, duration
 from clod_adapter.cli.devices import on_device, pick_device
-from clod_adapter.cli.files import check_output, labels, make_folder
+from clod_adapter.cli.files import labels, make_folder
 from clod_adapter.cli.inputs import read_checkpoint, read_scene
 from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.kernels import prepare_kernels
+from clod_adapter.cli.outputs import check_outputs
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, write_report
 from clod_adapter.cli.settings import make_configs
 from clod_adapter.errors import ClodError
@@ -57,8 +58,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
                     notes += require_alignment(checkpoint, scene, args, console)[1]
     make_folder(folder)  # only now: what cannot be read, or does not fit, leaves none behind
     make_folder(folder / "cells")
-    for path in outputs.values():
-        check_output(path, args.ply)
+    check_outputs(outputs.values(), args.ply, args.images)
     with stop.listening():
         with watch.time("cells"):
             interrupted = run_cells(missing, scene, found, console, stop)
