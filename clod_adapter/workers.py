@@ -10,7 +10,7 @@ import _thread
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
@@ -120,7 +120,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget)
 
 
-def in_order(calls: Iterable[Callable[[], Result]], count: int) -> Iterator[Result]:
+def in_order(calls: Iterable[Callable[[], Result]], count: int) -> Generator[Result, None, None]:
     """The results of the calls, in their order, made on ``count`` workers; at most twice as many are ahead.
 
     Where one raises, or the iterator is closed, those that were begun are waited for and no more are made.

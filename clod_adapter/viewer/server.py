@@ -57,7 +57,7 @@ class Server(ThreadingHTTPServer):
     # Waited for when it is closed: one that still held a tensor while the interpreter ends would abort the process.
     daemon_threads = False
     block_on_close = (
-        False  # here and not by socketserver, which also waits for threads that a Ctrl-C kept from starting
+        False  # server_close waits; socketserver's would for threads, too, that a Ctrl-C kept from starting
     )
     allow_reuse_address = sys.platform != "win32"  # there it would let two servers share a port
 

@@ -94,5 +94,5 @@ def test_memory_that_a_photograph_lacks_is_not_its_damage(capture: Any, monkeypa
 
     monkeypatch.setattr(images, "_rgb", short)
     with pytest.raises(MemoryError) as found:
-        read_image(capture.scene / "images" / "000.png", 64, 48)
+        read_image(capture.scene / "images" / "000.png", 64, 48, 1600)
     assert not isinstance(found.value, ClodError)
