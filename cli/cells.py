@@ -13,6 +13,7 @@ from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.version import package_version
 from clod_adapter.robustness import BASELINE_SHARES, Outcome
+from clod_adapter.text import as_text
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Cell:
         if outcome.adapter:
             save_adapter(self.adapter_file, outcome.adapter)
         cell = {
-            "checkpoint": self.label, "max_sv": self.config.max_sv if self.config else None,
+            "checkpoint": as_text(self.label), "max_sv": self.config.max_sv if self.config else None,
             "adapter": str(self.adapter_file) if outcome.adapter else None, "seconds": round(outcome.seconds, 3),
             "rows": outcome.rows, "distribution": outcome.distribution, "machine": machine(), "key": self.key(),
         }  # fmt: skip

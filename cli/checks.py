@@ -14,7 +14,8 @@ from clod_adapter.cli.checks_memory import check_memory
 from clod_adapter.cli.checks_plan import check_plan
 from clod_adapter.cli.checks_view import check_view
 from clod_adapter.cli.dials import given_budget
-from clod_adapter.cli.files import Outputs, check_output, check_ply_name, labels
+from clod_adapter.cli.files import Outputs, check_ply_name, labels
+from clod_adapter.cli.outputs import check_no_input, check_outputs
 from clod_adapter.cli.settings import make_config, make_configs
 from clod_adapter.errors import ClodError
 from clod_adapter.io.ply_header import PREFIX, ROW, all_comments, read_header
@@ -28,19 +29,17 @@ def check_adapt(args: Namespace) -> None:
     make_config(args)
     check_plan(args)
     check_memory(args)
-    Outputs.of(args.ply, args.out).check([args.ply])
-    if args.report:
-        check_page(Outputs.of(args.ply, args.out).ply.with_suffix(".html"), ["rendering", "adapting"], [args.ply])
     check_checkpoint(args.ply)
     if args.images is not None:
         check_scene(args.images)
+    outputs, page = Outputs.of(args.ply, args.out), list[Path]()
+    if args.report:
+        page = page_files(outputs.ply.with_suffix(".html"), ["rendering", "adapting"])
+    outputs.check([args.ply], args.images, page)
 
 
 def check_evaluate(args: Namespace) -> None:
     check_dials(args, args.model)
-    if args.report:
-        inputs = [args.model, *args.against, *([args.base] if args.base else [])]
-        check_page(Path(args.report), ["rendering"], inputs)
     labels(args.against)
     for path in (args.model, *args.against):
         check_checkpoint(path)
@@ -52,6 +51,10 @@ def check_evaluate(args: Namespace) -> None:
                 "--against"
             )
     check_scene(args.images)
+    if args.report:
+        inputs = [args.model, *args.against, *([args.base] if args.base else [])]
+        page, *charts = page_files(Path(args.report), ["rendering"])
+        check_outputs([page], inputs, args.images, beside=charts)
 
 
 def check_render(args: Namespace) -> None:
@@ -64,9 +67,9 @@ def check_render(args: Namespace) -> None:
 def check_apply(args: Namespace) -> None:
     out = Path(args.out)
     check_ply_name(out, "--out")
-    check_output(out, [args.base, args.adapter])
     if not Path(args.adapter).is_file():
         raise ClodError(f"{args.adapter}: No such file; give the .safetensors that clod-adapt wrote")
+    check_outputs([out], [args.base, args.adapter])
     check_checkpoint(args.base)
 
 
@@ -79,15 +82,17 @@ def check_robustness(args: Namespace) -> None:
     for path in args.ply:
         check_checkpoint(path)
     check_scene(args.images)
+    folder = Path(args.out)
+    there = [*folder.glob("robustness.*"), *(folder / "cells").glob("*")]
+    check_no_input(there, args.ply, args.images)
 
 
-def check_page(path: Path, charts: list[str], inputs: list[str]) -> None:
-    """Refuses a page that could not be drawn or written, or one of its charts."""
+def page_files(path: Path, charts: list[str]) -> list[Path]:
+    """A page and its charts; refuses a page that could not be drawn."""
     check_matplotlib()
     if path.suffix.lower() != ".html":
         raise ClodError(f"{path}: --report names the page to write, so it must end in .html")
-    for file in (path, *(chart_file(path, name) for name in charts)):
-        check_output(file, inputs)
+    return [path, *(chart_file(path, name) for name in charts)]
 
 
 def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fps",)) -> None:

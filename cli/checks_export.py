@@ -8,7 +8,7 @@ from pathlib import Path
 from clod_adapter.cli import checks
 from clod_adapter.cli.dials import given_budget
 from clod_adapter.cli.export_formats import FORMATS, LOD_META, PACKED, PAGE, level_paths, suffix_of, suffixes
-from clod_adapter.cli.files import check_output
+from clod_adapter.cli.outputs import check_outputs
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import check_target
 from clod_adapter.io.splat_transform import SplatTransform
@@ -17,7 +17,9 @@ from clod_adapter.io.splat_transform import SplatTransform
 def check_export(args: Namespace) -> None:
     bakes = bool(args.levels) or args.sv is not None or given_budget(args) is not None
     check_together(args, bakes)
-    check_outputs(args)
+    if args.images is not None:
+        checks.check_scene(args.images)
+    check_export_outputs(args)
     checks.check_dials(args, args.model, measured=measured(args))
     checks.check_checkpoint(args.model)
     dial = checks.has_dial(args.model)
@@ -27,8 +29,6 @@ def check_export(args: Namespace) -> None:
         raise ClodError(f"{args.model}: has no sigma_d, so there is no order to put its rows in; adapt it first")
     if not args.lod_meta:
         check_format(args, bakes, dial)
-    if args.images is not None:
-        checks.check_scene(args.images)
     if args.lod_meta or suffix_of(Path(args.out)) in PACKED:
         SplatTransform.find()
 
@@ -60,12 +60,12 @@ def check_together(args: Namespace, bakes: bool) -> None:
         raise ClodError(f"--images is for baking, --order and a {PAGE}; give one of them with it, as in --sv 2")
 
 
-def check_outputs(args: Namespace) -> None:
+def check_export_outputs(args: Namespace) -> None:
     out = Path(args.out)
     if not args.lod_meta:
         for path in level_paths(out, args.levels) if args.levels else [out]:
             suffix_of(path)
-            check_output(path, [args.model])
+            check_outputs([path], [args.model], args.images)
         return
     if out.suffix.lower() in (".json", *suffixes()):
         raise ClodError(f"{out}: with --lod-meta, --out names the folder that {LOD_META} is to be in, not a file")

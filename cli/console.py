@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from clod_adapter.io.silence import WARNING
 
+tqdm.monitor_interval = 0  # its thread would watch bars that are drawn at every step anyway, and may never start
 LINE_EVERY = 10.0  # seconds between progress lines where stderr is no terminal
 BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 

@@ -12,8 +12,9 @@ import torch
 from clod_adapter.cli import adapt
 from clod_adapter.cli.commands import ADAPT
 from clod_adapter.cli.console import Console, duration
-from clod_adapter.cli.files import Outputs, check_output, make_folder
+from clod_adapter.cli.files import Outputs, make_folder
 from clod_adapter.cli.kernels import announced_compiling, prepare_kernels
+from clod_adapter.cli.outputs import check_outputs
 from clod_adapter.cli.parser import make_parser
 from clod_adapter.cli.report import Stopwatch
 from clod_adapter.demo.pictures import Panel, dial_strip, quality_curve
@@ -37,8 +38,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     make_folder(folder)
     capture, base, model = folder / "capture", folder / "base.ply", folder / "gallery.ply"
     pictures = {"dial": folder / "dial.png", "curve": folder / "curve.png"}
-    for path in (base, *vars(Outputs.of(str(base), str(model))).values(), *pictures.values()):
-        check_output(path, [])
+    check_outputs((), (), beside=[*vars(Outputs.of(str(base), str(model))).values(), *pictures.values()])
+    if base.exists() and not capture.exists():
+        raise ClodError(f"{base}: is there without {capture}, so it is not the demo's; choose another --out")
     prepare_kernels(console)
     with announced_compiling(console):
         prepare(capture, base, console)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from glob import escape
 from pathlib import Path
 
+from clod_adapter.cli.outputs import check_no_input, check_outputs
 from clod_adapter.errors import ClodError
-from clod_adapter.io.atomic import check_target
 
 
 @dataclass(frozen=True)
@@ -29,24 +30,15 @@ class Outputs:
         """What ``--resume`` goes on from; there only while a run is not finished."""
         return self.ply.with_suffix(".resume.safetensors")
 
-    def check(self, inputs: Sequence[str]) -> None:
-        """``check_output`` for each of them."""
+    def check(self, inputs: Sequence[str], scene: str | None, more: Sequence[Path]) -> None:
+        """``check_outputs`` for them, the states and chunks of a run, and ``more``."""
         check_ply_name(self.ply, "--out")
-        for path in (*vars(self).values(), self.state):
-            check_output(path, inputs)
+        check_outputs([self.ply], inputs, scene, beside=[self.adapter, self.report, *more])
+        chunks = self.ply.parent.glob(f"{escape(self.ply.stem)}.*.safetensors")  # which are looked into when found
+        check_no_input([self.state, *chunks], inputs, scene)
 
     def names(self) -> dict[str, str]:
         return {name: str(path) for name, path in vars(self).items()}
-
-
-def check_output(path: Path, inputs: Sequence[str]) -> None:
-    """Refuses, before any work is done, an output that could not be written or would replace an input."""
-    check_target(path)
-    if path.is_dir():
-        raise ClodError(f"{path}: is a folder; give the name of a file in it")
-    for given in map(Path, inputs):
-        if path.exists() and given.exists() and path.samefile(given):
-            raise ClodError(f"{path}: is an input file, which is never overwritten; choose another output")
 
 
 def check_ply_name(path: Path, option: str) -> None:

@@ -20,6 +20,7 @@ from clod_adapter.cli.help_view import VIEW
 from clod_adapter.cli.interrupts import sigterm_as_interrupt
 from clod_adapter.cli.launch import launched, silence_but_first
 from clod_adapter.cli.parser import Parser, make_parser
+from clod_adapter.cli.shortages import check_addresses, shortage
 from clod_adapter.errors import ClodError
 from clod_adapter.io.version import package_version
 
@@ -37,8 +38,16 @@ def main(argv: list[str] | None = None) -> int:
 
     A report that has an exit_code of its own ends with that.
     """
+    print_any_name()
     with silence_but_first():
         return _main(argv)
+
+
+def print_any_name() -> None:
+    """Makes stdout and stderr escape what their encoding has no letter for: a file's name may hold it."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _main(argv: list[str] | None) -> int:
@@ -61,10 +70,12 @@ def _main(argv: list[str] | None) -> int:
         # The reader of a pipe is gone; without this Python complains once more when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except MemoryError as error:
-        print(f"{PROG}: error: there is not enough memory ({error or 'allocating'}); free some", file=sys.stderr)
-        return 2
-    except OSError as error:
+    except (MemoryError, RuntimeError, ImportError, OSError) as error:
+        if (line := shortage(error)) is not None:
+            print(f"{PROG}: error: {line}", file=sys.stderr)
+            return 2
+        if not isinstance(error, OSError):
+            raise
         name = f"{error.filename}: " if error.filename is not None else ""
         print(f"{PROG}: error: {name}{error.strerror or error}; check the path and its permissions", file=sys.stderr)
         return 2
@@ -111,6 +122,7 @@ def import_command(command: Command, args: argparse.Namespace) -> Any:
     """The command's module, with torch and all, which takes a second or two."""
     from clod_adapter.cli.console import Console
 
+    check_addresses()
     name = f"clod_adapter.cli.{command.module}"
     if name in sys.modules:
         return sys.modules[name]

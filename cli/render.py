@@ -10,7 +10,7 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from PIL import Image
+from PIL import Image, PngImagePlugin
 from torch import Tensor
 
 from clod_adapter.cameras import Camera, Scene, View
@@ -20,6 +20,7 @@ from clod_adapter.cli.devices import on_device, pick_device
 from clod_adapter.cli.evaluate import choose_dials
 from clod_adapter.cli.inputs import read_checkpoint, read_scene
 from clod_adapter.cli.kernels import prepare_kernels
+from clod_adapter.cli.outputs import check_no_input, check_ours
 from clod_adapter.cli.report import Stopwatch
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
@@ -27,6 +28,7 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.version import package_version
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
+from clod_adapter.text import file_name
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,10 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     model = on_device(read_checkpoint(args.model, console, args.activated), device)
     scene = read_scene(args.images, console, model.origin)
     views = pick_views(scene, args.views)
+    written = [out / name for name in files(views)]
+    check_no_input(written, [args.model], args.images)
+    for path in written:
+        check_ours(path)
     solved, notes = solve_dials(args, model, [view.camera for view in views], console)
     dials, beyond = choose_dials(solved or [1.0], model.gaussians.attenuation)
     notes += beyond
@@ -102,7 +108,7 @@ def _shorter(name: str) -> tuple[str, ...]:
 
 def files(views: Sequence[View]) -> list[Path]:
     """For each view the PNG's name: that of its photograph, whose suffix stays where names would else collide."""
-    paths = [Path(*PureWindowsPath(view.camera.name).parts) for view in views]
+    paths = [Path(file_name(str(Path(*PureWindowsPath(view.camera.name).parts)))) for view in views]
     short = [path.with_suffix(".png") for path in paths]
     return short if len(set(short)) == len(short) else [path.with_name(f"{path.name}.png") for path in paths]
 
@@ -127,7 +133,9 @@ def write_png(path: Path, pixels: Tensor) -> None:
     except OSError as error:
         raise ClodError(f"{path.parent}: cannot be made ({error.strerror or error}); choose another --out") from error
     with atomic_path(path) as temporary:
-        Image.fromarray(pixels.cpu().numpy()).save(temporary)
+        about = PngImagePlugin.PngInfo()
+        about.add_text("Software", f"clod-adapter {package_version()}")  # by which a later run knows it for its own
+        Image.fromarray(pixels.cpu().numpy()).save(temporary, pnginfo=about)
 
 
 def summary(pictures: Sequence[Picture], dials: Sequence[float], total: int, out: Path) -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.text import as_text
 
 if TYPE_CHECKING:
     from clod_adapter.evaluate import Row
@@ -81,11 +82,13 @@ def _cpu_name() -> str:
 
 
 def jsonable(value: Any) -> Any:
-    """``value`` with what JSON has no word for (an infinite PSNR) as null."""
+    """``value`` with what JSON has no word for (an infinite PSNR) as null, and names of files as text."""
     if isinstance(value, dict):
-        return {key: jsonable(entry) for key, entry in value.items()}
+        return {jsonable(key): jsonable(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [jsonable(entry) for entry in value]
+    if isinstance(value, str):
+        return as_text(value)
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

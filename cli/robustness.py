@@ -14,10 +14,11 @@ from clod_adapter.cli.alignment import require_alignment
 from clod_adapter.cli.cells import Cell, cells_of
 from clod_adapter.cli.console import Console, Meter, duration
 from clod_adapter.cli.devices import on_device, pick_device
-from clod_adapter.cli.files import check_output, labels, make_folder
+from clod_adapter.cli.files import labels, make_folder
 from clod_adapter.cli.inputs import read_checkpoint, read_scene
 from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.cli.kernels import prepare_kernels
+from clod_adapter.cli.outputs import check_outputs
 from clod_adapter.cli.report import Stopwatch, machine, report_dials, write_report
 from clod_adapter.cli.settings import make_configs
 from clod_adapter.errors import ClodError
@@ -26,6 +27,7 @@ from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.version import package_version
 from clod_adapter.report.robustness_figure import robustness_figure
 from clod_adapter.robustness import Outcome, adapt_at_range, baseline, scene_fingerprint
+from clod_adapter.text import as_text
 from clod_adapter.train import Progress
 
 COLUMNS = (
@@ -56,8 +58,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
                     notes += require_alignment(checkpoint, scene, args, console)[1]
     make_folder(folder)  # only now: what cannot be read, or does not fit, leaves none behind
     make_folder(folder / "cells")
-    for path in outputs.values():
-        check_output(path, args.ply)
+    check_outputs(outputs.values(), args.ply, args.images)
     with stop.listening():
         with watch.time("cells"):
             interrupted = run_cells(missing, scene, found, console, stop)
@@ -164,7 +165,7 @@ def describe(
 
 
 def write_outputs(report: dict[str, Any], outputs: dict[str, Path], scene: str) -> None:
-    title = f"{scene}: the dial after the fact, by range; mean of {report['views']} held-out photographs"
+    title = f"{as_text(scene)}: the dial after the fact, by range; mean of {report['views']} held-out photographs"
     robustness_figure(outputs["png"], report["cells"], title)
     with atomic_path(outputs["csv"]) as part, open(part, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS)

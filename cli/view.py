@@ -12,6 +12,7 @@ from clod_adapter.cli.browsers import open_browser
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.dials import opens_at
 from clod_adapter.cli.inputs import read_checkpoint
+from clod_adapter.cli.report import jsonable
 from clod_adapter.io.poses import load_cameras
 from clod_adapter.io.version import package_version
 from clod_adapter.viewer.page import policy, served_page
@@ -28,7 +29,7 @@ def run(args: argparse.Namespace) -> None:
     with Server(answers, args.port) as server:
         report |= {"url": server.url, "port": server.port}
         # Not after the command, as main prints other reports: a script needs the address while it is served.
-        shown = json.dumps(report) if args.json else f"{server.url}  (Ctrl-C ends)"
+        shown = json.dumps(jsonable(report)) if args.json else f"{server.url}  (Ctrl-C ends)"
         try:  # from the address on: who has read it may interrupt before the first request is waited for
             print(shown, file=sys.__stdout__ if args.json else None, flush=True)
             if not args.no_browser and not open_browser(server.url):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from clod_adapter.text import as_text
+
 
 class ClodError(Exception):
     """Something the user gave cannot be used.
@@ -12,4 +14,4 @@ class ClodError(Exception):
 
     def __init__(self, message: str) -> None:
         # Parts of it may come from a file, and are not to begin a line or to steer the terminal.
-        super().__init__("".join(c if c.isprintable() else " " for c in message))
+        super().__init__("".join(c if c.isprintable() else " " for c in as_text(message)))

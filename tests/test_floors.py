@@ -17,7 +17,7 @@ PACKAGE = "clod_adapter"
 
 # Lowest first. A module may import from lower floors, and from its own unless the floor is in SEPARATE.
 FLOORS = [
-    {"errors", "_lazy", "fusing"},
+    {"errors", "_lazy", "fusing", "text", "workers"},
     {"_kernels"},
     {
         "config",

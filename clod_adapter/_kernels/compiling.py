@@ -8,8 +8,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from numba import njit
+from numba import config, njit
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+from clod_adapter.errors import ClodError
+
+if config.DISABLE_JIT:  # type: ignore[attr-defined]
+    raise ClodError("NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it")
 
 # A kernel takes constants and functions from other files, so the stamp is of all kernels' sources.
 _STAMP = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(Path(__file__).parent.glob("*.py")))).hexdigest()

@@ -6,25 +6,15 @@ threads avoid a second OpenMP runtime beside torch's, which would spin against i
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import partial
 from typing import Any
 
 import torch
 
-
-@lru_cache(maxsize=1)
-def _pool(workers: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max_workers=workers, thread_name_prefix="clod-adapter")
-
-
-if hasattr(os, "register_at_fork"):  # a forked child has the pool's bookkeeping, but not its threads
-    os.register_at_fork(after_in_child=_pool.cache_clear)
-
+from clod_adapter.workers import Job, some
 
 _lock = threading.Lock()
 _alone, _before = 0, 0  # how many want torch on one thread now, and how many threads it had
@@ -57,16 +47,21 @@ def torch_on_one_thread() -> Iterator[None]:
 
 
 def run(kernel: Callable[..., Any], workers: int, *arguments: Any) -> None:
-    """Calls ``kernel(worker, workers, *arguments)`` for each worker and waits for all of them."""
+    """Calls ``kernel(worker, workers, *arguments)`` for each worker and waits for all of them.
+
+    Raises:
+        MemoryError: a thread cannot be started, or has died.
+    """
     if workers == 1:
         kernel(0, 1, *arguments)
         return
-    others: list[Future[Any]] = []
+    others: list[Job] = []
     try:
-        for worker in range(1, workers):
-            others.append(_pool(workers - 1).submit(kernel, worker, workers, *arguments))
+        for worker, thread in enumerate(some(workers - 1), start=1):
+            others.append(thread.submit(partial(kernel, worker, workers, *arguments)))
         kernel(0, workers, *arguments)
     finally:
-        wait(others)  # also when interrupted: nobody may still write into arrays that are handed back
+        for other in others:
+            other.wait()  # also when interrupted: nobody may still write into arrays that are handed back
     for other in others:
         other.result()

@@ -6,8 +6,9 @@ All of it is stored on the surfaces: a render costs one ray per sample, and matt
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from math import cos, pi, sin, sqrt
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from clod_adapter.demo.intersect import compiled, nearest, surface_point
 from clod_adapter.demo.raytrace import MIRROR_HEIGHT, Tables, radiance, trace_rays
+from clod_adapter.workers import in_order
 
 LIFT = 1e-4  # world units a ray starts above its surface
 GATHER_SPREAD = 0.2  # width of a light-gathering ray per unit of distance: coarse textures, less noise
@@ -116,9 +118,8 @@ def light_texels(surfaces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
 def in_chunks(count: int, fill: Callable[[slice, np.ndarray], None]) -> np.ndarray:
     """``[count, 3]`` float32, filled part by part on all cores."""
     out = np.empty((count, 3), np.float32)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        parts = [slice(k, k + CHUNK) for k in range(0, count, CHUNK)]
-        list(pool.map(lambda part: fill(part, out[part]), parts))
+    parts = [slice(k, k + CHUNK) for k in range(0, count, CHUNK)]
+    deque(in_order((partial(fill, part, out[part]) for part in parts), os.cpu_count() or 1), maxlen=0)
     return out
 
 

@@ -9,7 +9,8 @@ y pointing down; distances are in world units; colours are linear RGB until `enc
 from __future__ import annotations
 
 import os
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from functools import partial
 from math import floor, log2, sqrt
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ import numpy as np
 
 from clod_adapter.cameras import Camera
 from clod_adapter.demo.intersect import compiled, nearest, record, sphere_uv, surface_point
+from clod_adapter.workers import in_order
 
 MIRROR_HEIGHT = 24  # rows of a glossy surface's picture of its surroundings; it is twice as wide
 BAND = 16  # image rows per task: small enough to keep every core busy to the end
@@ -168,9 +170,9 @@ def render_linear(tables: Tables, camera: Camera, samples: int) -> np.ndarray:
     eye, rays = camera_rays(camera)
     spread = 1 / (float(camera.K[0, 0]) * samples)
     out = np.empty((camera.height, camera.width, 3), np.float32)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        rows = range(0, camera.height, BAND)
-        list(pool.map(lambda row: trace_rows(tables, eye, rays, spread, samples, row, out[row : row + BAND]), rows))
+    rows = range(0, camera.height, BAND)
+    calls = (partial(trace_rows, tables, eye, rays, spread, samples, row, out[row : row + BAND]) for row in rows)
+    deque(in_order(calls, os.cpu_count() or 1), maxlen=0)
     return out
 
 

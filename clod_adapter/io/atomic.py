@@ -82,7 +82,7 @@ def check_target(final: Path) -> None:
 
 def _mark(final: Path) -> str:
     """How its temporaries' names begin: short, however long its own is."""
-    return f".tmp-{zlib.crc32(final.name.encode()):08x}-"
+    return f".tmp-{zlib.crc32(os.fsencode(final.name)):08x}-"
 
 
 def _temporary(final: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,6 +35,9 @@ class Photograph(NamedTuple):
 
 TRANSPARENT: Note = ("have transparency: laid over black", "")
 
+LARGE = 1 << 26  # pixels of a photograph that is brought down before anything else is done to it
+BAND = 64  # rows of what is made of one, at a time
+
 _TURNS = {
     5: Image.Transpose.TRANSPOSE,
     6: Image.Transpose.ROTATE_270,
@@ -43,33 +47,44 @@ _TURNS = {
 _ORIENTATION, _BITS, _PLANES = 0x0112, 258, 284  # tags of EXIF and TIFF
 
 
-def read_image(path: Path, width: int, height: int) -> tuple[Image.Image, list[Note]]:
-    """The file as 8-bit RGB in the shape of its camera, and notes on what that took.
+def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Image.Image, tuple[int, int], list[Note]]:
+    """The file as 8-bit RGB in the shape of its camera, its size in the file, and notes on what that took.
 
     16 bits per channel are brought to 8, grey becomes RGB, transparency is laid over black. Colour profiles are not
     applied. The EXIF rotation is not either, as COLMAP does not, unless the photograph has its camera's shape only
     once it is turned: then the model was made from turned copies.
 
+    One of more than LARGE pixels is brought down by a whole factor first, to ``2 max_width`` or more: a JPEG while it
+    is decoded, others by the mean over squares of pixels.
+
     Args:
         width, height: the camera's; the photograph may be of another size, but not of another shape.
+        max_width: the width that is made of it in the end.
 
     Raises:
         ClodError: the file cannot be decoded, has too many pixels, or another shape than the camera.
     """
     notes: list[Note] = []
     with _opened(path) as source:
-        turned = _same_shape(source.size, height, width) and not _same_shape(source.size, width, height)
+        size = source.size
+        turned = _same_shape(size, height, width) and not _same_shape(size, width, height)
         turn = _TURNS.get(source.getexif().get(_ORIENTATION, 1)) if turned else None
-        pixels = _rgb(path, source, notes)
+        shape = size if turn is None else size[::-1]
+        if not _same_shape(shape, width, height):
+            raise ClodError(
+                f"{path}: is {shape[0]}x{shape[1]}, its camera {width}x{height}, another shape; "
+                "give the images the model was made from"
+            )
+        factor = max(1, shape[0] // (2 * max_width)) if size[0] * size[1] > LARGE else 1
+        if factor > 1:
+            source.draft(source.mode, (size[0] // factor, size[1] // factor))  # of JPEG alone
+            factor = max(1, factor * source.width // size[0])
+            notes.append((f"have more than {LARGE / 1e6:.0f} million pixels, which takes long: brought down first", ""))
+        pixels = _rgb(path, source, factor, notes)
     if turn is not None:
         pixels = pixels.transpose(turn)
         notes.append(("turned as their EXIF says, as the cameras have the turned shape", ""))
-    if not _same_shape(pixels.size, width, height):
-        raise ClodError(
-            f"{path}: is {pixels.width}x{pixels.height}, its camera {width}x{height}, another shape; "
-            "give the images the model was made from"
-        )
-    return pixels, notes
+    return pixels, size, list(dict.fromkeys(notes))
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -83,7 +98,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     try:
         with Image.open(path) as source:
             yield source
-    except ClodError:
+    except (ClodError, MemoryError):
         raise
     except UnidentifiedImageError as error:
         raise ClodError(
@@ -99,17 +114,30 @@ def _same_shape(size: tuple[int, int], width: int, height: int) -> bool:
     return abs(size[0] * height / (size[1] * width) - 1) <= 0.01  # a scaled copy is rounded to whole pixels
 
 
-def _rgb(path: Path, source: Image.Image, notes: list[Note]) -> Image.Image:
+def _rgb(path: Path, source: Image.Image, factor: int, notes: list[Note]) -> Image.Image:
+    """The photograph in 8-bit RGB, its width and height divided by ``factor``."""
     tags: dict[int, Any] = getattr(source, "tag_v2", {})  # a TIFF's
     if tags.get(_PLANES) == 2 and max(tags.get(_BITS) or (8,)) > 8:  # Pillow would take each byte for a pixel
         raise ClodError(f"{path}: has more than 8 bits in planes of one colour each; convert it to 8 bits")
-    if source.mode.startswith("I;16") or (source.mode == "I" and source.format == "PNG"):
-        deep = np.asarray(source).astype(np.uint32)  # grey; 16-bit colour Pillow has brought to 8 bits itself
-        return Image.fromarray(((deep + 128) // 257).astype(np.uint8)).convert("RGB")
-    if source.mode in ("I", "F"):
+    deep = source.mode.startswith("I;16") or (source.mode == "I" and source.format == "PNG")
+    if source.mode in ("I", "F") and not deep:
         raise ClodError(f"{path}: has 32 bits per channel, whose range is not known; convert it to 8 bits")
     if source.mode == "CMYK":
         notes.append(("are CMYK: brought to RGB without their colour profile", ""))
+    if factor == 1:
+        return _converted(source, deep, notes)
+    source.load()
+    small, rows = Image.new("RGB", (-(-source.width // factor), -(-source.height // factor))), factor * BAND
+    for top in range(0, source.height, rows):  # no copy of the whole is made
+        band = source.crop((0, top, source.width, min(top + rows, source.height)))
+        small.paste(_converted(band, deep, notes).reduce(factor), (0, top // factor))
+    return small
+
+
+def _converted(source: Image.Image, deep: bool, notes: list[Note]) -> Image.Image:
+    if deep:
+        values = np.asarray(source).astype(np.uint32)  # grey; 16-bit colour Pillow has brought to 8 bits itself
+        return Image.fromarray(((values + 128) // 257).astype(np.uint8)).convert("RGB")
     if "A" not in source.getbands() and "transparency" not in source.info:
         if source.mode != "RGB":
             return source.convert("RGB")
@@ -120,3 +148,25 @@ def _rgb(path: Path, source: Image.Image, notes: list[Note]) -> Image.Image:
         return rgba.convert("RGB")
     notes.append(TRANSPARENT)
     return Image.alpha_composite(Image.new("RGBA", rgba.size, (0, 0, 0, 255)), rgba).convert("RGB")
+
+
+class Room:
+    """Pixels that may be worked on at a time, by all threads together; a photograph of more is worked on alone."""
+
+    def __init__(self, pixels: int) -> None:
+        self.pixels, self.taken = pixels, 0
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def of(self, pixels: int) -> Iterator[None]:
+        """Waits until there is room for so many."""
+        with self._changed:
+            while self.taken and self.taken + pixels > self.pixels:
+                self._changed.wait()
+            self.taken += pixels
+        try:
+            yield
+        finally:
+            with self._changed:
+                self.taken -= pixels
+                self._changed.notify_all()

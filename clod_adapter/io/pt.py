@@ -22,7 +22,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.card import KEY
 from clod_adapter.io.foreign import refuse
 from clod_adapter.io.ply_columns import SIGMA
-from clod_adapter.io.regular import read_start
+from clod_adapter.io.regular import read_start, utf8_name
 
 # As gsplat's trainer names its parameters, and as they are called here.
 NAMES = {
@@ -111,12 +111,14 @@ def _load(path: Path) -> Any:
     check_pt(path)
     try:
         # Mapped, so that what else a checkpoint holds (optimisers, networks) is not read.
-        with warnings.catch_warnings(action="ignore"):
-            return torch.load(str(path), map_location="cpu", weights_only=True, mmap=True)
+        with warnings.catch_warnings(action="ignore"), utf8_name(path) as name:
+            return torch.load(name, map_location="cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
         raise ClodError(
             f"{path}: holds more than tensors, or is damaged, and was not unpickled; export the checkpoint as a PLY"
         ) from error
+    except MemoryError:
+        raise
     except Exception as error:  # torch lets RuntimeError, KeyError, TypeError and more through
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ClodError(f"{path}: is damaged ({reason}); copy or export it again") from error

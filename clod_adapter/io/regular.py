@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from clod_adapter.errors import ClodError
@@ -25,3 +28,17 @@ def read_start(path: Path, size: int = 64) -> bytes:
             return file.read(size)
     except (OSError, ValueError) as error:  # ValueError: a name that holds a NUL
         raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
+
+
+@contextmanager
+def utf8_name(path: Path) -> Iterator[str]:
+    """A name of the file for libraries that pass names on as UTF-8: its own, or where that is not UTF-8 a handle's."""
+    try:
+        same = str(path).encode() == os.fsencode(path)
+    except UnicodeEncodeError:
+        same = False
+    if same:
+        yield str(path)
+    else:
+        with open(path, "rb") as held:
+            yield f"/dev/fd/{held.fileno()}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from copy import copy
 from functools import partial
 from pathlib import Path
@@ -14,18 +14,21 @@ import numpy as np
 import torch
 from PIL import Image
 
+from clod_adapter._kernels.memory import release
 from clod_adapter.cameras import Camera, Scene, View, in_its_unit
 from clod_adapter.errors import ClodError
 from clod_adapter.io.colmap_model import read_model
 from clod_adapter.io.dataparser import trained_frame
 from clod_adapter.io.image_cache import ImageCache
-from clod_adapter.io.images import TRANSPARENT, Note, Photograph, read_image
+from clod_adapter.io.images import LARGE, TRANSPARENT, Note, Photograph, Room, image_size, read_image
 from clod_adapter.io.origin import NOWHERE
 from clod_adapter.io.posed import HUGE, TEST_EVERY, PosedImage, held_out
 from clod_adapter.io.scene_folder import find_cameras, find_photographs
 from clod_adapter.io.transforms import MASKS, read_transforms
+from clod_adapter.workers import in_order
 
 MOST_AT_ONCE = 8  # photographs of full size in memory
+ROOM = Room(1 << 28)  # their pixels in memory, of 4 bytes each while they are decoded
 
 
 def load_scene(
@@ -103,16 +106,17 @@ def _load(
     cache = None if all(image.is_pinhole for image, _ in present) else _cache_folder(folder)
     views, sizes, notes = list[View](), list[tuple[int, int]](), list[Note]()
     workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
-    with warnings.catch_warnings(), ThreadPoolExecutor(workers) as pool:
+    with warnings.catch_warnings():
         # Large, but below the size at which it is refused: photographs are no attack.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         loads = [partial(_load_view, image, path, cache, max_width) for image, path in present]
-        for (view, size, remarks), load in zip(pool.map(lambda load: load(), loads), loads, strict=True):
-            views.append(keep.store(view, partial(_again, load)) if keep else view)
-            sizes.append(size)
-            notes += remarks
-            if progress:
-                progress(len(views), len(present))
+        with closing(in_order(loads, workers)) as found:
+            for (view, size, remarks), load in zip(found, loads, strict=True):
+                views.append(keep.store(view, partial(_again, load)) if keep else view)
+                sizes.append(size)
+                notes += remarks
+                if progress:
+                    progress(len(views), len(present))
     return views, sizes, notes
 
 
@@ -181,9 +185,17 @@ def _load_view(
 
 def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
     """The photograph as a pinhole camera has it, no wider than ``max_width``."""
+    width, height = image_size(path)
+    with ROOM.of(width * height):
+        photograph = _worked_on(image, path, max_width)
+        if width * height > LARGE:
+            release()  # or this thread keeps for itself what the next one takes again
+        return photograph
+
+
+def _worked_on(image: PosedImage, path: Path, max_width: int) -> Photograph:
     camera = copy(image.camera)
-    pixels, notes = read_image(path, camera.width, camera.height)
-    source = pixels.size
+    pixels, source, notes = read_image(path, camera.width, camera.height, max_width)
     if pixels.size != (camera.width, camera.height):
         sizes = f"{pixels.width}x{pixels.height} where the model says {camera.width}x{camera.height}"
         notes.append(("are {}: intrinsics scaled", sizes))

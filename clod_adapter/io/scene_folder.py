@@ -11,6 +11,7 @@ from os.path import isfile
 from pathlib import Path, PureWindowsPath
 
 from clod_adapter.errors import ClodError
+from clod_adapter.text import as_text, file_name
 
 TRANSFORMS = ("transforms_train.json", "transforms.json")
 SMALLER = ("images_2", "images_4", "images_8")  # copies at a part of the size, as Mip-NeRF 360 and Inria's code have
@@ -74,7 +75,7 @@ def find_photographs(
     Raises:
         ClodError: a name is there twice or leads out of the folder, or more than half of the photographs are missing.
     """
-    parts = [inside(name, cameras) for name in names]
+    parts = [tuple(map(file_name, inside(name, cameras))) for name in names]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise ClodError(f"{cameras}: has image {twice[0]} more than once; export it again")
     roots = [each for each in photograph_folders(folder, cameras) if raw or each.name != RAW or each == folder]
@@ -84,7 +85,7 @@ def find_photographs(
     notes = []
     if root.name in (*SMALLER, RAW) and root != folder:
         notes.append(f"the photographs are those in {root.name}, as there are more than in images")
-    missing = [str(Path(*each)) for each, path in zip(parts, paths, strict=True) if path is None]
+    missing = [as_text(str(Path(*each))) for each, path in zip(parts, paths, strict=True) if path is None]
     if missing:
         what = f"({', '.join(missing[:3])}{', ...' if len(missing) > 3 else ''})"
         if len(missing) > MISSING * len(names):
@@ -103,6 +104,8 @@ def inside(name: str, cameras: Path) -> tuple[str, ...]:
     Raises:
         ClodError: the name is empty, leads out of the folder it is looked for in, or is no name of a file.
     """
+    if as_text(name) != name:
+        raise ClodError(f"{cameras}: image name {name[:80]} is no text in UTF-8; rename the photograph, there too")
     path = PureWindowsPath(name)
     controls = any(sign < " " or "\x7f" <= sign <= "\x9f" for sign in name)
     if not path.parts or path.anchor or ".." in path.parts or controls:

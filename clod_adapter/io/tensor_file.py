@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from safetensors import safe_open
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.foreign import refuse_known
-from clod_adapter.io.regular import read_start
+from clod_adapter.io.regular import read_start, utf8_name
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """The tensors and the metadata of a file; raises OSError, or on damage whatever safetensors does."""
-    with safe_open(path, framework="pt") as file:
+    with _opened(path, "pt") as file:
         # Copies, since the file may change under a memory map.
         return {name: file.get_tensor(name).clone() for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
 
@@ -40,8 +40,14 @@ def read_metadata(path: Path) -> dict[str, str]:
     Raises:
         ClodError: as ``load_tensors``.
     """
-    with _said_in_one_line(path), safe_open(path, framework="np") as file:
+    with _said_in_one_line(path), _opened(path, "np") as file:
         return file.metadata() or {}
+
+
+@contextmanager
+def _opened(path: Path, framework: str) -> Iterator[Any]:
+    with utf8_name(path) as name, safe_open(name, framework=framework) as file:
+        yield file
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from clod_adapter.io.colmap_library import pycolmap
 from clod_adapter.io.images import image_size
 from clod_adapter.io.posed import PosedImage, check_posed
 from clod_adapter.io.scene_folder import inside
+from clod_adapter.text import file_name
 
 DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in
 MASKS = "the masks"  # how the note on them begins
@@ -65,7 +66,7 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
             raise ClodError(f"{path}: frame {number} has no file_path; export the file again")
         name = _name(path, frame["file_path"])
         where = f"{path}: frame {name}"
-        camera = _camera(where, path.parent / name, ChainMap(frame, content))
+        camera = _camera(where, path.parent / file_name(name), ChainMap(frame, content))
         images.append(check_posed(PosedImage(name, _viewmat(where, frame), camera, held_out), path))
     notes = []
     if "applied_transform" in content and not path.with_name(DATAPARSER).is_file():
@@ -94,7 +95,7 @@ def read_json(path: Path) -> Any:
 def _name(path: Path, file_path: str) -> str:
     name = "/".join(inside(file_path, path))
     endings = ("", ".png", ".jpg", ".jpeg")  # isfile, as it is False for what can be no path
-    return next((name + ending for ending in endings if isfile(path.parent / (name + ending))), name)
+    return next((name + ending for ending in endings if isfile(path.parent / file_name(name + ending))), name)
 
 
 def _viewmat(where: str, frame: Mapping[str, Any]) -> np.ndarray:

@@ -19,6 +19,7 @@ import numpy as np
 from PIL import Image
 
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.text import as_text
 
 WIDEST = 1000  # pixels; wider pictures are scaled down
 QUALITY = 88  # of WebP
@@ -69,7 +70,7 @@ def write_page(path: str | Path, title: str, kicker: str, body: Iterable[str], d
 </html>
 """
     with atomic_path(path) as part:
-        part.write_text(page, encoding="utf-8")
+        part.write_text(as_text(page), encoding="utf-8")
 
 
 def section(title: str, *parts: str) -> str:

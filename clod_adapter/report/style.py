@@ -13,6 +13,7 @@ from typing import Any
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.version import package_version
 
 INK, QUIET, GRID, PAPER = "#1c1c1e", "#6b6b70", "#e4e4e7", "#ffffff"
 BLUE, ORANGE, GREEN, PURPLE = "#1f5fa8", "#c2571a", "#2d7d5a", "#7a4fa3"
@@ -56,8 +57,10 @@ def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
 
 def save(figure: Any, path: str | Path) -> None:
     """Writes the figure; the file appears whole or not at all."""
+    # Of a PNG the text by which a later run knows it for its own.
+    about = {"Software": f"clod-adapter {package_version()}"} if Path(path).suffix.lower() == ".png" else {}
     with atomic_path(path) as part:
-        figure.savefig(part, facecolor=PAPER)
+        figure.savefig(part, facecolor=PAPER, metadata=about)
 
 
 def shades(count: int) -> list[str]:

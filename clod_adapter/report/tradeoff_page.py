@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from os.path import abspath
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -93,7 +94,7 @@ def _title(report: Mapping[str, Any]) -> str:
 def _lead(report: Mapping[str, Any], series: Sequence[Series]) -> list[str]:
     """What was run on what, and what came of it, in sentences."""
     own, count = own_teacher(report), report["base_count"]
-    scene = "" if own else Path(report["scene"]).resolve().name
+    scene = "" if own else PurePath(abspath(report["scene"])).name
     if report["command"] == "eval":
         first = f"{report['model']} holds {count:,} Gaussians. It was measured on held-out photographs of {scene}."
     else:

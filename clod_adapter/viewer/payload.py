@@ -21,6 +21,7 @@ from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.ply_columns import SIGMA, column_map, inria_dtype
 from clod_adapter.io.ply_header import write_comments
 from clod_adapter.io.version import package_version
+from clod_adapter.text import as_text
 
 ROWS = 1 << 14  # in a block
 
@@ -41,8 +42,7 @@ class Payload:
 
     @classmethod
     def of(cls, checkpoint: Checkpoint) -> Payload:
-        name = checkpoint.path.name.encode("utf-8", "replace").decode()  # the file system's may hold what is no text
-        return cls(name, checkpoint.gaussians.without_empty_bands(), checkpoint.calibration)
+        return cls(as_text(checkpoint.path.name), checkpoint.gaussians.without_empty_bands(), checkpoint.calibration)
 
     @cached_property
     def head(self) -> bytes:

@@ -11,6 +11,7 @@ import re
 import socket
 import socketserver
 import sys
+import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -55,11 +56,15 @@ class Server(ThreadingHTTPServer):
 
     # Waited for when it is closed: one that still held a tensor while the interpreter ends would abort the process.
     daemon_threads = False
+    block_on_close = (
+        False  # server_close waits; socketserver's would for threads, too, that a Ctrl-C kept from starting
+    )
     allow_reuse_address = sys.platform != "win32"  # there it would let two servers share a port
 
     def __init__(self, answers: Mapping[str, Answer], port: int = 0) -> None:
         self.answers = dict(answers)
         self._requests: set[socket.socket] = set()
+        self._answering: list[threading.Thread] = []
         try:
             super().__init__((HOST, port), _Handler)
         except OSError as error:
@@ -85,6 +90,11 @@ class Server(ThreadingHTTPServer):
         self._requests.add(request)
         return request, address
 
+    def process_request(self, request: Any, client_address: Any) -> None:
+        thread = threading.Thread(target=self.process_request_thread, args=(request, client_address))
+        self._answering = [*(each for each in self._answering if each.is_alive()), thread]
+        thread.start()
+
     def shutdown_request(self, request: Any) -> None:
         self._requests.discard(request)
         super().shutdown_request(request)
@@ -95,6 +105,9 @@ class Server(ThreadingHTTPServer):
             with suppress(OSError):
                 request.shutdown(socket.SHUT_RDWR)
         super().server_close()
+        for thread in self._answering:
+            if thread.is_alive():  # and not one that has not started
+                thread.join()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Says nothing of a browser that goes away within an answer, as it does when its tab is closed."""

@@ -32,7 +32,7 @@ STATE = "dial.resume.safetensors"
 TINY = ("--iters", 12, "--max-sv", 4, "--out", "dial.ply")
 
 
-EARLIER = "an earlier run's"
+EARLIER = "an earlier run's of clod_adapter"
 
 
 def names(folder: Path) -> list[str]:

@@ -54,7 +54,7 @@ def test_pictures_that_were_not_drawn_are_not_reported(
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(outcome, "measure_result", lambda *_: ([], [], True))
     (tmp_path / "demo").mkdir()
-    (tmp_path / "demo" / "dial.png").write_text("an earlier run's")
+    (tmp_path / "demo" / "dial.png").write_text("an earlier run's of clod_adapter")
     done = clod("demo", "--json")
     assert done.code == 0 and json.loads(done.out)["pictures"] == {} and "no pictures" in done.err
     assert not any((tmp_path / "demo" / name).exists() for name in PICTURES)

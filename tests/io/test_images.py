@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import struct
+import threading
 import zlib
 from pathlib import Path
 
@@ -9,14 +10,15 @@ import pytest
 from PIL import Image
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.images import image_size, read_image
+from clod_adapter.io import images
+from clod_adapter.io.images import BAND, Room, image_size, read_image
 from photographs import pixels
 
 GREY = pixels(0)[..., 0]
 
 
 def read(path: Path, width: int = 40, height: int = 30) -> tuple[np.ndarray, list[str]]:
-    image, notes = read_image(path, width, height)
+    image, _, notes = read_image(path, width, height, 1600)
     assert image.mode == "RGB"
     return np.asarray(image), [what for what, _ in notes]
 
@@ -151,3 +153,81 @@ def test_too_many_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 def test_no_file(tmp_path: Path) -> None:
     with pytest.raises(ClodError, match="a.png: cannot be decoded .*No such file"):
         read(tmp_path / "a.png")
+
+
+def brought_down(path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int, max_width: int) -> np.ndarray:
+    monkeypatch.setattr(images, "LARGE", 1000)
+    image, size, notes = read_image(path, width, height, max_width)
+    assert size in ((width, height), (height, width)) and len(notes) == len(set(notes))
+    assert sum("which takes long: brought down first" in what for what, _ in notes) == 1
+    return np.asarray(image).astype(float)
+
+
+@pytest.mark.parametrize("kind", ["RGB", "L", "RGBA", "P", "I;16", "CMYK"])
+def test_a_large_photograph_is_brought_down_as_its_own_mean(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """By 3, so that it is at least twice as wide as what is made of it; in bands, of which the last one is cut."""
+    width, height = 200, 3 * BAND + 70
+    rgb = pixels(3, width, height)
+    image = Image.fromarray(rgb)
+    if kind == "RGBA":
+        image.putalpha(Image.fromarray(rgb[..., 0]))
+    elif kind == "I;16":
+        image = Image.fromarray(rgb[..., 0].astype(np.uint16) * 257)
+    else:
+        image = image.convert(kind)
+    path = tmp_path / ("a.tif" if kind == "CMYK" else "a.png")
+    image.save(path)
+    whole = read(path, width, height)[0].astype(float)
+    got = brought_down(path, monkeypatch, width, height, 33)
+    assert got.shape == (-(-height // 3), -(-width // 3), 3)
+    want = whole[: height // 3 * 3, : width // 3 * 3].reshape(height // 3, 3, width // 3, 3, 3).mean((1, 3))
+    assert np.abs(got[: height // 3, : width // 3] - want).max() <= 1
+
+
+def test_a_large_jpeg_is_brought_down_while_it_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ramp = np.linspace(0, 255, 400 * 300).reshape(300, 400).astype(np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(ramp).convert("RGB").save(tmp_path / "a.jpg", quality=95, exif=exif)
+    whole = read(tmp_path / "a.jpg", 300, 400)[0].astype(float)
+    loaded = []
+    convert = images._converted
+    monkeypatch.setattr(images, "_converted", lambda image, *rest: loaded.append(image.size) or convert(image, *rest))
+    got = brought_down(tmp_path / "a.jpg", monkeypatch, 300, 400, 30)  # by 5, of which 4 by the decoder
+    assert loaded == [(100, 75)] and got.shape == (100, 75, 3)
+    assert np.abs(got - whole.reshape(100, 4, 75, 4, 3).mean((1, 3))).max() < 4
+
+
+def test_another_shape_is_said_before_anything_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Image.fromarray(GREY).save(tmp_path / "a.png")
+    monkeypatch.setattr(images, "_rgb", None)
+    with pytest.raises(ClodError, match="is 40x30, its camera 30x30, another shape"):
+        read(tmp_path / "a.png", 30, 30)
+
+
+def test_room_for_pixels() -> None:
+    """Two that fit are worked on together, a third waits, and one that is too large for all comes in alone."""
+    room, order = Room(100), list[str]()
+    ready = threading.Barrier(3)
+
+    def work(name: str, pixels: int) -> None:
+        with room.of(pixels):
+            order.append(name)
+            if name in "ab":
+                ready.wait(10)
+
+    pair = [threading.Thread(target=work, args=(name, 50)) for name in "ab"]
+    for thread in pair:
+        thread.start()
+    large = threading.Thread(target=work, args=("large", 1000))
+    while len(order) < 2:
+        pass
+    large.start()
+    large.join(0.1)
+    assert sorted(order) == ["a", "b"] and large.is_alive()
+    ready.wait(10)
+    for thread in (*pair, large):
+        thread.join(10)
+    assert order[2:] == ["large"] and room.taken == 0

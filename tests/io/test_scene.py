@@ -109,10 +109,10 @@ def test_an_interrupted_load_reads_no_more(tmp_path: Path, monkeypatch: pytest.M
     write_scene(tmp_path, 40)
     read: list[Path] = []
 
-    def slowly(path: Path, width: int, height: int) -> object:
+    def slowly(path: Path, width: int, height: int, max_width: int) -> object:
         read.append(path)
         time.sleep(0.01)
-        return read_image(path, width, height)
+        return read_image(path, width, height, max_width)
 
     def stop(done: int, total: int) -> None:
         raise KeyboardInterrupt
@@ -208,7 +208,7 @@ def test_a_photograph_in_colour_is_in_memory_once(tmp_path: Path, monkeypatch: p
     """Converting what is RGB already copies it, as large as it is in the file."""
     Image.fromarray(pixels(0, 64, 48)).save(tmp_path / "a.jpg")
     monkeypatch.setattr(Image.Image, "convert", lambda *_, **__: pytest.fail("copies"))
-    read, _ = read_image(tmp_path / "a.jpg", 64, 48)
+    read, *_ = read_image(tmp_path / "a.jpg", 64, 48, 1600)
     assert read.mode == "RGB" and np.asarray(read).shape == (48, 64, 3)
 
 
@@ -217,12 +217,12 @@ def test_only_so_many_photographs_are_decoded_at_once(tmp_path: Path, monkeypatc
     write_scene(tmp_path, 12)
     now, most = [0], [0]
 
-    def counted(path: Path, width: int, height: int) -> object:
+    def counted(path: Path, width: int, height: int, max_width: int) -> object:
         now[0] += 1
         most[0] = max(most[0], now[0])
         time.sleep(0.01)
         now[0] -= 1
-        return read_image(path, width, height)
+        return read_image(path, width, height, max_width)
 
     monkeypatch.setattr("clod_adapter.io.scene.read_image", counted)
     found = []

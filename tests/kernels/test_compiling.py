@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -33,6 +34,14 @@ def test_a_folder_that_cannot_be_written_only_costs_the_cache() -> None:
 
 def test_kernels_are_cached() -> None:
     assert run() == "_Cache 1.0"
+
+
+def test_a_switch_that_turns_compiling_off(capture: Any, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "clod_adapter", str(capture.ply), "--out", str(tmp_path / "dial.ply")]
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and os.listdir(tmp_path) == []
+    assert done.stderr == ("clod-adapt: error: NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it\n")
 
 
 @pytest.fixture

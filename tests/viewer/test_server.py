@@ -137,3 +137,18 @@ def test_closing_hangs_up_and_waits_for_what_is_being_answered() -> None:
             server.server_close()
             assert held == [1]
     thread.join()
+
+
+def test_a_thread_that_was_kept_from_starting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a Ctrl-C that comes as a request does."""
+
+    def interrupted(self: threading.Thread) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(threading.Thread, "start", interrupted)
+    with (
+        pytest.raises(KeyboardInterrupt),
+        Server({}) as server,
+        socket.create_connection(("127.0.0.1", server.port)),
+    ):
+        server.handle_request()
