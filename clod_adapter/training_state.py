@@ -73,7 +73,7 @@ class Progress:
         gaussians: gives the state now (before training, the base; within the last ``average`` of it, the mean so
             far); it shares memory with what is being trained, so use it within the callback.
         state: gives what training can be resumed from, likewise; None before training.
-        lost: why training ends here, where a process that trained along is gone.
+        lost: why training ends here, where a process that trained along is gone or an error ends it.
     """
 
     phase: str
@@ -96,9 +96,10 @@ class Adapted:
         steps: training steps done.
         seconds: wall time of the training loop; start_seconds: of what comes before it. Of a resumed training both
             count from its first beginning.
-        interrupted: a KeyboardInterrupt, or the loss of a process, ended it early.
-        lost: which loss.
+        interrupted: a KeyboardInterrupt, the loss of a process, or a loss that is not finite ended it early.
+        lost: which process was lost; failed: which step's loss was not finite.
         waiting, exchanging: of these seconds, in this call, those spent on other processes (``distributed.Peers``).
+        held: Gaussians that some step of this call did not move, as their gradients were not finite.
     """
 
     gaussians: Gaussians
@@ -109,3 +110,5 @@ class Adapted:
     lost: str | None = None
     waiting: float = 0.0
     exchanging: float = 0.0
+    failed: str | None = None
+    held: int = 0
