@@ -63,6 +63,11 @@ class Saver:
     def _look(self, resume: bool) -> None:
         """Reads the file that is there; also where it is only to be replaced, so that no other file ever is."""
         state, found = load_state(self.path)
+        if (wrong := _wrong_entry(found)) is not None:
+            raise ClodError(
+                f"{self.path}: is no training state or damaged (its record has {wrong} {found[wrong]!r:.60}); "
+                "remove it to start afresh"
+            )
         if resume:
             self.state, self.found, self.saved = state, found, state.steps
             self._refuse_other_settings()
@@ -108,7 +113,7 @@ class Saver:
     @property
     def frozen(self) -> list[str] | None:
         """The attributes that the run to go on with froze; None where there is none."""
-        return [str(name) for name in self.found.get("frozen", [])] if self.state is not None else None
+        return list(self.found.get("frozen", [])) if self.state is not None else None
 
     def watching(self, follow: Callable[[Progress], None]) -> Callable[[Progress], None]:
         """The progress callback that also saves: after the first step, now and then, and when training is stopped.
@@ -192,6 +197,20 @@ class Saver:
 def _tell(text: str) -> None:
     with suppress(OSError):  # stderr is closed, or on the disk that is full
         print(text, file=sys.stderr)
+
+
+def _wrong_entry(found: dict[str, Any]) -> str | None:
+    """Which entry of a state's record is of the wrong type, of those that are more than compared."""
+    frozen, overruled = found.get("frozen", []), found.get("overruled", {})
+    if not _is_words(frozen):
+        return "frozen"
+    if not isinstance(overruled, dict) or not all(map(_is_words, overruled.values())):
+        return "overruled"
+    return None
+
+
+def _is_words(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(word, str) for word in value)
 
 
 def _as_option(name: str, value: object) -> str:

@@ -218,6 +218,7 @@ class _Run:
             tensor.copy_(state.tensors[name])
         self.loss, self.averaged = state.loss, state.averaged
         self.done, self.seconds, self.start_seconds = state.steps, state.seconds, state.start_seconds
+        require_finite(self.gaussians(), "the training state", "start afresh")
 
     def _changing(self) -> dict[str, Tensor]:
         """The tensors themselves that steps change, named as in ``TrainingState``."""

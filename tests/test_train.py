@@ -474,8 +474,18 @@ def test_a_state_of_something_else_is_refused(captured: tuple[Gaussians, Scene])
     for impossible in (
         {"tensors": damaged}, {"steps": 0}, {"averaged": -1}, {"averaged": 9}, {"seconds": math.nan}, {"seconds": -1.0},
     ):  # fmt: skip
-        with pytest.raises(ClodError, match="counts steps or seconds that cannot be|of other Gaussians"):
+        with pytest.raises(
+            ClodError, match="steps or seconds that cannot be|steps.* that cannot be|of other Gaussians"
+        ):
             adapt(base, scene, config, None, replace(state, **impossible))
+    for name, value in (
+        ("parameter.means", math.nan), ("parameter.opacity_logits", math.inf), ("first.sh0", math.inf),
+        ("second.sh0", -1.0), ("second.means", math.nan), ("parameter.log_sigma", 1e30),
+    ):  # fmt: skip
+        tensors = {n: t.clone() for n, t in state.tensors.items()}
+        tensors[name][7] = value
+        with pytest.raises(ClodError, match="the training state.*; start afresh"):
+            adapt(base, scene, config, None, replace(state, tensors=tensors))
     for broken in ({}, {**state.random, "state": {"state": -1, "inc": "x"}}):
         with pytest.raises(ClodError, match="random state is damaged"):
             adapt(base, scene, config, None, replace(state, random=broken))
