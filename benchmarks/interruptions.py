@@ -49,6 +49,7 @@ def measure(scene: str, config: clod.AdaptConfig, path: Path) -> None:
     saver.belong(base.gaussians, photographs, scene, scene)
     digest_seconds = time.perf_counter() - began
     adapted = clod.adapt(base.gaussians, photographs, config, saver.watching(lambda progress: None))
+    saver.keep()
     began = time.perf_counter()
     load_state(path)
     append(FILE, {

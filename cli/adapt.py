@@ -54,10 +54,14 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     with now.watch.time("evaluate"):
         now.base_rows, notes = look_at_base(gaussians, scene, args, now.console)
     now.notes = [*inputs.notes, *notes]
-    with now.stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
-        page = AdaptPage(gaussians, scene, inputs.config, now.console) if args.report else None
-        outcome = learn_and_write(now, inputs, page)
-    return finish(now, outcome, page)
+    try:
+        with now.stop.listening():  # until everything is written, so that one Ctrl-C loses nothing
+            page = AdaptPage(gaussians, scene, inputs.config, now.console) if args.report else None
+            outcome = learn_and_write(now, inputs, page)
+        return finish(now, outcome, page)
+    except Exception:  # whatever it is, it ends the run: of what was learned nothing is lost
+        now.saver.rescue()
+        raise
 
 
 def begin(args: argparse.Namespace) -> tuple[Run, AdaptConfig]:
@@ -138,12 +142,13 @@ def train(
 
     with closing(follower), together(lambda: Job.of(plan, scene, saver.state), follower) as peers:
         adapted = plan.adapt(scene, saver.watching(whole), saver.state, peers)
+    saver.keep()
     adapted = replace(
         adapted, gaussians=plan.whole(base, adapted.gaussians),
         start_seconds=adapted.start_seconds + plan.seconds["start"],
     )  # fmt: skip
     if follower.stop.aborted:
         raise KeyboardInterrupt
-    how = "interrupted after" if adapted.interrupted else "trained"
+    how = "ended after" if adapted.failed else "interrupted after" if adapted.interrupted else "trained"
     console.say(f"{how} {adapted.steps} steps, {duration(adapted.seconds)}")
     return adapted

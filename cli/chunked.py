@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from clod_adapter.cameras import Scene, View
@@ -37,13 +37,18 @@ from clod_adapter.training_state import Progress
 
 @dataclass
 class Chunked:
-    """One run in chunks. Its files are where it goes on from, in whichever process."""
+    """One run in chunks. Its files are where it goes on from, in whichever process.
+
+    Attributes:
+        failed: of the chunks that this process has trained, where training ended early for a loss that was not finite.
+    """
 
     args: argparse.Namespace
     plan: MemoryPlan
     console: Console
     stop: GracefulStop
     files: ChunkFiles
+    failed: list[str] = field(default_factory=list)
 
     @classmethod
     def of(
@@ -84,7 +89,8 @@ class Chunked:
             after = merge(division, learned)
             steps, seconds = steps + sum(p.steps for p in learned), seconds + sum(p.seconds for p in learned)
         assert after is not None
-        return Adapted(after, steps, seconds, start_seconds, interrupted=False)
+        failed = "; ".join(self.failed) or None
+        return Adapted(after, steps, seconds, start_seconds, interrupted=False, failed=failed)
 
     def alone(self, base: Gaussians, scene: Scene, config: AdaptConfig) -> dict[str, Any]:
         """Does what ``--chunk`` asks for, and no more: the start, or the next pass of one chunk; returns the report."""
@@ -107,7 +113,7 @@ class Chunked:
             "command": "adapt", "version": package_version(), "model": self.args.ply, "scene": self.args.images,
             "chunk": chunk, "chunks": division.count, "passes": division.passes, "pass": number, "missing": missing,
             "steps": learned.steps if learned else 0, "memory": asdict(self.plan), "machine": machine(),
-            "outputs": {"chunk": str(path)},
+            "outputs": {"chunk": str(path)}, "exit_code": 1 if self.failed else 0,
         }  # fmt: skip
 
     def _first_pass(self, division: Division, views: Sequence[View], config: AdaptConfig) -> Gaussians:
@@ -161,17 +167,26 @@ class Chunked:
         saver = Saver(state, state.exists(), own, self.console, self.stop)
         of = f"{files.belongs['checkpoint']}, {files.belongs['start']}, {name}"
         saver.claim(of, files.belongs["photographs"], f"{self.args.ply} in {files.start}", "before")
-        with self._following(name) as follow:
-            learned, adapted = adapt_chunk(
-                division, views, config, block, after=after, progress=saver.watching(follow), resume=saver.state,
-                cache=ImageCache(self.plan.cache),
-            )  # fmt: skip
-        if adapted.interrupted:
+        try:
+            with self._following(name) as follow:
+                learned, adapted = adapt_chunk(
+                    division, views, config, block, after=after, progress=saver.watching(follow), resume=saver.state,
+                    cache=ImageCache(self.plan.cache),
+                )  # fmt: skip
+            saver.keep()
+            release_memory()
+            if adapted.failed or not adapted.interrupted:
+                files.save_learned(learned, block, number)
+        except Exception:
+            saver.rescue("the same command")
+            raise
+        if adapted.failed:
+            self.failed.append(f"{name}: {adapted.failed}")
+            self.console.say(f"{name}: ended after step {adapted.steps}: {adapted.failed}")
+        elif adapted.interrupted:
             more = "" if saver.saved is None else "; the same command goes on with it"
             self.console.say(f"{name}: stopped after step {adapted.steps}{more}")
             raise KeyboardInterrupt
-        release_memory()
-        files.save_learned(learned, block, number)
         saver.close(finished=True)
         self.console.say(f"{name}: {len(learned.rows):,} Gaussians, {learned.steps} steps, {duration(learned.seconds)}")
         return learned

@@ -99,7 +99,13 @@ result is written it is finished first; while it is measured the rest is
 skipped. Before training nothing is written. A background job of a
 script ignores Ctrl-C; SIGTERM stops it.
 
-exit codes: 0 written; 2 bad input or a full disk, one line on stderr and no
+The state is also saved where training ends, so that no error after it loses
+what was learned; where that cannot be beside the output, it is in the folder
+for temporary files, and stderr says what to do with it.
+
+exit codes: 0 written; 1 a loss that is not finite ended training early (what
+was learned before is written), or a fault of this program (a traceback, and
+where to report it); 2 bad input or a full disk, one line on stderr and no
 output written; 130 interrupted with nothing to write, or aborted
 
 examples:

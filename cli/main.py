@@ -8,6 +8,7 @@ import io
 import json
 import os
 import sys
+import traceback
 from contextlib import nullcontext, redirect_stdout
 from importlib import import_module
 from typing import Any
@@ -25,6 +26,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.version import package_version
 
 PROG = "clod-adapt"
+REPORT = "please report it, with the lines above, as an issue of the repository that this program is from"
 
 # Adapting is the main job and needs no word.
 COMMANDS: dict[str, Command] = {
@@ -36,11 +38,20 @@ COMMANDS: dict[str, Command] = {
 def main(argv: list[str] | None = None) -> int:
     """Runs a command line; returns its exit code: 0, 2 for bad input, 130 when interrupted with nothing written.
 
-    A report that has an exit_code of its own ends with that.
+    A report that has an exit_code of its own ends with that. An error that nobody foresaw is shown as the traceback
+    that it is, and ends with 1.
     """
     print_any_name()
-    with silence_but_first():
-        return _main(argv)
+    try:
+        with silence_but_first():
+            return _main(argv)
+    except Exception:
+        traceback.print_exc()
+        print(
+            f"{PROG}: error: this is a fault of {PROG} {package_version()}, not of what was given: {REPORT}",
+            file=sys.stderr,
+        )
+        return 1
 
 
 def print_any_name() -> None:

@@ -104,6 +104,10 @@ def hand_out(run: Run, inputs: Inputs, plan: Plan | None, adapted: Adapted) -> O
         run.note(f"tau is {adapter.attenuation.tau:.2g} and not {inputs.config.tau:g}: the Gaussians are faint")
     if adapted.lost:
         run.note(f"training ended at step {adapted.steps}: {explain(adapted.lost)}")
+    if adapted.failed:
+        run.note(f"training ended early, and what was learned before is written: {adapted.failed}")
+    if adapted.held:
+        run.note(f"{adapted.held:,} Gaussians stayed where they were in some steps: their gradients were not finite")
     result = adapter.apply(gaussians)
     inputs = replace(inputs, base=with_rows(base, run.args) if run.chunked else base)
     report = describe_run(run, inputs, plan, adapted, adapter, result)
@@ -164,6 +168,8 @@ def finish(run: Run, outcome: Outcome, page: AdaptPage | None) -> dict[str, Any]
         "rows": [row.as_dict() for row in rows], "detached_row": plain[0].as_dict() if plain else None,
         "notes": notes_of(run, inputs), "seconds": run.watch.report(),
     }  # fmt: skip
+    if adapted.failed:
+        report["exit_code"] = 1
     if rows and not cut_short:
         written = (inputs.base, outcome.adapter, outcome.result, rows, inputs.scene)
         write_measured(*written, run.outputs, report, run.console, late)

@@ -118,7 +118,7 @@ def explain(lost: str) -> str:
 
 def hurried(adapted: Adapted) -> bool:
     """Whether the launcher is ending this: after its signal, or where a process is gone, it waits for 30 seconds."""
-    return adapted.interrupted and launched().size > 1
+    return adapted.interrupted and not adapted.failed and launched().size > 1
 
 
 def describe_processes(adapted: Adapted, batch: int) -> dict[str, Any]:

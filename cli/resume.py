@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import math
+import sys
+import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -35,6 +38,7 @@ class Saver:
     Attributes:
         state: what to go on from, where ``--resume`` found it.
         saved: the step that the file of this run is of; None where it has written none yet.
+        latest: where the training of this run stands that is not saved yet; it holds on to all that is trained.
         seconds, saves: spent in saving, and how often.
 
     Raises:
@@ -47,6 +51,7 @@ class Saver:
         self.found: dict[str, Any] = {}
         self.state: TrainingState | None = None
         self.saved: int | None = None
+        self.latest: Progress | None = None
         self.seconds, self.saves, self.warned = 0.0, 0, False
         self.began, self.due = math.inf, 0.0
         remove_leftovers(path)
@@ -58,6 +63,11 @@ class Saver:
     def _look(self, resume: bool) -> None:
         """Reads the file that is there; also where it is only to be replaced, so that no other file ever is."""
         state, found = load_state(self.path)
+        if (wrong := _wrong_entry(found)) is not None:
+            raise ClodError(
+                f"{self.path}: is no training state or damaged (its record has {wrong} {found[wrong]!r:.60}); "
+                "remove it to start afresh"
+            )
         if resume:
             self.state, self.found, self.saved = state, found, state.steps
             self._refuse_other_settings()
@@ -103,15 +113,19 @@ class Saver:
     @property
     def frozen(self) -> list[str] | None:
         """The attributes that the run to go on with froze; None where there is none."""
-        return [str(name) for name in self.found.get("frozen", [])] if self.state is not None else None
+        return list(self.found.get("frozen", [])) if self.state is not None else None
 
     def watching(self, follow: Callable[[Progress], None]) -> Callable[[Progress], None]:
-        """The progress callback that also saves: after the first step, now and then, and when training is stopped."""
+        """The progress callback that also saves: after the first step, now and then, and when training is stopped.
+
+        An error of ``follow`` stops it too.
+        """
 
         def call(progress: Progress) -> None:
+            self.latest = progress if progress.state else None
             try:
                 follow(progress)
-            except KeyboardInterrupt:
+            except (KeyboardInterrupt, Exception):
                 if not self.stop.aborted:
                     self._save(progress)
                 raise
@@ -128,24 +142,75 @@ class Saver:
         self.began = min(self.began, began)
         try:
             save_state(self.path, progress.state(), self.belongs)
-            self.saved = progress.done
+            self.saved, self.latest = progress.done, None
         except (ClodError, MemoryError) as error:
             if not self.warned:
-                self.console.say(f"warning: training goes on, but --resume will not know of it: {error}")
+                self.console.say(f"warning: the run goes on, but --resume will not know of it: {error}")
             self.warned = True
         now = time.perf_counter()
         cost = now - began
         self.seconds, self.saves = self.seconds + cost, self.saves + 1
         self.due = max(now + SAVE_EVERY, self.began + (self.seconds + cost) / SAVE_COST)
 
+    def keep(self) -> None:
+        """Saves where training has ended, so that what comes after it can fail. Where it cannot, see ``rescue``."""
+        if self.latest is not None:
+            self._save(self.latest)
+
+    def rescue(self, how: str = "--resume") -> None:
+        """After a failure: says what goes on from where, on stderr also with ``--quiet``.
+
+        What could not be saved beside the output is saved in a new folder for temporary files.
+        """
+        self.keep()
+        if self.latest is not None and (path := self._save_elsewhere(self.latest)):
+            _tell(f"step {self.latest.done} is in {path}: move it to {self.path}, and {how} goes on from there")
+        elif self.saves and self.saved is not None:
+            _tell(f"{how} goes on from step {self.saved}, which is in {self.path}")
+
+    def _save_elsewhere(self, progress: Progress) -> Path | None:
+        """Where, if it could."""
+        assert progress.state is not None
+        try:
+            folder = Path(tempfile.mkdtemp(prefix="clod-adapt-"))
+        except OSError:
+            return None
+        try:
+            save_state(folder / self.path.name, progress.state(), self.belongs)
+        except (ClodError, MemoryError):
+            folder.rmdir()
+            return None
+        return folder / self.path.name
+
     def close(self, finished: bool) -> None:
         """Removes this run's file, or says what it is for; one of another run that it has not replaced stays."""
+        self.latest = None
         if self.saved is None:
             return
         if finished:
             self.path.unlink(missing_ok=True)
+            self.saved = None
         else:
             self.console.say(f"--resume goes on from step {self.saved}, which is in {self.path}")
+
+
+def _tell(text: str) -> None:
+    with suppress(OSError):  # stderr is closed, or on the disk that is full
+        print(text, file=sys.stderr)
+
+
+def _wrong_entry(found: dict[str, Any]) -> str | None:
+    """Which entry of a state's record is of the wrong type, of those that are more than compared."""
+    frozen, overruled = found.get("frozen", []), found.get("overruled", {})
+    if not _is_words(frozen):
+        return "frozen"
+    if not isinstance(overruled, dict) or not all(map(_is_words, overruled.values())):
+        return "overruled"
+    return None
+
+
+def _is_words(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(word, str) for word in value)
 
 
 def _as_option(name: str, value: object) -> str:

@@ -132,7 +132,8 @@ class AdaptConfig:
         require(0 < self.lr_final <= 1, "lr_final", self.lr_final, "above 0 and at most 1")
         require(0 <= self.average <= 1, "average", self.average, "between 0 and 1")
         for name in ("sigma", "means", "quats", "scales", "opacities", "sh0", "shN"):
-            require(getattr(self, f"lr_{name}") >= 0, f"lr_{name}", getattr(self, f"lr_{name}"), "at least 0")
+            rate = getattr(self, f"lr_{name}")  # far longer steps would overflow float32 in the end
+            require(0 <= rate <= 1e6, f"lr_{name}", rate, "between 0 and 1e6")
         self.attenuation(1.0)  # checks the rest
 
     @classmethod

@@ -45,7 +45,7 @@ class Draws:
         Raises:
             ClodError: they are of other views, or damaged.
         """
-        if not all(0 <= view < len(self.views) for view in order):
+        if not all(0 <= view < len(self.views) for view in order) or len(set(order)) < len(order):
             raise ClodError(OTHER_RUN)
         try:
             self.random.bit_generator.state = random

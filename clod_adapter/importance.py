@@ -16,6 +16,7 @@ from clod_adapter.collapse import leaving_order
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.extinction import sigma_for_extinction
+from clod_adapter.finite import bad_rows, largest_colour
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import splat
 from clod_adapter.units import in_world_units, known_distance, with_distance
@@ -156,6 +157,9 @@ def removal_error(
 
     Args:
         progress: called with the number of views done after each, and of all of them.
+
+    Raises:
+        ClodError: an error is not finite, as colours overflow in the pictures.
     """
     generator = torch.Generator().manual_seed(seed)
     total = torch.zeros_like(gaussians.means[:, 0])
@@ -168,6 +172,9 @@ def removal_error(
         total += (gradient * opacities.detach()).square()
         if progress:
             progress(done, len(views))
+    if (bad := bad_rows(total)) is not None:
+        much = f"what removing {int(bad.sum()):,} of the Gaussians does to the pictures is not finite"
+        raise ClodError(f"{much}; {largest_colour(gaussians)}")
     return total / max(len(views), 1)
 
 

@@ -82,6 +82,19 @@ class RowAdam:
             _adam(*flat, rows[:, None], length, correction, rates[name], self.beta1, self.beta2, self.epsilon)
 
 
+@torch.no_grad()
+def add_to_mean(mean: dict[str, Tensor], values: dict[str, Tensor], count: int) -> None:
+    """Takes the ``count``-th ``values`` into their running ``mean``, in place; the first make it.
+
+    An infinite value is its own mean: it is an opacity that no step changes, and inf - inf would be NaN.
+    """
+    for name, value in values.items():
+        if count == 1:
+            mean[name] = value.clone()
+        else:
+            torch.where(value.isinf(), value, mean[name].lerp_(value, 1 / count), out=mean[name])
+
+
 def _adam_rows(
     parameter: Tensor, first: Tensor, second: Tensor, gradient: Tensor, rows: Tensor, length: Tensor,
     correction: Tensor, rate: Number, beta1: Number, beta2: Number, epsilon: Number,

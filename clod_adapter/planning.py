@@ -172,13 +172,15 @@ class _Planner:
         return gone
 
     def _probe(self, plan: Plan) -> tuple[Gaussians, TrainingState]:
-        """The first steps of the training, after which it stops: PROBE of them, or those of SHARE of a time budget."""
+        """The first steps of the training, after which it stops: PROBE of them, those of SHARE of a time budget, or
+        those before one that fails, which the training then comes to.
+        """
         found: list[tuple[Gaussians, TrainingState]] = []
 
         def follow(now: Progress) -> None:
             if now.phase == "train":
                 self._report("probe", now.done, PROBE)
-                if now.state is not None and (now.done == PROBE or now.share >= SHARE):
+                if now.state is not None and (now.done == PROBE or now.share >= SHARE or now.lost):
                     found.append((now.gaussians(), now.state()))
                     raise KeyboardInterrupt
 

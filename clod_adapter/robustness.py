@@ -18,6 +18,7 @@ from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.cameras import Scene, View
 from clod_adapter.compare import by_opacity
 from clod_adapter.config import AdaptConfig
+from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.origin import NOWHERE, Origin
@@ -67,9 +68,12 @@ def adapt_at_range(
 
     Raises:
         KeyboardInterrupt: also where ``adapt`` would return what it has: half an adaptation is no cell.
+        ClodError: a step's loss is not finite, likewise.
     """
     base = detach(base)
     adapted = adapt(base, scene, config, follow)
+    if adapted.failed:
+        raise ClodError(f"max_sv {config.max_sv:g}: {adapted.failed}; leave this range or checkpoint out")
     if adapted.interrupted:
         raise KeyboardInterrupt
     adapter = extract(base, adapted.gaussians, fingerprint=fingerprint, config=asdict(config), origin=origin)

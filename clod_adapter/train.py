@@ -16,10 +16,11 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.distributed import PeerLost, Peers
 from clod_adapter.drawing import Draws
 from clod_adapter.errors import ClodError
+from clod_adapter.finite import LossNotFinite, largest_colour, require_finite, spoilt_rows
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import for_training, seeing, start
 from clod_adapter.objective import Objective, Part, Pull
-from clod_adapter.optimizer import RowAdam
+from clod_adapter.optimizer import RowAdam, add_to_mean
 from clod_adapter.training_state import Adapted, Progress, TrainingState
 from clod_adapter.units import in_world_units, with_distance
 
@@ -57,6 +58,10 @@ def adapt(
     does the loss of a process that trains along, after a last call of ``progress``; of several processes that were
     given the same, a KeyboardInterrupt that ``progress`` raises in one ends all of them after the same step.
 
+    The outcome is finite where the base is (an opacity logit of +-inf stays). A row whose gradient is not finite is not
+    moved by that step, and counted in ``Adapted.held``. Before a step whose loss is not finite training ends, and what
+    there is is returned. Any other error while a view is drawn is raised; both come after a last call of ``progress``.
+
     Args:
         resume: goes on from here (``Progress.state`` of an earlier call with the same base, views and config) and
             ends, on as many threads and processes, with the same bits as an undisturbed run; a time budget counts from
@@ -66,8 +71,9 @@ def adapt(
             step's views, and all have the same outcome: but for rounding, that of one process.
 
     Raises:
-        ClodError: no training views, none that has a Gaussian before it, no Gaussians, ``resume`` is of something
-            else, fewer views a step than processes, or one of these was lost before the first step.
+        ClodError: no training views, none that has a Gaussian before it, no Gaussians, an attribute that is not
+            finite, a first step whose loss is not, ``resume`` is of something else, fewer views a step than processes,
+            or one of these was lost before the first step.
     """
     config = config or AdaptConfig()
     if not scene.train:
@@ -76,6 +82,7 @@ def adapt(
         raise ClodError("the checkpoint has no Gaussians, so there is nothing to adapt")
     if peers and config.batch < peers.size:
         raise ClodError(f"batch is {config.batch}, it must be at least {peers.size}, a view for each of the processes")
+    require_finite(base, "the checkpoint", "leave out such rows")
     began = time.perf_counter()
 
     def report(phase: str, done: int, total: int) -> None:
@@ -140,18 +147,21 @@ class _Run:
         self.parameters[self.decay] = self.objective.parameter(start.sigma_d)
         self.optimizer = RowAdam(self._trained(), beta1=BETA1**config.batch, beta2=BETA2**config.batch)
         self.empty_bands: Tensor | None = None  # the base's whole shN, where what was left out of it comes back
-        self.all_rows = torch.ones(part.trained, dtype=torch.bool, device=start.means.device)
         self.done, self.seconds, self.start_seconds = 0, 0.0, 0.0
         self.loss = math.nan
         self.mean: dict[str, Tensor] = {}  # of the parameters over the last ``average`` of the steps
         self.averaged = 0
+        # Rows that had a gradient that was not finite.
+        self.held = torch.zeros(part.trained, dtype=torch.bool, device=start.means.device)
 
     def _trained(self) -> dict[str, Tensor]:
         """What steps change: views of the first rows of the parameters."""
         return {name: self.parameters[name][: self.objective.trained] for name in self.stepped}
 
     def run(self) -> Adapted:
-        began, going, lost = time.perf_counter() - self.seconds, True, None
+        began, going = time.perf_counter() - self.seconds, True
+        lost: str | None = None
+        failed: str | None = None
         before = self._with_peers()
         try:
             while True:
@@ -169,15 +179,22 @@ class _Run:
         except PeerLost as error:
             going, lost = False, str(error)
             self._tell(lost)
+        except LossNotFinite as error:
+            if self.done == 0:
+                raise ClodError(f"{error}, so nothing can be learned; {largest_colour(self.gaussians())}") from error
+            going, failed = False, str(error)
         self.seconds = time.perf_counter() - began
-        spent = [now - then for now, then in zip(self._with_peers(), before, strict=True)]
-        return Adapted(self.gaussians(), self.done, self.seconds, self.start_seconds, not going, lost, *spent)
+        waiting, exchanging = (now - then for now, then in zip(self._with_peers(), before, strict=True))
+        return Adapted(
+            self.gaussians(), self.done, self.seconds, self.start_seconds, not going, lost, waiting, exchanging,
+            failed, int(self.held.sum()),
+        )  # fmt: skip
 
     def _with_peers(self) -> tuple[float, float]:
         return (self.peers.waiting, self.peers.exchanging) if self.peers else (0.0, 0.0)
 
     def _tell(self, lost: str | None = None) -> bool:
-        """Says how far it is; whether to go on."""
+        """Says how far it is, and what ends it here; whether to go on."""
         if self.progress:
             share = self._share_done(self.done, self.seconds)
             told = ("train", self.done, self.config.iters, self.seconds, share, self.loss)
@@ -206,6 +223,7 @@ class _Run:
             tensor.copy_(state.tensors[name])
         self.loss, self.averaged = state.loss, state.averaged
         self.done, self.seconds, self.start_seconds = state.steps, state.seconds, state.start_seconds
+        require_finite(self.gaussians(), "the training state", "start afresh")
 
     def _changing(self) -> dict[str, Tensor]:
         """The tensors themselves that steps change, named as in ``TrainingState``."""
@@ -229,38 +247,40 @@ class _Run:
         sigma = self.objective.sigma(parameters[self.decay])
         return in_world_units(Gaussians(**values, sigma_d=sigma, attenuation=self.objective.attenuation))
 
-    def _average(self) -> None:
-        """Takes the parameters as they stand into their mean; the optimiser goes on from where it is."""
-        now = self._trained()
-        self.averaged += 1
-        if self.averaged == 1:
-            self.mean = {name: value.clone() for name, value in now.items()}
-        for name, mean in self.mean.items():
-            mean.lerp_(now[name], 1 / self.averaged)
-
     def _pull(self) -> Pull:
-        """Of the next views; those of a batch that other processes have are pulled by them."""
+        """Of the next views; those of a batch that other processes have are pulled by them.
+
+        Where that fails the state is as after the last step, with these views still to come, and is told.
+        """
         before = self.draws.state()
         draws = [self.draws.draw() for _ in range(self.config.batch)]
-        if self.peers is None:
-            return self.objective.pull(self.parameters, draws)
         try:
-            return self.peers.sum(self.objective.pull(self.parameters, self.peers.share(draws)))
-        except PeerLost:  # these views are still to come for whoever goes on from here
+            pull = self.objective.pull(self.parameters, self.peers.share(draws) if self.peers else draws)
+            pull = self.peers.sum(pull) if self.peers else pull
+            if not math.isfinite(pull.loss):
+                names = ", ".join(view.camera.name or "a view without a name" for view, _ in draws)
+                raise LossNotFinite(f"the loss of step {self.done + 1} is not finite ({names})")
+            return pull
+        except Exception as error:
             self.draws.restore(*before)
+            if self.done > 0 and not isinstance(error, PeerLost):  # which is told by who ends the run
+                self._tell(str(error) or type(error).__name__)
             raise
 
     @torch_on_one_thread()
     def step(self, share_done: float) -> None:
         """Some views, their dial values, one update."""
         pull = self._pull()
+        sound = ~spoilt_rows(pull.gradients)
+        self.held |= ~sound
         now = pull.loss / self.config.batch
         self.loss = now if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * now
         rates = {name: rate * self.config.lr_final**share_done for name, rate in self.rates.items()}
         # The paper's count term moves opacities too, of those that have left as well.
         everywhere = {self.decay} | ({"opacity_logits"} if self.config.count_term == "paper" else set())
-        for rows, names in ((pull.kept, set(self.stepped) - everywhere), (self.all_rows, everywhere)):
+        for rows, names in ((pull.kept & sound, set(self.stepped) - everywhere), (sound, everywhere)):
             self.optimizer.step({name: pull.gradients[name] for name in self.stepped if name in names}, rows, rates)
         self.parameters[self.decay].clamp_(*self.range)
-        if share_done >= 1 - self.config.average:
-            self._average()
+        if share_done >= 1 - self.config.average:  # into the mean as they stand; the optimiser goes on from there
+            self.averaged += 1
+            add_to_mean(self.mean, self._trained(), self.averaged)

@@ -52,11 +52,22 @@ class TrainingState:
         shapes = [{name: (t.shape, t.dtype) for name, t in tensors.items()} for tensors in (own, self.tensors)]
         if shapes[0] != shapes[1]:
             raise ClodError(OTHER_RUN)
-        # A row's steps are an index in compiled code, which checks none.
-        counts = [steps for name, steps in self.tensors.items() if name.startswith("steps.")]
-        possible = all(bool(((steps >= 0) & (steps <= self.steps)).all()) for steps in counts)
-        if not possible or not 0 <= self.averaged <= self.steps or not 0 <= self.seconds < math.inf:
+        times = (self.seconds, self.start_seconds)
+        possible = 0 <= self.averaged <= self.steps < 2**31 and all(0 <= seconds < math.inf for seconds in times)
+        if not possible:
             raise ClodError("the training state counts steps or seconds that cannot be; start afresh")
+        for name, values in self.tensors.items():
+            kind, _, attribute = name.partition(".")
+            if kind == "steps":  # an index in compiled code, which checks none
+                sound = (values >= 0) & (values <= self.steps)
+            elif kind == "second":
+                sound = values >= 0  # and not NaN
+            elif kind == "first":  # Adam's is at most 7.3 times the root of the second
+                sound = values.abs() <= 10 * self.tensors[f"second.{attribute}"].sqrt() + 1e-15
+            else:  # an infinite opacity stays what it is in the base
+                sound = values.isfinite() | (values == own[f"parameter.{attribute}"])
+            if not bool(sound.all()):
+                raise ClodError(f"the training state has {name} that cannot be; start afresh")
 
 
 @dataclass(frozen=True)
@@ -73,7 +84,7 @@ class Progress:
         gaussians: gives the state now (before training, the base; within the last ``average`` of it, the mean so
             far); it shares memory with what is being trained, so use it within the callback.
         state: gives what training can be resumed from, likewise; None before training.
-        lost: why training ends here, where a process that trained along is gone.
+        lost: why training ends here, where a process that trained along is gone or an error ends it.
     """
 
     phase: str
@@ -96,9 +107,10 @@ class Adapted:
         steps: training steps done.
         seconds: wall time of the training loop; start_seconds: of what comes before it. Of a resumed training both
             count from its first beginning.
-        interrupted: a KeyboardInterrupt, or the loss of a process, ended it early.
-        lost: which loss.
+        interrupted: a KeyboardInterrupt, the loss of a process, or a loss that is not finite ended it early.
+        lost: which process was lost; failed: which step's loss was not finite.
         waiting, exchanging: of these seconds, in this call, those spent on other processes (``distributed.Peers``).
+        held: Gaussians that some step of this call did not move, as their gradients were not finite.
     """
 
     gaussians: Gaussians
@@ -109,3 +121,5 @@ class Adapted:
     lost: str | None = None
     waiting: float = 0.0
     exchanging: float = 0.0
+    failed: str | None = None
+    held: int = 0

@@ -22,7 +22,10 @@ ADAPT = BOTH | {
     "lr_final": [0.0, 1.1, math.nan], "full_weight": [-1.0, math.nan],
     "start": ["random"], "parameter": ["sqrt"], "sampling": ["normal"],
     "count_term": ["none", "relative"],
-    **{f"lr_{name}": [-1e-9, math.nan] for name in ("sigma", "means", "quats", "scales", "opacities", "sh0", "shN")},
+    **{
+        f"lr_{name}": [-1e-9, 1.1e6, math.nan]
+        for name in ("sigma", "means", "quats", "scales", "opacities", "sh0", "shN")
+    },
 }  # fmt: skip
 ATTENUATION = BOTH | {"scene_distance": [0.0, -1.0, math.inf, math.nan]}
 BAD = [

@@ -28,6 +28,7 @@ FLOORS = [
         "collapse",
         "counting",
         "extinction",
+        "finite",
         "hook",
         "losses",
         "metrics",

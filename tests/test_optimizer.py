@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.optimizer import RowAdam
+from clod_adapter.optimizer import RowAdam, add_to_mean
 
 SHAPES = {"means": (3,), "quats": (4,), "opacity_logits": (), "sh0": (1, 3), "shN": (8, 3)}
 
@@ -191,3 +193,14 @@ def test_no_columns() -> None:
     optimizer = RowAdam({"shN": torch.empty(4, 0, 3)})
     optimizer.step({"shN": torch.empty(4, 0, 3)}, everything(4), {"shN": 0.1})
     assert optimizer.parameters["shN"].shape == (4, 0, 3)
+
+
+def test_the_mean_is_one(n: int = 9) -> None:
+    """Of finite values; an infinite one is its own."""
+    mean: dict[str, Tensor] = {}
+    all_values = [torch.randn(n, 3, generator=torch.Generator().manual_seed(k)) for k in range(4)]
+    for count, values in enumerate(all_values, 1):
+        values[2, 1], values[5, 0] = math.inf, -math.inf
+        add_to_mean(mean, {"any": values}, count)
+    assert mean["any"] is not all_values[0]
+    torch.testing.assert_close(mean["any"], torch.stack(all_values).mean(0))

@@ -17,6 +17,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import removal_error, start
+from clod_adapter.objective import Objective
 from clod_adapter.plan import NAMES, RATES, Decision, Overrule, Plan
 from clod_adapter.planning import make_plan
 from clod_adapter.render import render
@@ -248,6 +249,23 @@ def test_an_interrupt_ends_the_plan(captured: tuple[Gaussians, Scene], phase: st
 
     with pytest.raises(KeyboardInterrupt):
         make_plan(*captured, CONFIG, progress=follow)
+
+
+def test_a_probe_that_fails_leaves_the_failure_to_the_training(
+    captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which then ends with what the steps before have learned."""
+    pull, steps = Objective.pull, []
+
+    def failing(self: Objective, *given: Any) -> Any:
+        steps.append(1)
+        found = pull(self, *given)
+        return found if len(steps) < 4 else replace(found, loss=float("nan"))
+
+    monkeypatch.setattr(Objective, "pull", failing)
+    plan = make_plan(*captured, CONFIG)
+    found = plan.adapt(captured[1])
+    assert found.steps == 3 and "loss of step 4 is not finite" in (found.failed or "") and plan.frozen == ()
 
 
 def test_going_on_with_what_was_frozen(captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch) -> None:

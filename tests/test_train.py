@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -526,8 +527,18 @@ def test_a_state_of_something_else_is_refused(captured: tuple[Gaussians, Scene])
     for impossible in (
         {"tensors": damaged}, {"steps": 0}, {"averaged": -1}, {"averaged": 9}, {"seconds": math.nan}, {"seconds": -1.0},
     ):  # fmt: skip
-        with pytest.raises(ClodError, match="counts steps or seconds that cannot be|of other Gaussians"):
+        with pytest.raises(
+            ClodError, match="steps or seconds that cannot be|steps.* that cannot be|of other Gaussians"
+        ):
             adapt(base, scene, config, None, replace(state, **impossible))
+    for name, value in (
+        ("parameter.means", math.nan), ("parameter.opacity_logits", math.inf), ("first.sh0", math.inf),
+        ("second.sh0", -1.0), ("second.means", math.nan), ("parameter.log_sigma", 1e30),
+    ):  # fmt: skip
+        tensors = {n: t.clone() for n, t in state.tensors.items()}
+        tensors[name][7] = value
+        with pytest.raises(ClodError, match="the training state.*; start afresh"):
+            adapt(base, scene, config, None, replace(state, tensors=tensors))
     for broken in ({}, {**state.random, "state": {"state": -1, "inc": "x"}}):
         with pytest.raises(ClodError, match="random state is damaged"):
             adapt(base, scene, config, None, replace(state, random=broken))
@@ -563,6 +574,111 @@ def test_what_cannot_be_adapted_is_named(captured: tuple[Gaussians, Scene]) -> N
         adapt(base, Scene((), scene.test))
     with pytest.raises(ClodError, match="no Gaussians"):
         adapt(gaussians(0, 1, 0), scene)
+
+
+@pytest.mark.parametrize(
+    "config", [config_of(iters=10, average=1.0), AdaptConfig.paper(iters=6)], ids=["ours", "paper"]
+)
+@pytest.mark.parametrize("logit", [math.inf, -math.inf])
+def test_infinite_opacities_stay(captured: tuple[Gaussians, Scene], config: AdaptConfig, logit: float) -> None:
+    """Fully opaque or invisible before and after; all else is finite, and what is finite is trained."""
+    base, scene = captured
+    logits = base.opacity_logits.clone()
+    logits[:9] = logit
+    found = adapt(base.replace(opacity_logits=logits), scene, config).gaussians
+    assert (found.opacity_logits[:9] == logit).all() and found.opacity_logits[9:].isfinite().all()
+    assert not torch.equal(found.opacity_logits[9:], logits[9:])
+    assert all(value.isfinite().all() for name, value in found.tensors().items() if name != "opacity_logits")
+
+
+def test_a_base_that_is_not_finite_is_refused(captured: tuple[Gaussians, Scene]) -> None:
+    base, scene = captured
+    for name, value in (("sh0", math.inf), ("log_scales", -math.inf), ("opacity_logits", math.nan)):
+        values = getattr(base, name).clone()
+        values[5:7] = value
+        with pytest.raises(ClodError, match=rf"{name} is not finite in 2 rows \(the first is 5\); leave out"):
+            adapt(base.replace(**{name: values}), scene, config_of(iters=1))
+    huge = torch.full_like(base.sh0, 1e38)
+    huge[7] = 2e38
+    for how in ("importance", "identity"):  # looked at before training, or found by its first step
+        with pytest.raises(ClodError, match="not finite.* the largest sh0 is 2e.38, in row 7: leave out such rows"):
+            adapt(base.replace(sh0=huge), Scene(scene.train[:1], ()), config_of(iters=1, start=how))
+
+
+def pulls_changed(monkeypatch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]) -> None:
+    """From here on the ``at``-th pull is what ``change`` makes of it."""
+    pull, count = objective.Objective.pull, iter(range(1, 10_000))
+
+    def changed(self: Any, *given: Any) -> Any:
+        found = pull(self, *given)
+        return change(found) if next(count) == at else found
+
+    monkeypatch.setattr(objective.Objective, "pull", changed)
+
+
+def test_a_row_whose_gradient_is_not_finite_is_held(
+    captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By that step: the others move, and so does it in later ones."""
+
+    def spoil(pull: Any) -> Any:
+        pull.gradients["means"][3, 1], pull.gradients["log_sigma"][4] = math.nan, -math.inf
+        return pull
+
+    base, scene = captured
+    pulls_changed(monkeypatch, 1, spoil)
+    seen: list[Gaussians] = []
+    config = config_of(iters=12, average=0.0)
+    result = adapt(
+        base, scene, config, lambda p: seen.append(p.gaussians().select(torch.arange(9))) if p.state else None
+    )
+    assert result.held == 2 and all(value.isfinite().all() for value in result.gaussians.tensors().values())
+    first = start(base, scene.train, config)
+    assert torch.equal(seen[0].sigma_d[3:5], first.sigma_d[3:5]) and not torch.equal(seen[0].sigma_d, first.sigma_d[:9])
+    assert (result.gaussians.sigma_d[3:5] != first.sigma_d[3:5]).all()
+
+
+def test_a_loss_that_is_not_finite_ends_training_before_its_step(
+    captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, told, states = config_of(iters=9, average=0.9), list[Progress](), dict[int, TrainingState]()
+    whole = adapt(*captured, config).gaussians
+
+    def watch(progress: Progress) -> None:
+        told.append(progress)
+        states_of({4}, states)(progress)
+
+    with monkeypatch.context() as patch:
+        pulls_changed(patch, 5, lambda pull: replace(pull, loss=math.nan))
+        result = adapt(*captured, config, watch)
+    assert result.steps == 4 and result.interrupted and result.lost is None
+    assert re.fullmatch(r"the loss of step 5 is not finite \(view_\d.png\)", result.failed)
+    assert [p.done for p in told if p.state] == [1, 2, 3, 4, 4] and told[-1].lost == result.failed
+    assert all(value.isfinite().all() for value in result.gaussians.tensors().values())
+    assert_equal(adapt(*captured, config, None, states[4]).gaussians, whole)
+
+
+def test_an_error_is_told_with_the_state_before_it(
+    captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And is raised all the same; going on from that state gives the bits of an undisturbed run."""
+    config, states, lost = config_of(iters=8), dict[int, TrainingState](), list[str | None]()
+    whole = adapt(*captured, config).gaussians
+
+    def fail(_: Any) -> Any:
+        raise ZeroDivisionError("in a rasterizer")
+
+    def watch(progress: Progress) -> None:
+        lost.append(progress.lost)
+        if progress.lost:
+            states[progress.done] = copy.deepcopy(progress.state())
+
+    with monkeypatch.context() as patch:
+        pulls_changed(patch, 6, fail)
+        with pytest.raises(ZeroDivisionError, match="in a rasterizer"):
+            adapt(*captured, config, watch)
+    assert lost[-2:] == [None, "in a rasterizer"] and list(states) == [5]
+    assert_equal(adapt(*captured, config, None, states[5]).gaussians, whole)
 
 
 def test_scene_units(captured: tuple[Gaussians, Scene]) -> None:

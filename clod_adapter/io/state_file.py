@@ -50,13 +50,23 @@ def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
     refuse_irregular(path, "remove it to start afresh")
     try:
         tensors, metadata = read_tensors(path)
-        about = json.loads(metadata[KEY])
-        belongs, attenuation = about.pop("belongs"), AttenuationConfig(**about.pop("attenuation"))
-        order, random = tuple(map(int, about.pop("order"))), dict(about.pop("random"))
-        counts = {name: int(about.pop(name)) for name in ("averaged", "steps")}
-        rest = {name: float(value) for name, value in about.items()}
-        return TrainingState(tensors, attenuation, random, order, **counts, **rest), dict(belongs)  # type: ignore
+        about = _typed(json.loads(metadata[KEY]), dict)
+        belongs, random = _typed(about.pop("belongs"), dict), _typed(about.pop("random"), dict)
+        attenuation = AttenuationConfig(**about.pop("attenuation"))
+        order = tuple(_typed(view, int) for view in _typed(about.pop("order"), list))
+        counts = {name: _typed(about.pop(name), int) for name in ("averaged", "steps")}
+        rest = {name: float(_typed(value, float, int)) for name, value in about.items()}
+        return TrainingState(tensors, attenuation, random, order, **counts, **rest), belongs  # type: ignore[arg-type]
     except OSError as error:
         raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    except MemoryError:  # of a file that is whole
+        raise
     except Exception as error:  # SafetensorError, and whatever a crafted file provokes
         raise ClodError(f"{path}: is no training state or damaged ({error}); remove it to start afresh") from error
+
+
+def _typed(value: Any, *kinds: type) -> Any:
+    """The value, where it is of one of these types of JSON's; raises TypeError. A bool is no number there."""
+    if type(value) not in kinds:
+        raise TypeError(f"{value!r:.40} is not of the type {kinds[0].__name__}")
+    return value

@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
+import clod_adapter
 from clod_adapter import memory
 from clod_adapter.cli import memory_plan, resume, training
 from clod_adapter.io.chunk_file import load_chunk
 from clod_adapter.memory import MemoryPlan, make_plan
+from clod_adapter.objective import Objective
 from clod_adapter.training_state import Progress
 from scenes import stripped
 
@@ -230,10 +234,49 @@ def test_opaque_gaussians_are_handed_on(clod: Callable[..., Any], capture: Any, 
     logits = capture.gaussians.opacity_logits.clone()
     logits[::7] = float("inf")
     ply = capture.write(tmp_path / "opaque.ply", capture.gaussians.replace(opacity_logits=logits))
-    given = [ply, "--images", capture.scene, "--iters", 4, "--max-sv", 3, "--memory", "8GB", "--out", "a.ply"]
+    given = [ply, "--images", capture.scene, "--iters", 9, "--max-sv", 3, "--memory", "8GB", "--out", "a.ply"]
     assert clod(*given, "--chunk", 1).code == 0
     done = clod(*given)
     assert done.code == 0, done
+    found = clod_adapter.load(tmp_path / "a.ply").gaussians.opacity_logits
+    assert torch.equal(found.isinf(), logits.isinf()) and not found.isnan().any()
+
+
+def test_a_chunk_whose_loss_is_not_finite_ends_early(
+    adapt: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The others do not, and all that was learned is written."""
+    pull, pulls = Objective.pull, count(1)
+
+    def spoilt(self: Objective, *given: Any) -> Any:
+        found = pull(self, *given)  # not of the run that prepares the kernels
+        return replace(found, loss=float("nan")) if self.config.max_sv == 3 and next(pulls) == 3 else found
+
+    monkeypatch.setattr(Objective, "pull", spoilt)
+    done = adapt("a.ply", "--json")
+    report = json.loads(done.out)
+    note = "chunk 1 of 3, pass 1 of 2: the loss of step 3 is not finite"
+    assert done.code == 1 and any(note in each for each in report["notes"]) and len(report["rows"]) > 2, done
+    assert "chunk 1 of 3, pass 1 of 2: ended after step 2: the loss of step 3" in done.err
+    assert clod_adapter.load(tmp_path / "a.ply").gaussians.sigma_d is not None
+
+
+def test_an_error_in_a_chunk_leaves_its_state(
+    adapt: Callable[..., Any], whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pull, pulls = Objective.pull, count(1)
+
+    def failing(self: Objective, *given: Any) -> Any:
+        if self.config.max_sv == 3 and next(pulls) == 6:
+            raise ZeroDivisionError
+        return pull(self, *given)
+
+    monkeypatch.setattr(Objective, "pull", failing)
+    done = adapt("a.ply", "--quiet")
+    state = "a.chunk1.pass1.resume.safetensors"
+    assert done.code == 1 and f"the same command goes on from step 5, which is in {state}\n" in done.err, done
+    done = adapt("a.ply")
+    assert done.code == 0 and f"resuming {state} from step 5" in done.err and outputs(tmp_path, "a") == whole
 
 
 def test_ctrl_c_leaves_what_is_finished(

@@ -298,15 +298,26 @@ def test_threads_do_not_spin() -> None:
 
 def test_ctrl_c_within_compiled_code(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Numba's dispatcher hands it on as a SystemError; other SystemErrors are nobody's Ctrl-C."""
-    for cause, answer in ((KeyboardInterrupt(), 130), (None, None)):
+    for cause, code, last in ((KeyboardInterrupt(), 130, "clod-adapt: interrupted"), (None, 1, "please report it")):
 
         def read(*_: object, cause: BaseException | None = cause) -> None:
             raise SystemError("returned a result with an exception set") from cause
 
         monkeypatch.setattr("clod_adapter.cli.evaluate.read_checkpoint", read)
-        if answer is None:
-            with pytest.raises(SystemError):
-                clod("eval", capture.ply, "--images", capture.scene)
-        else:
-            done = clod("eval", capture.ply, "--images", capture.scene)
-            assert done.code == answer and done.err.endswith("clod-adapt: interrupted\n")
+        done = clod("eval", capture.ply, "--images", capture.scene)
+        assert done.code == code and last in done.err.splitlines()[-1], done
+
+
+def test_an_unknown_error_is_a_traceback_and_where_to_report_it(
+    clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("of ours")
+
+    monkeypatch.setattr("clod_adapter.cli.evaluate.read_checkpoint", fail)
+    done = clod("eval", capture.ply, "--images", capture.scene, "--json", "--quiet")
+    lines = done.err.splitlines()
+    assert done.code == 1 and done.out == "" and lines[0] == "Traceback (most recent call last):", done
+    assert lines[-2] == "ZeroDivisionError: of ours" and 'raise ZeroDivisionError("of ours")' in done.err
+    assert lines[-1].startswith(f"clod-adapt: error: this is a fault of clod-adapt {package_version()}, not of what")
+    assert "please report it, with the lines above" in lines[-1]

@@ -25,7 +25,7 @@ from PIL import Image
 import clod_adapter
 from clod_adapter.cli import adapt as adapt_command
 from clod_adapter.cli import evaluate as evaluate_command
-from clod_adapter.cli import inputs, outcome, results, resume
+from clod_adapter.cli import inputs, results, resume
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.interrupts import GracefulStop
 from clod_adapter.config import AdaptConfig
@@ -41,7 +41,7 @@ ITERS, KILLS = 24, 20
 
 # Imports everything once; a line on stdin is a command, run in a process of its own, or asks for the last one's end.
 SERVER = """
-import json, os, signal, sys
+import json, os, signal, sys, tempfile
 import torch
 torch.set_num_threads(1)  # a process that forks must have no threads
 from clod_adapter.cli import adapt, console, main, resume
@@ -60,6 +60,7 @@ for line in sys.stdin:
     child = os.fork()
     if child == 0:
         os.chdir(folder)
+        tempfile.tempdir = os.path.dirname(folder)
         log = os.open(f"{folder}.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         for stream in (1, 2):
             os.dup2(log, stream)
@@ -276,16 +277,20 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_full_disk(
     server: Server, words: list[Any], capture: Any, small_disk: Path, undisturbed: tuple[Path, float]
 ) -> None:
-    """The state fits once, and the outputs no more; with space again --resume ends as if nothing had happened."""
+    """The state fits once, the outputs do not: the last state is saved elsewhere, and --resume goes on from there."""
     before = fingerprints(capture.ply, capture.scene)
     code, log = server.run(small_disk, *words)
     assert code == 2 and names(small_disk) == [STATE], log
     *_, last = log.splitlines()
     assert re.match(r"clod-adapt: error: dial.ply: cannot be written: (No space left on device|\d+ requested)", last)
-    assert log.count("training goes on") == 1 and load_state(small_disk / STATE)[0].steps == 1, log
+    assert log.count("the run goes on") == 1 and load_state(small_disk / STATE)[0].steps == 1, log
     assert fingerprints(capture.ply, capture.scene) == before
     subprocess.run(["mount", "-o", "remount,size=1m", str(small_disk)], check=True)
-    assert server.run(small_disk, *words, "--resume")[0] == 0
+    (kept,) = small_disk.parent.glob(f"clod-adapt-*/{STATE}")
+    assert f"step {ITERS} is in {kept}: move it to {STATE}, and --resume goes on from there\n" in log
+    shutil.move(kept, small_disk / STATE)
+    code, log = server.run(small_disk, *words, "--resume")
+    assert code == 0 and f"resuming {STATE} from step {ITERS}" in log, log
     assert_same(small_disk, undisturbed[0])
 
 
@@ -294,14 +299,14 @@ TINY = ("--iters", 12, "--max-sv", 4, "--out", "dial.ply")
 
 @pytest.fixture
 def broken_off(clod: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Runs the command up to where the outputs are to be written, so that the state after one step is there."""
+    """Runs the command up to where training has ended and is to be saved: the state after one step is there."""
 
     def run(*words: object) -> None:
         def stop(*_: Any) -> None:
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr(outcome, "write", stop)
+            patch.setattr(resume.Saver, "keep", stop)
             assert clod(*words).code == 130
 
     return run
