@@ -1,0 +1,168 @@
+"""Runs the test suite under conditions in which processors, users, shells and folders differ, and prints one table.
+
+    python benchmarks/portability.py                               # all conditions: an hour on two idle cores
+    python benchmarks/portability.py ignored_sigint c_locale       # two of them
+    python benchmarks/portability.py one_thread --tests tests/io   # one of them, over some of the tests
+    python benchmarks/portability.py --record                      # and a row each in results/portability.jsonl
+
+Run by another virtual environment's Python it tests the versions that are installed there (docs/dependencies.md). The
+exit code is 1 where a test failed or a condition could not be had. The conditions:
+
+- ``plain``: as ``make test`` runs it;
+- ``aten_default``, ``aten_avx2``: torch's loops without vectors, and with those of 2013;
+- ``mkl_compatible``: the results that MKL gives on every processor;
+- ``numba_generic``: kernels compiled for the oldest processor of the architecture;
+- ``one_thread``, ``one_core``: a single thread; as many as otherwise, on one core;
+- ``no_root``: for root, in a user namespace without root's rights; for others ``plain`` is that;
+- ``ignored_sigint``, ``blocked_signals``: as a script's background job, and below a program that blocks signals;
+- ``c_locale``: ASCII as the encoding of files and of the terminal, and a day's time zone away from Greenwich;
+- ``folders``: temporary files, home and kernel cache in folders with spaces and other letters in their names;
+- ``checkout``: the last commit as a clone in such a folder, with an environment of its own (pip installs it).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import requires, version
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from common import ROOT, SHARED, append
+
+FILE = "portability.jsonl"
+SPACED = "a folder, spàced"
+PARALLEL = (
+    "--numprocesses=auto",
+    "--maxprocesses=4",
+    "--dist=loadfile",
+    "--no-loadscope-reorder",
+)  # as in the Makefile
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What is set, in which ``{work}`` is a temporary folder, and the command that starts the tests' own."""
+
+    environment: dict[str, str] = field(default_factory=dict)
+    prefix: tuple[str, ...] = ()
+
+
+CONDITIONS = {
+    "plain": Condition(),
+    "aten_default": Condition({"ATEN_CPU_CAPABILITY": "default"}),
+    "aten_avx2": Condition({"ATEN_CPU_CAPABILITY": "avx2"}),
+    "mkl_compatible": Condition({"MKL_CBWR": "COMPATIBLE"}),
+    "numba_generic": Condition({"NUMBA_CPU_NAME": "generic"}),
+    "one_thread": Condition({"OMP_NUM_THREADS": "1"}),
+    "one_core": Condition({}, ("taskset", "--cpu-list", str(min(os.sched_getaffinity(0))))),
+    "no_root": Condition({}, ("unshare", "--user") if os.geteuid() == 0 else ()),
+    "ignored_sigint": Condition({}, ("env", "--ignore-signal=INT")),
+    "blocked_signals": Condition({}, ("env", "--block-signal=INT,TERM")),
+    "c_locale": Condition(
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "TZ": "Pacific/Kiritimati"},
+    ),
+    "folders": Condition(
+        {"TMPDIR": "{work}/tmp", "HOME": "{work}/home", "XDG_CACHE_HOME": "", "NUMBA_CACHE_DIR": "{work}/cache"},
+    ),
+    "checkout": Condition(),
+}
+
+
+def run(name: str, tests: Sequence[str], parallel: Sequence[str] = PARALLEL) -> dict[str, Any]:
+    """Counts and seconds of the tests under a condition; ``failures`` names those that failed, or says why none ran.
+
+    Args:
+        tests: paths in the checkout; all of its tests where there are none.
+    """
+    condition = CONDITIONS[name]
+    with tempfile.TemporaryDirectory() as outer:
+        work = Path(outer) / SPACED
+        for folder in ("tmp", "home", "cache"):
+            (work / folder).mkdir(parents=True)
+        root, python = clone(work) if name == "checkout" else (ROOT, Path(sys.executable))
+        report = Path(outer) / "report.xml"
+        words = [*condition.prefix, str(python), "-m", "pytest", *parallel, f"--junitxml={report}", *tests]
+        environment = {key: value.format(work=work) for key, value in condition.environment.items()}
+        environment["CLOD_SHARED_DATA"] = str(SHARED)  # which is not beside a clone
+        began = time.perf_counter()
+        done = subprocess.run(
+            words, cwd=root, env=os.environ | environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            errors="replace", check=False,
+        )  # fmt: skip
+        seconds = round(time.perf_counter() - began, 1)
+        found = counts(report) if report.exists() else {"failures": [last_line(done.stdout)]}
+    if done.returncode != 0 and not found["failures"]:
+        found["failures"] = [f"exit code {done.returncode}: {last_line(done.stdout)}"]
+    return {"passed": 0, "failed": 1, "skipped": 0, **found, "seconds": seconds}
+
+
+def clone(work: Path) -> tuple[Path, Path]:
+    """The last commit in a folder of its own, and the Python of an environment that has it beside what this one has."""
+    root = work / ROOT.name
+    subprocess.run(["git", "clone", "--quiet", str(ROOT), str(root)], check=True)
+    subprocess.run([sys.executable, "-m", "venv", str(root / ".venv")], check=True)
+    python = root / ".venv" / "bin" / "python"
+    (site,) = (root / ".venv").glob("lib/python*/site-packages")
+    (site / "beside.pth").write_text(site_packages(), encoding="utf-8")
+    subprocess.run([str(python), "-m", "pip", "install", "--quiet", "--no-deps", "--editable", str(root)], check=True)
+    return root, python
+
+
+def site_packages() -> str:
+    """Where this environment's packages are, in lines of a .pth file."""
+    own = Path(sysconfig.get_path("purelib"))
+    return "\n".join(path for path in sys.path if Path(path) == own or Path(path).name == "site-packages")
+
+
+def counts(report: Path) -> dict[str, Any]:
+    """The counts of a JUnit report, and the names of the tests that failed."""
+    (suite,) = ElementTree.parse(report).getroot().iter("testsuite")
+    bad = [case for case in suite.iter("testcase") if any(case.findall(kind) for kind in ("failure", "error"))]
+    skipped = int(suite.attrib["skipped"])
+    names = sorted({f"{case.get('classname')}::{case.get('name')}" for case in bad})
+    total = len(list(suite.iter("testcase")))
+    return {"passed": total - len(bad) - skipped, "failed": len(bad), "skipped": skipped, "failures": names}
+
+
+def last_line(text: str) -> str:
+    return next((line for line in reversed(text.splitlines()) if line.strip()), "no output")
+
+
+def packages() -> dict[str, str]:
+    """The versions that are installed of what pyproject.toml lists as needed to run."""
+    needed = [line for line in requires("clod-adapter") or [] if "extra ==" not in line]
+    return {name: version(name) for line in needed for name in re.findall(r"^[\w.-]+", line)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("conditions", nargs="*", choices=[[], *CONDITIONS], help="default: all of them")
+    parser.add_argument("--tests", nargs="+", default=[], metavar="PATH", help="default: all of them")
+    parser.add_argument("--record", action="store_true", help=f"add a row for each to results/{FILE}")
+    args = parser.parse_args()
+    print(f"{'condition':16} {'passed':>7} {'failed':>7} {'skipped':>7} {'seconds':>8}", flush=True)
+    failed = False
+    for name in args.conditions or CONDITIONS:
+        found = run(name, args.tests)
+        failed |= bool(found["failures"])
+        print(f"{name:16} {found['passed']:7} {found['failed']:7} {found['skipped']:7} {found['seconds']:8}")
+        print("\n".join(f"    {line}" for line in found["failures"]), end="\n" * bool(found["failures"]), flush=True)
+        if args.record:
+            load = round(os.getloadavg()[0], 2)
+            about = {"benchmark": "portability", "condition": name, "tests": args.tests or ["tests"]}
+            append(FILE, {**about, "load": load, "packages": packages(), **found})
+    sys.exit(failed)
+
+
+if __name__ == "__main__":
+    main()

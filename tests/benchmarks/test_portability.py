@@ -1,0 +1,54 @@
+"""The conditions are those that the tests find, and their counts are right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import portability
+import pytest
+
+TESTS = """
+import locale, os, signal, tempfile
+import pytest
+
+def test_ignored():
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+def test_blocked():
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == {signal.SIGINT, signal.SIGTERM}
+
+def test_spaced():
+    assert " " in tempfile.gettempdir() and os.path.isdir(tempfile.gettempdir())
+
+def test_ascii():
+    assert locale.getencoding() in ("ANSI_X3.4-1968", "US-ASCII", "646")
+
+def test_skipped():
+    pytest.skip("always")
+
+@pytest.fixture
+def broken():
+    raise ValueError
+
+def test_error(broken):
+    pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("condition", "holds"),
+    [("ignored_sigint", "ignored"), ("blocked_signals", "blocked"), ("folders", "spaced"), ("c_locale", "ascii")],
+)
+def test_a_condition_and_its_counts(tmp_path: Path, condition: str, holds: str) -> None:
+    path = tmp_path / "test_made.py"
+    path.write_text(TESTS)
+    found = portability.run(condition, [str(path)], ["-p", "no:xdist", "-p", "no:cacheprovider"])
+    assert [found[key] for key in ("passed", "failed", "skipped")] == [1, 4, 1], found
+    failed = {name.partition("::test_")[2] for name in found["failures"]}
+    assert failed == {"ignored", "blocked", "spaced", "ascii", "error"} - {holds}
+
+
+def test_a_condition_that_cannot_be_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(portability.CONDITIONS, "plain", portability.Condition({}, ("env", "--no-such-option")))
+    found = portability.run("plain", [str(tmp_path)], [])
+    assert found["passed"] == 0 and found["failed"] == 1 and "env --help" in found["failures"][0]
