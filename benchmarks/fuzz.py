@@ -35,6 +35,9 @@ import torch
 from common import append
 from mutants import FORMATS, Input, make, mutate, write, write_images
 
+from clod_adapter.cli.console import Console
+from clod_adapter.cli.interrupts import GracefulStop
+from clod_adapter.cli.resume import Saver
 from clod_adapter.errors import ClodError
 from clod_adapter.io.adapter_file import load_adapter
 
@@ -42,7 +45,7 @@ FILE = "fuzz.jsonl"
 LIMIT_S, LIMIT_MB = 10.0, 64
 BATCH = 5000  # cases a process
 MANY = 50  # processes that died, after which a format is given up
-SHARES = {"ply": 0.3, "safetensors": 0.15, "colmap": 0.2, "transforms": 0.1, "pt": 0.05, "models": 0.2}
+SHARES = {"ply": 0.3, "safetensors": 0.15, "colmap": 0.2, "transforms": 0.1, "pt": 0.05, "models": 0.2, "states": 0.05}
 HARMFUL = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect", "ctypes.dlopen")
 # What a process tells the one that watches it, in shared memory.
 CASE, READ, REFUSED, SLOWEST_US, SLOWEST, EXTRA_KB = range(6)
@@ -84,6 +87,10 @@ def read(kind: str, folder: Path, case: Input, number: int) -> None:
         clod.load_scene(folder)
     elif kind == "safetensors":
         load_adapter(folder / next(iter(case)))
+    elif kind == "states":
+        saver = Saver(folder / next(iter(case)), True, clod.AdaptConfig(), Console(quiet=True), GracefulStop())
+        if saver.state is None or saver.frozen is None:
+            raise AssertionError("the state was not read")
     else:
         clod.load(folder / next(iter(case)), activated=None if number % 2 else "both")
 
@@ -209,7 +216,7 @@ def again(kind: str, seed: int, number: int, folder: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", type=int, default=200_000, help="over all formats")
+    parser.add_argument("--cases", type=int, default=200_000, help="over all formats; of states a twentieth more")
     parser.add_argument("--format", choices=FORMATS, help="this one alone")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--case", type=int, help="this one alone, in this process")

@@ -15,6 +15,7 @@ import shutil
 import zipfile
 from collections.abc import Callable
 from copy import deepcopy
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +31,12 @@ import clod_adapter as clod
 from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.ply_columns import inria_dtype
 from clod_adapter.io.ply_header import read_head
+from clod_adapter.io.state_file import save_state
+from clod_adapter.io.version import package_version
+from clod_adapter.training_state import TrainingState
 
 Input = dict[str, bytes]
-FORMATS = ("ply", "safetensors", "colmap", "transforms", "pt", "models")
+FORMATS = ("ply", "safetensors", "states", "colmap", "transforms", "pt", "models")
 IMAGES = ("a.png", "b.png", "c.png")
 SIZE = (8, 6)
 CAMERAS = {
@@ -44,7 +48,8 @@ CAMERAS = {
 def make(kind: str, folder: Path) -> list[Input]:
     """The undamaged inputs of a format; ``folder`` is for files on the way."""
     makers: dict[str, Callable[[Path], list[Input]]] = {
-        "ply": _plys, "safetensors": _adapters, "colmap": _models, "transforms": _transforms, "pt": _pts,
+        "ply": _plys, "safetensors": _adapters, "states": _states, "colmap": _models, "transforms": _transforms,
+        "pt": _pts,
         "models": lambda folder: model_inputs(folder, _base(folder).gaussians),
     }  # fmt: skip
     return makers[kind](folder)
@@ -109,6 +114,20 @@ def _adapters(folder: Path) -> list[Input]:
     for adapted in (gaussians, tuned):
         adapter = clod.extract(base.gaussians, adapted, fingerprint=base.fingerprint, config={"seed": 0, "row": row})
         save_adapter(folder / "a.safetensors", adapter)
+        inputs.append({"a.safetensors": (folder / "a.safetensors").read_bytes()})
+    return inputs
+
+
+def _states(folder: Path) -> list[Input]:
+    """Of an interrupted training, as ``--resume`` looks for it: with a mean, and without one."""
+    inputs, random = [], np.random.default_rng(0)
+    for kinds in (("parameter", "first", "second"), ("parameter", "first", "second", "mean")):
+        tensors = {f"{kind}.means": torch.rand(6, 3) for kind in kinds} | {"steps.means": torch.ones(6).int()}
+        state = TrainingState(
+            tensors, clod.AttenuationConfig(), random.bit_generator.state, (2, 0), 0.1, len(kinds) - 3, 1, 0.5, 0.5
+        )
+        belongs = {"version": package_version(), "config": asdict(clod.AdaptConfig()), "base_sha256": "0" * 64}
+        save_state(folder / "a.safetensors", state, belongs | {"frozen": ["quats"], "overruled": {"--with": ["sh0"]}})
         inputs.append({"a.safetensors": (folder / "a.safetensors").read_bytes()})
     return inputs
 
@@ -227,15 +246,16 @@ def _describe(data: bytes, chance: random.Random) -> bytearray:
     """A safetensors file whose description is damaged: as text, or a value in it, the lengths right again."""
     size = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + size])
-    about = json.loads(header["__metadata__"]["clod_adapter"])
+    (key,) = header["__metadata__"]
+    about = json.loads(header["__metadata__"][key])
     if chance.random() < 0.3:
         text = bytearray(json.dumps(about).encode())
         damage(text, chance)
-        header["__metadata__"]["clod_adapter"] = text.decode("latin1")
+        header["__metadata__"][key] = text.decode("latin1")
     else:
         _replace(header if chance.random() < 0.2 else about, chance)
         if isinstance(header.get("__metadata__"), dict):
-            header["__metadata__"]["clod_adapter"] = json.dumps(about)
+            header["__metadata__"][key] = json.dumps(about)
     changed = json.dumps(header).encode()
     return bytearray(len(changed).to_bytes(8, "little") + changed + data[8 + size :])
 

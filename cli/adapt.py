@@ -35,6 +35,7 @@ from clod_adapter.io.atomic import remove_leftovers
 from clod_adapter.plan import Plan
 from clod_adapter.rasterizers.cpu import release_memory
 from clod_adapter.train import Adapted, Progress
+from clod_adapter.training_state import StateRefused
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
@@ -59,6 +60,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             page = AdaptPage(gaussians, scene, inputs.config, now.console) if args.report else None
             outcome = learn_and_write(now, inputs, page)
         return finish(now, outcome, page)
+    except StateRefused as error:
+        raise now.saver.naming(error) from error
     except Exception:  # whatever it is, it ends the run: of what was learned nothing is lost
         now.saver.rescue()
         raise

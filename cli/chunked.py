@@ -32,7 +32,7 @@ from clod_adapter.memory import MemoryPlan
 from clod_adapter.rasterizers.cpu import release_memory
 from clod_adapter.robustness import scene_fingerprint
 from clod_adapter.train import Adapted
-from clod_adapter.training_state import Progress
+from clod_adapter.training_state import Progress, StateRefused
 
 
 @dataclass
@@ -177,6 +177,8 @@ class Chunked:
             release_memory()
             if adapted.failed or not adapted.interrupted:
                 files.save_learned(learned, block, number)
+        except StateRefused as error:
+            raise saver.naming(error) from error
         except Exception:
             saver.rescue("the same command")
             raise

@@ -24,7 +24,7 @@ from clod_adapter.io.atomic import remove_leftovers
 from clod_adapter.io.state_file import load_state, save_state
 from clod_adapter.io.version import package_version
 from clod_adapter.robustness import scene_fingerprint
-from clod_adapter.training_state import Progress, TrainingState
+from clod_adapter.training_state import Progress, StateRefused, TrainingState
 
 # Not "leave out --resume", which the demo gives by itself.
 BEGUN = "give what it was begun with, or remove it to start afresh"
@@ -97,6 +97,10 @@ class Saver:
             if self.found.get(key) != self.belongs[key]:
                 raise ClodError(f"{self.path}: is of {what}; {BEGUN}")
         self.console.say(f"resuming {self.path} from step {self.state.steps}")
+
+    def naming(self, error: StateRefused) -> ClodError:
+        """What the state found was refused for, with the name of its file."""
+        return ClodError(f"{self.path}: {str(error).partition(';')[0]}; remove it to start afresh")
 
     def _refuse_other_settings(self) -> None:
         if (then := self.found.get("version")) != (now := self.belongs["version"]):

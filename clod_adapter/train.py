@@ -21,7 +21,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import for_training, seeing, start
 from clod_adapter.objective import Objective, Part, Pull
 from clod_adapter.optimizer import RowAdam, add_to_mean
-from clod_adapter.training_state import Adapted, Progress, TrainingState
+from clod_adapter.training_state import Adapted, Progress, StateRefused, TrainingState
 from clod_adapter.units import in_world_units, with_distance
 
 __all__ = ["Adapted", "Progress", "TrainingState", "adapt"]
@@ -72,8 +72,8 @@ def adapt(
 
     Raises:
         ClodError: no training views, none that has a Gaussian before it, no Gaussians, an attribute that is not
-            finite, a first step whose loss is not, ``resume`` is of something else, fewer views a step than processes,
-            or one of these was lost before the first step.
+            finite, a first step whose loss is not, ``resume`` is of something else or damaged (StateRefused), fewer
+            views a step than processes, or one of these was lost before the first step.
     """
     config = config or AdaptConfig()
     if not scene.train:
@@ -108,7 +108,10 @@ def adapt(
     run.empty_bands = None if lean is base else base.shN.clone()
     run.start_seconds = time.perf_counter() - began
     if resume is not None:
-        run.restore(resume)
+        try:
+            run.restore(resume)
+        except ClodError as error:
+            raise StateRefused(str(error)) from error
     del resume  # by now a copy of what is in the run
     return run.run()
 

@@ -16,6 +16,10 @@ from clod_adapter.gaussians import Gaussians
 OTHER_RUN = "the training state is of other Gaussians, views or settings; give those it was saved with"
 
 
+class StateRefused(ClodError):
+    """A training state cannot be gone on from: it is of another run, or damaged."""
+
+
 @dataclass(frozen=True)
 class TrainingState:
     """All that the steps to come depend on, besides the base, the views and the config.
@@ -31,6 +35,9 @@ class TrainingState:
         random: the state of NumPy's generator; order: the views to come in this round, the next one last.
         loss: its running mean; averaged: how many steps are in the mean.
         steps, seconds: done and spent in training; start_seconds: spent before it.
+
+    Raises:
+        StateRefused: it counts steps or seconds that cannot be.
     """
 
     tensors: dict[str, Tensor]
@@ -43,19 +50,21 @@ class TrainingState:
     seconds: float
     start_seconds: float
 
+    def __post_init__(self) -> None:
+        times = (self.seconds, self.start_seconds)
+        possible = 0 <= self.averaged <= self.steps < 2**31 and all(0 <= seconds < math.inf for seconds in times)
+        if not possible:
+            raise StateRefused("the training state counts steps or seconds that cannot be; start afresh")
+
     def check(self, own: dict[str, Tensor]) -> None:
         """Refuses a state whose tensors are not like a run's ``own``, or that cannot be.
 
         Raises:
-            ClodError: it is of another run, or damaged.
+            StateRefused: it is of another run, or damaged.
         """
         shapes = [{name: (t.shape, t.dtype) for name, t in tensors.items()} for tensors in (own, self.tensors)]
         if shapes[0] != shapes[1]:
-            raise ClodError(OTHER_RUN)
-        times = (self.seconds, self.start_seconds)
-        possible = 0 <= self.averaged <= self.steps < 2**31 and all(0 <= seconds < math.inf for seconds in times)
-        if not possible:
-            raise ClodError("the training state counts steps or seconds that cannot be; start afresh")
+            raise StateRefused(OTHER_RUN)
         for name, values in self.tensors.items():
             kind, _, attribute = name.partition(".")
             if kind == "steps":  # an index in compiled code, which checks none
@@ -67,7 +76,7 @@ class TrainingState:
             else:  # an infinite opacity stays what it is in the base
                 sound = values.isfinite() | (values == own[f"parameter.{attribute}"])
             if not bool(sound.all()):
-                raise ClodError(f"the training state has {name} that cannot be; start afresh")
+                raise StateRefused(f"the training state has {name} that cannot be; start afresh")
 
 
 @dataclass(frozen=True)

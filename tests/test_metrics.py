@@ -9,7 +9,7 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio
 
 from clod_adapter.losses import ssim_plain
-from clod_adapter.metrics import psnr_ssim
+from clod_adapter.metrics import psnr, psnr_ssim
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -29,6 +29,13 @@ def test_renders_are_clamped_first() -> None:
     target = torch.tensor([0, 255], dtype=torch.uint8).repeat(6, 3)[..., None].expand(6, 6, 3).contiguous()
     beyond = torch.where(target > 0, 7.0, -3.0)
     assert psnr_ssim(beyond, target) == (math.inf, pytest.approx(1, abs=1e-6))
+
+
+def test_a_picture_that_is_no_number_is_not_taken_for_the_photograph() -> None:
+    picture, target = torch.zeros(12, 12, 3), torch.zeros(12, 12, 3, dtype=torch.uint8)
+    assert psnr(picture, target) == math.inf
+    picture[3, 4, 1] = math.nan
+    assert math.isnan(psnr(picture, target))
 
 
 def test_known_value() -> None:

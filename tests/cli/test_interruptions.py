@@ -21,6 +21,8 @@ from typing import Any
 import pytest
 import torch
 from PIL import Image
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 import clod_adapter
 from clod_adapter.cli import adapt as adapt_command
@@ -356,6 +358,16 @@ def test_other_inputs_are_refused(
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--resume")
     assert (
         done.code == 2 and f"error: {STATE}: is of version {package_version()} of this package, not 0.0.7" in done.err
+    )
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    broken = dict(load_file(tmp_path / STATE))
+    broken["first.means"][0] = float("nan")
+    with safe_open(tmp_path / STATE, framework="pt") as file:
+        save_file(broken, tmp_path / STATE, file.metadata())
+    done = clod(capture.ply, "--images", capture.scene, *TINY, "--resume")
+    assert done.code == 2 and done.err.splitlines()[-1] == (
+        f"clod-adapt: error: {STATE}: the training state has first.means that cannot be; remove it to start afresh"
     )
     (tmp_path / STATE).write_bytes(state[:-9])
     for words in ([], ["--resume"]):  # what is no state, an adapter say, is not replaced either

@@ -181,6 +181,24 @@ def test_three_with_uneven_shares(server: Server, words: list[Any], tmp_path: Pa
     assert_close(three.folder, one.folder)
 
 
+def test_a_loss_that_is_not_finite_ends_both(server: Server, words: list[Any], tmp_path: Path) -> None:
+    """After the same step, whichever has it; what was learned before is written and measured."""
+    spoil = (
+        "from dataclasses import replace; from clod_adapter.objective import Objective\n"
+        "pull, steps = Objective.pull, []\n"
+        "def spoilt(self, *given):\n"
+        "    steps.append(1)\n"
+        "    return replace(pull(self, *given), loss=float('nan') if len(steps) == 4 else 0.1)\n"
+        "Objective.pull = spoilt"
+    )
+    run = server.start(tmp_path / "run", *words, *TINY, before={1: spoil})
+    assert run.wait() == [1, 0], run.log(0) + run.log(1)
+    report = run.report()
+    assert report["interrupted"] and report["steps"] == 3 and len(report["rows"]) > 1
+    assert any("the loss of step 4 is not finite" in note for note in report["notes"])
+    assert load_state(run.folder / STATE)[0].steps == 3
+
+
 def test_a_time_budget_ends_all_at_once(server: Server, words: list[Any], tmp_path: Path) -> None:
     """By the first one's clock: that of the second is far ahead."""
     ahead = "import clod_adapter.train as t; at = t.time.perf_counter; t.time.perf_counter = lambda: 1e3 * at()"

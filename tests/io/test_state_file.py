@@ -66,7 +66,20 @@ def test_what_is_no_state_is_named(tmp_path: Path, state: TrainingState) -> None
 
 @pytest.mark.parametrize(
     "changes",
-    [{"steps": None}, {"order": 3}, {"random": "x"}, {"attenuation": {"tau": 7}}, {"belongs": 1}, {"more": 1.0}, None],
+    [
+        {"steps": None},
+        {"steps": "9"},
+        {"steps": 9.0},
+        {"loss": True},
+        {"seconds": math.nan},
+        {"order": [1.0]},
+        {"order": 3},
+        {"random": "x"},
+        {"attenuation": {"tau": 7}},
+        {"belongs": 1},
+        {"more": 1.0},
+        None,
+    ],
     ids=str,
 )
 def test_a_damaged_description(tmp_path: Path, state: TrainingState, changes: dict[str, Any] | None) -> None:
