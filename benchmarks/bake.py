@@ -5,7 +5,7 @@
     python benchmarks/bake.py --table                      # the rows as a Markdown table
 
 The model is an adapted file of the capture. At each dial value the count is the dial's mean over the held-out views,
-and PSNR is on these. Files of that count (or of s = 1, where a file keeps fewer there) are baked for:
+and PSNR is on these. Files of that count, or of the nearest one that a dial value has, are baked for:
 
 - ``d' = 1``: one distance for all Gaussians, ``scene_distance``, with the opacities of the dial value itself, as
   earlier versions did;
@@ -76,7 +76,8 @@ def measure(model: str, scene: str, label: str) -> None:
         counts, found = {"dial": dial.kept}, {"dial": dial.psnr}
         files = {"d' = 1": at_one_distance(adapted, count)}
         for name, places in cameras.items():
-            at = clod.dial_for(adapted, keep=count, cameras=places, baked=True).virtual_scale
+            least = len(clod.bake(adapted, config.max_sv, cameras=places))
+            at = clod.dial_for(adapted, keep=max(count, least), cameras=places, baked=True).virtual_scale
             files[name] = clod.bake(adapted, at, cameras=places)
         files["at s"] = clod.bake(adapted, s, cameras=training)
         for name, gaussians in files.items():

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera, View
 from clod_adapter.cli.console import Console
+from clod_adapter.cli.evaluate import measure
 from clod_adapter.cli.inputs import read_scene
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.render import named
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.poses import load_cameras
@@ -69,27 +69,25 @@ def _placed(model: Checkpoint, console: Console) -> tuple[Target, list[str]]:
 
 
 @dataclass(frozen=True)
-class Measured:
-    """The dial value that a PSNR budget allows a file.
+class Photographs:
+    """What files are measured on, for a PSNR budget.
 
     Attributes:
-        virtual_scale: the dial s.
+        views: the held-out ones.
         reference: dB of the model at s = 1.
-        views: held-out photographs that both are measured on.
     """
 
-    virtual_scale: float
-    reference: float
     views: Sequence[View]
+    reference: float
 
-    def psnr(self, gaussians: Gaussians) -> float:
-        """dB of Gaussians without a dial, the mean over the views."""
-        return evaluate(gaussians, self.views, [1.0])[0].psnr
+    def lost(self, gaussians: Gaussians, console: Console, label: str) -> float:
+        """dB by which Gaussians without a dial are below the model at s = 1."""
+        return self.reference - _psnr(gaussians, self.views, console, label)
 
 
 def measure_drop(
     args: argparse.Namespace, model: Checkpoint, candidate: Callable[[float], Gaussians], console: Console
-) -> Measured:
+) -> tuple[float, Photographs]:
     """The largest dial value, to 1 %, whose file is at most ``--psnr-drop`` below the model at s = 1.
 
     Args:
@@ -102,25 +100,24 @@ def measure_drop(
     if not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to measure on; give at least two")
     assert model.gaussians.attenuation is not None
-    largest = model.gaussians.attenuation.max_sv
     prepare_kernels(console, model.gaussians.means.device, training=False)
-    with console.meter("measuring") as meter:
-        found = Measured(1.0, evaluate(model.gaussians, scene.test, [1.0])[0].psnr, scene.test)
-        steps = 2 + max(math.ceil(math.log2(math.log(largest) / math.log(CLOSE))), 0) if largest > 1 else 1
-        done = 0
+    photographs = Photographs(scene.test, _psnr(model.gaussians, scene.test, console, "the dial, s=1"))
 
-        def lost(s: float) -> float:
-            nonlocal done
-            loss = found.reference - found.psnr(candidate(s))
-            done += 1
-            meter.update(min(done / steps, 1.0), f"s={s:.4g} loses {loss:.2f} dB")
-            return loss
+    def lost(s: float) -> float:
+        return photographs.lost(candidate(s), console, f"a file, s={s:.4g}")
 
-        if (least := lost(1.0)) > drop:
-            raise ClodError(
-                f"--psnr-drop {drop:g} is out of reach: the file of s = 1 is {least:.2f} dB below the model at s = 1"
-            )
-        return Measured(largest_within(lost, drop, largest), found.reference, scene.test)
+    if (least := lost(1.0)) > drop:
+        raise ClodError(
+            f"--psnr-drop {drop:g} is out of reach: the file of s = 1 is {least:.2f} dB below the model at s = 1"
+        )
+    return largest_within(lost, drop, model.gaussians.attenuation.max_sv), photographs
+
+
+def _psnr(gaussians: Gaussians, views: Sequence[View], console: Console, label: str) -> float:
+    rows, interrupted = measure(gaussians, views, [1.0], console, label)
+    if interrupted:
+        raise KeyboardInterrupt
+    return rows[0].psnr
 
 
 def largest_within(lost: Callable[[float], float], drop: float, largest: float) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from clod_adapter.cameras import Camera
-from clod_adapter.cli.baking import Measured, Target, find_target, measure_drop
+from clod_adapter.cli.baking import Photographs, Target, find_target, measure_drop
 from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.devices import on_device, pick_device
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     if args.images is not None and (args.fps or args.psnr_drop):  # frames are timed, or files measured
         model = on_device(model, pick_device(args.device, console))
     export, notes = prepare(args, model, page, console)
-    dials, measured, more = dial_values(args, export, page, console)
+    dials, photographs, more = dial_values(args, export, page, console)
     notes += [*more, *left_out(model)]
     for note in notes:
         console.say(note)
@@ -47,8 +47,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         outputs, lost = write_set(export, out, dials)
     else:
         outputs, lost = write_files(export, level_paths(out, args.levels) if args.levels else [out], dials)
-    if measured:
-        lost += add_psnr(outputs[0], export, measured, args.psnr_drop[0])
+    if photographs:
+        lost += add_psnr(outputs[0], export, photographs, args.psnr_drop[0])
     for note in dict.fromkeys(lost):
         console.note(note)
     lines = [*(describe(output, len(export.gaussians)) for output in outputs)]
@@ -77,13 +77,16 @@ def prepare(args: argparse.Namespace, model: Checkpoint, page: bool, console: Co
 
 def dial_values(
     args: argparse.Namespace, export: Export, page: bool, console: Console
-) -> tuple[list[float] | None, Measured | None, list[str]]:
-    """The dial values to bake, for a page where it opens, None where the dial is to stay; what was measured; notes."""
+) -> tuple[list[float] | None, Photographs | None, list[str]]:
+    """The dial values to bake, for a page where it opens, None where the dial is to stay; and notes on them.
+
+    Between them the photographs that the file is to be measured on, if it is.
+    """
     model, target = export.model, export.target
     attenuation = model.gaussians.attenuation
     if args.psnr_drop and args.images is not None and target.camera is None and not page:
-        found = measure_drop(args, model, partial(export.candidate, Path(args.out)), console)
-        return [found.virtual_scale], found, []
+        found, photographs = measure_drop(args, model, partial(export.candidate, Path(args.out)), console)
+        return [found], photographs, []
     solved, notes = args.levels, list[str]()
     if solved is None:
         solved, notes = solve_dials(args, model, target.cameras, console, baked=target.camera is None and not page)
@@ -128,12 +131,12 @@ def write_set(export: Export, out: Path, dials: list[float] | None) -> tuple[lis
     return [{"file": str(out / LOD_META), "levels": levels, "count": sum(counts), "bytes": total}], list(notes)
 
 
-def add_psnr(output: dict[str, Any], export: Export, measured: Measured, drop: float) -> list[str]:
+def add_psnr(output: dict[str, Any], export: Export, photographs: Photographs, drop: float) -> list[str]:
     """Measures the file that was written, adds that to what is said of it; a note where it lost more than ``drop``."""
     path = Path(output["file"])
-    psnr = measured.psnr(export.read_back(path, suffix_of(path)))
-    output |= {"psnr": psnr, "reference_psnr": measured.reference, "views": len(measured.views)}
-    lost = measured.reference - psnr
+    lost = photographs.lost(export.read_back(path, suffix_of(path)), export.console, path.name)
+    reference = photographs.reference
+    output |= {"psnr": reference - lost, "reference_psnr": reference, "views": len(photographs.views)}
     return [f"{path} is {lost:.2f} dB below, not {drop:g}: values are rounded"] if lost > drop else []
 
 

@@ -92,8 +92,8 @@ def test_a_psnr_budget_is_true_of_the_file(clod: Any, capture: Any, dialled: Pat
 
 
 def test_a_psnr_that_no_file_has(clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = baking.Measured.psnr
-    monkeypatch.setattr(baking.Measured, "psnr", lambda self, gaussians: real(self, gaussians) - 1)
+    real = baking.Photographs.lost
+    monkeypatch.setattr(baking.Photographs, "lost", lambda *words: real(*words) + 1)
     done = clod("export", dialled, "--psnr-drop", 0.1, "--images", capture.scene, "-o", "x.ply")
     assert done.code == 2 and not Path("x.ply").exists()
     assert " out of reach: the file of s = 1 is " in done.err.splitlines()[-1]
