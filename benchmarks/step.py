@@ -24,7 +24,7 @@ from common import append, capture
 
 from clod_adapter import optimizer, train
 from clod_adapter._kernels import threads
-from clod_adapter.importance import start
+from clod_adapter.importance import for_training, start
 from clod_adapter.rasterizers import cpu
 
 FILE = "step.jsonl"
@@ -81,7 +81,8 @@ def profile(scene: str, steps: int, clock: Clock, warm: int = 5) -> dict[str, An
     """Milliseconds a step, in all and by section."""
     base, views = clod.load(capture(scene) / "pretrained.ply").gaussians, clod.load_scene(capture(scene)).train
     config = clod.AdaptConfig()
-    run = train._Run(start(base, views, config), views, config, None)
+    begun = for_training(start(base, views, config), views, config)
+    run = train._Run(begun, views, config, None)
     for _ in range(warm):
         run.step(0.0)
     clock.seconds.clear()

@@ -19,6 +19,8 @@ from clod_adapter.gaussians import Gaussians
 # Quantile of the distances from the middle of a scene that stands for the typical one. In three captures it is 0.28,
 # 1.03 and 1.09 of that (few photographs near one another, two scenes all around).
 REACH = 0.9
+# Down to this ratio eps = 1e-8 of the new unit hides only sigma_d below 0.007 of the old one.
+SMALL = 0.01
 
 
 @torch.no_grad()
@@ -26,7 +28,8 @@ def with_distance(gaussians: Gaussians, distance: float) -> Gaussians:
     """The same dial with ``scene_distance`` D' = ``distance``, world units, > 0; Gaussians without a dial as they are.
 
     ``sigma'^2 = ((D / D')^2 (2 sigma^2 + eps) - eps) / 2``, in float64, at least 0. What is 0 or below stays, and so
-    does SIGMA_MAX. The normalisers ``max`` and ``quantile`` do not use D, and keep their sigma_d. The result's
+    does SIGMA_MAX. Where D / D' is below SMALL, eps would hide sigma': there it becomes ``(D / D')^2 eps``, to six
+    digits. The normalisers ``max`` and ``quantile`` do not use D, and keep their sigma_d. The result's
     ``reference_distance`` is ``known_distance`` of what was given.
     """
     config, sigma = gaussians.attenuation, gaussians.sigma_d
@@ -35,7 +38,9 @@ def with_distance(gaussians: Gaussians, distance: float) -> Gaussians:
     changed = replace(config, scene_distance=distance, reference_distance=known_distance(config))
     if config.normalizer == "scene":
         ratio = config.scene_distance / distance
-        scaled = twice_variance(sigma, config.eps).mul_(ratio**2).sub_(config.eps).div_(2).clamp_(min=0).sqrt_()
+        if ratio < SMALL:
+            changed = replace(changed, eps=float(f"{config.eps * ratio**2:.6g}"))
+        scaled = twice_variance(sigma, config.eps).mul_(ratio**2).sub_(changed.eps).div_(2).clamp_(min=0).sqrt_()
         unscaled = (sigma <= 0) | (sigma >= SIGMA_MAX)
         sigma = torch.where(unscaled, sigma, scaled.clamp_(max=SIGMA_MAX).to(sigma.dtype))
     return gaussians.replace(sigma_d=sigma, attenuation=changed)

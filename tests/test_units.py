@@ -36,8 +36,9 @@ def test_another_distance_is_the_same_dial(distance: float, eps: float, s: float
         assert each.sigma_d is not None and each.attenuation is not None
         d = normalized_distances(each.means, camera(), each.attenuation)
         found.append(attenuate(each.opacity_logits, each.sigma_d, d, s, each.attenuation).log_opacities)
-    # Where D'^2 is so small that eps alone fades less, sigma' would have to be imaginary.
+    # Where the unit grows a little, eps alone may fade less than a tiny sigma did: sigma' would have to be imaginary.
     possible = other.sigma_d > 0
+    assert eps > 1e-6 or possible[some.sigma_d > 0.01].all()
     torch.testing.assert_close(found[1][possible], found[0][possible], rtol=1e-6, atol=1e-9)
 
 
@@ -77,3 +78,13 @@ def test_the_estimate_is_of_the_scene_and_not_of_its_farthest() -> None:
     assert estimated_distance(stray) == pytest.approx(distance, rel=0.3)
     assert estimated_distance(7 * means + 100) == pytest.approx(7 * distance, rel=1e-3)
     assert estimated_distance(means[:0]) == 1.0 and estimated_distance(means[:1]) == 1.0
+
+
+def test_in_a_scene_of_tiny_units_eps_hides_no_sigma() -> None:
+    some = dialled(scene_distance=1e-4)
+    there = in_world_units(some)
+    assert there.attenuation is not None and there.attenuation.eps == 1e-16
+    torch.testing.assert_close(there.sigma_d, 1e-4 * some.sigma_d)
+    back = with_distance(there, 1e-4)
+    torch.testing.assert_close(back.sigma_d, some.sigma_d)
+    assert in_world_units(dialled(scene_distance=0.1)).attenuation.eps == 1e-8  # type: ignore[union-attr]

@@ -24,6 +24,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.card import FORMAT as MODEL
 from clod_adapter.io.origin import NOWHERE, parse_origin
+from clod_adapter.io.silence import as_before
 from clod_adapter.io.tensor_file import load_tensors
 
 KEY = "clod_adapter"
@@ -97,7 +98,7 @@ def load_adapter(path: str | Path) -> Adapter:
         kept = _rows(tensors.pop("kept"), trimmed["base_count"]) if "kept" in tensors else None
         return Adapter(
             sigma_d=tensors.pop("sigma_d"),
-            attenuation=AttenuationConfig(**about["attenuation"]),
+            attenuation=AttenuationConfig(**as_before(about["attenuation"])[0]),
             updates=tensors,
             base_fingerprint=about["base_sha256"],
             config=about["config"],

@@ -28,7 +28,7 @@ def adapter(n: int = 5, config: dict[str, object] | None = None, tau: float = 0.
         "opacity_logits": torch.randn(n, generator=generator),
         "shN": torch.zeros(n, 0, 3).half(),
     }
-    attenuation = AttenuationConfig(tau=tau, scene_distance=np.float64(1) / 3, max_sv=7.0)
+    attenuation = AttenuationConfig(tau=tau, reference_distance=np.float64(1) / 3, max_sv=7.0)
     return Adapter(torch.rand(n, generator=generator), attenuation, updates, "ab" * 32, config or {})
 
 
@@ -79,6 +79,18 @@ def test_what_a_trimmed_result_has_is_kept(tmp_path: Path, count: int, degree: i
     else:
         with pytest.raises(ClodError, match=r"Adapter.kept is bool \[\d+\], it must be bool with \d+ set"):
             load_adapter(tmp_path / "b")
+
+
+def test_settings_of_an_earlier_version_are_read_as_before(tmp_path: Path) -> None:
+    """It had other defaults, and wrote no reference distance."""
+    save_adapter(tmp_path / "a", adapter())
+    with safe_open(tmp_path / "a", framework="pt") as file:
+        about = json.loads(file.metadata()["clod_adapter"])
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    text = json.dumps(about | {"attenuation": {"scene_distance": 2.5}})
+    save_file(tensors, tmp_path / "b", {"clod_adapter": text})
+    want = AttenuationConfig(tau=1 / 255, cut="hard", scene_distance=2.5, reference_distance=2.5)
+    assert load_adapter(tmp_path / "b").attenuation == want
 
 
 @pytest.mark.parametrize("value", [{1, 2}, torch.ones(1), float("nan"), object()])

@@ -1,0 +1,124 @@
+"""What is left of the dial once another tool has rewritten an adapted PLY without its header's comments.
+
+    python benchmarks/constants.py plush_half --iters 200
+    python benchmarks/constants.py --table                  # the rows as a Markdown table
+
+A checkpoint is adapted with each of some settings and saved. The held-out views are measured at each dial value on the
+file as it was written, as plyfile writes it without comments, and as splat-transform does where it is installed; and on
+a file as earlier versions wrote it, with sigma_d in units of the typical distance, rewritten likewise. ``same`` says
+whether all numbers, and who is kept in each view, are those of the file as it was written; ``note`` is what loading it
+says.
+
+Each setting adds a row to ``results/constants.jsonl``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from common import RESULTS, append, capture
+from plyfile import PlyData, PlyElement
+
+import clod_adapter as clod
+from clod_adapter.errors import ClodError
+from clod_adapter.io.silence import WARNING
+from clod_adapter.io.splat_transform import SplatTransform, time_limit
+from clod_adapter.render import render
+from clod_adapter.units import with_distance
+
+FILE = "constants.jsonl"
+DIALS = (1.0, 2.0, 3.0, 5.0)
+SETTINGS: dict[str, clod.AdaptConfig] = {
+    "default": clod.AdaptConfig(),
+    "tau 0.013": clod.AdaptConfig(tau=0.013),
+    "normalizer max": clod.AdaptConfig(normalizer="max"),
+    "normalizer quantile": clod.AdaptConfig(normalizer="quantile"),
+    "form paper": clod.AdaptConfig.paper(),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*", help="captures beside the checkout")
+    parser.add_argument("--iters", type=int, default=200)
+    parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=[*SETTINGS])
+    parser.add_argument("--table", action="store_true", help="print the rows there are")
+    args = parser.parse_args()
+    for scene in args.scenes:
+        for name in args.settings:
+            append(
+                FILE, {"benchmark": "constants", "scene": scene, "settings": name, **measure(scene, name, args.iters)}
+            )
+    if args.table:
+        print_table()
+
+
+def measure(scene: str, name: str, iters: int) -> dict[str, Any]:
+    base, photographs = clod.load(capture(scene) / "pretrained.ply"), clod.load_scene(capture(scene))
+    config = clod.AdaptConfig(**{**asdict(SETTINGS[name]), "iters": iters})
+    result = clod.adapt(base.gaussians, photographs, config).gaussians
+    found: dict[str, Any] = {}
+    with TemporaryDirectory() as folder:
+        clod.save(Path(folder) / "model.ply", result, base)
+        wanted = look(Path(folder) / "model.ply", photographs)
+        for tool, path in rewritten(Path(folder), result):
+            got = look(path, photographs)
+            found[tool] = {"same": got["rows"] == wanted["rows"] and torch.equal(got["kept"], wanted["kept"]),
+                           "rows": got["rows"], "note": got["note"]}  # fmt: skip
+    return {"config": asdict(config), "gaussians": len(result), "views": len(photographs.test),
+            "reference_distance": result.attenuation and result.attenuation.reference_distance,
+            "written": wanted["rows"], **found}  # fmt: skip
+
+
+def rewritten(folder: Path, result: clod.Gaussians) -> Iterator[tuple[str, Path]]:
+    """The file that stands there as tools leave it, and one as earlier versions wrote it."""
+    model = PlyData.read(str(folder / "model.ply"))["vertex"].data
+    PlyData([PlyElement.describe(model, "vertex")], byte_order="<").write(str(folder / "plyfile.ply"))
+    yield "plyfile", folder / "plyfile.ply"
+    try:
+        tool = SplatTransform.find()
+        tool.run(folder / "model.ply", folder / "tool.ply", timeout=time_limit(len(model)))
+        yield f"splat-transform {tool.version}", folder / "tool.ply"
+    except ClodError as error:
+        print(f"without splat-transform: {error}")
+    assert result.attenuation is not None
+    if result.attenuation.normalizer == "scene":
+        then = with_distance(result, result.attenuation.reference_distance).sigma_d
+        assert then is not None
+        model["sigma_d"] = then.numpy()
+        PlyData([PlyElement.describe(model, "vertex")], byte_order="<").write(str(folder / "earlier.ply"))
+        yield "plyfile, of an earlier version", folder / "earlier.ply"
+
+
+def look(path: Path, photographs: clod.Scene) -> dict[str, Any]:
+    """The held-out views at each dial value: numbers, who is kept, and what loading says."""
+    checkpoint = clod.load(path)
+    rows = clod.evaluate(checkpoint.gaussians, photographs.test, DIALS)
+    kept = [render(checkpoint.gaussians, view.camera, s).kept for view in photographs.test for s in DIALS]
+    numbers = [{"virtual_scale": r.virtual_scale, "psnr": r.psnr, "ssim": r.ssim, "kept": r.kept} for r in rows]
+    return {"rows": numbers, "kept": torch.stack(kept), "note": "; ".join(checkpoint.notes)}
+
+
+def print_table() -> None:
+    """A line for each file, with PSNR @ share kept at each dial value."""
+    print("| scene, settings | file | same | " + " | ".join(f"s = {s:g}" for s in DIALS) + " | said |")
+    print("|---" * (4 + len(DIALS)) + "|")
+    for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
+        row: dict[str, Any] = json.loads(line)
+        files = {"as written": {"same": "", "rows": row["written"], "note": ""}}
+        files |= {name: value for name, value in row.items() if isinstance(value, dict) and "same" in value}
+        for name, file in files.items():
+            cells = [f"{r['psnr']:.2f} @ {r['kept'] / row['gaussians']:.1%}" for r in file["rows"]]
+            said = "warning" if file["note"].startswith(WARNING) else "note" if file["note"] else ""
+            print(f"| {row['scene']}, {row['settings']} | {name} | {file['same']} | {' | '.join(cells)} | {said} |")
+
+
+if __name__ == "__main__":
+    main()
