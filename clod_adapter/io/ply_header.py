@@ -12,10 +12,11 @@ from typing import Any
 from plyfile import PlyData
 
 from clod_adapter.calibration import AGAINST, Calibration, CalibrationRow
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.io.foreign import refuse
 from clod_adapter.io.regular import read_start
+from clod_adapter.io.screen_filter import KEY, parse_words, tagged, words_of
 from clod_adapter.io.version import package_version
 
 PREFIX = "clod_adapter "
@@ -89,19 +90,22 @@ def write_comments(
     inherited: Iterable[str],
     version: str | None = None,
     calibration: Calibration | None = None,
+    screen_filter: ScreenFilter = CLASSIC,
 ) -> list[str]:
     """The comments of an output: the base's, then ours, which replace any the base had.
 
     One comment per field of ``config``, as ``clod_adapter tau 0.00392156862745098``: the shortest
     decimal that gives back the same double. Before them the ``version`` that made the values, by default this one;
-    after them the calibration, one short line for each row, as some readers do not take long ones.
+    after them the screen-space filter, if it is not the usual one, and the calibration, one short line for each row, as
+    some readers do not take long ones.
     """
-    comments = [comment for comment in inherited if not comment.startswith(PREFIX)]
+    comments = tagged([comment for comment in inherited if not comment.startswith(PREFIX)], screen_filter)
     comments.append(f"{PREFIX}version {version or package_version()}")
     for field in fields(config) if config is not None else ():
         value = getattr(config, field.name)
         kind: Any = type(field.default)
         comments.append(f"{PREFIX}{field.name} {value if value is None else kind(value)}")
+    comments += [f"{PREFIX}{words}" for words in words_of(screen_filter)]
     if calibration is not None:
         c = calibration
         comments.append(f"{PREFIX}{MACHINE} {c.machine}")
@@ -144,7 +148,7 @@ def read_attenuation(path: Path, comments: Iterable[str]) -> tuple[AttenuationCo
     """
     ours = [comment[len(PREFIX) :].split(maxsplit=1) for comment in comments if comment.startswith(PREFIX)]
     stored = {words[0]: words[1].strip() for words in ours if len(words) == 2}
-    for other in ("version", MACHINE, EXTENT, ROW):
+    for other in ("version", MACHINE, EXTENT, ROW, KEY):
         stored.pop(other, None)
     kinds = {field.name: type(field.default) for field in fields(AttenuationConfig)}
     missing = [name for name in kinds if name not in stored]
@@ -156,6 +160,20 @@ def read_attenuation(path: Path, comments: Iterable[str]) -> tuple[AttenuationCo
     try:
         values = {name: _parse(stored[name], kind) for name, kind in kinds.items() if name in stored}
         return AttenuationConfig(**values), notes
+    except (ValueError, ClodError) as error:
+        raise ClodError(f"{path}: a clod_adapter header comment is unusable ({error}); restore or remove it") from error
+
+
+def read_screen_filter(path: Path, comments: Iterable[str]) -> ScreenFilter | None:
+    """The filter that the header's comments of ours say the Gaussians were trained with; None where they do not.
+
+    Raises:
+        ClodError: they say none that there is.
+    """
+    start = f"{PREFIX}{KEY}"
+    said = [comment.removeprefix(start) for comment in comments if re.match(rf"{start}\b", comment)]
+    try:
+        return parse_words(said[-1]) if said else None
     except (ValueError, ClodError) as error:
         raise ClodError(f"{path}: a clod_adapter header comment is unusable ({error}); restore or remove it") from error
 
