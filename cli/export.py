@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from clod_adapter.cameras import Camera
+from clod_adapter.cli.antialiasing import with_filter
 from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console, duration
 from clod_adapter.cli.devices import on_device, pick_device
@@ -33,6 +34,8 @@ from clod_adapter.io.splat_transform import SplatTransform, time_limit
 from clod_adapter.io.version import package_version
 from clod_adapter.io.writers import write
 from clod_adapter.viewer.page import write_page
+
+SAY_FILTER = (".spz", ".safetensors", PAGE)  # formats that say it to every reader
 
 
 @dataclass(frozen=True)
@@ -135,13 +138,13 @@ class Export:
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
-    model = read_checkpoint(args.model, console, args.activated)
+    model = with_filter(read_checkpoint(args.model, console, args.activated), args, console)
     camera, cameras, notes = reference(args, model)
     dials, more = dial_values(args, model, camera, console)
     gaussians = model.gaussians
     if args.order:
         gaussians = gaussians.select(order_by_extinction(gaussians, cameras))
-    notes += [*more, *left_out(model)]
+    notes += [*more, *left_out(model), *filter_notes(args, gaussians, dials)]
     for note in notes:
         console.say(note)
     export = Export(model, gaussians, camera, cameras, bool(args.order), console)
@@ -195,6 +198,16 @@ def left_out(model: Checkpoint) -> list[str]:
     known = {*(inria_dtype(model.gaussians.sh_degree).names or ()), SIGMA, *MASKS}
     others = [name for name in model.vertex.dtype.names or () if name not in known]
     return [f"columns left out: {', '.join(others)}"] if others else []
+
+
+def filter_notes(args: argparse.Namespace, gaussians: Gaussians, dials: list[float] | None) -> list[str]:
+    """A note on the filter of a file without a dial that the readers it is for have to be told of."""
+    suffix = LOD_META if args.lod_meta else suffix_of(Path(args.out))
+    dialled = gaussians.sigma_d is not None and dials is None
+    if not gaussians.screen_filter.compensate or dialled or suffix in SAY_FILTER:
+        return []
+    told = 'as PlayCanvas by antiAlias and gsplat by rasterize_mode="antialiased"'
+    return [f"trained antialiased ({gaussians.screen_filter.says}): most readers have to be told, {told}"]
 
 
 def write_files(export: Export, paths: list[Path], dials: list[float] | None) -> tuple[list[dict[str, Any]], list[str]]:
