@@ -40,7 +40,7 @@ def test_found_out_tuned_and_stored(clod: Any, trained: tuple[Path, Path], tmp_p
     report = json.loads(done.out)
     (note,) = [note for note in report["notes"] if "antialiasing" in note]
     assert note in done.err and report["screen_filter"] == {"variance": 0.3, "compensate": True}
-    assert report["base_row"]["psnr"] > 45  # but for the rounding to bytes it is what the photographs are of
+    assert report["base_rows"][0]["psnr"] > 45  # but for the rounding to bytes it is what the photographs are of
     found = clod_adapter.load(tmp_path / "dial.ply")
     assert found.gaussians.screen_filter == FILTERS["on"] and found.filter_known
     assert clod_adapter.load_adapter(tmp_path / "dial.safetensors").screen_filter == FILTERS["on"]
