@@ -77,6 +77,7 @@ class Payload:
             "name": self.name, "href": None, "element": None, "format": "ply", "sigma": None,
             "count": len(self.gaussians), "max_sv": attenuation.max_sv if attenuation else 1.0,
             "attenuation": asdict(attenuation) if attenuation else None,
+            "screen_filter": asdict(self.gaussians.screen_filter),
             "no_dial": None if attenuation else no_dial(self.name), "calibration": _rows_of(self.calibration),
         } | where  # fmt: skip
 

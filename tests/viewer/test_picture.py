@@ -13,7 +13,7 @@ from PIL import Image
 
 import scenes
 from clod_adapter.cameras import Camera
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import FILTERS, AttenuationConfig, ScreenFilter
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import Rendering, render
 
@@ -73,6 +73,21 @@ def test_with_other_settings(show: Any, files: Any, artefacts: Path, attenuation
     wanted = render(gaussians, camera, 2.0)
     assert 0.05 < wanted.kept.float().mean() < 0.95
     assert_same(shown, wanted, artefacts / f"{attenuation.cut}_{attenuation.normalizer}_{attenuation.eps:g}.png")
+
+
+@pytest.mark.parametrize("screen_filter", [FILTERS["on"], FILTERS["mip"], ScreenFilter(variance=2.0)], ids=str)
+def test_with_the_filter_of_the_file(show: Any, files: Any, artefacts: Path, screen_filter: ScreenFilter) -> None:
+    """Of a pixel and less, where filters differ: the usual one is another picture."""
+    dial = dialled(0)
+    gaussians = dial.replace(log_scales=dial.log_scales - 2.0, screen_filter=screen_filter)
+    camera, usual = scenes.camera(320, 240), dial.replace(log_scales=dial.log_scales - 2.0)
+    shown = show(files.save(gaussians), "--base", files.save(usual, "usual.ply"))
+    shown.camera(camera)
+    for s in (1.0, 3.0):
+        shown.run("clod.setDial(given)", s)
+        assert_same(shown, render(gaussians, camera, s), artefacts / f"filter_{screen_filter.variance}_s{s:g}.png")
+    with pytest.raises(AssertionError):
+        assert_alike(shown.picture(), render(usual, camera, 3.0).pixels.numpy(), artefacts / "not_that.png")
 
 
 def test_through_cameras_of_other_shapes(show: Any, files: Any, artefacts: Path) -> None:

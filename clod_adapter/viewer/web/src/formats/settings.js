@@ -21,6 +21,19 @@ export function readSettings(comments) {
   return settings;
 }
 
+/** The screen-space filter of the comments, ours or other programs', as io/screen_filter.py has it. */
+export function readScreenFilter(comments, dialled) {
+  const said = entries(comments).findLast(([name]) => name === "screen_filter")?.[1];
+  if (said) {
+    const [, variance, compensate] = /^(\S+) (True|False)$/.exec(said) ?? [];
+    if (!(variance >= 1e-3 && variance <= 100)) throw new Error(`a clod_adapter header comment is unusable (screen_filter ${said})`);
+    return { variance: Number(variance), compensate: compensate === "True" };
+  }
+  // What a dial was tuned with, where the file does not say, is the usual one.
+  const compensate = !dialled && comments.some((comment) => /^\s*(splatrendermode:\s*mip|antialiased 1)\s*$/i.test(comment));
+  return { variance: compensate && comments.includes("Exported from Brush") ? 0.1 : 0.3, compensate };
+}
+
 /** Rows {virtual_scale, count, psnr}; empty where there are none or they are of other Gaussians. */
 export function readCalibration(comments, total) {
   const found = entries(comments);
