@@ -12,6 +12,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from clod_adapter.io.silence import WARNING
+
 LINE_EVERY = 10.0  # seconds between progress lines where stderr is no terminal
 BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 
@@ -27,6 +29,10 @@ class Console:
             with _unbreakable():
                 tqdm.write(text, file=sys.stderr)  # not print: a bar may be on this line
                 sys.stderr.flush()
+
+    def note(self, text: str) -> None:
+        """A note on what was read or written; one that begins with "warning: " as that."""
+        self.say(f"  {text}" if text.startswith(WARNING) else f"  note: {text}")
 
     @contextmanager
     def status(self, text: str) -> Iterator[Callable[[str], None]]:

@@ -33,6 +33,7 @@ from clod_adapter.io.poses import load_cameras
 from clod_adapter.io.splat_transform import SplatTransform, time_limit
 from clod_adapter.io.version import package_version
 from clod_adapter.io.writers import write
+from clod_adapter.units import nominal_distance
 from clod_adapter.viewer.page import write_page
 
 SAY_FILTER = (".spz", ".safetensors", PAGE)  # formats that say it to every reader
@@ -153,7 +154,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     else:
         outputs, lost = write_files(export, level_paths(out, args.levels) if args.levels else [out], dials)
     for note in dict.fromkeys(lost):
-        console.say(f"  note: {note}")
+        console.note(note)
     baked = None if out.suffix.lower() == PAGE else dials
     print("\n".join([*(describe(output, len(gaussians)) for output in outputs), *exactness(export, baked)]))
     return {
@@ -254,7 +255,8 @@ def exactness(export: Export, dials: list[float] | None) -> list[str]:
     if export.camera is not None:
         place = f"from the camera of {export.camera.name}"
     elif attenuation.normalizer == "scene":
-        place = f"at {attenuation.scene_distance:.4g} world units from the camera"
+        distance = attenuation.scene_distance * nominal_distance(export.model.gaussians.means, attenuation)
+        place = f"at {distance:.4g} world units from the camera"
     else:
         place = "at the distance that the picture's own are divided by"
     return [f"exact {place} only, and lossy: the dial and the Gaussians that it leaves out are gone"]

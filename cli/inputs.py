@@ -29,7 +29,7 @@ def read_checkpoint(
     filtered = "" if drawn == CLASSIC else f", drawn with {drawn.says}"
     console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{dial}{filtered}")
     for note in checkpoint.notes:
-        console.say(f"  note: {note}")
+        console.note(note)
     return checkpoint
 
 
@@ -44,7 +44,7 @@ def read_scene(folder: str, console: Console, origin: Origin, cache: ImageCache 
     size = f"{camera.width}x{camera.height}"
     console.say(f"{folder}: {len(scene.train)} photographs to train on, {len(scene.test)} held out, {size}")
     for note in scene.notes:
-        console.say(f"  note: {note}")
+        console.note(note)
     return scene
 
 
@@ -55,7 +55,7 @@ def complement_scene(
     with console.status("looking for places of cameras ..."):
         more, lighter = complement(gaussians, scene, config)
     for note in more.notes[len(scene.notes) :]:
-        console.say(f"  note: {note}")
+        console.note(note)
     return more, lighter
 
 

@@ -12,6 +12,7 @@ from clod_adapter.cli.console import duration
 from clod_adapter.cli.files import size
 from clod_adapter.inspection import Inspection, Splat, inspect
 from clod_adapter.inspection_values import Spread
+from clod_adapter.io.silence import WARNING
 from clod_adapter.io.version import package_version
 
 WIDTH = 13  # of the names at the left
@@ -38,7 +39,9 @@ def lines_of(found: Inspection) -> list[str]:
         lines += tensor_lines(found.about)
     lines += _block("odd", [oddity.says for oddity in found.oddities])
     lines += _block("left out", found.left_out)
-    return lines + _block("note", found.notes)
+    warnings = [note.removeprefix(WARNING) for note in found.notes if note.startswith(WARNING)]
+    lines += _block("note", [note for note in found.notes if not note.startswith(WARNING)])
+    return lines + _block("warning", warnings)
 
 
 def splat_lines(splat: Splat) -> list[str]:
@@ -61,7 +64,7 @@ def splat_lines(splat: Splat) -> list[str]:
     if splat.dial is None:
         return [*lines, _line("dial", "none: no sigma_d")]
     a = splat.dial.attenuation
-    lines.append(_line("dial", f"s = 1 to {a.max_sv:g}, {a.cut} cut at tau, distances over {_normalizer(a)}"))
+    lines.append(_line("dial", f"s = 1 to {a.max_sv:g}, {a.cut} cut at tau, distances {_unit(a)}"))
     return lines + calibration_lines(splat.dial.calibration)
 
 
@@ -117,10 +120,10 @@ def _harmonics(splat: Splat) -> str:
     return f"degree {splat.sh_degree}" + (f", of which only {used} is used" if used < splat.sh_degree else "")
 
 
-def _normalizer(attenuation: Any) -> str:
+def _unit(attenuation: Any) -> str:
     if attenuation.normalizer == "scene":
-        return f"{attenuation.scene_distance:.4g}"
-    return f"each view's {attenuation.normalizer}"
+        return "in world units" if attenuation.scene_distance == 1 else f"over {attenuation.scene_distance:.4g}"
+    return f"over each view's {attenuation.normalizer}"
 
 
 def _block(name: str, says: Iterable[str]) -> list[str]:

@@ -50,7 +50,7 @@ def prepare(args: argparse.Namespace, console: Console) -> tuple[dict[str, Answe
     opening, more = opens_at(args.sv, attenuation.max_sv if attenuation else None)
     notes += more
     for note in notes:
-        console.say(f"  note: {note}")
+        console.note(note)
     payloads = {MODEL: Payload.of(model)} | ({BASE: Payload.of(base)} if base else {})
     entries = [payload.describe(href=path) for path, payload in payloads.items()]
     page = served_page(page_config(entries[0], entries[1] if base else None, cameras, opening))

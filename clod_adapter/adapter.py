@@ -19,6 +19,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.origin import NOWHERE, Origin
 from clod_adapter.io.version import package_version
+from clod_adapter.units import in_world_units
 
 HALF_ERROR = 2e-3  # the rounding that a difference may suffer, as a share of the largest
 ATTRIBUTES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
@@ -143,22 +144,23 @@ def extract(
 ) -> Adapter:
     """What has to be added to ``base`` to get ``adapted``, rounded to float16 differences.
 
-    Attributes with identical values are left out. Where the differences do not fit float16 (one
-    overflows, all are tiny, or an infinite logit became finite) the attribute is kept as its float32 values. A
-    dial that ``base`` may already have plays no part.
+    sigma_d is taken in world units. Attributes with identical values are left out. Where the differences do not fit
+    float16 (one overflows, all are tiny, or an infinite logit became finite) the attribute is kept as its float32
+    values. A dial that ``base`` may already have plays no part.
 
     Raises:
         ClodError: ``adapted`` has no dial, is not finite, or is not the same Gaussians as ``base``.
     """
     if adapted.sigma_d is None or adapted.attenuation is None:
         raise ClodError("the adapted Gaussians have no sigma_d; attach a dial first")
-    updates = {}
+    adapted, updates = in_world_units(adapted), {}
     for name in ATTRIBUTES:
         old, new = getattr(base, name).detach().float(), getattr(adapted, name).detach().float()
         if old.shape != new.shape:
             raise ClodError(f"{name} is {_kind(new)}, in the base {_kind(old)}; give the Gaussians that were adapted")
         if not torch.equal(old, new):
             updates[name] = _update(name, old, new).cpu()
+    assert adapted.sigma_d is not None and adapted.attenuation is not None
     sigma_d = adapted.sigma_d.detach().float().cpu().clone()
     return Adapter(
         sigma_d, adapted.attenuation, updates, fingerprint, dict(config), origin=origin,
@@ -169,9 +171,13 @@ def extract(
 def attach(
     gaussians: Gaussians, sigma_d: Tensor | None = None, attenuation: AttenuationConfig | None = None
 ) -> Gaussians:
-    """The Gaussians with a dial; without ``sigma_d`` one that changes nothing (SIGMA_MAX)."""
+    """The Gaussians with a dial, by the default settings; without ``sigma_d`` one that changes nothing.
+
+    That is SIGMA_MAX, and unless told otherwise a hard cut at 1/255, below which rasterizers draw nothing anyway.
+    """
     if sigma_d is None:
         sigma_d = torch.full_like(gaussians.opacity_logits, SIGMA_MAX, dtype=torch.float32)
+        attenuation = attenuation or AttenuationConfig(tau=1 / 255, cut="hard")
     return gaussians.replace(sigma_d=sigma_d, attenuation=attenuation or AttenuationConfig())
 
 

@@ -33,6 +33,7 @@ from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import wait_for
 from clod_adapter.render import render
+from clod_adapter.units import nominal_distance
 
 TIMED_VIEWS, TIMED_DIALS, TIMED_REPEATS = 4, 6, 2
 
@@ -64,7 +65,7 @@ def dial_for(
     Args:
         gaussians: with a dial.
         keep: Gaussians, at most: in the view of the one camera, the mean over several, without any camera at the
-            normalised distance 1, where ``export.bake`` looks from.
+            nominal distance, where ``export.bake`` looks from.
         psnr_drop: dB below what the calibration has at s = 1. Here alone it is the largest dial value: from the first
             point on where the interpolated PSNR falls below, the budget counts as spent.
         fps: frames a second. With a calibration its times are taken as they stand, whatever they were measured on
@@ -205,7 +206,7 @@ def _polished(guess: float, views: _Views, wanted: int) -> float:
 
 
 class _Views:
-    """The Gaussians as some cameras see them; without a camera, all at the normalised distance 1."""
+    """The Gaussians as some cameras see them; without a camera, all at ``units.nominal_distance``."""
 
     def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
         assert gaussians.sigma_d is not None and gaussians.attenuation is not None
@@ -218,8 +219,10 @@ class _Views:
 
     def _distances(self) -> Iterator[Tensor]:
         for camera in self.cameras:
-            far = torch.ones_like(self.logits)
-            yield far if camera is None else normalized_distances(self.means, camera, self.config)
+            if camera is None:
+                yield torch.full_like(self.logits, nominal_distance(self.means, self.config))
+            else:
+                yield normalized_distances(self.means, camera, self.config)
 
     def extinction_scales(self) -> Iterator[Tensor]:
         """``[N]`` for each view, one at a time: all of them at once are views times Gaussians."""

@@ -136,7 +136,7 @@ def divide(
         if progress:
             progress("blocks", k + 1, len(views))
     begun = base.replace(sigma_d=begun.sigma_d, attenuation=begun.attenuation)
-    extent = camera_extent([view.camera for view in views]) or begun.attenuation.scene_distance  # type: ignore[union-attr]
+    extent = camera_extent([view.camera for view in views]) or begun.attenuation.reference_distance  # type: ignore[union-attr]
     return Division(begun, block, seen, kept, extent)
 
 

@@ -30,23 +30,26 @@ def require(ok: bool, name: str, value: object, what: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class AttenuationConfig:
-    """How a stored ``sigma_d`` is to be read. Travels with the file.
+    """How a stored ``sigma_d`` is to be read. Travels with the file; the defaults are what adapting writes by default.
 
     The cut keeps a Gaussian iff its attenuated opacity exceeds ``tau * virtual_scale``, and draws it with that
     opacity (``hard``, the paper's) or with what is above the threshold (``soft``; ``attenuation.attenuate``). The
     normaliser D turns a distance into the ``d'`` of the equation:
 
-    - ``scene``: one constant, ``scene_distance``, for every view;
+    - ``scene``: one constant, ``scene_distance``, for every view; 1 for a sigma_d in world units, as files have it;
     - ``quantile``: the ``quantile`` of the distances of the Gaussians in the view frustum;
     - ``max``: their maximum, the paper's form.
     """
 
-    tau: float = option(1 / 255, "base opacity threshold of the cut; 1/255 is what rasterizers drop anyway")
-    cut: str = option("hard", "how a Gaussian leaves: hard (at opacity tau s, the paper's) or soft (at 0)")
+    tau: float = option(0.02, "base opacity threshold of the cut; rasterizers drop what is below 1/255 anyway")
+    cut: str = option("soft", "how a Gaussian leaves: hard (at opacity tau s, the paper's) or soft (at 0)")
     eps: float = option(1e-8, "the paper's epsilon under sigma_d squared; keeps sigma_d = 0 defined")
     normalizer: str = option("scene", "what distances are divided by: scene, quantile or max")
     quantile: float = option(0.95, "share of the frustum's Gaussians nearer than D (normalizer quantile)")
-    scene_distance: float = option(1.0, "D in world units (normalizer scene)")
+    scene_distance: float = option(1.0, "D in world units (normalizer scene); 1 in files: sigma_d is in world units")
+    reference_distance: float = option(
+        0.0, "typical distance in the training views, world units, for what has no camera; 0 where it is not known"
+    )
     max_sv: float = option(5.0, "largest dial value the file was trained for")
 
     def __post_init__(self) -> None:
@@ -56,6 +59,8 @@ class AttenuationConfig:
         require(self.normalizer in NORMALIZERS, "normalizer", self.normalizer, f"one of {', '.join(NORMALIZERS)}")
         require(0 < self.quantile <= 1, "quantile", self.quantile, "above 0 and at most 1")
         require(0 < self.scene_distance < math.inf, "scene_distance", self.scene_distance, "positive and finite")
+        reference = self.reference_distance
+        require(0 <= reference < math.inf, "reference_distance", reference, "at least 0 and finite")
         require(1 <= self.max_sv < math.inf, "max_sv", self.max_sv, "at least 1 and finite")
         require(
             self.tau * self.max_sv < 1,
@@ -201,7 +206,7 @@ class AdaptConfig:
         return replace(self, **{name: share * getattr(self, name) for name in names})
 
     def attenuation(self, scene_distance: float) -> AttenuationConfig:
-        """What travels with the file."""
+        """What training reads sigma_d by; ``units.in_world_units`` of it travels with the file."""
         return AttenuationConfig(
             tau=self.tau, cut=self.cut, eps=self.eps, normalizer=self.normalizer, quantile=self.quantile,
             scene_distance=scene_distance, max_sv=self.max_sv,

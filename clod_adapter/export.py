@@ -13,16 +13,18 @@ from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
 from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import OPAQUE, Gaussians
+from clod_adapter.units import nominal_distance
 
 
 @torch.no_grad()
 def bake(gaussians: Gaussians, virtual_scale: float, camera: Camera | None = None) -> Gaussians:
     """The Gaussians that one dial value keeps as seen from one place, faded as they are there, without a dial.
 
-    ``logit' = log o - log(1 - o)`` with ``o`` the opacity that is drawn (``attenuation.attenuate``) at d' = 1, or at
-    the d' that ``camera`` has. Lossy: the result has neither the dial nor the other Gaussians, and is what a renderer
-    of the adapted file shows only for what is at that distance, ``scene_distance`` with the default normaliser, or from
-    where the camera is. Nearer Gaussians come out fainter than they should be, or are missing; farther ones stronger.
+    ``logit' = log o - log(1 - o)`` with ``o`` the opacity that is drawn (``attenuation.attenuate``) at the nominal
+    distance (``units.nominal_distance``), or at the d' that ``camera`` has. Lossy: the result has neither the dial nor
+    the other Gaussians, and is what a renderer of the adapted file shows only for what is at that distance,
+    ``reference_distance`` with the default normaliser, or from where the camera is. Nearer Gaussians come out fainter
+    than they should be, or are missing; farther ones stronger.
     Where the dial does nothing the logits are as they were, but for +inf, which becomes ``OPAQUE``.
 
     Args:
@@ -40,7 +42,7 @@ def bake(gaussians: Gaussians, virtual_scale: float, camera: Camera | None = Non
     distances = _distances(gaussians, camera)
     faded = attenuate(logits, gaussians.sigma_d, distances, virtual_scale, gaussians.attenuation)
     if not faded.keep.any():
-        where = "and the normalised distance 1" if camera is None else f"from the camera {camera.name!r}"
+        where = "at the scene's typical distance" if camera is None else f"from the camera {camera.name!r}"
         raise ClodError(f"no Gaussian is kept at s = {virtual_scale:g} {where}; bake a smaller s")
     # From log a'', and by expm1 and not 1 - o, which cancels where o is near 1; the cut's part of it is 1 for most.
     drawn = faded.log_opacities + (faded.drawn / faded.opacities).log()
@@ -52,7 +54,9 @@ def bake(gaussians: Gaussians, virtual_scale: float, camera: Camera | None = Non
 
 @torch.no_grad()
 def order_by_extinction(gaussians: Gaussians, cameras: Sequence[Camera] = ()) -> Tensor:
-    """``[N]`` int64, the rows by falling extinction scale s* at d' = 1, or as cameras have it; ties as they were.
+    """``[N]`` int64, the rows by falling extinction scale s* at the nominal distance, or as cameras have it.
+
+    Ties stay in their order.
 
     For renderers that draw a prefix of a file: with ``gaussians.select(rows)`` the first n are those that the dial
     which keeps n keeps there (``extinction.extinction_scale``), up to the rounding of s*. Over several cameras it is
@@ -71,7 +75,9 @@ def order_by_extinction(gaussians: Gaussians, cameras: Sequence[Camera] = ()) ->
 
 
 def _distances(gaussians: Gaussians, camera: Camera | None) -> Tensor:
-    """``[N]`` d' of the equation: 1 without a camera."""
-    if camera is None or gaussians.attenuation is None:
-        return torch.ones_like(gaussians.opacity_logits)
+    """``[N]`` d' of the equation: ``units.nominal_distance`` without a camera."""
+    assert gaussians.attenuation is not None
+    if camera is None:
+        nominal = nominal_distance(gaussians.means, gaussians.attenuation)
+        return torch.full_like(gaussians.opacity_logits, nominal)
     return normalized_distances(gaussians.means, camera, gaussians.attenuation)

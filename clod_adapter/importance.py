@@ -18,6 +18,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import splat
+from clod_adapter.units import in_world_units, known_distance, with_distance
 
 T = TypeVar("T")
 
@@ -42,8 +43,8 @@ def start(
 ) -> Gaussians:
     """The Gaussians with a sigma_d to train from, by what they do in up to MOST_VIEWS of the views, evenly spread.
 
-    A dial that ``base`` already has is kept, with its own settings but the config's ``max_sv``; one
-    that does nothing (``SIGMA_MAX`` throughout, as ``attach`` makes it) counts as none.
+    The sigma_d is in world units. A dial that ``base`` already has is kept, with its own settings but the config's
+    ``max_sv``; one that does nothing (``SIGMA_MAX`` throughout, as ``attach`` makes it) counts as none.
 
     Args:
         progress: called with "start" and the number of views done, and of those that are looked at in all; then with
@@ -51,12 +52,14 @@ def start(
         error: ``[N]`` from ``removal_error``, of these views and seed, where it is known already.
     """
     if base.attenuation is not None and has_dial(base):
-        return base.replace(attenuation=dataclasses.replace(base.attenuation, max_sv=config.max_sv))
+        own = dataclasses.replace(base.attenuation, max_sv=config.max_sv)
+        return in_world_units(base.replace(attenuation=own))
     views = spread(views, MOST_VIEWS)
     attenuation = config.attenuation(scene_distance(base, views, config.quantile))
     if config.start in ("constant", "identity"):
         value = 1.0 if config.start == "constant" else WIDEST * config.max_sv
-        return base.replace(sigma_d=torch.full_like(base.means[:, 0], value), attenuation=attenuation)
+        constant = torch.full_like(base.means[:, 0], value)
+        return in_world_units(base.replace(sigma_d=constant, attenuation=attenuation))
     if error is None:
         looked = partial(progress, "start") if progress else None
         error = removal_error(base, views, seed=config.seed, progress=looked)
@@ -69,7 +72,16 @@ def start(
     sigma = sigma_from_importance(
         base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent
     )
-    return base.replace(sigma_d=sigma.minimum(WIDEST * config.max_sv * distances), attenuation=attenuation)
+    sigma = sigma.minimum(WIDEST * config.max_sv * distances)
+    return in_world_units(base.replace(sigma_d=sigma, attenuation=attenuation))
+
+
+def for_training(begun: Gaussians, views: Sequence[View], config: AdaptConfig) -> Gaussians:
+    """``begun`` with sigma_d in units of the scene's typical distance, that of the views where it is not known."""
+    assert begun.attenuation is not None
+    known = known_distance(begun.attenuation) or scene_distance(begun, spread(views, MOST_VIEWS), config.quantile)
+    own = dataclasses.replace(begun.attenuation, reference_distance=known)
+    return with_distance(begun.replace(attenuation=own), known)
 
 
 def has_dial(base: Gaussians) -> bool:
@@ -100,7 +112,7 @@ def fitting_tau(opacities: Tensor, error: Tensor, config: AdaptConfig) -> float:
     """``config.tau``, or less for a checkpoint that is too faint for it; by itself no less than TAU_MIN.
 
     At most 1/FADING of the opacity below which there is FAINT_SHARE of all removal error; and low enough for as many
-    Gaussians as the count law wants at ``max_sv`` to be opaque enough to be there.
+    Gaussians as the count law wants at ``max_sv`` to be opaque enough to be there. To six digits: a float32 holds them.
 
     Args:
         error: ``[N]`` from ``removal_error``.
@@ -112,7 +124,8 @@ def fitting_tau(opacities: Tensor, error: Tensor, config: AdaptConfig) -> float:
     faint = float(ordered[int((lost < FAINT_SHARE * lost[-1]).sum())])
     wanted = max(round(len(ordered) * config.max_sv**-config.exponent), 1)
     opaque = float(ordered[-wanted]) / config.max_sv
-    return min(config.tau, max(faint / FADING, TAU_MIN), max(opaque / FADING, TAU_MIN))
+    lowered = min(max(faint / FADING, TAU_MIN), max(opaque / FADING, TAU_MIN))
+    return min(config.tau, float(f"{lowered:.6g}"))
 
 
 def spread(views: Sequence[T], most: int) -> Sequence[T]:

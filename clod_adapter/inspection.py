@@ -16,8 +16,18 @@ from clod_adapter.inspection_values import FAR, Values, values_of
 from clod_adapter.io.authorship import NERFSTUDIO, looks_like
 from clod_adapter.io.origin import Origin, origin_of
 from clod_adapter.io.packed_ply import is_packed
-from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map
-from clod_adapter.io.ply_header import PREFIX, Head, read_attenuation, read_calibration, read_head, read_screen_filter
+from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, read_table
+from clod_adapter.io.ply_constants import PREFIX as CONSTANT
+from clod_adapter.io.ply_constants import read_constants
+from clod_adapter.io.ply_header import (
+    PREFIX,
+    Head,
+    has_settings,
+    read_attenuation,
+    read_calibration,
+    read_head,
+    read_screen_filter,
+)
 from clod_adapter.io.ply_values import FILTER, as_stored_by_inria, choice_of, in_question
 from clod_adapter.io.readers import PLY, read_rows, reader_of
 from clod_adapter.io.rows import Rows
@@ -135,12 +145,14 @@ def inspect(path: str | Path) -> Inspection:
 
 
 def _inspect_splat(path: Path, rows: Rows, head: Head | None) -> Inspection:
-    said, expected = read_screen_filter(path, rows.comments), likely(rows.comments, rows.vertex.dtype.names or ())
+    names = rows.vertex.dtype.names or ()
+    constants = read_constants(path, rows.vertex) if SIGMA in names else {}
+    said, expected = read_screen_filter(path, rows.comments, constants), likely(rows.comments, names)
     doubts = {} if rows.settled else in_question(rows.vertex)
     columns = _columns(head)
     vertex, _, changes = as_stored_by_inria(path, rows.vertex, choice_of(doubts))
     origin = origin_of(vertex) if rows.origin is None else rows.origin
-    attenuation, notes = read_attenuation(path, rows.comments) if SIGMA in (vertex.dtype.names or ()) else (None, [])
+    attenuation, notes = _reading(path, rows, vertex) if SIGMA in (vertex.dtype.names or ()) else (None, [])
     tau = attenuation.tau if attenuation else AdaptConfig().tau
     values = values_of(vertex, rows.sh_degree, origin, tau)
     if values is None:
@@ -163,6 +175,21 @@ def _inspect_splat(path: Path, rows: Rows, head: Head | None) -> Inspection:
         oddities=tuple(_oddities(splat, doubts)), left_out=tuple(_left_out(splat, rows, changes)),
         notes=(*rows.notes, *notes),
     )  # fmt: skip
+
+
+def _reading(path: Path, rows: Rows, vertex: np.ndarray) -> tuple[AttenuationConfig, list[str]]:
+    """How sigma_d is read, and notes on that; ``vertex`` as ``as_stored_by_inria`` has made it."""
+    attenuation, notes = read_attenuation(path, rows.comments, read_constants(path, vertex))
+    if not has_settings(rows.comments):
+        import torch  # here and not above, as most files have settings
+
+        from clod_adapter.io.plausible import judge
+
+        table = torch.from_numpy(read_table(vertex, ("x", "y", "z", "opacity", SIGMA)))
+        usable = table[table.isfinite().all(1)]
+        if len(usable):
+            notes += judge(usable[:, :3], usable[:, 3], usable[:, 4], attenuation)
+    return attenuation, notes
 
 
 def _columns(head: Head | None) -> tuple[tuple[str, str], ...]:
@@ -190,7 +217,8 @@ def _writer(rows: Rows) -> str | None:
 
 def _extra(names: Sequence[str], sh_degree: int) -> tuple[str, ...]:
     known = {name for group in column_map(sh_degree).values() for name in group}
-    return tuple(name for name in names if name not in known | {*NORMALS, SIGMA, *MASKS, FILTER})
+    known |= {*NORMALS, SIGMA, *MASKS, FILTER}
+    return tuple(name for name in names if name not in known and not name.startswith(CONSTANT))
 
 
 def _oddities(splat: Splat, doubts: dict[str, tuple[float, float]]) -> list[Oddity]:

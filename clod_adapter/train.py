@@ -18,10 +18,11 @@ from clod_adapter.distributed import PeerLost, Peers
 from clod_adapter.drawing import Draws
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.importance import seeing, start
+from clod_adapter.importance import for_training, seeing, start
 from clod_adapter.objective import Objective, Part, Pull
 from clod_adapter.optimizer import RowAdam
 from clod_adapter.training_state import Adapted, Progress, TrainingState
+from clod_adapter.units import in_world_units, with_distance
 
 __all__ = ["Adapted", "Progress", "TrainingState", "adapt"]
 
@@ -47,7 +48,8 @@ def adapt(
     w_s L_render(s)``, L_render being ``losses.photometric_loss`` and ``w_s = (1 - weight_slope s / max_sv)^2``, while
     ``counting.count_gradient`` presses the share of Gaussians kept towards its law by way of sigma_d. The outcome is
     the mean of the parameters over the last ``average`` of the steps: step sizes can then stay long to the end. A base
-    that already has a sigma_d is continued from.
+    that already has a sigma_d is continued from. Training divides sigma_d by the typical distance; the outcome has it
+    in world units.
 
     ``AdaptConfig.paper`` gives CLoD-GS's own objective instead (section 3.3): one s a step and
     ``w_s (L_render + reg_weight L_reg)`` with ``L_reg = (s - 1)^2 relu(eta - s^-exponent)^2``, eta the share kept.
@@ -86,13 +88,16 @@ def adapt(
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
     views = seeing(base, scene.train)
     if resume is None:
-        begun = start(lean, views, config, report)
+        begun = for_training(start(lean, views, config, report), views, config)
         if peers:  # the same bits in all of them
             own = {"sigma_d": begun.sigma_d, "attenuation": begun.attenuation}
             begun = begun.replace(**peers.broadcast(own)).to(begun.means.device)
     else:
+        reading = resume.attenuation
         unset = torch.ones_like(base.opacity_logits)  # what is trained is in the state
-        begun = lean.replace(sigma_d=unset if base.sigma_d is None else base.sigma_d, attenuation=resume.attenuation)
+        dialled = with_distance(in_world_units(lean), reading.scene_distance)  # by the same roundings as at first
+        sigma = unset if lean.sigma_d is None else dialled.sigma_d
+        begun = lean.replace(sigma_d=sigma, attenuation=reading)
     run = _Run(begun, views, config, progress, part, peers)
     run.empty_bands = None if lean is base else base.shN.clone()
     run.start_seconds = time.perf_counter() - began
@@ -224,7 +229,7 @@ class _Run:
             values["shN"] = self.empty_bands
         sigma = self.objective.sigma(parameters[self.decay])
         dial: Any = {"sigma_d": sigma, "attenuation": self.objective.attenuation}
-        return Gaussians(**values, **dial, screen_filter=self.objective.screen_filter)
+        return in_world_units(Gaussians(**values, **dial, screen_filter=self.objective.screen_filter))
 
     def _average(self) -> None:
         """Takes the parameters as they stand into their mean; the optimiser goes on from where it is."""

@@ -42,7 +42,8 @@ own form.
 ## AttenuationConfig
 
 How `sigma_d` is to be read: the constants of [the equation](equation.md), which travel with the file. The
-defaults are those of a dial that is attached by hand; training writes its own.
+defaults are what adapting writes by default, and how [a file without a
+description](formats.md#when-a-tool-drops-the-description) is read.
 
 | field | default | what |
 |---|---|---|

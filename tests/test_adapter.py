@@ -14,7 +14,7 @@ from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 
-CONFIG = AttenuationConfig(tau=0.01, scene_distance=3.5)
+CONFIG = AttenuationConfig(tau=0.01, reference_distance=3.5)
 
 
 def gaussians(n: int = 6, seed: int = 0, bands: int = 8) -> Gaussians:
@@ -111,7 +111,8 @@ def test_unchanged_values_keep_their_bits() -> None:
 def test_disabled_means_the_base() -> None:
     base = gaussians()
     on = attach(base)
-    assert on.attenuation == AttenuationConfig() and bits(detach(on)) == bits(base)
+    assert on.attenuation == AttenuationConfig(tau=1 / 255, cut="hard") and bits(detach(on)) == bits(base)
+    assert attach(base, torch.ones(len(base))).attenuation == AttenuationConfig()
     assert detach(on).sigma_d is None and detach(on).attenuation is None
     distance = torch.logspace(-6, 4, 1000)
     for sigma in (torch.tensor(SIGMA_MAX), torch.tensor(SIGMA_MAX, dtype=torch.float64)):

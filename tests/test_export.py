@@ -46,7 +46,7 @@ def test_the_same_picture_at_the_reference_distance(s: float, cut: str) -> None:
 
 @CUTS
 def test_opacities_are_those_drawn(cut: str) -> None:
-    config = replace(CONFIG, cut=cut)
+    config = replace(CONFIG, cut=cut, tau=1 / 255)
     logits = torch.tensor([-3.0, 0, 8, 30, math.inf, math.inf, 2.0])
     sigma = torch.tensor([2.0, 2, 2, 2, 2, 1e9, 0.6765])  # the last between tau s and 1.5 tau s
     some = attach(gaussians(7, 0, 0).replace(opacity_logits=logits), sigma, config)
@@ -59,7 +59,7 @@ def test_opacities_are_those_drawn(cut: str) -> None:
 
 @CUTS
 def test_a_gaussian_at_the_threshold_has_an_opacity_that_a_file_can_hold(cut: str) -> None:
-    config = AttenuationConfig(tau=0.02, cut=cut)
+    config = AttenuationConfig(tau=0.02, cut=cut, reference_distance=1.0)
     logits, ones = torch.linspace(-2, 6, 5000), torch.ones(5000)
     for s in (1.0, 1.7, 3.3):
         sigma = sigma_for_extinction(logits, ones, s * ones, config)
@@ -70,7 +70,7 @@ def test_a_gaussian_at_the_threshold_has_an_opacity_that_a_file_can_hold(cut: st
 def test_a_dial_that_does_nothing_changes_nothing() -> None:
     some = gaussians(50, 0, 1)
     some.opacity_logits[:2] = torch.tensor([22.0, math.inf])  # more than opaque is left, no number is not
-    baked = bake(attach(some), 1.0)
+    baked = bake(attach(some, attenuation=AttenuationConfig(tau=1 / 255, cut="hard")), 1.0)
     want = some.opacity_logits[some.opacities > 1 / 255]
     assert (float(baked.opacity_logits[1]), float(want[1])) == (20.0, math.inf)
     assert torch.equal(baked.opacity_logits[2:], want[2:]) and baked.opacity_logits[0] == 22

@@ -34,6 +34,7 @@ FLOORS = [
         "optimizer",
         "perceptual",
         "training_state",
+        "units",
     },
     {"io", "rasterizers", "adapter"},
     {"render"},

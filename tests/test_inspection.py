@@ -34,7 +34,7 @@ from clod_adapter.io.writers import write as save_as
 from clod_adapter.training_state import TrainingState
 from packing import write_packed
 
-ATTENUATION = AttenuationConfig(tau=0.01, max_sv=6.0, cut="soft", scene_distance=3.5)
+ATTENUATION = AttenuationConfig(tau=0.01, max_sv=6.0, cut="soft", reference_distance=3.5)
 
 
 def table(n: int = 300, degree: int = 1, seed: int = 0) -> np.ndarray:

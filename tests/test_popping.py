@@ -23,7 +23,8 @@ from scenes import gaussians, ring
 def dialled(tau: float = 1 / 255, n: int = 200, **settings: object) -> Gaussians:
     """Gaussians that fade at different dial values; scene distance 4, where the ring of cameras is."""
     sigma = torch.linspace(0.3, 4, n)[torch.randperm(n, generator=torch.Generator().manual_seed(3))]
-    return attach(gaussians(n, 1, 0, size=0.2), sigma, AttenuationConfig(tau=tau, scene_distance=4.0, **settings))
+    config = AttenuationConfig(**({"tau": tau, "cut": "hard", "scene_distance": 4.0} | settings))
+    return attach(gaussians(n, 1, 0, size=0.2), sigma, config)
 
 
 def test_an_even_fade_and_a_switch_by_hand() -> None:

@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,6 +21,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.importance import scene_distance, start
+from clod_adapter.io.ply import load, save
 from clod_adapter.losses import photometric_loss
 from clod_adapter.objective import Part
 from clod_adapter.render import render, splat
@@ -151,7 +153,8 @@ def test_the_start_follows_the_count_law(captured: tuple[Gaussians, Scene]) -> N
     base, scene = captured
     base = base.replace(opacity_logits=base.opacity_logits.abs())  # all able to last
     found = start(base, scene.train, config_of(start_share=0.7, exponent=1.5))
-    assert found.attenuation.scene_distance == pytest.approx(scene_distance(base, scene.train, 0.95))
+    assert found.attenuation.scene_distance == 1
+    assert found.attenuation.reference_distance == pytest.approx(scene_distance(base, scene.train, 0.95))
     for row in evaluate(found, scene.train, SCALES):
         s = row.virtual_scale
         assert row.kept_share == pytest.approx(1 / (s**1.5 + (1 / 0.7 - 1) * s**-1.5), rel=0.25)
@@ -169,12 +172,62 @@ def test_continues_from_a_sigma(captured: tuple[Gaussians, Scene], trained: tupl
     assert start(first, captured[1].train, config).sigma_d is first.sigma_d
 
 
+def test_the_outcome_is_in_world_units_and_read_back_as_it_was(
+    captured: tuple[Gaussians, Scene], trained: tuple[Adapted, list[Progress]], tmp_path: Path
+) -> None:
+    """What was evaluated is what is written: nothing is converted, and so rounded, on the way."""
+    result = trained[0].gaussians
+    assert result.attenuation is not None and result.attenuation.scene_distance == 1
+    assert result.attenuation.reference_distance == pytest.approx(scene_distance(captured[0], captured[1].train, 0.95))
+    save(tmp_path / "a.ply", result)
+    again = load(tmp_path / "a.ply").gaussians
+    assert torch.equal(again.sigma_d, result.sigma_d) and again.attenuation == result.attenuation
+    last = trained[1][-1].gaussians()
+    assert last.attenuation == result.attenuation
+
+
+@pytest.mark.parametrize("distance", [1.0, 4.0])
+def test_rows_that_are_only_drawn_keep_their_units_when_resumed(
+    captured: tuple[Gaussians, Scene], distance: float
+) -> None:
+    """Their sigma_d is in no state: it is the base's, in whichever unit that has it."""
+    base, scene = captured
+    settings = AttenuationConfig(scene_distance=distance, reference_distance=4.0)
+    base = attach(base, torch.linspace(0.3, 3, len(base)) * 4 / distance, settings)
+    part, states = Part(len(base) // 2), dict[int, TrainingState]()
+    whole = adapt(base, scene, config_of(iters=4), states_of({2}, states), part=part)
+    again = adapt(base, scene, config_of(iters=4), None, states[2], part=part)
+    assert_equal(again.gaussians, whole.gaussians)
+    rest = slice(len(base) // 2, None)
+    torch.testing.assert_close(whole.gaussians.sigma_d[rest], base.sigma_d[rest] * distance)
+
+
+@pytest.mark.parametrize("lost", [False, True], ids=["known", "lost"])
+def test_continuing_divides_by_the_typical_distance_again(
+    captured: tuple[Gaussians, Scene], trained: tuple[Adapted, list[Progress]], lost: bool
+) -> None:
+    """The one in the file, or that of the views where another tool has dropped it: the steps are the same."""
+    first, states = trained[0].gaussians, list[float]()
+    if lost:
+        first = first.replace(attenuation=replace(first.attenuation, reference_distance=0.0))
+
+    def follow(now: Progress) -> None:
+        if now.state:
+            states.append(now.state().attenuation.scene_distance)
+
+    result = adapt(first, captured[1], config_of(iters=1), follow).gaussians
+    want = scene_distance(first, captured[1].train, 0.95) if lost else first.attenuation.reference_distance
+    assert states == [pytest.approx(want)] and want > 2
+    assert result.attenuation.reference_distance == pytest.approx(want)
+    assert (result.sigma_d / first.sigma_d).log().abs().max() <= 1.01e-2  # a step of log sigma
+
+
 def test_a_file_s_own_settings_outlive_other_defaults(captured: tuple[Gaussians, Scene]) -> None:
     """A sigma_d learned under one tau and normaliser means something else under others."""
     own = AttenuationConfig(tau=0.02, eps=1e-6, normalizer="max", scene_distance=2.0, max_sv=4.0)
     dialled = attach(captured[0], torch.full((len(captured[0]),), 1.5), own)
     result = adapt(dialled, captured[1], config_of(iters=1, max_sv=3.0)).gaussians
-    assert result.attenuation == replace(own, max_sv=3.0)
+    assert result.attenuation == replace(own, max_sv=3.0, scene_distance=1.0, reference_distance=2.0)
 
 
 def test_a_dial_that_does_nothing_is_started(captured: tuple[Gaussians, Scene]) -> None:

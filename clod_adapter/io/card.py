@@ -17,6 +17,7 @@ from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.io.origin import NOWHERE, Origin, parse_origin
 from clod_adapter.io.screen_filter import entry_of, parse_entry
+from clod_adapter.io.silence import as_before
 from clod_adapter.io.version import package_version
 
 if TYPE_CHECKING:
@@ -115,20 +116,19 @@ def read_card(path: Path, text: str | bytes | dict[str, Any] | None, total: int)
         raise ClodError(f"{path}: its description is damaged ({error!r:.80}); export the file again") from error
 
 
-def settings_of(path: Path, card: Card, notes: list[str]) -> AttenuationConfig:
-    """How the file's sigma_d is to be read: the defaults, with a note, where the file is silent."""
-    if card.attenuation is None:
-        notes.append(f"sigma_d without settings in {path.name}: defaults used")
-    return card.attenuation or AttenuationConfig()
+def settings_of(card: Card) -> AttenuationConfig:
+    """How the file's sigma_d is to be read: by the defaults, of earlier versions in a description without settings."""
+    unsaid = AttenuationConfig(**as_before({})[0]) if card.version else AttenuationConfig()
+    return card.attenuation or unsaid
 
 
 def _attenuation(values: dict[str, Any], notes: list[str]) -> AttenuationConfig:
     kinds: dict[str, Any] = {field.name: type(field.default) for field in fields(AttenuationConfig)}
     if unknown := [name for name in values if name not in kinds]:
         notes.append(f"settings unknown to this version ignored: {', '.join(unknown)}")
-    if missing := [name for name in kinds if name not in values]:
-        notes.append(f"settings that are missing have their defaults: {', '.join(missing)}")
-    return AttenuationConfig(**{name: kind(values[name]) for name, kind in kinds.items() if name in values})
+    known, remarks = as_before({name: kind(values[name]) for name, kind in kinds.items() if name in values})
+    notes += remarks
+    return AttenuationConfig(**known)
 
 
 def _calibration(values: dict[str, Any], total: int) -> tuple[Calibration | None, list[str]]:

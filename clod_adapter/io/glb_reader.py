@@ -72,7 +72,7 @@ def load_glb(path: str | Path) -> Model:
     if moved != card.origin:  # not as we wrote it
         stored["means"], moved = _moved(stored["means"], moved)
         card = replace(card, origin=moved)
-    attenuation = settings_of(path, card, notes) if "sigma_d" in arrays else None
+    attenuation = settings_of(card) if "sigma_d" in arrays else None
     return Model(gaussians_of(path, stored, attenuation, card.screen_filter), card, (*doubts, *notes))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +76,7 @@ def read_model(path: Path) -> Rows:
         return read_converted(path)
     model = load_model(path)
     g = model.gaussians
-    card = replace(model.card, attenuation=g.attenuation)  # the defaults, where the file is silent
+    card = model.card
     arrays = {name: tensor.numpy() for name, tensor in g.tensors().items()}
     vertex = rows_of(arrays, g.sh_degree)
     kinds = [(name, np.dtype("f8") if name in AXES and any(card.origin) else kind) for name, kind in _fields(vertex)]

@@ -63,6 +63,6 @@ def load_safetensors(path: str | Path) -> Model:
     wanted = (*_NAMES, "sigma_d") if "sigma_d" in tensors else _NAMES
     if odd := [name for name in wanted if not tensors[name].is_floating_point()]:
         raise ClodError(f"{path}: tensor {odd[0]!r} is not of floating-point numbers; export it again")
-    attenuation = settings_of(path, card, notes) if "sigma_d" in tensors else None
+    attenuation = settings_of(card) if "sigma_d" in tensors else None
     arrays = {name: tensors[name].float().numpy() for name in wanted}
     return Model(gaussians_of(path, arrays, attenuation, card.screen_filter), card, tuple(notes))

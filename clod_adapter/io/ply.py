@@ -17,13 +17,22 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.origin import AXES, NOWHERE, Origin, origin_of, relative
+from clod_adapter.io.plausible import judge
 from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, inria_dtype, read_table
-from clod_adapter.io.ply_header import read_attenuation, read_calibration, read_screen_filter, write_comments
+from clod_adapter.io.ply_constants import dial_constants, filter_constants, read_constants
+from clod_adapter.io.ply_header import (
+    has_settings,
+    read_attenuation,
+    read_calibration,
+    read_screen_filter,
+    write_comments,
+)
 from clod_adapter.io.ply_merge import ROWS, write_rows
 from clod_adapter.io.ply_values import Activated, as_stored_by_inria
 from clod_adapter.io.readers import read_rows
 from clod_adapter.io.screen_filter import likely
 from clod_adapter.io.usable import row_rules
+from clod_adapter.units import in_world_units
 
 
 @dataclass(frozen=True)
@@ -87,7 +96,9 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
     """
     path = Path(path)
     rows = read_rows(path)
-    said, expected = read_screen_filter(path, rows.comments), likely(rows.comments, rows.vertex.dtype.names or ())
+    names = rows.vertex.dtype.names or ()
+    constants = read_constants(path, rows.vertex) if SIGMA in names else {}
+    said, expected = read_screen_filter(path, rows.comments, constants), likely(rows.comments, names)
     vertex, was, changes = as_stored_by_inria(path, rows.vertex, "none" if rows.settled else activated)
     if origin is None:
         origin = origin_of(vertex) if rows.origin is None else rows.origin
@@ -99,12 +110,14 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
         vertex = vertex[keep]
     gaussians, calibration = _gaussians(values), None
     if SIGMA in values:
-        attenuation, remarks = read_attenuation(path, rows.comments)
+        attenuation, remarks = read_attenuation(path, rows.comments, constants)
         sigma_d = torch.from_numpy(values[SIGMA][:, 0])
         gaussians = gaussians.replace(sigma_d=sigma_d, attenuation=attenuation)
+        if not has_settings(rows.comments):
+            remarks += judge(gaussians.means, gaussians.opacity_logits, sigma_d, attenuation)
         calibration, doubts = read_calibration(rows.comments, len(gaussians))
         notes += remarks + doubts
-        expected = CLASSIC  # what a dial was tuned with, where the file does not say
+        expected = CLASSIC  # what a dial was tuned with, where nothing says
     gaussians = gaussians.replace(screen_filter=said or expected)
     notes = [*changes, *notes, *rows.notes]
     fingerprint = _sha256(path) if was == "none" else f"{was}:{_sha256(path)}"
@@ -128,8 +141,9 @@ def save(
 
     Row ``i`` of ``gaussians`` is row ``i`` of ``base``. Columns keep name, order and type; a value is
     overwritten only where it differs from the base's float32 reading, so what was not tuned stays
-    byte-equal. Where the base has an origin, x, y and z are written as double. The settings follow the element line
-    as comments. Without a sigma_d a plain file results.
+    byte-equal. Where the base has an origin, x, y and z are written as double. sigma_d is written in world units
+    (``units.in_world_units``). The settings follow the element line as comments, and those that are not the defaults
+    stand in columns too (``ply_constants``). Without a sigma_d a plain file results.
 
     Args:
         version: of the package that made the values, for the header (``Adapter.version``); by default the running one.
@@ -150,9 +164,13 @@ def save(
             f"{path}: {len(gaussians)} Gaussians of SH degree {gaussians.sh_degree} do not fit their base {base.path} "
             f"({len(base.vertex)} of degree {base.gaussians.sh_degree}); save with the checkpoint they came from"
         )
+    gaussians = in_world_units(gaussians)
     comments = write_comments(gaussians.attenuation, base.comments, version, calibration, gaussians.screen_filter)
+    constants = dial_constants(gaussians.attenuation)
+    if gaussians.sigma_d is not None:  # a plain file has the columns of Inria's layout and no others
+        constants |= filter_constants(gaussians.screen_filter)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        write_rows(file, path, gaussians, base.vertex, base.origin, comments)
+        write_rows(file, path, gaussians, base.vertex, base.origin, comments, constants)
 
 
 def blank(count: int, sh_degree: int, origin: Origin = NOWHERE) -> Checkpoint:

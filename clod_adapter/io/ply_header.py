@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,10 @@ from clod_adapter.calibration import AGAINST, Calibration, CalibrationRow
 from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.io.foreign import refuse
+from clod_adapter.io.ply_constants import dial_settings, filter_of
 from clod_adapter.io.regular import read_start
 from clod_adapter.io.screen_filter import KEY, parse_words, tagged, words_of
+from clod_adapter.io.silence import as_before, with_range
 from clod_adapter.io.version import package_version
 
 PREFIX = "clod_adapter "
@@ -140,45 +142,65 @@ def read_calibration(comments: Iterable[str], total: int) -> tuple[Calibration |
     return calibration, []
 
 
-def read_attenuation(path: Path, comments: Iterable[str]) -> tuple[AttenuationConfig, list[str]]:
-    """The settings in the header's comments, defaults where they are silent, and notes on both.
+def read_attenuation(
+    path: Path, comments: Iterable[str], constants: Mapping[str, float] | None = None
+) -> tuple[AttenuationConfig, list[str]]:
+    """The settings in the header's comments, else in columns, and notes on them.
+
+    What neither has is the default; in a file with comments of ours, which an earlier version wrote, what was the
+    default then (``silence.BEFORE``).
+
+    Args:
+        constants: from ``ply_constants.read_constants``.
 
     Raises:
-        ClodError: a comment of ours holds a value that is no setting.
+        ClodError: a comment of ours, or a column, holds a value that is no setting.
     """
     ours = [comment[len(PREFIX) :].split(maxsplit=1) for comment in comments if comment.startswith(PREFIX)]
     stored = {words[0]: words[1].strip() for words in ours if len(words) == 2}
     for other in ("version", MACHINE, EXTENT, ROW, KEY):
         stored.pop(other, None)
     kinds = {field.name: type(field.default) for field in fields(AttenuationConfig)}
-    missing = [name for name in kinds if name not in stored]
-    notes = []
-    if missing:
-        notes.append(f"sigma_d without header comments on {', '.join(missing)}: defaults used")
-    if unknown := [name for name in stored if name not in kinds]:
-        notes.append(f"settings unknown to this version ignored: {', '.join(unknown)}")
     try:
         values = {name: _parse(stored[name], kind) for name, kind in kinds.items() if name in stored}
-        return AttenuationConfig(**values), notes
+        known = dial_settings(constants or {}) | values
+        notes = [f"settings of the dial read from columns: {', '.join(known)}"] if known and not values else []
+        if ours:
+            known, notes = as_before(known)
+        if unknown := [name for name in stored if name not in kinds]:
+            notes.append(f"settings unknown to this version ignored: {', '.join(unknown)}")
+        return with_range(known), notes
     except (ValueError, ClodError) as error:
-        raise ClodError(f"{path}: a clod_adapter header comment is unusable ({error}); restore or remove it") from error
+        what = "header comment" if ours else "column"
+        raise ClodError(f"{path}: a clod_adapter {what} is unusable ({error}); restore or remove it") from error
 
 
-def read_screen_filter(path: Path, comments: Iterable[str]) -> ScreenFilter | None:
-    """The filter that the header's comments of ours say the Gaussians were trained with; None where they do not.
+def read_screen_filter(
+    path: Path, comments: Iterable[str], constants: Mapping[str, float] | None = None
+) -> ScreenFilter | None:
+    """The filter that the Gaussians were trained with, by our comments, else by columns; None where neither tells.
+
+    Args:
+        constants: from ``ply_constants.read_constants``.
 
     Raises:
-        ClodError: they say none that there is.
+        ClodError: a comment of ours, or a column, holds a value that is no setting.
     """
     start = f"{PREFIX}{KEY}"
     said = [comment.removeprefix(start) for comment in comments if re.match(rf"{start}\b", comment)]
     try:
-        return parse_words(said[-1]) if said else None
+        return parse_words(said[-1]) if said else filter_of(constants or {})
     except (ValueError, ClodError) as error:
-        raise ClodError(f"{path}: a clod_adapter header comment is unusable ({error}); restore or remove it") from error
+        what = "header comment" if said else "column"
+        raise ClodError(f"{path}: a clod_adapter {what} is unusable ({error}); restore or remove it") from error
 
 
 def _parse(text: str, kind: type) -> Any:
     if text == "None":
         return None
     return text == "True" if kind is bool else kind(text)
+
+
+def has_settings(comments: Iterable[str]) -> bool:
+    """Whether there is a comment of ours, so that the file says by which settings its sigma_d is to be read."""
+    return any(comment.startswith(PREFIX) for comment in comments)

@@ -1,4 +1,4 @@
-"""The rows of an output: the base's, with the values that changed written in, and ``sigma_d`` as the last column.
+"""The rows of an output: the base's with the values that changed written in, constants, and last ``sigma_d``.
 
 They are made and written some thousands at a time, so that no second copy of a large file is ever held, and because
 picking columns out of rows that stay in the processor's cache is several times as fast.
@@ -6,7 +6,7 @@ picking columns out of rows that stay in the processor's cache is several times 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,13 +18,15 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.origin import AXES, Origin, relative
 from clod_adapter.io.ply_columns import SIGMA, column_map, read_table
+from clod_adapter.io.ply_constants import PREFIX
 
 ROWS = 4096  # in a block
 
 
 def write_rows(
-    file: BinaryIO, path: Path, gaussians: Gaussians, vertex: np.ndarray, origin: Origin, comments: list[str]
-) -> None:
+    file: BinaryIO, path: Path, gaussians: Gaussians, vertex: np.ndarray, origin: Origin, comments: list[str],
+    constants: Mapping[str, float],
+) -> None:  # fmt: skip
     """Writes header and rows of a binary little-endian PLY.
 
     Args:
@@ -32,24 +34,28 @@ def write_rows(
         vertex: ``[N]`` the base's rows, of which ``gaussians`` are the Gaussians.
         origin: what the means are relative to; where it is not 0 coordinates become doubles.
         comments: of the element, in the header.
+        constants: by name, float columns of one value each (``ply_constants``); those of the base do not go along.
 
     Raises:
         ClodError: a new value is not finite.
     """
-    kind = _dtype(vertex, origin, gaussians.sigma_d is not None)
+    kind = _dtype(vertex, origin, [*constants, *([SIGMA] if gaussians.sigma_d is not None else [])])
     one = np.broadcast_to(np.zeros((), kind), len(vertex))  # of which plyfile makes a header without the rows
     element = PlyElement.describe(one, "vertex", comments=comments)
     file.write(f"{PlyData([element], byte_order='<').header}\n".encode("ascii"))
     for block in _blocks(path, gaussians, vertex, origin, kind):
+        for name, value in constants.items():
+            block[name] = value
         file.write(block.astype(kind.newbyteorder("<"), copy=False).data)
 
 
-def _dtype(vertex: np.ndarray, origin: Origin, dial: bool) -> np.dtype:
+def _dtype(vertex: np.ndarray, origin: Origin, added: list[str]) -> np.dtype:
     """Names, order and types of the base, but for coordinates that need more digits, as those far from 0 do."""
-    columns = [(name, vertex.dtype[name]) for name in vertex.dtype.names or () if name != SIGMA]
+    own = [name for name in vertex.dtype.names or () if name != SIGMA and not name.startswith(PREFIX)]
+    columns = [(name, vertex.dtype[name]) for name in own]
     if any(origin):
         columns = [(name, np.dtype("f8") if name in AXES else kind) for name, kind in columns]
-    return np.dtype(columns + ([(SIGMA, np.dtype("f4"))] if dial else []))
+    return np.dtype(columns + [(name, np.dtype("f4")) for name in added])
 
 
 def _blocks(
@@ -61,7 +67,7 @@ def _blocks(
         rows = slice(start, start + ROWS)
         old, block = vertex[rows], np.empty(len(vertex[rows]), kind)
         for name in kind.names or ():
-            if name != SIGMA:
+            if name != SIGMA and not name.startswith(PREFIX):
                 block[name] = old[name]
         for attribute, group in groups.items():
             new = _numpy(tensors[attribute][rows]).reshape(len(old), -1)

@@ -50,7 +50,7 @@ def load_pt(path: str | Path) -> Model:
     path = Path(path)
     values, text = read_splats(path)
     card, notes = read_card(path, text, len(values["means"]))
-    attenuation = settings_of(path, card, notes) if SIGMA in values else None
+    attenuation = settings_of(card) if SIGMA in values else None
     arrays = {NAMES.get(name, name): value for name, value in values.items()}
     notes += [] if card.version else [FRAME]
     return Model(gaussians_of(path, arrays, attenuation, card.screen_filter), card, tuple(notes))

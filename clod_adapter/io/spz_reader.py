@@ -58,7 +58,7 @@ def load_spz(path: str | Path) -> Model:
     arrays = _in_our_axes(path, arrays, records.get(AXES, _UNTURNED))
     if sigma is not None:
         arrays["sigma_d"] = sigma
-    attenuation = settings_of(path, card, notes) if sigma is not None else None
+    attenuation = settings_of(card) if sigma is not None else None
     return Model(gaussians_of(path, arrays, attenuation, card.screen_filter), card, tuple(notes))
 
 

@@ -60,7 +60,7 @@ def write(
     origin: Origin = NOWHERE,
     calibration: Calibration | None = None,
 ) -> tuple[str, ...]:
-    """Writes Gaussians in the format of the name's suffix, whole or not at all.
+    """Writes Gaussians in the format of the name's suffix, whole or not at all, sigma_d in world units.
 
     Args:
         gaussians: with or without sigma_d.
@@ -81,4 +81,6 @@ def write(
     function: Callable[..., tuple[str, ...]] = getattr(
         import_module(f"clod_adapter.io.{writer.module}"), writer.function
     )
-    return function(path, gaussians, about, origin=origin, calibration=calibration)
+    from clod_adapter.units import in_world_units  # here and not above, as the table needs no torch
+
+    return function(path, in_world_units(gaussians), about, origin=origin, calibration=calibration)

@@ -283,7 +283,7 @@ def saved(path: Path, degree: int) -> Any:
     from scenes import gaussians
 
     sigma = torch.linspace(0.3, 3, 50)
-    model = clod_adapter.attach(gaussians(50, degree, 4), sigma, clod_adapter.AttenuationConfig(scene_distance=3.0))
+    model = clod_adapter.attach(gaussians(50, degree, 4), sigma, clod_adapter.AttenuationConfig(reference_distance=3.0))
     save(path, model)
     return model
 

@@ -39,8 +39,8 @@ def my_opacity(
 def adapted(capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> clod_adapter.Gaussians:
     """Written as adapted.ply in the test's folder."""
     monkeypatch.chdir(tmp_path)
-    sigma_d = 0.5 + 3 * torch.rand(len(capture.gaussians), generator=torch.Generator().manual_seed(0))
-    attenuation = AttenuationConfig(tau=0.02, cut="soft", scene_distance=5.0)
+    sigma_d = 2.5 + 15 * torch.rand(len(capture.gaussians), generator=torch.Generator().manual_seed(0))
+    attenuation = AttenuationConfig(tau=0.02, cut="soft", reference_distance=5.0)
     gaussians = capture.gaussians.replace(sigma_d=sigma_d, attenuation=attenuation)
     clod_adapter.save("adapted.ply", gaussians)
     return gaussians

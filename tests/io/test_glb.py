@@ -12,6 +12,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io import ply
@@ -55,7 +56,7 @@ def test_as_an_independent_reader_sees_it(tmp_path: Path) -> None:
         "kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective",
         "sortingMethod": "cameraDistance",
     }  # fmt: skip
-    assert gltf.asset.extras["clod_adapter"]["attenuation"]["scene_distance"] == ATTENUATION.scene_distance
+    assert gltf.asset.extras["clod_adapter"]["attenuation"]["reference_distance"] == ATTENUATION.reference_distance
     found = {}
     for name, number in vars(primitive.attributes).items():
         if number is None:
@@ -142,7 +143,8 @@ def test_files_of_others(tmp_path: Path) -> None:
     write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
     path = rewritten(tmp_path / "a.glb", lambda g: g["asset"].pop("extras"))
     again, card, notes = load_glb(path)
-    assert card.origin == ORIGIN and "defaults used" in notes[0] and again.sigma_d is not None
+    assert card.origin == ORIGIN and not notes and again.sigma_d is not None
+    assert again.attenuation == AttenuationConfig()
     rows = np.zeros(5, [("position", "<f4", 3), ("rotation", "<i2", 4), ("opacity", "u1"), ("pad", "u1", 3)])
     rows["position"], rows["rotation"], rows["opacity"] = np.arange(15).reshape(5, 3), [0, 0, 0, 32767], 255
 

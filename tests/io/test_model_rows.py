@@ -15,10 +15,11 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from clod_adapter.adapter import extract
+from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.inspection import inspect
 from clod_adapter.io.adapter_file import save_adapter
-from clod_adapter.io.models import LOADERS
+from clod_adapter.io.models import LOADERS, load_model
 from clod_adapter.io.ply import load, save
 from clod_adapter.io.readers import MODEL, READERS, check_readable, file_has_dial
 from clod_adapter.io.writers import WRITERS, write
@@ -104,7 +105,10 @@ def test_settings_that_are_not_there_are_said_once(tmp_path: Path) -> None:
     card = json.loads(text)
     card.pop("attenuation")
     save_file(tensors, path, {"clod_adapter": json.dumps(card)})
-    assert sum("defaults used" in note for note in load(path).notes) == 1
+    found = load(path)
+    assert sum("defaults of earlier versions" in note for note in found.notes) == 1
+    assert found.gaussians.attenuation == load_model(path).gaussians.attenuation
+    assert found.gaussians.attenuation == AttenuationConfig(tau=1 / 255, cut="hard", reference_distance=1.0)
 
 
 @pytest.mark.parametrize("suffix", LOADERS)

@@ -21,7 +21,7 @@ from clod_adapter.io import ply
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 
 RESTS = (0, 9, 24, 45, 72)
-CONFIG = AttenuationConfig(tau=0.1 + 0.2 - 0.29, eps=1e-7, normalizer="quantile", quantile=1 / 3, max_sv=7.0)
+CONFIG = AttenuationConfig(tau=0.02, eps=1e-7, normalizer="quantile", quantile=1 / 3, max_sv=7.0)
 
 
 def needed(degree: int) -> list[str]:
@@ -114,7 +114,8 @@ def test_any_layout_round_trips(tmp_path: Path, file: tuple[np.ndarray, str, int
     out = tmp_path / "out.ply"
     ply.save(out, g.replace(sigma_d=sigma_d, attenuation=CONFIG), base)
     lines, rows = read_back(out)
-    assert rows.dtype.names == (*vertex.dtype.names, "sigma_d") and rows.dtype["sigma_d"] == "<f4"
+    constants = ("clod_eps", "clod_quantile", "sigma_d")  # of CONFIG, what is not the default, but for max_sv
+    assert rows.dtype.names == (*vertex.dtype.names, *constants) and rows.dtype["sigma_d"] == "<f4"
     for name in vertex.dtype.names:
         assert rows[name].tobytes() == vertex[name].astype(rows.dtype[name]).tobytes(), name
         assert rows.dtype[name] == vertex.dtype[name]
@@ -151,8 +152,8 @@ def test_extended_header(tmp_path: Path) -> None:
     base = ply.load(
         write(tmp_path / "in.ply", vertex, comments=("a photo", "clod_adapter tau 0.125", "clod_adapter odd 1"))
     )
-    assert base.gaussians.attenuation == AttenuationConfig(tau=0.125)
-    assert "odd" in base.notes[1] and "eps, normalizer" in base.notes[0]
+    assert base.gaussians.attenuation == AttenuationConfig(tau=0.125, cut="hard", reference_distance=1.0)
+    assert "odd" in base.notes[1] and "earlier versions: cut, eps, normalizer" in base.notes[0]
     ply.save(tmp_path / "out.ply", base.gaussians.replace(attenuation=CONFIG), base)
     lines, rows = read_back(tmp_path / "out.ply")
     assert lines[:4] == ["ply", "format binary_little_endian 1.0", "element vertex 2", "comment a photo"]
@@ -167,7 +168,7 @@ def test_extended_header(tmp_path: Path) -> None:
 
 def test_settings_of_any_number_type_round_trip(tmp_path: Path) -> None:
     base = ply.load(write(tmp_path / "in.ply", make(1, needed(0))))
-    config = AttenuationConfig(scene_distance=np.float64(1) / 3, max_sv=3, tau=np.float32(0.01))
+    config = AttenuationConfig(reference_distance=np.float64(1) / 3, max_sv=3, tau=np.float32(0.01))
     ply.save(tmp_path / "out.ply", base.gaussians.replace(sigma_d=torch.ones(1), attenuation=config), base)
     assert ply.load(tmp_path / "out.ply").gaussians.attenuation == config
 
@@ -175,7 +176,7 @@ def test_settings_of_any_number_type_round_trip(tmp_path: Path) -> None:
 def test_sigma_without_header_uses_defaults(tmp_path: Path) -> None:
     checkpoint = ply.load(write(tmp_path / "in.ply", make(2, [*needed(1), "sigma_d"])))
     assert checkpoint.gaussians.attenuation == AttenuationConfig()
-    assert len(checkpoint.notes) == 1 and "defaults used" in checkpoint.notes[0]
+    assert len(checkpoint.notes) == 1 and "its dial is not described" in checkpoint.notes[0]
 
 
 @pytest.mark.parametrize("comment", ["tau banana", "tau 7", "normalizer mean", "scene_distance nan"])

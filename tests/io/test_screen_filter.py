@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.models import load_model
 from clod_adapter.io.ply import load, save
+from clod_adapter.io.ply_constants import filter_constants, filter_of
 from clod_adapter.io.screen_filter import is_antialiased, likely, parse_words, tagged, words_of
 from clod_adapter.io.spz_reader import load_spz
 from clod_adapter.io.writers import write
@@ -158,3 +160,22 @@ def test_a_dial_was_tuned_with_what_its_file_says(tmp_path: Path) -> None:
     assert found.gaussians.screen_filter == CLASSIC and found.filter_known
     save(tmp_path / "b.ply", detach(found.gaussians), found)
     assert not is_antialiased(load(tmp_path / "b.ply").comments)
+
+
+@pytest.mark.parametrize("screen_filter", [*FILTERS.values(), ScreenFilter(variance=0.123, compensate=True)], ids=str)
+def test_columns_keep_it_where_comments_are_dropped(tmp_path: Path, screen_filter: ScreenFilter) -> None:
+    """Of a file with a dial; a plain one has the columns of Inria's layout and no others."""
+    write(tmp_path / "a.ply", model(1).replace(screen_filter=screen_filter))
+    data = re.sub(rb"(?m)^comment .*\n", b"", (tmp_path / "a.ply").read_bytes())
+    (tmp_path / "a.ply").write_bytes(data)
+    found = load(tmp_path / "a.ply")
+    assert found.gaussians.screen_filter == screen_filter and found.filter_known and found.comments == ()
+    assert filter_of(filter_constants(screen_filter)) == (screen_filter if screen_filter != CLASSIC else None)
+    write(tmp_path / "b.ply", detach(found.gaussians))
+    assert not any(name.startswith("clod_") for name in load(tmp_path / "b.ply").vertex.dtype.names or ())
+
+
+def test_a_damaged_column_is_named(tmp_path: Path) -> None:
+    with_column(tmp_path / "a.ply", model(1), "clod_screen_variance", -1.0)
+    with pytest.raises(ClodError, match=r"a.ply: a clod_adapter column is unusable \(variance is -1.0"):
+        load(tmp_path / "a.ply")

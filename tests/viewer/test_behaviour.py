@@ -20,7 +20,7 @@ from clod_adapter.cli.view import prepare
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.colmap import write_model
-from clod_adapter.render import dial
+from clod_adapter.render import dial, render
 from clod_adapter.viewer import page, payload
 from clod_adapter.viewer.page import write_page
 from shown import SIZE, Shown, serve
@@ -113,6 +113,43 @@ def test_a_dropped_file_is_shown(show: Any, files: Any, gaussians: Gaussians) ->
         plain.camera(camera)
         plain.run("clod.setDial(2)")
         assert plain.page.is_enabled("#dial") and np.array_equal(plain.picture(), wanted), name
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"tau": 1 / 255, "cut": "hard", "normalizer": "max"}, {"tau": 0.013}], ids=str
+)
+def test_a_dropped_file_without_comments_keeps_its_dial(
+    show: Any, files: Any, gaussians: Gaussians, settings: dict[str, Any]
+) -> None:
+    """As other tools leave it: the columns are all that says how sigma_d is read."""
+    model = gaussians.replace(attenuation=AttenuationConfig(**settings))
+    path = files.save(model, "model.ply")
+    given, plain = show(path), show(files.save(plain_of(gaussians), "plain.ply"))
+    camera = scenes.camera(320, 240)
+    rows = PlyData.read(str(path), mmap=False)["vertex"].data
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(files.folder / "bare.ply"))
+    drop(plain, "bare.ply", (files.folder / "bare.ply").read_bytes())
+    plain.until("document.title === 'bare.ply'")
+    for shown in (given, plain):
+        shown.camera(camera)
+        shown.run("clod.setDial(1.5)")
+    kept = int(render(model, camera, 1.5).kept.sum())
+    assert given.counts()["kept"] == plain.counts()["kept"] == kept and 0 < kept < 800
+    assert np.array_equal(plain.picture(), given.picture())
+
+
+def test_a_dropped_file_of_an_earlier_version_has_the_defaults_of_then(
+    show: Any, files: Any, gaussians: Gaussians
+) -> None:
+    rows = PlyData.read(str(files.save(gaussians)), mmap=False)["vertex"].data
+    old, plain = files.folder / "old.ply", show(files.save(plain_of(gaussians), "plain.ply"))
+    PlyData([PlyElement.describe(rows, "vertex", comments=["clod_adapter max_sv 4.0"])]).write(str(old))
+    drop(plain, "old.ply", old.read_bytes())
+    plain.until("document.title === 'old.ply'")
+    plain.camera(scenes.camera(320, 240))
+    plain.run("clod.setDial(1.5)")
+    kept = int(render(clod_adapter.load(old).gaussians, scenes.camera(320, 240), 1.5).kept.sum())
+    assert plain.counts()["kept"] == kept and 0 < kept < 800
 
 
 def test_a_name_is_text_on_the_page(show: Any, files: Any, gaussians: Gaussians) -> None:

@@ -32,7 +32,7 @@ def dialled(degree: int) -> Gaussians:
     logits[::20] = -12.0
     sigma_d = torch.randn(1000, generator=torch.Generator().manual_seed(1)).exp()
     sigma_d[:3] = torch.tensor([0.0, 1e9, -0.5])
-    attenuation = AttenuationConfig(tau=0.02, cut="soft", scene_distance=3.0)
+    attenuation = AttenuationConfig(tau=0.02, cut="soft", reference_distance=3.0)
     return plain.replace(opacity_logits=logits, sigma_d=sigma_d, attenuation=attenuation)
 
 

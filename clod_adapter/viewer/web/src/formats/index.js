@@ -14,11 +14,11 @@ const noDial = (name) => `${name} has no sigma_d, so there is no dial to turn; g
 export async function readFile(buffer, name) {
   const gaussians = usable(await readGaussians(new Uint8Array(buffer), name).catch(said));
   const dialled = gaussians.sigma !== null;
-  const settings = dialled ? gaussians.settings ?? readSettings(gaussians.comments) : null;
+  const settings = dialled ? gaussians.settings ?? readSettings(gaussians.comments, gaussians.constants) : null;
   return {
     gaussians,
     about: {
-      name, attenuation: settings, screen_filter: gaussians.screenFilter ?? readScreenFilter(gaussians.comments, dialled),
+      name, attenuation: settings, screen_filter: gaussians.screenFilter ?? readScreenFilter(gaussians.comments, dialled, gaussians.constants),
       max_sv: settings?.max_sv ?? 1, notes: gaussians.notes,
       no_dial: dialled ? null : noDial(name),
       calibration: readCalibration(gaussians.comments, gaussians.count),

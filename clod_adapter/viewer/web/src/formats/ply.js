@@ -55,8 +55,22 @@ export function readPly(bytes, header) {
   if (vertex.properties.some((property) => property.name === "sigma_d")) {
     gaussians.sigma = new Float32Array(vertex.count);
     put(gaussians.sigma, 1, 0, "sigma_d");
+    gaussians.constants = constantsOf(vertex, columns);
   }
   return gaussians;
+}
+
+/** The value of each clod_* column, which is one for all rows (io/ply_constants.py). */
+function constantsOf({ properties }, columns) {
+  const found = {};
+  for (const { name } of properties.filter((property) => property.name.startsWith("clod_"))) {
+    columns(name, (i, value) => {
+      const narrow = Math.fround(value);
+      if (i && narrow !== found[name]) throw new Error(`property ${name} must be one value for all rows and has several`);
+      found[name] = narrow;
+    });
+  }
+  return found;
 }
 
 function degreeOf({ properties }) {

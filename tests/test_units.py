@@ -1,0 +1,79 @@
+"""The unit of sigma_d: the same dial whatever distances are divided by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clod_adapter.adapter import attach
+from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.units import estimated_distance, in_world_units, known_distance, nominal_distance, with_distance
+from scenes import camera, gaussians
+
+
+def dialled(n: int = 400, **config: float | str) -> Gaussians:
+    some = gaussians(n, 0, 3)
+    sigma = torch.logspace(-2, 2, n)
+    return attach(some, sigma, AttenuationConfig(**({"scene_distance": 3.7} | config)))  # type: ignore[arg-type]
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.floats(1e-3, 1e4), st.sampled_from([0.0, 1e-8, 0.3]), st.floats(1, 20))
+def test_another_distance_is_the_same_dial(distance: float, eps: float, s: float) -> None:
+    some = dialled(eps=eps, max_sv=20.0)
+    some = some.replace(sigma_d=some.sigma_d.double(), means=some.means.double())
+    other = with_distance(some, distance)
+    assert other.attenuation is not None and other.attenuation.scene_distance == distance
+    assert known_distance(other.attenuation) == 3.7
+    found = []
+    for each in (some, other):
+        assert each.sigma_d is not None and each.attenuation is not None
+        d = normalized_distances(each.means, camera(), each.attenuation)
+        found.append(attenuate(each.opacity_logits, each.sigma_d, d, s, each.attenuation).log_opacities)
+    # Where D'^2 is so small that eps alone fades less, sigma' would have to be imaginary.
+    possible = other.sigma_d > 0
+    torch.testing.assert_close(found[1][possible], found[0][possible], rtol=1e-6, atol=1e-9)
+
+
+def test_what_is_no_number_of_the_equation_stays() -> None:
+    sigma = torch.tensor([0.0, -1.0, SIGMA_MAX, 2.0])
+    some = attach(gaussians(4, 0, 0), sigma, AttenuationConfig(scene_distance=8.0))
+    there = in_world_units(some)
+    assert there.sigma_d is not None and there.sigma_d[:3].tolist() == [0.0, -1.0, SIGMA_MAX]
+    assert there.sigma_d[3].item() == pytest.approx(16.0)
+    assert in_world_units(there) is there and in_world_units(gaussians(4, 0, 0)).attenuation is None
+    assert there.attenuation == AttenuationConfig(reference_distance=8.0)
+
+
+def test_other_normalisers_keep_their_sigma() -> None:
+    for normalizer in ("max", "quantile"):
+        some = dialled(normalizer=normalizer)
+        there = in_world_units(some)
+        assert torch.equal(there.sigma_d, some.sigma_d) and there.attenuation is not None
+        assert (there.attenuation.scene_distance, there.attenuation.reference_distance) == (1.0, 3.7)
+
+
+def test_the_nominal_distance_is_the_one_of_the_training_views_where_that_is_known() -> None:
+    means = gaussians(500, 0, 1).means
+    config = AttenuationConfig()
+    assert nominal_distance(means, config) == estimated_distance(means)
+    assert nominal_distance(means, replace(config, reference_distance=2.5)) == 2.5
+    assert nominal_distance(means, replace(config, scene_distance=4.0)) == 1.0  # as earlier versions wrote
+    assert nominal_distance(means, replace(config, scene_distance=4.0, reference_distance=2.0)) == 0.5
+    assert nominal_distance(means, replace(config, normalizer="max", reference_distance=2.5)) == 1.0
+
+
+def test_the_estimate_is_of_the_scene_and_not_of_its_farthest() -> None:
+    means = gaussians(1000, 0, 1).means
+    distance = estimated_distance(means)
+    stray = means.clone()
+    stray[:30] *= 1e6
+    assert estimated_distance(stray) == pytest.approx(distance, rel=0.3)
+    assert estimated_distance(7 * means + 100) == pytest.approx(7 * distance, rel=1e-3)
+    assert estimated_distance(means[:0]) == 1.0 and estimated_distance(means[:1]) == 1.0
