@@ -13,7 +13,7 @@ from torch import Tensor
 
 import clod_adapter as clod
 from clod_adapter._kernels.threads import torch_on_one_thread
-from clod_adapter.adapter import ATTRIBUTES
+from clod_adapter.adapter import ATTRIBUTES, detach
 from clod_adapter.cameras import camera_extent
 from clod_adapter.losses import photometric_loss
 from clod_adapter.optimizer import RowAdam
@@ -72,32 +72,35 @@ def tune(
 
     With ``draw`` each step's loss is that of all Gaussians plus that of a random prefix of them, after Matryoshka
     Gaussian Splatting (arXiv 2603.19234): two renders a step, no weights. ``start`` is then in the order of importance.
+    Drawn with the screen-space filter of ``start``.
     """
+    start = detach(start)
     own = {"dtype": torch.float32, "copy": True, "memory_format": torch.contiguous_format}
     parameters = {name: getattr(start, name).detach().to(**own) for name in ATTRIBUTES}
     rates = config.rates | {"means": config.rates["means"] * camera_extent([view.camera for view in views])}
     tuned = [name for name in ATTRIBUTES if rates[name] > 0 and parameters[name].numel()]
     optimizer, random = RowAdam(parameters), np.random.default_rng(config.seed)
     everyone, order = torch.ones(len(start), dtype=torch.bool), []
-    _gradients(parameters, tuned, views[0], len(start) if config.draw else None)  # compiled before the clock starts
+    # Compiled before the clock starts.
+    _gradients(start, parameters, tuned, views[0], len(start) if config.draw else None)
     began, steps, mean = time.perf_counter(), 0, math.nan
     while (share := config.share_done(steps, time.perf_counter() - began)) < 1:
         order = order or random.permutation(len(views)).tolist()
         prefix = config.prefix(random, len(start)) if config.draw else None
-        loss, gradients = _gradients(parameters, tuned, views[order.pop()], prefix)
+        loss, gradients = _gradients(start, parameters, tuned, views[order.pop()], prefix)
         optimizer.step(gradients, everyone, {name: rate * config.final**share for name, rate in rates.items()})
         mean = loss if math.isnan(mean) else 0.98 * mean + 0.02 * loss
         steps += 1
         progress(config.share_done(steps, time.perf_counter() - began), f"step {steps}, loss {mean:.4f}")
-    return Tuned(clod.Gaussians(**parameters), steps, time.perf_counter() - began)
+    return Tuned(start.replace(**parameters), steps, time.perf_counter() - began)
 
 
 @torch_on_one_thread()
 def _gradients(
-    parameters: dict[str, Tensor], tuned: list[str], view: clod.View, prefix: int | None
+    start: clod.Gaussians, parameters: dict[str, Tensor], tuned: list[str], view: clod.View, prefix: int | None
 ) -> tuple[float, dict[str, Tensor]]:
     leaves = {name: value.detach().requires_grad_(name in tuned) for name, value in parameters.items()}
-    gaussians = clod.Gaussians(**leaves)
+    gaussians = start.replace(**leaves)
     loss = photometric_loss(splat(gaussians, gaussians.opacities, view.camera)[0], view.image)
     if prefix is not None:
         # The rasterizer leaves out what has opacity 0 before anything else.

@@ -9,6 +9,7 @@ from typing import Any
 
 from clod_adapter.cameras import Scene
 from clod_adapter.cli.alignment import require_alignment
+from clod_adapter.cli.antialiasing import with_filter
 from clod_adapter.cli.chunked import Chunked
 from clod_adapter.cli.console import Console, duration
 from clod_adapter.cli.devices import on_device, pick_device
@@ -90,6 +91,12 @@ def read_inputs(args: argparse.Namespace, config: AdaptConfig, console: Console,
         photographs = read_scene(folder, console, base.origin, cache) if folder is not None else None
     with watch.time("kernels"):
         prepare_kernels(console, base.gaussians.means.device)
+    with watch.time("evaluate"):
+        views = [] if photographs is None else [*photographs.test, *photographs.train]
+        base = with_filter(base, args, console, views)
+    if base.gaussians.screen_filter.compensate:
+        with watch.time("kernels"):
+            prepare_kernels(console, base.gaussians.means.device, screen_filter=base.gaussians.screen_filter)
     if photographs is None:
         with watch.time("place"):
             return Inputs(base, place_scene(base.gaussians, config.seed, console), config, None, [])

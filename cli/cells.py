@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from clod_adapter.cli.report import machine, write_report
-from clod_adapter.config import AdaptConfig
+from clod_adapter.config import CLASSIC, AdaptConfig
 from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.version import package_version
@@ -87,5 +87,7 @@ def cells_of(
 ) -> list[Cell]:
     """The baseline of a checkpoint, which is quick, and its ranges."""
     inputs = {"checkpoint_sha256": checkpoint.fingerprint, "scene_sha256": scene}
+    if checkpoint.gaussians.screen_filter != CLASSIC:
+        inputs["screen_filter"] = repr(checkpoint.gaussians.screen_filter)
     first = Cell(label, checkpoint, None, BASELINE_SHARES, inputs, folder)
     return [first, *(Cell(label, checkpoint, config, tuple(dials), inputs, folder) for config in configs)]

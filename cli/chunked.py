@@ -70,7 +70,7 @@ class Chunked:
             photographs = scene_fingerprint(scene, lambda done, of: meter.update(done / of, f"{done}/{of}"))
         files.belongs = {
             "version": package_version(), "settings": asdict(config), "checkpoint": base.fingerprint,
-            "photographs": photographs,
+            "photographs": photographs, "screen_filter": asdict(base.gaussians.screen_filter),
         }  # fmt: skip
         return cls(args, plan, console, stop, files)
 

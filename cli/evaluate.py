@@ -8,6 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from clod_adapter.cameras import View
+from clod_adapter.cli.antialiasing import with_filter
 from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.devices import on_device, pick_device
@@ -21,6 +22,7 @@ from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import Row, evaluate
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.version import package_version
 from clod_adapter.perceptual import Metric, available_metrics
 
@@ -33,14 +35,19 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         device = pick_device(args.device, console)
         model = on_device(read_checkpoint(args.model, console, args.activated), device)
 
-        def beside(path: str) -> Gaussians:
-            return read_checkpoint(path, console, args.activated, model.origin).gaussians.to(device)
+        def beside(path: str) -> Checkpoint:
+            return on_device(read_checkpoint(path, console, args.activated, model.origin), device)
 
-        base = beside(args.base) if args.base else None
-        others = {path: beside(path) for path in args.against}
+        read = {path: beside(path) for path in [*([args.base] if args.base else []), *args.against]}
         scene = read_scene(args.images, console, model.origin)
     if not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
+    with watch.time("kernels"):
+        prepare_kernels(console, device, training=bool(args.base))
+    model = with_filter(model, args, console, scene.test)
+    shown = {path: with_filter(each, args, console, scene.test).gaussians for path, each in read.items()}
+    base = shown[args.base] if args.base else None
+    others = {path: shown[path] for path in args.against}
     if model.gaussians.sigma_d is None:
         console.say(f"{args.model} has no sigma_d: every dial value shows it in full")
     attenuation = model.gaussians.attenuation
@@ -50,8 +57,6 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     notes = [*solved, *notes, *missing]
     for note in notes:
         console.say(note)
-    with watch.time("kernels"):
-        prepare_kernels(console, device, training=base is not None)
     with watch.time("evaluate"):
         rows, interrupted = measure(model.gaussians, scene.test, dials, console, metrics=perceptual)
     if interrupted and not rows:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from clod_adapter.cameras import Camera
+from clod_adapter.cli.antialiasing import with_filter
 from clod_adapter.cli.baking import Photographs, Target, find_target, measure_drop
 from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console
@@ -20,6 +21,7 @@ from clod_adapter.cli.files import size
 from clod_adapter.cli.inputs import read_checkpoint
 from clod_adapter.cli.report import Stopwatch
 from clod_adapter.export import order_by_extinction
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.ply_columns import MASKS, SIGMA, inria_dtype
@@ -30,17 +32,18 @@ OF_THE_DIAL = (
     "--psnr-drop goes by the calibration, which is of the dial: at equal counts, files of three captures were at most "
     "0.05 dB below it; with --images the file itself is measured"
 )
+SAY_FILTER = (".spz", ".safetensors", PAGE)  # formats that say it to every reader
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
     page = out.suffix.lower() == PAGE
-    model = read_checkpoint(args.model, console, args.activated)
+    model = with_filter(read_checkpoint(args.model, console, args.activated), args, console)
     if args.images is not None and (args.fps or args.psnr_drop):  # frames are timed, or files measured
         model = on_device(model, pick_device(args.device, console))
     export, notes = prepare(args, model, page, console)
     dials, photographs, more = dial_values(args, export, page, console)
-    notes += [*more, *left_out(model)]
+    notes += [*more, *left_out(model), *filter_notes(args, export.gaussians, dials)]
     for note in notes:
         console.say(note)
     if args.lod_meta:
@@ -106,6 +109,16 @@ def left_out(model: Checkpoint) -> list[str]:
     known = {*(inria_dtype(model.gaussians.sh_degree).names or ()), SIGMA, *MASKS}
     others = [name for name in model.vertex.dtype.names or () if name not in known]
     return [f"columns left out: {', '.join(others)}"] if others else []
+
+
+def filter_notes(args: argparse.Namespace, gaussians: Gaussians, dials: list[float] | None) -> list[str]:
+    """A note on the filter of a file without a dial that the readers it is for have to be told of."""
+    suffix = LOD_META if args.lod_meta else suffix_of(Path(args.out))
+    dialled = gaussians.sigma_d is not None and dials is None
+    if not gaussians.screen_filter.compensate or dialled or suffix in SAY_FILTER:
+        return []
+    told = 'as PlayCanvas by antiAlias and gsplat by rasterize_mode="antialiased"'
+    return [f"trained antialiased ({gaussians.screen_filter.says}): most readers have to be told, {told}"]
 
 
 def write_files(export: Export, paths: list[Path], dials: list[float] | None) -> tuple[list[dict[str, Any]], list[str]]:

@@ -88,7 +88,7 @@ class Miniature:
         image: ``[48, 64, 3]``, black behind.
     """
 
-    arguments: dict[str, Tensor]
+    arguments: dict[str, Any]
     camera: Camera
     image: Tensor
 
@@ -104,7 +104,7 @@ class Miniature:
         def normal(*shape: int) -> Tensor:
             return torch.randn(*shape, generator=random)
 
-        arguments = {
+        arguments: dict[str, Any] = {
             "means": normal(60, 3).clamp(-1.5, 1.5), "quats": normal(60, 4), "scales": (0.5 * normal(60, 3) - 2).exp(),
             "opacities": (1.5 * normal(60)).sigmoid().clamp(max=0.95), "sh0": normal(60, 1, 3),
             "shN": 0.1 * normal(60, 3, 3),
@@ -115,7 +115,7 @@ class Miniature:
         image, _ = reference.rasterize(**arguments, camera=camera, background=torch.zeros(3))
         return cls(arguments, camera, image)
 
-    def on(self, device: Any) -> dict[str, Tensor]:
+    def on(self, device: Any) -> dict[str, Any]:
         """The arguments on a device."""
         return {name: tensor.to(device) for name, tensor in self.arguments.items()}
 

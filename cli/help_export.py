@@ -9,7 +9,7 @@ from math import inf
 from clod_adapter.cli.commands import Command
 from clod_adapter.cli.dials import add_dial_options
 from clod_adapter.cli.export_formats import format_table
-from clod_adapter.cli.options import add_activated, add_device
+from clod_adapter.cli.options import add_activated, add_antialiasing, add_device
 
 DIGITS = 6  # significant ones of a level, all of which its file's name has
 
@@ -51,6 +51,7 @@ def export_options(parser: ArgumentParser) -> None:
     )  # fmt: skip
     add_device(parser, "measure, for --fps and --psnr-drop with --images")
     add_activated(parser)
+    add_antialiasing(parser, photographs=False)
     parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
 
 

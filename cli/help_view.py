@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser
 
 from clod_adapter.cli.commands import Command
-from clod_adapter.cli.options import add_activated
+from clod_adapter.cli.options import add_activated, add_antialiasing
 
 
 def view_options(parser: ArgumentParser) -> None:
@@ -16,6 +16,7 @@ def view_options(parser: ArgumentParser) -> None:
     parser.add_argument("--port", metavar="P", type=int, default=0, help="where to listen (default: a free port)")
     parser.add_argument("--no-browser", action="store_true", help="print the address, and open nothing")
     add_activated(parser)
+    add_antialiasing(parser, photographs=False)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 

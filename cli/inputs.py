@@ -7,7 +7,7 @@ from pathlib import Path
 from clod_adapter.cameras import Scene
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.files import size
-from clod_adapter.config import AdaptConfig
+from clod_adapter.config import CLASSIC, AdaptConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.image_cache import ImageCache
 from clod_adapter.io.origin import Origin
@@ -25,7 +25,9 @@ def read_checkpoint(
         checkpoint = load(path, activated=activated, origin=origin)
     gaussians = checkpoint.gaussians
     dial = ", with sigma_d" if gaussians.sigma_d is not None else ""
-    console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{dial}")
+    drawn = gaussians.screen_filter
+    filtered = "" if drawn == CLASSIC else f", drawn with {drawn.says}"
+    console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{dial}{filtered}")
     for note in checkpoint.notes:
         console.note(note)
     return checkpoint

@@ -11,7 +11,7 @@ from numba.core.event import Event, Listener, install_listener
 
 from clod_adapter.cameras import Camera, Scene, View
 from clod_adapter.cli.console import Console, Meter
-from clod_adapter.config import AdaptConfig
+from clod_adapter.config import CLASSIC, AdaptConfig, ScreenFilter
 from clod_adapter.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.train import adapt
@@ -22,11 +22,16 @@ OTHER = ""
 SHARES = {"project": 0.2, "project_gradient": 0.42, OTHER: 0.035}
 
 
-def prepare_kernels(console: Console, device: torch.device = CPU, *, training: bool = True) -> None:
-    """Adapts and evaluates a miniature on the device, so that all kernels that this takes are there."""
+def prepare_kernels(
+    console: Console, device: torch.device = CPU, *, training: bool = True, screen_filter: ScreenFilter = CLASSIC
+) -> None:
+    """Adapts and evaluates a miniature on the device, so that all kernels that this takes are there.
+
+    Training with a filter that compensates opacities takes a kernel of its own.
+    """
     one = Gaussians(
         torch.zeros(1, 3), torch.ones(1, 4), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3),
-        torch.zeros(1, 3, 3),
+        torch.zeros(1, 3, 3), screen_filter=screen_filter,
     ).to(device)  # fmt: skip
     viewmat, K = torch.eye(4), torch.eye(3)
     viewmat[2, 3] = 2.0

@@ -7,12 +7,22 @@ from argparse import ArgumentParser
 from clod_adapter.cli.dials import add_dial_options
 from clod_adapter.cli.help_plan import add_plan_options
 from clod_adapter.cli.settings import add_settings
+from clod_adapter.config import FILTERS
 
 
 def add_activated(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--activated", choices=["none", "opacity", "scales", "both"],
         help="what a checkpoint stores activated: opacities as such, scales as lengths; asked for where it looks so",
+    )  # fmt: skip
+
+
+def add_antialiasing(parser: ArgumentParser, photographs: bool = True) -> None:
+    otherwise = "the photographs, where the file does not say" if photographs else "else off"
+    parser.add_argument(
+        "--antialiasing", choices=["auto", *FILTERS], default="auto",
+        help="what a checkpoint was trained with: off; on (gsplat's rasterize_mode antialiased, Inria's "
+        f"--antialiasing); mip (Mip-Splatting's); auto asks the file and {otherwise} (default: auto)",
     )  # fmt: skip
 
 
@@ -51,6 +61,7 @@ def adapt_options(parser: ArgumentParser) -> None:
     )
     parser.add_argument("--report", action="store_true", help="also a page to look at, OUT.html, and its charts")
     add_activated(parser)
+    add_antialiasing(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
@@ -77,6 +88,7 @@ def evaluate_options(parser: ArgumentParser) -> None:
     parser.add_argument("--report", metavar="OUT.html", help="also a page to look at, and beside it its charts")
     add_device(parser, "render")
     add_activated(parser)
+    add_antialiasing(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
@@ -95,6 +107,7 @@ def render_options(parser: ArgumentParser) -> None:
     parser.add_argument("--beside", action="store_true", help="put the photograph left of the renderings")
     add_device(parser, "render")
     add_activated(parser)
+    add_antialiasing(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
@@ -123,6 +136,7 @@ def robustness_options(parser: ArgumentParser) -> None:
     )
     add_device(parser, "train and measure")
     add_activated(parser)
+    add_antialiasing(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 

@@ -138,6 +138,7 @@ def describe_run(
     return {
         "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
         "teacher": "checkpoint" if args.images is None else "photographs",
+        "screen_filter": asdict(result.screen_filter),
         "base_count": adapter.base_count, "config": config, "attenuation": asdict(adapter.attenuation),
         "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
         "processes": describe_processes(adapted, config["batch"]), "outputs": run.outputs.names(),

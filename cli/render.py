@@ -14,6 +14,7 @@ from PIL import Image, PngImagePlugin
 from torch import Tensor
 
 from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.cli.antialiasing import with_filter
 from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.devices import on_device, pick_device
@@ -46,6 +47,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     device = pick_device(args.device, console)
     model = on_device(read_checkpoint(args.model, console, args.activated), device)
     scene = read_scene(args.images, console, model.origin)
+    prepare_kernels(console, device, training=False)
+    model = with_filter(model, args, console, [*scene.test, *scene.train])
     views = pick_views(scene, args.views)
     written = [out / name for name in files(views)]
     check_no_input(written, [args.model], args.images)
@@ -56,7 +59,6 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     notes += beyond
     for note in notes:
         console.say(note)
-    prepare_kernels(console, device, training=False)
     gaussians, pictures, interrupted = model.gaussians.without_empty_bands(), [], False
     try:
         with console.meter("render") as meter:

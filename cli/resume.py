@@ -224,7 +224,7 @@ def _as_option(name: str, value: object) -> str:
 
 def _fingerprint(gaussians: Gaussians) -> str:
     """SHA-256, hex, of the Gaussians as they were read, which the options of reading have a part in."""
-    digest = hashlib.sha256(repr(gaussians.attenuation).encode())
+    digest = hashlib.sha256(repr((gaussians.attenuation, gaussians.screen_filter)).encode())
     for name, tensor in gaussians.tensors().items():
         digest.update(f"{name} {tuple(tensor.shape)};".encode())
         digest.update(tensor.detach().cpu().contiguous().flatten().numpy().data)

@@ -11,6 +11,7 @@ from typing import Any
 
 from clod_adapter.cameras import Scene
 from clod_adapter.cli.alignment import require_alignment
+from clod_adapter.cli.antialiasing import with_filter
 from clod_adapter.cli.cells import Cell, cells_of
 from clod_adapter.cli.console import Console, Meter, duration
 from clod_adapter.cli.devices import on_device, pick_device
@@ -42,16 +43,22 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     with watch.time("load"):
         checkpoints = read_checkpoints(args, console)
         scene = read_scene(args.images, console, checkpoints[0].origin)
-        cells = plan(args, checkpoints, scene)
     if not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
+    device = checkpoints[0].gaussians.means.device
+    with watch.time("kernels"):
+        prepare_kernels(console, device, training=False)
+    with watch.time("evaluate"):
+        checkpoints = [with_filter(each, args, console, scene.test) for each in checkpoints]
+    cells = plan(args, checkpoints, scene)
     found = {cell.name: read for cell in cells if (read := cell.read())}
     missing, notes = [cell for cell in cells if cell.name not in found], list[str]()
     if found:
         console.say(f"{len(found)} of {len(cells)} cells are there already: {', '.join(found)}")
     if missing:
         with watch.time("kernels"):
-            prepare_kernels(console, checkpoints[0].gaussians.means.device)
+            for screen_filter in dict.fromkeys(each.gaussians.screen_filter for each in checkpoints):
+                prepare_kernels(console, device, screen_filter=screen_filter)
         with watch.time("evaluate"):
             for checkpoint in checkpoints:
                 if any(cell.checkpoint is checkpoint for cell in missing):

@@ -8,6 +8,7 @@ import sys
 from typing import Any
 
 from clod_adapter.cameras import Camera
+from clod_adapter.cli.antialiasing import with_filter
 from clod_adapter.cli.browsers import open_browser
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.dials import opens_at
@@ -41,8 +42,10 @@ def run(args: argparse.Namespace) -> None:
 
 def prepare(args: argparse.Namespace, console: Console) -> tuple[dict[str, Answer], dict[str, Any]]:
     """What is served, by path, and what is reported of it."""
-    model = read_checkpoint(args.model, console, args.activated)
-    base = read_checkpoint(args.base, console, args.activated, model.origin) if args.base else None
+    model = with_filter(read_checkpoint(args.model, console, args.activated), args, console)
+    base = None
+    if args.base:
+        base = with_filter(read_checkpoint(args.base, console, args.activated, model.origin), args, console)
     cameras, notes = load_cameras(args.images, model.origin) if args.images else (list[Camera](), list[str]())
     attenuation = model.gaussians.attenuation
     opening, more = opens_at(args.sv, attenuation.max_sv if attenuation else None)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from clod_adapter.budget import DialValue, dial_for
     from clod_adapter.calibration import Calibration
     from clod_adapter.cameras import Camera, Scene, View
-    from clod_adapter.config import AdaptConfig, AttenuationConfig
+    from clod_adapter.config import AdaptConfig, AttenuationConfig, ScreenFilter
     from clod_adapter.errors import ClodError
     from clod_adapter.evaluate import evaluate
     from clod_adapter.export import bake, order_by_extinction
@@ -48,7 +48,7 @@ on_first_use(__name__, {
     "budget": ("DialValue", "dial_for"),
     "calibration": ("Calibration",),
     "cameras": ("Camera", "Scene", "View"),
-    "config": ("AdaptConfig", "AttenuationConfig"),
+    "config": ("AdaptConfig", "AttenuationConfig", "ScreenFilter"),
     "errors": ("ClodError",),
     "evaluate": ("evaluate",),
     "export": ("bake", "order_by_extinction"),
@@ -67,7 +67,7 @@ on_first_use(__name__, {
 
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
-    "Decision", "DialValue", "Gaussians", "Hook", "Overrule", "Part", "Plan", "Rendering", "Scene", "View", "adapt",
-    "attach", "bake", "detach", "dial_for", "evaluate", "extract", "imagine", "load", "load_adapter", "load_scene",
-    "make_plan", "order_by_extinction", "place", "render", "save", "save_adapter",
+    "Decision", "DialValue", "Gaussians", "Hook", "Overrule", "Part", "Plan", "Rendering", "Scene", "ScreenFilter",
+    "View", "adapt", "attach", "bake", "detach", "dial_for", "evaluate", "extract", "imagine", "load", "load_adapter",
+    "load_scene", "make_plan", "order_by_extinction", "place", "render", "save", "save_adapter",
 ]  # fmt: skip

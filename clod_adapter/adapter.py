@@ -14,7 +14,7 @@ from torch import Tensor
 
 from clod_adapter.attenuation import SIGMA_MAX
 from clod_adapter.calibration import Calibration
-from clod_adapter.config import SH_COUNTS, AttenuationConfig
+from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.origin import NOWHERE, Origin
@@ -41,6 +41,7 @@ class Adapter:
         origin: ``[3]`` what the base's means were relative to, world units (``Checkpoint.origin``).
         kept: of a result with fewer rows than its base, ``[base_count]`` bool: the rows that it has. None for all.
         sh_degree: of a result with fewer SH bands than its base. None for the base's.
+        screen_filter: that it was trained with, and the result is drawn with.
 
     Raises:
         ClodError: a tensor has the wrong type or shape, sigma_d is not finite, or version is no plain text.
@@ -56,6 +57,7 @@ class Adapter:
     origin: Origin = NOWHERE
     kept: Tensor | None = None
     sh_degree: int | None = None
+    screen_filter: ScreenFilter = CLASSIC
 
     def __post_init__(self) -> None:
         if self.sigma_d.dim() != 1 or self.sigma_d.dtype != torch.float32:
@@ -120,7 +122,10 @@ class Adapter:
             if update.dtype == torch.float16:  # old, not old + 0, where nothing changed: that would turn -0 into 0
                 update = torch.where(update == 0, old, old + update.float())
             changes[name] = update
-        return base.replace(**changes, sigma_d=self.sigma_d.to(base.means.device), attenuation=self.attenuation)
+        return base.replace(
+            **changes, sigma_d=self.sigma_d.to(base.means.device), attenuation=self.attenuation,
+            screen_filter=self.screen_filter,
+        )  # fmt: skip
 
 
 def trim(gaussians: Gaussians, kept: Tensor | None, sh_degree: int | None) -> Gaussians:
@@ -157,7 +162,10 @@ def extract(
             updates[name] = _update(name, old, new).cpu()
     assert adapted.sigma_d is not None and adapted.attenuation is not None
     sigma_d = adapted.sigma_d.detach().float().cpu().clone()
-    return Adapter(sigma_d, adapted.attenuation, updates, fingerprint, dict(config), origin=origin)
+    return Adapter(
+        sigma_d, adapted.attenuation, updates, fingerprint, dict(config), origin=origin,
+        screen_filter=adapted.screen_filter,
+    )  # fmt: skip
 
 
 def attach(

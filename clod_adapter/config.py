@@ -22,6 +22,12 @@ def option(default: Any, help: str) -> Any:
     return field(default=default, metadata={"help": help})
 
 
+def require(ok: bool, name: str, value: object, what: str) -> None:
+    """Raises ClodError naming the field, its value and what it must be."""
+    if not ok:
+        raise ClodError(f"{name} is {value}, it must be {what}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class AttenuationConfig:
     """How a stored ``sigma_d`` is to be read. Travels with the file; the defaults are what adapting writes by default.
@@ -62,6 +68,48 @@ class AttenuationConfig:
             self.tau,
             f"below 1/max_sv = {1 / self.max_sv:.3g}, or nothing survives the cut",
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScreenFilter:
+    """The screen-space filter that a checkpoint was trained with, and so has to be drawn with. Travels with the file.
+
+    With C ``[2, 2]`` the covariance of a projected Gaussian, in px^2, a renderer draws C + variance I. With
+    ``compensate`` it also multiplies the opacity by
+
+        c = sqrt(max(0, det C / det(C + variance I)))
+
+    so that a Gaussian that the filter widens keeps its integral, and drops it where the product is below 1/255.
+    The 2D Mip filter of Mip-Splatting (Yu et al., CVPR 2024, Eq. 8); ``rasterize_mode="antialiased"`` of gsplat and
+    ``--antialiasing`` of Inria's trainer are the same with a variance of 0.3 in place of 0.1. (Inria's c is at least
+    0.005, Mip-Splatting's at least 0.001; gsplat's has no such floor, and neither has this one.)
+    """
+
+    variance: float = option(0.3, "px^2 added to the covariance of every projected Gaussian")
+    compensate: bool = option(False, "whether the opacity is scaled by how much that widens it")
+
+    def __post_init__(self) -> None:
+        require(1e-3 <= self.variance <= 100, "variance", self.variance, "between 0.001 and 100 px^2")
+        require(isinstance(self.compensate, bool), "compensate", self.compensate, "true or false")
+
+    @property
+    def name(self) -> str | None:
+        """Its name in FILTERS; None for another one."""
+        return next((name for name, known in FILTERS.items() if known == self), None)
+
+    @property
+    def says(self) -> str:
+        """In words."""
+        return f"{self.variance:g} px^2 of blur, opacities {'' if self.compensate else 'not '}compensated for it"
+
+
+CLASSIC = ScreenFilter()
+FILTERS = {
+    "off": CLASSIC,
+    "on": ScreenFilter(compensate=True),
+    "mip": ScreenFilter(variance=0.1, compensate=True),
+}
+"""By the names that ``--antialiasing`` has: 3DGS's own, gsplat's and Inria's with antialiasing, Mip-Splatting's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,12 +212,6 @@ class AdaptConfig:
             tau=self.tau, cut=self.cut, eps=self.eps, normalizer=self.normalizer, quantile=self.quantile,
             scene_distance=scene_distance, max_sv=self.max_sv,
         )  # fmt: skip
-
-
-def require(ok: bool, name: str, value: object, what: str) -> None:
-    """Raises ClodError naming the field, its value and what it must be."""
-    if not ok:
-        raise ClodError(f"{name} is {value}, it must be {what}")
 
 
 def describe(config: Any) -> dict[str, str]:

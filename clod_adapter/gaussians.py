@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clod_adapter.config import SH_COUNTS, AttenuationConfig
+from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 
 SH_C0 = 0.28209479177387814
@@ -31,6 +31,7 @@ class Gaussians:
         shN: ``[N, K-1, 3]`` higher bands, K in {1, 4, 9, 16, 25}.
         sigma_d: ``[N]`` distance decay of opacity, or None for a checkpoint without a dial.
         attenuation: how ``sigma_d`` is to be read; present exactly when ``sigma_d`` is.
+        screen_filter: the filter that they were trained with, and are drawn with.
 
     Raises:
         ClodError: a tensor has the wrong shape, or one of sigma_d and attenuation is missing.
@@ -44,6 +45,7 @@ class Gaussians:
     shN: Tensor
     sigma_d: Tensor | None = None
     attenuation: AttenuationConfig | None = None
+    screen_filter: ScreenFilter = CLASSIC
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
@@ -83,7 +85,7 @@ class Gaussians:
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, Tensor)}
 
-    def replace(self, **changes: Tensor | AttenuationConfig | None) -> Gaussians:
+    def replace(self, **changes: Tensor | AttenuationConfig | ScreenFilter | None) -> Gaussians:
         """A copy with the named fields replaced."""
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
 

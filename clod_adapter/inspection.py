@@ -10,19 +10,28 @@ from typing import Any
 import numpy as np
 
 from clod_adapter.calibration import Calibration
-from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.config import CLASSIC, AdaptConfig, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.inspection_values import FAR, Values, values_of
-from clod_adapter.io.authorship import NERFSTUDIO, is_antialiased, looks_like
+from clod_adapter.io.authorship import NERFSTUDIO, looks_like
 from clod_adapter.io.origin import Origin, origin_of
 from clod_adapter.io.packed_ply import is_packed
 from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, read_table
 from clod_adapter.io.ply_constants import PREFIX as CONSTANT
 from clod_adapter.io.ply_constants import read_constants
-from clod_adapter.io.ply_header import PREFIX, Head, has_settings, read_attenuation, read_calibration, read_head
+from clod_adapter.io.ply_header import (
+    PREFIX,
+    Head,
+    has_settings,
+    read_attenuation,
+    read_calibration,
+    read_head,
+    read_screen_filter,
+)
 from clod_adapter.io.ply_values import FILTER, as_stored_by_inria, choice_of, in_question
 from clod_adapter.io.readers import PLY, read_rows, reader_of
 from clod_adapter.io.rows import Rows
+from clod_adapter.io.screen_filter import likely
 
 NORMALS = ("nx", "ny", "nz")
 
@@ -62,6 +71,7 @@ class Splat:
         comments: of the header, without ours.
         tau: the threshold that ``values.fainter_than_tau`` is about: the dial's, or adapting's default.
         origin: what an adaptation reads the positions relative to, world units; 0 unless they are far from 0.
+        screen_filter: that it is drawn with, as far as the file tells.
     """
 
     sh_degree: int
@@ -73,6 +83,7 @@ class Splat:
     tau: float
     origin: Origin
     dial: Dial | None
+    screen_filter: ScreenFilter
 
 
 @dataclass(frozen=True)
@@ -134,6 +145,9 @@ def inspect(path: str | Path) -> Inspection:
 
 
 def _inspect_splat(path: Path, rows: Rows, head: Head | None) -> Inspection:
+    names = rows.vertex.dtype.names or ()
+    constants = read_constants(path, rows.vertex) if SIGMA in names else {}
+    said, expected = read_screen_filter(path, rows.comments, constants), likely(rows.comments, names)
     doubts = {} if rows.settled else in_question(rows.vertex)
     columns = _columns(head)
     vertex, _, changes = as_stored_by_inria(path, rows.vertex, choice_of(doubts))
@@ -151,7 +165,7 @@ def _inspect_splat(path: Path, rows: Rows, head: Head | None) -> Inspection:
         sh_degree=rows.sh_degree, encoding=_encoding(head), columns=columns,
         extra=() if head and is_packed(head.ply) else _extra([name for name, _ in columns], rows.sh_degree),
         comments=tuple(comment for comment in rows.comments if not comment.startswith(PREFIX)), values=values, tau=tau,
-        origin=origin, dial=dial,
+        origin=origin, dial=dial, screen_filter=said or (CLASSIC if dial else expected),
     )  # fmt: skip
     writer = looks_like(head) if head else _writer(rows)
     if writer == NERFSTUDIO:
@@ -229,8 +243,8 @@ def _oddities(splat: Splat, doubts: dict[str, tuple[float, float]]) -> list[Oddi
         found.append(Oddity("far_from_0", 0, "the scene is far from 0: read relative to an origin of its own"))
     wide = [name for name, kind in splat.columns if kind == "float64"]
     note("double_precision", len(wide), f"{{count}} properties are double: {_list(wide)}")
-    if is_antialiased(splat.comments):
-        found.append(Oddity("antialiased", 0, "its header says it was trained antialiased, which is not applied here"))
+    if splat.screen_filter.compensate:
+        found.append(Oddity("antialiased", 0, f"trained antialiased, and drawn so: {splat.screen_filter.says}"))
     return found
 
 

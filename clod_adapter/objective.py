@@ -14,7 +14,7 @@ from torch import Tensor
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances
 from clod_adapter.cameras import View
-from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.config import CLASSIC, AdaptConfig, AttenuationConfig, ScreenFilter
 from clod_adapter.counting import Quota, count_gradient, law_quota, paper_count
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import photometric_loss
@@ -70,12 +70,14 @@ class Objective:
     Attributes:
         tuned: the attributes that are trained, beside ``opacity_logits`` and the decay, which always are.
         part: which rows are, and what is asked of them.
+        screen_filter: that the pictures are drawn with.
     """
 
     config: AdaptConfig
     attenuation: AttenuationConfig
     tuned: tuple[str, ...]
     part: Part
+    screen_filter: ScreenFilter = CLASSIC
 
     @property
     def trained(self) -> int:
@@ -122,7 +124,8 @@ class Objective:
         logits, decay = leaves["opacity_logits"], leaves[self.decay]
         sigma = self.sigma(decay[dialled_rows])
         distances = normalized_distances(parameters["means"], view.camera, self.attenuation)[dialled_rows]
-        of_attributes: dict[str, Any] = {name: leaves[name] for name in ATTRIBUTES}
+        drawn_of: Any = {name: leaves[name] for name in ATTRIBUTES}
+        shown = Gaussians(**drawn_of, screen_filter=self.screen_filter)
         photograph = view.image.to(decay.device)
         total, count = decay.new_zeros(()), torch.zeros_like(decay[first])
         kept = torch.zeros_like(count, dtype=torch.bool)
@@ -133,7 +136,7 @@ class Objective:
             if self.part.rest_in_full:
                 drawn = torch.cat([drawn, parameters["opacity_logits"][self.trained :].sigmoid()])
             # Dropped rows have opacity 0: the rasterizer leaves them out, and they get no gradient.
-            image, _ = splat(Gaussians(**of_attributes), drawn, view.camera)
+            image, _ = splat(shown, drawn, view.camera)
             loss = photometric_loss(image, photograph, config.ssim_weight)
             losses.append(float(loss.detach()))
             weight = self._weight(s, alone=len(dials) == 1)

@@ -74,8 +74,9 @@ def splat(
             f"({len(gaussians)},)"
         )
     return rasterize(
-        gaussians.means, gaussians.quats, gaussians.scales, opacities, gaussians.sh0, gaussians.shN, camera, behind
-    )
+        gaussians.means, gaussians.quats, gaussians.scales, opacities, gaussians.sh0, gaussians.shN, camera, behind,
+        gaussians.screen_filter,
+    )  # fmt: skip
 
 
 def render(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -139,7 +140,7 @@ class _Run:
         }  # fmt: skip
         # What is stepped by row; a frozen attribute asks the rasterizer for no gradient.
         tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
-        self.objective = Objective(config, start.attenuation, tuple(tuned), part)
+        self.objective = Objective(config, start.attenuation, tuple(tuned), part, start.screen_filter)
         self.decay, self.stepped, self.range = self.objective.decay, self.objective.stepped, self.objective.decay_range
         self.rates = {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
         self.rates[self.decay] = config.lr_sigma * math.sqrt(config.batch)
@@ -248,7 +249,8 @@ class _Run:
         if self.empty_bands is not None:
             values["shN"] = self.empty_bands
         sigma = self.objective.sigma(parameters[self.decay])
-        return in_world_units(Gaussians(**values, sigma_d=sigma, attenuation=self.objective.attenuation))
+        dial: Any = {"sigma_d": sigma, "attenuation": self.objective.attenuation}
+        return in_world_units(Gaussians(**values, **dial, screen_filter=self.objective.screen_filter))
 
     def _pull(self) -> Pull:
         """Of the next views; those of a batch that other processes have are pulled by them.

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from clod_adapter.cameras import Camera
+from clod_adapter.config import ScreenFilter
 from clod_adapter.rasterizers.cpu import rasterize
 
 NEAREST = 0.2
@@ -85,6 +86,13 @@ def _depths(settings: Any, means: Tensor) -> Tensor:
     return means @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]
 
 
+def _filter(settings: Any) -> ScreenFilter:
+    """Of the forks that have one in their settings; the others', and those told nothing, have the usual one."""
+    if kernel := getattr(settings, "kernel_size", None):
+        return ScreenFilter(variance=kernel, compensate=True)
+    return ScreenFilter(compensate=bool(getattr(settings, "antialiasing", None)))
+
+
 def _draw(settings: Any, given: dict[str, Any]) -> dict[str, Tensor]:
     """Every result that some fork has; ``radii`` and ``touched`` are of the Gaussians, not of what is drawn."""
     width, height = settings.image_width, settings.image_height
@@ -97,8 +105,9 @@ def _draw(settings: Any, given: dict[str, Any]) -> dict[str, Tensor]:
         given[name][seen] for name in ("means3D", "rotations", "scales", "opacities", "shs")
     )
     image, alpha = rasterize(
-        means, quats, scales, opacities[:, 0], shs[:, :1], shs[:, 1:], camera=view, background=settings.bg
-    )
+        means, quats, scales, opacities[:, 0], shs[:, :1], shs[:, 1:], camera=view, background=settings.bg,
+        screen_filter=_filter(settings),
+    )  # fmt: skip
     radii = torch.where(seen, (99 * given["scales"].amax(1) / depths.clamp(min=NEAREST)).ceil(), 0).int()
     color = image.permute(2, 0, 1) + 0 * given["means2D"].sum()
     return {

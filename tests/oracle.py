@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
+from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.rasterizers import Rasterizer, reference
 
 IMAGE, GRADIENT, ON_A_CUT = 2e-5, 5e-4, 0.02
@@ -41,19 +42,20 @@ def weights(camera: Camera, seed: int = 0) -> tuple[Tensor, Tensor]:
 
 
 def differentiate(
-    rasterize: Rasterizer, scene: Parameters, camera: Camera, v: tuple[Tensor, Tensor], background: Tensor = BACKGROUND
-) -> Result:
+    rasterize: Rasterizer, scene: Parameters, camera: Camera, v: tuple[Tensor, Tensor],
+    background: Tensor = BACKGROUND, screen_filter: ScreenFilter = CLASSIC,
+) -> Result:  # fmt: skip
     """Forward and backward, in the scene's float type."""
     dtype = scene["means"].dtype
     leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
     behind = background.to(dtype, copy=True).requires_grad_()
-    image, alpha = rasterize(**leaves, camera=camera, background=behind)
+    image, alpha = rasterize(**leaves, camera=camera, background=behind, screen_filter=screen_filter)
     total = (image * v[0].to(dtype)).sum() + (alpha * v[1].to(dtype)).sum()
     found = torch.autograd.grad(total, [*leaves.values(), behind])
     return Result(image.detach(), alpha.detach(), dict(zip([*leaves, "background"], found, strict=True)))
 
 
-def on_a_cut(scene: Parameters, camera: Camera, nudge: float) -> Tensor:
+def on_a_cut(scene: Parameters, camera: Camera, nudge: float, screen_filter: ScreenFilter) -> Tensor:
     """``[H, W]`` bool: the reference's pixel changes when its cuts move by the relative ``nudge``.
 
     Or has an alpha as near to the clamp, where the gradient stops.
@@ -62,7 +64,8 @@ def on_a_cut(scene: Parameters, camera: Camera, nudge: float) -> Tensor:
     def draw(patch: pytest.MonkeyPatch, **constants: object) -> Tensor:
         for name, value in constants.items():
             patch.setattr(reference, name, value)
-        return reference.rasterize(**scene, camera=camera, background=BACKGROUND.double())[0]
+        behind = BACKGROUND.double()
+        return reference.rasterize(**scene, camera=camera, background=behind, screen_filter=screen_filter)[0]
 
     images, seen, blend = [], [], reference.blend
     for factor in (1 - nudge, 1 + nudge):
@@ -76,7 +79,7 @@ def on_a_cut(scene: Parameters, camera: Camera, nudge: float) -> Tensor:
 
 def assert_agrees(
     rasterize: Rasterizer, scene: Parameters, camera: Camera, *, image: float = IMAGE, gradient: float = GRADIENT,
-    cut: float = ON_A_CUT, nudge: float = 1e-4, rows: Tensor | None = None,
+    cut: float = ON_A_CUT, nudge: float = 1e-4, rows: Tensor | None = None, screen_filter: ScreenFilter = CLASSIC,
 ) -> None:  # fmt: skip
     """Asserts agreement; with ``rows``, of the scene with the reference's picture of those rows alone.
 
@@ -85,12 +88,15 @@ def assert_agrees(
     looser = getattr(rasterize, "looser", 1.0)  # a backend in float32 with fast intrinsics
     image, gradient, cut, nudge = image * looser, gradient * looser, cut * looser**0.5, nudge * looser**0.5
     twin = {name: (value if rows is None else value[rows]).double() for name, value in scene.items()}
-    unsure = on_a_cut(twin, camera, nudge)
+    unsure = on_a_cut(twin, camera, nudge, screen_filter)
     share = unsure.double().mean().item() if unsure.numel() else 0.0
     assert share <= cut, f"{share:.2%} of the pixels are on a cut: this scene tests nothing"
     v_image, v_alpha = weights(camera)
     v = v_image * ~unsure[..., None], v_alpha * ~unsure
-    found, want = (differentiate(*case, camera, v) for case in ((rasterize, scene), (reference.rasterize, twin)))
+    found, want = (
+        differentiate(*case, camera, v, screen_filter=screen_filter)
+        for case in ((rasterize, scene), (reference.rasterize, twin))
+    )
     colors = want.image.abs().max().clamp(min=1)
     for name in ("image", "alpha"):
         error = (getattr(found, name) - getattr(want, name)).abs()

@@ -76,6 +76,16 @@ class Shown:
         return dict(self.page.evaluate("clod.settled().then(clod.counts)"))
 
 
+def drop(shown: Shown, name: str, data: bytes) -> None:
+    """Lets a file fall on the page, as a user does."""
+    script = """([name, data]) => {
+        const all = new DataTransfer();
+        all.items.add(new File([new Uint8Array(data)], name));
+        document.body.dispatchEvent(new DragEvent("drop", { dataTransfer: all, bubbles: true, cancelable: true }));
+    }"""
+    shown.page.evaluate(script, [name, list(data)])
+
+
 @contextmanager
 def serve(*words: object) -> Iterator[str]:
     """The address of what ``clod-adapt view`` serves for these words."""

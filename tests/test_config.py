@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from clod_adapter.config import AdaptConfig, AttenuationConfig, describe, require
+from clod_adapter.config import CLASSIC, FILTERS, AdaptConfig, AttenuationConfig, ScreenFilter, describe, require
 from clod_adapter.errors import ClodError
 
 BOTH = {
@@ -27,10 +27,11 @@ ADAPT = BOTH | {
         for name in ("sigma", "means", "quats", "scales", "opacities", "sh0", "shN")
     },
 }  # fmt: skip
+SCREEN = {"variance": [0.0, 9e-4, 101.0, -0.3, math.inf, math.nan], "compensate": [1, "yes", None]}
 ATTENUATION = BOTH | {"scene_distance": [0.0, -1.0, math.inf, math.nan]}
 BAD = [
     (kind, name, value)
-    for kind, table in ((AdaptConfig, ADAPT), (AttenuationConfig, ATTENUATION))
+    for kind, table in ((AdaptConfig, ADAPT), (AttenuationConfig, ATTENUATION), (ScreenFilter, SCREEN))
     for name, values in table.items()
     for value in values
 ]
@@ -54,7 +55,7 @@ def test_values_at_the_edge_are_taken(name: str) -> None:
     assert getattr(AdaptConfig(**{name: EDGES[name]}), name) == EDGES[name]
 
 
-@pytest.mark.parametrize("kind", [AdaptConfig, AttenuationConfig])
+@pytest.mark.parametrize("kind", [AdaptConfig, AttenuationConfig, ScreenFilter])
 def test_every_field_has_help_and_a_default(kind: type) -> None:
     kind()
     texts = describe(kind)
@@ -63,7 +64,7 @@ def test_every_field_has_help_and_a_default(kind: type) -> None:
     assert describe(kind()) == texts
 
 
-@pytest.mark.parametrize("kind", [AdaptConfig, AttenuationConfig])
+@pytest.mark.parametrize("kind", [AdaptConfig, AttenuationConfig, ScreenFilter])
 def test_frozen_and_by_keyword(kind: type) -> None:
     with pytest.raises(TypeError):
         kind(0.5)
@@ -100,3 +101,9 @@ def test_require() -> None:
     require(True, "a", 1, "b")
     with pytest.raises(ClodError, match="^a is 1, it must be b$"):
         require(False, "a", 1, "b")
+
+
+def test_filters_by_their_names() -> None:
+    assert FILTERS["off"] == CLASSIC == ScreenFilter() and FILTERS["mip"].variance == 0.1
+    assert [each.name for each in FILTERS.values()] == list(FILTERS) and ScreenFilter(variance=0.2).name is None
+    assert ScreenFilter().says == "0.3 px^2 of blur, opacities not compensated for it"

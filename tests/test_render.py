@@ -9,7 +9,7 @@ import torch
 
 from clod_adapter.adapter import attach, detach
 from clod_adapter.attenuation import attenuate, normalized_distances
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import reference
@@ -85,11 +85,12 @@ def test_is_the_picture_of_the_attenuated_opacities(s: float) -> None:
 def test_the_rasterizer_sees_only_what_is_kept() -> None:
     seen = []
 
-    def spy(means, quats, scales, opacities, sh0, shN, camera, background):
+    def spy(means, quats, scales, opacities, sh0, shN, camera, background, screen_filter):
         seen.append(opacities)
+        assert screen_filter == FILTERS["mip"]
         return torch.zeros(camera.height, camera.width, 3), torch.zeros(camera.height, camera.width)
 
-    some, view = adapted(), camera()
+    some, view = adapted().replace(screen_filter=FILTERS["mip"]), camera()
     rendering = render(some, view, 3.0, rasterizer=spy)
     assert torch.equal(seen[0] > 0, rendering.kept)
     expected = attenuate(some.opacity_logits, some.sigma_d, normalized_distances(some.means, view, CONFIG), 3.0, CONFIG)

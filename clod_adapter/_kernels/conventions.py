@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from numba import float32
 
-# Blur added to the covariance (px^2), alpha below which nothing is drawn, largest alpha, and the transmittance before
-# which a pixel ends.
-BLUR, ALPHA_MIN, ALPHA_MAX, T_MIN = (float32(v) for v in (0.3, 1 / 255, 0.999, 1e-4))
+# Alpha below which nothing is drawn, largest alpha, and the transmittance before which a pixel ends.
+ALPHA_MIN, ALPHA_MAX, T_MIN = (float32(v) for v in (1 / 255, 0.999, 1e-4))
 LOG2E, LOG2_255, TWO_LN2 = float32(1.4426950408889634), float32(7.994353436858858), float32(1.3862943611198906)
 HALF, ZERO, ONE, TWO = float32(0.5), float32(0), float32(1), float32(2)
 HUGE = float32(3e38)  # what is not below it is dropped as not finite
@@ -17,16 +16,18 @@ MX, MY, QA, QB, QC, LOG, RED, GREEN, BLUE, REACH, RX, DET, X0, Y0, X1, Y1 = rang
 RECORD = 16
 
 # A camera: viewmat row-major (16), fx, fy, cx, cy, width, height, ray clamp low x, high x, low y, high y,
-# centre in world coordinates (3), near plane.
+# centre in world coordinates (3), near plane; then the screen-space filter: its variance (px^2), and 1 where opacities
+# are compensated for it.
 FX, FY, CX, CY, WIDTH, HEIGHT, LOW_X, HIGH_X, LOW_Y, HIGH_Y, EYE = range(16, 27)
-NEAR = EYE + 3
-CAMERA = NEAR + 1
+NEAR, BLUR, COMPENSATE = range(EYE + 3, EYE + 6)
+CAMERA = COMPENSATE + 1
 
 # The workspace of sixteen Gaussians, a vector each, a lane a Gaussian. As stored: mean (3), quaternion (4), scales (3).
-# Then camera point (3), rotation (9), U = J R_view (6), P = U R S (6), covariance (3), its determinant, unit
-# quaternion (4), 1 / |quaternion|.
-MEAN, STORED, SCALE, POINT, ROT, UMAT, PMAT, COV, COVDET, QUAT, QINV = 0, 3, 7, 10, 13, 22, 28, 34, 37, 38, 42
-WORKSPACE = 43 + 16  # load_rows fills sixteen vectors, however few columns it reads
+# Then camera point (3), rotation (9), U = J R_view (6), P = U R S (6), blurred covariance (3), its determinant, unit
+# quaternion (4), 1 / |quaternion|, determinant of P P^T.
+MEAN, STORED, SCALE, POINT, ROT, UMAT, PMAT = 0, 3, 7, 10, 13, 22, 28
+COV, COVDET, QUAT, QINV, RAWDET = 34, 37, 38, 42, 43
+WORKSPACE = 44 + 16  # load_rows fills sixteen vectors, however few columns it reads
 
 # Edge of a tile in pixels: a multiple of the 4 of a block.
 TILE = 64

@@ -1,8 +1,8 @@
 """Projection of Gaussians to the image: the local affine approximation (EWA splatting).
 
-Conventions of gsplat: pixel centres at +0.5, a blur of 0.3 px^2 added to the covariance, the
-Jacobian's ray clamped to 1.3 times the field of view (0.3 beyond the image on either side), the
-camera's near plane, alpha below 1/255 dropped. Sixteen Gaussians at a time, a lane each.
+Conventions of gsplat: pixel centres at +0.5, the filter's variance added to the covariance and, where it says so, the
+opacity compensated for that; the Jacobian's ray clamped to 1.3 times the field of view (0.3 beyond the image on either
+side), the camera's near plane, alpha below 1/255 dropped. Sixteen Gaussians at a time, a lane each.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from clod_adapter._kernels.conventions import (
     ALPHA_MIN,
     BLUE,
     BLUR,
+    COMPENSATE,
     COV,
     COVDET,
     CX,
@@ -46,6 +47,7 @@ from clod_adapter._kernels.conventions import (
     QC,
     QINV,
     QUAT,
+    RAWDET,
     REACH,
     RECORD,
     RED,
@@ -113,7 +115,7 @@ def covariance(means, quats, scales, rows, cam, w):  # type: ignore[no-untyped-d
         for k in range(3):
             along = w[u] * w[ROT + k] + w[u + 1] * w[ROT + 3 + k] + w[u + 2] * w[ROT + 6 + k]
             w[PMAT + 3 * row + k] = along * w[SCALE + k]
-    finish_covariance(w)
+    finish_covariance(w, cam)
     return both(valid, gt(splat(HUGE), w[COVDET]))
 
 
@@ -133,13 +135,15 @@ def rotation(w):  # type: ignore[no-untyped-def]
 
 
 @part
-def finish_covariance(w):  # type: ignore[no-untyped-def]
-    """Covariance ``P P^T + blur`` and its determinant as a sum of squares, exact even for needles."""
+def finish_covariance(w, cam):  # type: ignore[no-untyped-def]
+    """Covariance ``P P^T + blur``, and determinants with and without blur as sums of squares, exact for needles."""
+    blur = cam[BLUR]
     p0, p1, p2, p3, p4, p5 = w[PMAT], w[PMAT + 1], w[PMAT + 2], w[PMAT + 3], w[PMAT + 4], w[PMAT + 5]
     xx, yy = p0 * p0 + p1 * p1 + p2 * p2, p3 * p3 + p4 * p4 + p5 * p5
-    w[COV], w[COV + 1], w[COV + 2] = xx + BLUR, p0 * p3 + p1 * p4 + p2 * p5, yy + BLUR
+    w[COV], w[COV + 1], w[COV + 2] = xx + blur, p0 * p3 + p1 * p4 + p2 * p5, yy + blur
     cx, cy, cz = p1 * p5 - p2 * p4, p2 * p3 - p0 * p5, p0 * p4 - p1 * p3
-    w[COVDET] = cx * cx + cy * cy + cz * cz + BLUR * (xx + yy) + BLUR * BLUR
+    w[RAWDET] = cx * cx + cy * cy + cz * cz
+    w[COVDET] = w[RAWDET] + blur * (xx + yy) + blur * blur
 
 
 @part
@@ -175,6 +179,9 @@ def make_records(w, centre, opacity, cam, record):  # type: ignore[no-untyped-de
     record[MX], record[MY] = mx, my
     record[QA], record[QC] = HALF * LOG2E * w[COV + 2] * idet, HALF * LOG2E * w[COV] * idet
     record[QB], record[DET] = -(LOG2E * w[COV + 1] * idet), LOG2E * LOG2E * idet
+    if cam[COMPENSATE] > ZERO:  # a covariance that is infinite makes NaN of it, which is not drawn
+        opacity = opacity * vsqrt(w[RAWDET] * idet)
+    drawn = ge(opacity, splat(ALPHA_MIN))
     record[LOG] = log2(opacity)
     record[RED] = record[GREEN] = record[BLUE] = splat(ZERO)
     reach = vmax(record[LOG] + LOG2_255, splat(ZERO))
@@ -184,7 +191,7 @@ def make_records(w, centre, opacity, cam, record):  # type: ignore[no-untyped-de
     record[X1] = vmin(vfloor(mx + rx - HALF + SLACK), splat(cam[WIDTH] - ONE))
     record[Y0] = vmax(vceil(my - ry - HALF - SLACK), splat(ZERO))
     record[Y1] = vmin(vfloor(my + ry - HALF + SLACK), splat(cam[HEIGHT] - ONE))
-    return both(ge(record[X1], record[X0]), ge(record[Y1], record[Y0]))
+    return both(drawn, both(ge(record[X1], record[X0]), ge(record[Y1], record[Y0])))
 
 
 @part

@@ -22,6 +22,7 @@ from clod_adapter._kernels.conventions import (
     POINT,
     QINV,
     QUAT,
+    RAWDET,
     RECORD,
     RED,
     ROT,
@@ -44,7 +45,7 @@ GRADIENTS = 37 + 16
 
 
 @part
-def covariance_gradient(w, g, cam):  # type: ignore[no-untyped-def]
+def covariance_gradient(w, g, cam, compensated):  # type: ignore[no-untyped-def]
     """From the sums over pixels to the gradients of scales, rotation matrix and mean."""
     idet = ONE / w[COVDET]
     a, b, c = w[COV + 2] * idet, -(w[COV + 1] * idet), w[COV] * idet
@@ -52,7 +53,7 @@ def covariance_gradient(w, g, cam):  # type: ignore[no-untyped-def]
     # K = adj(P P^T + blur) / det term by term: for a needle, K times its long column of P would cancel to noise.
     for k in range(3):
         p0, p1 = w[PMAT + k], w[PMAT + 3 + k]
-        t0, t1 = BLUR * p0, BLUR * p1
+        t0, t1 = cam[BLUR] * p0, cam[BLUR] * p1
         for j in range(3):
             if j != k:  # else it is 0, but not where one of the products is fused with the difference
                 cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
@@ -61,6 +62,8 @@ def covariance_gradient(w, g, cam):  # type: ignore[no-untyped-def]
         t0, t1 = t0 * idet, t1 * idet
         m0, m1 = g[SUMS + 6] * t0 + g[SUMS + 7] * t1, g[SUMS + 7] * t0 + g[SUMS + 8] * t1
         g[V_P + k], g[V_P + 3 + k] = a * m0 + b * m1, b * m0 + c * m1
+        if compensated is not None:
+            compensation_gradient(w, g, k, t0, t1)
         g[V_SCALE + k] = splat(ZERO)
         for d in range(3):
             v = w[UMAT + d] * g[V_P + k] + w[UMAT + 3 + d] * g[V_P + 3 + k]
@@ -68,6 +71,21 @@ def covariance_gradient(w, g, cam):  # type: ignore[no-untyped-def]
             g[V_ROT + 3 * d + k] = v * w[SCALE + k]
     v_x, v_y = a * g[SUMS + 4] + b * g[SUMS + 5], b * g[SUMS + 4] + c * g[SUMS + 5]
     point_gradient(w, g, v_x, v_y, cam)
+
+
+@part
+def compensation_gradient(w, g, k, t0, t1):  # type: ignore[no-untyped-def]
+    """Adds to the gradient of column k of P that by the compensation c: of log c it is ``(P P^T)^-1 P - K P``.
+
+    ``t0, t1`` is the column of K P. The gradient by log c is that by the logarithm of the opacity.
+    """
+    p0, p1, u0, u1, inverse = w[PMAT + k], w[PMAT + 3 + k], splat(ZERO), splat(ZERO), ONE / w[RAWDET]
+    for j in range(3):
+        if j != k:
+            cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
+            u0, u1 = u0 + w[PMAT + 3 + j] * cross, u1 - w[PMAT + j] * cross
+    g[V_P + k] = g[V_P + k] + g[SUMS + 3] * (u0 * inverse - t0)
+    g[V_P + 3 + k] = g[V_P + 3 + k] + g[SUMS + 3] * (u1 * inverse - t1)
 
 
 @part
@@ -155,11 +173,13 @@ def no_gradient(first, last, shaped, colored, bands, v_means, v_quats, v_scales,
 @kernel
 def project_gradient(  # type: ignore[no-untyped-def]
     worker, workers, means, quats, scales, opacities, shN, degree, cam, records, packed_ids, counts, slots,
-    pair_sums, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN,
+    pair_sums, compensated, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN,
 ):  # fmt: skip
     """Sums each visible Gaussian's slots and carries them back to its parameters; row order, so memory streams.
 
-    Empty arrays for means, quats and scales leave their gradients out, an empty ``v_sh0`` or ``v_shN`` its own.
+    ``compensated`` is True where the camera's filter compensates opacities, else None: a type of its own, so that
+    numba compiles the kernel without what it would add. Empty arrays for means, quats and scales leave their gradients
+    out, an empty ``v_sh0`` or ``v_shN`` its own.
     """
     w, g = scratch(f32x16, WORKSPACE), scratch(f32x16, GRADIENTS)
     sh, basis = scratch(f32x16, 80), scratch(f32x16, 25)
@@ -189,7 +209,7 @@ def project_gradient(  # type: ignore[no-untyped-def]
             color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN)
         if shaped:
             covariance(means, quats, scales, rows, cam, w)
-            covariance_gradient(w, g, cam)
+            covariance_gradient(w, g, cam, compensated)
             quat_gradient(w, g)
             store_rows(v_means, rows, 3, 0, 3, g, V_MEAN)
             store_rows(v_quats, rows, 4, 0, 4, g, V_QUAT)

@@ -60,6 +60,9 @@ def rasterization(
     ``retain_grad()`` and, with ``absgrad``, has its ``absgrad``, as the densification strategies need it. (Of several
     cameras it is a copy of what was drawn from, which ``torch.autograd.grad`` and hooks of its own do not reach.)
 
+    A file's ``Gaussians.screen_filter`` is gsplat's ``eps2d`` (its variance) and, where it compensates opacities,
+    ``rasterize_mode="antialiased"``: to be given, as without a dial.
+
     The distance is that from the centre of ``viewmats``, whatever the camera: an orthographic one that steps back sees
     the same, fainter; of a rolling shutter it is the start. For the normalisers ``max`` and ``quantile`` those are in
     sight that a pinhole with these ``Ks`` has in its image; ``scene``, the usual one, does without.

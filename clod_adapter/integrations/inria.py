@@ -54,7 +54,9 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
         """What the installed fork returns for the Gaussians that one dial value keeps, faded as the camera sees them.
 
         Equals the fork called with ``attenuation.attenuate``'s opacities and only the rows that are kept, with those
-        that are not as rows of radius 0. Differentiable in ``sigma_d``; the distances are constants.
+        that are not as rows of radius 0. Differentiable in ``sigma_d``; the distances are constants. A file's
+        ``Gaussians.screen_filter`` is to be given in the settings of forks that have it (``antialiasing``,
+        Mip-Splatting's ``kernel_size``).
 
         Args:
             means3D, means2D, opacities, args, kwargs: the fork's own, by position or by name.

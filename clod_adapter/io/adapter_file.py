@@ -24,6 +24,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.card import FORMAT as MODEL
 from clod_adapter.io.origin import NOWHERE, parse_origin
+from clod_adapter.io.screen_filter import entry_of, parse_entry
 from clod_adapter.io.silence import as_before
 from clod_adapter.io.tensor_file import load_tensors
 
@@ -47,6 +48,7 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
         "base_sha256": adapter.base_fingerprint,
         "attenuation": asdict(adapter.attenuation),
         "config": adapter.config,
+        **entry_of(adapter.screen_filter),
     }
     if any(adapter.origin):
         about["origin"] = adapter.origin
@@ -107,6 +109,7 @@ def load_adapter(path: str | Path) -> Adapter:
             origin=parse_origin(about.get("origin", NOWHERE)),
             kept=kept,
             sh_degree=trimmed.get("sh_degree"),
+            screen_filter=parse_entry(about),
         )
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ClodError(f"{path}: its description is damaged ({error!r}); copy or export the adapter again") from error

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import check_target
@@ -47,7 +47,12 @@ def arrays_of(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
     return arrays
 
 
-def gaussians_of(path: Path, arrays: Mapping[str, np.ndarray], attenuation: AttenuationConfig | None) -> Gaussians:
+def gaussians_of(
+    path: Path,
+    arrays: Mapping[str, np.ndarray],
+    attenuation: AttenuationConfig | None,
+    screen_filter: ScreenFilter = CLASSIC,
+) -> Gaussians:
     """Gaussians of the arrays, as float32.
 
     Raises:
@@ -57,7 +62,7 @@ def gaussians_of(path: Path, arrays: Mapping[str, np.ndarray], attenuation: Atte
     if not all(tensor.ndim and len(tensor) for tensor in tensors.values()):
         raise ClodError(f"{path}: has no Gaussians in it; export it again")
     try:
-        return Gaussians(**tensors, attenuation=attenuation)
+        return Gaussians(**tensors, attenuation=attenuation, screen_filter=screen_filter)
     except ClodError as error:
         raise ClodError(f"{path}: {error}; export it again") from error
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 
 from clod_adapter.config import SH_COUNTS
 from clod_adapter.io.packed_ply import is_packed
@@ -22,7 +21,6 @@ COMMENTS = (
     (r"Exported from Brush", "Brush"),
     (r"antialiased [01]", "Postshot"),
 )
-ANTIALIASED = r"(?i)\s*(splatrendermode:\s*mip|antialiased 1)\s*"
 
 
 def looks_like(head: Head) -> str | None:
@@ -37,11 +35,6 @@ def looks_like(head: Head) -> str | None:
                 return who.format(*found.groups())
     names = [p.name for p in head.ply["vertex"].properties] if "vertex" in head.ply else []
     return "gsplat's exporter, or a tool of PlayCanvas" if is_packed(head.ply) else _by_layout(names)
-
-
-def is_antialiased(comments: Sequence[str]) -> bool:
-    """Whether a comment says that the splat was trained with Mip-Splatting's screen-space filter."""
-    return any(re.fullmatch(ANTIALIASED, comment) for comment in comments)
 
 
 def _by_layout(names: list[str]) -> str | None:

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from clod_adapter.calibration import Calibration
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.io.origin import NOWHERE, Origin, parse_origin
+from clod_adapter.io.screen_filter import entry_of, parse_entry
 from clod_adapter.io.silence import as_before
 from clod_adapter.io.version import package_version
 
@@ -38,6 +39,7 @@ class Card:
         origin: what the means are relative to, world units.
         about: lines on how they came about.
         version: of the package that wrote the file; "" where another program did.
+        screen_filter: that they were trained with, as far as the file says.
     """
 
     attenuation: AttenuationConfig | None = None
@@ -45,6 +47,7 @@ class Card:
     origin: Origin = NOWHERE
     about: tuple[str, ...] = ()
     version: str = ""
+    screen_filter: ScreenFilter = CLASSIC
 
 
 class Model(NamedTuple):
@@ -62,6 +65,7 @@ def write_card(
     values: dict[str, Any] = {"format": FORMAT, "format_version": FORMAT_VERSION, "package_version": package_version()}
     if gaussians.attenuation is not None:
         values["attenuation"] = asdict(gaussians.attenuation)
+    values |= entry_of(gaussians.screen_filter)
     if any(origin):
         values["origin"] = list(origin)
     if calibration is not None:
@@ -104,6 +108,7 @@ def read_card(path: Path, text: str | bytes | dict[str, Any] | None, total: int)
             origin=parse_origin(values.get("origin", NOWHERE)),
             about=about,
             version=version,
+            screen_filter=parse_entry(values),
         ), notes
     except ClodError as error:
         raise ClodError(f"{path}: {error}") from error

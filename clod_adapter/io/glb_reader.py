@@ -73,7 +73,7 @@ def load_glb(path: str | Path) -> Model:
         stored["means"], moved = _moved(stored["means"], moved)
         card = replace(card, origin=moved)
     attenuation = settings_of(card) if "sigma_d" in arrays else None
-    return Model(gaussians_of(path, stored, attenuation), card, (*doubts, *notes))
+    return Model(gaussians_of(path, stored, attenuation, card.screen_filter), card, (*doubts, *notes))
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:

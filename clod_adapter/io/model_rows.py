@@ -109,5 +109,5 @@ def _comments(card: Card) -> tuple[str, ...]:
     about = ["".join(c if c.isascii() and c.isprintable() else "?" for c in line) for line in card.about]
     if card.attenuation is None and not card.version:
         return tuple(line for line in about if not line.startswith(PREFIX))
-    comments = write_comments(card.attenuation, about, card.version or None, card.calibration)
+    comments = write_comments(card.attenuation, about, card.version or None, card.calibration, card.screen_filter)
     return tuple(comment for comment in comments if card.version or not comment.startswith(f"{PREFIX}version "))

@@ -65,4 +65,4 @@ def load_safetensors(path: str | Path) -> Model:
         raise ClodError(f"{path}: tensor {odd[0]!r} is not of floating-point numbers; export it again")
     attenuation = settings_of(card) if "sigma_d" in tensors else None
     arrays = {name: tensors[name].float().numpy() for name in wanted}
-    return Model(gaussians_of(path, arrays, attenuation), card, tuple(notes))
+    return Model(gaussians_of(path, arrays, attenuation, card.screen_filter), card, tuple(notes))

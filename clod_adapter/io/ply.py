@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from clod_adapter.calibration import Calibration, Viewpoint
+from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
@@ -18,11 +19,18 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.origin import AXES, NOWHERE, Origin, origin_of, relative
 from clod_adapter.io.plausible import judge
 from clod_adapter.io.ply_columns import MASKS, SIGMA, column_map, inria_dtype, read_table
-from clod_adapter.io.ply_constants import dial_constants, read_constants
-from clod_adapter.io.ply_header import has_settings, read_attenuation, read_calibration, write_comments
+from clod_adapter.io.ply_constants import dial_constants, filter_constants, read_constants
+from clod_adapter.io.ply_header import (
+    has_settings,
+    read_attenuation,
+    read_calibration,
+    read_screen_filter,
+    write_comments,
+)
 from clod_adapter.io.ply_merge import ROWS, write_rows
 from clod_adapter.io.ply_values import Activated, as_stored_by_inria
 from clod_adapter.io.readers import read_rows
+from clod_adapter.io.screen_filter import likely
 from clod_adapter.io.usable import row_rules
 from clod_adapter.units import in_world_units
 
@@ -42,6 +50,8 @@ class Checkpoint:
         calibration: what its dial values keep, cost and take, if the file says so.
         origin: ``[3]`` what the means are relative to, world units: not 0 only for a scene far from 0, whose
             photographs are to be read relative to it too (``load_scene``). Outputs are in the file's own coordinates.
+        filter_known: whether the file says which screen-space filter it was trained with, or a dial was tuned with it;
+            else that of the Gaussians is only the likely one.
     """
 
     gaussians: Gaussians
@@ -52,6 +62,7 @@ class Checkpoint:
     path: Path
     calibration: Calibration | None = None
     origin: Origin = NOWHERE
+    filter_known: bool = False
 
     @property
     def viewpoints(self) -> tuple[Viewpoint, ...]:
@@ -91,6 +102,9 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
     """
     path = Path(path)
     rows = read_rows(path)
+    names = rows.vertex.dtype.names or ()
+    constants = read_constants(path, rows.vertex) if SIGMA in names else {}
+    said, expected = read_screen_filter(path, rows.comments, constants), likely(rows.comments, names)
     vertex, was, changes = as_stored_by_inria(path, rows.vertex, "none" if rows.settled else activated)
     if origin is None:
         origin = origin_of(vertex) if rows.origin is None else rows.origin
@@ -102,7 +116,6 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
         vertex = vertex[keep]
     gaussians, calibration = _gaussians(values), None
     if SIGMA in values:
-        constants = read_constants(path, rows.vertex)
         attenuation, remarks = read_attenuation(path, rows.comments, constants)
         sigma_d = torch.from_numpy(values[SIGMA][:, 0])
         gaussians = gaussians.replace(sigma_d=sigma_d, attenuation=attenuation)
@@ -110,11 +123,14 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
             remarks += judge(gaussians.means, gaussians.opacity_logits, sigma_d, attenuation)
         calibration, doubts = read_calibration(rows.comments, len(gaussians))
         notes += remarks + doubts
+        expected = CLASSIC  # what a dial was tuned with, where nothing says
+    gaussians = gaussians.replace(screen_filter=said or expected)
     notes = [*changes, *notes, *rows.notes]
     fingerprint = _sha256(path) if was == "none" else f"{was}:{_sha256(path)}"
     return Checkpoint(
-        gaussians, vertex, (*rows.comments, *changes), tuple(notes), fingerprint, path, calibration, origin
-    )
+        gaussians, vertex, (*rows.comments, *changes), tuple(notes), fingerprint, path, calibration, origin,
+        filter_known=said is not None or SIGMA in values,
+    )  # fmt: skip
 
 
 def save(
@@ -155,8 +171,10 @@ def save(
             f"({len(base.vertex)} of degree {base.gaussians.sh_degree}); save with the checkpoint they came from"
         )
     gaussians = in_world_units(gaussians)
-    comments = write_comments(gaussians.attenuation, base.comments, version, calibration)
+    comments = write_comments(gaussians.attenuation, base.comments, version, calibration, gaussians.screen_filter)
     constants = dial_constants(gaussians.attenuation)
+    if gaussians.sigma_d is not None:  # a plain file has the columns of Inria's layout and no others
+        constants |= filter_constants(gaussians.screen_filter)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         write_rows(file, path, gaussians, base.vertex, base.origin, comments, constants)
 

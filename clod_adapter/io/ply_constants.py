@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 
 PREFIX = "clod_"
 TAU, EPS, HARD, QUANTILE, MAX = "clod_tau", "clod_eps", "clod_hard_cut", "clod_quantile", "clod_max"
+VARIANCE, COMPENSATE = "clod_screen_variance", "clod_compensate"
 DIGITS = 6  # decimal digits that any float32 holds
 
 
@@ -43,6 +44,24 @@ def dial_settings(constants: Mapping[str, float]) -> dict[str, Any]:
     if QUANTILE in constants or constants.get(MAX):
         found["normalizer"] = "max" if constants.get(MAX) else "quantile"
     return found
+
+
+def filter_constants(screen_filter: ScreenFilter) -> dict[str, float]:
+    """The columns, by name, of a screen-space filter, as far as it is not the usual one."""
+    found = {VARIANCE: screen_filter.variance} if screen_filter.variance != CLASSIC.variance else {}
+    return found | ({COMPENSATE: 1.0} if screen_filter.compensate else {})
+
+
+def filter_of(constants: Mapping[str, float]) -> ScreenFilter | None:
+    """The inverse; None where no column tells.
+
+    Raises:
+        ClodError: a value is out of range.
+    """
+    if VARIANCE not in constants and COMPENSATE not in constants:
+        return None
+    variance = constants.get(VARIANCE, CLASSIC.variance)
+    return ScreenFilter(variance=variance, compensate=bool(constants.get(COMPENSATE)))
 
 
 def read_constants(path: Path, vertex: np.ndarray) -> dict[str, float]:

@@ -12,11 +12,12 @@ from typing import Any
 from plyfile import PlyData
 
 from clod_adapter.calibration import AGAINST, Calibration, CalibrationRow, Viewpoint
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.io.foreign import refuse
-from clod_adapter.io.ply_constants import dial_settings
+from clod_adapter.io.ply_constants import dial_settings, filter_of
 from clod_adapter.io.regular import read_start
+from clod_adapter.io.screen_filter import KEY, parse_words, tagged, words_of
 from clod_adapter.io.silence import as_before, with_range
 from clod_adapter.io.version import package_version
 
@@ -91,19 +92,22 @@ def write_comments(
     inherited: Iterable[str],
     version: str | None = None,
     calibration: Calibration | None = None,
+    screen_filter: ScreenFilter = CLASSIC,
 ) -> list[str]:
     """The comments of an output: the base's, then ours, which replace any the base had.
 
     One comment per field of ``config``, as ``clod_adapter tau 0.00392156862745098``: the shortest
     decimal that gives back the same double. Before them the ``version`` that made the values, by default this one;
-    after them the calibration, one short line for each row, as some readers do not take long ones.
+    after them the screen-space filter, if it is not the usual one, and the calibration, one short line for each row, as
+    some readers do not take long ones.
     """
-    comments = [comment for comment in inherited if not comment.startswith(PREFIX)]
+    comments = tagged([comment for comment in inherited if not comment.startswith(PREFIX)], screen_filter)
     comments.append(f"{PREFIX}version {version or package_version()}")
     for field in fields(config) if config is not None else ():
         value = getattr(config, field.name)
         kind: Any = type(field.default)
         comments.append(f"{PREFIX}{field.name} {value if value is None else kind(value)}")
+    comments += [f"{PREFIX}{words}" for words in words_of(screen_filter)]
     if calibration is not None:
         c = calibration
         comments.append(f"{PREFIX}{MACHINE} {c.machine}")
@@ -158,7 +162,7 @@ def read_attenuation(
     """
     ours = [comment[len(PREFIX) :].split(maxsplit=1) for comment in comments if comment.startswith(PREFIX)]
     stored = {words[0]: words[1].strip() for words in ours if len(words) == 2}
-    for other in ("version", MACHINE, EXTENT, ROW, VIEWPOINT):
+    for other in ("version", MACHINE, EXTENT, ROW, VIEWPOINT, KEY):
         stored.pop(other, None)
     kinds = {field.name: type(field.default) for field in fields(AttenuationConfig)}
     try:
@@ -172,6 +176,26 @@ def read_attenuation(
         return with_range(known), notes
     except (ValueError, ClodError) as error:
         what = "header comment" if ours else "column"
+        raise ClodError(f"{path}: a clod_adapter {what} is unusable ({error}); restore or remove it") from error
+
+
+def read_screen_filter(
+    path: Path, comments: Iterable[str], constants: Mapping[str, float] | None = None
+) -> ScreenFilter | None:
+    """The filter that the Gaussians were trained with, by our comments, else by columns; None where neither tells.
+
+    Args:
+        constants: from ``ply_constants.read_constants``.
+
+    Raises:
+        ClodError: a comment of ours, or a column, holds a value that is no setting.
+    """
+    start = f"{PREFIX}{KEY}"
+    said = [comment.removeprefix(start) for comment in comments if re.match(rf"{start}\b", comment)]
+    try:
+        return parse_words(said[-1]) if said else filter_of(constants or {})
+    except (ValueError, ClodError) as error:
+        what = "header comment" if said else "column"
         raise ClodError(f"{path}: a clod_adapter {what} is unusable ({error}); restore or remove it") from error
 
 

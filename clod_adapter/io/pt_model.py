@@ -53,4 +53,4 @@ def load_pt(path: str | Path) -> Model:
     attenuation = settings_of(card) if SIGMA in values else None
     arrays = {NAMES.get(name, name): value for name, value in values.items()}
     notes += [] if card.version else [FRAME]
-    return Model(gaussians_of(path, arrays, attenuation), card, tuple(notes))
+    return Model(gaussians_of(path, arrays, attenuation, card.screen_filter), card, tuple(notes))

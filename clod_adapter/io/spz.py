@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from clod_adapter.calibration import Calibration
+from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.arrays import arrays_of, bytes_of, normalized, sigmoid
@@ -39,7 +40,7 @@ MAGIC, VERSION = 0x5053474E, 3
 RECORD = 0x434C0001  # vendor "CL", its first extension
 AXES = 0xADBE0003  # SPZ_ADOBE_coordinate_system
 RDF = 6  # right, down, forward
-EXTENDED = 2  # the flag of records after the arrays
+ANTIALIASED, EXTENDED = 1, 2  # flags: of a filter that compensates opacities, of records after the arrays
 MOST = 10_000_000  # Gaussians that the reference reads
 DEGREE = 3  # the highest that all readers know
 COLOR = 0.15  # of the range of bytes to one of sh0
@@ -72,9 +73,12 @@ def write_spz(
             f"within {float(gaussians.means.abs().max()):.4g}; keep fewer or write a .ply"
         )
     degree = min(gaussians.sh_degree, DEGREE)
-    header = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, bits, EXTENDED, 0)
+    screen_filter = gaussians.screen_filter
+    flags = EXTENDED | (ANTIALIASED if screen_filter.compensate else 0)
+    header = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, bits, flags, 0)
     parts = [header, *_packed(arrays, bits, degree), struct.pack("<III", AXES, 4, RDF)]
-    if gaussians.sigma_d is not None or any(origin) or calibration is not None or about:
+    says = (gaussians.sigma_d is not None, any(origin), calibration is not None, about, screen_filter != CLASSIC)
+    if any(says):
         text = card_text(write_card(gaussians, about, origin, calibration)).encode()
         sigma = np.clip(arrays.get("sigma_d", np.zeros(0)), -_SIGMA_MOST, _SIGMA_MOST).astype("<f2").tobytes()
         parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(sigma), len(text)) + text + sigma)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from clod_adapter.config import SH_COUNTS
+from clod_adapter.config import FILTERS, SH_COUNTS
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.arrays import gaussians_of, half_turn, logits_of_bytes, read_whole
 from clod_adapter.io.card import Model, read_card, settings_of
-from clod_adapter.io.spz import AXES, COLOR, EXTENDED, HEADER, MAGIC, MAGNITUDE, MOST, RDF, RECORD
+from clod_adapter.io.screen_filter import TAG
+from clod_adapter.io.spz import ANTIALIASED, AXES, COLOR, EXTENDED, HEADER, MAGIC, MAGNITUDE, MOST, RDF, RECORD
 
 _BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10
 _CONVERT = "convert it: splat-transform IN.spz OUT.ply"
@@ -50,12 +52,14 @@ def load_spz(path: str | Path) -> Model:
     records = _records(data[end:]) if flags & EXTENDED else {}
     text, sigma = _ours(path, records[RECORD], count) if RECORD in records else (None, None)
     card, notes = read_card(path, text, count)
+    if flags & ANTIALIASED and not card.screen_filter.compensate:  # of another program, as ours say more
+        card = replace(card, screen_filter=FILTERS["on"], about=(*card.about, TAG))
     arrays = _unquantized(columns, bits, bands)
     arrays = _in_our_axes(path, arrays, records.get(AXES, _UNTURNED))
     if sigma is not None:
         arrays["sigma_d"] = sigma
     attenuation = settings_of(card) if sigma is not None else None
-    return Model(gaussians_of(path, arrays, attenuation), card, tuple(notes))
+    return Model(gaussians_of(path, arrays, attenuation, card.screen_filter), card, tuple(notes))
 
 
 def _unpacked(path: Path, data: bytes) -> bytes:

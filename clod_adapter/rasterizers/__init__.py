@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
+from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.errors import ClodError
 
 
@@ -22,6 +23,8 @@ class Rasterizer(Protocol):
         sh0: ``[N, 1, 3]``; shN: ``[N, K-1, 3]``.
         camera: where from; no gradient.
         background: ``[3]``.
+        screen_filter: what is added to the projected covariances, and whether opacities are compensated for it, which
+            skips rows that fall below 1/255 by it.
 
     Returns:
         The image ``[H, W, 3]``, not clamped, and the accumulated alpha ``[H, W]``; both
@@ -30,7 +33,7 @@ class Rasterizer(Protocol):
 
     def __call__(
         self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor,
-        camera: Camera, background: Tensor,
+        camera: Camera, background: Tensor, screen_filter: ScreenFilter = CLASSIC,
     ) -> tuple[Tensor, Tensor]: ...  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 from clod_adapter._kernels import blend, blocks, conventions, project, project_gradient, threads, tiles
 from clod_adapter._kernels.memory import aligned, recycled, release
 from clod_adapter.cameras import Camera
+from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.rasterizers import require_float32
 
 
@@ -71,6 +72,7 @@ class _Frame:
     masks: np.ndarray
     offsets: np.ndarray
     tiles: np.ndarray
+    compensated: bool | None
     workers: int
 
     def room(self, size: int) -> np.ndarray:
@@ -78,8 +80,8 @@ class _Frame:
         return self.buffers.get("room", (self.workers, size), np.float32)
 
 
-def camera_vector(camera: Camera) -> np.ndarray:
-    """The camera as the kernels read it (layout in ``_kernels/conventions.py``)."""
+def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.ndarray:
+    """The camera and the screen-space filter as the kernels read them (layout in ``_kernels/conventions.py``)."""
     out = np.empty(conventions.CAMERA, np.float32)
     K = camera.K.detach().cpu().double()
     fx, fy, cx, cy = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
@@ -90,6 +92,7 @@ def camera_vector(camera: Camera) -> np.ndarray:
     out[24:26] = -(cy / fy + margin_y), (camera.height - cy) / fy + margin_y
     out[26:29] = camera.position.detach().cpu().numpy()
     out[conventions.NEAR] = camera.near
+    out[conventions.BLUR], out[conventions.COMPENSATE] = screen_filter.variance, screen_filter.compensate
     return out
 
 
@@ -112,9 +115,11 @@ def _project(buffers: _Buffers, arrays: list[np.ndarray], degree: int, cam: np.n
     return records, packed_ids, counts, tiles.radix_sort(keys, order, *other, visible)
 
 
-def _prepare(arrays: list[np.ndarray], degree: int, camera: Camera, workers: int) -> _Frame:
+def _prepare(
+    arrays: list[np.ndarray], degree: int, camera: Camera, screen_filter: ScreenFilter, workers: int
+) -> _Frame:
     """Projection, depth order and tile lists."""
-    buffers, cam = _take(), camera_vector(camera)
+    buffers, cam = _take(), camera_vector(camera, screen_filter)
     records, packed_ids, counts, order = _project(buffers, arrays, degree, cam, workers)
     across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
     histogram, totals = np.empty((workers, across * down), np.int64), np.empty(workers, np.int64)
@@ -127,7 +132,8 @@ def _prepare(arrays: list[np.ndarray], degree: int, camera: Camera, workers: int
     longest_first = np.argsort(-np.diff(offsets), kind="stable")
     return _Frame(
         buffers, cam, camera.width, camera.height, across, records, packed_ids, counts, slots, entries,
-        entry_slots, buffers.get("masks", (total * blocks.WORDS,), np.uint64), offsets, longest_first, workers,
+        entry_slots, buffers.get("masks", (total * blocks.WORDS,), np.uint64), offsets, longest_first,
+        screen_filter.compensate or None, workers,
     )  # fmt: skip
 
 
@@ -139,8 +145,9 @@ def _arrays(tensors: Any) -> list[np.ndarray]:
 
 class _Splat(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means, quats, scales, opacities, sh0, shN, background, camera, degree):  # type: ignore[no-untyped-def]
-        frame = _prepare(_arrays((means, quats, scales, opacities, sh0, shN)), degree, camera, threads.worker_count())
+    def forward(ctx: Any, means, quats, scales, opacities, sh0, shN, background, camera, screen_filter, degree):  # type: ignore[no-untyped-def]
+        arrays = _arrays((means, quats, scales, opacities, sh0, shN))
+        frame = _prepare(arrays, degree, camera, screen_filter, threads.worker_count())
         image, alpha = recycled((frame.height, frame.width, 3)), recycled((frame.height, frame.width))
         threads.run(
             blend.blend, frame.workers, frame.records, frame.entries, frame.offsets, frame.across, frame.width,
@@ -173,16 +180,16 @@ class _Splat(torch.autograd.Function):
         grads = [recycled(x.shape if want else (0, *x.shape[1:])) for x, want in zip(inputs, wanted, strict=True)]
         threads.run(
             project_gradient.project_gradient, frame.workers, *arrays, shN, ctx.degree, frame.camera, frame.records,
-            frame.packed_ids, frame.counts, frame.slots, pair_sums, *_arrays(grads),
+            frame.packed_ids, frame.counts, frame.slots, pair_sums, frame.compensated, *_arrays(grads),
         )  # fmt: skip
         v_background = ((1 - alpha)[..., None] * gradients[0]).sum((0, 1)) if ctx.needs_input_grad[6] else None
         wanted = [g if need else None for g, need in zip(grads, ctx.needs_input_grad, strict=False)]
-        return *wanted, v_background, None, None
+        return *wanted, v_background, None, None, None
 
 
 def rasterize(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor, camera: Camera,
-    background: Tensor,
+    background: Tensor, screen_filter: ScreenFilter = CLASSIC,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """See ``clod_adapter.rasterizers.Rasterizer``.
 
@@ -193,4 +200,6 @@ def rasterize(
         "CPU", means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN, background=background
     )
     degree = round((shN.shape[1] + 1) ** 0.5) - 1
-    return _Splat.apply(means, quats, scales, opacities, sh0, shN, background, camera, degree)  # type: ignore[no-any-return, no-untyped-call]
+    return _Splat.apply(  # type: ignore[no-any-return, no-untyped-call]
+        means, quats, scales, opacities, sh0, shN, background, camera, screen_filter, degree
+    )

@@ -25,10 +25,11 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
 from clod_adapter.cameras import Camera
+from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.rasterizers import require_float32
 
-ALPHA_MIN, BLUR, TILE = 1 / 255, 0.3, 16
+ALPHA_MIN, TILE = 1 / 255, 16
 OLDEST, INSTALL = (1, 5, 3), "pip install gsplat==1.5.3"
 
 
@@ -64,7 +65,7 @@ def require_gsplat() -> None:
 
 def rasterize(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor, camera: Camera,
-    background: Tensor,
+    background: Tensor, screen_filter: ScreenFilter = CLASSIC,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """See ``clod_adapter.rasterizers.Rasterizer``.
 
@@ -77,7 +78,7 @@ def rasterize(
     }  # fmt: skip
     require_float32("CUDA", **{name: tensor for name, tensor in given.items() if tensor.is_cuda})
     rows, geometry = compact(means, quats, scales, opacities)
-    drawn = _project(geometry, sh0, shN, rows, camera) if len(rows) else None
+    drawn = _project(geometry, sh0, shN, rows, camera, screen_filter) if len(rows) else None
     if drawn is None or len(drawn["means2d"]) == 0:
         # Nothing to draw, but the inputs have gradients: 0.
         nothing = sum(_Rows.apply(rows[:0], x).sum() for x in (means, quats, scales, opacities, sh0, shN))
@@ -93,21 +94,23 @@ def compact(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> 
     return rows, [_Rows.apply(rows, x) for x in (means, quats, scales, opacities)]
 
 
-def _project(geometry: list[Tensor], sh0: Tensor, shN: Tensor, rows: Tensor, camera: Camera) -> dict[str, Tensor]:
+def _project(
+    geometry: list[Tensor], sh0: Tensor, shN: Tensor, rows: Tensor, camera: Camera, screen_filter: ScreenFilter
+) -> dict[str, Tensor]:
     """What gsplat's tiles and pixels take of the Gaussians that are in the picture: a row each, in the rows' order."""
     import gsplat
 
     means, quats, scales, opacities = geometry
     viewmat, K, eye = _camera(camera, means)
-    _, _, ids, radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
-        means, None, quats, scales, viewmat, K, camera.width, camera.height, eps2d=BLUR, packed=True,
-        near_plane=camera.near, far_plane=math.inf, radius_clip=0.0, sparse_grad=False, calc_compensations=False,
-        camera_model="pinhole", opacities=opacities.detach(),
+    _, _, ids, radii, means2d, depths, conics, compensations = gsplat.fully_fused_projection(
+        means, None, quats, scales, viewmat, K, camera.width, camera.height, eps2d=screen_filter.variance, packed=True,
+        near_plane=camera.near, far_plane=math.inf, radius_clip=0.0, sparse_grad=False,
+        calc_compensations=screen_filter.compensate, camera_model="pinhole", opacities=opacities.detach(),
     )  # fmt: skip
     coefficients = _Rows.apply(rows[ids], sh0, shN)
     degree = math.isqrt(coefficients.shape[1]) - 1
     colors = 0.5 + gsplat.spherical_harmonics(degree, _Rows.apply(ids, means) - eye, coefficients)
-    shown = _Rows.apply(ids, opacities)
+    shown = _Rows.apply(ids, opacities) * (1 if compensations is None else compensations)
     # A row that has a number which is not finite, or projects to one, is not drawn; in the kernels it would be opaque.
     sound = (means2d.sum(1) + conics.sum(1) + colors.sum(1) + shown).detach().isfinite()
     rows_of = sound[:, None]

@@ -1,8 +1,8 @@
 """The oracle: plain torch splatting, every Gaussian at every pixel, gradients by autograd.
 
 Any device, any float type, no speed. Same conventions as the fast backends: pixel centres at +0.5,
-blur 0.3, the camera's near plane, alpha clamped to 0.999 and dropped below 1/255, a pixel ends before its
-transmittance would fall to 1e-4.
+the screen-space filter, the camera's near plane, alpha clamped to 0.999 and dropped below 1/255, a pixel ends
+before its transmittance would fall to 1e-4.
 """
 
 from __future__ import annotations
@@ -11,27 +11,29 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
+from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.gaussians import SH_C0
 
-BLUR, ALPHA_MIN, ALPHA_MAX, T_MIN = 0.3, 1 / 255, 0.999, 1e-4
+ALPHA_MIN, ALPHA_MAX, T_MIN = 1 / 255, 0.999, 1e-4
 
 
 def rasterize(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor, camera: Camera,
-    background: Tensor,
+    background: Tensor, screen_filter: ScreenFilter = CLASSIC,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """See ``clod_adapter.rasterizers.Rasterizer``."""
     viewmat, K = camera.viewmat.to(means), camera.K.to(means)
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     rows = ((points[:, 2] >= camera.near) & (opacities >= ALPHA_MIN) & (quats.norm(dim=1) > 0)).nonzero()[:, 0]
     rows = rows[points[rows, 2].argsort(stable=True)]
-    centres, covariance = project(points[rows], quats[rows], scales[rows], viewmat, K, camera)
+    centres, projected = project(points[rows], quats[rows], scales[rows], viewmat, K, camera)
+    covariance, opacities = blurred(projected, opacities[rows], screen_filter)
     colors = shade(means[rows], sh0[rows], shN[rows], camera.position.to(means))
     x, y = torch.arange(camera.width).to(means) + 0.5, torch.arange(camera.height).to(means) + 0.5
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 1, 2)
     offsets = pixels - centres
     power = -0.5 * torch.einsum("pni,nij,pnj->pn", offsets, torch.linalg.inv(covariance), offsets)
-    alphas = (opacities[rows] * power.exp()).clamp(max=ALPHA_MAX)
+    alphas = (opacities * power.exp()).clamp(max=ALPHA_MAX)
     weights, transmittance = blend(torch.where(alphas >= ALPHA_MIN, alphas, 0))
     image = weights @ colors + transmittance[:, None] * background
     return image.reshape(camera.height, camera.width, 3), (1 - transmittance).reshape(camera.height, camera.width)
@@ -40,7 +42,7 @@ def rasterize(
 def project(
     points: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor]:
-    """Image centres ``[n, 2]`` and covariances ``[n, 2, 2]`` by the local affine approximation (EWA)."""
+    """Image centres ``[n, 2]`` and P ``[n, 2, 3]`` of covariances P P^T by the local affine approximation (EWA)."""
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
     rotations = torch.stack(
         [
@@ -60,7 +62,23 @@ def project(
     jacobian[:, :, 2] = -focal * ray / depth[:, None]
     half = jacobian @ viewmat[:3, :3] @ rotations * scales[:, None, :]
     centres = focal * points[:, :2] / depth[:, None] + K[:2, 2]
-    return centres, half @ half.transpose(1, 2) + BLUR * torch.eye(2).to(points)
+    return centres, half
+
+
+def blurred(half: Tensor, opacities: Tensor, screen_filter: ScreenFilter) -> tuple[Tensor, Tensor]:
+    """Covariances ``[n, 2, 2]`` with the filter's variance, and the opacities ``[n]`` that go with them.
+
+    A compensated opacity below ALPHA_MIN is 0. ``det P P^T`` is taken as the squared length of the cross product of
+    the rows of P ``[n, 2, 3]``, exact where P P^T would cancel.
+    """
+    covariance = half @ half.transpose(1, 2) + screen_filter.variance * torch.eye(2).to(half)
+    if not screen_filter.compensate:
+        return covariance, opacities
+    unblurred = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(1)
+    ratio = unblurred / torch.linalg.det(covariance)
+    shown = ratio > 0  # a root has no slope at 0
+    compensated = opacities * ratio.where(shown, 1).sqrt().where(shown, 0)
+    return covariance, compensated.where(compensated >= ALPHA_MIN, 0)
 
 
 def blend(alphas: Tensor) -> tuple[Tensor, Tensor]:

@@ -50,7 +50,8 @@ class Payload:
         names = [name for name in inria_dtype(self.gaussians.sh_degree).names or () if name not in ("nx", "ny", "nz")]
         names += [SIGMA] if self.gaussians.sigma_d is not None else []
         row = np.zeros((), [(name, "<f4") for name in names])
-        comments = write_comments(self.gaussians.attenuation, (), calibration=self.calibration)
+        g = self.gaussians
+        comments = write_comments(g.attenuation, (), calibration=self.calibration, screen_filter=g.screen_filter)
         element = PlyElement.describe(np.broadcast_to(row, len(self.gaussians)), "vertex", comments=comments)
         return f"{PlyData([element], byte_order='<').header}\n".encode("ascii")
 
@@ -76,6 +77,7 @@ class Payload:
             "name": self.name, "href": None, "element": None, "format": "ply", "sigma": None,
             "count": len(self.gaussians), "max_sv": attenuation.max_sv if attenuation else 1.0,
             "attenuation": asdict(attenuation) if attenuation else None,
+            "screen_filter": asdict(self.gaussians.screen_filter),
             "no_dial": None if attenuation else no_dial(self.name), "calibration": _rows_of(self.calibration),
         } | where  # fmt: skip
 

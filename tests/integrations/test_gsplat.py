@@ -19,7 +19,7 @@ from torch import Tensor
 import gsplat_in_torch
 from clod_adapter.attenuation import attenuate, normalized_distances
 from clod_adapter.cameras import Camera
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
@@ -168,6 +168,24 @@ def test_without_fading_it_is_gsplats_own_call(tools: Tools, layout: str, packed
     assert list(ours[2]) == list(theirs[2])
     for mine, want in ((ours[0], theirs[0]), (ours[1], theirs[1]), *((ours[2][k], theirs[2][k]) for k in theirs[2])):
         same(mine, want)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_with_the_file_s_filter_it_draws_our_picture(tools: Tools, name: str) -> None:
+    """Told by gsplat's own arguments; the compensation comes after the dial, as in ``render``."""
+    given, views = arguments(N, 1, device=tools.device)
+    given["scales"] = 0.2 * given["scales"]
+    sigma_d, mode = reach(N, device=tools.device), "antialiased" if FILTERS[name].compensate else "classic"
+    options = {"sh_degree": 1, "rasterize_mode": mode, "eps2d": FILTERS[name].variance}
+    ours = tools.ours(**given, **views, **options, sigma_d=sigma_d, virtual_scale=2.0, attenuation=SOFT)
+    own = Gaussians(
+        given["means"], given["quats"], given["scales"].log(), given["opacities"].logit(), given["colors"][:, :1],
+        given["colors"][:, 1:], sigma_d, SOFT, FILTERS[name],
+    ).to("cpu")  # fmt: skip
+    want = render(own, camera(WIDTH, HEIGHT), 2.0).image
+    torch.testing.assert_close(ours[0][0].cpu(), want, rtol=1e-3, atol=1e-3)
+    usual = render(own.replace(screen_filter=FILTERS["off"]), camera(WIDTH, HEIGHT), 2.0).image
+    assert name == "off" or float((want - usual).abs().max()) > 0.02
 
 
 @pytest.mark.parametrize("cut", ["hard", "soft"])

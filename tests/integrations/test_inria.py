@@ -13,8 +13,10 @@ from torch import Tensor
 
 import inria_forks
 from clod_adapter.attenuation import attenuate, normalized_distances
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.render import render
 from scenes import camera, ring, scene
 
 N = 150
@@ -89,6 +91,28 @@ def test_it_draws_what_the_fork_draws_of_the_kept_rows(
         assert mine.shape == leaf.shape and not mine[~keep].any()
         torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-4)
     assert float(slopes[0][-1].abs().max()) > 0
+
+
+@pytest.mark.parametrize(
+    ("fork", "settings", "name"),
+    [("inria 2024", {"antialiasing": True}, "on"), ("mip-splatting", {"kernel_size": 0.1}, "mip")],
+)
+def test_with_the_file_s_filter_it_draws_our_picture(
+    fork: str, settings: dict[str, Any], name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Told by the fork's own settings; the compensation comes after the dial, as in ``render``."""
+    module, given, sigma_d = inria_forks.module(fork), arguments(), reach()
+    given["scales"] = 0.2 * given["scales"]
+    black = inria_forks.settings_of(module.GaussianRasterizationSettings, VIEW, bg=torch.zeros(3), **settings)
+    ours = wrapper(monkeypatch, module).GaussianRasterizer(black)
+    color = ours(**given, sigma_d=sigma_d, virtual_scale=DIAL, attenuation=config())[0].permute(1, 2, 0)
+    own = Gaussians(
+        given["means3D"], given["rotations"], given["scales"].log(), given["opacities"][:, 0].logit(),
+        given["shs"][:, :1], given["shs"][:, 1:], sigma_d, config(), FILTERS[name],
+    )  # fmt: skip
+    torch.testing.assert_close(color, render(own, VIEW, DIAL).image, rtol=1e-3, atol=1e-3)
+    usual = render(own.replace(screen_filter=FILTERS["off"]), VIEW, DIAL).image
+    assert float((color - usual).detach().abs().max()) > 0.01
 
 
 @pytest.mark.parametrize("name", inria_forks.FORKS)

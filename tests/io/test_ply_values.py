@@ -8,7 +8,7 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from clod_adapter.adapter import attach, extract
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io import ply
 from clod_adapter.io.ply_columns import inria_dtype
@@ -176,8 +176,8 @@ def test_the_picture_is_that_of_the_filtered_gaussians(tmp_path: Path) -> None:
     scales, opacities = fused(vertex)
     filtered = unfiltered.replace(
         log_scales=torch.from_numpy(np.log(scales)).float(),
-        opacity_logits=torch.from_numpy(np.log(opacities / (1 - opacities))).float(),
-    )
+        opacity_logits=torch.from_numpy(np.log(opacities / (1 - opacities))).float(), screen_filter=FILTERS["mip"],
+    )  # fmt: skip
     expected = render(filtered, view).image
     torch.testing.assert_close(render(loaded, view).image, expected, atol=2e-5, rtol=0)
     assert (render(unfiltered, view).image - expected).abs().mean() > 0.02

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from clod_adapter.cameras import Camera
+from clod_adapter.config import FILTERS, ScreenFilter
 from clod_adapter.rasterizers import Rasterizer
 from oracle import BACKGROUND, IMAGE, assert_agrees
 from scenes import camera, in_front, scene
@@ -155,6 +156,24 @@ def test_thousands_in_one_tile(rasterize: Rasterizer) -> None:
     some["opacities"] = some["opacities"] * 0.02 + 1 / 255
     # So many alphas per pixel that a cut is nearby in most: look closer.
     assert_agrees(rasterize, some, camera(5, 4), cut=0.1, nudge=1e-5)
+
+
+@pytest.mark.parametrize("screen_filter", [FILTERS["on"], FILTERS["mip"], ScreenFilter(variance=2.0)], ids=str)
+@pytest.mark.parametrize("size", [0.005, 0.02, 0.2])
+def test_screen_filters(rasterize: Rasterizer, size: float, screen_filter: ScreenFilter) -> None:
+    """Of sizes from a tenth of a pixel to several: opacities compensated to nothing, by half, and hardly."""
+    view = camera(70, 50)
+    assert_agrees(rasterize, scene(200, 1, 11, size=size), view, screen_filter=screen_filter, cut=0.04)
+
+
+@pytest.mark.parametrize(
+    "scales", [(1.0, 1e-6, 1e-6), (0.3, 4e-3, 4e-3), (0.3, 0.3, 3e-7)], ids=["needle", "thread", "disc"]
+)
+def test_compensation_of_long_and_flat_ones(rasterize: Rasterizer, scales: tuple[float, float, float]) -> None:
+    """A needle has no area and is not drawn; of a disc seen from its edge the compensation is steep."""
+    some, view = scene(80, 1, 3), camera()
+    some["scales"] = torch.tensor(scales).repeat(80, 1)
+    assert_agrees(rasterize, some, view, image=3e-4, screen_filter=FILTERS["on"])
 
 
 @pytest.mark.parametrize("far", [1e4, 1e6, 1e8])

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
+from clod_adapter.config import CLASSIC, FILTERS, ScreenFilter
 from clod_adapter.rasterizers import reference
 from scenes import camera, in_front, scene
 
@@ -49,13 +50,14 @@ def test_a_gaussian_looks_like_one() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_projection_is_the_first_order_one(seed: int) -> None:
-    """``J W Sigma W^T J^T + 0.3`` with J from finite differences of the pinhole, Sigma from a rotation matrix."""
+    """``J W Sigma W^T J^T + variance``, J from finite differences of the pinhole, Sigma from a rotation matrix."""
     g = torch.Generator().manual_seed(seed)
     view = camera(80, 60)
     points = torch.tensor([[0.3, 0.2, 2.0]]).double() + 0.3 * torch.randn(5, 3, generator=g).double()
     quats, scales = torch.randn(5, 4, generator=g).double(), torch.rand(5, 3, generator=g).double() + 0.01
     viewmat, K = view.viewmat.double(), view.K.double()
-    centres, covariances = reference.project(points, quats, scales, viewmat, K, view)
+    centres, factors = reference.project(points, quats, scales, viewmat, K, view)
+    covariances, _ = reference.blurred(factors, torch.ones(5).double(), ScreenFilter(variance=0.7))
     torch.testing.assert_close(centres, pixels_of(view, points))
     for point, (w, *v), scale, found in zip(points, quats, scales, covariances, strict=True):
         h = 1e-6 * torch.eye(3, dtype=torch.float64)
@@ -66,8 +68,32 @@ def test_projection_is_the_first_order_one(seed: int) -> None:
         rotation = torch.linalg.matrix_exp(2 * half * cross)
         sigma = rotation @ torch.diag(scale**2) @ rotation.T
         W = viewmat[:3, :3]
-        want = jacobian @ W @ sigma @ W.T @ jacobian.T + 0.3 * torch.eye(2, dtype=torch.float64)
+        want = jacobian @ W @ sigma @ W.T @ jacobian.T + 0.7 * torch.eye(2, dtype=torch.float64)
         torch.testing.assert_close(found, want, rtol=1e-6, atol=1e-6, msg=lambda m: f"seed {seed}: {m}")
+
+
+@pytest.mark.parametrize("name", ["on", "mip"])
+@pytest.mark.parametrize("size", [0.5, 1.0, 4.0])
+def test_a_compensated_gaussian_keeps_its_integral(name: str, size: float) -> None:
+    """Of ``size`` pixels: the sum over pixels is ``2 pi`` opacity ``size^2``, whatever the filter widens it to."""
+    view = Camera(torch.eye(4), torch.tensor([[100.0, 0, 40], [0, 100.0, 40], [0, 0, 1]]), 80, 80)
+    some = one(view, means=torch.tensor([[0.0, 0.0, 2.0]]), scales=torch.full((1, 3), size / 50))
+    _, alpha = reference.rasterize(**some, camera=view, background=BLACK, screen_filter=FILTERS[name])
+    widened = size**2 + FILTERS[name].variance
+    lost = 1 / 255 * widened  # what is below 1/255 is not drawn: of a Gaussian's integral its edge's height times area
+    torch.testing.assert_close(float(alpha.sum()), 2 * math.pi * (0.8 * size**2 - lost), rtol=0.03, atol=0)
+
+
+def test_a_compensated_opacity_below_the_cut_is_dropped() -> None:
+    """At 0.1 pixels the classic filter draws 0.8 at the centre, antialiasing 0.8 * 0.01 / 0.31; at 0.035 nothing."""
+    view = Camera(torch.eye(4), torch.tensor([[100.0, 0, 40.5], [0, 100.0, 40.5], [0, 0, 1]]), 81, 81)
+    for size, want in ((0.1, 0.8 * 0.01 / 0.31), (0.035, 0.0)):
+        some = one(view, means=torch.tensor([[0.0, 0.0, 2.0]]), scales=torch.full((1, 3), size / 50))
+        shown = [
+            reference.rasterize(**some, camera=view, background=BLACK, screen_filter=chosen)[1]
+            for chosen in (CLASSIC, FILTERS["on"])
+        ]
+        torch.testing.assert_close([float(a.max()) for a in shown], [0.8, want], rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -79,7 +105,8 @@ def test_the_ray_is_clamped_beyond_the_image(axis: int) -> None:
     points = torch.zeros(3, 3).double()
     points[:, 2], points[:, axis] = 1.0, torch.stack([edge * 0.99, edge, edge * 3])
     arguments = torch.tensor([[1.0, 0, 0, 0]]).double().repeat(3, 1), torch.full((3, 3), 0.1).double()
-    centres, covariances = reference.project(points, *arguments, torch.eye(4).double(), K, view)
+    centres, factors = reference.project(points, *arguments, torch.eye(4).double(), K, view)
+    covariances = factors @ factors.mT
     torch.testing.assert_close(centres, pixels_of(view, points))
     torch.testing.assert_close(covariances[1], covariances[2])
     assert (covariances[0] - covariances[1])[axis, axis].abs() > 1e-3
@@ -132,18 +159,21 @@ def test_colours_do_not_go_below_black() -> None:
     torch.testing.assert_close(reference.shade(means, sh0, shN, eye), want)
 
 
-@pytest.mark.parametrize("degree", [0, 2])
-def test_gradients_numerically(degree: int) -> None:
+@pytest.mark.parametrize(("degree", "name"), [(0, "off"), (2, "off"), (0, "on"), (1, "mip")])
+def test_gradients_numerically(degree: int, name: str) -> None:
     """Autograd of the oracle passes through its cuts as through constants, so the scene stays clear of them."""
     view = camera(6, 5)
     some = {name: value.double() for name, value in scene(3, degree, 1).items()}
     some["means"] = in_front(view, torch.tensor([[0.1, 0, 2.0], [-0.1, 0.1, 3.0], [0.0, -0.2, 4.0]])).double()
     some["scales"] = some["scales"] + 2.0
+    if name != "off":  # of a few pixels: of larger ones the compensation is 1
+        view = Camera(view.viewmat, view.K / torch.tensor([[40.0, 1, 1], [1, 40.0, 1], [1, 1, 1]]), 6, 5)
     some["opacities"] = torch.tensor([0.6, 0.5, 0.7]).double()
     some["sh0"] = some["sh0"].abs()
     leaves = [value.requires_grad_() for value in some.values()]
     background = torch.tensor([0.1, 0.2, 0.3]).double().requires_grad_()
-    assert torch.autograd.gradcheck(lambda *p: reference.rasterize(*p[:6], view, p[6]), [*leaves, background])
+    inputs = [*leaves, background]
+    assert torch.autograd.gradcheck(lambda *p: reference.rasterize(*p[:6], view, p[6], FILTERS[name]), inputs)
 
 
 def test_background_shows_through() -> None:

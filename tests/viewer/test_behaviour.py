@@ -23,7 +23,7 @@ from clod_adapter.io.colmap import write_model
 from clod_adapter.render import dial, render
 from clod_adapter.viewer import page, payload
 from clod_adapter.viewer.page import write_page
-from shown import SIZE, Shown, serve
+from shown import SIZE, Shown, drop, serve
 
 
 @pytest.fixture(scope="module")
@@ -35,16 +35,6 @@ def gaussians() -> Gaussians:
 
 def plain_of(gaussians: Gaussians) -> Gaussians:
     return gaussians.replace(sigma_d=None, attenuation=None)
-
-
-def drop(shown: Any, name: str, data: bytes) -> None:
-    """Lets a file fall on the page, as a user does."""
-    script = """([name, data]) => {
-        const all = new DataTransfer();
-        all.items.add(new File([new Uint8Array(data)], name));
-        document.body.dispatchEvent(new DragEvent("drop", { dataTransfer: all, bubbles: true, cancelable: true }));
-    }"""
-    shown.page.evaluate(script, [name, list(data)])
 
 
 def test_a_file_without_sigma_d_says_why_there_is_no_dial(show: Any, files: Any, gaussians: Gaussians) -> None:

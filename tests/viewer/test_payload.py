@@ -15,14 +15,15 @@ from plyfile import PlyData, PlyElement
 import clod_adapter
 import scenes
 from clod_adapter.calibration import Calibration, CalibrationRow
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.viewer.payload import ROWS, Payload, page_config
 
 
 def dialled(n: int = 40, degree: int = 1) -> Gaussians:
     plain = scenes.gaussians(n, degree, 3)
-    return plain.replace(sigma_d=torch.linspace(-0.1, 3, n), attenuation=AttenuationConfig(tau=0.02, cut="soft"))
+    attenuation = AttenuationConfig(tau=0.02, cut="soft")
+    return plain.replace(sigma_d=torch.linspace(-0.1, 3, n), attenuation=attenuation, screen_filter=FILTERS["mip"])
 
 
 def read_back(payload: Payload, folder: Path) -> Any:
@@ -34,7 +35,7 @@ def read_back(payload: Payload, folder: Path) -> Any:
 
 
 def assert_same(one: Gaussians, other: Gaussians) -> None:
-    assert one.attenuation == other.attenuation
+    assert one.attenuation == other.attenuation and one.screen_filter == other.screen_filter
     assert {k: v.tolist() for k, v in one.tensors().items()} == {k: v.tolist() for k, v in other.tensors().items()}
 
 
@@ -113,6 +114,7 @@ def test_description() -> None:
     assert entry["calibration"][1] == {"virtual_scale": 3.0, "count": 9.0, "psnr": 28.0}
     plain = Payload("p.ply", scenes.gaussians(5, 0, 0)).describe()
     assert plain["attenuation"] is None and plain["max_sv"] == 1.0 and plain["calibration"] == []
+    assert plain["screen_filter"] == {"variance": 0.3, "compensate": False}
     assert plain["no_dial"].startswith("p.ply has no sigma_d") and "clod-adapt p.ply" in plain["no_dial"]
 
 

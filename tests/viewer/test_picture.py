@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,12 @@ from PIL import Image
 
 import scenes
 from clod_adapter.cameras import Camera
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import FILTERS, AttenuationConfig, ScreenFilter
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.ply import load
+from clod_adapter.io.writers import write
 from clod_adapter.render import Rendering, render
+from shown import drop
 
 WITHIN = 45.0  # dB
 COUNTS = 1e-3  # of the count
@@ -73,6 +77,42 @@ def test_with_other_settings(show: Any, files: Any, artefacts: Path, attenuation
     wanted = render(gaussians, camera, 2.0)
     assert 0.05 < wanted.kept.float().mean() < 0.95
     assert_same(shown, wanted, artefacts / f"{attenuation.cut}_{attenuation.normalizer}_{attenuation.eps:g}.png")
+
+
+@pytest.mark.parametrize("screen_filter", [FILTERS["on"], FILTERS["mip"], ScreenFilter(variance=2.0)], ids=str)
+def test_with_the_filter_of_the_file(show: Any, files: Any, artefacts: Path, screen_filter: ScreenFilter) -> None:
+    """Of a pixel and less, where filters differ: the usual one is another picture."""
+    dial = dialled(0)
+    gaussians = dial.replace(log_scales=dial.log_scales - 2.0, screen_filter=screen_filter)
+    camera, usual = scenes.camera(320, 240), dial.replace(log_scales=dial.log_scales - 2.0)
+    shown = show(files.save(gaussians), "--base", files.save(usual, "usual.ply"))
+    shown.camera(camera)
+    for s in (1.0, 3.0):
+        shown.run("clod.setDial(given)", s)
+        assert_same(shown, render(gaussians, camera, s), artefacts / f"filter_{screen_filter.variance}_s{s:g}.png")
+    with pytest.raises(AssertionError):
+        assert_alike(shown.picture(), render(usual, camera, 3.0).pixels.numpy(), artefacts / "not_that.png")
+
+
+@pytest.mark.parametrize("form", ["comments", "columns", "spz", "tag"])
+def test_a_dropped_file_is_drawn_with_its_filter(show: Any, files: Any, artefacts: Path, form: str) -> None:
+    """Said by our comments, by columns where those are gone, in an SPZ, and by another program's comment."""
+    dial = dialled(0)
+    name = "on" if form == "tag" else "mip"
+    gaussians = dial.replace(log_scales=dial.log_scales - 2.0, screen_filter=FILTERS[name])
+    gaussians = gaussians.replace(sigma_d=None, attenuation=None) if form == "tag" else gaussians
+    path = files.folder / ("a.spz" if form == "spz" else "a.ply")
+    write(path, gaussians)
+    if form in ("columns", "tag"):
+        gone = rb"(?m)^comment .*\n" if form == "columns" else rb"(?m)^comment clod_adapter .*\n"
+        path.write_bytes(re.sub(gone, b"", path.read_bytes()))
+    camera, found = scenes.camera(320, 240), load(path).gaussians
+    assert found.screen_filter == FILTERS[name]
+    shown = show(files.save(dial, "other.ply"))
+    drop(shown, path.name, path.read_bytes())
+    shown.until(f"document.title === '{path.name}'")
+    shown.camera(camera)
+    assert_same(shown, render(found, camera), artefacts / f"dropped_{form}.png")
 
 
 def test_through_cameras_of_other_shapes(show: Any, files: Any, artefacts: Path) -> None:

@@ -7,7 +7,7 @@ import workerSource from "worker:./worker.js";
 const SH_C0 = 0.28209479177387814;
 const RECORD_TEXELS = 4;
 
-/** `about`: name, attenuation or null, no_dial, max_sv, calibration. `gaussians`: as the readers in formats/ make them. */
+/** `about`: name, attenuation or null, screen_filter, no_dial, max_sv, calibration. `gaussians`: as the readers in formats/ make them. */
 export function createModel(gl, gaussians, about) {
   const { count, degree, means, opacityLogits } = gaussians, { records, higher } = upload(gl, gaussians);
   const attenuation = gaussians.sigma ? about.attenuation : null, extent = extentOf(gaussians), worker = startWorker();

@@ -19,7 +19,7 @@ export async function fetchModel(entry, arrived) {
   return {
     gaussians,
     about: {
-      ...about, name: entry.name, attenuation, max_sv: entry.max_sv ?? about.max_sv,
+      ...about, name: entry.name, attenuation, screen_filter: entry.screen_filter, max_sv: entry.max_sv ?? about.max_sv,
       no_dial: attenuation ? null : entry.no_dial ?? about.no_dial, calibration: entry.calibration ?? [],
     },
   };

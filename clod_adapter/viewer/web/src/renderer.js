@@ -50,6 +50,8 @@ export function createRenderer(canvas) {
     gl.uniform3fv(u.eye, view.eye);
     gl.uniform4f(u.pinhole, view.fx, view.fy, view.cx, view.cy);
     gl.uniform3f(u.size, view.width, view.height, view.near);
+    gl.uniform1f(u.blur, model.screen_filter.variance);
+    gl.uniform1i(u.compensate, model.screen_filter.compensate);
     gl.uniform1i(u.dialled, side.dialled);
     if (side.dialled) {
       gl.uniform1f(u.dial, side.dial);

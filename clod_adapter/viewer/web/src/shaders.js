@@ -1,4 +1,4 @@
-// What the GPU runs. The conventions are those of clod_adapter/_kernels: pixel centres at +0.5, a blur of 0.3 px^2,
+// What the GPU runs. The conventions are those of clod_adapter/_kernels: pixel centres at +0.5, the model's screen-space filter,
 // the ray clamped to 0.15 of the picture beyond its edges, alpha at most 0.999 and dropped below 1/255.
 import attenuation from "../../../integrations/shaders/attenuation.glsl";
 import { WIDTH } from "./gpu.js";
@@ -52,6 +52,8 @@ uniform vec4 pinhole;        // fx, fy, cx, cy
 uniform vec3 size;           // width, height, near
 uniform bool dialled, soft;
 uniform float dial, distance_unit, eps, tau;
+uniform float blur;          // px^2 that the screen-space filter adds to covariances
+uniform bool compensate;     // and whether opacities are scaled by how much that widens them
 // As bits, which every WebGL2 can draw into: centre, major half-axis; conic, length of the minor one; colour, opacity.
 layout(location = 0) out uvec4 first; layout(location = 1) out uvec4 second; layout(location = 2) out uvec4 third;
 
@@ -85,9 +87,11 @@ void main() {
   vec3 q = pinhole.y / point.z * ((down - slope.y * forward) * turned) * shape.xyz;
   float xx = dot(p, p), yy = dot(q, q), xy = dot(p, q);
   vec3 c = cross(p, q);
-  float det = dot(c, c) + 0.3 * (xx + yy) + 0.09;   // a sum of squares: exact even for needles
-  xx += 0.3; yy += 0.3;
+  float area = dot(c, c), det = area + blur * (xx + yy) + blur * blur;   // sums of squares: exact even for needles
+  xx += blur; yy += blur;
   if (!(det < 3e38)) return;
+  if (compensate) opacity *= sqrt(area / det);
+  if (opacity < 1.0 / 255.0) return;
 
   float half_gap = length(vec2(0.5 * (xx - yy), xy));
   float major = 0.5 * (xx + yy) + half_gap, minor = det / major;

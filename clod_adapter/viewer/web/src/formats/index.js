@@ -2,7 +2,7 @@
 import { isCompressed, readCompressed } from "./compressed.js";
 import { usable } from "./gaussians.js";
 import { readHeader, readPly } from "./ply.js";
-import { readCalibration, readSettings } from "./settings.js";
+import { readCalibration, readScreenFilter, readSettings } from "./settings.js";
 import { readSog } from "./sog.js";
 import { readSplat } from "./splat.js";
 import { readSpz } from "./spz.js";
@@ -18,7 +18,8 @@ export async function readFile(buffer, name) {
   return {
     gaussians,
     about: {
-      name, attenuation: settings, max_sv: settings?.max_sv ?? 1, notes: gaussians.notes,
+      name, attenuation: settings, screen_filter: gaussians.screenFilter ?? readScreenFilter(gaussians.comments, dialled, gaussians.constants),
+      max_sv: settings?.max_sv ?? 1, notes: gaussians.notes,
       no_dial: dialled ? null : noDial(name),
       calibration: readCalibration(gaussians.comments, gaussians.count),
     },

@@ -45,6 +45,22 @@ function simplest(value) {
   return value;
 }
 
+/** The screen-space filter of the comments, ours or other programs', as io/screen_filter.py has it. */
+export function readScreenFilter(comments, dialled, { clod_screen_variance, clod_compensate } = {}) {
+  const said = entries(comments).findLast(([name]) => name === "screen_filter")?.[1];
+  if (said) {
+    const [, variance, compensate] = /^(\S+) (True|False)$/.exec(said) ?? [];
+    if (!(variance >= 1e-3 && variance <= 100)) throw new Error(`a clod_adapter header comment is unusable (screen_filter ${said})`);
+    return { variance: Number(variance), compensate: compensate === "True" };
+  }
+  if (clod_screen_variance !== undefined || clod_compensate) {
+    return { variance: clod_screen_variance === undefined ? 0.3 : simplest(clod_screen_variance), compensate: Boolean(clod_compensate) };
+  }
+  // What a dial was tuned with, where nothing says, is the usual one.
+  const compensate = !dialled && comments.some((comment) => /^\s*(splatrendermode:\s*mip|antialiased 1)\s*$/i.test(comment));
+  return { variance: compensate && comments.includes("Exported from Brush") ? 0.1 : 0.3, compensate };
+}
+
 /** Rows {virtual_scale, count, psnr}; empty where there are none or they are of other Gaussians. */
 export function readCalibration(comments, total) {
   const found = entries(comments);

@@ -4,7 +4,7 @@ import { blank, logit, smallestThree } from "./gaussians.js";
 
 const MAGIC = 0x5053474e, HEADER = 16;
 const COLOR = 0.15; // colours are stored as 0.15 f_dc + 0.5
-const EXTENDED = 2, RECORD = 0x434c0001; // the flag of records, and the type of ours
+const ANTIALIASED = 1, EXTENDED = 2, RECORD = 0x434c0001; // flags: opacities compensated, records; the type of ours
 
 export function readSpz(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset);
@@ -15,7 +15,7 @@ export function readSpz(bytes) {
   const sizes = [9, 1, 3, 3, turn, bands], starts = [HEADER];
   sizes.forEach((size) => starts.push(starts.at(-1) + size * count));
   if (bytes.length < starts[6]) throw new Error("it is truncated; copy or export it again");
-  const gaussians = blank(count, degree);
+  const gaussians = { ...blank(count, degree), screenFilter: { variance: 0.3, compensate: (bytes[14] & ANTIALIASED) > 0 } };
   for (let i = 0; i < count; i++) {
     for (let k = 0; k < 3; k++) {
       const p = starts[0] + 9 * i + 3 * k, raw = bytes[p] | (bytes[p + 1] << 8) | (bytes[p + 2] << 16);
@@ -41,6 +41,7 @@ function withRecord(gaussians, bytes, view, at) {
     if (type !== RECORD || at > bytes.length) continue;
     const end = start + view.getUint32(start - 4, true);
     const card = JSON.parse(new TextDecoder().decode(bytes.subarray(start, end)));
+    if (card.screen_filter) gaussians.screenFilter = card.screen_filter;
     if (at - end !== 2 * gaussians.count || !card.attenuation) continue;
     const sigma = Float32Array.from({ length: gaussians.count }, (_, i) => whole(view.getUint16(end + 2 * i, true)));
     return { ...gaussians, sigma, settings: card.attenuation };

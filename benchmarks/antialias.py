@@ -1,0 +1,102 @@
+"""Checkpoints drawn with the filter that they were trained with, and with another one: quality, and what is found out.
+
+    python benchmarks/antialias.py [--iters 800] [--adapt 400] [--keep DIR] [SCENE ...]
+
+No capture here has a checkpoint that was trained antialiased, so stand-ins are made: each scene's checkpoint, whose
+attributes are tuned on its training photographs at full detail with gsplat's antialiasing ("on") and Mip-Splatting's
+("mip"). Of these and of the classic checkpoints a row each: PSNR of the held-out photographs with each filter, and
+what ``compare_filters`` chooses (its views are of both kinds, as the command's are). Then one stand-in of each scene is
+adapted with the right filter and with the classic one. Rows in results/antialias.jsonl.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
+
+# isort: split
+from common import append, capture
+from tuning import Tuning, tune
+
+from clod_adapter.antialiasing import compare_filters
+from clod_adapter.config import CLASSIC, FILTERS
+from clod_adapter.evaluate import evaluate
+
+FILE = "antialias.jsonl"
+CLASSIC_FILES = {
+    "ci_banana": ("pretrained.ply",), "plush_half": ("pretrained.ply", "pretrained_mask.ply"),
+    "bonsai146": ("pretrained.ply",),
+}  # fmt: skip
+TUNED = ("ci_banana", "plush_half")
+DIALS = (1.0, 2.0, 3.0, 5.0)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*", default=list(CLASSIC_FILES))
+    parser.add_argument("--iters", type=int, default=800, help="steps that a stand-in is tuned for")
+    parser.add_argument("--adapt", type=int, default=400, help="steps that a stand-in is adapted for")
+    parser.add_argument("--keep", type=Path, help="a folder of stand-ins, made or used again")
+    args = parser.parse_args()
+    with TemporaryDirectory() as temporary:
+        folder = args.keep or Path(temporary)
+        for name in args.scenes:
+            scene = clod.load_scene(capture(name))
+            for file in CLASSIC_FILES[name]:
+                base = clod.load(capture(name) / file)
+                append(FILE, {"scene": name, "file": file, "trained": "off", **row(base.gaussians, scene)})
+            for trained, standin in standins(name, scene, args.iters, folder) if name in TUNED else ():
+                about = {"scene": name, "file": f"stand-in, {args.iters} steps", "trained": trained}
+                append(FILE, about | row(standin, scene))
+                if trained == "on":
+                    for drawn in ("on", "off"):
+                        append(FILE, about | adapted(standin, scene, drawn, args.adapt))
+
+
+def standins(name: str, scene: clod.Scene, iters: int, folder: Path) -> Iterator[tuple[str, clod.Gaussians]]:
+    """By the filter that they were trained with; without a word on it, as such files come."""
+    base = clod.load(capture(name) / "pretrained.ply")
+    for trained in ("on", "mip"):
+        path = folder / f"{name}_{trained}_{iters}.ply"
+        if not path.exists():
+            start = base.gaussians.replace(screen_filter=FILTERS[trained])
+            tuned = tune(start, scene.train, Tuning(iters=iters), lambda share, text: None).gaussians
+            clod.save(path, tuned.replace(screen_filter=CLASSIC), base)
+        yield trained, clod.load(path).gaussians
+
+
+def row(gaussians: clod.Gaussians, scene: clod.Scene) -> dict[str, Any]:
+    """PSNR of the held-out photographs with each filter, and what the photographs say; seconds are the processor's."""
+    psnr = {
+        name: round(evaluate(gaussians.replace(screen_filter=each), scene.test, [1.0])[0].psnr, 2)
+        for name, each in FILTERS.items()
+    }
+    began = time.process_time()
+    found = compare_filters(gaussians, [*scene.test, *scene.train])
+    seconds = time.process_time() - began
+    compared = {name: round(value, 2) for name, value in found.psnr.items()}
+    return {
+        "count": len(gaussians), "psnr": psnr, "chosen": found.chosen, "compared": compared,
+        "compare_cpu_s": round(seconds, 2),
+    }  # fmt: skip
+
+
+def adapted(gaussians: clod.Gaussians, scene: clod.Scene, drawn: str, iters: int) -> dict[str, Any]:
+    """What adapting with one filter comes to, drawn with the same."""
+    start = gaussians.replace(screen_filter=FILTERS[drawn])
+    result = clod.adapt(start, scene, clod.AdaptConfig(max_sv=5, iters=iters))
+    rows = [
+        {"s": r.virtual_scale, "psnr": round(r.psnr, 2), "kept": round(r.kept)}
+        for r in evaluate(result.gaussians, scene.test, DIALS)
+    ]
+    return {"adapted_with": drawn, "iters": iters, "max_sv": 5, "seed": 0, "rows": rows}
+
+
+if __name__ == "__main__":
+    main()
