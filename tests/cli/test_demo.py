@@ -106,7 +106,7 @@ def test_goes_on_with_what_was_interrupted(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(outcome, "write", stop)
+        patch.setattr(resume.Saver, "keep", stop)
         assert clod("demo").code == 130
     state = tmp_path / "demo" / "gallery.resume.safetensors"
     with monkeypatch.context() as patch:
