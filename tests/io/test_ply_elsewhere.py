@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from clod_adapter.config import AttenuationConfig
 from clod_adapter.io import ply
 from clod_adapter.io.writers import write
 from formats import model, splat_transform
@@ -47,4 +48,4 @@ def test_splat_transform_keeps_sigma_d(tmp_path: Path) -> None:
     again = ply.load(tmp_path / "b.ply")
     assert again.gaussians.sigma_d is not None and torch.equal(again.gaussians.sigma_d, g.sigma_d)
     assert torch.equal(again.gaussians.means, g.means) and torch.equal(again.gaussians.shN, g.shN)
-    assert "defaults used" in again.notes[0]
+    assert again.gaussians.attenuation == AttenuationConfig() and "its dial is not described" in again.notes[0]
