@@ -98,7 +98,7 @@ def dial_values(
     if page and attenuation is not None:
         opening, more = opens_at(solved[0], attenuation.max_sv)
         return [opening], None, notes + more
-    if args.psnr_drop and not page:
+    if args.psnr_drop and target.camera is None:
         notes.append(OF_THE_DIAL)
     dials, beyond = choose_dials(solved, attenuation)
     return dials, None, notes + beyond
