@@ -40,6 +40,13 @@ def with_filter(
     return _noted(checkpoint, found.screen_filter, _news(checkpoint, found), console)
 
 
+def alike(base: Checkpoint, model: Checkpoint, args: argparse.Namespace) -> Checkpoint:
+    """The base that a model was made of, with the filter of the model where its own file does not say."""
+    if args.antialiasing != "auto" or base.filter_known or not model.filter_known:
+        return base
+    return replace(base, gaussians=base.gaussians.replace(screen_filter=model.gaussians.screen_filter))
+
+
 def _news(checkpoint: Checkpoint, found: FilterComparison) -> str:
     chosen, expected = (f"{found.psnr[name]:.2f} dB {WORDS[name]}" for name in (found.chosen, found.expected))
     return (

@@ -8,7 +8,7 @@ import sys
 from typing import Any
 
 from clod_adapter.cameras import Camera
-from clod_adapter.cli.antialiasing import with_filter
+from clod_adapter.cli.antialiasing import alike, with_filter
 from clod_adapter.cli.browsers import open_browser
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.dials import opens_at
@@ -46,6 +46,7 @@ def prepare(args: argparse.Namespace, console: Console) -> tuple[dict[str, Answe
     base = None
     if args.base:
         base = with_filter(read_checkpoint(args.base, console, args.activated, model.origin), args, console)
+        base = alike(base, model, args)
     cameras, notes = load_cameras(args.images, model.origin) if args.images else (list[Camera](), list[str]())
     attenuation = model.gaussians.attenuation
     opening, more = opens_at(args.sv, attenuation.max_sv if attenuation else None)

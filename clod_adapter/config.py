@@ -80,7 +80,7 @@ class ScreenFilter:
         c = sqrt(max(0, det C / det(C + variance I)))
 
     so that a Gaussian that the filter widens keeps its integral, and drops it where the product is below 1/255.
-    The 2D Mip filter of Mip-Splatting (Yu et al., CVPR 2024, Eq. 8); ``rasterize_mode="antialiased"`` of gsplat and
+    The 2D Mip filter of Mip-Splatting (Yu et al., CVPR 2024); ``rasterize_mode="antialiased"`` of gsplat and
     ``--antialiasing`` of Inria's trainer are the same with a variance of 0.3 in place of 0.1. (Inria's c is at least
     0.005, Mip-Splatting's at least 0.001; gsplat's has no such floor, and neither has this one.)
     """

@@ -17,7 +17,7 @@ from clod_adapter import importance, objective, train
 from clod_adapter.adapter import ATTRIBUTES, attach
 from clod_adapter.attenuation import SIGMA_MAX, attenuate, log_attenuation, normalized_distances
 from clod_adapter.cameras import Scene, camera_extent
-from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.config import FILTERS, AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
@@ -292,6 +292,17 @@ def test_empty_bands_are_not_evaluated(
     found = adapt(base, captured[1], config_of(iters=4, lr_shN=rate)).gaussians
     assert set(bands) == {evaluated}
     assert found.shN.shape == base.shN.shape and found.shN.any() == (rate > 0)
+
+
+def test_every_picture_has_the_filter_of_the_checkpoint(
+    captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base, seen = captured[0].replace(screen_filter=FILTERS["mip"]), set()
+    for module in (objective, importance):
+        monkeypatch.setattr(module, "splat", lambda g, *rest: seen.add(g.screen_filter) or splat(g, *rest))
+    shown = []
+    result = adapt(base, captured[1], config_of(iters=4), lambda now: shown.append(now.gaussians().screen_filter))
+    assert seen == set(shown) == {result.gaussians.screen_filter} == {FILTERS["mip"]}
 
 
 def test_one_step_by_hand(captured: tuple[Gaussians, Scene]) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,10 @@ import pytest
 from PIL import Image
 
 import clod_adapter
+from clod_adapter.cli.console import Console
+from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.resume import _fingerprint
+from clod_adapter.cli.view import prepare
 from clod_adapter.config import CLASSIC, FILTERS
 from clod_adapter.io.scene import load_scene
 
@@ -129,3 +134,14 @@ def test_inspect_says_it(clod: Any, trained: tuple[Path, Path]) -> None:
     done = clod("inspect", "a.ply")
     assert "trained antialiased, and drawn so: 0.1 px^2 of blur, opacities compensated" in done.out + done.err
     assert json.loads(clod("inspect", "a.ply", "--json").out)["splat"]["screen_filter"]["variance"] == 0.1
+
+
+def test_the_base_beside_a_model_is_drawn_alike(clod: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
+    """Without photographs, and although its own file does not say."""
+    assert clod(trained[0], "--images", trained[1], *FAST).code == 0
+    words = ["dial.ply", "--base", str(trained[0])]
+    for more, want in ((), FILTERS["on"]), (("--antialiasing", "off"), FILTERS["off"]):
+        answers, _ = prepare(build_parser("view").parse_args([*words, *more]), Console(quiet=True))
+        page = b"".join(answers["/"].blocks()).decode()
+        found = re.findall(r'"screen_filter": ?({[^}]*})', page)
+        assert [json.loads(each) for each in found] == [asdict(want)] * 2

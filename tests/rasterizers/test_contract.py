@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from backends import Backend
+from clod_adapter.config import FILTERS
 from clod_adapter.errors import ClodError
 from clod_adapter.rasterizers import cpu, cuda, for_device
 from oracle import BACKGROUND, Parameters, assert_same, differentiate, weights
@@ -284,6 +285,32 @@ def test_huge_rows_are_survived(rasterize: Backend, name: str, value: float) -> 
         for what, x in {"image": found.image, "alpha": found.alpha, **found.gradients}.items():
             assert x.isfinite().all(), f"{what}, axis {axis}"
         assert (found.alpha >= 0).all() and (found.alpha <= 1).all()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e20, 3e38])
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities"])
+def test_wild_rows_are_survived_with_compensation(rasterize: Backend, name: str, value: float) -> None:
+    """Whatever is drawn of them, it is finite, and so are the gradients; NaN in one row is in no other's."""
+    view, some = camera(), scene(150, 1, 5, size=0.03)
+    some[name][::15] = value
+    found = differentiate(rasterize, some, view, weights(view), screen_filter=FILTERS["on"])
+    for what, x in {"image": found.image, "alpha": found.alpha, **found.gradients}.items():
+        assert x.isfinite().all(), what
+    assert (found.gradients["opacities"] != 0).any() and (found.alpha >= 0).all() and (found.alpha <= 1).all()
+
+
+def test_rows_that_compensation_takes_below_the_cut_are_skipped(rasterize: Backend) -> None:
+    view, some = camera(), scene(300, 1, 3, size=0.1)
+    gone = torch.rand(300, generator=torch.Generator().manual_seed(0)) < 0.5
+    some["scales"][gone] *= 1e-3  # a thousandth of a pixel: c is 1e-5 and less
+    kept = {name: value[~gone] for name, value in some.items()}
+    found, want = (
+        differentiate(rasterize, each, view, weights(view), screen_filter=FILTERS["on"]) for each in (some, kept)
+    )
+    for name in FIELDS:
+        assert (found.gradients[name][gone] == 0).all(), name
+        found.gradients[name] = found.gradients[name][~gone]
+    assert_same(found, want, **rasterize.rounding)
 
 
 def test_thousands_in_one_tile_are_quick(rasterize: Backend) -> None:
