@@ -25,6 +25,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.export import bake, order_by_extinction
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path, atomic_paths
+from clod_adapter.io.claims import claimed
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.ply_columns import MASKS, SIGMA, inria_dtype
 from clod_adapter.io.ply_header import PREFIX
@@ -145,10 +146,11 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     for note in notes:
         console.say(note)
     export = Export(model, gaussians, camera, cameras, bool(args.order), console)
-    if args.lod_meta:
-        outputs, lost = write_set(export, out, dials)
-    else:
-        outputs, lost = write_files(export, level_paths(out, args.levels) if args.levels else [out], dials)
+    with claimed(out):
+        if args.lod_meta:
+            outputs, lost = write_set(export, out, dials)
+        else:
+            outputs, lost = write_files(export, level_paths(out, args.levels) if args.levels else [out], dials)
     for note in dict.fromkeys(lost):
         console.say(f"  note: {note}")
     baked = None if out.suffix.lower() == PAGE else dials
