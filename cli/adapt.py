@@ -33,6 +33,7 @@ from clod_adapter.evaluate import Row
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import check_config
 from clod_adapter.io.atomic import remove_leftovers
+from clod_adapter.io.claims import claimed
 from clod_adapter.plan import Plan
 from clod_adapter.rasterizers.cpu import release_memory
 from clod_adapter.train import Adapted, Progress
@@ -40,6 +41,12 @@ from clod_adapter.training_state import StateRefused
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
+    with claimed(Outputs.of(args.ply, args.out).ply, shared=args.chunk is not None):
+        return adapt(args)
+
+
+def adapt(args: argparse.Namespace) -> dict[str, Any]:
+    """What ``run`` does while no other run writes the same outputs."""
     now, config = begin(args)
     inputs = read_inputs(args, config, now.console, now.watch)
     now.memory = plan_memory(args, inputs.base, inputs.scene, now.console)

@@ -20,6 +20,7 @@ from clod_adapter.cli.report import Stopwatch
 from clod_adapter.demo.pictures import Panel, dial_strip, quality_curve
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluate import evaluate
+from clod_adapter.io.claims import claimed
 from clod_adapter.io.ply import load, save
 from clod_adapter.io.scene import load_scene
 from clod_adapter.render import render
@@ -33,9 +34,16 @@ CROP = (100, 70, 96, 72)
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    folder, console, watch = Path(args.out), Console(args.quiet), Stopwatch()
+    folder = Path(args.out)
     check_extra()
     make_folder(folder)
+    with claimed(folder / "demo", of=folder):
+        return show(args, folder)
+
+
+def show(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """What ``run`` does while no other run writes to the folder."""
+    console, watch = Console(args.quiet), Stopwatch()
     capture, base, model = folder / "capture", folder / "base.ply", folder / "gallery.ply"
     pictures = {"dial": folder / "dial.png", "curve": folder / "curve.png"}
     check_outputs((), (), beside=[*vars(Outputs.of(str(base), str(model))).values(), *pictures.values()])

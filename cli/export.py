@@ -23,6 +23,7 @@ from clod_adapter.cli.report import Stopwatch
 from clod_adapter.export import order_by_extinction
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path, atomic_paths
+from clod_adapter.io.claims import claimed
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.ply_columns import MASKS, SIGMA, inria_dtype
 from clod_adapter.io.poses import load_cameras
@@ -46,10 +47,11 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     notes += [*more, *left_out(model), *filter_notes(args, export.gaussians, dials)]
     for note in notes:
         console.say(note)
-    if args.lod_meta:
-        outputs, lost = write_set(export, out, dials)
-    else:
-        outputs, lost = write_files(export, level_paths(out, args.levels) if args.levels else [out], dials)
+    with claimed(out):
+        if args.lod_meta:
+            outputs, lost = write_set(export, out, dials)
+        else:
+            outputs, lost = write_files(export, level_paths(out, args.levels) if args.levels else [out], dials)
     if photographs:
         lost += add_psnr(outputs[0], export, photographs, args.psnr_drop[0])
     for note in dict.fromkeys(lost):

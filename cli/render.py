@@ -19,6 +19,7 @@ from clod_adapter.cli.budgets import solve_dials
 from clod_adapter.cli.console import Console
 from clod_adapter.cli.devices import on_device, pick_device
 from clod_adapter.cli.evaluate import choose_dials
+from clod_adapter.cli.files import make_folder
 from clod_adapter.cli.inputs import read_checkpoint, read_scene
 from clod_adapter.cli.kernels import prepare_kernels
 from clod_adapter.cli.outputs import check_no_input, check_ours
@@ -26,6 +27,7 @@ from clod_adapter.cli.report import Stopwatch
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.claims import claimed
 from clod_adapter.io.version import package_version
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
@@ -60,8 +62,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     for note in notes:
         console.say(note)
     gaussians, pictures, interrupted = model.gaussians.without_empty_bands(), [], False
+    make_folder(out)
     try:
-        with console.meter("render") as meter:
+        with claimed(out / "pictures", of=out), console.meter("render") as meter:
             for picture in draw(gaussians, views, dials, out, args.beside):
                 pictures.append(picture)
                 meter.update(len(pictures) / len(views), f"{len(pictures)}/{len(views)}")

@@ -24,6 +24,7 @@ from clod_adapter.cli.report import Stopwatch, machine, report_dials, write_repo
 from clod_adapter.cli.settings import make_configs
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.claims import claimed
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.version import package_version
 from clod_adapter.report.robustness_figure import robustness_figure
@@ -66,7 +67,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     make_folder(folder)  # only now: what cannot be read, or does not fit, leaves none behind
     make_folder(folder / "cells")
     check_outputs(outputs.values(), args.ply, args.images)
-    with stop.listening():
+    with claimed(outputs["json"], of=folder), stop.listening():
         with watch.time("cells"):
             interrupted = run_cells(missing, scene, found, console, stop)
         if not found:

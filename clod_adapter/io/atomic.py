@@ -65,8 +65,14 @@ def atomic_paths(*finals: str | Path) -> Iterator[tuple[Path, ...]]:
 def remove_leftovers(final: Path) -> None:
     """Removes what killed processes left beside ``final`` of their attempts to write it; where it can, that is."""
     for path in final.parent.glob(f"{_mark(final)}*"):
-        with suppress(OSError):
-            _remove(path)
+        if path != lock_file(final):
+            with suppress(OSError):
+                _remove(path)
+
+
+def lock_file(final: Path) -> Path:
+    """Beside ``final``, what a process holds a lock of while it writes it (``claims``)."""
+    return final.parent / f"{_mark(final)}lock"
 
 
 def check_target(final: Path) -> None:

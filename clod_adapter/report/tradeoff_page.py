@@ -7,6 +7,7 @@ from os.path import abspath
 from pathlib import Path, PurePath
 from typing import Any
 
+from clod_adapter.io.atomic import atomic_paths
 from clod_adapter.report import page
 from clod_adapter.report.charts import chart_file, inline_svg, rendering_chart, training_chart, write_png
 from clod_adapter.report.page import Picture
@@ -38,7 +39,7 @@ def write_tradeoff_report(
     others: Mapping[str, Picture],
     training: Mapping[str, Any] | None = None,
 ) -> dict[str, Path]:
-    """Writes the page, and beside it its charts as PNGs; returns their paths.
+    """Writes the page, and beside it its charts as PNGs, which appear together; returns their paths.
 
     Args:
         report: what ``clod-adapt`` or ``clod-adapt eval`` prints with --json; see ``series_of`` for its rows.
@@ -57,8 +58,6 @@ def write_tradeoff_report(
     if training:
         charts["adapting"] = training_chart(training["curves"], None if own else training["base_psnr"])
     outputs = {name: chart_file(path, name) for name in charts}
-    for name, draw in charts.items():
-        write_png(outputs[name], draw)
     body = [page.paragraph(text, "lead") for text in _lead(report, series)]
     body += [page.tiles(_tiles(drawn)), *_pictures(frames, others)]
     if drawn:
@@ -74,7 +73,10 @@ def write_tradeoff_report(
     body += [_rows(series), page.section("How to read this", *map(page.paragraph, reading))]
     body += [_plan(report), _settings(report)]
     kicker = f"clod-adapter {report['version']}, {'evaluation' if report['command'] == 'eval' else 'adaptation'} report"
-    page.write_page(path, _title(report), kicker, body, {"report": report, "training": training})
+    with atomic_paths(path, *outputs.values()) as (temporary, *pngs):
+        for chart, draw in zip(pngs, charts.values(), strict=True):
+            write_png(chart, draw)
+        page.write_page(temporary, _title(report), kicker, body, {"report": report, "training": training})
     return {"page": path, **outputs}
 
 

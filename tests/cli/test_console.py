@@ -116,3 +116,16 @@ def test_a_status_may_say_more(capsys: pytest.CaptureFixture[str], monkeypatch: 
     with Console(quiet=True).status("packing ...") as show:
         show("packing, 99 s")
     assert "99" not in terminal.getvalue()
+
+
+def test_a_clock_that_is_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bars look at the clock of the day; nothing else does."""
+    hours = iter(range(1000, 0, -1))
+    monkeypatch.setattr("tqdm.std.time", lambda: 3600.0 * next(hours))
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    with Console().meter("training") as meter:
+        meter.bar.delay = 0
+        for step in range(1, 5):
+            meter.update(step / 4)
+            meter.bar.refresh()
+    assert "100%" in terminal.getvalue()

@@ -257,6 +257,23 @@ def test_an_ignored_interrupt_stays_ignored(
     assert done.code == 0 and json.loads(done.out)["interrupted"] == (number == signal.SIGTERM), done
 
 
+def test_a_second_run_to_the_same_output(
+    server: Server, words: list[Any], undisturbed: tuple[Path, float], tmp_path: Path, clod: Any
+) -> None:
+    """It is refused while the first one lives, stopped or not; the first one ends as if nothing had happened."""
+    child = server.start(tmp_path, *words)
+    wait_for(tmp_path / STATE, child)
+    os.kill(child, signal.SIGSTOP)
+    before = fingerprints(tmp_path / STATE)
+    for more in ((), ("--resume",)):
+        done = clod(*words, *more)
+        assert done.code == 2 and f"dial.ply: another run (process {child}) is writing it; wait" in done.err, done
+    assert fingerprints(tmp_path / STATE) == before
+    os.kill(child, signal.SIGCONT)
+    assert server.wait() == 0, log_of(tmp_path)
+    assert_same(tmp_path, undisturbed[0])
+
+
 def wait_for(path: Path, child: int) -> None:
     until = time.monotonic() + 60
     while not path.exists():

@@ -1,0 +1,119 @@
+"""No room for a file, at whichever write: one line, exit code 2, and the files of an earlier run as they were."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clod_adapter.report import page
+
+if sys.platform == "win32":
+    pytest.skip("limits are those of POSIX", allow_module_level=True)
+import resource
+
+Room = Callable[[int], Any]
+
+
+@pytest.fixture
+def room() -> Room:
+    """Within, files of this process end at so many bytes, where a write fails as on a full disk."""
+
+    @contextmanager
+    def limited(size: int) -> Iterator[None]:
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limited
+
+
+def held(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def one_error(done: Any) -> str:
+    assert done.code == 2 and done.out == "", done
+    errors = [line for line in done.err.splitlines() if line.startswith("clod-adapt: error: ")]
+    assert len(errors) == 1 and "cannot be written" in errors[0], done
+    return errors[0]
+
+
+def test_adapting(clod: Any, capture: Any, tmp_path: Path, room: Room) -> None:
+    """Report, adapter and PLY are ever larger; the page is larger still, and costs nothing but itself."""
+    words = (capture.ply, "--images", capture.scene, "--iters", 2, "--max-sv", 2, "-o", "dial.ply")
+    assert clod(*words, "--seed", 5).code == 0
+    earlier = held(tmp_path)
+    report, adapter, ply = (len(earlier[f"dial.{suffix}"]) for suffix in ("json", "safetensors", "ply"))
+    assert report < adapter < ply
+    for size in (report // 2, (report + adapter) // 2, (adapter + ply) // 2):
+        with room(size):
+            one_error(clod(*words))
+        assert held(tmp_path) == earlier
+    with room(ply + 5000):
+        done = clod(*words, "--report")
+    assert done.code == 0 and "there is no page: " in done.err
+    now = held(tmp_path)
+    assert now.keys() == earlier.keys() and not any(now[name] == earlier[name] for name in now)
+
+
+def test_a_page(
+    clod: Any, capture: Any, dialled: Path, tmp_path: Path, room: Room, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Page and charts are of one run, also where there is room for the charts alone."""
+    words = ("eval", dialled, "--images", capture.scene, "--sv", 1, "--report", "page.html")
+    assert clod(*words).code == 0
+    earlier = held(tmp_path)
+    write = page.write_page
+
+    def later(path: Path, *rest: Any) -> None:
+        with room(100):
+            write(path, *rest)
+
+    monkeypatch.setattr(page, "write_page", later)
+    done = clod(*words)
+    assert done.code == 0 and "there is no page: " in done.err and "File too large" in done.err, done
+    assert held(tmp_path) == earlier
+
+
+@pytest.mark.parametrize("name", ["x.ply", "x.pt", "x.glb", "x.spz", "x.safetensors", "x.html"])
+def test_exports(clod: Any, dialled: Path, tmp_path: Path, room: Room, name: str) -> None:
+    (tmp_path / name).write_bytes(b"earlier")
+    with room(2000):
+        one_error(clod("export", dialled, "-o", name))
+    assert held(tmp_path) == {name: b"earlier"}
+
+
+def test_levels(clod: Any, dialled: Path, tmp_path: Path, room: Room) -> None:
+    """Of several files the first fit; none is written."""
+    assert clod("export", dialled, "-o", "x.ply", "--levels", "1,3").code == 0
+    large, small = len(held(tmp_path)["x_s1.ply"]), len(held(tmp_path)["x_s3.ply"])
+    for path in tmp_path.iterdir():
+        path.unlink()
+    assert small < large
+    with room((small + large) // 2):
+        one_error(clod("export", dialled, "-o", "x.ply", "--levels", "1,3"))
+    assert held(tmp_path) == {}
+
+
+def test_pictures_and_applying(clod: Any, capture: Any, dialled: Path, tmp_path: Path, room: Room) -> None:
+    with room(1000):
+        one_error(clod("render", dialled, "--images", capture.scene, "-o", "pictures"))
+        one_error(clod("apply", capture.ply, dialled.with_suffix(".safetensors"), "-o", "x.ply"))
+    assert held(tmp_path) == {} and held(tmp_path / "pictures") == {}
+
+
+def test_the_robustness_experiment(clod: Any, capture: Any, tmp_path: Path, room: Room) -> None:
+    words = ("robustness", capture.ply, "--images", capture.scene, "--iters", 2, "--max-sv", 2, "-o", "out")
+    for size in (1000, 12000):  # the first cell, and one of the next ones or the figure
+        with room(size):
+            one_error(clod(*words))
+        assert not any(name.startswith(".") for folder in ("out", "out/cells") for name in held(tmp_path / folder))
+    assert clod(*words).code == 0

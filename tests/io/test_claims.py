@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.atomic import remove_leftovers
+from clod_adapter.io.claims import claimed
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="locks are those of POSIX")
+
+
+def test_one_at_a_time(tmp_path: Path) -> None:
+    final = tmp_path / "out.ply"
+    with claimed(final), claimed(tmp_path / "other.ply"):
+        remove_leftovers(final)  # which a second run would do, had it not been refused
+        said = rf"out.ply: another run \(process {os.getpid()}\) is writing it; wait for that"
+        with pytest.raises(ClodError, match=said), claimed(final):
+            raise AssertionError("the body must not run")
+        with pytest.raises(ClodError, match="^all: another run"), claimed(final, of=Path("all"), shared=True):
+            raise AssertionError("the body must not run")
+    assert os.listdir(tmp_path) == []
+    with claimed(final):
+        pass
+
+
+def test_jobs_share_it(tmp_path: Path) -> None:
+    final = tmp_path / "out.ply"
+    with claimed(final, shared=True):
+        with claimed(final, shared=True):
+            pass
+        with pytest.raises(ClodError, match="another run"), claimed(final):
+            raise AssertionError("the body must not run")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_killed_holder_holds_nothing(tmp_path: Path) -> None:
+    final = tmp_path / "out.ply"
+    code = (
+        "import os, sys; from pathlib import Path; from clod_adapter.io.claims import claimed\n"
+        "with claimed(Path(sys.argv[1])): os.kill(os.getpid(), 9)"
+    )
+    assert subprocess.run([sys.executable, "-c", code, str(final)], check=False).returncode == -9
+    assert len(os.listdir(tmp_path)) == 1
+    with claimed(final):
+        pass
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_file_system_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import fcntl
+
+    def refuse(*_: object) -> None:
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with claimed(tmp_path / "out.ply"), claimed(tmp_path / "out.ply"):
+        assert os.listdir(tmp_path) == []
+
+
+def test_the_last_holder_may_remove_the_file_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lock on a file that is there no more would be of nothing."""
+    import fcntl
+
+    lock, removed = fcntl.flock, []
+
+    def late(handle: int, how: int) -> None:
+        lock(handle, how)
+        if not removed:
+            removed.extend(tmp_path.iterdir())
+            removed[0].unlink()
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with claimed(tmp_path / "out.ply"), pytest.raises(ClodError, match="another run"), claimed(tmp_path / "out.ply"):
+        raise AssertionError("the body must not run")
+    assert removed and os.listdir(tmp_path) == []
