@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import shutil
 import signal
 from collections.abc import Callable
@@ -69,7 +70,7 @@ def test_says_what_it_did(clod: Any, capture: Any) -> None:
     assert [line[0] for line in table] == ["dial", "base", "1", "1.25", "1.5", "2", "2.5", "3", "4", "plain"]
     assert len({len(line) for line in done.out.splitlines()[1:11]}) == 1  # aligned
     assert "plain: what a viewer that does not know the dial makes of dial.ply" in done.out
-    assert f"clod-adapt eval dial.ply --images {capture.scene} --sv 1 4" in done.out
+    assert f"clod-adapt eval dial.ply --images {shlex.quote(str(capture.scene))} --sv 1 4" in done.out
     assert "300 Gaussians, SH degree 1" in done.err and "8 photographs to train on, 2 held out, 64x48" in done.err
     assert "trained 12 steps" in done.err and "\r" not in done.err
     quiet = clod(capture.ply, "--images", capture.scene, *TINY, "--quiet")

@@ -407,7 +407,7 @@ def test_a_streaming_set_that_cannot_be_is_refused_before_any_work(
 @pytest.mark.parametrize(
     ("behave", "code", "said"),
     [
-        ("print('✗ Error: no memory'); sys.exit(1)", 2, "splat-transform 3.7.0 failed: Error: no memory"),
+        ("print('\\u2717 Error: no memory'); sys.exit(1)", 2, "splat-transform 3.7.0 failed: Error: no memory"),
         ("import time; time.sleep(60)", 2, "splat-transform was ended, it took longer than 1 s"),
     ],
 )

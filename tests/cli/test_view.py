@@ -126,7 +126,7 @@ def test_opens_a_browser_but_none_in_the_terminal(monkeypatch: pytest.MonkeyPatc
 def test_opens_the_program_that_browser_names(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """As editors name one that opens the page where their window is; it is not waited for."""
     helper = tmp_path / "helper.sh"
-    helper.write_text(f'#!/bin/sh\necho "$1" > {tmp_path}/part; mv {tmp_path}/part {tmp_path}/url; sleep 3\n')
+    helper.write_text(f"#!/bin/sh\ncd '{tmp_path}'; echo \"$1\" > part; mv part url; sleep 3\n")
     helper.chmod(0o755)
     monkeypatch.setenv("BROWSER", str(helper))
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser(str(helper)))

@@ -104,6 +104,8 @@ def test_long_and_steering_names_are_refused(tmp_path: Path, form: str) -> None:
 
 @pytest.mark.parametrize("name", ["äö ü/日本 (1).png", "a.b/c d.png", "~/a.png", "$HOME.png"])
 def test_usual_and_odd_names_are_names(tmp_path: Path, name: str) -> None:
+    if not name.isascii() and sys.getfilesystemencoding() != "utf-8":
+        pytest.skip("files have ASCII names here")
     model(tmp_path, "binary", (name,))
     (tmp_path / "images" / name).parent.mkdir(parents=True)
     Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "images" / name)

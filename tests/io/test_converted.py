@@ -29,7 +29,7 @@ def stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None
 def test_reads_what_it_converts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     was = gaussians(5, 1, 0)
     save(tmp_path / "plain.ply", was, blank(5, 1))
-    stand_in(tmp_path, monkeypatch, f'echo "$@" >{tmp_path}/seen; cp {tmp_path}/plain.ply "$last"')
+    stand_in(tmp_path, monkeypatch, f'cd \'{tmp_path}\'; echo "$@" >seen; cp plain.ply "$last"')
     (tmp_path / name).write_bytes(b"NGSP, if it is an SPZ: of version 4")
     check_readable(tmp_path / name)
     assert not file_has_dial(tmp_path / name)

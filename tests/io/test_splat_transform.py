@@ -86,8 +86,8 @@ def test_it_is_run_with_the_words_and_timed(tmp_path: Path) -> None:
     ("lines", "said"),
     [
         (
-            ["print('splat-transform v3.7.0')", "print('  ✗ Error: no room')", "print('    at f (x.mjs:1)')",
-             "print('✗ failed in 0.1s')", "sys.exit(1)"], "Error: no room",
+            ["print('splat-transform v3.7.0')", "print('  \\u2717 Error: no room')", "print('    at f (x.mjs:1)')",
+             "print('\\u2717 failed in 0.1s')", "sys.exit(1)"], "Error: no room",
         ),
         (["sys.stderr.write('first\\nlast\\n')", "sys.exit(3)"], "last"),
         (["sys.exit(1)"], "it said nothing"),
