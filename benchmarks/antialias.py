@@ -6,7 +6,8 @@ No capture here has a checkpoint that was trained antialiased, so stand-ins are 
 attributes are tuned on its training photographs at full detail with gsplat's antialiasing ("on") and Mip-Splatting's
 ("mip"). Of these and of the classic checkpoints a row each: PSNR of the held-out photographs with each filter, and
 what ``compare_filters`` chooses (its views are of both kinds, as the command's are). Then one stand-in of each scene is
-adapted with the right filter and with the classic one, to photographs and to its own pictures. Rows in results/antialias.jsonl.
+adapted with the right filter and with the classic one, to photographs and to its own pictures. Rows in
+results/antialias.jsonl.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ def row(gaussians: clod.Gaussians, scene: clod.Scene) -> dict[str, Any]:
 
 
 def adapted(gaussians: clod.Gaussians, scene: clod.Scene, drawn: str, iters: int, teacher: str) -> dict[str, Any]:
-    """What adapting with one filter comes to, drawn with the same; of the photographs, or of the file's own pictures."""
+    """What adapting with one filter comes to, drawn with the same; to photographs, or to the file's own pictures."""
     start = gaussians.replace(screen_filter=FILTERS[drawn])
     own = clod.imagine(start, clod.place(start)) if teacher == "checkpoint" else scene
     result = clod.adapt(start, own, clod.AdaptConfig(max_sv=5, iters=iters))
