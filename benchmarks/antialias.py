@@ -6,7 +6,8 @@ No capture here has a checkpoint that was trained antialiased, so stand-ins are 
 attributes are tuned on its training photographs at full detail with gsplat's antialiasing ("on") and Mip-Splatting's
 ("mip"). Of these and of the classic checkpoints a row each: PSNR of the held-out photographs with each filter, and
 what ``compare_filters`` chooses (its views are of both kinds, as the command's are). Then one stand-in of each scene is
-adapted with the right filter and with the classic one. Rows in results/antialias.jsonl.
+adapted with the right filter and with the classic one, to photographs and to its own pictures. Rows in
+results/antialias.jsonl.
 """
 
 from __future__ import annotations
@@ -54,9 +55,9 @@ def main() -> None:
             for trained, standin in standins(name, scene, args.iters, folder) if name in TUNED else ():
                 about = {"scene": name, "file": f"stand-in, {args.iters} steps", "trained": trained}
                 append(FILE, about | row(standin, scene))
-                if trained == "on":
-                    for drawn in ("on", "off"):
-                        append(FILE, about | adapted(standin, scene, drawn, args.adapt))
+                for drawn in ("on", "off") if trained == "on" else ():
+                    for teacher in ("photographs", "checkpoint"):
+                        append(FILE, about | adapted(standin, scene, drawn, args.adapt, teacher))
 
 
 def standins(name: str, scene: clod.Scene, iters: int, folder: Path) -> Iterator[tuple[str, clod.Gaussians]]:
@@ -87,15 +88,16 @@ def row(gaussians: clod.Gaussians, scene: clod.Scene) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def adapted(gaussians: clod.Gaussians, scene: clod.Scene, drawn: str, iters: int) -> dict[str, Any]:
-    """What adapting with one filter comes to, drawn with the same."""
+def adapted(gaussians: clod.Gaussians, scene: clod.Scene, drawn: str, iters: int, teacher: str) -> dict[str, Any]:
+    """What adapting with one filter comes to, drawn with the same; to photographs, or to the file's own pictures."""
     start = gaussians.replace(screen_filter=FILTERS[drawn])
-    result = clod.adapt(start, scene, clod.AdaptConfig(max_sv=5, iters=iters))
+    own = clod.imagine(start, clod.place(start)) if teacher == "checkpoint" else scene
+    result = clod.adapt(start, own, clod.AdaptConfig(max_sv=5, iters=iters))
     rows = [
         {"s": r.virtual_scale, "psnr": round(r.psnr, 2), "kept": round(r.kept)}
         for r in evaluate(result.gaussians, scene.test, DIALS)
     ]
-    return {"adapted_with": drawn, "iters": iters, "max_sv": 5, "seed": 0, "rows": rows}
+    return {"adapted_with": drawn, "teacher": teacher, "iters": iters, "max_sv": 5, "seed": 0, "rows": rows}
 
 
 if __name__ == "__main__":

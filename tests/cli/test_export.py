@@ -243,12 +243,12 @@ def test_what_other_columns_there_were_is_said(clod: Any, dialled: Path, tmp_pat
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".glb", ".pt", ".safetensors"])
 def test_what_the_file_says_of_itself_goes_along(clod: Any, dialled: Path, tmp_path: Path, suffix: str) -> None:
-    data = dialled.read_bytes().replace(b"\nproperty", b"\ncomment SplatRenderMode: mip\nproperty", 1)
-    (tmp_path / "mip.ply").write_bytes(data)
-    assert clod("export", "mip.ply", "--sv", 2, "-o", f"baked{suffix}").code == 0
+    data = dialled.read_bytes().replace(b"\nproperty", b"\ncomment SplatRenderMode: default\nproperty", 1)
+    (tmp_path / "said.ply").write_bytes(data)
+    assert clod("export", "said.ply", "--sv", 2, "-o", f"baked{suffix}").code == 0
     assert clod("export", f"baked{suffix}", "-o", "again.ply").code == 0
     header = (tmp_path / "again.ply").read_bytes().partition(b"end_header")[0].decode()
-    for line in ("baked at s = 2 by clod-adapter for 8 training cameras", "SplatRenderMode: mip"):
+    for line in ("baked at s = 2 by clod-adapter for 8 training cameras", "SplatRenderMode: default"):
         assert header.count(f"comment {line}\n") == 1
 
 
