@@ -132,4 +132,4 @@ def test_a_name_that_is_no_text(tmp_path: Path) -> None:
     gaussians = dialled()
     clod_adapter.save(tmp_path / "a.ply", gaussians)
     checkpoint = dataclasses.replace(clod_adapter.load(tmp_path / "a.ply"), path=Path("b\udcff.ply"))
-    assert Payload.of(checkpoint).name == "b?.ply"
+    assert Payload.of(checkpoint).name == "b\\xff.ply"
