@@ -17,6 +17,7 @@ exit code is 1 where a test failed or a condition could not be had. The conditio
 - ``ignored_sigint``, ``blocked_signals``: as a script's background job, and below a program that blocks signals;
 - ``c_locale``: ASCII as the encoding of files and of the terminal, and a day's time zone away from Greenwich;
 - ``folders``: temporary files, home and kernel cache in folders with spaces and other letters in their names;
+- ``no_pycolmap``: as on Linux on arm64, for which pycolmap has no wheel;
 - ``checkout``: the last commit as a clone in such a folder, with an environment of its own (pip installs it).
 """
 
@@ -31,8 +32,9 @@ import sysconfig
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from importlib.metadata import requires, version
+from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -74,6 +76,7 @@ CONDITIONS = {
     "folders": Condition(
         {"TMPDIR": "{work}/tmp", "HOME": "{work}/home", "XDG_CACHE_HOME": "", "NUMBA_CACHE_DIR": "{work}/cache"},
     ),
+    "no_pycolmap": Condition({"PYTHONPATH": "{work}/absent"}),
     "checkout": Condition(),
 }
 
@@ -87,8 +90,9 @@ def run(name: str, tests: Sequence[str], parallel: Sequence[str] = PARALLEL) -> 
     condition = CONDITIONS[name]
     with tempfile.TemporaryDirectory() as outer:
         work = Path(outer) / SPACED
-        for folder in ("tmp", "home", "cache"):
+        for folder in ("tmp", "home", "cache", "absent"):
             (work / folder).mkdir(parents=True)
+        (work / "absent" / "pycolmap.py").write_text("raise ModuleNotFoundError('no pycolmap', name='pycolmap')\n")
         root, python = clone(work) if name == "checkout" else (ROOT, Path(sys.executable))
         report = Path(outer) / "report.xml"
         words = [*condition.prefix, str(python), "-m", "pytest", *parallel, f"--junitxml={report}", *tests]
@@ -141,7 +145,11 @@ def last_line(text: str) -> str:
 def packages() -> dict[str, str]:
     """The versions that are installed of what pyproject.toml lists as needed to run."""
     needed = [line for line in requires("clod-adapter") or [] if "extra ==" not in line]
-    return {name: version(name) for line in needed for name in re.findall(r"^[\w.-]+", line)}
+    found = {}
+    for name in (name for line in needed for name in re.findall(r"^[\w.-]+", line)):
+        with suppress(PackageNotFoundError):  # pycolmap is not needed everywhere
+            found[name] = version(name)
+    return found
 
 
 def main() -> None:
