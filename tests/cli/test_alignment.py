@@ -119,7 +119,7 @@ def test_nerfstudios_export_fits_with_its_transforms_beside_the_photographs(
     turn = np.vstack([APPLIED["today"], [0, 0, 0, 1]])
     _, written = trained(turn @ torch.linalg.inv(viewmats).numpy() @ opengl.numpy(), APPLIED["today"])
     similarity, scale = np.array(written["transform"]), written["scale"]
-    w, x, y, z = torch.from_numpy(Rotation.from_matrix(similarity[:, :3]).as_quat(scalar_first=True)).float()
+    w, x, y, z = torch.from_numpy(Rotation.from_matrix(similarity[:, :3]).as_quat()[..., [3, 0, 1, 2]]).float()
     product = torch.stack([
         torch.stack([w, -x, -y, -z]), torch.stack([x, w, -z, y]), torch.stack([y, z, w, -x]),
         torch.stack([z, -y, x, w]),
