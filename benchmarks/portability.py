@@ -2,6 +2,7 @@
 
     python benchmarks/portability.py                               # all conditions: an hour on two idle cores
     python benchmarks/portability.py ignored_sigint c_locale       # two of them
+    python benchmarks/portability.py no_root+c_locale              # two of them at once
     python benchmarks/portability.py one_thread --tests tests/io   # one of them, over some of the tests
     python benchmarks/portability.py --record                      # and a row each in results/portability.jsonl
 
@@ -34,6 +35,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import reduce
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Any
@@ -57,6 +59,9 @@ class Condition:
 
     environment: dict[str, str] = field(default_factory=dict)
     prefix: tuple[str, ...] = ()
+
+    def __add__(self, other: Condition) -> Condition:
+        return Condition(self.environment | other.environment, self.prefix + other.prefix)
 
 
 CONDITIONS = {
@@ -85,15 +90,17 @@ def run(name: str, tests: Sequence[str], parallel: Sequence[str] = PARALLEL) -> 
     """Counts and seconds of the tests under a condition; ``failures`` names those that failed, or says why none ran.
 
     Args:
+        name: of a condition, or of several at once, joined by +.
         tests: paths in the checkout; all of its tests where there are none.
     """
-    condition = CONDITIONS[name]
+    names = name.split("+")
+    condition = reduce(Condition.__add__, (CONDITIONS[each] for each in names))
     with tempfile.TemporaryDirectory() as outer:
         work = Path(outer) / SPACED
         for folder in ("tmp", "home", "cache", "absent"):
             (work / folder).mkdir(parents=True)
         (work / "absent" / "pycolmap.py").write_text("raise ModuleNotFoundError('no pycolmap', name='pycolmap')\n")
-        root, python = clone(work) if name == "checkout" else (ROOT, Path(sys.executable))
+        root, python = clone(work) if "checkout" in names else (ROOT, Path(sys.executable))
         report = Path(outer) / "report.xml"
         words = [*condition.prefix, str(python), "-m", "pytest", *parallel, f"--junitxml={report}", *tests]
         environment = {key: value.format(work=work) for key, value in condition.environment.items()}
@@ -154,10 +161,12 @@ def packages() -> dict[str, str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("conditions", nargs="*", choices=[[], *CONDITIONS], help="default: all of them")
+    parser.add_argument("conditions", nargs="*", help="default: each of them; a+b is both at once")
     parser.add_argument("--tests", nargs="+", default=[], metavar="PATH", help="default: all of them")
     parser.add_argument("--record", action="store_true", help=f"add a row for each to results/{FILE}")
     args = parser.parse_args()
+    if unknown := {each for name in args.conditions for each in name.split("+")} - set(CONDITIONS):
+        parser.error(f"there is no condition {', '.join(sorted(unknown))}; there are {', '.join(CONDITIONS)}")
     print(f"{'condition':16} {'passed':>7} {'failed':>7} {'skipped':>7} {'seconds':>8}", flush=True)
     failed = False
     for name in args.conditions or CONDITIONS:
