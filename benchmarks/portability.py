@@ -44,7 +44,7 @@ from xml.etree import ElementTree
 from common import ROOT, SHARED, append
 
 FILE = "portability.jsonl"
-SPACED = "a folder, spàced"
+SPACED = os.fsdecode("a folder, spàced".encode())  # under an ASCII locale too
 PARALLEL = (
     "--numprocesses=auto",
     "--maxprocesses=4",

@@ -16,6 +16,7 @@ from PIL import Image
 
 from clod_adapter.cli import view
 from clod_adapter.cli.main import build_parser
+from clod_adapter.text import file_name
 
 ODD = "gr\udcfcn"  # Latin-1 for an umlaut, which is not UTF-8
 SUFFIXES = (".ply", ".safetensors")
@@ -95,9 +96,8 @@ def test_names_within_a_transforms_file(clod: Any, dialled: Path, tmp_path: Path
 @pytest.mark.skipif(sys.platform == "win32", reason="locales are those of POSIX")
 def test_an_ascii_locale(capture: Any, dialled: Path, tmp_path: Path) -> None:
     """Paths and photographs whose names have umlauts, which nothing in that locale can decode."""
-    scene = _transforms(tmp_path / "Gärten", ["größe.png", "b.png", "c.png"], capture)
-    shutil.copy(dialled, tmp_path / "Gärten.ply")
-    (tmp_path / "Gärten.ply").rename(tmp_path / "für.ply")
+    scene = _transforms(tmp_path / file_name("Gärten"), ["größe.png", "b.png", "c.png"], capture)
+    shutil.copy(dialled, tmp_path / file_name("für.ply"))
     code = (
         "import sys; from clod_adapter.cli.main import main\n"
         "assert sys.getfilesystemencoding() == 'ascii'\n"
@@ -112,11 +112,11 @@ def test_an_ascii_locale(capture: Any, dialled: Path, tmp_path: Path) -> None:
     plain = {key: value for key, value in os.environ.items() if key != "LANG" and not key.startswith("LC_")}
     environment = plain | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     done = subprocess.run(
-        [sys.executable, "-c", code, "für.ply", str(scene)], cwd=tmp_path, capture_output=True, check=False,
+        [sys.executable, "-c", code, file_name("für.ply"), str(scene)], cwd=tmp_path, capture_output=True, check=False,
         env=environment,
     )  # fmt: skip
     assert done.returncode == 0, done
-    assert (tmp_path / "bild" / "größe.png").is_file()
+    assert (tmp_path / "bild" / file_name("größe.png")).is_file()
     assert "größe.png" in (tmp_path / "seite.html").read_text("utf-8")
     assert "für.ply" in (tmp_path / "bericht.html").read_text("utf-8")
 
@@ -130,7 +130,7 @@ def _transforms(folder: Path, names: list[str], capture: Any = None) -> Path:
         pose[:3, 3] = [0.3 * k, 0.0, 4.0]
         frames.append({"file_path": name, "transform_matrix": pose.tolist()})
         if capture is not None:
-            Image.open(capture.scene / "images" / f"{k:03}.png").save(folder / name)
+            Image.open(capture.scene / "images" / f"{k:03}.png").save(folder / file_name(name))
     content = {"fl_x": 60, "w": 64, "h": 48, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
     return folder

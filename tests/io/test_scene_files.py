@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from clod_adapter.io.scene_files import scene_files
+from clod_adapter.text import file_name
 from photographs import as_text, write_scene
 
 
@@ -35,6 +36,7 @@ def test_transforms_and_what_they_name(tmp_path: Path) -> None:
     (tmp_path / "transforms_test.json").write_text(json.dumps(test))
     (tmp_path / "transforms.json").write_text("no JSON")
     names = ["train/r_0.png", "train/ü.jpg", "masks/0.png", "test/r_0.png", "depth/0.tif"]
+    names = [file_name(name) for name in names]
     for name in [*names, "train/r_1.png"]:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")
