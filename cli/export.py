@@ -26,6 +26,7 @@ from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.claims import claimed
 from clod_adapter.io.ply import Checkpoint
 from clod_adapter.io.ply_columns import MASKS, SIGMA, inria_dtype
+from clod_adapter.io.ply_constants import PREFIX
 from clod_adapter.io.poses import load_cameras
 from clod_adapter.io.version import package_version
 
@@ -109,7 +110,8 @@ def dial_values(
 def left_out(model: Checkpoint) -> list[str]:
     """A note on the columns that outputs do not have."""
     known = {*(inria_dtype(model.gaussians.sh_degree).names or ()), SIGMA, *MASKS}
-    others = [name for name in model.vertex.dtype.names or () if name not in known]
+    names = model.vertex.dtype.names or ()
+    others = [name for name in names if name not in known and not name.startswith(PREFIX)]  # those are settings
     return [f"columns left out: {', '.join(others)}"] if others else []
 
 

@@ -29,8 +29,9 @@ def with_distance(gaussians: Gaussians, distance: float) -> Gaussians:
 
     ``sigma'^2 = ((D / D')^2 (2 sigma^2 + eps) - eps) / 2``, in float64, at least 0. What is 0 or below stays, and so
     does SIGMA_MAX. Where D / D' is below SMALL, eps would hide sigma': there it becomes ``(D / D')^2 eps``, to six
-    digits. The normalisers ``max`` and ``quantile`` do not use D, and keep their sigma_d. The result's
-    ``reference_distance`` is ``known_distance`` of what was given.
+    digits; where D / D' is above 1 / SMALL, eps grows back so, to four digits, but not beyond the default. The
+    normalisers ``max`` and ``quantile`` do not use D, and keep their sigma_d. The result's ``reference_distance`` is
+    ``known_distance`` of what was given.
     """
     config, sigma = gaussians.attenuation, gaussians.sigma_d
     if config is None or sigma is None or config.scene_distance == distance:
@@ -40,6 +41,9 @@ def with_distance(gaussians: Gaussians, distance: float) -> Gaussians:
         ratio = config.scene_distance / distance
         if ratio < SMALL:
             changed = replace(changed, eps=float(f"{config.eps * ratio**2:.6g}"))
+        elif ratio > 1 / SMALL:  # or each change there and back would leave a smaller eps
+            usual = AttenuationConfig().eps
+            changed = replace(changed, eps=max(config.eps, float(f"{min(config.eps * ratio**2, usual):.4g}")))
         scaled = twice_variance(sigma, config.eps).mul_(ratio**2).sub_(changed.eps).div_(2).clamp_(min=0).sqrt_()
         unscaled = (sigma <= 0) | (sigma >= SIGMA_MAX)
         sigma = torch.where(unscaled, sigma, scaled.clamp_(max=SIGMA_MAX).to(sigma.dtype))

@@ -88,3 +88,15 @@ def test_in_a_scene_of_tiny_units_eps_hides_no_sigma() -> None:
     back = with_distance(there, 1e-4)
     torch.testing.assert_close(back.sigma_d, some.sigma_d)
     assert in_world_units(dialled(scene_distance=0.1)).attenuation.eps == 1e-8  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("typical", [3e-4, 0.006, 3.0, 612.34, 4.2e5])
+def test_eps_is_the_same_after_each_training(typical: float) -> None:
+    there = in_world_units(dialled(scene_distance=typical))
+    again = there
+    for _ in range(4):  # as one training after the other has it
+        again = in_world_units(with_distance(again, typical))
+    assert there.attenuation is not None and again.attenuation is not None
+    assert again.attenuation.eps == pytest.approx(there.attenuation.eps, rel=1e-3)
+    assert typical < 0.01 or again.attenuation.eps == 1e-8
+    torch.testing.assert_close(again.sigma_d, there.sigma_d, rtol=1e-4, atol=1e-6)

@@ -34,6 +34,7 @@ from clod_adapter.io.arrays import arrays_of, bytes_of, normalized, sigmoid
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.card import card_text, write_card
 from clod_adapter.io.origin import NOWHERE, Origin
+from clod_adapter.units import estimated_distance, known_distance, with_distance
 
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
 MAGIC, VERSION = 0x5053474E, 3
@@ -47,6 +48,7 @@ COLOR = 0.15  # of the range of bytes to one of sh0
 MAGNITUDE = 511 * math.sqrt(2)  # of the three components of a rotation that are not the largest
 _BITS = 6  # of a harmonic
 _SIGMA_MOST = float(np.finfo(np.float16).max)
+_FAR = 100.0  # world units: a typical distance from which on some sigma_d that fade at high dial values are beyond that
 
 
 def write_spz(
@@ -65,7 +67,7 @@ def write_spz(
     Raises:
         ClodError: more than 10,000,000 Gaussians, or a scene that reaches farther than 4,000,000, besides.
     """
-    path = Path(path)
+    path, gaussians = Path(path), _within_float16(gaussians)
     arrays, bits, moved = _nearer(arrays_of(path, gaussians))
     if len(gaussians) > MOST or bits < 1:
         raise ClodError(
@@ -86,6 +88,15 @@ def write_spz(
         gzip = zlib.compressobj(wbits=31)
         temporary.write_bytes(gzip.compress(b"".join(parts)) + gzip.flush())
     return (*moved, *_losses(arrays, bits, degree))
+
+
+def _within_float16(gaussians: Gaussians) -> Gaussians:
+    """With sigma_d in units of the typical distance where that is large: in world units float16 would cut it off."""
+    config = gaussians.attenuation
+    if config is None or config.normalizer != "scene":
+        return gaussians
+    typical = known_distance(config) or estimated_distance(gaussians.means)
+    return with_distance(gaussians, typical) if typical > _FAR else gaussians
 
 
 def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, tuple[str, ...]]:

@@ -16,6 +16,7 @@ from clod_adapter.io.arrays import gaussians_of, half_turn, logits_of_bytes, rea
 from clod_adapter.io.card import Model, read_card, settings_of
 from clod_adapter.io.screen_filter import TAG
 from clod_adapter.io.spz import ANTIALIASED, AXES, COLOR, EXTENDED, HEADER, MAGIC, MAGNITUDE, MOST, RDF, RECORD
+from clod_adapter.units import in_world_units
 
 _BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10
 _CONVERT = "convert it: splat-transform IN.spz OUT.ply"
@@ -59,7 +60,10 @@ def load_spz(path: str | Path) -> Model:
     if sigma is not None:
         arrays["sigma_d"] = sigma
     attenuation = settings_of(card) if sigma is not None else None
-    return Model(gaussians_of(path, arrays, attenuation, card.screen_filter), card, tuple(notes))
+    gaussians = in_world_units(gaussians_of(path, arrays, attenuation, card.screen_filter))
+    if card.attenuation is not None:
+        card = replace(card, attenuation=gaussians.attenuation)
+    return Model(gaussians, card, tuple(notes))
 
 
 def _unpacked(path: Path, data: bytes) -> bytes:

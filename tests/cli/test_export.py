@@ -241,6 +241,13 @@ def test_what_other_columns_there_were_is_said(clod: Any, dialled: Path, tmp_pat
     assert same(load("x.ply").gaussians, load(dialled).gaussians)
 
 
+def test_settings_in_columns_are_not_left_out(clod: Any, dialled: Path) -> None:
+    model = load(dialled).gaussians
+    save("hard.ply", model.replace(attenuation=replace(model.attenuation, tau=0.01, cut="hard")))  # type: ignore[type-var]
+    report = json.loads(clod("export", "hard.ply", "-o", "x.ply", "--json").out)
+    assert report["notes"] == [] and load("x.ply").vertex.dtype == load("hard.ply").vertex.dtype
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".glb", ".pt", ".safetensors"])
 def test_what_the_file_says_of_itself_goes_along(clod: Any, dialled: Path, tmp_path: Path, suffix: str) -> None:
     data = dialled.read_bytes().replace(b"\nproperty", b"\ncomment SplatRenderMode: default\nproperty", 1)

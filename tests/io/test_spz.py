@@ -3,6 +3,7 @@ from __future__ import annotations
 import gzip
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,22 @@ def test_the_same_again_to_its_rounding(tmp_path: Path, degree: int) -> None:
     assert again.sigma_d[:2].tolist() == [65504, 0] and again.sigma_d[3] == 65504
     error = (again.sigma_d - g.sigma_d).abs() / g.sigma_d
     assert error[4:].max() <= 2.0**-11 and error[2] < 1e-3
+
+
+@pytest.mark.parametrize("typical", [250.0, 40_000.0])
+@pytest.mark.parametrize("known", [True, False])
+def test_a_dial_of_large_units_fits(tmp_path: Path, typical: float, known: bool) -> None:
+    generator = torch.Generator().manual_seed(0)
+    g = model(0)
+    assert g.sigma_d is not None
+    sigma = typical * torch.logspace(-1, 1.5, len(g))
+    means = typical * torch.nn.functional.normalize(torch.randn(len(g), 3, generator=generator))
+    config = replace(ATTENUATION, reference_distance=typical if known else 0.0)
+    write(tmp_path / "a.spz", g.replace(sigma_d=sigma, means=means, attenuation=config))
+    again, card, _ = load_spz(tmp_path / "a.spz")
+    assert card.attenuation == again.attenuation is not None and again.attenuation.scene_distance == 1
+    assert again.attenuation.eps == config.eps and (not known or again.attenuation.reference_distance == typical)
+    torch.testing.assert_close(again.sigma_d, sigma, rtol=2.0**-11, atol=0)
 
 
 def test_the_header_and_the_record(tmp_path: Path) -> None:
