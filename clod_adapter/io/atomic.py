@@ -84,6 +84,9 @@ def check_target(final: Path) -> None:
         raise ClodError(f"{final}: folder {folder} is not writable; choose another or change its permissions")
     if final.is_dir() and any(final.iterdir()):
         raise ClodError(f"{final}: is a folder that is not empty; choose another name")
+    if final.is_file() and not (final.stat().st_mode & 0o222 and os.access(final, os.W_OK)):
+        # A rename would replace it all the same, and root has access to everything.
+        raise ClodError(f"{final}: is write-protected; choose another output, or chmod u+w if it is to be replaced")
 
 
 def _mark(final: Path) -> str:

@@ -127,3 +127,13 @@ def test_a_long_name(tmp_path: Path) -> None:
     with atomic_path(final) as temporary, atomic_path(temporary) as nested:
         nested.write_bytes(b"new")
     assert final.read_bytes() == b"new"
+
+
+def test_a_write_protected_file_is_not_replaced(tmp_path: Path) -> None:
+    """Not by root either, who may write to any file, and although a rename asks for the folder's permission only."""
+    target = tmp_path / "a.txt"
+    target.write_text("earlier")
+    target.chmod(0o444)
+    with pytest.raises(ClodError, match="a.txt: is write-protected; choose another output"), atomic_path(target):
+        pass
+    assert target.read_text() == "earlier" and list(tmp_path.iterdir()) == [target]
