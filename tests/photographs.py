@@ -13,6 +13,27 @@ from clod_adapter.cameras import Camera
 from clod_adapter.io.colmap import write_model
 from clod_adapter.io.colmap_library import pycolmap
 
+SIZE = {"width": 160, "height": 120}
+LENSES = {
+    "SIMPLE_RADIAL": [140, 82, 58, -0.12],
+    "RADIAL": [140, 82, 58, -0.15, 0.05],
+    "OPENCV": [140, 142, 82, 58, -0.15, 0.05, 0.004, -0.003],
+    "FULL_OPENCV": [140, 142, 82, 58, -0.15, 0.05, 0.004, -0.003, 0.01, 0.02, 0.01, 0],
+    "FOV": [140, 142, 82, 58, 0.5],
+    "SIMPLE_DIVISION": [140, 82, 58, 0.1],
+    "DIVISION": [140, 142, 82, 58, -0.1],
+    "EUCM": [140, 142, 82, 58, 0.3, 1.1],
+    "SIMPLE_FISHEYE": [100, 82, 58],
+    "FISHEYE": [100, 102, 82, 58],
+    "SIMPLE_RADIAL_FISHEYE": [100, 82, 58, 0.03],
+    "RADIAL_FISHEYE": [100, 82, 58, 0.03, -0.01],
+    "OPENCV_FISHEYE": [100, 102, 82, 58, 0.03, -0.01, 0.002, 0.001],
+    "THIN_PRISM_FISHEYE": [100, 102, 82, 58, 0.03, -0.01, 0.001, 0.002, 0.01, 0.02, 0.001, 0.002],
+    "RAD_TAN_THIN_PRISM_FISHEYE": [
+        *(100, 102, 82, 58, 0.03, -0.01, 0.01, 0.002, 0.001, 0.0003, 0.002, -0.003, 0.004, 0.001, -0.002, 0.003)
+    ],
+}
+
 
 def pose(seed: int) -> torch.Tensor:
     rotation, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))

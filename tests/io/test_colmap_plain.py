@@ -16,28 +16,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io import colmap, colmap_model, colmap_plain, colmap_records, undistort
 from clod_adapter.io.colmap_model import read_model
 from clod_adapter.io.scene import load_scene
-from photographs import as_text, camera, pixels, seen, write_scene
-
-SIZE = {"width": 160, "height": 120}
-LENSES = {
-    "SIMPLE_RADIAL": [140, 82, 58, -0.12],
-    "RADIAL": [140, 82, 58, -0.15, 0.05],
-    "OPENCV": [140, 142, 82, 58, -0.15, 0.05, 0.004, -0.003],
-    "FULL_OPENCV": [140, 142, 82, 58, -0.15, 0.05, 0.004, -0.003, 0.01, 0.02, 0.01, 0],
-    "FOV": [140, 142, 82, 58, 0.5],
-    "SIMPLE_DIVISION": [140, 82, 58, 0.1],
-    "DIVISION": [140, 142, 82, 58, -0.1],
-    "EUCM": [140, 142, 82, 58, 0.3, 1.1],
-    "SIMPLE_FISHEYE": [100, 82, 58],
-    "FISHEYE": [100, 102, 82, 58],
-    "SIMPLE_RADIAL_FISHEYE": [100, 82, 58, 0.03],
-    "RADIAL_FISHEYE": [100, 82, 58, 0.03, -0.01],
-    "OPENCV_FISHEYE": [100, 102, 82, 58, 0.03, -0.01, 0.002, 0.001],
-    "THIN_PRISM_FISHEYE": [100, 102, 82, 58, 0.03, -0.01, 0.001, 0.002, 0.01, 0.02, 0.001, 0.002],
-    "RAD_TAN_THIN_PRISM_FISHEYE": [
-        *(100, 102, 82, 58, 0.03, -0.01, 0.01, 0.002, 0.001, 0.0003, 0.002, -0.003, 0.004, 0.001, -0.002, 0.003)
-    ],
-}
+from photographs import LENSES, SIZE, as_text, camera, pixels, seen, write_scene
 
 
 @pytest.fixture

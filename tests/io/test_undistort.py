@@ -12,24 +12,7 @@ from clod_adapter.cameras import Scene, View
 from clod_adapter.errors import ClodError
 from clod_adapter.io.colmap_library import pycolmap
 from clod_adapter.io.scene import load_scene
-from photographs import model_of, psnr_of, seen
-
-SIZE = {"width": 160, "height": 120}
-LENSES = {
-    "SIMPLE_RADIAL": [140, 82, 58, -0.12],
-    "RADIAL": [140, 82, 58, -0.15, 0.05],
-    "OPENCV": [140, 142, 82, 58, -0.15, 0.05, 0.004, -0.003],
-    "FULL_OPENCV": [140, 142, 82, 58, -0.15, 0.05, 0.004, -0.003, 0.01, 0.02, 0.01, 0],
-    "FOV": [140, 142, 82, 58, 0.5],
-    "DIVISION": [140, 142, 82, 58, -0.1],
-    "EUCM": [140, 142, 82, 58, 0.3, 1.1],
-    "SIMPLE_FISHEYE": [100, 82, 58],
-    "FISHEYE": [100, 102, 82, 58],
-    "SIMPLE_RADIAL_FISHEYE": [100, 82, 58, 0.03],
-    "RADIAL_FISHEYE": [100, 82, 58, 0.03, -0.01],
-    "OPENCV_FISHEYE": [100, 102, 82, 58, 0.03, -0.01, 0.002, 0.001],
-    "THIN_PRISM_FISHEYE": [100, 102, 82, 58, 0.03, -0.01, 0.001, 0.002, 0, 0, 0.001, 0.001],
-}
+from photographs import LENSES, SIZE, model_of, psnr_of, seen
 
 
 @pytest.fixture(autouse=True)
