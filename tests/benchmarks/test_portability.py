@@ -63,6 +63,8 @@ def already(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
     ],
 )
 def test_a_condition_and_its_counts(tmp_path: Path, already: set[str], condition: str, holds: set[str]) -> None:
+    if condition == "c_locale" and not str(tmp_path).isascii():
+        pytest.skip("pytest itself fails in that locale where its folders have other letters")
     found = run_made(tmp_path, condition)
     holds = holds | already
     assert [found[key] for key in ("passed", "failed", "skipped")] == [len(holds), 5 - len(holds), 1], found
