@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import pickle
 import re
 import time
@@ -113,7 +114,7 @@ class Peers:
 def joined(store: Store, rank: int, size: int) -> Iterator[Peers]:
     """Within, this process trains with the others that enter with the same ``store``: gloo on CPUs, NCCL on GPUs."""
     nccl = torch.cuda.is_available() and dist.is_nccl_available()
-    with _losses():
+    with _losses(), _silent_stdout():
         dist.init_process_group(
             "cpu:gloo,cuda:nccl" if nccl else "gloo", store=store, rank=rank, world_size=size, timeout=PATIENCE
         )
@@ -121,6 +122,23 @@ def joined(store: Store, rank: int, size: int) -> Iterator[Peers]:
         yield Peers()
     finally:
         dist.destroy_process_group()
+
+
+@contextmanager
+def _silent_stdout() -> Iterator[None]:
+    """Nothing is written to the file descriptor of stdout: gloo prints there whom it connected, as in torch 2.9.1."""
+    try:
+        stdout = os.dup(1)
+    except OSError:  # it is closed
+        yield
+        return
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 1)
+        yield
+    finally:
+        os.dup2(stdout, 1)
+        os.close(stdout)
 
 
 @contextmanager

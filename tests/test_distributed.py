@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -70,3 +71,12 @@ def test_a_loss_is_told_from_other_errors() -> None:
         raise RuntimeError("[/a/b/pair.cc:547] Connection closed by peer [127.0.0.1]:1. This may be caused by\nmore")
     with pytest.raises(torch.OutOfMemoryError), distributed._losses():
         raise torch.OutOfMemoryError("CUDA out of memory")
+
+
+def test_connecting_prints_nothing(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    """Of some versions of torch gloo does, from C++, into what --json prints."""
+    monkeypatch.setattr(dist, "init_process_group", lambda *_, **__: os.write(1, b"[Gloo] Rank 0 is connected\n"))
+    monkeypatch.setattr(dist, "destroy_process_group", lambda: None)
+    with joined(dist.HashStore(), 0, 1):
+        os.write(1, b"after\n")
+    assert capfd.readouterr().out == "after\n"

@@ -52,7 +52,8 @@ def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
         tensors, metadata = read_tensors(path)
         about = _typed(json.loads(metadata[KEY]), dict)
         belongs, random = _typed(about.pop("belongs"), dict), _typed(about.pop("random"), dict)
-        attenuation = AttenuationConfig(**about.pop("attenuation"))
+        settings = _typed(about.pop("attenuation"), dict)
+        attenuation = AttenuationConfig(**{name: _typed(each, float, int, str) for name, each in settings.items()})
         order = tuple(_typed(view, int) for view in _typed(about.pop("order"), list))
         counts = {name: _typed(about.pop(name), int) for name in ("averaged", "steps")}
         rest = {name: float(_typed(value, float, int)) for name, value in about.items()}
