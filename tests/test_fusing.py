@@ -97,9 +97,9 @@ def test_compiled_it_is_the_same_to_rounding(request: pytest.FixtureRequest, for
 
 
 def assert_same(found: list[Tensor], want: list[Tensor]) -> None:
-    for k, (mine, expected) in enumerate(zip(found, want, strict=True)):
-        rtol, atol = (1e-5, 1e-6) if k % 6 > 3 else (1e-6, 1e-7)  # a gradient; a value
-        torch.testing.assert_close(mine.float(), expected.float(), rtol=rtol, atol=atol, equal_nan=True)
+    """Within some roundings of float32: another torch fuses other operations."""
+    for mine, expected in zip(found, want, strict=True):
+        torch.testing.assert_close(mine.float(), expected.float(), rtol=1e-5, atol=1e-6, equal_nan=True)
 
 
 def test_a_failure_to_compile_is_said_once_and_survived(
