@@ -115,10 +115,15 @@ def test_one_that_covers_the_whole_image(rasterize: Rasterizer, opacity: float) 
     "scales", [(1.0, 1e-6, 1e-6), (0.3, 3e-7, 3e-7), (0.3, 0.3, 3e-7)], ids=["needle", "short", "disc"]
 )
 def test_axis_ratio_of_a_million(rasterize: Rasterizer, scales: tuple[float, float, float], seed: int) -> None:
-    """A needle of a thousand pixels cancels three digits of its exponent: the image's bound is wider here."""
+    """Bounds of a needle are wider: its exponent is a small difference of terms of up to ``61^2 / (2 x 0.3) = 6,200``.
+
+    Each is rounded by ``2^-24`` of itself in float32, in all by about 1e-3. Processors round differently: 40 seeds
+    reach 4.7e-4 in the image and 3e-3 in the gradients on one of them.
+    """
     some = scene(80, 1, seed)
     some["scales"] = torch.tensor(scales).repeat(80, 1)
-    assert_agrees(rasterize, some, camera(), image=3e-4)
+    wider = {} if scales[1] > 1e-3 else {"image": 1e-3, "gradient": 1e-2}
+    assert_agrees(rasterize, some, camera(), **wider)
 
 
 @pytest.mark.parametrize("length", [1e-8, 0.0, 1e2, 1e3, 1e4])
