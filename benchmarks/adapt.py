@@ -24,7 +24,7 @@ from typing import Any
 from common import RESULTS, append, capture
 
 import clod_adapter as clod
-from clod_adapter.popping import dial_popping, path_popping
+from clod_adapter.evaluation.popping import dial_popping, path_popping
 
 FILE = "adapt.jsonl"
 DIALS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 14.0)

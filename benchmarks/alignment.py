@@ -22,11 +22,11 @@ from common import append, capture
 from torch import Tensor
 
 import clod_adapter as clod
-from clod_adapter.alignment import DOUBTFUL, check_alignment
-from clod_adapter.alignment_guess import guess_frame
+from clod_adapter.alignment.check import DOUBTFUL, check_alignment
+from clod_adapter.alignment.search import guess_frame
 from clod_adapter.cameras import View
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.colmap import load_points
+from clod_adapter.io.scene.colmap import load_points
 
 SCENES = ("plush_half", "ci_banana", "bonsai146")
 EYE = torch.eye(3, dtype=torch.float64)

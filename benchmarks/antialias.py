@@ -25,9 +25,9 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 from common import append, capture
 from tuning import Tuning, tune
 
-from clod_adapter.antialiasing import compare_filters
+from clod_adapter.alignment.screen_filter import compare_filters
 from clod_adapter.config import CLASSIC, FILTERS
-from clod_adapter.evaluate import evaluate
+from clod_adapter.evaluation.evaluate import evaluate
 
 FILE = "antialias.jsonl"
 CLASSIC_FILES = {

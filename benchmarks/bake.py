@@ -31,10 +31,10 @@ from common import RESULTS, append, capture
 import clod_adapter as clod
 from clod_adapter.attenuation import attenuate
 from clod_adapter.calibration import Viewpoint
-from clod_adapter.cli.baking import PLACED
-from clod_adapter.cli.budgets import VIEWPOINTS
+from clod_adapter.cli.export.baking import PLACED
+from clod_adapter.cli.shared.budgets import VIEWPOINTS
 from clod_adapter.extinction import extinction_scale
-from clod_adapter.importance import spread
+from clod_adapter.initialization.importance import spread
 from clod_adapter.viewpoints import viewpoint_of
 
 FILE = "bake.jsonl"

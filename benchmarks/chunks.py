@@ -27,17 +27,17 @@ import torch
 from city import write_city
 from common import append, capture
 
+from clod_adapter.blocks.divide import Division, divide
+from clod_adapter.blocks.targets import target
+from clod_adapter.blocks.train import adapt_chunk, merge
 from clod_adapter.cameras import View
-from clod_adapter.chunks import adapt_chunk, merge
-from clod_adapter.chunks_aims import target
-from clod_adapter.chunks_division import Division, divide
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.importance import seeing
-from clod_adapter.io.ply import load
-from clod_adapter.io.scene import load_scene
+from clod_adapter.initialization.importance import seeing
+from clod_adapter.io.checkpoint import load
+from clod_adapter.io.scene.load import load_scene
 from clod_adapter.render import render
-from clod_adapter.train import adapt
+from clod_adapter.training.loop import adapt
 
 DIALS = (1.0, 3.0, 5.0)
 SOLE = 0.9

@@ -27,8 +27,8 @@ from clod_adapter.cameras import Camera
 from clod_adapter.config import SH_COUNTS
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.colmap import write_model
-from clod_adapter.io.ply import save
+from clod_adapter.io.checkpoint import save
+from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.rasterizers.reference import sh_basis
 from clod_adapter.render import render
 

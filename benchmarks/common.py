@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import clod_adapter
-from clod_adapter.cli.report import jsonable, machine
+from clod_adapter.cli.shared.report import jsonable, machine
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"

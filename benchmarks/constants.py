@@ -28,8 +28,8 @@ from plyfile import PlyData, PlyElement
 
 import clod_adapter as clod
 from clod_adapter.errors import ClodError
-from clod_adapter.io.silence import WARNING
-from clod_adapter.io.splat_transform import SplatTransform, time_limit
+from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
+from clod_adapter.io.settings import WARNING
 from clod_adapter.render import render
 from clod_adapter.units import with_distance
 

@@ -22,10 +22,10 @@ from common import ROOT, append
 from torch import Tensor
 
 import clod_adapter as clod
-from clod_adapter import popping
-from clod_adapter.cli.console import Console
+from clod_adapter.cli.shared.console import Console
+from clod_adapter.evaluation import popping
+from clod_adapter.evaluation.popping import Popping
 from clod_adapter.metrics import psnr
-from clod_adapter.popping import Popping
 from clod_adapter.report.style import BLUE, ORANGE, QUIET, new_figure, save, tidy
 
 PICTURE = ROOT / "docs" / "images" / "discrete_vs_continuous.png"

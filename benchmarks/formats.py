@@ -26,8 +26,8 @@ import torch
 from common import RESULTS, append, capture
 
 import clod_adapter as clod
-from clod_adapter.importance import seeing, start
-from clod_adapter.io.models import load_model
+from clod_adapter.initialization.importance import seeing, start
+from clod_adapter.io.formats.models import load_model
 from clod_adapter.io.writers import WRITERS, write
 
 FILE = "formats.jsonl"

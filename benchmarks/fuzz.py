@@ -35,9 +35,9 @@ import torch
 from common import append
 from mutants import FORMATS, Input, make, mutate, write, write_images
 
-from clod_adapter.cli.console import Console
-from clod_adapter.cli.interrupts import GracefulStop
-from clod_adapter.cli.resume import Saver
+from clod_adapter.cli.adapt.resume import Saver
+from clod_adapter.cli.shared.console import Console
+from clod_adapter.cli.shared.interrupts import GracefulStop
 from clod_adapter.errors import ClodError
 from clod_adapter.io.adapter_file import load_adapter
 

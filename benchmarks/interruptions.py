@@ -20,10 +20,10 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 import torch
 from common import append, capture
 
-from clod_adapter.cli.console import Console
-from clod_adapter.cli.interrupts import GracefulStop
-from clod_adapter.cli.resume import Saver
-from clod_adapter.io.state_file import load_state
+from clod_adapter.cli.adapt.resume import Saver
+from clod_adapter.cli.shared.console import Console
+from clod_adapter.cli.shared.interrupts import GracefulStop
+from clod_adapter.training.state_file import load_state
 
 FILE = "resume.jsonl"
 THREADS = 2

@@ -10,7 +10,7 @@ from pathlib import Path
 from plyfile import PlyData, PlyElement
 
 import clod_adapter as clod
-from clod_adapter.io.splat_transform import SplatTransform
+from clod_adapter.io.formats.splat_transform import SplatTransform
 
 TIMEOUT = 3600.0  # seconds
 

@@ -29,11 +29,11 @@ from plyfile import PlyData, PlyElement
 
 import clod_adapter as clod
 from clod_adapter.io.adapter_file import save_adapter
-from clod_adapter.io.ply_columns import inria_dtype
-from clod_adapter.io.ply_header import read_head
-from clod_adapter.io.state_file import save_state
-from clod_adapter.io.version import package_version
-from clod_adapter.training_state import TrainingState
+from clod_adapter.io.ply.columns import inria_dtype
+from clod_adapter.io.ply.header import read_head
+from clod_adapter.training.state import TrainingState
+from clod_adapter.training.state_file import save_state
+from clod_adapter.version import package_version
 
 Input = dict[str, bytes]
 FORMATS = ("ply", "safetensors", "states", "colmap", "transforms", "pt", "models")

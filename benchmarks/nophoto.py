@@ -24,7 +24,7 @@ from adapt import at_shares
 from common import RESULTS, append, capture
 
 import clod_adapter as clod
-from clod_adapter.placement import complement, imagine, place, typical_reach
+from clod_adapter.training.pseudo_views import complement, imagine, place, typical_reach
 
 FILE = "nophoto.jsonl"
 KINDS = ("photographs", "teacher", "placed", "complemented")

@@ -22,7 +22,7 @@ from typing import Any
 
 from common import RESULTS, SHARED, append
 
-from clod_adapter.cli.help_plan import NAMES
+from clod_adapter.cli.commands.plan import NAMES
 
 FILE = "plan.jsonl"
 SCENES = (

@@ -29,8 +29,8 @@ from common import RESULTS, append, capture
 from torch import Tensor
 
 import clod_adapter as clod
-from clod_adapter.cli.console import Console
-from clod_adapter.importance import removal_error
+from clod_adapter.cli.shared.console import Console
+from clod_adapter.initialization.importance import removal_error
 
 FILE = "prefix.jsonl"
 DIALS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)

@@ -28,7 +28,7 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 import torch
 from common import append, capture
 
-from clod_adapter.distributed import joined
+from clod_adapter.training.distributed import joined
 
 FILE = "processes.jsonl"
 CORES = 2

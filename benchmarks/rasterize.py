@@ -35,7 +35,7 @@ import workloads
 from common import ROOT, append
 from contenders import SHARES, THREADS, Worker
 
-from clod_adapter.cli.report import jsonable
+from clod_adapter.cli.shared.report import jsonable
 
 FILE = "rasterize.jsonl"
 YARDSTICK = Path(os.environ.get("CLOD_YARDSTICK", ROOT.parent / "shared" / "yardstick"))

@@ -32,9 +32,9 @@ from torch import Tensor
 from tuning import RATES, Tuning, tune
 
 import clod_adapter as clod
-from clod_adapter.cli.console import Console
+from clod_adapter.cli.shared.console import Console
 from clod_adapter.gaussians import SH_C0
-from clod_adapter.importance import removal_error
+from clod_adapter.initialization.importance import removal_error
 from clod_adapter.render import splat
 
 FILE = "rivals.jsonl"

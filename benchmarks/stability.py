@@ -20,7 +20,7 @@ import stability_scenes
 import stability_stiffness
 from common import RESULTS, ROOT, commit
 
-from clod_adapter.cli.report import jsonable, machine
+from clod_adapter.cli.shared.report import jsonable, machine
 
 FILE, PAGE, IMAGES = RESULTS / "stability.jsonl", ROOT / "docs" / "stability.md", ROOT / "docs" / "images"
 PARTS = {

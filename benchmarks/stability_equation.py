@@ -31,8 +31,8 @@ from torch import Tensor
 import exact
 from clod_adapter.attenuation import SIGMA_MAX, attenuate, log_attenuation
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.counting import count_slope, soft_count
 from clod_adapter.extinction import extinction_scale, sigma_for_extinction
+from clod_adapter.training.target_count import count_slope, soft_count
 from exact import DTYPES, Array, Case, Wide, plain, tensor, wide
 
 NAIVE = 1e3  # units of eps from which on the paper's formula has failed

@@ -30,8 +30,8 @@ from plyfile import PlyData, PlyElement
 import clod_adapter as clod
 from clod_adapter.cameras import Camera, Scene, View, in_its_unit
 from clod_adapter.gaussians import SH_C0
-from clod_adapter.io.colmap import write_model
-from clod_adapter.placement import complement
+from clod_adapter.io.scene.colmap import write_model
+from clod_adapter.training.pseudo_views import complement
 
 CAPTURE, STEPS, ALLOWED = "ci_banana", 200, 0.3
 RATIO = math.log(1e6)

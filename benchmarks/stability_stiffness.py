@@ -32,10 +32,10 @@ from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.attenuation import Attenuated, attenuate, normalized_distances
-from clod_adapter.counting import count_gradient
-from clod_adapter.objective import SIGMA_RANGE
-from clod_adapter.optimizer import RowAdam
 from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, PURPLE, QUIET, label_log, new_figure, save, tidy
+from clod_adapter.training.objective import SIGMA_RANGE
+from clod_adapter.training.optimizer import RowAdam
+from clod_adapter.training.target_count import count_gradient
 
 PICTURE = "stability_stiffness.png"
 RATES = tuple(10 ** (k / 2) for k in range(-8, 1))  # 1e-4 to 1 in half decades

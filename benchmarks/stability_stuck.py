@@ -25,12 +25,12 @@ from clod_adapter.adapter import attach
 from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances
 from clod_adapter.cameras import Camera, View
 from clod_adapter.config import AdaptConfig
-from clod_adapter.counting import count_gradient, count_law, soft_count
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.importance import sigma_from_importance
+from clod_adapter.initialization.importance import sigma_from_importance
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import render
-from clod_adapter.train import _Run
+from clod_adapter.training.loop import _Run
+from clod_adapter.training.target_count import count_gradient, count_law, soft_count
 
 FROZEN = {f"lr_{name}": 0.0 for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
 CONFIG = AdaptConfig(**FROZEN)

@@ -22,10 +22,10 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 import torch
 from common import append, capture
 
-from clod_adapter import optimizer, train
 from clod_adapter._kernels import threads
-from clod_adapter.importance import for_training, start
+from clod_adapter.initialization.importance import for_training, start
 from clod_adapter.rasterizers import cpu
+from clod_adapter.training import loop, optimizer
 
 FILE = "step.jsonl"
 THREADS = 2
@@ -62,10 +62,10 @@ def main() -> None:
     torch.set_num_threads(THREADS)
     clock = Clock()
     clock.wrap(threads, "run")
-    clock.wrap(train, "attenuate", "attenuate")
-    clock.wrap(train, "count_gradient", "count")
-    clock.wrap(train, "splat", "splat forward")
-    clock.wrap(train, "photometric_loss", "loss")
+    clock.wrap(loop, "attenuate", "attenuate")
+    clock.wrap(loop, "count_gradient", "count")
+    clock.wrap(loop, "splat", "splat forward")
+    clock.wrap(loop, "photometric_loss", "loss")
     clock.wrap(torch.autograd, "grad", "backward")
     clock.wrap(cpu._Splat, "backward", "splat backward")
     clock.wrap(optimizer.RowAdam, "step", "optimiser")
@@ -82,7 +82,7 @@ def profile(scene: str, steps: int, clock: Clock, warm: int = 5) -> dict[str, An
     base, views = clod.load(capture(scene) / "pretrained.ply").gaussians, clod.load_scene(capture(scene)).train
     config = clod.AdaptConfig()
     begun = for_training(start(base, views, config), views, config)
-    run = train._Run(begun, views, config, None)
+    run = loop._Run(begun, views, config, None)
     for _ in range(warm):
         run.step(0.0)
     clock.seconds.clear()

@@ -21,7 +21,7 @@ from typing import Any
 from common import RESULTS, ROOT, append, capture
 
 import clod_adapter as clod
-from clod_adapter.cli.console import Console
+from clod_adapter.cli.shared.console import Console
 from clod_adapter.report import page
 from clod_adapter.report.charts import draw_training, error, inline_svg, training_chart
 from clod_adapter.report.style import new_figure, save

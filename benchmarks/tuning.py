@@ -16,8 +16,8 @@ from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES, detach
 from clod_adapter.cameras import camera_extent
 from clod_adapter.losses import photometric_loss
-from clod_adapter.optimizer import RowAdam
 from clod_adapter.render import splat
+from clod_adapter.training.optimizer import RowAdam
 
 # 3DGS's rates of training; means times the cameras' extent.
 RATES = {"means": 1.6e-4, "quats": 1e-3, "log_scales": 5e-3, "opacity_logits": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}

@@ -27,7 +27,7 @@ from common import ROOT, append, capture
 import clod_adapter as clod
 from clod_adapter.adapter import detach
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.io.splat_transform import SplatTransform
+from clod_adapter.io.formats.splat_transform import SplatTransform
 from clod_adapter.viewer.page import write_page
 
 sys.path.insert(0, str(ROOT / "tests"))

@@ -6,14 +6,15 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from clod_adapter.cli.console import Console
-from clod_adapter.cli.files import size
-from clod_adapter.cli.inputs import read_checkpoint
 from clod_adapter.errors import ClodError
 from clod_adapter.io.adapter_file import load_adapter
-from clod_adapter.io.ply import save
+from clod_adapter.io.checkpoint import save
 from clod_adapter.io.trimming import trimmed
-from clod_adapter.io.version import package_version
+from clod_adapter.version import package_version
+
+from .shared.console import Console
+from .shared.files import size
+from .shared.inputs import read_checkpoint
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:

@@ -9,22 +9,23 @@ from typing import Any
 
 import torch
 
-from clod_adapter.cli import adapt
-from clod_adapter.cli.commands import ADAPT
-from clod_adapter.cli.console import Console, duration
-from clod_adapter.cli.files import Outputs, make_folder
-from clod_adapter.cli.kernels import announced_compiling, prepare_kernels
-from clod_adapter.cli.outputs import check_outputs
-from clod_adapter.cli.parser import make_parser
-from clod_adapter.cli.report import Stopwatch
 from clod_adapter.demo.pictures import Panel, dial_strip, quality_curve
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluate import evaluate
+from clod_adapter.evaluation.evaluate import evaluate
+from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.claims import claimed
-from clod_adapter.io.ply import load, save
-from clod_adapter.io.scene import load_scene
+from clod_adapter.io.scene.load import load_scene
 from clod_adapter.render import render
-from clod_adapter.train import Progress
+from clod_adapter.training.loop import Progress
+
+from .adapt import run as adapt
+from .commands.adapt import ADAPT
+from .commands.parser import make_parser
+from .shared.console import Console, duration
+from .shared.files import Outputs, make_folder
+from .shared.kernels import announced_compiling, prepare_kernels
+from .shared.outputs import check_outputs
+from .shared.report import Stopwatch
 
 POINTS, FIT_STEPS, ADAPT_STEPS, MAX_SV = 60_000, 2000, 1000, 5.0
 DIALS = (1.0, 2.0, 3.0, 5.0)

@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from clod_adapter.cameras import View
-from clod_adapter.cli.antialiasing import with_filter
-from clod_adapter.cli.budgets import solve_dials
-from clod_adapter.cli.console import Console
-from clod_adapter.cli.devices import on_device, pick_device
-from clod_adapter.cli.inputs import read_checkpoint, read_scene
-from clod_adapter.cli.instruments import Instruments
-from clod_adapter.cli.interrupts import GracefulStop
-from clod_adapter.cli.kernels import prepare_kernels
-from clod_adapter.cli.pages import write_eval_page
-from clod_adapter.cli.report import Stopwatch, machine, table
-from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluate import Row, evaluate
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.ply import Checkpoint
-from clod_adapter.io.version import package_version
-from clod_adapter.perceptual import Metric, available_metrics
+from clod_adapter.evaluation.perceptual import available_metrics
+from clod_adapter.io.checkpoint import Checkpoint
+from clod_adapter.version import package_version
 
-DIALS = (1.0, 2.0, 3.0, 5.0)
+from .comparisons import Instruments
+from .shared.antialiasing import with_filter
+from .shared.budgets import solve_dials
+from .shared.console import Console
+from .shared.devices import on_device, pick_device
+from .shared.inputs import read_checkpoint, read_scene
+from .shared.kernels import prepare_kernels
+from .shared.measure import choose_dials, measure
+from .shared.pages import write_eval_page
+from .shared.report import Stopwatch, machine, table
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
@@ -76,38 +70,3 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         "device": str(model.gaussians.means.device), "seconds": watch.report(),
     }  # fmt: skip
     return report | write_eval_page(args, report, model.gaussians, base, scene, console)
-
-
-def choose_dials(given: list[float] | None, attenuation: AttenuationConfig | None) -> tuple[list[float], list[str]]:
-    """The dial values to measure, and a note where they are beyond what the file was trained for."""
-    trained = attenuation.max_sv if attenuation else None
-    if given is None:
-        return [s for s in DIALS if trained is None or s < trained] + ([trained] if trained else []), []
-    if trained is None or max(given) <= trained:
-        return given, []
-    return given, [f"trained up to s = {trained:g}; beyond that nothing was learned"]
-
-
-def measure(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    virtual_scales: Sequence[float],
-    console: Console,
-    label: str = "measure",
-    metrics: Mapping[str, Metric] | None = None,
-) -> tuple[list[Row], bool]:
-    """The rows of the dial values, none where there are no views, and whether Ctrl-C cut them short."""
-    rows, stop = list[Row](), GracefulStop()  # raised between frames: within a kernel it would be a SystemError
-    with console.meter(label) as meter, stop.listening():
-        try:
-            for i, virtual_scale in enumerate(virtual_scales if views else ()):
-
-                def report(done: int, total: int, before: int = i, s: float = virtual_scale) -> None:
-                    meter.update((before + done / total) / len(virtual_scales), f"s={s:g}")
-                    if stop.requests:
-                        raise KeyboardInterrupt
-
-                rows += evaluate(gaussians, views, [virtual_scale], metrics=metrics, progress=report)
-        except KeyboardInterrupt:
-            return rows, True
-    return rows, stop.requests > 0

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from clod_adapter.calibration import Calibration
-from clod_adapter.cli.console import duration
-from clod_adapter.cli.files import size
-from clod_adapter.inspection import Inspection, Splat, inspect
-from clod_adapter.inspection_values import Spread
-from clod_adapter.io.silence import WARNING
-from clod_adapter.io.version import package_version
+from clod_adapter.inspection.report import Inspection, Splat, inspect
+from clod_adapter.inspection.statistics import Spread
+from clod_adapter.io.settings import WARNING
+from clod_adapter.version import package_version
+
+from .shared.console import duration
+from .shared.files import size
 
 WIDTH = 13  # of the names at the left
 MOST_ROWS = 8  # of a calibration: the first and last are always shown

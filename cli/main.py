@@ -13,17 +13,24 @@ from contextlib import nullcontext, redirect_stdout
 from importlib import import_module
 from typing import Any
 
-from clod_adapter.cli.commands import ADAPT, APPLY, DEMO, EVALUATE, RENDER, ROBUSTNESS, Command
-from clod_adapter.cli.help_doctor import DOCTOR
-from clod_adapter.cli.help_export import EXPORT
-from clod_adapter.cli.help_inspect import INSPECT
-from clod_adapter.cli.help_view import VIEW
-from clod_adapter.cli.interrupts import sigterm_as_interrupt
-from clod_adapter.cli.launch import launched, silence_but_first
-from clod_adapter.cli.parser import Parser, make_parser
-from clod_adapter.cli.shortages import check_addresses, shortage
 from clod_adapter.errors import ClodError
-from clod_adapter.io.version import package_version
+from clod_adapter.version import package_version
+
+from .commands.adapt import ADAPT
+from .commands.apply import APPLY
+from .commands.command import Command
+from .commands.demo import DEMO
+from .commands.doctor import DOCTOR
+from .commands.evaluate import EVALUATE
+from .commands.export import EXPORT
+from .commands.inspect import INSPECT
+from .commands.parser import Parser, make_parser
+from .commands.render import RENDER
+from .commands.robustness import ROBUSTNESS
+from .commands.view import VIEW
+from .shared.interrupts import sigterm_as_interrupt
+from .shared.launch import launched, silence_but_first
+from .shared.shortages import check_addresses, shortage
 
 PROG = "clod-adapt"
 REPORT = "please report it, with the lines above, as an issue of the repository that this program is from"
@@ -100,7 +107,7 @@ def run_here(command: Command, args: argparse.Namespace) -> int:
         return run(command, args)
     if command is not ADAPT:
         raise ClodError("only adapting takes several processes; run this command without torchrun")
-    from clod_adapter.cli.processes import leading, take_part
+    from .adapt.processes import leading, take_part
 
     if launch.rank > 0:
         with sigterm_as_interrupt():
@@ -116,10 +123,9 @@ def run(command: Command, args: argparse.Namespace) -> int:
     Returns:
         The exit code that the report has, or 0.
     """
-    from clod_adapter.cli.checks import CHECKS  # here and not above, as --help needs nothing of what it imports
-    from clod_adapter.cli.report import jsonable
+    from .shared.report import jsonable
 
-    CHECKS[command.module](args)
+    command.check(args)
     module = import_command(command, args)
     aside = io.StringIO() if args.quiet else sys.stderr
     with redirect_stdout(aside) if args.json else nullcontext(), sigterm_as_interrupt():
@@ -131,10 +137,10 @@ def run(command: Command, args: argparse.Namespace) -> int:
 
 def import_command(command: Command, args: argparse.Namespace) -> Any:
     """The command's module, with torch and all, which takes a second or two."""
-    from clod_adapter.cli.console import Console
+    from .shared.console import Console
 
     check_addresses()
-    name = f"clod_adapter.cli.{command.module}"
+    name = f"{__package__}.{command.module}"
     if name in sys.modules:
         return sys.modules[name]
     gc.disable()  # a tenth of the time, with nothing to collect

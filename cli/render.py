@@ -13,25 +13,27 @@ import torch
 from PIL import Image, PngImagePlugin
 from torch import Tensor
 
-from clod_adapter.cameras import Camera, Scene, View
-from clod_adapter.cli.antialiasing import with_filter
-from clod_adapter.cli.budgets import solve_dials
-from clod_adapter.cli.console import Console
-from clod_adapter.cli.devices import on_device, pick_device
-from clod_adapter.cli.evaluate import choose_dials
-from clod_adapter.cli.files import make_folder
-from clod_adapter.cli.inputs import read_checkpoint, read_scene
-from clod_adapter.cli.kernels import prepare_kernels
-from clod_adapter.cli.outputs import check_no_input, check_ours
-from clod_adapter.cli.report import Stopwatch
+from clod_adapter._support.text import file_name
+from clod_adapter.cameras import View
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.claims import claimed
-from clod_adapter.io.version import package_version
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
-from clod_adapter.text import file_name
+from clod_adapter.version import package_version
+
+from .shared.antialiasing import with_filter
+from .shared.budgets import solve_dials
+from .shared.console import Console
+from .shared.devices import on_device, pick_device
+from .shared.files import make_folder
+from .shared.inputs import read_checkpoint, read_scene
+from .shared.kernels import prepare_kernels
+from .shared.measure import choose_dials
+from .shared.outputs import check_no_input, check_ours
+from .shared.report import Stopwatch
+from .shared.views import pick_views
 
 
 @dataclass(frozen=True)
@@ -79,36 +81,6 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         "interrupted": interrupted, "notes": [*model.notes, *scene.notes, *notes], "seconds": watch.report(),
         "outputs": {"folder": args.out},
     }  # fmt: skip
-
-
-def pick_views(scene: Scene, wanted: Sequence[str]) -> list[View]:
-    """The held-out views, all, or those named, in the scene's order."""
-    views = sorted([*scene.train, *scene.test], key=lambda view: view.camera.name)
-    if list(wanted) == ["all"]:
-        return views
-    if list(wanted) == ["held-out"]:
-        return list(scene.test or scene.train)  # of a single photograph none is held out
-    cameras = [view.camera for view in views]
-    chosen = {camera.name for name in wanted for camera in named(cameras, name, "--views")}
-    return [view for view in views if view.camera.name in chosen]
-
-
-def named(cameras: Sequence[Camera], name: str, option: str) -> list[Camera]:
-    """Those of the photograph of that whole name; where there is none, without its suffix, its folder, or both.
-
-    Raises:
-        ClodError: no photograph is called that.
-    """
-    whole = [camera for camera in cameras if camera.name == name]
-    if found := whole or [camera for camera in cameras if name in _shorter(camera.name)]:
-        return found
-    some = ", ".join(camera.name for camera in cameras[:3])
-    raise ClodError(f"{option} has {name!r}, and no photograph is called that; names here are like {some}")
-
-
-def _shorter(name: str) -> tuple[str, ...]:
-    path = PureWindowsPath(name)
-    return str(Path(name).with_suffix("")), path.name, path.stem
 
 
 def files(views: Sequence[View]) -> list[Path]:

@@ -9,28 +9,29 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from clod_adapter._support.text import as_text
 from clod_adapter.cameras import Scene
-from clod_adapter.cli.alignment import require_alignment
-from clod_adapter.cli.antialiasing import with_filter
-from clod_adapter.cli.cells import Cell, cells_of
-from clod_adapter.cli.console import Console, Meter, duration
-from clod_adapter.cli.devices import on_device, pick_device
-from clod_adapter.cli.files import labels, make_folder
-from clod_adapter.cli.inputs import read_checkpoint, read_scene
-from clod_adapter.cli.interrupts import GracefulStop
-from clod_adapter.cli.kernels import prepare_kernels
-from clod_adapter.cli.outputs import check_outputs
-from clod_adapter.cli.report import Stopwatch, machine, report_dials, write_report
-from clod_adapter.cli.settings import make_configs
 from clod_adapter.errors import ClodError
+from clod_adapter.evaluation.robustness import Outcome, adapt_at_range, baseline, scene_fingerprint
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.claims import claimed
-from clod_adapter.io.ply import Checkpoint
-from clod_adapter.io.version import package_version
 from clod_adapter.report.robustness_figure import robustness_figure
-from clod_adapter.robustness import Outcome, adapt_at_range, baseline, scene_fingerprint
-from clod_adapter.text import as_text
-from clod_adapter.train import Progress
+from clod_adapter.training.loop import Progress
+from clod_adapter.version import package_version
+
+from .commands.settings import make_configs
+from .robustness_cells import Cell, cells_of
+from .shared.alignment import require_alignment
+from .shared.antialiasing import with_filter
+from .shared.console import Console, Meter, duration
+from .shared.devices import on_device, pick_device
+from .shared.files import labels, make_folder
+from .shared.inputs import read_checkpoint, read_scene
+from .shared.interrupts import GracefulStop
+from .shared.kernels import prepare_kernels
+from .shared.outputs import check_outputs
+from .shared.report import Stopwatch, machine, report_dials, write_report
 
 COLUMNS = (
     "checkpoint", "max_sv", "within_range", "virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"

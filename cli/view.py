@@ -8,17 +8,18 @@ import sys
 from typing import Any
 
 from clod_adapter.cameras import Camera
-from clod_adapter.cli.antialiasing import alike, with_filter
-from clod_adapter.cli.browsers import open_browser
-from clod_adapter.cli.console import Console
-from clod_adapter.cli.dials import opens_at
-from clod_adapter.cli.inputs import read_checkpoint
-from clod_adapter.cli.report import jsonable
-from clod_adapter.io.poses import load_cameras
-from clod_adapter.io.version import package_version
+from clod_adapter.io.scene.poses import load_cameras
+from clod_adapter.version import package_version
 from clod_adapter.viewer.page import policy, served_page
 from clod_adapter.viewer.payload import Payload, page_config
 from clod_adapter.viewer.server import Answer, Server
+
+from .shared.antialiasing import alike, with_filter
+from .shared.browsers import open_browser
+from .shared.console import Console
+from .shared.dials import opens_at
+from .shared.inputs import read_checkpoint
+from .shared.report import jsonable
 
 MODEL, BASE = "/files/model", "/files/base"
 

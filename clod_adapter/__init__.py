@@ -14,7 +14,7 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from clod_adapter._lazy import on_first_use
+from clod_adapter._support.lazy import on_first_use
 
 if "torch" not in sys.modules:
     # GNU OpenMP's idle threads spin by default and take the cores from the splatting threads: measured at
@@ -23,46 +23,46 @@ if "torch" not in sys.modules:
 
 if TYPE_CHECKING:
     from clod_adapter.adapter import Adapter, attach, detach, extract
-    from clod_adapter.budget import DialValue, dial_for
+    from clod_adapter.bake import bake, order_by_extinction
     from clod_adapter.calibration import Calibration
     from clod_adapter.cameras import Camera, Scene, View
     from clod_adapter.config import AdaptConfig, AttenuationConfig, ScreenFilter
     from clod_adapter.errors import ClodError
-    from clod_adapter.evaluate import evaluate
-    from clod_adapter.export import bake, order_by_extinction
+    from clod_adapter.evaluation.budget import DialValue, dial_for
+    from clod_adapter.evaluation.evaluate import evaluate
     from clod_adapter.gaussians import Gaussians
     from clod_adapter.hook import Hook
     from clod_adapter.io.adapter_file import load_adapter, save_adapter
-    from clod_adapter.io.ply import Checkpoint, load, save
-    from clod_adapter.io.scene import load_scene
-    from clod_adapter.objective import Part
-    from clod_adapter.placement import imagine, place
-    from clod_adapter.plan import Decision, Overrule, Plan
-    from clod_adapter.planning import make_plan
+    from clod_adapter.io.checkpoint import Checkpoint, load, save
+    from clod_adapter.io.scene.load import load_scene
     from clod_adapter.render import Rendering, render
-    from clod_adapter.train import Adapted, adapt
+    from clod_adapter.training.loop import Adapted, adapt
+    from clod_adapter.training.objective import Part
+    from clod_adapter.training.plan import Decision, Overrule, Plan
+    from clod_adapter.training.planner import make_plan
+    from clod_adapter.training.pseudo_views import imagine, place
 
 # Imported on first use: torch takes a second or two, which the command's --help and most of its errors do without.
 on_first_use(__name__, {
     "adapter": ("Adapter", "attach", "detach", "extract"),
-    "budget": ("DialValue", "dial_for"),
+    "evaluation.budget": ("DialValue", "dial_for"),
     "calibration": ("Calibration",),
     "cameras": ("Camera", "Scene", "View"),
     "config": ("AdaptConfig", "AttenuationConfig", "ScreenFilter"),
     "errors": ("ClodError",),
-    "evaluate": ("evaluate",),
-    "export": ("bake", "order_by_extinction"),
+    "evaluation.evaluate": ("evaluate",),
+    "bake": ("bake", "order_by_extinction"),
     "gaussians": ("Gaussians",),
     "hook": ("Hook",),
     "io.adapter_file": ("load_adapter", "save_adapter"),
-    "io.scene": ("load_scene",),
-    "io.ply": ("Checkpoint", "load", "save"),
-    "objective": ("Part",),
-    "placement": ("imagine", "place"),
-    "plan": ("Decision", "Overrule", "Plan"),
-    "planning": ("make_plan",),
+    "io.scene.load": ("load_scene",),
+    "io.checkpoint": ("Checkpoint", "load", "save"),
+    "training.objective": ("Part",),
+    "training.pseudo_views": ("imagine", "place"),
+    "training.plan": ("Decision", "Overrule", "Plan"),
+    "training.planner": ("make_plan",),
     "render": ("Rendering", "render"),
-    "train": ("Adapted", "adapt"),
+    "training.loop": ("Adapted", "adapt"),
 })  # fmt: skip
 
 __all__ = [

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-
-from clod_adapter.cli.main import main
+from importlib import import_module
 
 if __name__ == "__main__":
-    sys.exit(main())
+    # By name: in the source tree the command is in cli/, and type checkers find no clod_adapter.cli.
+    sys.exit(import_module("clod_adapter.cli.main").main())

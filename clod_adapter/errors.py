@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from clod_adapter.text import as_text
+from clod_adapter._support.text import as_text
 
 
 class ClodError(Exception):

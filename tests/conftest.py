@@ -24,8 +24,8 @@ import fake_gpu
 from clod_adapter.cameras import Camera
 from clod_adapter.cli.main import main
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.colmap import write_model
-from clod_adapter.io.ply_columns import column_map
+from clod_adapter.io.ply.columns import column_map
+from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import render
 
 fake_gpu.register()

@@ -10,8 +10,8 @@ import torch
 from PIL import Image
 
 from clod_adapter.cameras import Camera
-from clod_adapter.io.colmap import write_model
-from clod_adapter.io.colmap_library import pycolmap
+from clod_adapter.io.scene.colmap import write_model
+from clod_adapter.io.scene.colmap_library import pycolmap
 
 SIZE = {"width": 160, "height": 120}
 LENSES = {

@@ -15,8 +15,8 @@ import numpy as np
 from PIL import Image
 
 from clod_adapter.cameras import Camera
-from clod_adapter.cli.console import Console
 from clod_adapter.cli.main import build_parser
+from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.view import prepare
 from clod_adapter.viewer.payload import page_config
 from clod_adapter.viewer.server import Server

@@ -21,9 +21,9 @@ from clod_adapter.attenuation import (
     normalizing_distance,
 )
 from clod_adapter.cameras import Camera
-from clod_adapter.counting import soft_count
 from clod_adapter.errors import ClodError
 from clod_adapter.extinction import extinction_scale, sigma_for_extinction
+from clod_adapter.training.target_count import soft_count
 from exact import (
     DISTANCES,
     DTYPES,

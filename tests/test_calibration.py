@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from clod_adapter.adapter import attach, extract
 from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluate import Row
+from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
-from clod_adapter.io.ply import load, save
+from clod_adapter.io.checkpoint import load, save
 from scenes import gaussians
 
 number = st.floats(-1e6, 1e6, allow_nan=False)

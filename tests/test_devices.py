@@ -18,25 +18,25 @@ from torch import Tensor
 
 import gsplat_in_torch
 from clod_adapter import Gaussians, evaluate, render
-from clod_adapter.alignment import check_alignment
-from clod_adapter.budget import dial_for, frame_times
+from clod_adapter.alignment.check import check_alignment
+from clod_adapter.bake import bake, order_by_extinction
+from clod_adapter.blocks.divide import divide
+from clod_adapter.blocks.targets import target
+from clod_adapter.blocks.train import adapt_chunk, merge
 from clod_adapter.cameras import Camera, Scene
-from clod_adapter.chunks import adapt_chunk, merge
-from clod_adapter.chunks_aims import target
-from clod_adapter.chunks_division import divide
-from clod_adapter.compare import matching_dial, mean_kept, rankings
 from clod_adapter.config import AdaptConfig
-from clod_adapter.counting import count_gradient, paper_count
-from clod_adapter.export import bake, order_by_extinction
-from clod_adapter.importance import seeing, start
+from clod_adapter.evaluation.baselines import matching_dial, mean_kept, rankings
+from clod_adapter.evaluation.budget import dial_for, frame_times
+from clod_adapter.evaluation.popping import dial_popping, path_popping
+from clod_adapter.initialization.importance import seeing, start
 from clod_adapter.losses import photometric_loss
 from clod_adapter.metrics import psnr_ssim
-from clod_adapter.optimizer import RowAdam
-from clod_adapter.placement import imagine, place
-from clod_adapter.planning import make_plan
-from clod_adapter.popping import dial_popping, path_popping
 from clod_adapter.rasterizers import cpu, cuda
-from clod_adapter.train import adapt
+from clod_adapter.training.loop import adapt
+from clod_adapter.training.optimizer import RowAdam
+from clod_adapter.training.planner import make_plan
+from clod_adapter.training.pseudo_views import imagine, place
+from clod_adapter.training.target_count import count_gradient, paper_count
 from fake_gpu import fake_gpu
 from scenes import capture, gaussians, ring
 
@@ -138,7 +138,7 @@ def test_numbers(setup: Setup) -> None:
 
 
 def test_frame_times(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.import_module("clod_adapter.budget"), "TIMED_REPEATS", 1)
+    monkeypatch.setattr(importlib.import_module("clod_adapter.evaluation.budget"), "TIMED_REPEATS", 1)
     assert all(taken > 0 for _, taken in frame_times(setup.there, setup.cameras[:1]))
 
 
@@ -171,7 +171,7 @@ def test_a_step_of_training(setup: Setup) -> None:
 
 def test_a_whole_training_after_its_plan(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
     """The plan measures, the training goes on from its probe, and what was left out is put back."""
-    monkeypatch.setattr(importlib.import_module("clod_adapter.planning"), "PROBE", 1)
+    monkeypatch.setattr(importlib.import_module("clod_adapter.training.planner"), "PROBE", 1)
     plain, scene = setup.there.replace(sigma_d=None, attenuation=None), Scene(setup.scene.train[:2], ())
     config = AdaptConfig(iters=10, max_sv=4.0)
     plan = make_plan(plain, scene, config)

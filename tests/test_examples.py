@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 import clod_adapter
-from clod_adapter.io.ply import blank
+from clod_adapter.io.checkpoint import blank
 
 FOLDER = Path(__file__).resolve().parents[1] / "examples"
 EXAMPLES = {int(path.name[:2]): path for path in sorted(FOLDER.glob("[0-9]*.py"))}

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from clod_adapter.workers import Job, some
+from clod_adapter._support.workers import Job, some
 
 _lock = threading.Lock()
 _alone, _before = 0, 0  # how many want torch on one thread now, and how many threads it had

@@ -13,7 +13,7 @@ from clod_adapter.attenuation import SIGMA_MAX
 from clod_adapter.cameras import Scene
 from clod_adapter.config import SH_COUNTS, AdaptConfig
 from clod_adapter.gaussians import SH_C0, Gaussians
-from clod_adapter.train import Progress, adapt
+from clod_adapter.training.loop import Progress, adapt
 
 
 def fit_base(

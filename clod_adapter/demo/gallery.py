@@ -21,7 +21,7 @@ from clod_adapter.demo.paths import path_cameras
 from clod_adapter.demo.raytrace import Tables, camera_rays, encode_srgb, render_linear, trace_rays
 from clod_adapter.demo.shapes import Finish, SceneBuilder
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.colmap import write_model
+from clod_adapter.io.scene.colmap import write_model
 
 LOW, HIGH = np.array([-3.0, -3.0, 0.0]), np.array([3.0, 0.0, 8.0])
 CANDIDATES = 4  # pixels looked at per point, of which those with detail are preferred

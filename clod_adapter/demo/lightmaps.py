@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from clod_adapter._support.workers import in_order
 from clod_adapter.demo.intersect import compiled, nearest, surface_point
 from clod_adapter.demo.raytrace import MIRROR_HEIGHT, Tables, radiance, trace_rays
-from clod_adapter.workers import in_order
 
 LIFT = 1e-4  # world units a ray starts above its surface
 GATHER_SPREAD = 0.2  # width of a light-gathering ray per unit of distance: coarse textures, less noise

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from clod_adapter._support.workers import in_order
 from clod_adapter.cameras import Camera
 from clod_adapter.demo.intersect import compiled, nearest, record, sphere_uv, surface_point
-from clod_adapter.workers import in_order
 
 MIRROR_HEIGHT = 24  # rows of a glossy surface's picture of its surroundings; it is twice as wide
 BAND = 16  # image rows per task: small enough to keep every core busy to the end

@@ -22,11 +22,11 @@ from clod_adapter.calibration import Calibration
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.card import FORMAT as MODEL
-from clod_adapter.io.origin import NOWHERE, parse_origin
+from clod_adapter.io.formats.metadata import FORMAT as MODEL
 from clod_adapter.io.screen_filter import entry_of, parse_entry
-from clod_adapter.io.silence import as_before
+from clod_adapter.io.settings import as_before
 from clod_adapter.io.tensor_file import load_tensors
+from clod_adapter.origin import NOWHERE, parse_origin
 
 KEY = "clod_adapter"
 FORMAT = "clod-adapter"

@@ -26,9 +26,9 @@ class Reader(NamedTuple):
     has_dial: str = ""
 
 
-PLY = Reader("ply_rows", "read_ply", "check_ply", "ply_has_dial")
-MODEL = Reader("model_rows", "read_model", "check_model", "model_has_dial")
-CONVERTED = Reader("converted", "read_converted", "check_converted")
+PLY = Reader("ply.rows", "read_ply", "check_ply", "ply_has_dial")
+MODEL = Reader("formats.rows", "read_model", "check_model", "model_has_dial")
+CONVERTED = Reader("formats.converted", "read_converted", "check_converted")
 # Whatever is not listed is read as a PLY, and what is none is named by what it is.
 READERS = {
     ".ply": PLY,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clod_adapter.io.origin import Origin
+from clod_adapter.origin import Origin
 
 
 @dataclass(frozen=True)

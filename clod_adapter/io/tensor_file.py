@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from safetensors import safe_open
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.foreign import refuse_known
 from clod_adapter.io.regular import read_start, utf8_name
+from clod_adapter.io.sniff import refuse_known
 
 if TYPE_CHECKING:
     from torch import Tensor

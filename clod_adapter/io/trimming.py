@@ -8,8 +8,8 @@ import numpy as np
 from torch import Tensor
 
 from clod_adapter.adapter import trim
-from clod_adapter.io.ply import Checkpoint
-from clod_adapter.io.ply_columns import column_map
+from clod_adapter.io.checkpoint import Checkpoint
+from clod_adapter.io.ply.columns import column_map
 
 
 def trimmed(checkpoint: Checkpoint, kept: Tensor | None, sh_degree: int | None) -> Checkpoint:

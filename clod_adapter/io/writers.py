@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.origin import NOWHERE, Origin
+from clod_adapter.origin import NOWHERE, Origin
 
 if TYPE_CHECKING:
     from clod_adapter.calibration import Calibration
@@ -31,12 +31,12 @@ class Writer(NamedTuple):
 
 
 WRITERS = {
-    ".ply": Writer("ply_plain", "write_ply", True),
-    ".glb": Writer("glb", "write_glb", True),
-    ".spz": Writer("spz", "write_spz", True),
-    ".safetensors": Writer("model_safetensors", "write_safetensors", True),
-    ".pt": Writer("pt_model", "write_pt", True),
-    ".splat": Writer("splat", "write_splat", False),
+    ".ply": Writer("formats.ply", "write_ply", True),
+    ".glb": Writer("formats.glb", "write_glb", True),
+    ".spz": Writer("formats.spz", "write_spz", True),
+    ".safetensors": Writer("formats.safetensors", "write_safetensors", True),
+    ".pt": Writer("formats.pt_model", "write_pt", True),
+    ".splat": Writer("formats.splat", "write_splat", False),
 }
 
 

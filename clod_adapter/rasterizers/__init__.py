@@ -2,52 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import torch
-from torch import Tensor
 
-from clod_adapter.cameras import Camera
-from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.errors import ClodError
+from clod_adapter.rasterizers.protocol import Rasterizer, wait_for
 
-
-class Rasterizer(Protocol):
-    """Splats activated Gaussians into one camera.
-
-    Args:
-        means: ``[N, 3]`` world units.
-        quats: ``[N, 4]`` wxyz, any length but zero.
-        scales: ``[N, 3]`` standard deviations, world units.
-        opacities: ``[N]`` in [0, 1]; rows below 1/255 are skipped before any other work.
-        sh0: ``[N, 1, 3]``; shN: ``[N, K-1, 3]``.
-        camera: where from; no gradient.
-        background: ``[3]``.
-        screen_filter: what is added to the projected covariances, and whether opacities are compensated for it, which
-            skips rows that fall below 1/255 by it.
-
-    Returns:
-        The image ``[H, W, 3]``, not clamped, and the accumulated alpha ``[H, W]``; both
-        differentiable in every tensor argument.
-    """
-
-    def __call__(
-        self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor,
-        camera: Camera, background: Tensor, screen_filter: ScreenFilter = CLASSIC,
-    ) -> tuple[Tensor, Tensor]: ...  # fmt: skip
-
-
-def require_float32(backend: str, **tensors: Tensor) -> None:
-    """Raises the ClodError of a rasterizer that is given a tensor of another type, by the tensor's name."""
-    for name, tensor in tensors.items():
-        if tensor.dtype != torch.float32:
-            raise ClodError(f"the {backend} rasterizer takes float32 only, and {name} is {tensor.dtype}: use .float()")
-
-
-def wait_for(device: torch.device) -> None:
-    """Returns when the device has done what it was given, so that a clock may be read; the CPU always has."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+__all__ = ["Rasterizer", "for_device", "wait_for"]
 
 
 def for_device(device: torch.device) -> Rasterizer:

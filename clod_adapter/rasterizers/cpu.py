@@ -15,7 +15,7 @@ from clod_adapter._kernels import blend, blocks, conventions, project, project_g
 from clod_adapter._kernels.memory import aligned, recycled, release
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
-from clod_adapter.rasterizers import require_float32
+from clod_adapter.rasterizers.protocol import require_float32
 
 
 class _Buffers:

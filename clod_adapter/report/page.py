@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from clod_adapter._support.text import as_text
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.text import as_text
 
 WIDEST = 1000  # pixels; wider pictures are scaled down
 QUALITY = 88  # of WebP

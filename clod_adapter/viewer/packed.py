@@ -11,8 +11,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.ply import load
-from clod_adapter.io.splat_transform import SplatTransform, time_limit
+from clod_adapter.io.checkpoint import load
+from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
 from clod_adapter.viewer.payload import Payload
 
 BITS = 11  # of a sigma_d's fraction that are kept; it is off by at most 2^-12 of itself

@@ -17,8 +17,8 @@ from typing import Any
 
 from clod_adapter.cameras import Camera
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.ply import Checkpoint
-from clod_adapter.io.splat_transform import SplatTransform
+from clod_adapter.io.checkpoint import Checkpoint
+from clod_adapter.io.formats.splat_transform import SplatTransform
 from clod_adapter.viewer.packed import Packed, pack
 from clod_adapter.viewer.payload import Payload, page_config
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from clod_adapter.io.ply import load
-from clod_adapter.io.scene import load_scene
+from clod_adapter.io.checkpoint import load
+from clod_adapter.io.scene.load import load_scene
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
 

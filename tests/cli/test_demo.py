@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from clod_adapter.cli import adapt, demo, outcome, resume
+from clod_adapter.cli import demo
+from clod_adapter.cli.adapt import result, resume, run
 from clod_adapter.cli.main import build_parser
 
 PICTURES = ("dial.png", "curve.png")
@@ -32,8 +33,8 @@ def short(monkeypatch: pytest.MonkeyPatch, capture: Any) -> None:
 
     monkeypatch.setattr(demo, "prepare", prepare)
     monkeypatch.setattr(demo, "draw", draw)
-    real, few = adapt.decide, partial(replace, iters=2)
-    monkeypatch.setattr(adapt, "decide", lambda args, base, scene, config, *a: real(args, base, scene, few(config), *a))
+    real, few = run.decide, partial(replace, iters=2)
+    monkeypatch.setattr(run, "decide", lambda args, base, scene, config, *a: real(args, base, scene, few(config), *a))
 
 
 def test_says_where_things_are_and_what_is_next(clod: Any, short: None, tmp_path: Path) -> None:
@@ -52,7 +53,7 @@ def test_pictures_that_were_not_drawn_are_not_reported(
     clod: Any, short: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr(outcome, "measure_result", lambda *_: ([], [], True))
+    monkeypatch.setattr(result, "measure_result", lambda *_: ([], [], True))
     (tmp_path / "demo").mkdir()
     (tmp_path / "demo" / "dial.png").write_text("an earlier run's of clod_adapter")
     done = clod("demo", "--json")

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import clod_adapter
-from clod_adapter.cli import instruments
+from clod_adapter.cli import comparisons
 
 TINY = ("--iters", 3, "--quiet", "--max-sv", 4, "--out", "dial.ply")
 
@@ -34,7 +34,7 @@ def test_base_by_rank(clod: Any, capture: Any, adapted: Path) -> None:
     assert all(entry["row"]["kept_share"] == entry["row"]["kept"] / 300 for entry in report["ranked"])
     base, views = clod_adapter.load(capture.ply).gaussians, clod_adapter.load_scene(capture.scene).test
     top = base.opacity_logits.argsort(descending=True)[: round(kept[4])]
-    (want,) = clod_adapter.evaluate(base.select(top), views, [1.0])
+    (want,) = clod_adapter.evaluation.evaluate(base.select(top), views, [1.0])
     assert report["ranked"][2]["row"]["psnr"] == pytest.approx(want.psnr, abs=1e-4)
     block = done.err[done.err.index("cut to the same counts by rank") :].splitlines()[2:]
     by = ["opacity", "removal"]  # and error
@@ -97,7 +97,7 @@ def test_no_dial_does_not_pop(clod: Any, capture: Any) -> None:
 def test_interrupt_keeps_what_is_measured(
     clod: Any, capture: Any, adapted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real, calls = instruments.evaluate, []
+    real, calls = comparisons.evaluate, []
 
     def evaluate(*args: Any, **rest: Any) -> Any:
         calls.append(args)
@@ -105,7 +105,7 @@ def test_interrupt_keeps_what_is_measured(
             raise KeyboardInterrupt
         return real(*args, **rest)
 
-    monkeypatch.setattr(instruments, "evaluate", evaluate)
+    monkeypatch.setattr(comparisons, "evaluate", evaluate)
     words = ("eval", adapted, "--images", capture.scene, "--sv", 1, 2, "--base", capture.ply, "--popping", "--json")
     done = clod(*words)
     report = json.loads(done.out)

@@ -16,12 +16,13 @@ import pytest
 import torch
 
 import clod_adapter
-from clod_adapter.cli import outcome, pages, results
-from clod_adapter.cli.training import Follower
+from clod_adapter.cli.adapt import files, result
+from clod_adapter.cli.adapt.progress import Follower
+from clod_adapter.cli.shared import pages
 from clod_adapter.errors import ClodError
-from clod_adapter.io.state_file import load_state
-from clod_adapter.objective import Objective
-from clod_adapter.train import Progress
+from clod_adapter.training.loop import Progress
+from clod_adapter.training.objective import Objective
+from clod_adapter.training.state_file import load_state
 from scenes import stripped
 
 OUTPUTS = ["dial.json", "dial.ply", "dial.safetensors"]
@@ -149,7 +150,7 @@ def test_an_error_while_writing(
         raise error
 
     with monkeypatch.context() as patch:
-        patch.setattr(results, "save", raising)
+        patch.setattr(files, "save", raising)
         done = clod(*words)
     assert done.code == code and names(tmp_path) == [STATE], done
     assert load_state(tmp_path / STATE)[0].steps == ITERS and f"--resume goes on from step {ITERS}, which" in done.err
@@ -163,7 +164,7 @@ def test_an_error_while_measuring(
 ) -> None:
     """The files are there, not measured."""
     with monkeypatch.context() as patch:
-        patch.setattr(outcome, step, fail)
+        patch.setattr(result, step, fail)
         done = clod(*words)
     assert done.code == 1 and names(tmp_path) == sorted([*OUTPUTS, STATE]), done
     assert "the result was not measured" in json.loads((tmp_path / "dial.json").read_text())["notes"]
@@ -213,8 +214,10 @@ def test_nowhere_to_save(clod: Any, capture: Any, tmp_path: Path, monkeypatch: p
     """The one error is that of the output."""
     (tmp_path / "out").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
-    monkeypatch.setattr(outcome, "write", lambda *_: shutil.rmtree("out") or fail())
-    monkeypatch.setattr("clod_adapter.cli.resume.save_state", lambda path, *_: (_ for _ in ()).throw(ClodError("full")))
+    monkeypatch.setattr(result, "write", lambda *_: shutil.rmtree("out") or fail())
+    monkeypatch.setattr(
+        "clod_adapter.cli.adapt.resume.save_state", lambda path, *_: (_ for _ in ()).throw(ClodError("full"))
+    )
     done = clod(capture.ply, "--images", capture.scene, *TINY, "out/dial.ply")
     assert done.code == 1 and "ZeroDivisionError: of ours" in done.err and "goes on from" not in done.err, done
 

@@ -25,16 +25,17 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 import clod_adapter
-from clod_adapter.cli import adapt as adapt_command
-from clod_adapter.cli import evaluate as evaluate_command
-from clod_adapter.cli import inputs, results, resume
-from clod_adapter.cli.console import Console
-from clod_adapter.cli.interrupts import GracefulStop
+from clod_adapter.cli.adapt import files, resume
+from clod_adapter.cli.adapt import run as adapt_command
+from clod_adapter.cli.shared import inputs
+from clod_adapter.cli.shared import measure as evaluate_command
+from clod_adapter.cli.shared.console import Console
+from clod_adapter.cli.shared.interrupts import GracefulStop
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.io.state_file import load_state
-from clod_adapter.io.version import package_version
-from clod_adapter.train import Progress
+from clod_adapter.training.loop import Progress
+from clod_adapter.training.state_file import load_state
+from clod_adapter.version import package_version
 from scenes import stripped
 
 OUTPUTS = ["dial.json", "dial.ply", "dial.safetensors"]
@@ -483,8 +484,8 @@ def test_an_interrupt_between_measuring_and_writing(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All was measured, so that nothing is left to skip: the run ends as if undisturbed."""
-    calibrate = results.calibrate
-    monkeypatch.setattr(results, "calibrate", lambda *a: signal.raise_signal(signal.SIGINT) or calibrate(*a))
+    calibrate = files.calibrate
+    monkeypatch.setattr(files, "calibrate", lambda *a: signal.raise_signal(signal.SIGINT) or calibrate(*a))
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
     assert done.code == 0 and json.loads(done.out)["calibration"] and names(tmp_path) == OUTPUTS, done
 

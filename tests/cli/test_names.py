@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from clod_adapter._support.text import file_name
 from clod_adapter.cli import view
 from clod_adapter.cli.main import build_parser
-from clod_adapter.text import file_name
 
 ODD = "gr\udcfcn"  # Latin-1 for an umlaut, which is not UTF-8
 SUFFIXES = (".ply", ".safetensors")

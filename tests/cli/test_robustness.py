@@ -18,7 +18,7 @@ from PIL import Image
 
 import clod_adapter
 from clod_adapter.cli import robustness as command
-from clod_adapter.robustness import BASELINE_SHARES
+from clod_adapter.evaluation.robustness import BASELINE_SHARES
 
 pytest.importorskip("matplotlib")
 OUTPUTS = ["robustness.csv", "robustness.json", "robustness.png"]
@@ -69,7 +69,7 @@ def test_every_checkpoint_at_every_range(run: Any, clod: Any, tmp_path: Path) ->
     # A cell's adapter gives the model that was measured.
     assert clod("apply", "plain.ply", "robustness/cells/plain_sv3.safetensors", "-o", "x.ply").code == 0
     scene = clod_adapter.load_scene(report["scene"])
-    (again,) = clod_adapter.evaluate(clod_adapter.load("x.ply").gaussians, scene.test, [3.0])
+    (again,) = clod_adapter.evaluation.evaluate(clod_adapter.load("x.ply").gaussians, scene.test, [3.0])
     assert again.psnr == at(report["cells"][2], 3)["psnr"]
 
 
@@ -128,7 +128,7 @@ def test_ctrl_c_before_the_first_cell(run: Any, tmp_path: Path, monkeypatch: pyt
 
 
 def test_progress_is_over_all_cells(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("clod_adapter.cli.console.LINE_EVERY", 0)
+    monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
     done = run()
     lines = re.findall(r"^robustness +(\d+)%, .* left, (\w+) \((\d)/6\)", done.err, re.M)
     shares = [int(share) for share, *_ in lines]

@@ -14,7 +14,7 @@ from clod_adapter.demo.gallery import HIGH, LOW, Gallery, unlit_room, write_gall
 from clod_adapter.demo.raytrace import camera_rays, trace_rays
 from clod_adapter.demo.textures import photograph
 from clod_adapter.errors import ClodError
-from clod_adapter.io.colmap_library import pycolmap
+from clod_adapter.io.scene.colmap_library import pycolmap
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ import pytest
 
 from clod_adapter.cli.main import main
 from clod_adapter.config import AdaptConfig
-from clod_adapter.counting import count_law
+from clod_adapter.training.target_count import count_law
 from fences import ROOT
 
 DOCS, RESULTS = ROOT / "docs", ROOT / "benchmarks" / "results"

@@ -112,7 +112,7 @@ def test_the_search_knows_the_pages_and_the_docstrings(site: Path) -> None:
     index = json.loads((site / "search" / "search_index.json").read_text(encoding="utf-8"))
     places = {entry["location"].partition("#")[0] for entry in index["docs"]}
     assert {f"{page.stem}.html" for page in DOCS.glob("*.md")} == places
-    assert {"api.html#clod_adapter.io.ply.load", "api.html#clod_adapter.train.adapt"} <= {
+    assert {"api.html#clod_adapter.io.checkpoint.load", "api.html#clod_adapter.training.loop.adapt"} <= {
         entry["location"] for entry in index["docs"]
     }
     assert (site / "search" / "search_index.js").is_file()  # what a page opened from a folder searches

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.io import ply
+from clod_adapter.io.checkpoint import load
 from clod_adapter.io.writers import write
 from formats import model, splat_transform
 
@@ -36,7 +36,7 @@ def test_what_gsply_writes(tmp_path: Path) -> None:
     rest = {"scales": arrays["log_scales"], "opacities": arrays["opacity_logits"].clip(max=20), "shN": arrays["shN"]}
     data = gsply.GSData(means=arrays["means"], quats=arrays["quats"], sh0=arrays["sh0"][:, 0], **rest)
     gsply.plywrite(tmp_path / "a.ply", data)
-    again = ply.load(tmp_path / "a.ply").gaussians
+    again = load(tmp_path / "a.ply").gaussians
     assert torch.equal(again.means, g.means) and torch.equal(again.shN, g.shN)
 
 
@@ -45,7 +45,7 @@ def test_splat_transform_keeps_sigma_d(tmp_path: Path) -> None:
     g = model(3)
     write(tmp_path / "a.ply", g)
     splat_transform(tmp_path / "a.ply", tmp_path / "b.ply")
-    again = ply.load(tmp_path / "b.ply")
+    again = load(tmp_path / "b.ply")
     assert again.gaussians.sigma_d is not None and torch.equal(again.gaussians.sigma_d, g.sigma_d)
     assert torch.equal(again.gaussians.means, g.means) and torch.equal(again.gaussians.shN, g.shN)
     assert again.gaussians.attenuation == AttenuationConfig() and "its dial is not described" in again.notes[0]

@@ -9,8 +9,8 @@ import torch
 
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.io import ply
-from clod_adapter.io.models import LOADERS, load_model
+from clod_adapter.io.checkpoint import load
+from clod_adapter.io.formats.models import LOADERS, load_model
 from clod_adapter.io.writers import WRITERS, write, writer_of
 from formats import model
 from scenes import gaussians
@@ -32,7 +32,7 @@ def test_suffixes(tmp_path: Path) -> None:
 def test_ply(tmp_path: Path) -> None:
     g = gaussians(20, 3, 0).replace(sigma_d=torch.rand(20), attenuation=AttenuationConfig(tau=0.02))
     assert write(tmp_path / "a.ply", g, ("why",), origin=(1e6, 0.0, 0.0)) == ()
-    again = ply.load(tmp_path / "a.ply", origin=(1e6, 0.0, 0.0))
+    again = load(tmp_path / "a.ply", origin=(1e6, 0.0, 0.0))
     assert again.gaussians.attenuation == g.attenuation and "why" in again.comments
     for name, tensor in g.tensors().items():
         assert torch.equal(tensor, again.gaussians.tensors()[name]), name
@@ -41,7 +41,7 @@ def test_ply(tmp_path: Path) -> None:
 def test_opaque_gaussians_are_finite_in_a_ply(tmp_path: Path) -> None:
     (note,) = write(tmp_path / "a.ply", model())
     assert note == "1 opacities of +inf are written as 20, which is 1 too"
-    again = ply.load(tmp_path / "a.ply").gaussians
+    again = load(tmp_path / "a.ply").gaussians
     assert torch.equal(again.opacities, model().opacities) and again.opacity_logits.isfinite().all()
 
 
@@ -86,5 +86,5 @@ def test_colours_of_any_size(tmp_path: Path, suffix: str) -> None:
     plain = model(1).replace(sigma_d=None, attenuation=None)
     most = torch.finfo(torch.float32).max
     write(tmp_path / f"a{suffix}", plain.replace(sh0=plain.sh0.sign() * most, shN=plain.shN.sign() * most))
-    again = ply.load(tmp_path / f"a{suffix}").gaussians
+    again = load(tmp_path / f"a{suffix}").gaussians
     assert len(again) == 40 and torch.equal(again.sh0.sign().unique(), torch.tensor([-1.0, 1.0]))

@@ -14,12 +14,12 @@ from plyfile import PlyData, PlyElement
 
 import clod_adapter
 import scenes
-from clod_adapter.cli.console import Console
 from clod_adapter.cli.main import build_parser
+from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.view import prepare
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.colmap import write_model
+from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import dial, render
 from clod_adapter.viewer import page, payload
 from clod_adapter.viewer.page import write_page

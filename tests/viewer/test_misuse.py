@@ -14,7 +14,7 @@ import torch
 import scenes
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.colmap import write_model
+from clod_adapter.io.scene.colmap import write_model
 from shown import Shown, serve
 
 DROP = """([name, data, wait, fails]) => {

@@ -17,7 +17,7 @@ import scenes
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.splat_transform import SplatTransform
+from clod_adapter.io.formats.splat_transform import SplatTransform
 from clod_adapter.render import render
 from clod_adapter.viewer.packed import pack
 from clod_adapter.viewer.page import write_page

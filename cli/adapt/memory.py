@@ -1,0 +1,64 @@
+"""``--memory``: how its bytes are planned, printed before any work; and what is not kept meanwhile."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import replace
+
+from clod_adapter.blocks.memory import IMAGES, MemoryPlan, Needs, in_words, make_plan, parse_size
+from clod_adapter.cameras import Scene, StoredView
+from clod_adapter.errors import ClodError
+from clod_adapter.io.checkpoint import Checkpoint, load
+from clod_adapter.io.scene.image_cache import ImageCache
+
+from ..shared.console import Console
+
+
+def image_cache(args: argparse.Namespace) -> ImageCache | None:
+    """What photographs may take of ``--memory``."""
+    return ImageCache(int(IMAGES * parse_size(args.memory))) if args.memory else None
+
+
+def plan_memory(args: argparse.Namespace, base: Checkpoint, scene: Scene, console: Console) -> MemoryPlan | None:
+    """The plan for ``--memory``, which is printed; None without it.
+
+    Raises:
+        ClodError: it is too little; says the least that would do.
+    """
+    if not args.memory:
+        return None
+    views, gaussians = (*scene.train, *scene.test), base.gaussians
+    pixels = [view.camera.width * view.camera.height for view in views]
+    attributes = sum(tensor.element_size() * tensor.numel() for tensor in gaussians.tensors().values())
+    made = sum(3 * size for view, size in zip(views, pixels, strict=True) if not isinstance(view, StoredView))
+    needs = Needs(
+        len(gaussians), math.ceil(attributes / len(gaussians)), base.vertex.dtype.itemsize,
+        images=3 * sum(pixels) - made, pixels=max(pixels), pictures=made,
+    )  # fmt: skip
+    plan = make_plan(needs, parse_size(args.memory))
+    how = "the whole at once" if plan.chunks == 1 else f"in {plan.chunks} chunks"
+    console.say(f"memory: {in_words(plan.peak)} of {in_words(plan.limit)}, {how}; at most, with the program's own:")
+    for name, what in (
+        ("base", "reading the checkpoint"), ("start", "the start, of the whole scene"), ("train", "training"),
+        ("write", "writing"), ("cache", "of it photographs"),
+    ):  # fmt: skip
+        console.say(f"  {in_words(getattr(plan, name)):>8}  {what}")
+    return plan
+
+
+def without_rows(base: Checkpoint) -> Checkpoint:
+    """The checkpoint without the rows of its file, which only writing needs."""
+    return replace(base, vertex=base.vertex[:0].copy())
+
+
+def with_rows(base: Checkpoint, args: argparse.Namespace) -> Checkpoint:
+    """The inverse of ``without_rows``: reads them again.
+
+    Raises:
+        ClodError: the file is another one by now.
+    """
+    again = load(args.ply, activated=args.activated, origin=base.origin)
+    if again.fingerprint != base.fingerprint:
+        raise ClodError(f"{args.ply}: has changed since it was read; run the same command again")
+    return replace(again, gaussians=base.gaussians)

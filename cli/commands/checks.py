@@ -1,0 +1,82 @@
+"""What can be seen to be wrong without torch, which takes a second or two to import; refused before that."""
+
+from __future__ import annotations
+
+import math
+import os
+from argparse import Namespace
+from collections.abc import Collection
+from pathlib import Path
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.ply.header import PREFIX, ROW, all_comments, read_header
+from clod_adapter.io.readers import PLY, check_readable, file_has_dial, reader_of
+from clod_adapter.io.scene.folder import find_cameras
+from clod_adapter.report.charts import chart_file
+from clod_adapter.report.style import check_matplotlib
+
+from ..shared.dials import given_budget
+
+
+def page_files(path: Path, charts: list[str]) -> list[Path]:
+    """A page and its charts; refuses a page that could not be drawn."""
+    check_matplotlib()
+    if path.suffix.lower() != ".html":
+        raise ClodError(f"{path}: --report names the page to write, so it must end in .html")
+    return [path, *(chart_file(path, name) for name in charts)]
+
+
+def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fps",)) -> None:
+    """Refuses values that are none, and budgets that the file's header says nothing can be solved for.
+
+    Args:
+        measured: the budgets that the command measures for itself, without a calibration.
+    """
+    for virtual_scale in args.sv or ():
+        if not 1 <= virtual_scale < math.inf:
+            raise ClodError(f"--sv has {virtual_scale:g}, dial values must be at least 1 (1 is full quality)")
+    budget = given_budget(args)
+    if budget is None:
+        return
+    name, option, values = budget
+    for value in values:
+        if not 0 < value < math.inf:
+            raise ClodError(f"{option} has {value:g}, it must be positive and finite")
+    if not has_dial(model):
+        raise ClodError(f"{model}: has no sigma_d, so no dial for {option}; give it one first: clod-adapt {model} ...")
+    needed = name != "keep" and name not in measured
+    if needed and reader_of(Path(model)) is PLY and not _has_calibration(model):  # others say so when they are read
+        raise ClodError(
+            f"{model}: has no calibration in its header, which {option} needs; adapt it again, and let it measure to "
+            "the end, or give --sv or --keep"
+        )
+
+
+def _has_calibration(model: str) -> bool:
+    return any(comment.startswith(f"{PREFIX}{ROW} ") for comment in all_comments(read_header(Path(model))))
+
+
+def has_dial(model: str) -> bool:
+    """Whether the file's header has a sigma_d."""
+    return file_has_dial(Path(model))
+
+
+def check_checkpoint(path: str) -> None:
+    """Refuses what by its first bytes is no checkpoint."""
+    check_readable(Path(path))
+
+
+def check_scene(folder: str) -> None:
+    """Refuses what is no folder with a COLMAP model or a transforms.json."""
+    if not Path(folder).is_dir():
+        raise ClodError(f"{folder}: is not a folder; give the one that holds images/ and sparse/0")
+    find_cameras(Path(folder))
+
+
+def check_makeable(out: Path) -> None:
+    """Refuses a folder that is no folder, or cannot be made or written to."""
+    parent = next(folder for folder in (out, *out.parents) if folder.exists())
+    if not parent.is_dir():
+        raise ClodError(f"{out}: {parent} is a file; choose another --out")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise ClodError(f"{out}: folder {parent} is not writable; choose another --out")

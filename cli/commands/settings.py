@@ -1,0 +1,70 @@
+"""The settings of the main job: options that are fields of its config, and their values in the user's words."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import Any
+
+from clod_adapter.config import AdaptConfig, describe
+from clod_adapter.errors import ClodError
+
+from ..shared.launch import launched
+
+OPTIONS: dict[str, Any] = {
+    "max_sv": ("S", float), "iters": ("N", int), "batch": ("N", int), "time_budget": ("SEC", float),
+    "seed": ("N", int),
+}  # fmt: skip
+# Those whose default another one has a say in: as many views are seen whatever the batch.
+DEFAULTS = {"iters": "1500, divided by the batch", "batch": "1; of several processes, one each"}
+
+
+def add_settings(parser: argparse.ArgumentParser, without: Sequence[str] = ()) -> None:
+    """Adds the options but those of the fields in ``without``, which a command has in another form."""
+    helps, defaults = describe(AdaptConfig), AdaptConfig()
+    for name, (metavar, kind) in OPTIONS.items():
+        if name in without:
+            continue
+        default = None if name in DEFAULTS else getattr(defaults, name)
+        shown = f" (default: {DEFAULTS[name]})" if name in DEFAULTS else ""
+        shown = shown if default is None else f" (default: {default:g})"
+        parser.add_argument(
+            f"--{name.replace('_', '-')}", metavar=metavar, type=kind, default=default, help=helps[name] + shown
+        )
+
+    parser.add_argument(
+        "--form",
+        choices=["ours", "paper"],
+        default="ours",
+        help="of the training: ours, or the paper's own (default: ours)",
+    )
+
+
+def make_config(args: argparse.Namespace) -> AdaptConfig:
+    """The settings; what is wrong with one is said in the words of the command line."""
+    make = AdaptConfig.paper if args.form == "paper" else AdaptConfig
+    limit = 1 / make().tau
+    if args.max_sv >= limit:
+        raise ClodError(f"--max-sv is {args.max_sv:g}, it must be below {limit:g}, where nothing survives the cut")
+    given = {name: getattr(args, name) for name in OPTIONS}
+    size = launched().size
+    given["batch"] = size if given["batch"] is None else given["batch"]
+    if given["iters"] is None:
+        given["iters"] = max(round(make().iters / max(given["batch"], 1)), 1)
+    for name, value in given.items():  # one at a time, which tells the option to name
+        try:
+            make(**{name: value})
+        except ClodError as error:
+            raise ClodError(f"--{name.replace('_', '-')}{_without_name(str(error), name)}") from error
+    if given["batch"] < size:
+        raise ClodError(f"--batch is {given['batch']}, it must be at least {size}: a view for each process")
+    return make(**given)
+
+
+def make_configs(args: argparse.Namespace) -> list[AdaptConfig]:
+    """One a range, ascending, where ``--max-sv`` takes several."""
+    return [make_config(argparse.Namespace(**vars(args) | {"max_sv": value})) for value in sorted(set(args.max_sv))]
+
+
+def _without_name(message: str, name: str) -> str:
+    return message.removeprefix(name) if message.startswith(f"{name} ") else f": {message}"

@@ -1,0 +1,97 @@
+"""Before training: does the checkpoint stand where the cameras look? Stops with what was found where it does not."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from clod_adapter.alignment.check import DOUBTFUL, Alignment, check_alignment
+from clod_adapter.alignment.frames import focus_of
+from clod_adapter.alignment.search import Guess, guess_frame
+from clod_adapter.cameras import Scene, View
+from clod_adapter.errors import ClodError
+from clod_adapter.io.checkpoint import Checkpoint
+from clod_adapter.io.scene.colmap import load_points
+from clod_adapter.origin import Origin
+
+from .console import Console
+
+OTHER_COLOURS = (
+    "warning: {ply} shows the photographs in {images}, but some are farther from it than from their own mean colours: "
+    "another exposure, views that it does not cover, or a poor checkpoint?"
+)
+FLAT = "warning: the photographs in {images} show one colour each, which is what the checkpoint will be trained on"
+
+
+def require_alignment(
+    checkpoint: Checkpoint, scene: Scene, args: argparse.Namespace, console: Console
+) -> tuple[dict[str, Any], list[str]]:
+    """The numbers of ``check_alignment`` and the ``guess``, for the report, and a note where the file does not fit.
+
+    Where the file fits poorly, or not at all, other frames are tried on it, which takes some seconds.
+
+    Raises:
+        ClodError: it does not fit, or clearly better in another frame; not with --misaligned-ok.
+    """
+    base, ply, views = checkpoint.gaussians, checkpoint.path, [*scene.test, *scene.train]
+    with console.status("comparing the checkpoint with the photographs ..."):
+        found = check_alignment(base, views)
+    guess = None
+    if not found.on_white and (not found.fits or found.margin < DOUBTFUL):
+        with console.status("the checkpoint fits poorly: trying other frames ..."):
+            guess = guess_frame(base, views, found, load_points(args.images, checkpoint.origin))
+    numbers = found.as_dict() | {"guess": guess and guess.says}
+    if found.fits and guess is None:
+        notes = [FLAT.format(images=args.images)] if not found.views else []
+        notes += [OTHER_COLOURS.format(ply=ply, images=args.images)] if found.margin < 0 else []
+        for note in notes:
+            console.say(note)
+        return numbers, notes
+    message = f"{ply}: does not fit {args.images}: {describe(checkpoint, views, found, guess)}"
+    if not args.misaligned_ok:
+        raise ClodError(f"{message}; --misaligned-ok trains regardless")
+    console.say(f"warning: {message}")
+    return numbers, [f"warning: {message}"]
+
+
+def describe(checkpoint: Checkpoint, views: Sequence[View], found: Alignment, guess: Guess | None) -> str:
+    """What was found, and what to do."""
+    share = f"{found.in_view:.2g}" if 0 < found.in_view < 0.01 else f"{found.in_view:.0%}"
+    facts = f"{share} of its Gaussians are in view"
+    if found.views:
+        facts = (
+            f"its renders of {found.views} views are {found.psnr:.1f} dB from the photographs, whose own mean colours "
+            f"are {found.mean_colour_psnr:.1f} dB from them, and {facts}"
+        )
+    if found.on_white:
+        return (
+            f"{facts}; over white the renders are {found.white_psnr:.1f} dB from them, but clod-adapt renders over "
+            "black: give photographs with the background cut out (transparent PNGs are laid over black) or a "
+            "checkpoint trained on black"
+        )
+    if guess:
+        return f"{facts}; in another frame it is {guess.psnr:.1f} dB from them: {guess.says}"
+    return f"{facts}; {places(checkpoint, views)}; give the checkpoint of this scene, in the cameras' frame"
+
+
+def places(checkpoint: Checkpoint, views: Sequence[View]) -> str:
+    """Where the Gaussians are, and where the cameras, in the coordinates of their files."""
+    base, origin = checkpoint.gaussians, checkpoint.origin
+    if not len(base):
+        return "it is empty"
+    middle = base.means.median(dim=0).values
+    radius = float((base.means - middle).norm(dim=1).median())
+    centres = torch.stack([view.camera.position for view in views])
+    focus = focus_of(torch.stack([view.camera.viewmat for view in views])).to(centres)
+    away = float((centres - focus).norm(dim=1).median())
+    return (
+        f"half of it lies within {radius:.3g} of {_point(middle, origin)}, the cameras look at about "
+        f"{_point(focus, origin)} from {away:.3g} away"
+    )
+
+
+def _point(position: torch.Tensor, origin: Origin) -> str:
+    return "(" + ", ".join(f"{value + by:.3g}" for value, by in zip(position.tolist(), origin, strict=True)) + ")"

@@ -1,0 +1,134 @@
+"""What the user sees while something runs: lines and progress, all of it on stderr."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from tqdm import tqdm
+
+from clod_adapter.io.settings import WARNING
+
+tqdm.monitor_interval = 0  # its thread would watch bars that are drawn at every step anyway, and may never start
+LINE_EVERY = 10.0  # seconds between progress lines where stderr is no terminal
+BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
+
+
+@dataclass(frozen=True)
+class Console:
+    """Writes lines to stderr, or with ``quiet`` nothing."""
+
+    quiet: bool = False
+
+    def say(self, text: str) -> None:
+        if not self.quiet:
+            with _unbreakable():
+                tqdm.write(text, file=sys.stderr)  # not print: a bar may be on this line
+                sys.stderr.flush()
+
+    def note(self, text: str) -> None:
+        """A note on what was read or written; one that begins with "warning: " as that."""
+        self.say(f"  {text}" if text.startswith(WARNING) else f"  note: {text}")
+
+    @contextmanager
+    def status(self, text: str) -> Iterator[Callable[[str], None]]:
+        """Shows on a terminal what is being done, while it is, where there is no telling how far it is.
+
+        Gives a function to show something else with; off a terminal that is a line now and then.
+        """
+        shown, printed = None, time.perf_counter()
+        if not self.quiet and sys.stderr.isatty():
+            with _unbreakable():
+                shown = tqdm(bar_format="{desc}", desc=text, file=sys.stderr, leave=False, dynamic_ncols=True)
+
+        def show(more: str) -> None:
+            nonlocal printed
+            if shown is not None:
+                with _unbreakable():
+                    shown.set_description_str(more)
+            elif time.perf_counter() - printed >= LINE_EVERY:
+                printed = time.perf_counter()
+                self.say(more)
+
+        try:
+            yield show
+        finally:
+            if shown is not None:
+                with _unbreakable():
+                    shown.close()
+
+    @contextmanager
+    def meter(self, label: str) -> Iterator[Meter]:
+        """The progress of one phase, which ends with the block."""
+        meter = Meter(self, label)
+        try:
+            yield meter
+        finally:
+            meter.close()
+
+
+@dataclass
+class Meter:
+    """Progress with the time left: a bar on a terminal, elsewhere a line now and then.
+
+    Args:
+        slow: of few and uneven steps: shown from the start, and judged by all of its time so far.
+        initial: the share that was done before.
+    """
+
+    console: Console
+    label: str
+    slow: bool = False
+    initial: float = 0.0
+    bar: Any = None
+    began: float = field(default_factory=time.perf_counter)
+    printed: float = field(default_factory=time.perf_counter)
+
+    def __post_init__(self) -> None:
+        if not self.console.quiet and sys.stderr.isatty():
+            self.bar = tqdm(
+                total=1.0, initial=self.initial, desc=self.label, bar_format=BAR_FORMAT, file=sys.stderr,
+                leave=False, delay=0 if self.slow else 0.5, smoothing=0 if self.slow else 0.3,
+                miniters=0, dynamic_ncols=True,
+            )  # fmt: skip
+
+    def update(self, share: float, text: str = "") -> None:
+        """Shows the ``share`` that is done, in [0, 1], and ``text`` behind it."""
+        now = time.perf_counter()
+        if self.bar is not None:
+            with _unbreakable():
+                self.bar.set_postfix_str(text, refresh=False)
+                self.bar.update(min(share, 1.0) - self.bar.n)
+        elif now - self.printed >= LINE_EVERY:
+            self.printed = now
+            left = (now - self.began) * (1 - share) / max(share - self.initial, 1e-9)
+            self.console.say(f"{self.label} {share:4.0%}, {duration(left)} left, {text}".removesuffix(", "))
+
+    def close(self) -> None:
+        if self.bar is not None:
+            with _unbreakable():
+                self.bar.close()
+            self.bar = None
+
+
+def duration(seconds: float) -> str:
+    """``0.4 s``, ``42 s``, ``2:05``, ``1:02:05``."""
+    if seconds < 59.5:
+        return f"{seconds:.1f} s" if seconds < 9.95 else f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+@contextmanager
+def _unbreakable() -> Iterator[None]:
+    """When the reader of stderr is gone the work goes on unseen; a training run is not lost over it."""
+    try:
+        yield
+    except BrokenPipeError:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115

@@ -1,0 +1,73 @@
+"""Checkpoints and scenes as the commands read them: with a word to the user on what is in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from clod_adapter.cameras import Scene
+from clod_adapter.config import CLASSIC, AdaptConfig
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.checkpoint import Checkpoint, load
+from clod_adapter.io.ply.values import Activated
+from clod_adapter.io.scene.image_cache import ImageCache
+from clod_adapter.io.scene.load import load_scene
+from clod_adapter.origin import Origin
+from clod_adapter.training.pseudo_views import complement, imagine, place
+
+from .console import Console
+from .files import size
+
+
+def read_checkpoint(
+    path: str, console: Console, activated: Activated | None = None, origin: Origin | None = None
+) -> Checkpoint:
+    """Reads a checkpoint and says what is in it; the options as ``load`` takes them."""
+    with console.status(f"reading {path} ({size(Path(path))}) ..."):
+        checkpoint = load(path, activated=activated, origin=origin)
+    gaussians = checkpoint.gaussians
+    dial = ", with sigma_d" if gaussians.sigma_d is not None else ""
+    drawn = gaussians.screen_filter
+    filtered = "" if drawn == CLASSIC else f", drawn with {drawn.says}"
+    console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{dial}{filtered}")
+    for note in checkpoint.notes:
+        console.note(note)
+    return checkpoint
+
+
+def read_scene(folder: str, console: Console, origin: Origin, cache: ImageCache | None = None) -> Scene:
+    """Reads the photographs and says how they are used."""
+    with console.meter("photographs") as meter:
+        scene = load_scene(
+            folder, origin=origin, progress=lambda done, total: meter.update(done / total, f"{done}/{total}"),
+            cache=cache,
+        )  # fmt: skip
+    camera = scene.train[0].camera
+    size = f"{camera.width}x{camera.height}"
+    console.say(f"{folder}: {len(scene.train)} photographs to train on, {len(scene.test)} held out, {size}")
+    for note in scene.notes:
+        console.note(note)
+    return scene
+
+
+def complement_scene(
+    gaussians: Gaussians, scene: Scene, config: AdaptConfig, console: Console
+) -> tuple[Scene, AdaptConfig]:
+    """What ``placement.complement`` makes of few photographs, and says so."""
+    with console.status("looking for places of cameras ..."):
+        more, lighter = complement(gaussians, scene, config)
+    for note in more.notes[len(scene.notes) :]:
+        console.note(note)
+    return more, lighter
+
+
+def place_scene(gaussians: Gaussians, seed: int, console: Console) -> Scene:
+    """Without photographs: places cameras, takes the checkpoint's own pictures, and says so."""
+    with console.meter("placing cameras") as meter:
+        cameras = place(
+            gaussians, seed=seed, progress=lambda done, total: meter.update(done / total, f"{done}/{total}")
+        )
+    with console.meter("pictures") as meter:
+        scene = imagine(gaussians, cameras, progress=lambda done, total: meter.update(done / total, f"{done}/{total}"))
+    for note in scene.notes:
+        console.say(note)
+    return scene

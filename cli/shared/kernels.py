@@ -1,0 +1,101 @@
+"""Compiled kernels, made ready before anything is measured or timed: loaded, or on the first run compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+import torch
+from numba.core.caching import NullCache
+from numba.core.event import Event, Listener, install_listener
+
+from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.config import CLASSIC, AdaptConfig, ScreenFilter
+from clod_adapter.evaluation.evaluate import evaluate
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.training.loop import adapt
+
+from .console import Console, Meter
+
+CPU = torch.device("cpu")
+OTHER = ""
+# What a kernel takes of the time that all of them take to compile; only the time left that is shown depends on it.
+SHARES = {"project": 0.2, "project_gradient": 0.42, OTHER: 0.035}
+
+
+def prepare_kernels(
+    console: Console, device: torch.device = CPU, *, training: bool = True, screen_filter: ScreenFilter = CLASSIC
+) -> None:
+    """Adapts and evaluates a miniature on the device, so that all kernels that this takes are there.
+
+    Training with a filter that compensates opacities takes a kernel of its own.
+    """
+    one = Gaussians(
+        torch.zeros(1, 3), torch.ones(1, 4), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3),
+        torch.zeros(1, 3, 3), screen_filter=screen_filter,
+    ).to(device)  # fmt: skip
+    viewmat, K = torch.eye(4), torch.eye(3)
+    viewmat[2, 3] = 2.0
+    view = View(Camera(viewmat, K, 4, 4), torch.zeros(4, 4, 3, dtype=torch.uint8))
+    with announced_compiling(console, SHARES), one_thread():
+        evaluate(one, [view], [1.0])
+        if training:
+            adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0))
+            if adapted.interrupted:  # it keeps what it has, and that is nothing here
+                raise KeyboardInterrupt
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Of several, each would compile on its own once a Ctrl-C has ended that of the first."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def announced_compiling(console: Console, shares: Mapping[str, float] | None = None) -> Iterator[None]:
+    """Says so when something has to be compiled within the block; it takes a while.
+
+    Args:
+        shares: of the time, by kernel and for ``OTHER`` ones: with them, how far it is is shown too, and that it will
+            happen again where what is compiled cannot be kept.
+    """
+    listener = _Compiling(console, shares)
+    try:
+        with install_listener("numba:compile", listener):
+            yield
+    finally:
+        listener.close()
+
+
+class _Compiling(Listener):  # type: ignore[misc]
+    """Follows compilations; those of what a kernel is made of happen within its own."""
+
+    def __init__(self, console: Console, shares: Mapping[str, float] | None) -> None:
+        self.console, self.shares = console, shares
+        self.meter: Meter | None = None
+        self.said, self.depth, self.done = False, 0, 0.0
+
+    def on_start(self, event: Event) -> None:
+        self.depth += 1
+        if not self.said:
+            self.said = True
+            # What the demo's ray tracer compiles is never kept: its pictures are.
+            cached = not self.shares or not isinstance(event.data["dispatcher"]._cache, NullCache)
+            nowhere = "on every run, as no folder to keep them in can be written: set NUMBA_CACHE_DIR"
+            self.console.say(f"compiling kernels ({'first run only, well under a minute' if cached else nowhere}) ...")
+            self.meter = Meter(self.console, "compiling", slow=True) if self.shares else None
+
+    def on_end(self, event: Event) -> None:
+        self.depth -= 1
+        if self.depth == 0 and self.meter and self.shares:
+            self.done += self.shares.get(event.data["dispatcher"].py_func.__name__, self.shares[OTHER])
+            self.meter.update(self.done)
+
+    def close(self) -> None:
+        if self.meter:
+            self.meter.close()

@@ -1,0 +1,139 @@
+"""What a run reports: a JSON row for scripts, a table for people."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clod_adapter._support.text import as_text
+from clod_adapter.io.atomic import atomic_path
+
+if TYPE_CHECKING:
+    from clod_adapter.evaluation.evaluate import Row
+    from clod_adapter.evaluation.popping import Popping
+
+# Round values, each about 1.4 times the last, closer below 3 where most Gaussians leave. No dial reaches 1/tau, 50.
+DIALS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
+
+
+class Stopwatch:
+    """Named wall times, for the report."""
+
+    def __init__(self) -> None:
+        self.began = time.perf_counter()
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def time(self, name: str) -> Iterator[None]:
+        """Adds the block's time to what ``name`` already has."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+
+    def report(self) -> dict[str, float]:
+        return {name: round(value, 3) for name, value in {**self.seconds, "total": self.total()}.items()}
+
+    def total(self) -> float:
+        return time.perf_counter() - self.began
+
+
+def machine() -> dict[str, Any]:
+    """What the times were taken on."""
+    import numba
+    import torch
+
+    gpu = {"gpu": torch.cuda.get_device_name()} if torch.cuda.is_available() else {}
+    return {
+        **gpu,
+        "cpu": _cpu_name(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numba": numba.__version__,
+    }
+
+
+def machine_name(device: str = "cpu") -> str:
+    """The machine in a line: what frame times on that kind of device depend on most."""
+    about = machine()
+    if device == "cuda":
+        return about["gpu"]
+    return f"{about['cpu']}, {about['threads']} threads"
+
+
+def _cpu_name() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def jsonable(value: Any) -> Any:
+    """``value`` with what JSON has no word for (an infinite PSNR) as null, and names of files as text."""
+    if isinstance(value, dict):
+        return {jsonable(key): jsonable(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(entry) for entry in value]
+    if isinstance(value, str):
+        return as_text(value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_report(path: Path, report: dict[str, Any]) -> None:
+    """Writes the report as an indented JSON file."""
+    with atomic_path(path) as temporary:
+        text = json.dumps(jsonable(report), indent=2, allow_nan=False, ensure_ascii=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def report_dials(max_sv: float) -> list[float]:
+    """Dial values worth a row, in even steps of their logarithm, dense enough to read between; last ``max_sv``."""
+    return [s for s in DIALS if s < max_sv] + [max_sv]
+
+
+def table(rows: Sequence[Row], base_rows: Sequence[Row] = (), plain_rows: Sequence[Row] = ()) -> str:
+    """The rows under each other, those of the base first and those without the dial last, both marked."""
+    marked = [("base", row) for row in base_rows] + [(f"{row.virtual_scale:.5g}", row) for row in rows]
+    return rows_table(marked + [("plain", row) for row in plain_rows])
+
+
+def rows_table(marked: Sequence[tuple[str, Row]]) -> str:
+    """The rows under each other, each behind its label; LPIPS and FLIP where they were measured."""
+    width = max(6, *(len(label) for label, _ in marked))
+    more = [name for name in ("lpips", "flip") if any(getattr(row, name) is not None for _, row in marked)]
+    heads = "".join(f"  {name.upper():>6}" for name in more)
+    lines = [f"{'dial':>{width}}  PSNR dB    SSIM{heads}        kept              in view  frame ms"]
+    for label, row in marked:
+        extra = "".join(f"  {getattr(row, name):6.4f}" for name in more)
+        kept = f"{row.kept:10,.0f}  {row.kept_share:7.1%}  {row.in_view:10,.0f}  {row.frame_ms:8.1f}"
+        lines.append(f"{label:>{width}}  {row.psnr:7.2f}  {row.ssim:.4f}{extra}  {kept}")
+    return "\n".join(lines)
+
+
+def popping_table(results: Sequence[tuple[str, Popping]]) -> str:
+    """How the picture changes over each sweep, and how to read it."""
+    width = max(len(moved) for moved, _ in results)
+    lines = [
+        "popping: how much a step changes the picture, in levels of 255 (RMS over the picture, largest pixel). Halving",
+        "the step leaves 0.5 of a fade's largest change, and 1.0 of a jump's:",
+        f"{'what moves':>{width}}  steps     mean  largest     at  / mean  halved   pixel  halved",
+    ]
+    for moved, p in results:
+        lines.append(
+            f"{moved:>{width}}  {p.steps:5}  {p.mean:7.4f}  {p.largest:7.4f}  {p.at:5.2f}  {p.ratio:6.1f}"
+            f"  {p.persistence:6.2f}  {p.pixel:6.1f}  {p.pixel_persistence:6.2f}"
+        )
+    return "\n".join(lines)

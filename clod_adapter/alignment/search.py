@@ -1,0 +1,179 @@
+"""Where a checkpoint that does not fit its cameras stands, if it can be told.
+
+Known frames (``alignment_frames``) are ranked by the correlation of small pictures of the Gaussians that cover most. If
+the best is none, a scale and an offset are searched by it. Whatever is found is measured as the file was
+(``check_alignment``): only what fits clearly better is named.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from clod_adapter.alignment.check import CLEAR, Alignment, check_alignment, compare
+from clod_adapter.alignment.frames import Frame, centres_of, focus_of, into_file, known_frames
+from clod_adapter.cameras import View
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.importance import spread
+
+MOST_GAUSSIANS = 20_000
+WIDTH, FINE_WIDTH = 72, 240  # of the small pictures, pixels
+VIEWS = 4  # of them
+SCALES = [10 ** (k / 12) for k in range(-24, 25)]  # a hundredth to a hundred, 21 % apart
+HOPELESS = 0.5  # correlation after the coarse search
+MOST_TRIALS = 80  # of a climb, where a dozen steps do
+BETTER_THAN_MEAN = 1.5  # dB
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A frame in which the checkpoint fits.
+
+    Attributes:
+        says: what it is, and what to do.
+        psnr: dB, pooled, of the renders in it.
+    """
+
+    says: str
+    psnr: float
+
+
+@torch.no_grad()
+def guess_frame(
+    gaussians: Gaussians, views: Sequence[View], found: Alignment, points: Tensor | None = None
+) -> Guess | None:
+    """A frame that explains the photographs clearly better than the cameras' own; None where none was found.
+
+    Clearly: by BETTER_THAN_MEAN dB more than the photographs' mean colours and CLEAR dB more than ``found``.
+
+    Args:
+        views: all there are: trainers normalise by all the cameras.
+        found: of ``check_alignment``.
+        points: ``[M, 3]`` the scene's points, world units.
+    """
+    if len(gaussians) == 0 or found.views == 0:
+        return None
+    viewmats = torch.stack([view.camera.viewmat.double() for view in views])
+    small = _Stage(gaussians, views, WIDTH)
+
+    def measured(frame: Frame) -> Guess | None:
+        psnr = check_alignment(gaussians, _moved(views, frame.viewmats)).psnr
+        enough = max(found.mean_colour_psnr + BETTER_THAN_MEAN, found.psnr + CLEAR)
+        return Guess(frame.says, psnr) if psnr >= enough else None
+
+    known = measured(max(known_frames(viewmats, points), key=lambda frame: small.score(frame.viewmats)))
+    if known:
+        return known
+    searched = _search(small, _Stage(gaussians, views, FINE_WIDTH), viewmats)
+    return measured(searched) if searched else None
+
+
+class _Stage:
+    """Small pictures of the Gaussians that cover most, against small photographs."""
+
+    def __init__(self, gaussians: Gaussians, views: Sequence[View], width: int):
+        chosen = spread(range(len(views)), VIEWS)
+        self.index = torch.tensor(list(chosen))
+        self.views = [_shrunk(views[k], width) for k in chosen]
+        self.middle = gaussians.means.double().median(dim=0).values.cpu()  # where cameras are
+        if len(gaussians) > MOST_GAUSSIANS:
+            cover = F.logsigmoid(gaussians.opacity_logits) + gaussians.log_scales.topk(2, dim=1).values.sum(1)
+            gaussians = gaussians.select(cover.topk(MOST_GAUSSIANS).indices)
+        self.gaussians = gaussians
+
+    def score(self, viewmats: Tensor) -> float:
+        """The correlation, in [-1, 1], of pictures from these poses of all the views with the photographs."""
+        moved = _moved(self.views, viewmats[self.index])
+        rows = [row for view in moved if (row := compare(self.gaussians, view)) is not None]
+        if not rows:
+            return -1.0
+        _, _, constant, rendered, shared = torch.stack(rows).sum(0).tolist()
+        return shared / math.sqrt(constant * rendered) if rendered > 0 else 0.0
+
+
+def _search(small: _Stage, fine: _Stage, viewmats: Tensor) -> Frame | None:
+    """The best scale and offset; None where nothing comes near the photographs.
+
+    From the best scale about the origin, and the best one about the point that the cameras look at with the Gaussians'
+    median there, to the nearest maximum of the correlation.
+    """
+    focus = focus_of(viewmats)
+    unit = float((centres_of(viewmats) - focus).norm(dim=1).quantile(0.5).clamp(min=1e-9))
+    found = []
+    for towards in (0.0, 1.0):
+        places = [_Place(scale, towards * (focus - scale * small.middle)) for scale in SCALES]
+        place = max(places, key=lambda p: small.score(p.seen_from(viewmats)))
+        found.append(_climb(small, viewmats, place, focus, unit, (0.1, 0.02)))
+    score, place = max(found, key=lambda pair: pair[0])
+    if score < HOPELESS:
+        return None
+    _, place = _climb(fine, viewmats, place, focus, unit, (0.01, 0.001))
+    return Frame(place.says(unit), place.seen_from(viewmats))
+
+
+@dataclass(frozen=True)
+class _Place:
+    """``x_cameras = scale x_file + offset``."""
+
+    scale: float
+    offset: Tensor
+
+    def seen_from(self, viewmats: Tensor) -> Tensor:
+        return into_file(viewmats, torch.eye(3, dtype=viewmats.dtype), self.scale, self.offset)
+
+    def neighbours(self, step: float, focus: Tensor, unit: float) -> list[_Place]:
+        """Moved along the axes, and scaled about the point that the cameras look at, so that it stays in sight."""
+        axes = torch.eye(3, dtype=focus.dtype)
+        moves = [_Place(self.scale, self.offset + sign * step * unit * axis) for axis in axes for sign in (1, -1)]
+        factors = (1 + step, 1 / (1 + step))
+        return moves + [_Place(self.scale * by, focus - by * (focus - self.offset)) for by in factors]
+
+    def says(self, unit: float) -> str:
+        parts = []
+        if abs(math.log(self.scale)) > 0.02:
+            larger = self.scale > 1
+            parts.append(f"{self.scale if larger else 1 / self.scale:.3g} times {'larger' if larger else 'smaller'}")
+        if float(self.offset.norm()) > 0.02 * unit:
+            parts.append("moved by (" + ", ".join(f"{value:.3g}" for value in self.offset.tolist()) + ")")
+        return f"the file would have to be {' and '.join(parts) or 'moved a little'}: export it in the cameras' frame"
+
+
+def _climb(
+    stage: _Stage, viewmats: Tensor, place: _Place, focus: Tensor, unit: float, steps: tuple[float, float]
+) -> tuple[float, _Place]:
+    """To the nearest maximum, by a pattern search whose step is halved from one share of ``unit`` to another."""
+    step, smallest = steps
+    best, trials = stage.score(place.seen_from(viewmats)), 0
+    while step >= smallest and trials < MOST_TRIALS:
+        for neighbour in place.neighbours(step, focus, unit):
+            trials += 1
+            score = stage.score(neighbour.seen_from(viewmats))
+            if score > best:
+                best, place = score, neighbour
+                break
+        else:
+            step /= 2
+    return best, place
+
+
+def _shrunk(view: View, width: int) -> View:
+    """The photograph and camera at a smaller width, by area averages."""
+    camera = view.camera
+    if camera.width <= width:
+        return view
+    height = max(1, round(camera.height * width / camera.width))
+    image = F.adaptive_avg_pool2d(view.image.permute(2, 0, 1).float(), (height, width)).permute(1, 2, 0)
+    K = camera.K * camera.K.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
+    return View(replace(camera, K=K, width=width, height=height), image.round().to(torch.uint8))
+
+
+def _moved(views: Sequence[View], viewmats: Tensor) -> list[View]:
+    return [
+        View(replace(view.camera, viewmat=viewmat.to(view.camera.viewmat)), view.image)
+        for view, viewmat in zip(views, viewmats, strict=True)
+    ]

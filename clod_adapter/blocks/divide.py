@@ -1,0 +1,182 @@
+"""A scene in blocks: which Gaussians each has, which views see it, and what all of them begin from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from clod_adapter.attenuation import attenuate, normalized_distances
+from clod_adapter.cameras import Camera, View, camera_extent
+from clod_adapter.config import AdaptConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.initialization.importance import start
+from clod_adapter.render import splat
+
+UNSEEN = 0.005  # of what all views show of a block, the share that those it is not trained on may show
+SMALLER = 4  # times, the pictures that tell which views see which blocks
+DIALS = 9  # at which the start's Gaussians are counted
+
+
+@dataclass(frozen=True)
+class Division:
+    """A scene in blocks, and what all of them begin from.
+
+    Attributes:
+        begun: the Gaussians with the sigma_d that training begins from.
+        block: ``[N]`` int16, the block of each.
+        seen: ``[V, B]`` float32, the share of each view's picture that is of each block.
+        kept: ``[V, DIALS]`` float32, how many Gaussians the start keeps in each view, at even steps of log s.
+        extent: of all cameras, world units.
+    """
+
+    begun: Gaussians
+    block: Tensor
+    seen: Tensor
+    kept: Tensor
+    extent: float
+
+    @property
+    def count(self) -> int:
+        """Of blocks."""
+        return self.seen.shape[1]
+
+    @property
+    def passes(self) -> int:
+        """How often each block is trained; one that is alone has nothing to come into accord with."""
+        return 2 if self.count > 1 else 1
+
+    def rows(self, block: int) -> Tensor:
+        """``[n]`` int64, ascending: the Gaussians of a block."""
+        return (self.block == block).nonzero()[:, 0]
+
+    def views(self, block: int) -> list[int]:
+        """The fewest views that show all but UNSEEN of what is seen of a block, ascending; none of an unseen one."""
+        shares, order = self.seen[:, block].double().sort(descending=True, stable=True)
+        covered = shares.cumsum(0)
+        if not covered[-1] > 0:
+            return []
+        fewest = int((covered < (1 - UNSEEN) * covered[-1]).sum()) + 1
+        return sorted(order[:fewest].tolist())
+
+    def steps(self, block: int, config: AdaptConfig) -> int:
+        """Of a block, both passes: as many as an undivided run takes of the views that see it."""
+        return math.ceil(config.iters * len(self.views(block)) / len(self.seen))
+
+
+def split(means: Tensor, count: int) -> Tensor:
+    """``[N]`` int16: which of ``count`` blocks each centre is in; blocks differ by at most one in size.
+
+    A k-d tree: the longest side is halved at the median (at the fitting quantile where the count is odd). Sides are
+    taken between the 5 % and the 95 % quantile, so that a few far Gaussians do not decide where a scene is cut.
+
+    Raises:
+        ClodError: there are fewer Gaussians than blocks.
+    """
+    if not 1 <= count <= min(len(means), 2**15 - 1):
+        raise ClodError(f"{len(means)} Gaussians cannot be split into {count} blocks; take from 1 to as many as these")
+    block = np.empty(len(means), np.int16)
+    points = means.detach().cpu().numpy()
+    todo = [(np.arange(len(means)), 0, count)]
+    while todo:
+        rows, first, parts = todo.pop()
+        if parts == 1:
+            block[rows] = first
+            continue
+        some = points[rows[:: max(len(rows) // 100_000, 1)]]
+        low, high = np.quantile(some, (0.05, 0.95), axis=0)
+        fewer = parts // 2
+        cut = first_size(len(rows), parts, fewer)
+        order = np.argpartition(points[rows, int((high - low).argmax())], cut)
+        todo += [(rows[order[:cut]], first, fewer), (rows[order[cut:]], first + fewer, parts - fewer)]
+    return torch.from_numpy(block).to(means.device)
+
+
+def first_size(total: int, parts: int, fewer: int) -> int:
+    """How many of ``total`` the first ``fewer`` of ``parts`` even parts have."""
+    whole, rest = divmod(total, parts)
+    return fewer * whole + min(fewer, rest)
+
+
+def divide(
+    base: Gaussians,
+    views: Sequence[View],
+    config: AdaptConfig,
+    count: int,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Division:
+    """Splits a scene into ``count`` blocks and takes the start, of the whole scene, that all of them begin from.
+
+    Args:
+        views: ``importance.seeing`` of the training views.
+        progress: as ``importance.start`` calls it, and with "blocks" and the number of views looked at, and of all.
+
+    Raises:
+        ClodError: the settings are some that blocks cannot be trained with, or there are fewer Gaussians than blocks.
+    """
+    check_divisible(config)
+    block = split(base.means, count)
+    begun = start(base.without_empty_bands(), views, config, progress)
+    assert begun.attenuation is not None
+    if begun.attenuation.normalizer != "scene":
+        raise ClodError(
+            f"the checkpoint's dial has the normaliser {begun.attenuation.normalizer}, whose distances depend on all "
+            "Gaussians in view: it cannot be trained in chunks; adapt it whole"
+        )
+    seen, kept = torch.empty(len(views), count), torch.empty(len(views), DIALS)
+    for k, view in enumerate(views):
+        shown = coverage(begun, begun.opacities, _smaller(view.camera)).double()
+        seen[k] = (shown.new_zeros(count).index_add_(0, block.long(), shown) / shown.sum().clamp(min=1e-9)).float()
+        kept[k] = torch.tensor(kept_counts(begun, view, dial_grid(config)))
+        if progress:
+            progress("blocks", k + 1, len(views))
+    begun = base.replace(sigma_d=begun.sigma_d, attenuation=begun.attenuation)
+    extent = camera_extent([view.camera for view in views]) or begun.attenuation.reference_distance  # type: ignore[union-attr]
+    return Division(begun, block, seen, kept, extent)
+
+
+def check_divisible(config: AdaptConfig) -> None:
+    """Raises the ClodError of settings that need all of a scene at once."""
+    if config.count_term == "paper" or config.normalizer != "scene":
+        raise ClodError(
+            "the paper's form cannot be trained in chunks: its count and its distances are of all Gaussians at once; "
+            "leave out --form paper, or --memory"
+        )
+
+
+def dial_grid(config: AdaptConfig) -> list[float]:
+    """DIALS dial values from 1 to ``max_sv`` in even steps of their logarithm."""
+    return [config.max_sv ** (k / (DIALS - 1)) for k in range(DIALS)]
+
+
+@torch.no_grad()
+def kept_counts(gaussians: Gaussians, view: View, dials: Sequence[float]) -> list[float]:
+    """How many Gaussians are kept in a view at some dial values."""
+    assert gaussians.sigma_d is not None and gaussians.attenuation is not None
+    distances = normalized_distances(gaussians.means, view.camera, gaussians.attenuation)
+    given = gaussians.opacity_logits, gaussians.sigma_d, distances
+    return [float(attenuate(*given, s, gaussians.attenuation).keep.sum()) for s in dials]
+
+
+def coverage(gaussians: Gaussians, opacities: Tensor, camera: Camera) -> Tensor:
+    """``[N]`` how many pixels each Gaussian covers: the sum over the picture of its transmittance times its alpha.
+
+    The gradient of a picture by the colours that it is mixed from.
+    """
+    grey = gaussians.sh0.new_zeros(gaussians.sh0.shape).requires_grad_()
+    plain = gaussians.replace(sh0=grey, shN=gaussians.shN[:, :0], sigma_d=None, attenuation=None)
+    image, _ = splat(plain, opacities, camera)
+    (gradient,) = torch.autograd.grad(image[..., 0].sum(), grey)
+    return gradient[:, 0, 0] / SH_C0
+
+
+def _smaller(camera: Camera) -> Camera:
+    """The same view in fewer pixels."""
+    width, height = (max(size // SMALLER, 1) for size in (camera.width, camera.height))
+    shrink = camera.K.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
+    return replace(camera, K=camera.K * shrink, width=width, height=height)

@@ -1,0 +1,52 @@
+"""What an adapted file is compared with: other files at the same counts, and its base cut down by rank."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from clod_adapter.cameras import Camera, View
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluation.budget import dial_for
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.importance import MOST_VIEWS, removal_error, spread
+from clod_adapter.render import dial
+
+
+@torch.no_grad()
+def mean_kept(gaussians: Gaussians, cameras: Sequence[Camera], virtual_scale: float) -> float:
+    """Gaussians that the dial leaves in, mean over the cameras; nothing is rendered."""
+    return fmean(int(dial(gaussians, camera, virtual_scale).keep.sum()) for camera in cameras)
+
+
+def matching_dial(gaussians: Gaussians, cameras: Sequence[Camera], count: float) -> float:
+    """The dial value that keeps ``count`` on average: 1 without a dial or where that keeps no more, max_sv at most."""
+    if gaussians.attenuation is None:
+        return 1.0
+    try:
+        return dial_for(gaussians, keep=max(count, 1), cameras=cameras).virtual_scale
+    except ClodError:  # out of reach
+        return gaussians.attenuation.max_sv
+
+
+def rankings(
+    base: Gaussians, views: Sequence[View], progress: Callable[[int, int], None] | None = None
+) -> dict[str, Tensor]:
+    """``[N]`` indices of the Gaussians of an unadapted base, the ones to keep longest first, by two rules.
+
+    ``opacity``: the stored one. ``removal error``: the error that removing it alone would cause in up to 64 of the
+    training views, evenly spread (``importance.removal_error``). ``base.select(order[:n])`` is the base at n Gaussians.
+
+    Args:
+        progress: called with (views done, views in all).
+    """
+    removal = removal_error(base, spread(views, MOST_VIEWS), progress=progress)
+    return {"opacity": by_opacity(base), "removal error": removal.argsort(descending=True, stable=True)}
+
+
+def by_opacity(gaussians: Gaussians) -> Tensor:
+    """``[N]`` indices, the most opaque first; equals in their order."""
+    return gaussians.opacity_logits.argsort(descending=True, stable=True)

@@ -1,0 +1,204 @@
+"""The training-free start: what each Gaussian contributes to the views, and the sigma_d that follows from its rank."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from clod_adapter.attenuation import SIGMA_MAX, normalizing_distance
+from clod_adapter.cameras import View
+from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.extinction import sigma_for_extinction
+from clod_adapter.finite import bad_rows, largest_colour
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.pruning_order import leaving_order
+from clod_adapter.render import splat
+from clod_adapter.units import in_world_units, known_distance, with_distance
+from clod_adapter.viewpoints import typical_distance
+
+T = TypeVar("T")
+
+# A start beyond this many times the normalised distance at the largest dial value would fade by less than a
+# thousandth there, and its gradient with it: such a sigma would never move again.
+WIDEST = 22.0
+# Views that are looked at, at most: twice as many changed the trained result by 0.01 to 0.04 dB (docs/performance.md).
+MOST_VIEWS = 64
+# A checkpoint may be so faint that the cut would take its picture. Tau is lowered until those that it fades by their
+# opacity alone are worth at most this share of the picture at s = 1.
+FAINT_SHARE = 0.05
+TAU_MIN = 1e-6
+FADING = 1.5  # times the threshold: fainter ones are drawn less than they are (attenuation's soft cut)
+
+
+def start(
+    base: Gaussians,
+    views: Sequence[View],
+    config: AdaptConfig,
+    progress: Callable[[str, int, int], None] | None = None,
+    error: Tensor | None = None,
+) -> Gaussians:
+    """The Gaussians with a sigma_d to train from, by what they do in up to MOST_VIEWS of the views, evenly spread.
+
+    The sigma_d is in world units. A dial that ``base`` already has is kept, with its own settings but the config's
+    ``max_sv``; one that does nothing (``SIGMA_MAX`` throughout, as ``attach`` makes it) counts as none.
+
+    Args:
+        progress: called with "start" and the number of views done, and of those that are looked at in all; then with
+            "order" and the number of Gaussians whose place is known, and of all of them.
+        error: ``[N]`` from ``removal_error``, of these views and seed, where it is known already.
+    """
+    if base.attenuation is not None and has_dial(base):
+        own = dataclasses.replace(base.attenuation, max_sv=config.max_sv)
+        return in_world_units(base.replace(attenuation=own))
+    views = spread(views, MOST_VIEWS)
+    attenuation = config.attenuation(scene_distance(base, views, config.quantile))
+    if config.start in ("constant", "identity"):
+        value = 1.0 if config.start == "constant" else WIDEST * config.max_sv
+        constant = torch.full_like(base.means[:, 0], value)
+        return in_world_units(base.replace(sigma_d=constant, attenuation=attenuation))
+    if error is None:
+        looked = partial(progress, "start") if progress else None
+        error = removal_error(base, views, seed=config.seed, progress=looked)
+    attenuation = dataclasses.replace(attenuation, tau=fitting_tau(base.opacities, error, config))
+    importance = error
+    if config.start == "importance":
+        order = partial(progress, "order") if progress else None
+        importance = leaving_order(base, error.sqrt() * base.opacities, order)
+    distances = typical_distance(base.means, [view.camera for view in views], attenuation)
+    sigma = sigma_from_importance(
+        base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent
+    )
+    sigma = sigma.minimum(WIDEST * config.max_sv * distances)
+    return in_world_units(base.replace(sigma_d=sigma, attenuation=attenuation))
+
+
+def for_training(begun: Gaussians, views: Sequence[View], config: AdaptConfig) -> Gaussians:
+    """``begun`` with sigma_d in units of the scene's typical distance, that of the views where it is not known."""
+    assert begun.attenuation is not None
+    known = known_distance(begun.attenuation) or scene_distance(begun, spread(views, MOST_VIEWS), config.quantile)
+    own = dataclasses.replace(begun.attenuation, reference_distance=known)
+    return with_distance(begun.replace(attenuation=own), known)
+
+
+def has_dial(base: Gaussians) -> bool:
+    """Whether there is a sigma_d that does anything."""
+    return base.sigma_d is not None and bool((base.sigma_d < SIGMA_MAX).any())
+
+
+def seeing(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
+    """The views that have a Gaussian's centre beyond their near plane: from the others nothing is drawn or learned.
+
+    Raises:
+        ClodError: there is none.
+    """
+    found = []
+    for view in views:
+        depths = base.means @ view.camera.viewmat[2, :3].to(base.means) + view.camera.viewmat[2, 3].to(base.means)
+        if bool((depths >= view.camera.near).any()):
+            found.append(view)
+    if not found:
+        raise ClodError(
+            f"no Gaussian is in front of any of the {len(views)} training cameras: checkpoint and cameras are not of "
+            "one scene, or not in one coordinate frame; give the photographs and poses it was trained on"
+        )
+    return tuple(found)
+
+
+def fitting_tau(opacities: Tensor, error: Tensor, config: AdaptConfig) -> float:
+    """``config.tau``, or less for a checkpoint that is too faint for it; by itself no less than TAU_MIN.
+
+    At most 1/FADING of the opacity below which there is FAINT_SHARE of all removal error; and low enough for as many
+    Gaussians as the count law wants at ``max_sv`` to be opaque enough to be there. To six digits: a float32 holds them.
+
+    Args:
+        error: ``[N]`` from ``removal_error``.
+    """
+    ordered, order = opacities.sort()
+    lost = error[order].double().cumsum(0)
+    if not lost[-1] > 0:
+        return config.tau
+    faint = float(ordered[int((lost < FAINT_SHARE * lost[-1]).sum())])
+    wanted = max(round(len(ordered) * config.max_sv**-config.exponent), 1)
+    opaque = float(ordered[-wanted]) / config.max_sv
+    lowered = min(max(faint / FADING, TAU_MIN), max(opaque / FADING, TAU_MIN))
+    return min(config.tau, float(f"{lowered:.6g}"))
+
+
+def spread(views: Sequence[T], most: int) -> Sequence[T]:
+    """At most ``most`` of the views, evenly spread."""
+    return [views[k * len(views) // most] for k in range(most)] if len(views) > most else views
+
+
+def scene_distance(base: Gaussians, views: Sequence[View], quantile: float) -> float:
+    """D of the scene normaliser: mean over views of the ``quantile`` distance in the frustum, world units."""
+    probe = AttenuationConfig(normalizer="quantile", quantile=quantile)
+    total = 0.0
+    for view in views:
+        distances = (base.means - view.camera.position.to(base.means)).norm(dim=1)
+        total += float(normalizing_distance(distances, base.means, view.camera, probe))
+    return total / len(views)
+
+
+def removal_error(
+    gaussians: Gaussians, views: Sequence[View], *, seed: int = 0, progress: Callable[[int, int], None] | None = None
+) -> Tensor:
+    """``[N]`` estimate of the squared picture error that removing each Gaussian alone would cause.
+
+    To first order removing Gaussian i changes pixel p by ``a_i dC_p/da_i``. Its sum of squares over
+    the pixels, mean over the views, is estimated without a bias by one backward pass a view: with random signs
+    z, ``E[(sum_p z_p dC_p/da_i)^2] = sum_p (dC_p/da_i)^2`` (Hutchinson's estimator on the
+    Gauss-Newton matrix). Works with every differentiable rasterizer.
+
+    Args:
+        progress: called with the number of views done after each, and of all of them.
+
+    Raises:
+        ClodError: an error is not finite, as colours overflow in the pictures.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    total = torch.zeros_like(gaussians.means[:, 0])
+    for done, view in enumerate(views, 1):
+        opacities = gaussians.opacities.detach().requires_grad_()
+        image, _ = splat(gaussians, opacities, view.camera)
+        drawn = torch.randint(0, 2, image.shape, generator=generator, dtype=torch.uint8)
+        signs = drawn.to(image.device).to(image) * 2 - 1
+        (gradient,) = torch.autograd.grad((image * signs).sum(), opacities)  # as grad_outputs they would import sympy
+        total += (gradient * opacities.detach()).square()
+        if progress:
+            progress(done, len(views))
+    if (bad := bad_rows(total)) is not None:
+        much = f"what removing {int(bad.sum()):,} of the Gaussians does to the pictures is not finite"
+        raise ClodError(f"{much}; {largest_colour(gaussians)}")
+    return total / max(len(views), 1)
+
+
+def sigma_from_importance(
+    gaussians: Gaussians,
+    importance: Tensor,
+    distances: Tensor,
+    config: AttenuationConfig,
+    *,
+    share: float,
+    exponent: float,
+) -> Tensor:
+    """``[N]`` sigma_d with which the share kept follows the count law from the start, before any training.
+
+    Gaussians are ranked by importance. The one at rank fraction r (0 the most important) leaves
+    where ``counting.count_law`` falls to r. Ranks beyond ``share`` leave before s = 1.
+
+    Args:
+        importance: ``[N]``, larger stays longer.
+        distances: ``[N]`` normalised distance at which the law is to hold.
+        share: of all Gaussians, kept at s = 1; in (0.5, 1].
+    """
+    rank, order = torch.empty_like(distances), importance.argsort(descending=True, stable=True)
+    rank[order] = (torch.arange(len(rank), device=rank.device) + 0.5) / len(rank)
+    power = (1 / rank + (rank**-2 - 4 * (1 / share - 1)).clamp(min=0).sqrt()) / 2
+    extinction = torch.where(rank <= share, power ** (1 / exponent), share / rank)
+    return sigma_for_extinction(gaussians.opacity_logits, distances, extinction, config)

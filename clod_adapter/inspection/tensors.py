@@ -1,0 +1,47 @@
+"""Safetensors files of this package other than models: adapters, and the states of interrupted runs."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from clod_adapter.inspection.statistics import Spread
+from clod_adapter.io.adapter_file import FORMAT, KEY, load_adapter
+from clod_adapter.io.tensor_file import read_metadata
+from clod_adapter.training.state_file import KEY as STATE_KEY
+from clod_adapter.training.state_file import load_state
+
+
+def inspect_tensors(path: Path) -> tuple[str, dict[str, Any]] | None:
+    """What such a file is, and plain JSON about it; None where it is neither.
+
+    Raises:
+        ClodError: it cannot be read, or is damaged.
+    """
+    metadata = read_metadata(path)
+    if STATE_KEY in metadata:
+        return "the state of an interrupted run, for --resume", _state(path)
+    if KEY in metadata and f'"{FORMAT}"' in metadata[KEY]:
+        return "an adapter: what clod-adapt learned, without its checkpoint", _adapter(path)
+    return None
+
+
+def _adapter(path: Path) -> dict[str, Any]:
+    adapter = load_adapter(path)
+    kinds = {name: f"{str(t.dtype).removeprefix('torch.')} {list(t.shape)}" for name, t in adapter.updates.items()}
+    return {
+        "kind": "adapter", "writer": f"clod-adapter {adapter.version}", "count": len(adapter.sigma_d),
+        "base": adapter.base_fingerprint, "attenuation": asdict(adapter.attenuation), "config": adapter.config,
+        "updates": kinds, "origin": list(adapter.origin), "sigma": asdict(Spread.of(adapter.sigma_d.numpy())),
+        "calibration": adapter.calibration and adapter.calibration.as_dict(),
+    }  # fmt: skip
+
+
+def _state(path: Path) -> dict[str, Any]:
+    state, belongs = load_state(path)
+    return {
+        "kind": "state", "writer": None, "count": next((len(t) for t in state.tensors.values() if t.ndim), 0),
+        "steps": state.steps, "seconds": state.seconds, "loss": state.loss, "belongs": belongs,
+        "attenuation": asdict(state.attenuation),
+    }  # fmt: skip

@@ -1,0 +1,181 @@
+"""Reading Gaussians from glTF binary files with ``KHR_gaussian_splatting``, without trusting their numbers."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import recfunctions as rec
+
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.formats.arrays import gaussians_of, half_turn, logit, logs_of, read_whole
+from clod_adapter.io.formats.glb import COLOR_SPACE, DEGREE, EXTENSION, HALF_TURN, SIGMA, coefficient
+from clod_adapter.io.formats.metadata import KEY, Model, read_card, settings_of
+from clod_adapter.origin import AXES, NOWHERE, Origin, origin_of
+
+_JSON, _BIN = 0x4E4F534A, 0x004E4942
+_FLOAT = 5126
+# Component types that the extension allows in the place of floats, and what their largest stands for 1 of.
+_KINDS = {5120: ("i1", 127), 5121: ("u1", 255), 5122: ("<i2", 32767), 5123: ("<u2", 65535), _FLOAT: ("<f4", 1)}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_ATTRIBUTES = {
+    "means": ("POSITION", 3), "quats": (f"{EXTENSION}:ROTATION", 4), "log_scales": (f"{EXTENSION}:SCALE", 3),
+    "opacity_logits": (f"{EXTENSION}:OPACITY", 1), "sh0": (coefficient(0, 0), 3),
+}  # fmt: skip
+_REMEDY = "export it again, as a .ply"
+IDENTITY = [0.0, 0.0, 0.0, 1.0]  # as xyzw
+_FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
+
+
+def read_glb(path: str | Path) -> Gaussians:
+    """The Gaussians of a file; ``load_glb`` gives what it says about them too."""
+    return load_glb(path).gaussians
+
+
+def load_glb(path: str | Path) -> Model:
+    """Reads the first primitive with the extension, into the axes of checkpoints: y down.
+
+    A node that is not turned holds numbers in glTF's own axes, which are turned back here; files of ours hold those
+    of the checkpoint.
+
+    Raises:
+        ClodError: the file cannot be read, is damaged, has no such primitive or a compressed one, or its node stands
+            below another, is scaled, or turned in another way.
+    """
+    path = Path(path)
+    try:
+        gltf, binary = _chunks(read_whole(path))
+        (mesh, primitive), *others = _find(gltf)
+        attributes, doubts = primitive["attributes"], _doubts(primitive, len(others))
+        arrays = {key: _read(gltf, binary, attributes[name], width) for key, (name, width) in _ATTRIBUTES.items()}
+        degree = 0
+        while degree < DEGREE and coefficient(degree + 1, 0) in attributes:
+            degree += 1
+        bands = [coefficient(band, index) for band in range(1, degree + 1) for index in range(2 * band + 1)]
+        rest = [_read(gltf, binary, attributes[name], 3) for name in bands]
+        arrays["shN"] = np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
+        if SIGMA in attributes:
+            arrays["sigma_d"] = _read(gltf, binary, attributes[SIGMA], 1)
+        text = gltf["asset"].get("extras", {}).get(KEY)
+        turned, moved = _placed(gltf, mesh)
+    except ClodError as error:
+        raise ClodError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+    except (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
+        raise ClodError(f"{path}: is damaged or no such .glb ({error!r:.80}); {_REMEDY}") from error
+    card, notes = read_card(path, text, len(arrays["means"]))
+    stored = _stored(arrays) if turned else half_turn(_stored(arrays), "z")
+    if moved != card.origin:  # not as we wrote it
+        stored["means"], moved = _moved(stored["means"], moved)
+        card = replace(card, origin=moved)
+    attenuation = settings_of(card) if "sigma_d" in arrays else None
+    return Model(gaussians_of(path, stored, attenuation, card.screen_filter), card, (*doubts, *notes))
+
+
+def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The JSON and the binary chunk."""
+    if data[:4] != b"glTF":
+        raise ClodError(f"is no glTF binary file; {_REMEDY}")
+    version, length = struct.unpack_from("<II", data, 4) if len(data) >= 12 else (0, 0)
+    if version != 2 or length > len(data):
+        raise ClodError("is truncated, or no glTF 2.0; copy or export it again")
+    found: dict[int, bytes] = {}
+    start = 12
+    while start + 8 <= length:
+        size, kind = struct.unpack_from("<II", data, start)
+        if start + 8 + size > length:
+            raise ClodError("is truncated; copy or export it again")
+        found.setdefault(kind, data[start + 8 : start + 8 + size])
+        start += 8 + size
+    if _JSON not in found:
+        raise ClodError("has no description in it; export it again")
+    return json.loads(found[_JSON]), found.get(_BIN, b"")
+
+
+def _find(gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
+    """The primitives with Gaussians, of which there is one at least, each after the number of its mesh."""
+    found = [
+        (number, primitive)
+        for number, mesh in enumerate(gltf.get("meshes", []))
+        for primitive in mesh["primitives"]
+        if EXTENSION in primitive.get("extensions", {})
+    ]
+    if not found:
+        raise ClodError(f"has no Gaussians in it ({EXTENSION}), so it is a mesh; give a checkpoint of Gaussians")
+    _, first = found[0]
+    compressed = first["extensions"][EXTENSION].get("extensions")
+    if compressed or any(name not in first["attributes"] for name, _ in _ATTRIBUTES.values()):
+        raise ClodError("its Gaussians are compressed, or have no spherical harmonics; export them as a .ply")
+    return found
+
+
+def _doubts(primitive: dict[str, Any], others: int) -> list[str]:
+    """What of the file is not heeded."""
+    space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
+    notes = [f"its colours are in {space!r:.40}, and taken as {COLOR_SPACE}"] if space != COLOR_SPACE else []
+    return notes + ([f"{others} more primitives with Gaussians in it are left out"] if others else [])
+
+
+def _read(gltf: dict[str, Any], binary: bytes, number: int, width: int) -> np.ndarray:
+    """``[N, width]`` float32 of an accessor, ``[N]`` where the width is 1."""
+    accessor = gltf["accessors"][_whole(number)]
+    if "sparse" in accessor or _WIDTHS[accessor["type"]] != width:
+        raise ClodError(f"an attribute is sparse or of type {accessor['type']!r:.20}; {_REMEDY}")
+    kind, largest = _KINDS[accessor["componentType"]]
+    view = gltf["bufferViews"][_whole(accessor["bufferView"])]
+    if _whole(view["buffer"]) or "uri" in gltf["buffers"][0] or view.get("extensions"):
+        raise ClodError(f"its data are compressed, or in another file; {_REMEDY}")
+    item = np.dtype(kind).itemsize
+    stride = _whole(view.get("byteStride", item * width))
+    start, count = _whole(accessor.get("byteOffset", 0)), _whole(accessor["count"])
+    data = binary[_whole(view.get("byteOffset", 0)) :][: _whole(view["byteLength"])]
+    if not count or stride < item * width or start + (count - 1) * stride + item * width > len(data):
+        raise ClodError("an attribute has no values, or more than the file; copy or export it again")
+    values = np.ndarray((count, width), kind, data, start, (stride, item)).astype(np.float32)
+    if accessor.get("normalized"):
+        values = np.maximum(values / np.float32(largest), -1)
+    return values[:, 0] if width == 1 else values
+
+
+def _whole(value: Any) -> int:
+    if not isinstance(value, int) or value < 0:
+        raise ValueError(f"{value!r:.20} is no count")
+    return value
+
+
+def _placed(gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
+    """Whether the mesh's node makes the half turn, and the origin, in the axes of checkpoints, that it moves to."""
+    nodes: list[dict[str, Any]] = gltf.get("nodes", [])
+    number = next((number for number, node in enumerate(nodes) if node.get("mesh") == mesh), -1)
+    node = nodes[number] if number >= 0 else {}
+    below = any(number in other.get("children", []) for other in nodes)
+    rotation = [float(value) for value in node.get("rotation", IDENTITY)]
+    scale = [float(value) for value in node.get("scale", [1, 1, 1])]
+    turned = np.allclose(np.abs(rotation), HALF_TURN)
+    if below or "matrix" in node or scale != [1, 1, 1] or not (turned or np.allclose(np.abs(rotation), IDENTITY)):
+        raise ClodError("its node is scaled or turned, which is not undone here; apply the transform and export again")
+    x, y, z = (float(value) for value in node.get("translation", [0, 0, 0]))
+    if not np.isfinite([x, y, z]).all():
+        raise ClodError("its node moves it by what is not finite; export it again")
+    return turned, (0.0 - x, 0.0 - y, z)
+
+
+def _moved(means: np.ndarray, by: Origin) -> tuple[np.ndarray, Origin]:
+    """Means, and what they are relative to: moved where that is not far, as float32 has digits for it there."""
+    wide = means.astype(np.float64) + by
+    far = origin_of(rec.unstructured_to_structured(wide, names=list(AXES)))
+    return (means, by) if any(far) else (wide.astype(np.float32), NOWHERE)
+
+
+def _stored(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """As checkpoints store them."""
+    quats = np.roll(arrays["quats"], 1, axis=1)
+    logits = logit(np.clip(arrays["opacity_logits"], 0, 1))
+    return {
+        **arrays, "log_scales": logs_of(arrays["log_scales"]), "quats": quats,
+        "opacity_logits": np.maximum(logits, _FAINTEST), "sh0": arrays["sh0"][:, None],
+    }  # fmt: skip

@@ -1,0 +1,36 @@
+"""PLY files of Gaussians that come from no file: Inria's layout, and ``sigma_d`` where they have it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from clod_adapter.calibration import Calibration
+from clod_adapter.gaussians import OPAQUE, Gaussians
+from clod_adapter.io.checkpoint import blank, save
+from clod_adapter.io.formats.arrays import arrays_of
+from clod_adapter.origin import NOWHERE, Origin
+
+
+def write_ply(
+    path: str | Path,
+    gaussians: Gaussians,
+    about: Sequence[str] = (),
+    *,
+    origin: Origin = NOWHERE,
+    calibration: Calibration | None = None,
+) -> tuple[str, ...]:
+    """Writes every value as it is (but opacity = +inf), ``about`` as comments; ``writers.write`` has the arguments.
+
+    Raises:
+        ClodError: as ``ply.save``, or a rotation is zero.
+    """
+    arrays_of(Path(path), gaussians)  # which refuses what load would drop
+    base = replace(blank(len(gaussians), gaussians.sh_degree, origin), comments=tuple(about))
+    opaque = gaussians.opacity_logits == torch.inf
+    finite = torch.where(opaque, torch.full_like(gaussians.opacity_logits, OPAQUE), gaussians.opacity_logits)
+    save(path, gaussians.replace(opacity_logits=finite), base, calibration=calibration)
+    return (f"{int(opaque.sum())} opacities of +inf are written as {OPAQUE:g}, which is 1 too",) if opaque.any() else ()

@@ -1,0 +1,152 @@
+"""Checkpoints of gsplat's trainer, ``.pt``: the one format here that is a pickle, of which only tensors are taken.
+
+Those written here have one more tensor among the ``splats``, ``sigma_d``, and beside them the description (``card``)
+as a string under ``clod_adapter``. The trainer and its viewers take the tensors that they know, by name.
+"""
+
+from __future__ import annotations
+
+import pickle
+import pickletools
+import re
+import struct
+import warnings
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clod_adapter.config import SH_COUNTS
+from clod_adapter.errors import ClodError
+from clod_adapter.io.formats.metadata import KEY
+from clod_adapter.io.ply.columns import SIGMA
+from clod_adapter.io.regular import read_start, utf8_name
+from clod_adapter.io.sniff import refuse
+
+# As gsplat's trainer names its parameters, and as they are called here.
+NAMES = {
+    "means": "means", "quats": "quats", "scales": "log_scales", "opacities": "opacity_logits",
+    "sh0": "sh0", "shN": "shN",
+}  # fmt: skip
+FRAME = "gsplat's trainer may have normalised the coordinates; photographs must be in the same"
+_PICKLE_LIMIT = 1 << 20  # bytes; of a few tensors it has a few hundred
+_PLAIN = r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|torch \w+Storage"
+
+
+def check_pt(path: Path) -> None:
+    """Refuses, without torch, what is not a file of ``torch.save``, or would unpack to more than it is.
+
+    Raises:
+        ClodError: it is not, or cannot be read.
+    """
+    start = read_start(path)
+    if start.startswith(b"\x80"):
+        raise ClodError(f"{path}: is a pickle in PyTorch's format before 1.6; load it and torch.save it again")
+    if not start.startswith(b"PK"):
+        refuse(path, start, "is no file of torch.save; export the checkpoint as a PLY")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+            pickles = [entry for entry in entries if entry.filename.endswith("/data.pkl")]
+            stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
+            whole = stored and sum(entry.file_size for entry in entries) <= path.stat().st_size
+            if not whole or len(pickles) != 1 or pickles[0].file_size > _PICKLE_LIMIT:
+                raise ClodError(f"{path}: is a zip archive that torch.save does not write; export a PLY instead")
+            with warnings.catch_warnings(action="ignore"):  # of odd escapes in it
+                _check_pickle(path, archive.read(pickles[0]))
+    except (OSError, ValueError) as error:
+        raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, struct.error) as error:
+        raise ClodError(f"{path}: is damaged or truncated ({error}); copy or export it again") from error
+
+
+def _check_pickle(path: Path, data: bytes) -> None:
+    """Refuses a pickle that names anything but what plain tensors need.
+
+    ``weights_only`` runs no code either, but lets a pickle of a hundred bytes ask for gigabytes.
+    """
+    try:
+        for opcode, argument, _ in pickletools.genops(data):
+            named = opcode.name in ("GLOBAL", "INST", "STACK_GLOBAL")
+            if named and not re.fullmatch(_PLAIN, str(argument)):
+                raise ClodError(
+                    f"{path}: holds {argument}, more than tensors, and is not unpickled; export it as a PLY"
+                )
+    except (ValueError, IndexError) as error:  # no such opcode, or it ends early
+        raise ClodError(f"{path}: is damaged ({error}); copy or export it again") from error
+
+
+def read_splats(path: Path) -> tuple[dict[str, np.ndarray], str | None]:
+    """The parameters by gsplat's names, float32, of one number of rows and fitting shapes; and the description, if any.
+
+    The values are as in Inria's layout: scales are logarithms, opacities logits. What ``sigma_d``, if there, means,
+    ``pt_model.load_pt`` tells. Read with ``weights_only``: a pickle that calls anything but what makes tensors is
+    refused, and nothing is called.
+
+    Raises:
+        ClodError: not such a checkpoint, damaged, or more than tensors.
+    """
+    checkpoint = _load(path)
+    splats = checkpoint.get("splats") if isinstance(checkpoint, dict) else None
+    if not isinstance(splats, dict):
+        found = (
+            ", ".join(map(repr, list(checkpoint)[:5])) if isinstance(checkpoint, dict) else type(checkpoint).__name__
+        )
+        raise ClodError(
+            f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {found}); export it as a PLY"
+        )
+    wanted = (*NAMES, SIGMA) if SIGMA in splats else tuple(NAMES)
+    values = {name: _values(path, name, splats) for name in wanted}
+    _check_shapes(path, values)
+    text = checkpoint.get(KEY)
+    if text is not None and not isinstance(text, str):
+        raise ClodError(f"{path}: its description is damaged (a {type(text).__name__}); export the file again")
+    return values, text
+
+
+def _load(path: Path) -> Any:
+    import torch  # here and not above, as check_pt does without
+
+    check_pt(path)
+    try:
+        # Mapped, so that what else a checkpoint holds (optimisers, networks) is not read.
+        with warnings.catch_warnings(action="ignore"), utf8_name(path) as name:
+            return torch.load(name, map_location="cpu", weights_only=True, mmap=True)
+    except pickle.UnpicklingError as error:
+        raise ClodError(
+            f"{path}: holds more than tensors, or is damaged, and was not unpickled; export the checkpoint as a PLY"
+        ) from error
+    except MemoryError:
+        raise
+    except Exception as error:  # torch lets RuntimeError, KeyError, TypeError and more through
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ClodError(f"{path}: is damaged ({reason}); copy or export it again") from error
+
+
+def _values(path: Path, name: str, splats: dict[str, Any]) -> np.ndarray:
+    """A parameter as float32, unless it is none or claims more values than the file has bytes."""
+    import torch
+
+    value = splats.get(name)
+    if value is None:
+        more = "; with appearance optimisation its trainer stores no colours" if "features" in splats else ""
+        raise ClodError(f"{path}: splats has no {name!r}{more}; export it as a PLY with spherical harmonics")
+    usable = isinstance(value, torch.Tensor) and value.device.type == "cpu" and value.layout == torch.strided
+    if not usable or not value.is_floating_point() or value.nbytes > path.stat().st_size:
+        raise ClodError(f"{path}: splats[{name!r}] is no plain tensor of numbers; export the checkpoint as a PLY")
+    return value.detach().float().numpy()
+
+
+def _check_shapes(path: Path, values: dict[str, np.ndarray]) -> None:
+    count = len(values["means"]) if values["means"].ndim else 0
+    bands = values["shN"].shape[1] if values["shN"].ndim == 3 else -1
+    shapes = {
+        "means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,), "sh0": (count, 1, 3),
+        "shN": (count, bands, 3), SIGMA: (count,),
+    }  # fmt: skip
+    for name, value in values.items():
+        if value.shape != shapes[name]:
+            raise ClodError(f"{path}: splats[{name!r}] has shape {value.shape}, not {shapes[name]}; export it again")
+    if bands + 1 not in SH_COUNTS.values():
+        raise ClodError(f"{path}: splats['shN'] has {bands} coefficients, which fit no SH degree; export it again")

@@ -1,0 +1,159 @@
+"""SPZ files (Niantic), version 3, and in a record of our own sigma_d where there is a dial.
+
+One gzip stream: a 16-byte header, then one array after another: positions in 24-bit fixed point, opacities, colours
+and logarithms of scales in bytes, rotations in four bytes, spherical harmonics in bytes, as the reference
+(``load-spz.cc``) reads them. It writes harmonics with 5 bits at degree 1 and 4 above, rounding halves up; 6 bits,
+rounded to the nearest, take a third more space for 13 dB (docs/formats.md).
+
+Records of vendors follow the arrays, flagged in the header: type, length, bytes. Readers skip types that they do not
+know; most do not even read so far. Two are written:
+
+- Adobe's of the axes, which says that they are a checkpoint's (x right, y down, z ahead). The format's own are
+  OpenGL's, but the reference's ``ply_to_spz``, splat-transform, SuperSplat and gsply all leave those of the PLY, so
+  that turned numbers would be upside down in them;
+- ours, ``RECORD``: the length of the description (``card``) as uint32, the description, then sigma_d as float16, which
+  keeps it to 5e-4. What is larger than there is room for becomes the largest, 65504, which is no decay: it takes less
+  than ``(d' s)^2 1.2e-10`` of an opacity.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from clod_adapter.calibration import Calibration
+from clod_adapter.config import CLASSIC
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.formats.arrays import arrays_of, bytes_of, normalized, sigmoid
+from clod_adapter.io.formats.metadata import card_text, write_card
+from clod_adapter.origin import NOWHERE, Origin
+from clod_adapter.units import estimated_distance, known_distance, with_distance
+
+HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
+MAGIC, VERSION = 0x5053474E, 3
+RECORD = 0x434C0001  # vendor "CL", its first extension
+AXES = 0xADBE0003  # SPZ_ADOBE_coordinate_system
+RDF = 6  # right, down, forward
+ANTIALIASED, EXTENDED = 1, 2  # flags: of a filter that compensates opacities, of records after the arrays
+MOST = 10_000_000  # Gaussians that the reference reads
+DEGREE = 3  # the highest that all readers know
+COLOR = 0.15  # of the range of bytes to one of sh0
+MAGNITUDE = 511 * math.sqrt(2)  # of the three components of a rotation that are not the largest
+_BITS = 6  # of a harmonic
+_SIGMA_MOST = float(np.finfo(np.float16).max)
+_FAR = 100.0  # world units: a typical distance from which on some sigma_d that fade at high dial values are beyond that
+
+
+def write_spz(
+    path: str | Path,
+    gaussians: Gaussians,
+    about: Sequence[str] = (),
+    *,
+    origin: Origin = NOWHERE,
+    calibration: Calibration | None = None,
+) -> tuple[str, ...]:
+    """Writes to the format's 8 bits or so; ``writers.write`` has the arguments and errors.
+
+    Positions have as many of their 24 bits for the fraction as they leave, 20 at most. A few Gaussians at an enormous
+    distance, as many checkpoints have them, would leave the rest too few: see ``_nearer``.
+
+    Raises:
+        ClodError: more than 10,000,000 Gaussians, or a scene that reaches farther than 4,000,000, besides.
+    """
+    path, gaussians = Path(path), _within_float16(gaussians)
+    arrays, bits, moved = _nearer(arrays_of(path, gaussians))
+    if len(gaussians) > MOST or bits < 1:
+        raise ClodError(
+            f"{path}: an .spz holds at most {MOST:,} Gaussians within 4,000,000 of 0, these are {len(gaussians):,} "
+            f"within {float(gaussians.means.abs().max()):.4g}; keep fewer or write a .ply"
+        )
+    degree = min(gaussians.sh_degree, DEGREE)
+    screen_filter = gaussians.screen_filter
+    flags = EXTENDED | (ANTIALIASED if screen_filter.compensate else 0)
+    header = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, bits, flags, 0)
+    parts = [header, *_packed(arrays, bits, degree), struct.pack("<III", AXES, 4, RDF)]
+    says = (gaussians.sigma_d is not None, any(origin), calibration is not None, about, screen_filter != CLASSIC)
+    if any(says):
+        text = card_text(write_card(gaussians, about, origin, calibration)).encode()
+        sigma = np.clip(arrays.get("sigma_d", np.zeros(0)), -_SIGMA_MOST, _SIGMA_MOST).astype("<f2").tobytes()
+        parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(sigma), len(text)) + text + sigma)
+    with atomic_path(path) as temporary:
+        gzip = zlib.compressobj(wbits=31)
+        temporary.write_bytes(gzip.compress(b"".join(parts)) + gzip.flush())
+    return (*moved, *_losses(arrays, bits, degree))
+
+
+def _within_float16(gaussians: Gaussians) -> Gaussians:
+    """With sigma_d in units of the typical distance where that is large: in world units float16 would cut it off."""
+    config = gaussians.attenuation
+    if config is None or config.normalizer != "scene":
+        return gaussians
+    typical = known_distance(config) or estimated_distance(gaussians.means)
+    return with_distance(gaussians, typical) if typical > _FAR else gaussians
+
+
+def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, tuple[str, ...]]:
+    """The arrays, the bits of the fraction that they leave, and a line if the farthest were moved for it.
+
+    What is beyond 8 times the distance that 99 % keep to (rounded up to a power of two) is moved towards 0 and made
+    smaller by the same factor, and its sigma_d with it: from 0 it looks as before, from nearby very nearly.
+    """
+    reach = np.abs(arrays["means"]).max(1).astype(np.float64)
+    most = min(float(reach.max()), 8 * float(np.quantile(reach, 0.99)))
+    bits = min(20, 23 - math.frexp(most)[1])
+    factor = np.minimum(1, 2.0 ** (23 - bits) / np.maximum(reach, 1e-300))[:, None]
+    moved = int((factor < 1).sum())
+    if not moved:
+        return arrays, bits, ()
+    nearer = {**arrays, "means": arrays["means"] * factor, "log_scales": arrays["log_scales"] + np.log(factor)}
+    if "sigma_d" in arrays:
+        nearer["sigma_d"] = arrays["sigma_d"] * factor[:, 0]
+    return nearer, bits, (f"the {moved} farthest are moved to {2.0 ** (23 - bits):g} from 0, and made as much smaller",)
+
+
+def _packed(arrays: dict[str, np.ndarray], bits: int, degree: int) -> list[bytes]:
+    # Far beyond what a byte has room for, but not so far that it overflows.
+    sh0, harmonics = np.clip(arrays["sh0"], -9, 9), np.clip(arrays["shN"][:, : (degree + 1) ** 2 - 1], -9, 9)
+    fixed = np.round(arrays["means"].astype(np.float64) * 2.0**bits).clip(-(2**23), 2**23 - 1).astype("<i4")
+    parts = [
+        np.ascontiguousarray(fixed[..., None].view(np.uint8)[..., :3]),
+        bytes_of(255 * sigmoid(arrays["opacity_logits"])),
+        bytes_of(255 * (COLOR * sh0 + 0.5)),
+        bytes_of(16 * (arrays["log_scales"] + 10)),
+        _packed_quats(arrays["quats"]),
+    ]
+    step = 1 << (8 - _BITS)
+    parts.append(bytes_of(128 + step * np.round(128 / step * harmonics)))
+    return [part.tobytes() for part in parts]
+
+
+def _packed_quats(quats: np.ndarray) -> np.ndarray:
+    """``[N]`` uint32: the largest component's index in xyzw, then of each other a sign and 9 bits, over sqrt(1/2)."""
+    xyzw = np.roll(normalized(quats), -1, axis=1).astype(np.float64)
+    rows, largest = np.arange(len(xyzw)), np.abs(xyzw).argmax(1)
+    xyzw *= np.where(xyzw[rows, largest] < 0, -1.0, 1.0)[:, None]
+    packed = largest.astype(np.uint32)
+    for axis in range(4):
+        level = np.floor(MAGNITUDE * np.abs(xyzw[:, axis]) + 0.5).clip(max=511).astype(np.uint32)
+        more = (packed << 10) | (np.uint32(512) * (xyzw[:, axis] < 0)) | level
+        packed = np.where(largest == axis, packed, more)
+    return packed.astype("<u4")
+
+
+def _losses(arrays: dict[str, np.ndarray], bits: int, degree: int) -> tuple[str, ...]:
+    notes = [f"positions are rounded to {2.0**-bits:.1g}, colours, opacities, scales and rotations to about 8 bits"]
+    if arrays["shN"][:, (degree + 1) ** 2 - 1 :].any():
+        notes.append(f"spherical harmonics above degree {DEGREE} are dropped")
+    beyond = {
+        "harmonics beyond 1": np.abs(arrays["shN"]).max(initial=0) > 1.01,
+        "colours beyond the range": np.abs(arrays["sh0"]).max() > 0.51 / COLOR,
+        "scales beyond e^-10 to e^5.9": (np.abs(arrays["log_scales"] + 2.03125) > 8).any(),
+    }
+    return (*notes, *(f"{what} are cut to it" for what, there in beyond.items() if there))

@@ -1,0 +1,148 @@
+"""Reading SPZ files up to version 3, ours and others', without trusting their sizes."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from clod_adapter.config import FILTERS, SH_COUNTS
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.formats.arrays import gaussians_of, half_turn, logits_of_bytes, read_whole
+from clod_adapter.io.formats.metadata import Model, read_card, settings_of
+from clod_adapter.io.formats.spz import ANTIALIASED, AXES, COLOR, EXTENDED, HEADER, MAGIC, MAGNITUDE, MOST, RDF, RECORD
+from clod_adapter.io.screen_filter import TAG
+from clod_adapter.units import in_world_units
+
+_BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10
+_CONVERT = "convert it: splat-transform IN.spz OUT.ply"
+_TURNS = {RDF: "", 4: "x", 7: "z"}  # right, up, back; left, up, forward
+_UNTURNED = struct.pack("<I", RDF)
+_SMALL = 1 << 24  # bytes that any file may
+
+
+def read_spz(path: str | Path) -> Gaussians:
+    """The Gaussians of a file; ``load_spz`` gives what it says about them too."""
+    return load_spz(path).gaussians
+
+
+def load_spz(path: str | Path) -> Model:
+    """Reads versions 2 and 3, SH degree 0 to 4; values are the middles of what was rounded to them.
+
+    Raises:
+        ClodError: the file cannot be read, is damaged, of another version, or unpacks to far more than it could hold.
+    """
+    path = Path(path)
+    data = _unpacked(path, read_whole(path))
+    magic, version, count, degree, bits, flags, _ = HEADER.unpack_from(data)
+    if magic != MAGIC or version not in (2, 3) or degree not in SH_COUNTS or bits > 24 or count > MOST:
+        raise ClodError(f"{path}: is no SPZ file of version 2 or 3 (version {version}, {count} Gaussians); {_CONVERT}")
+    bands = SH_COUNTS[degree] - 1
+    sizes = {"means": 9, "opacities": 1, "colors": 3, "scales": 3, "quats": 4 if version == 3 else 3, "shN": 3 * bands}
+    end = HEADER.size + count * sum(sizes.values())
+    if not count or end > len(data):
+        raise ClodError(f"{path}: has no Gaussians or is truncated; copy or export it again")
+    columns, start = {}, HEADER.size
+    for name, size in sizes.items():
+        columns[name] = np.frombuffer(data, np.uint8, count * size, start).reshape(count, size)
+        start += count * size
+    records = _records(data[end:]) if flags & EXTENDED else {}
+    text, sigma = _ours(path, records[RECORD], count) if RECORD in records else (None, None)
+    card, notes = read_card(path, text, count)
+    if flags & ANTIALIASED and not card.screen_filter.compensate:  # of another program, as ours say more
+        card = replace(card, screen_filter=FILTERS["on"], about=(*card.about, TAG))
+    arrays = _unquantized(columns, bits, bands)
+    arrays = _in_our_axes(path, arrays, records.get(AXES, _UNTURNED))
+    if sigma is not None:
+        arrays["sigma_d"] = sigma
+    attenuation = settings_of(card) if sigma is not None else None
+    gaussians = in_world_units(gaussians_of(path, arrays, attenuation, card.screen_filter))
+    if card.attenuation is not None:
+        card = replace(card, attenuation=gaussians.attenuation)
+    return Model(gaussians, card, tuple(notes))
+
+
+def _unpacked(path: Path, data: bytes) -> bytes:
+    if data[:4] == MAGIC.to_bytes(4, "little"):
+        raise ClodError(f"{path}: is an SPZ file of version 4; {_CONVERT}")
+    if data[:2] != b"\x1f\x8b":
+        raise ClodError(f"{path}: is no SPZ file; copy or export it again")
+    limit = max(_SMALL, _BOMB * len(data))
+    gzip = zlib.decompressobj(wbits=31)
+    try:
+        unpacked = gzip.decompress(data, limit)
+    except zlib.error as error:
+        raise ClodError(f"{path}: is damaged ({error}); copy or export it again") from error
+    if not gzip.eof or len(unpacked) < HEADER.size:
+        raise ClodError(
+            f"{path}: is truncated, or unpacks to more than {limit:,} bytes, which no Gaussians do; export it again"
+        )
+    return unpacked
+
+
+def _records(data: bytes) -> dict[int, bytes]:
+    """The records after the arrays by their types, as far as they are whole."""
+    found, start = {}, 0
+    while start + 8 <= len(data):
+        kind, size = struct.unpack_from("<II", data, start)
+        start += 8 + size
+        if start <= len(data):
+            found[kind] = data[start - size : start]
+    return found
+
+
+def _ours(path: Path, body: bytes, count: int) -> tuple[bytes, np.ndarray | None]:
+    """Our record's description, and sigma_d if it is there."""
+    length = struct.unpack_from("<I", body)[0] if len(body) >= 4 else 0
+    rest = len(body) - 4 - length
+    if rest not in (0, 2 * count):
+        raise ClodError(f"{path}: its record of sigma_d is damaged; copy or export it again")
+    sigma = np.frombuffer(body, "<f2", offset=4 + length).astype(np.float32) if rest else None
+    return body[4 : 4 + length], sigma
+
+
+def _in_our_axes(path: Path, arrays: dict[str, np.ndarray], record: bytes) -> dict[str, np.ndarray]:
+    """As Adobe's record says; without one as they are, as the field's converters leave them."""
+    (axes,) = struct.unpack("<I", record) if len(record) == 4 else (0,)
+    if axes not in _TURNS:
+        raise ClodError(f"{path}: its axes are of kind {axes}, which is not undone here; {_CONVERT}")
+    return half_turn(arrays, _TURNS[axes]) if _TURNS[axes] else arrays
+
+
+def _unquantized(columns: dict[str, np.ndarray], bits: int, bands: int) -> dict[str, np.ndarray]:
+    count = len(columns["means"])
+    wide = np.zeros((count, 3, 4), np.uint8)
+    wide[..., 1:] = columns["means"].reshape(count, 3, 3)
+    fixed = wide.view("<i4")[..., 0] >> 8  # with the sign
+    quats = columns["quats"]
+    return {
+        "means": (fixed / 2.0**bits).astype(np.float32),
+        "quats": _smallest_three(quats) if quats.shape[1] == 4 else _first_three(quats),
+        "log_scales": columns["scales"].astype(np.float32) / 16 - 10,
+        "opacity_logits": logits_of_bytes(columns["opacities"][:, 0]),
+        "sh0": ((columns["colors"].astype(np.float32) / 255 - 0.5) / COLOR)[:, None],
+        "shN": (columns["shN"].reshape(count, bands, 3).astype(np.float32) - 128) / 128,
+    }
+
+
+def _smallest_three(quats: np.ndarray) -> np.ndarray:
+    """``[N, 4]`` wxyz; the inverse of ``spz._packed_quats``."""
+    packed = np.ascontiguousarray(quats).view("<u4")[:, 0]
+    largest, xyzw = packed >> 30, np.zeros((len(packed), 4), np.float64)
+    for axis in (3, 2, 1, 0):
+        there = largest != axis
+        value = (packed & 511) / MAGNITUDE
+        xyzw[:, axis] = np.where(there, np.where(packed & 512, -value, value), 0)
+        packed = np.where(there, packed >> 10, packed)
+    xyzw[np.arange(len(xyzw)), largest] = np.sqrt(np.maximum(0, 1 - (xyzw**2).sum(1)))
+    return np.roll(xyzw, 1, axis=1).astype(np.float32)
+
+
+def _first_three(quats: np.ndarray) -> np.ndarray:
+    """``[N, 4]`` wxyz of version 2: x, y and z in bytes, w >= 0."""
+    xyz = quats.astype(np.float32) / 127.5 - 1
+    return np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True))), xyz], 1)

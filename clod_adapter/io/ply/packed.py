@@ -1,0 +1,132 @@
+"""PlayCanvas's compressed PLY, which SuperSplat, splat-transform and gsplat's exporter write: 32 bits an attribute.
+
+Gaussians stand in blocks of 256. Of each block the element ``chunk`` has the ranges of position, logarithmic scale and,
+in newer files, colour; ``vertex`` has where in its block's ranges each Gaussian lies: position and scale in 11, 10 and
+11 bits, the three smaller parts of the unit quaternion in 10 bits each and which part is missing in 2, colour and
+opacity in 8 bits each. ``sh``, where it is there, has the higher harmonics in 8 bits, between -4 and 4.
+
+Source: splat-transform 3.7, ``read-ply``; gsplat, ``exporter.splat2ply_bytes_compressed``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData, PlyListProperty
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.ply.body import read_element
+from clod_adapter.io.ply.columns import column_map, degree_of, inria_dtype
+from clod_adapter.io.ply.header import Head, all_comments
+from clod_adapter.io.rows import Rows
+
+BLOCK = 256
+_BITS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_AXES = ("x", "y", "z")
+_RANGES = tuple(f"{end}_{what}{axis}" for what in ("", "scale_") for end in ("min", "max") for axis in _AXES)
+_COLOURS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb")
+NOTE = "quantised: positions and scales in 11 bits a block, rotations in 10, colours, harmonics and opacities in 8"
+
+
+def is_packed(header: PlyData) -> bool:
+    """Whether the vertices are packed."""
+    return "vertex" in header and any(p.name.startswith("packed_") for p in header["vertex"].properties)
+
+
+def check_packed(path: Path, header: PlyData) -> int:
+    """The SH degree of such a file, judged by its header.
+
+    Raises:
+        ClodError: an element or a property is missing or of another type.
+    """
+    _require(path, header, "chunk", _RANGES, "f4")
+    _require(path, header, "vertex", _BITS, "u4")
+    rest = len(header["sh"].properties) if "sh" in header else 0
+    if rest:
+        _require(path, header, "sh", tuple(f"f_rest_{k}" for k in range(rest)), "u1")
+    return degree_of(path, rest)
+
+
+def read_packed(path: Path, head: Head) -> Rows:
+    """The Gaussians of such a file.
+
+    An opacity of 0 or 255 is one that was rounded to it, and is taken as a quarter of a step within: neither ends as an
+    infinite logit.
+
+    Raises:
+        ClodError: as ``check_packed``; the file is damaged, or has fewer blocks than its Gaussians need.
+    """
+    from clod_adapter.gaussians import SH_C0  # here and not above, as check_packed does without torch
+
+    degree = check_packed(path, head.ply)
+    chunks, packed = read_element(path, head, "chunk"), read_element(path, head)
+    if len(chunks) * BLOCK < len(packed):
+        raise ClodError(
+            f"{path}: is damaged: {len(packed)} Gaussians need {-(-len(packed) // BLOCK)} chunks, and it has "
+            f"{len(chunks)}; copy or export it again"
+        )
+    columns, vertex = column_map(degree), np.zeros(len(packed), inria_dtype(degree))
+    block = np.arange(len(packed)) // BLOCK
+    with np.errstate(invalid="ignore", over="ignore"):  # ranges that are not finite: their rows are dropped later
+        for what, bits in (("", packed["packed_position"]), ("scale_", packed["packed_scale"])):
+            for k, (axis, share) in enumerate(zip(_AXES, _shares(bits, (11, 10, 11)), strict=True)):
+                low, high = (chunks[f"{end}_{what}{axis}"][block] for end in ("min", "max"))
+                vertex[columns["log_scales" if what else "means"][k]] = low * (1 - share) + high * share
+        *colours, opacity = _shares(packed["packed_color"], (8, 8, 8, 8))
+        for k, (channel, share) in enumerate(zip("rgb", colours, strict=True)):
+            if set(_COLOURS) <= set(chunks.dtype.names or ()):
+                share = chunks[f"min_{channel}"][block] * (1 - share) + chunks[f"max_{channel}"][block] * share
+            vertex[columns["sh0"][k]] = (share - 0.5) / SH_C0
+    opacity = np.clip(opacity, 0.25 / 255, 254.75 / 255)
+    vertex["opacity"] = np.log(opacity / (1 - opacity))
+    for name, values in zip(columns["quats"], _rotations(packed["packed_rotation"]), strict=True):
+        vertex[name] = values
+    if degree:
+        _read_harmonics(path, head, vertex)
+    return Rows(vertex, degree, all_comments(head.ply), (NOTE,), settled=True)
+
+
+def _require(path: Path, header: PlyData, element: str, names: tuple[str, ...], kind: str) -> None:
+    if element not in header:
+        raise ClodError(f"{path}: is a compressed PLY without its element {element}; export it again")
+    properties = header[element].properties
+    if any(isinstance(p, PlyListProperty) for p in properties):
+        raise ClodError(f"{path}: element {element} of a compressed PLY has a list; export it again")
+    types = {p.name: p.val_dtype for p in properties}
+    for name in names:
+        if types.get(name) != kind:
+            raise ClodError(
+                f"{path}: is a compressed PLY whose {element} has no {name} of type {kind}; export it again"
+            )
+
+
+def _shares(bits: np.ndarray, widths: tuple[int, ...]) -> list[np.ndarray]:
+    """The parts of ``[N]`` uint32, highest first, each over the largest it can be: ``[N]`` in [0, 1]."""
+    shift, found = 32, []
+    for width in widths:
+        shift -= width
+        largest = np.uint32((1 << width) - 1)
+        found.append(((bits >> np.uint32(shift)) & largest).astype(np.float32) / largest)
+    return found
+
+
+def _rotations(bits: np.ndarray) -> np.ndarray:
+    """``[4, N]`` unit quaternions, wxyz."""
+    small = (np.stack(_shares(bits << np.uint32(2), (10, 10, 10))) - 0.5) * np.float32(np.sqrt(2))
+    largest = np.sqrt(np.maximum(0, 1 - (small**2).sum(0)))
+    missing = bits >> np.uint32(30)
+    return np.stack([
+        np.where(missing == part, largest, np.where(missing > part, small[min(part, 2)], small[max(part - 1, 0)]))
+        for part in range(4)
+    ])  # fmt: skip
+
+
+def _read_harmonics(path: Path, head: Head, vertex: np.ndarray) -> None:
+    table = read_element(path, head, "sh")
+    if len(table) != len(vertex):
+        raise ClodError(f"{path}: is damaged: {len(table)} harmonics for {len(vertex)} Gaussians; export it again")
+    levels = np.arange(256, dtype=np.float32)
+    values = (np.where(levels == 0, 0, np.where(levels == 255, 1, (levels + 0.5) / 256)) - 0.5) * 8
+    for name in table.dtype.names or ():
+        vertex[name] = values[table[name]]

@@ -1,0 +1,78 @@
+"""Refusing damaged COLMAP models before COLMAP reads them, which trusts its files."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.regular import refuse_irregular
+from clod_adapter.io.scene.colmap_library import pycolmap
+
+
+def check_records(model: Path) -> None:
+    """Walks the binary records, as COLMAP reads past the end of a cut file until memory runs out.
+
+    Raises:
+        ClodError: a file cannot be read or does not hold the records that it says.
+    """
+    for name, after in _RECORDS.items():
+        path = model / name
+        for other in (path, path.with_suffix(".txt")):
+            refuse_irregular(other, "copy the model again")
+        if not path.is_file():
+            continue
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+        try:
+            at = 8
+            for _ in range(struct.unpack_from("<Q", data)[0]):
+                at = after(data, at)
+        except (struct.error, ValueError, OverflowError):
+            at = len(data) + 1
+        if at > len(data):
+            raise ClodError(f"{path}: is truncated or damaged; copy or export the model again")
+
+
+def check_name(model: Path, name: str) -> None:
+    """Refuses an image name that no file can have, or that is not safe to print.
+
+    Raises:
+        ClodError: it holds control characters, or is longer than file systems allow.
+    """
+    parts = name.encode(errors="surrogatepass").replace(b"\\", b"/").split(b"/")
+    if not name.isprintable() or len(name) > 4000 or max(map(len, parts)) > 255:
+        raise ClodError(f"{model}: image name {name[:40]!r} ({len(name)} characters) is no file's name; rename it")
+
+
+def _count(data: bytes, at: int) -> int:
+    return struct.unpack_from("<Q", data, at)[0]
+
+
+def _camera_end(data: bytes, at: int) -> int:
+    model = pycolmap.CameraModelId(struct.unpack_from("<i", data, at + 4)[0])
+    parameters = pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params  # ValueError: no such model
+    return at + 24 + 8 * len(parameters)  # id, model, width, height, parameters
+
+
+def _rig_end(data: bytes, at: int) -> int:
+    sensors = struct.unpack_from("<I", data, at + 4)[0]
+    at += 16 if sensors else 8  # id, count, the reference sensor
+    for _ in range(sensors - 1):
+        at += 65 if struct.unpack_from("<?", data, at + 8)[0] else 9  # sensor, whether it has a pose, the pose
+    return at
+
+
+# Where the record that starts at a position ends, by file.
+_RECORDS = {
+    "cameras.bin": _camera_end,
+    "rigs.bin": _rig_end,
+    # id, rotation, translation, camera id, name, keypoints
+    "images.bin": lambda data, at: (end := data.index(b"\0", at + 64) + 1) + 8 + 24 * _count(data, end),
+    # id, position, colour, error, track
+    "points3D.bin": lambda data, at: at + 51 + 8 * _count(data, at + 43),
+    # id, rig id, rotation, translation, members (the count has 32 bits here)
+    "frames.bin": lambda data, at: at + 68 + 16 * struct.unpack_from("<I", data, at + 64)[0],
+}

@@ -1,0 +1,113 @@
+"""Where a scene has its cameras and photographs. Apart from what reads them, so that a wrong folder is refused at once.
+
+Reading them takes pycolmap and torch, which take a second or two to import.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from os.path import isfile
+from pathlib import Path, PureWindowsPath
+
+from clod_adapter._support.text import as_text, file_name
+from clod_adapter.errors import ClodError
+
+TRANSFORMS = ("transforms_train.json", "transforms.json")
+SMALLER = ("images_2", "images_4", "images_8")  # copies at a part of the size, as Mip-NeRF 360 and Inria's code have
+RAW = "input"  # Inria's name for the photographs before they are undistorted into images
+MISSING = 0.5  # the share of a scene's photographs that may be
+
+
+def find_cameras(folder: Path) -> Path:
+    """The folder of a COLMAP model, or the transforms file of a scene: what says where each photograph was taken.
+
+    A model is looked for in ``sparse/0``, ``sparse`` and ``folder`` itself; then ``transforms_train.json`` and
+    ``transforms.json`` there; then a model in the first two beside ``folder``, which may be the images' own.
+
+    Raises:
+        ClodError: none of them is there.
+    """
+    beside = folder.resolve().parent / "sparse"
+    for model in (folder / "sparse" / "0", folder / "sparse", folder):
+        if _is_model(model):
+            return model
+    for name in TRANSFORMS:
+        if (folder / name).is_file():
+            return folder / name
+    for model in (beside / "0", beside):
+        if _is_model(model):
+            return model
+    raise ClodError(
+        f"{folder}: no COLMAP model (cameras, images, points3D as .bin or .txt) in sparse/0, sparse or the folder "
+        "itself, and no transforms.json; give the folder that holds images/ and sparse/0, or transforms.json"
+    )
+
+
+def _is_model(folder: Path) -> bool:
+    return any(
+        all((folder / f"{name}.{suffix}").is_file() for name in ("cameras", "images", "points3D"))
+        for suffix in ("bin", "txt")
+    )
+
+
+def photograph_folders(folder: Path, cameras: Path) -> list[Path]:
+    """Where the photographs of ``find_cameras(folder)`` may be, the likeliest first."""
+    if cameras.is_file():
+        return [cameras.parent]
+    likely = [folder / "images", folder, cameras.parent / "images", cameras.parent.parent / "images"]
+    return likely + [
+        base / name for name in (*SMALLER, RAW) for base in (folder, cameras.parent, cameras.parent.parent)
+    ]
+
+
+def find_photographs(
+    folder: Path, cameras: Path, names: Sequence[str], *, raw: bool
+) -> tuple[list[Path | None], list[str]]:
+    """The files of these names, None for those that are missing, and notes.
+
+    All are from one of ``photograph_folders``, the one that has most of them.
+
+    Args:
+        raw: whether they may be in ``input``. They may not where the cameras are pinholes, which Inria's code makes
+            together with other photographs.
+
+    Raises:
+        ClodError: a name is there twice or leads out of the folder, or more than half of the photographs are missing.
+    """
+    parts = [tuple(map(file_name, inside(name, cameras))) for name in names]
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
+        raise ClodError(f"{cameras}: has image {twice[0]} more than once; export it again")
+    roots = [each for each in photograph_folders(folder, cameras) if raw or each.name != RAW or each == folder]
+    found = [[path if isfile(path := root.joinpath(*each)) else None for each in parts] for root in roots]
+    paths = min(found, key=lambda candidates: candidates.count(None))
+    root = roots[found.index(paths)]
+    notes = []
+    if root.name in (*SMALLER, RAW) and root != folder:
+        notes.append(f"the photographs are those in {root.name}, as there are more than in images")
+    missing = [as_text(str(Path(*each))) for each, path in zip(parts, paths, strict=True) if path is None]
+    if missing:
+        what = f"({', '.join(missing[:3])}{', ...' if len(missing) > 3 else ''})"
+        if len(missing) > MISSING * len(names):
+            lists = cameras.name if cameras.is_file() else "the model"
+            raise ClodError(
+                f"{root}: {len(missing)} of {len(names)} images of {lists} are missing {what}, more than half; put "
+                "them there under these names"
+            )
+        notes.append(f"{len(missing)} of {len(names)} photographs are missing and left out {what}")
+    return paths, notes
+
+
+def inside(name: str, cameras: Path) -> tuple[str, ...]:
+    """The parts of a photograph's name; it is split at / and at the \\ of files made on Windows.
+
+    Raises:
+        ClodError: the name is empty, leads out of the folder it is looked for in, or is no name of a file.
+    """
+    if as_text(name) != name:
+        raise ClodError(f"{cameras}: image name {name[:80]} is no text in UTF-8; rename the photograph, there too")
+    path = PureWindowsPath(name)
+    controls = any(sign < " " or "\x7f" <= sign <= "\x9f" for sign in name)
+    if not path.parts or path.anchor or ".." in path.parts or controls:
+        raise ClodError(f"{cameras}: image name {name[:80]!r} leaves the images folder or is no name; rename it there")
+    return path.parts

@@ -1,0 +1,217 @@
+"""Posed photographs in, whichever way they come."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from copy import copy
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from clod_adapter._kernels.memory import release
+from clod_adapter._support.workers import in_order
+from clod_adapter.cameras import Camera, Scene, View, in_its_unit
+from clod_adapter.errors import ClodError
+from clod_adapter.io.scene.colmap_model import read_model
+from clod_adapter.io.scene.dataparser import trained_frame
+from clod_adapter.io.scene.folder import find_cameras, find_photographs
+from clod_adapter.io.scene.image_cache import ImageCache
+from clod_adapter.io.scene.images import LARGE, TRANSPARENT, Note, Photograph, Room, image_size, read_image
+from clod_adapter.io.scene.posed import HUGE, TEST_EVERY, PosedImage, held_out
+from clod_adapter.io.scene.transforms import MASKS, read_transforms
+from clod_adapter.origin import NOWHERE
+
+MOST_AT_ONCE = 8  # photographs of full size in memory
+ROOM = Room(1 << 28)  # their pixels in memory, of 4 bytes each while they are decoded
+
+
+def load_scene(
+    folder: str | Path,
+    *,
+    test_every: int = TEST_EVERY,
+    max_width: int = 1600,
+    origin: Sequence[float] = NOWHERE,
+    progress: Callable[[int, int], None] | None = None,
+    cache: ImageCache | None = None,
+) -> Scene:
+    """Reads posed photographs: a COLMAP model (binary or text, any version) or a transforms.json, and its images.
+
+    A model is looked for in ``sparse/0``, ``sparse`` and ``folder``, and is taken where there is a ``transforms.json``
+    (nerfstudio, instant-ngp, Blender's synthetic scenes) too. A model's images are looked for in ``images`` and
+    ``folder``, then beside the model and its parent, then in ``images_2``, ``images_4``, ``images_8`` and, for
+    distorted cameras, ``input``. What was done to the photographs is in the scene's notes.
+
+    Where the folder has nerfstudio's ``dataparser_transforms.json``, the cameras are brought into the frame that it
+    trained in, in which it exports its splats (``dataparser``).
+
+    Views are sorted by image name; of those that the scene lists, present or not, the 0th, 8th, 16th... are held out,
+    as Inria's code does (``llffhold``). A single image is for training. With ``transforms_train.json`` and
+    ``transforms_test.json`` those of the latter are held out instead.
+
+    Photographs of a distorted camera are undistorted by COLMAP into the user's cache folder, where a later run finds
+    them. A photograph of another size than its camera has that camera's intrinsics, scaled.
+
+    Args:
+        folder: usually the one with ``images/`` and ``sparse/0/``.
+        test_every: one view in this many is held out; at least 2.
+        max_width: wider images are scaled down to this many pixels, with Pillow's bicubic filter as
+            in Inria's code; the intrinsics follow, and a note says so.
+        origin: ``[3]`` what the cameras' world is to be relative to, in its units: ``Checkpoint.origin``.
+        progress: called with (images loaded, images in all).
+        cache: keeps the photographs, where not all are to be in memory; they are then read again when looked at.
+
+    Raises:
+        ClodError: no usable cameras; images that are damaged, of another shape than their camera, or named outside
+            their folder; more than half of them missing, or all that are for training.
+    """
+    if test_every < 2 or max_width < 1:
+        raise ClodError(f"test_every is {test_every}, max_width {max_width}; they must be at least 2 and 1")
+    folder = Path(folder)
+    cameras = find_cameras(folder)
+    images, notes = (read_transforms if cameras.is_file() else read_model)(cameras)
+    if not cameras.is_file() and (folder / "transforms.json").is_file():
+        notes.append("the cameras are the COLMAP model's, not those of transforms.json")
+    if frame := trained_frame(folder, cameras):
+        images, notes = frame.bring(images, cameras), [*notes, frame.note]
+    names = [image.name for image in images]
+    paths, more = find_photographs(folder, cameras, names, raw=not all(image.is_pinhole for image in images))
+    notes += more
+    present = [(image, path) for image, path in zip(images, paths, strict=True) if path is not None]
+    testing = held_out(images, test_every)
+    if not any(image.name not in testing for image, _ in present):
+        raise ClodError(f"{folder}: has no photograph to train on, as all that are there are held out; add more")
+    present = [(image.relative_to(origin), path) for image, path in present]
+    views, sizes, done = _load(present, folder, max_width, progress, cache)
+    train = tuple(view for view in views if view.camera.name not in testing)
+    test = tuple(view for view in views if view.camera.name in testing)
+    pinhole = all(image.is_pinhole for image, _ in present)
+    spared = _left_out(views, sizes, done, pinhole, any(note.startswith(MASKS) for note in notes))
+    return in_its_unit(Scene(train, test, (*notes, *_summary(done, len(views))), spared))
+
+
+def _load(
+    present: Sequence[tuple[PosedImage, Path]],
+    folder: Path,
+    max_width: int,
+    progress: Callable[[int, int], None] | None,
+    keep: ImageCache | None,
+) -> tuple[list[View], list[tuple[int, int]], list[Note]]:
+    """The views of the images, their sizes in the files, and notes. Each worker holds one of full size at a time."""
+    cache = None if all(image.is_pinhole for image, _ in present) else _cache_folder(folder)
+    views, sizes, notes = list[View](), list[tuple[int, int]](), list[Note]()
+    workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
+    with warnings.catch_warnings():
+        # Large, but below the size at which it is refused: photographs are no attack.
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        loads = [partial(_load_view, image, path, cache, max_width) for image, path in present]
+        with closing(in_order(loads, workers)) as found:
+            for (view, size, remarks), load in zip(found, loads, strict=True):
+                views.append(keep.store(view, partial(_again, load)) if keep else view)
+                sizes.append(size)
+                notes += remarks
+                if progress:
+                    progress(len(views), len(present))
+    return views, sizes, notes
+
+
+def _left_out(
+    views: Sequence[View], sizes: Sequence[tuple[int, int]], notes: Sequence[Note], pinhole: bool, masked: bool
+) -> tuple[tuple[str, str], ...]:
+    """What of the reading these photographs do not need, and why: ``Scene.left_out``.
+
+    Args:
+        sizes: of the photographs in their files.
+        pinhole, masked: whether all cameras are pinholes, and whether the scene has masks.
+    """
+    whole, used = sum(3 * w * h for w, h in sizes), sum(3 * view.camera.width * view.camera.height for view in views)
+    found = [("exposure", "each photograph counts as it is: no light is balanced between them")]
+    if pinhole:
+        found.append(("undistortion", f"all {len(views)} cameras are pinholes"))
+    if TRANSPARENT not in notes:
+        found.append(("alpha", f"none of {len(views)} photographs has transparency"))
+    if not masked:
+        found.append(("masks", "the scene has none"))
+    if used < whole:
+        kept = f"{used / 1e6:,.3g} MB of the {whole / 1e6:,.3g} MB in the files"
+        found.append(("pixels", f"kept are {kept}: photographs are scaled as they are decoded"))
+    else:
+        found.append(("scaling", f"all {len(views)} photographs are used at the size they have"))
+    return tuple(found)
+
+
+def _cache_folder(folder: Path) -> Path:
+    from clod_adapter.io.scene.undistort import cache_folder
+
+    return cache_folder(folder)
+
+
+def _again(load: Callable[[], tuple[View, tuple[int, int], list[Note]]]) -> torch.Tensor:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        return load()[0].image
+
+
+def _summary(notes: Sequence[Note], total: int) -> list[str]:
+    """One line for each thing done, however many sizes it was done to."""
+    lines = []
+    for what, count in Counter(what for what, _ in notes).items():
+        details = list(dict.fromkeys(detail for each, detail in notes if each == what))
+        others = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+        lines.append(f"{count} of {total} images {what.format(details[0] + others)}")
+    return lines
+
+
+def _load_view(
+    image: PosedImage, path: Path, cache: Path | None, max_width: int
+) -> tuple[View, tuple[int, int], list[Note]]:
+    if cache is None or image.is_pinhole:
+        pixels, K, source, notes = _photograph(image, path, max_width)
+    else:
+        from clod_adapter.io.scene.undistort import kept
+
+        pixels, K, source, notes = kept(cache, image, path, max_width, lambda: _photograph(image, path, max_width))
+        lens = f"from {image.camera.model_name} into {cache}"
+        notes = [*notes, ("undistorted {}, which may be deleted; the sources are untouched", lens)]
+    viewmat = torch.from_numpy(image.viewmat).float()
+    camera = Camera(viewmat, torch.from_numpy(K).float(), pixels.width, pixels.height, image.name)
+    return View(camera, torch.from_numpy(np.array(pixels))), source, notes
+
+
+def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
+    """The photograph as a pinhole camera has it, no wider than ``max_width``."""
+    width, height = image_size(path)
+    with ROOM.of(width * height):
+        photograph = _worked_on(image, path, max_width)
+        if width * height > LARGE:
+            release()  # or this thread keeps for itself what the next one takes again
+        return photograph
+
+
+def _worked_on(image: PosedImage, path: Path, max_width: int) -> Photograph:
+    camera = copy(image.camera)
+    pixels, source, notes = read_image(path, camera.width, camera.height, max_width)
+    if pixels.size != (camera.width, camera.height):
+        sizes = f"{pixels.width}x{pixels.height} where the model says {camera.width}x{camera.height}"
+        notes.append(("are {}: intrinsics scaled", sizes))
+        # With pixel centres at +0.5, in COLMAP as here, the principal point scales like the focal length.
+        camera.rescale(*pixels.size)
+    if not image.is_pinhole:
+        from clod_adapter.io.scene.undistort import undistort
+
+        pixels, camera = undistort(path, pixels, camera)
+    width, height = pixels.size
+    if width > max_width:
+        size = (max_width, max(1, int(height * max_width / width)))
+        pixels = pixels.resize(size, Image.Resampling.BICUBIC)
+        sizes = f"from {width}x{height} to {size[0]}x{size[1]}"
+        notes.append(("scaled {} (Pillow bicubic, as in Inria's code)", sizes))
+    K = np.array([[pixels.width / width], [pixels.height / height], [1.0]]) * camera.calibration_matrix()
+    if not 0 < min(K[0, 0], K[1, 1]) <= np.abs(K).max() < HUGE:
+        raise ClodError(f"{path}: its camera is not usable once undistorted; check the camera's parameters")
+    return Photograph(pixels, K, source, notes)

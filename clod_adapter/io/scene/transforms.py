@@ -1,0 +1,159 @@
+"""Cameras as nerfstudio, instant-ngp and Blender's synthetic scenes have them: ``transforms.json``."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import ChainMap
+from collections.abc import Mapping
+from os.path import isfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clod_adapter._support.text import file_name
+from clod_adapter.errors import ClodError
+from clod_adapter.io.scene.colmap_library import pycolmap
+from clod_adapter.io.scene.folder import inside
+from clod_adapter.io.scene.images import image_size
+from clod_adapter.io.scene.posed import PosedImage, check_posed
+
+DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in
+MASKS = "the masks"  # how the note on them begins
+MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
+FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+PERSPECTIVE = ("", "SIMPLE_PINHOLE", "PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+
+
+def read_transforms(path: Path) -> tuple[list[PosedImage], list[str]]:
+    """The frames of a transforms file, sorted by name, and notes.
+
+    ``transform_matrix`` is camera to world in OpenGL axes (x right, y up, z back)::
+
+        viewmat = inverse(transform_matrix diag(1, -1, -1, 1))
+
+    The intrinsics are ``fl_x, fl_y, cx, cy, w, h``, or follow from ``camera_angle_x`` and the photograph's size, each
+    in the frame or for all frames; the distortion is OpenCV's, ``k1 k2 p1 p2 k3``, or its fisheye's, ``k1 k2 k3 k4``.
+    A ``file_path`` without an extension gets .png, .jpg or .jpeg, the first that is there.
+
+    The frames of ``transforms_train.json`` are for training and those of ``transforms_test.json`` beside it, where
+    it is there, are held out.
+
+    Source: nerfstudio's documentation, "Data conventions"; instant-ngp's ``scripts/colmap2nerf.py``.
+
+    Raises:
+        ClodError: a file is damaged or too large, or a frame has no usable name, camera or pose.
+    """
+    test = path.with_name(path.name.replace("train", "test"))
+    if test == path or not test.is_file():
+        images, notes = _frames(path, None)
+    else:
+        images, notes = _frames(path, False)
+        images += _frames(test, True)[0]
+        notes.append(f"held out are the photographs of {test.name}")
+    return sorted(images, key=lambda image: image.name), notes
+
+
+def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[str]]:
+    content = read_json(path)
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise ClodError(f"{path}: has no list of frames; give nerfstudio's or instant-ngp's transforms.json")
+    images = []
+    for number, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise ClodError(f"{path}: frame {number} has no file_path; export the file again")
+        name = _name(path, frame["file_path"])
+        where = f"{path}: frame {name}"
+        camera = _camera(where, path.parent / file_name(name), ChainMap(frame, content))
+        images.append(check_posed(PosedImage(name, _viewmat(where, frame), camera, held_out), path))
+    notes = []
+    if "applied_transform" in content and not path.with_name(DATAPARSER).is_file():
+        notes.append(f"{path.name} turned COLMAP's world (applied_transform): a checkpoint of the turned one is needed")
+    if any("mask_path" in frame for frame in frames):
+        notes.append(f"{MASKS} of {path.name} are not used")
+    return images, notes
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        ClodError: it cannot be read, is damaged, or larger than MAX_BYTES.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ClodError(f"{path}: is larger than {MAX_BYTES >> 20} MB, so it is no list of cameras; check the path")
+        return json.loads(path.read_bytes())
+    except OSError as error:
+        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    except (ValueError, RecursionError) as error:
+        raise ClodError(f"{path}: is no JSON or damaged ({error}); export it again") from error
+
+
+def _name(path: Path, file_path: str) -> str:
+    name = "/".join(inside(file_path, path))
+    endings = ("", ".png", ".jpg", ".jpeg")  # isfile, as it is False for what can be no path
+    return next((name + ending for ending in endings if isfile(path.parent / file_name(name + ending))), name)
+
+
+def _viewmat(where: str, frame: Mapping[str, Any]) -> np.ndarray:
+    try:
+        pose = np.array(frame.get("transform_matrix"), np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pose = np.zeros(0)
+    if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
+        raise ClodError(f"{where}: transform_matrix is no 4x4 matrix of finite numbers; export the file again")
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max()
+    # A file may have few digits, but a scale or a mirror image would give a picture of another scene.
+    if (
+        not off < 0.01
+        or np.linalg.det(pose[:3, :3]) < 0
+        or not np.array_equal(pose[3:], np.eye(4)[3:][: len(pose) - 3])
+    ):
+        raise ClodError(f"{where}: transform_matrix is no rotation and translation; export the file again")
+    left, _, right = np.linalg.svd(pose[:3, :3])
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = (left @ right @ np.diag([1.0, -1.0, -1.0])).T
+    viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:3, 3]
+    return viewmat
+
+
+def _camera(where: str, photograph: Path, values: Mapping[str, Any]) -> pycolmap.Camera:
+    def number(key: str, default: float) -> float:
+        try:
+            value = float(default if values.get(key) is None else values[key])
+        except (TypeError, ValueError, OverflowError):
+            value = math.nan
+        if not abs(value) < 1e9:
+            raise ClodError(f"{where}: {key} is no number below 1e9; export the file again")
+        return value
+
+    width, height = (int(number(key, 0)) for key in ("w", "h"))
+    if width < 1 or height < 1:  # that of a missing photograph does not matter
+        width, height = image_size(photograph) if isfile(photograph) else (1, 1)
+    fx = number("fl_x", 0) or _focal(width, number("camera_angle_x", 0))
+    if fx <= 0:
+        raise ClodError(f"{where}: has neither fl_x nor camera_angle_x above 0; export the file again")
+    fy = number("fl_y", 0) or _focal(height, number("camera_angle_y", 0)) or fx
+    params = [fx, fy, number("cx", width / 2), number("cy", height / 2)]
+    k1, k2, k3, k4, p1, p2 = (number(key, 0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    model = str(values.get("camera_model") or "")
+    if model in FISHEYE or (model in PERSPECTIVE and values.get("is_fisheye")):
+        return pycolmap.Camera(model="OPENCV_FISHEYE", width=width, height=height, params=[*params, k1, k2, k3, k4])
+    if model not in PERSPECTIVE or k4:  # of k4 some writers mean a power of the radius, some a divisor
+        what = "k4 of a camera that is no fisheye" if k4 else f"camera_model {model[:40]!r}"
+        raise ClodError(f"{where}: {what} is not known; give the COLMAP model that the file was made from")
+    return pycolmap.Camera(
+        model="FULL_OPENCV" if k3 else "OPENCV",
+        width=width,
+        height=height,
+        params=[*params, k1, k2, p1, p2, *([k3, 0, 0, 0] if k3 else [])],
+    )
+
+
+def _focal(pixels: int, angle: float) -> float:
+    """The focal length with which this many pixels see this angle; 0 where it is no angle."""
+    return pixels / (2 * math.tan(angle / 2)) if 0 < angle < math.pi else 0.0

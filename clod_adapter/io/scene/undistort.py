@@ -1,0 +1,92 @@
+"""Photographs of distorted cameras made those of pinhole cameras, and kept so that it is done once."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import PIL
+from PIL import Image, PngImagePlugin
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.scene.caches import user_caches
+from clod_adapter.io.scene.colmap_library import pycolmap
+from clod_adapter.io.scene.images import Photograph
+from clod_adapter.io.scene.posed import PosedImage
+
+_KEY = "clod-adapter"  # of what a kept picture says of itself
+
+
+def undistort(path: Path, pixels: Image.Image, camera: pycolmap.Camera) -> tuple[Image.Image, pycolmap.Camera]:
+    """As ``colmap image_undistorter`` does by default: bilinear, the same focal length, cut to what has no blank pixel.
+
+    Args:
+        path: the photograph's, for messages.
+        camera: a distorted one, of the size of ``pixels``.
+
+    Raises:
+        ClodError: COLMAP cannot undistort with these parameters.
+    """
+    try:
+        bitmap, pinhole = pycolmap.undistort_image(
+            pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(np.asarray(pixels)), camera
+        )
+    except (ValueError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise ClodError(f"{path}: COLMAP cannot undistort it ({reason}); check its camera's parameters") from error
+    return Image.fromarray(bitmap.to_array()), pinhole
+
+
+def cache_folder(scene: Path) -> Path:
+    """Where the undistorted photographs of this scene are kept, made if it is missing.
+
+    In ``$XDG_CACHE_HOME``, or where the platform has its users' caches.
+
+    Raises:
+        ClodError: it cannot be made or written to.
+    """
+    scene = scene.resolve()
+    name = f"{scene.name}-{hashlib.sha256(str(scene).encode(errors='surrogateescape')).hexdigest()[:8]}"
+    folder = user_caches() / "clod-adapter" / "undistorted" / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(13, "Permission denied")
+    except OSError as error:
+        raise ClodError(
+            f"{folder}: undistorted photographs cannot be kept there ({error.strerror or error}); set XDG_CACHE_HOME "
+            "to a folder that can be written to"
+        ) from error
+    return folder
+
+
+def kept(folder: Path, image: PosedImage, path: Path, max_width: int, make: Callable[[], Photograph]) -> Photograph:
+    """What ``make`` gives, from ``folder`` where it is there from an earlier run.
+
+    One PNG for each photograph, which appears whole or not at all, so a run that is interrupted goes on where it was.
+    Its name is a hash of all that it depends on: the photograph's path, size and time of change, the camera,
+    ``max_width`` and the libraries' versions.
+    """
+    state, camera = path.stat(), image.camera
+    made_of = (
+        str(path.resolve()), state.st_size, state.st_mtime_ns, camera.model_name, camera.width, camera.height,
+        camera.params.tolist(), max_width, pycolmap.__version__, PIL.__version__,
+    )  # fmt: skip
+    file = folder / f"{hashlib.sha256(repr(made_of).encode()).hexdigest()[:32]}.png"
+    with suppress(Exception), Image.open(file) as source:  # absent, or damaged: Pillow raises many kinds
+        about = json.loads(source.info[_KEY])
+        notes = [(what, each) for what, each in about["notes"]]
+        return Photograph(source.convert("RGB"), np.array(about["K"]), tuple(about["source"]), notes)
+    photograph = make()
+    about = PngImagePlugin.PngInfo()
+    says = {"K": photograph.K.tolist(), "source": photograph.source, "notes": photograph.notes}
+    about.add_text(_KEY, json.dumps(says))
+    with atomic_path(file) as temporary:
+        photograph.pixels.save(temporary, pnginfo=about, compress_level=1)
+    return photograph

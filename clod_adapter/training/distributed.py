@@ -1,0 +1,178 @@
+"""Several processes that train one set of Gaussians, on ``torch.distributed``.
+
+Each holds all parameters, draws the same views from the same seed, and takes every step itself. What is shared out is
+the work on the views: of a batch each process pulls its part, and the pulls are summed before anyone steps. So all of
+them hold the same numbers throughout, and the first one's are the outcome.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import pickle
+import re
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from clod_adapter.errors import ClodError
+from clod_adapter.training.objective import Pull
+
+if TYPE_CHECKING:
+    from torch.distributed.distributed_c10d import Store
+
+T = TypeVar("T")
+
+# A process that says nothing for so long counts as lost. The first one may be drawing or saving in the meantime.
+PATIENCE = timedelta(minutes=10)
+
+
+class PeerLost(ClodError):
+    """A process that trained along is gone, or says nothing any more."""
+
+
+class Peers:
+    """This process among those that train together: the default group of ``torch.distributed``.
+
+    What the methods exchange has to be asked for by all processes, in the same order. They raise PeerLost where one of
+    them is gone; nothing more can be exchanged then.
+
+    Attributes:
+        rank, size: which one this is, from 0, and how many there are.
+        waiting, exchanging: seconds spent in waiting for the slowest, and in moving and summing numbers.
+    """
+
+    def __init__(self) -> None:
+        self.rank, self.size = dist.get_rank(), dist.get_world_size()
+        self.waiting, self.exchanging = 0.0, 0.0
+
+    def share(self, work: Sequence[T]) -> Sequence[T]:
+        """This process's part of the work: every ``size``-th, from its rank on."""
+        return work[self.rank :: self.size]
+
+    def agree(self, share_done: float, going: bool) -> tuple[float, bool]:
+        """The first process's ``share_done``, and whether all of them are ``going`` on."""
+        said = torch.tensor([share_done if self.rank == 0 else -math.inf, 0.0 if going else 1.0], dtype=torch.float64)
+        self._meet(said, "MAX")
+        return float(said[0]), not said[1]
+
+    def sum(self, pull: Pull) -> Pull:
+        """The sum of all processes' pulls; takes the place of this one's, tensor by tensor."""
+        loss = torch.tensor([pull.loss], dtype=torch.float64)
+        self._meet(loss)
+        gradients = {name: gradient.contiguous() for name, gradient in pull.gradients.items()}
+        kept = pull.kept.to(torch.uint8)
+        # All at once and in place. Only the rows kept, or one long message, would take longer to put together than it
+        # saves: measured on loopback, where a million Gaussians take 80 ms, packed 150 ms, the rows kept 300 ms.
+        with self._exchange():
+            under_way = [dist.all_reduce(kept, dist.ReduceOp.MAX, async_op=True)]
+            under_way += [dist.all_reduce(gradient, async_op=True) for gradient in gradients.values()]
+            for work in under_way:
+                work.wait()
+            if kept.is_cuda:
+                torch.cuda.synchronize()  # NCCL's own wait returns at once, and its time would be another's
+        return Pull(gradients, kept.bool(), float(loss))
+
+    def broadcast(self, value: T) -> T:
+        """The first process's value, with its tensors on the CPU; what the others give is not looked at."""
+        tensors: list[Tensor] = []
+        self._meet()
+        with self._exchange():
+            about: list[Any] = [None, None]
+            if self.rank == 0:
+                about = [_without_tensors(value, tensors), [(t.shape, t.dtype) for t in tensors]]
+            dist.broadcast_object_list(about, device=torch.device("cpu"))
+            if self.rank > 0:
+                tensors = [torch.empty(shape, dtype=dtype) for shape, dtype in about[1]]
+            for tensor in filter(Tensor.numel, tensors):
+                dist.broadcast(tensor.view(-1).view(torch.uint8), 0)  # which any backend has
+        return value if self.rank == 0 else _with_tensors(about[0], tensors)
+
+    def _meet(self, said: Tensor | None = None, how: str = "SUM") -> None:
+        """Waits for all of them, and reduces few numbers, on the CPU: of a loss gloo tells at once, NCCL might not."""
+        began = time.perf_counter()
+        with _losses():
+            dist.all_reduce(torch.zeros(1) if said is None else said, getattr(dist.ReduceOp, how))
+        self.waiting += time.perf_counter() - began
+
+    @contextmanager
+    def _exchange(self) -> Iterator[None]:
+        began = time.perf_counter()
+        with _losses():
+            yield
+        self.exchanging += time.perf_counter() - began
+
+
+@contextmanager
+def joined(store: Store, rank: int, size: int) -> Iterator[Peers]:
+    """Within, this process trains with the others that enter with the same ``store``: gloo on CPUs, NCCL on GPUs."""
+    nccl = torch.cuda.is_available() and dist.is_nccl_available()
+    with _losses(), _silent_stdout():
+        dist.init_process_group(
+            "cpu:gloo,cuda:nccl" if nccl else "gloo", store=store, rank=rank, world_size=size, timeout=PATIENCE
+        )
+    try:
+        yield Peers()
+    finally:
+        dist.destroy_process_group()
+
+
+@contextmanager
+def _silent_stdout() -> Iterator[None]:
+    """Nothing is written to the file descriptor of stdout: gloo prints there whom it connected, as in torch 2.9.1."""
+    try:
+        stdout = os.dup(1)
+    except OSError:  # it is closed
+        yield
+        return
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 1)
+        yield
+    finally:
+        os.dup2(stdout, 1)
+        os.close(stdout)
+
+
+@contextmanager
+def _losses() -> Iterator[None]:
+    """The backends' errors, which are RuntimeErrors, as PeerLost."""
+    try:
+        yield
+    except (torch.cuda.OutOfMemoryError, PeerLost):
+        raise
+    except RuntimeError as error:
+        what = re.sub(r"^\[[^]]*\] *", "", str(error).partition("\n")[0]).partition(". ")[0]
+        raise PeerLost(f"a process that trained along is gone ({what})") from error
+
+
+def _without_tensors(value: Any, tensors: list[Tensor]) -> bytes:
+    """A pickle of ``value`` that has numbers for its tensors, which are appended to ``tensors``."""
+
+    class Pickler(pickle.Pickler):
+        def persistent_id(self, found: Any) -> int | None:
+            if not isinstance(found, Tensor):
+                return None
+            tensors.append(found.detach().cpu().contiguous())
+            return len(tensors) - 1
+
+    file = io.BytesIO()
+    Pickler(file).dump(value)
+    return file.getvalue()
+
+
+def _with_tensors(pickled: bytes, tensors: list[Tensor]) -> Any:
+    """The inverse of ``_without_tensors``."""
+
+    class Unpickler(pickle.Unpickler):
+        def persistent_load(self, number: int) -> Tensor:
+            return tensors[number]
+
+    return Unpickler(io.BytesIO(pickled)).load()

@@ -1,0 +1,118 @@
+"""Adam that steps only some rows (Gaussians) at a time."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from clod_adapter._support.fusing import Fused, Number
+
+
+class RowAdam:
+    """Adam (Kingma and Ba 2015) over named ``[N, ...]`` parameters, a subset of rows a step.
+
+    A row that is not stepped keeps its value and its moments, and costs next to nothing; the bias
+    correction counts a row's own steps, so its first step is as long as anyone's.
+
+    Args:
+        parameters: updated in place; float32, contiguous, as the leading rows of a larger tensor are.
+    """
+
+    def __init__(
+        self, parameters: dict[str, Tensor], *, beta1: float = 0.9, beta2: float = 0.999, epsilon: float = 1e-15
+    ):
+        self.parameters = parameters
+        self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
+        self._moments = {name: (_zeros(p), _zeros(p)) for name, p in parameters.items()}
+        self._steps = {name: torch.zeros(len(p), dtype=torch.int32, device=p.device) for name, p in parameters.items()}
+        # After so many steps of its own a row's bias corrections are 1 in float32.
+        last = math.ceil(-25 * math.log(2) / math.log(max(beta1, beta2)))
+        count = np.arange(1, last + 2)
+        corrections = 1 / (1 - beta1**count), 1 / np.sqrt(1 - beta2**count)
+        self._corrections = np.pad(np.stack(corrections), ((0, 0), (1, 0))).astype(np.float32)
+        self._table: Tensor | None = None  # the same, where the parameters are if that is not the CPU
+
+    def state(self) -> dict[str, dict[str, Tensor]]:
+        """The tensors themselves that it keeps of each parameter: ``first`` and ``second`` moment, ``steps`` by row."""
+        moments = {
+            kind: {n: both[k] for n, both in self._moments.items()} for k, kind in enumerate(("first", "second"))
+        }
+        return {**moments, "steps": self._steps}
+
+    @torch.no_grad()
+    def step(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
+        """Steps the parameters named in ``gradients``, each at its rate, where ``rows`` (bool ``[N]``) is set.
+
+        A gradient has the shape of its parameter; what it holds elsewhere does not matter.
+        """
+        if rows.device.type == "cpu":
+            self._step_fused(gradients, rows, rates)
+        else:
+            self._step_plain(gradients, rows, rates)
+
+    def _step_fused(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
+        from clod_adapter._kernels import threads
+        from clod_adapter._kernels.adam import adam_rows
+
+        jobs = []
+        for name, gradient in gradients.items():
+            tensors = (self.parameters[name], *self._moments[name], gradient.contiguous())
+            flat = [x.view(len(x), math.prod(x.shape[1:])).numpy() for x in tensors]
+            jobs.append((*flat, rows.numpy(), self._steps[name].numpy(), self._corrections, rates[name]))
+
+        def adam(worker: int, workers: int) -> None:
+            for job in jobs:
+                adam_rows(worker, workers, *job, self.beta1, self.beta2, self.epsilon)
+
+        threads.run(adam, threads.worker_count())
+
+    def _step_plain(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
+        """The plain twin of the fused step: all rows, without asking which (a GPU would have to answer first)."""
+        if self._table is None or self._table.device != rows.device:
+            self._table = torch.from_numpy(self._corrections).to(rows.device)
+        for name, gradient in gradients.items():
+            steps = self._steps[name].add_(rows)
+            length, correction = self._table[:, steps.clamp(max=self._table.shape[1] - 1)].unsqueeze(2)
+            values = (self.parameters[name], *self._moments[name], gradient)
+            flat = [x.view(len(x), math.prod(x.shape[1:])) for x in values[:3]]
+            flat.append(gradient.reshape(flat[0].shape))
+            _adam(*flat, rows[:, None], length, correction, rates[name], self.beta1, self.beta2, self.epsilon)
+
+
+@torch.no_grad()
+def add_to_mean(mean: dict[str, Tensor], values: dict[str, Tensor], count: int) -> None:
+    """Takes the ``count``-th ``values`` into their running ``mean``, in place; the first make it.
+
+    An infinite value is its own mean: it is an opacity that no step changes, and inf - inf would be NaN.
+    """
+    for name, value in values.items():
+        if count == 1:
+            mean[name] = value.clone()
+        else:
+            torch.where(value.isinf(), value, mean[name].lerp_(value, 1 / count), out=mean[name])
+
+
+def _adam_rows(
+    parameter: Tensor, first: Tensor, second: Tensor, gradient: Tensor, rows: Tensor, length: Tensor,
+    correction: Tensor, rate: Number, beta1: Number, beta2: Number, epsilon: Number,
+) -> None:  # fmt: skip
+    """``_kernels.adam.adam_rows`` of ``[N, width]``, with ``rows [N, 1]`` and the corrections ``[N, 1]`` of each."""
+    m = beta1 * first + (1 - beta1) * gradient
+    v = beta2 * second + (1 - beta2) * gradient * gradient
+    moved = parameter - rate * length * m / (v.sqrt() * correction + epsilon)
+    first.copy_(torch.where(rows, m, first))
+    second.copy_(torch.where(rows, v, second))
+    parameter.copy_(torch.where(rows, moved, parameter))
+
+
+_adam = Fused(_adam_rows)
+
+
+def _zeros(parameter: Tensor) -> Tensor:
+    """Of its shape. On the CPU what is never stepped, as frozen harmonics are, takes no memory: no page is touched."""
+    if parameter.device.type != "cpu":
+        return torch.zeros_like(parameter)
+    return torch.from_numpy(np.zeros(parameter.shape, np.float32))

@@ -1,0 +1,165 @@
+"""Compiled formulas are the plain ones, in values and gradients, at every dial value without compiling anew."""
+
+from __future__ import annotations
+
+import locale
+import os
+from typing import Any
+
+import pytest
+import torch
+import torch._functorch.config
+from torch import Tensor
+
+from clod_adapter import attenuation
+from clod_adapter._support import fusing
+from clod_adapter._support.fusing import Fused
+from clod_adapter.attenuation import attenuate, attenuate_activated, attenuate_seen
+from clod_adapter.cameras import Camera
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.training import optimizer
+from clod_adapter.training.optimizer import RowAdam
+from scenes import camera
+
+SOFT = AttenuationConfig(cut="soft", scene_distance=2.0)
+DIALS = (1.0, 2.5, 6.0)
+
+
+@pytest.fixture
+def everything_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Here too, and however few the rows; and each test from the start."""
+    monkeypatch.setattr(Fused, "compiles", lambda self, first: not self._failed)
+    for name in ("_attenuated", "_seen", "_activated"):
+        monkeypatch.setattr(attenuation, name, Fused(getattr(attenuation, name).plain))
+    monkeypatch.setattr(optimizer, "_adam", Fused(optimizer._adam.plain))
+
+
+def faster(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Traced, decomposed, split into a way forward and a way back, and run without a compiler, which costs minutes."""
+    if not locale.getencoding().upper().startswith("UTF"):
+        pytest.skip("torch's compiler reads files of its own, which are UTF-8, in the locale's encoding")
+    compile_, backend = torch.compile, "aot_eager_decomp_partition"
+    monkeypatch.setattr(torch, "compile", lambda f, **kwargs: compile_(f, backend=backend, **kwargs))
+
+
+def inputs(n: int = 3001) -> dict[str, Tensor]:
+    g = torch.Generator().manual_seed(0)
+    logits, sigma = 3 * torch.randn(n, generator=g), 3 * torch.rand(n, generator=g)
+    logits[:3], sigma[3:6] = torch.tensor([torch.inf, -torch.inf, 0.0]), torch.tensor([0.0, 1e9, 1e-4])
+    return {"means": torch.randn(n, 3, generator=g), "logits": logits, "sigma": sigma}
+
+
+def results(given: dict[str, Tensor], view: Camera, config: AttenuationConfig, form: str) -> list[Tensor]:
+    """The four fields at each dial value, and the gradients of two of them."""
+    logits, sigma = given["logits"].clone().requires_grad_(), given["sigma"].clone().requires_grad_()
+    d = given["means"].norm(dim=1)
+    found: list[Tensor] = []
+    for s in DIALS:
+        if form == "seen":
+            out = attenuate_seen(given["means"], logits, sigma, view, s, config)
+        elif form == "logits":
+            out = attenuate(logits, sigma, d, s, config)
+        else:
+            out = attenuate_activated(logits.sigmoid(), sigma, d, s, config)
+        loss = (out.drawn * d).sum() + out.log_opacities.clamp(min=-30).sum()
+        found += [*(x.detach() for x in out), *torch.autograd.grad(loss, [logits, sigma])]
+    return found
+
+
+def test_traced_it_is_the_same_from_one_graph(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    def donates() -> Any:
+        """A setting of the user's own compiled code too; torch 2.4 has none."""
+        return getattr(torch._functorch.config, "donated_buffer", None)
+
+    before = donates()
+    want = results(inputs(), camera(), SOFT, "seen")
+    request.getfixturevalue("everything_compiles")
+    faster(monkeypatch)
+    torch._dynamo.utils.counters.clear()
+    found = results(inputs(), camera(), SOFT, "seen")
+    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == 1  # of three dial values
+    assert not attenuation._seen._failed and attenuation._seen._compiled is not None
+    assert_same(found, want)
+    assert donates() == before
+
+
+@pytest.mark.skipif(
+    not (torch.cuda.is_available() or os.environ.get("CLOD_COMPILE")),
+    reason="compiling takes minutes on a busy machine: done on a GPU, or with CLOD_COMPILE=1",
+)
+@pytest.mark.parametrize("form", ["seen", "logits", "opacities"])
+def test_compiled_it_is_the_same_to_rounding(request: pytest.FixtureRequest, form: str) -> None:
+    where = "cuda" if torch.cuda.is_available() else "cpu"
+    given = {name: value.to(where) for name, value in inputs().items()}
+    want = results(given, camera(), SOFT, form)
+    request.getfixturevalue("everything_compiles")
+    assert_same(results(given, camera(), SOFT, form), want)
+    used = {"seen": "_seen", "logits": "_attenuated", "opacities": "_activated"}[form]
+    assert not getattr(attenuation, used)._failed and getattr(attenuation, used)._compiled is not None
+
+
+def assert_same(found: list[Tensor], want: list[Tensor]) -> None:
+    """Within some roundings of float32: another torch fuses other operations."""
+    for mine, expected in zip(found, want, strict=True):
+        torch.testing.assert_close(mine.float(), expected.float(), rtol=1e-5, atol=1e-6, equal_nan=True)
+
+
+def test_a_failure_to_compile_is_said_once_and_survived(
+    monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    want = results(inputs(), camera(), SOFT, "logits")
+    request.getfixturevalue("everything_compiles")
+
+    def broken(function: Any, **kwargs: Any) -> Any:
+        def run(*args: Any, **kwargs: Any) -> Any:
+            raise RuntimeError("triton not found\nand more")
+
+        return run
+
+    monkeypatch.setattr(torch, "compile", broken)
+    with pytest.warns(UserWarning, match=r"torch.compile fails here \(triton not found\)") as seen:
+        found = results(inputs(), camera(), SOFT, "logits")
+    assert len([w for w in seen if "torch.compile" in str(w.message)]) == 1
+    assert all(torch.equal(a, b) for a, b in zip(found, want, strict=True))
+
+
+def test_running_out_of_memory_is_not_a_failure_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*args: Any) -> Any:
+        raise torch.OutOfMemoryError("full")
+
+    fused = Fused(lambda x: x)
+    monkeypatch.setattr(fused, "_compiled", full)
+    with pytest.raises(torch.OutOfMemoryError):
+        fused.compiled(torch.zeros(1))
+    assert not fused._failed
+
+
+def test_only_many_rows_on_a_gpu_are_worth_it() -> None:
+    class Row:
+        def __init__(self, on_gpu: bool, rows: int) -> None:
+            self.is_cuda, self.rows = on_gpu, rows
+
+        def __len__(self) -> int:
+            return self.rows
+
+    fused = Fused(lambda x: x)
+    assert fused.compiles(Row(True, fusing.ROWS))
+    assert not fused.compiles(Row(True, fusing.ROWS - 1)) and not fused.compiles(Row(False, fusing.ROWS))
+
+
+def test_a_traced_step_of_adam_is_the_plain_one(monkeypatch: pytest.MonkeyPatch, request: Any, n: int = 50) -> None:
+    def stepped() -> RowAdam:
+        g = torch.Generator().manual_seed(0)
+        rest = RowAdam({"means": torch.randn(n + 7, 3, generator=g)[:n], "sigma": torch.randn(n, generator=g)})
+        for k in range(3):
+            slopes = {"means": torch.randn(n, 3, generator=g), "sigma": torch.randn(n, generator=g)}
+            rest._step_plain(slopes, torch.arange(n) % (k + 2) == 0, {"means": 0.1, "sigma": 0.02})
+        return rest
+
+    want = stepped()
+    request.getfixturevalue("everything_compiles")
+    faster(monkeypatch)
+    found = stepped()
+    assert not optimizer._adam._failed
+    for name, value in want.parameters.items():
+        torch.testing.assert_close(found.parameters[name], value, rtol=1e-6, atol=1e-7)

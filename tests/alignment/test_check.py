@@ -1,0 +1,275 @@
+"""Does a checkpoint stand where the cameras look? What must pass, what must stop, and which frames are told."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import clod_adapter
+import scenes
+from clod_adapter.alignment.check import FLAT, check_alignment
+from clod_adapter.alignment.frames import NERFSTUDIO_TURNS, focus_of, into_file, known_frames
+from clod_adapter.alignment.search import guess_frame
+from clod_adapter.cameras import Scene, View
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.scene.colmap import load_points
+from clod_adapter.render import render
+
+EYE = torch.eye(3, dtype=torch.float64)
+NONE = torch.zeros(3, dtype=torch.float64)
+FLIP = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[Gaussians, list[View]]:
+    base, scene = scenes.capture(n=250, views=8, width=60, height=44)
+    return base, everything(scene)
+
+
+def everything(scene: Scene) -> list[View]:
+    return [*scene.test, *scene.train]
+
+
+def posed(view: View, viewmat: Tensor) -> View:
+    return View(replace(view.camera, viewmat=viewmat.to(view.camera.viewmat)), view.image)
+
+
+def in_world(views: Sequence[View], scale: float, rotation: Tensor, offset: Tensor) -> list[View]:
+    """The views in a world where ``x' = scale rotation x + offset``: camera and file are no longer in one frame."""
+    viewmats = torch.stack([view.camera.viewmat.double() for view in views])
+    moved = into_file(viewmats, rotation.T, 1 / scale, -rotation.T @ offset / scale)
+    return [posed(view, viewmat) for view, viewmat in zip(views, moved, strict=True)]
+
+
+def test_a_file_in_its_place_fits(pair: tuple[Gaussians, list[View]]) -> None:
+    base, views = pair
+    found = check_alignment(base, views)
+    assert found.fits and not found.on_white and found.views == 8
+    assert found.explained == 1 and found.correlation > 0.9 and found.margin > 6 and 0 < found.in_view <= 1
+
+
+def test_numbers_are_those_of_their_equations(pair: tuple[Gaussians, list[View]]) -> None:
+    base, views = pair
+    wrong = base.replace(means=base.means.roll(1, 1))
+    found = check_alignment(wrong, views)
+    renders = torch.stack([render(wrong, view.camera).image.clamp(0, 1) for view in views])
+    photographs = torch.stack([view.image / 255 for view in views])
+    constants = photographs.mean((1, 2), keepdim=True)
+    assert found.psnr == pytest.approx(-10 * math.log10((renders - photographs).square().mean()), abs=1e-4)
+    assert found.mean_colour_psnr == pytest.approx(
+        -10 * math.log10((constants - photographs).square().mean()), abs=1e-4
+    )
+    both = torch.stack([(renders - renders.mean((1, 2), keepdim=True)).flatten(), (photographs - constants).flatten()])
+    assert found.correlation == pytest.approx(float(torch.nn.functional.cosine_similarity(*both, dim=0)), abs=1e-4)
+
+
+@pytest.mark.parametrize("gain", [0.4, 0.7])
+def test_another_exposure_fits(pair: tuple[Gaussians, list[View]], gain: float) -> None:
+    base, views = pair
+    darker = [View(view.camera, (view.image * gain).round().to(torch.uint8)) for view in views]
+    assert check_alignment(base, darker).fits
+
+
+def test_an_underfitted_base_fits(pair: tuple[Gaussians, list[View]]) -> None:
+    base, views = pair
+    poor = base.select(torch.arange(len(base)) % 5 > 0)
+    poor = poor.replace(sh0=poor.sh0 * 0.7, shN=poor.shN[:, :0], log_scales=poor.log_scales + 0.15)
+    found = check_alignment(poor, views)
+    assert found.fits and found.margin < 6
+    assert guess_frame(poor, views, found) is None
+
+
+def test_views_that_the_file_does_not_reach_do_not_stop_it(pair: tuple[Gaussians, list[View]]) -> None:
+    """Three of eight cameras look the other way, at something bright: the pooled error is the worse one."""
+    base, views = pair
+    away = torch.diag(torch.tensor([-1.0, 1, -1, 1]))
+    bright = [View(view.camera, 255 - view.image // 4) for view in views[:3]]
+    found = check_alignment(base, [*(posed(view, away @ view.camera.viewmat) for view in bright), *views[3:]])
+    assert found.margin < 0 and found.explained == 5 / 8 and found.fits
+
+
+@pytest.mark.parametrize("level", [0, 255])
+def test_flat_photographs_say_nothing(pair: tuple[Gaussians, list[View]], level: int) -> None:
+    base, views = pair
+    flat = [View(view.camera, torch.full_like(view.image, level)) for view in views]
+    found = check_alignment(base, flat)
+    assert found.views == 0 and math.isnan(found.psnr) and found.fits and not found.on_white
+    assert guess_frame(base, flat, found) is None
+    assert check_alignment(base, [*flat[:6], *views[6:]]).margin > 6  # two that are not decide
+    assert not check_alignment(base.replace(means=base.means + 1000), flat).fits
+
+
+def test_nearly_flat_is_flat(pair: tuple[Gaussians, list[View]]) -> None:
+    base, views = pair
+    noise = torch.randint(100, 103, (44, 60, 3), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
+    assert (noise / 255).std() < FLAT
+    assert check_alignment(base, [View(views[0].camera, noise)]).views == 0
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_views_and_one_gaussian(pair: tuple[Gaussians, list[View]], count: int) -> None:
+    base, views = pair
+    assert check_alignment(base, views[:count]).fits
+    truth = scenes.gaussians(1, 0, 3, size=0.4).replace(means=torch.zeros(1, 3), opacity_logits=torch.full((1,), 3.0))
+    seen = scenes.photograph(truth, scenes.ring(count, 40, 30))
+    found = check_alignment(truth, seen)
+    assert found.fits and found.in_view == 1
+    stray = truth.replace(means=torch.full((1, 3), 50.0))
+    lost = check_alignment(stray, seen)
+    assert not lost.fits and guess_frame(stray, seen, lost) is None or count == 2
+
+
+def test_nothing_to_show_does_not_fit(pair: tuple[Gaussians, list[View]]) -> None:
+    base, views = pair
+    none = base.select(torch.zeros(len(base), dtype=torch.bool))
+    found = check_alignment(none, views)
+    assert not found.fits and found.in_view == 0 and found.correlation == 0
+    assert guess_frame(none, views, found) is None
+    with pytest.raises(ClodError, match="number of views"):
+        check_alignment(base, [])
+
+
+def test_trained_on_white(pair: tuple[Gaussians, list[View]]) -> None:
+    base, views = pair
+    white = [View(view.camera, render(base, view.camera, background=torch.ones(3)).pixels) for view in views]
+    found = check_alignment(base, white)
+    assert found.on_white and not found.fits and found.white_psnr > 40
+    assert not check_alignment(base, in_world(white, 5.0, FLIP, NONE + 9)).on_white
+
+
+CASES = [
+    ("file's x, -y, -z: ", 1.0, FLIP, NONE),
+    ("file's x, -z, y: ", 1.0, EYE.new_tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), NONE),
+    ("file's z, x, y: ", 1.0, EYE[[2, 0, 1]], NONE),
+    ("(mirrored)", 1.0, torch.diag(EYE.new_tensor([-1.0, 1, 1])), NONE),
+    ("9.7 times larger: ", 9.7, EYE, NONE),
+    ("20 times smaller: ", 0.05, EYE, NONE),
+    ("moved by (30, -20, 10): ", 1.0, EYE, EYE.new_tensor([30.0, -20, 10])),
+    ("4 times larger and moved by (", 4.0, EYE, EYE.new_tensor([3.0, -2, 1])),
+]
+
+
+@pytest.mark.parametrize(("says", "scale", "rotation", "offset"), CASES, ids=[case[0] for case in CASES])
+def test_another_frame_is_told(
+    pair: tuple[Gaussians, list[View]], says: str, scale: float, rotation: Tensor, offset: Tensor
+) -> None:
+    base, views = pair
+    elsewhere = in_world(views, scale, rotation, offset)
+    found = check_alignment(base, elsewhere)
+    assert not found.fits
+    guess = guess_frame(base, elsewhere, found)
+    assert guess is not None and guess.psnr > found.mean_colour_psnr + 3
+    assert says.rstrip(": ") in _rounded(guess.says)
+
+
+def _rounded(text: str) -> str:
+    """Numbers of the search to two digits at most, as it finds them to within a per cent or so."""
+    return " ".join(_round_word(word) for word in text.split(" "))
+
+
+def _round_word(word: str) -> str:
+    bare = word.strip("(),:")
+    try:
+        return word.replace(bare, f"{float(f'{float(bare):.2g}'):g}")
+    except ValueError:
+        return word
+
+
+def test_a_turn_is_told_from_all_others(pair: tuple[Gaussians, list[View]]) -> None:
+    """Each of the 48 ways to name the axes is undone by exactly one of those that are tried."""
+    _, views = pair
+    viewmats = torch.stack([view.camera.viewmat.double() for view in views])
+    for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)):
+        rotation = torch.diag(EYE.new_tensor(signs)) @ EYE[list(order)]
+        moved = torch.stack([v.camera.viewmat.double() for v in in_world(views, 1.0, rotation, NONE)])
+        near = [f for f in known_frames(moved) if "cameras' x" in f.says and (f.viewmats - viewmats).abs().max() < 1e-4]
+        assert len(near) == (0 if rotation.equal(EYE) else 1)
+
+
+@pytest.mark.parametrize("case", ["invert them", "negate the y and z axes of their poses", "and invert them"])
+def test_other_poses_are_told(pair: tuple[Gaussians, list[View]], case: str) -> None:
+    base, views = pair
+    backward = torch.diag(torch.tensor([1.0, -1, -1, 1]))
+    wrong = {
+        "invert them": lambda pose: torch.linalg.inv(pose),
+        "negate the y and z axes of their poses": lambda pose: backward @ pose,
+        "and invert them": lambda pose: torch.linalg.inv(pose) @ backward,
+    }[case]
+    elsewhere = [posed(view, wrong(view.camera.viewmat)) for view in views]
+    guess = guess_frame(base, elsewhere, check_alignment(base, elsewhere))
+    assert guess is not None and guess.says.endswith(case)
+
+
+def test_another_scene_is_no_frame(pair: tuple[Gaussians, list[View]]) -> None:
+    _, views = pair
+    other = scenes.gaussians(250, 1, 99, size=0.15)
+    found = check_alignment(other, views)
+    assert not found.fits and guess_frame(other, views, found) is None
+
+
+def test_nerfstudios_frame(pair: tuple[Gaussians, list[View]]) -> None:
+    """In it the cameras' mean is the origin, their mean up is z, and their farthest coordinate is 1."""
+    _, views = pair
+    viewmats = torch.stack([v.camera.viewmat.double() for v in in_world(views, 3.0, FLIP, NONE + 2)])
+    frames = [frame for frame in known_frames(viewmats) if "nerfstudio" in frame.says]
+    assert len(frames) == len(NERFSTUDIO_TURNS)
+    for frame in frames:
+        poses = torch.linalg.inv(frame.viewmats)
+        assert poses[:, :3, 3].mean(0).abs().max() < 1e-6
+        assert poses[:, :3, 3].abs().max() == pytest.approx(1, abs=1e-6)
+        up = -poses[:, :3, 1].mean(0)
+        assert up[:2].abs().max() < 1e-6 < up[2]
+
+
+def test_gsplats_frame(pair: tuple[Gaussians, list[View]]) -> None:
+    """In it the points' median is about the origin and their principal axes are the axes, the longest first."""
+    _, views = pair
+    viewmats = torch.stack([v.camera.viewmat.double() for v in in_world(views, 3.0, FLIP, NONE + 2)])
+    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([1.0, 5, 2]) + 3
+    frames = [frame for frame in known_frames(viewmats, points) if "gsplat" in frame.says]
+    assert len(frames) == 5  # without the points, and with each sign of their axes
+    for frame in frames[1:]:
+        # The map that takes the cameras there, from where the first one is in both.
+        back = torch.linalg.inv(frame.viewmats)
+        there = torch.linalg.inv(viewmats)
+        scale = (back[0, :3, 3] - back[1, :3, 3]).norm() / (there[0, :3, 3] - there[1, :3, 3]).norm()
+        rotation = back[0, :3, :3] @ there[0, :3, :3].T
+        moved = scale * (points.double() - there[0, :3, 3]) @ rotation.T + back[0, :3, 3]
+        assert torch.linalg.det(rotation) == pytest.approx(1)
+        assert moved.quantile(0.5, dim=0).abs().max() < 0.02  # to what a median per axis changes in a turn
+        spread = moved.T.cov()
+        assert (spread - torch.diag(spread.diag())).abs().max() < 1e-6 * spread.max()
+        assert spread.diag().tolist() == sorted(spread.diag().tolist(), reverse=True)
+
+
+def test_focus() -> None:
+    viewmats = torch.stack([camera.viewmat for camera in scenes.ring(6, 40, 30)])
+    assert focus_of(viewmats).abs().max() < 1e-5
+    assert torch.isfinite(focus_of(viewmats[:1])).all()
+
+
+@pytest.mark.parametrize("name", ["plush_half", "ci_banana", "bonsai146"])
+def test_real_files_fit_and_others_do_not(shared_data: Callable[[str], Path], name: str) -> None:
+    base = clod_adapter.load(shared_data(f"{name}/pretrained.ply")).gaussians
+    views = everything(clod_adapter.load_scene(shared_data(name)))
+    found = check_alignment(base, views)
+    assert found.fits and found.margin > 6
+    other = clod_adapter.load(shared_data("ci_banana/pretrained.ply")).gaussians if name != "ci_banana" else None
+    assert other is None or not check_alignment(other, views).fits
+
+
+def test_a_real_file_in_another_frame(shared_data: Callable[[str], Path]) -> None:
+    base = clod_adapter.load(shared_data("ci_banana/pretrained.ply")).gaussians
+    views = everything(clod_adapter.load_scene(shared_data("ci_banana")))
+    elsewhere = in_world(views, 1.0, FLIP, NONE)
+    found = check_alignment(base, elsewhere)
+    guess = guess_frame(base, elsewhere, found, load_points(shared_data("ci_banana")))
+    assert not found.fits and guess is not None and "x, -y, -z" in guess.says and guess.psnr > 26

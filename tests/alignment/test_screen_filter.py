@@ -1,0 +1,67 @@
+"""Which filter a checkpoint was trained with, by the photographs."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from clod_adapter.alignment.screen_filter import MOST_VIEWS, compare_filters
+from clod_adapter.cameras import View
+from clod_adapter.config import FILTERS
+from clod_adapter.evaluation.evaluate import evaluate
+from clod_adapter.gaussians import Gaussians
+from scenes import gaussians, photograph, ring
+
+
+def fine(seed: int = 0) -> Gaussians:
+    """Of a pixel and less in pictures 48 wide, where filters differ."""
+    return gaussians(1500, 0, seed, size=0.025)
+
+
+def seen_with(name: str, views: int = 5) -> tuple[Gaussians, tuple[View, ...]]:
+    """A checkpoint as a file without a word on its filter, and photographs of it drawn with ``name``."""
+    truth = fine().replace(screen_filter=FILTERS[name])
+    noisy = truth.sh0 + 0.1 * torch.randn(truth.sh0.shape, generator=torch.Generator().manual_seed(1))
+    return fine().replace(sh0=noisy), photograph(truth, ring(views, 48, 36))
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("expected", FILTERS)
+def test_the_filter_of_the_photographs_is_found(name: str, expected: str) -> None:
+    base, views = seen_with(name)
+    found = compare_filters(base, views, expected)
+    assert (found.chosen, found.expected, found.screen_filter) == (name, expected, FILTERS[name])
+    assert max(found.psnr, key=found.psnr.__getitem__) == name and found.psnr.keys() == FILTERS.keys()
+
+
+def test_numbers_are_psnrs_and_their_means() -> None:
+    base, views = seen_with("on", MOST_VIEWS)
+    found = compare_filters(base, views)
+    (row,) = evaluate(base.replace(screen_filter=FILTERS["mip"]), views, [1.0])
+    assert found.psnr["mip"] == pytest.approx(row.psnr, abs=1e-3)
+
+
+def test_where_nothing_is_clear_the_expected_one_stays() -> None:
+    """Gaussians so large that filters hardly change them."""
+    truth = gaussians(100, 0, 2, size=0.4)
+    views = photograph(truth.replace(screen_filter=FILTERS["on"]), ring(4, 48, 36))
+    base = truth.replace(sh0=truth.sh0 + 0.05)
+    for expected in FILTERS:
+        assert compare_filters(base, views, expected).chosen == expected
+
+
+def test_photographs_of_something_else_decide_nothing() -> None:
+    """Dark ones, so that the faintest picture is the nearest: less is not more where nothing is shown."""
+    base, views = seen_with("off")
+    shuffled = [View(view.camera, view.image.flip(0, 1) // 6) for view in views]
+    found = compare_filters(base, shuffled)
+    assert found.psnr["on"] > found.psnr["off"] + 0.5 and found.chosen == "off"
+
+
+def test_a_better_mean_that_comes_of_few_views_is_not_enough() -> None:
+    """Two of five photographs of another filter: clearly better in the mean, in most of them not better at all."""
+    base, classic = seen_with("off")
+    _, other = seen_with("on")
+    few = [*classic[:3], *(View(view.camera, view.image) for view in other[3:])]
+    alone = compare_filters(base, few[3:])
+    assert alone.chosen == "on" and compare_filters(base, few).chosen == "off"

@@ -1,0 +1,261 @@
+"""Adapting block by block: blocks, what each sees and draws, and that the whole is as one adapted undivided."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clod_adapter.blocks.divide import Division, coverage, divide, split
+from clod_adapter.blocks.targets import LEFT_OUT, Quotas, beside, config_of, target
+from clod_adapter.blocks.train import Learned, adapt_chunk, merge
+from clod_adapter.cameras import Scene, camera_extent
+from clod_adapter.config import AdaptConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluation.evaluate import evaluate
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.importance import start
+from clod_adapter.render import render
+from clod_adapter.training.loop import adapt
+from clod_adapter.training.state import Progress, TrainingState
+from clod_adapter.training.target_count import count_law
+from scenes import capture, gaussians
+
+CONFIG = AdaptConfig(iters=120)
+BLOCKS = 4
+
+
+@pytest.fixture(scope="module")
+def captured() -> tuple[Gaussians, Scene]:
+    return capture()
+
+
+@pytest.fixture(scope="module")
+def divided(captured: tuple[Gaussians, Scene]) -> Division:
+    base, scene = captured
+    return divide(base, scene.train, CONFIG, BLOCKS)
+
+
+@pytest.fixture(scope="module")
+def learned(captured: tuple[Gaussians, Scene], divided: Division) -> list[Learned]:
+    return [adapt_chunk(divided, captured[1].train, CONFIG, block)[0] for block in range(BLOCKS)]
+
+
+@pytest.fixture(scope="module")
+def whole(captured: tuple[Gaussians, Scene], divided: Division, learned: list[Learned]) -> Gaussians:
+    """After both passes."""
+    first, views = merge(divided, learned), captured[1].train
+    return merge(divided, [adapt_chunk(divided, views, CONFIG, block, after=first)[0] for block in range(BLOCKS)])
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(1, 400), st.integers(1, 40), st.integers(0, 2**31), st.sampled_from(["spread", "plane", "heaps", "far"])
+)
+def test_blocks_are_even_and_hold_everything(count: int, parts: int, seed: int, kind: str) -> None:
+    parts = min(parts, count)
+    means = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
+    if kind == "plane":
+        means[:, 1] = 0
+    elif kind == "heaps":
+        means = means.round()
+    elif kind == "far":
+        means[0] = 1e6
+    block = split(means, parts)
+    sizes = block.long().bincount(minlength=parts)
+    assert len(sizes) == parts and int(sizes.sum()) == count
+    assert int(sizes.max() - sizes.min()) <= 1
+
+
+def test_blocks_are_boxes() -> None:
+    """Of an even spread each block is one piece of space: the boxes around them hardly overlap."""
+    means = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([4.0, 1.0, 2.0])
+    block = split(means, 8)
+    sides = torch.stack([means[block == k].amax(0) - means[block == k].amin(0) for k in range(8)])
+    assert float(sides.prod(1).sum()) < 1.01 * 8
+    assert sides.amax() < 1.3  # the long side is cut, and cut again
+
+
+def test_a_few_far_ones_do_not_decide_the_cut() -> None:
+    means = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([4.0, 1.0, 1.0])
+    means[:10, 2] = 1e4
+    block = split(means, 2)
+    assert (means[10:, 0][block[10:] == 0]).max() <= (means[10:, 0][block[10:] == 1]).min() + 0.1
+
+
+def test_too_many_blocks_are_refused() -> None:
+    with pytest.raises(ClodError, match="3 Gaussians cannot be split into 4"):
+        split(torch.zeros(3, 3), 4)
+
+
+def test_coverage_is_what_a_picture_is_mixed_from(captured: tuple[Gaussians, Scene]) -> None:
+    """Adds up to the alpha, and is 0 for what no pixel shows."""
+    base, scene = captured
+    camera = scene.train[0].camera
+    shown = coverage(base, base.opacities, camera)
+    torch.testing.assert_close(shown.sum(), render(base, camera).alpha.sum(), rtol=1e-4, atol=0)
+    behind = replace(camera, viewmat=torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ camera.viewmat)
+    assert bool((shown >= 0).all()) and float(coverage(base, base.opacities, behind).sum()) < 0.2 * float(shown.sum())
+
+
+def test_a_block_has_the_views_that_see_it(divided: Division, captured: tuple[Gaussians, Scene]) -> None:
+    seen = torch.tensor([[0.5, 0.0], [0.3, 0.001], [0.2, 0.0], [0.0, 0.999]])
+    division = replace(divided, seen=seen)
+    assert division.views(0) == [0, 1, 2] and division.views(1) == [3]
+    assert division.steps(0, CONFIG) == 90 and division.steps(1, CONFIG) == 30
+    config = replace(CONFIG, time_budget=8.0)
+    passes = [[config_of(division, k, config, first=first) for first in (True, False)] for k in (0, 1)]
+    assert [[each.iters for each in both] for both in passes] == [[68, 22], [22, 8]]
+    assert sum(each.time_budget for both in passes for each in both) == pytest.approx(8.0)
+    # In the capture, whose cameras stand around it, all see everything.
+    assert all(divided.views(k) == list(range(len(captured[1].train))) for k in range(BLOCKS))
+    torch.testing.assert_close(divided.seen.sum(1), torch.ones(len(divided.seen)))
+
+
+def test_what_is_left_out_is_not_missed(captured: tuple[Gaussians, Scene]) -> None:
+    """Of many small ones behind a wall: pictures without what is not beside a block are nearly the same."""
+    base, scene = captured
+    hidden = gaussians(400, 1, 3, size=0.02)
+    hidden = hidden.replace(means=hidden.means * 0.2)  # within the cloud
+    both = base.replace(**{n: torch.cat([t, hidden.tensors()[n]]) for n, t in base.tensors().items()})
+    both = both.replace(opacity_logits=torch.cat([base.opacity_logits + 3, hidden.opacity_logits - 4]))
+    division = divide(both, scene.train, CONFIG, BLOCKS)
+    for block in range(BLOCKS):
+        rows = torch.cat([division.rows(block), beside(division, block, scene.train)])
+        assert len(rows) < len(both)
+        for view in scene.train[:3]:
+            whole, part = (render(g, view.camera).image for g in (both, both.select(rows)))
+            assert float((whole - part).abs().mean()) <= 2 * LEFT_OUT
+
+
+def test_the_start_is_that_of_the_whole(divided: Division, captured: tuple[Gaussians, Scene]) -> None:
+    base, scene = captured
+    whole = start(base, scene.train, CONFIG)
+    assert torch.equal(divided.begun.sigma_d, whole.sigma_d) and divided.begun.attenuation == whole.attenuation
+    assert divided.extent == camera_extent([view.camera for view in scene.train])
+
+
+def test_quotas_add_up_to_the_law(divided: Division, captured: tuple[Gaussians, Scene]) -> None:
+    """And where each block answers for its part of the loss, they press on each Gaussian as the whole's law does."""
+    views, count = captured[1].train, len(captured[0])
+    for first in (True, False):
+        quotas = [Quotas(divided, block, views, CONFIG, first=first) for block in range(BLOCKS)]
+        for k, view in enumerate(views[:2]):
+            for s in (1.0, 1.7, 3.0, CONFIG.max_sv):
+                asked = [quota(view, s, 0.1) for quota in quotas]
+                law = count_law(s, CONFIG.start_share, CONFIG.exponent)
+                wanted = sum(q.share * len(divided.rows(block)) for block, q in enumerate(asked))
+                assert wanted == pytest.approx(law * count, rel=0.05)
+                for block, q in enumerate(asked):
+                    loss = float(divided.seen[k, block]) if first else 1.0
+                    assert loss * q.weight / len(divided.rows(block)) == pytest.approx(1 / (law * count))
+
+
+def test_targets_ask_for_the_whole_error_once(captured: tuple[Gaussians, Scene], divided: Division) -> None:
+    """What the blocks are asked to change adds up to what is between checkpoint and photograph."""
+    base, scene = captured
+    view, asked = scene.train[0], 0.0
+    picture = render(base, view.camera).image
+    for block in range(BLOCKS):
+        rows = divided.rows(block)
+        ordered = base.select(torch.cat([rows, (divided.block != block).nonzero()[:, 0]]))
+        asked = asked + target(ordered, len(rows), view) / 255 - picture.clamp(0, 1)
+    torch.testing.assert_close(asked, view.image / 255 - picture.clamp(0, 1), rtol=0, atol=BLOCKS / 255)
+
+
+def test_merging_takes_each_row_from_its_block(divided: Division, learned: list[Learned]) -> None:
+    whole = merge(divided, learned)
+    for part in learned:
+        for name, values in part.values.items():
+            assert torch.equal(getattr(whole, name)[part.rows], values), name
+            assert not torch.equal(values, getattr(divided.begun, name)[part.rows]), name
+    assert torch.equal(whole.shN, divided.begun.shN)
+    with pytest.raises(ClodError, match="in no chunk or in two"):
+        merge(divided, learned[1:])
+    with pytest.raises(ClodError, match="in no chunk or in two"):
+        merge(divided, [*learned, learned[0]])
+
+
+def test_no_seams(captured: tuple[Gaussians, Scene], divided: Division, whole: Gaussians) -> None:
+    """Every picture here is across all borders, through a cloud that hides nothing: the hardest there is.
+
+    benchmarks/chunks.py measures it on captures.
+    """
+    base, scene = captured
+    undivided = adapt(base, scene, CONFIG).gaussians
+    dials = (1.0, 3.0, 5.0)
+    begun = evaluate(divided.begun, scene.test, dials)
+    for before, one, other in zip(begun, *(evaluate(g, scene.test, dials) for g in (undivided, whole)), strict=True):
+        gained = (other.psnr - before.psnr) / (one.psnr - before.psnr)
+        assert gained > 0.7, f"s {one.virtual_scale}"
+        assert other.kept_share == pytest.approx(one.kept_share, abs=0.06)
+
+
+def test_the_second_pass_brings_blocks_into_accord(
+    captured: tuple[Gaussians, Scene], divided: Division, learned: list[Learned], whole: Gaussians
+) -> None:
+    views = captured[1].train
+    first, second = (evaluate(g, views, (3.0, 5.0)) for g in (merge(divided, learned), whole))
+    assert sum(row.psnr for row in second) > sum(row.psnr for row in first) + 0.5
+
+
+def test_a_chunk_goes_on_with_the_same_bits(
+    captured: tuple[Gaussians, Scene], divided: Division, learned: list[Learned]
+) -> None:
+    states: list[TrainingState] = []
+
+    def keep(progress: Progress) -> None:
+        if progress.state is not None and progress.done == 30:
+            states.append(copy.deepcopy(progress.state()))
+
+    views = captured[1].train
+    once, _ = adapt_chunk(divided, views, CONFIG, 1, progress=keep)
+    again, outcome = adapt_chunk(divided, views, CONFIG, 1, resume=states[0])
+    assert outcome.steps == 0.75 * divided.steps(1, CONFIG)
+    for part in (again, learned[1]):
+        assert part.values.keys() == once.values.keys()
+        assert all(torch.equal(value, once.values[name]) for name, value in part.values.items())
+
+
+def test_chunks_have_seeds_of_their_own(divided: Division) -> None:
+    whole = replace(CONFIG, seed=2**63 - 1)
+    seeds = {config_of(divided, k, whole, first=first).seed for k in range(BLOCKS) for first in (True, False)}
+    assert len(seeds) == 2 * BLOCKS and whole.seed not in seeds
+
+
+@pytest.mark.parametrize("drawn", [True, False])
+def test_a_block_that_no_view_sees_stays(captured: tuple[Gaussians, Scene], drawn: bool) -> None:
+    """Also where nothing at all is drawn, and the block is behind the only camera."""
+    base, scene = captured
+    view = scene.train[0]
+    ahead, right = view.camera.viewmat[2, :3], view.camera.viewmat[0, :3]
+    means = base.means * 0.001 + view.camera.position + 3 * ahead + (0 if drawn else 30) * right
+    means[:100] -= 50 * ahead
+    division = divide(base.replace(means=means), [view], CONFIG, 3)
+    behind = int(division.block[0])
+    assert division.views(behind) == [] and division.steps(behind, CONFIG) == 0
+    part, outcome = adapt_chunk(division, [view], CONFIG, behind)
+    assert (part.steps, outcome.steps, list(part.values)) == (0, 0, ["sigma_d"])
+    assert torch.equal(part.values["sigma_d"], division.begun.sigma_d[division.rows(behind)])
+
+
+def test_every_wait_is_told(captured: tuple[Gaussians, Scene], divided: Division) -> None:
+    told: list[tuple[str, int, int]] = []
+    views = captured[1].train
+    adapt_chunk(divided, views, replace(CONFIG, iters=1), 0, progress=lambda p: told.append((p.phase, p.done, p.total)))
+    for phase in ("beside", "targets", "quotas"):
+        assert [one[1:] for one in told if one[0] == phase] == [(k + 1, len(views)) for k in range(len(views))]
+
+
+def test_what_needs_all_gaussians_at_once_is_refused(captured: tuple[Gaussians, Scene]) -> None:
+    base, scene = captured
+    with pytest.raises(ClodError, match="the paper's form cannot be trained in chunks"):
+        divide(base, scene.train, AdaptConfig.paper(), 2)
+    begun = start(base, scene.train, CONFIG)
+    dialled = begun.replace(attenuation=replace(begun.attenuation, normalizer="max"))
+    with pytest.raises(ClodError, match="normaliser max"):
+        divide(dialled, scene.train, CONFIG, 2)

@@ -1,0 +1,203 @@
+"""The plan as ``clod-adapt`` prints, stores, overrules and applies it."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import clod_adapter
+from clod_adapter.cli.commands import adapt as adapt_command
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.training import planner
+from clod_adapter.training.ablation import effect
+from clod_adapter.training.loop import Progress
+from clod_adapter.training.plan import NAMES
+
+TINY = ("--iters", 24, "--max-sv", 4, "--out", "dial.ply")
+OUTPUTS = ["dial.json", "dial.ply", "dial.safetensors"]
+
+
+@pytest.fixture(autouse=True)
+def short_probe(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planner, "PROBE", 6)
+    monkeypatch.setattr(planner, "SHARE", 0.3)
+
+
+@pytest.fixture
+def wasteful(capture: Any, tmp_path: Path) -> Path:
+    """The capture's checkpoint with a degree that does nothing, and 50 Gaussians that no camera sees among the rest."""
+    base: Gaussians = capture.gaussians
+    far = base.select(torch.arange(50)).replace(means=base.means[:50] + torch.tensor([0.0, 90.0, 0.0]))
+    values = {name: torch.cat([far.tensors()[name], value]) for name, value in base.tensors().items()}
+    values["shN"] = torch.cat([values["shN"], 1e-5 * torch.ones(350, 5, 3)], 1)
+    (tmp_path / "in").mkdir()
+    return Path(capture.write(tmp_path / "in" / "wasteful.ply", base.replace(**values)))
+
+
+def decisions(folder: Path) -> dict[str, dict[str, Any]]:
+    return {d["what"]: d for d in json.loads((folder / "dial.json").read_text())["plan"]["decisions"]}
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.is_file())
+
+
+def test_the_plan_is_printed_before_training_and_stored(
+    clod: Any, capture: Any, wasteful: Path, tmp_path: Path
+) -> None:
+    done = clod(wasteful, "--images", capture.scene, *TINY)
+    assert done.code == 0, done
+    lines = done.err.splitlines()
+    (first,) = (k for k, line in enumerate(lines) if line.startswith("plan: "))
+    assert max(map(len, lines[first:])) <= 120
+    assert re.search(r"^trained 24 steps", "\n".join(lines[first:]), re.M)
+    table = {line[2:].split("  ")[0]: line for line in lines[first + 1 :] if line.startswith("  ")}
+    assert re.search(r"left out +0\.0\d\d dB +change without it, 8 training views +--with bands$", table["SH band 2"])
+    assert re.search(r"kept +\d+\.\d+ dB +change without them, .* --without bands$", table["SH band 1 to 2"])
+    assert re.search(r"left out +\d+ +of 350 move no pixel of 8 .* --with unseen$", table["unseen Gaussians"])
+    assert re.search(r"left out +- +all 10 cameras are pinholes$", table["undistortion"])  # what reading them spared
+    for name in ("means", "quats", "scales", "opacities", "sh0"):
+        assert table[name].endswith(f"--without {name}"), done
+    report = json.loads((tmp_path / "dial.json").read_text())
+    stored = decisions(tmp_path)
+    assert list(stored) == list(table) and stored["unseen Gaussians"]["number"] >= 50
+    assert set(report["plan"]["seconds"]) == {"bands", "unseen", "start", "probe"}
+    assert min(report["plan"]["seconds"].values()) >= 0 and report["seconds"]["plan"] > 0
+    base, result = (clod_adapter.load(path).gaussians for path in (wasteful, tmp_path / "dial.ply"))
+    assert len(result) == 350 and torch.equal(result.shN, base.shN)  # what was left out is there
+    assert torch.equal(result.means[:50], base.means[:50]) and not torch.equal(result.means[50:], base.means[50:])
+    assert "plan:" not in clod(wasteful, "--images", capture.scene, *TINY, "--quiet").err
+
+
+def test_trimmed_files_are_made_again_bit_for_bit(clod: Any, capture: Any, wasteful: Path, tmp_path: Path) -> None:
+    clod(wasteful, "--images", capture.scene, *TINY)
+    whole = clod_adapter.load(tmp_path / "dial.ply").gaussians
+    large = (tmp_path / "dial.ply").stat().st_size
+    done = clod(wasteful, "--images", capture.scene, *TINY, "--trim")
+    assert done.code == 0, done
+    report, stored = json.loads((tmp_path / "dial.json").read_text()), decisions(tmp_path)
+    trimmed = clod_adapter.load(tmp_path / "dial.ply").gaussians
+    gone = int(stored["unseen Gaussians"]["number"])
+    assert (len(trimmed), trimmed.sh_degree, report["base_count"]) == (350 - gone, 1, 350)
+    assert report["rows"][0]["kept"] <= len(trimmed) and (tmp_path / "dial.ply").stat().st_size < 0.7 * large
+    assert "held out" in stored["what is left out"]["why"] and stored["what is left out"]["number"] < 0.02
+    adapter = clod_adapter.load_adapter(tmp_path / "dial.safetensors")
+    assert adapter.kept is not None and int((~adapter.kept).sum()) == gone and not adapter.kept[:50].any()
+    # The same training: only what was left out is missing, but for the rounding of differences to what stays.
+    for name, value in trimmed.tensors().items():
+        assert torch.allclose(value, whole.tensors()[name][adapter.kept][:, :3] if name == "shN"
+                              else whole.tensors()[name][adapter.kept], rtol=2e-3, atol=1e-5), name  # fmt: skip
+    done = clod("apply", wasteful, "dial.safetensors", "-o", "again.ply", "--json")
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
+    assert json.loads(done.out)["base_count"] == 350
+    refused = clod("apply", capture.ply, "dial.safetensors", "-o", "again.ply")
+    assert refused.code == 2 and "a different base was given" in refused.err
+
+
+def test_trimming_by_placed_cameras_warns(
+    clod: Any, capture: Any, wasteful: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What they do not see others may."""
+    scene = clod_adapter.load_scene(capture.scene)
+    monkeypatch.setattr("clod_adapter.cli.adapt.run.place_scene", lambda *_: scene)
+    settled = ("--iters", 2, "--with", "bands", "--trim")
+    assert "no placed camera sees; others may" in clod(wasteful, *settled, "--out", "dial.ply").err
+    assert "no placed camera" not in clod(wasteful, *settled, "--images", capture.scene, "--out", "dial.ply").err
+
+
+def test_nothing_to_trim(clod: Any, capture: Any, tmp_path: Path) -> None:
+    """Whoever trims what has nothing to spare gets the usual files, which earlier versions read."""
+    for name, options in (("dial.ply", ()), ("trimmed.ply", ("--trim",))):
+        words = ("--iters", 6, "--max-sv", 4, "--with", "unseen", "bands", "--out", name)
+        assert clod(capture.ply, "--images", capture.scene, *words, *options).code == 0
+    loaded = [clod_adapter.load(tmp_path / name).gaussians for name in ("dial.ply", "trimmed.ply")]
+    assert all(torch.equal(value, loaded[1].tensors()[name]) for name, value in loaded[0].tensors().items())
+    adapter = clod_adapter.load_adapter(tmp_path / "trimmed.safetensors")
+    assert adapter.kept is None and adapter.sh_degree is None
+
+
+def test_overruled(clod: Any, capture: Any, wasteful: Path, tmp_path: Path) -> None:
+    options = ("--with", "bands", "unseen", "--without", "quats", "--with", "sh0", "--without", "means")
+    done = clod(wasteful, "--images", capture.scene, *TINY, *options)
+    assert done.code == 0, done
+    stored = decisions(tmp_path)
+    assert {d["verdict"] for d in (stored["SH bands"], stored["unseen Gaussians"])} == {"kept"}
+    assert (stored["quats"]["verdict"], stored["sh0"]["verdict"]) == ("frozen", "trained")
+    assert "as asked, whatever it is worth" in done.err
+    assert set(clod_adapter.load_adapter(tmp_path / "dial.safetensors").updates) == {
+        "log_scales", "opacity_logits", "sh0",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--with", "colour"), "argument --with: invalid choice: 'colour' (choose from "),
+        (("--without",), "argument --without: expected at least one argument"),
+        (("--with", "quats", "--without", "sh0", "quats"), "--with and --without both name quats"),
+    ],
+)
+def test_misuse(clod: Any, capture: Any, tmp_path: Path, options: Any, message: str) -> None:
+    done = clod(capture.ply, "--images", capture.scene, *TINY, *options)
+    assert done.code == 2 and message in done.err and done.err.count("\n") == 1 and names(tmp_path) == []
+    if "colour" in options:
+        assert all(name in done.err for name in adapt_command.NAMES)
+
+
+def test_the_options_name_what_the_plan_decides() -> None:
+    assert adapt_command.NAMES == NAMES
+    assert all(name in adapt_command.PLAN for name in adapt_command.NAMES)
+
+
+@pytest.mark.parametrize("phase", ["bands", "start", "order", "probe"])
+def test_an_interrupt_leaves_nothing(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: str
+) -> None:
+    from clod_adapter.cli.adapt.progress import Follower
+
+    follow = Follower.__call__
+
+    def interrupted(self: Follower, now: Progress) -> None:
+        self.stop.requests += now.phase == phase
+        follow(self, now)
+
+    monkeypatch.setattr(Follower, "__call__", interrupted)
+    done = clod(capture.ply, "--images", capture.scene, *TINY)
+    assert done.code == 130 and "plan:" not in done.err and names(tmp_path) == [], done
+
+
+def test_resuming_what_the_plan_froze(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The attributes are judged once: what was frozen stays so, and the end is the same."""
+    from clod_adapter.cli.adapt.progress import Follower
+
+    def quats_do_nothing(name: str, *rest: Any) -> tuple[float, float]:
+        return (0.0, 1.0) if name == "quats" else effect(name, *rest)
+
+    monkeypatch.setattr(planner, "effect", quats_do_nothing)
+    words = (capture.ply, "--images", capture.scene, *TINY)
+    assert clod(*words).code == 0 and decisions(tmp_path)["quats"]["verdict"] == "frozen"
+    want = clod_adapter.load(tmp_path / "dial.ply").gaussians
+    follow = Follower.__call__
+    with monkeypatch.context() as patch:
+
+        def interrupted(self: Follower, now: Progress) -> None:
+            self.stop.requests += now.phase == "train" and now.done == 12
+            follow(self, now)
+
+        patch.setattr(Follower, "__call__", interrupted)
+        assert "--resume goes on from step 12" in clod(*words).err
+    monkeypatch.setattr(planner, "effect", lambda *_: pytest.fail("judged again"))
+    with monkeypatch.context() as patch:
+        patch.setattr(planner, "band_losses", lambda *_: pytest.fail("looked at before it was refused"))
+        refused = clod(*words, "--with", "sh0", "bands", "--resume")
+    assert refused.code == 2 and "is of a run with no --with or --without; give what it was" in refused.err, refused
+    done = clod(*words, "--resume")
+    assert done.code == 0 and "as before the interruption" in done.err, done
+    found = clod_adapter.load(tmp_path / "dial.ply").gaussians
+    assert all(torch.equal(value, found.tensors()[name]) for name, value in want.tensors().items())
+    assert names(tmp_path) == OUTPUTS

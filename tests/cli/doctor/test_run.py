@@ -1,0 +1,374 @@
+"""``clod-adapt doctor``: here, and on the machines that it is for."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+
+import gsplat_in_torch
+import inria_forks
+from clod_adapter import rasterizers
+from clod_adapter.cli.doctor import gpu as doctor_gpu
+from clod_adapter.cli.doctor import run, tools
+from clod_adapter.cli.shared.findings import Finding, Miniature, Off
+from clod_adapter.errors import ClodError
+from clod_adapter.rasterizers import reference
+
+NAMES = [
+    "python", "torch", "cpu", "driver", "cuda", "gsplat", "gpu", "inria", "processes", "plots", "glb",
+    "splat-transform", "demo", "lpips", "flip", "browser", "cores", "memory", "cache",
+]  # fmt: skip
+
+
+def find(name: str) -> Finding:
+    return Finding.of(name, run.LOOKS[name])
+
+
+def program(folder: Path, name: str, script: str) -> None:
+    (folder / name).write_text(f"#!/bin/sh\n{script}\n")
+    (folder / name).chmod(0o755)
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> torch.device:
+    """A processor that stands for a GPU."""
+    device = torch.device("cpu")
+    monkeypatch.setattr(doctor_gpu, "cuda_device", lambda: device)
+    return device
+
+
+def test_here(clod: Any) -> None:
+    done = clod("doctor")
+    *lines, last = done.out.splitlines()
+    assert done.code == 0 and [line.split()[0] for line in lines] == NAMES
+    for line in lines:
+        assert (line[17:20] == "ok ") != (" -> " in line), line  # what is off has its line
+    assert "cpu              ok   compiled for " in done.out and "RMS" in done.out
+    assert last.startswith("draws and trains on: cpu")
+
+
+def test_json(clod: Any) -> None:
+    done = clod("doctor", "--json")
+    report = json.loads(done.out)
+    assert set(report) == {"command", "version", "draws", "exit_code", "findings", "seconds"}
+    assert report["command"] == "doctor" and "cpu" in report["draws"] and report["exit_code"] == done.code == 0
+    assert [finding["name"] for finding in report["findings"]] == list(report["seconds"]) == NAMES
+    for finding in report["findings"]:
+        assert {name: type(value) for name, value in finding.items()} == {
+            "name": str, "ok": bool, "found": str, "fix": str,
+        }  # fmt: skip
+        assert finding["found"] and finding["ok"] != bool(finding["fix"]), finding
+    assert sum(report["seconds"].values()) < 60
+
+
+def test_as_a_module_of_the_interpreter() -> None:
+    """As torchrun starts it; without torch all is said all the same, and the exit code is 1."""
+    code = "import sys, runpy; sys.modules['torch'] = None; sys.argv = ['clod-adapt', 'doctor', '--json']\n"
+    code += "runpy.run_module('clod_adapter', run_name='__main__')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    report = json.loads(done.stdout)
+    assert done.returncode == report["exit_code"] == 1 and report["draws"] == [], done.stderr
+    found = {finding["name"]: finding for finding in report["findings"]}
+    assert not found["torch"]["ok"] and found["torch"]["fix"].startswith("pip install") and found["memory"]["ok"]
+    assert "Traceback" not in done.stderr
+    version = subprocess.run([sys.executable, "-m", "clod_adapter", "--version"], capture_output=True, text=True)
+    assert version.returncode == 0 and version.stdout.startswith("clod-adapt ")
+
+
+def wrong(**given: Any) -> tuple[torch.Tensor, torch.Tensor]:
+    image, alpha = reference.rasterize(**given)
+    return image.roll(1, dims=1), alpha
+
+
+def nan(**given: Any) -> tuple[torch.Tensor, torch.Tensor]:
+    image, alpha = reference.rasterize(**given)
+    return image * float("nan"), alpha
+
+
+def turned(**given: Any) -> tuple[torch.Tensor, torch.Tensor]:
+    image, alpha = reference.rasterize(**given)
+    return image.transpose(0, 1), alpha
+
+
+@pytest.mark.parametrize("rasterize", [wrong, nan, turned])
+def test_a_broken_picture(clod: Any, monkeypatch: pytest.MonkeyPatch, rasterize: Any) -> None:
+    monkeypatch.setattr(rasterizers, "for_device", lambda device: rasterize)
+    found = find("cpu")
+    assert not found.ok and found.found.startswith("it draws another picture than the reference") and found.fix
+
+
+def test_nothing_draws(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rasterizers, "for_device", lambda device: wrong)
+    monkeypatch.setattr(run, "LOOKS", {name: run.LOOKS[name] for name in ("torch", "cpu", "gpu")})
+    done = clod("doctor")
+    assert done.code == 1 and done.out.splitlines()[-1] == "nothing draws here: mend torch, then cpu"
+
+
+def test_whatever_fails_is_a_finding() -> None:
+    def look() -> str:
+        print("chatter")
+        raise MemoryError("no room\nand more")
+
+    assert Finding.of("x", look) == Finding("x", False, "it failed with MemoryError: no room")
+    compiled = SystemError("returned a result with an exception set")  # as Numba hands on a Ctrl-C
+    compiled.__cause__ = KeyboardInterrupt()
+    for interrupt in (KeyboardInterrupt(), compiled):
+        with pytest.raises(type(interrupt)):
+            Finding.of("x", lambda raised=interrupt: (_ for _ in ()).throw(raised))
+
+
+@pytest.mark.parametrize(
+    ("script", "bus", "ok", "said", "fix"),
+    [
+        ("echo 'NVIDIA H200, 570.1, 143771 MiB'", True, True, "NVIDIA H200, 570.1, 143771 MiB", ""),
+        ("echo 'Driver/library version mismatch'; exit 18", True, False, "fails: Driver/library ver", "--gpus all"),
+        ("echo 'could not talk to the driver' >&2; exit 9", True, False, "fails: could not talk", "--gpus all"),
+        ("exit 0", True, False, "it lists no GPU", "--gpus all"),
+        (None, True, False, "no nvidia-smi", "https://www.nvidia.com/drivers"),
+        (None, False, False, "no NVIDIA GPU on the PCI bus", "a machine with an NVIDIA GPU"),
+        ("sleep 5", True, False, "does not answer", "restart"),
+    ],
+)
+def test_driver(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str | None, bus: bool, ok: bool, said: str, fix: str
+) -> None:
+    (tmp_path / "bus" / "0000:01").mkdir(parents=True)
+    (tmp_path / "bus" / "0000:01" / "vendor").write_text("0x10de\n" if bus else "0x8086\n")
+    monkeypatch.setattr(doctor_gpu, "PCI", tmp_path / "bus")
+    monkeypatch.setattr(doctor_gpu, "ASKING", 0.5)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}/bin" if script else str(tmp_path))
+    if script:
+        program(tmp_path, "nvidia-smi", script)
+    found = find("driver")
+    assert found.ok == ok and said in found.found and fix in found.fix, found
+
+
+def test_torch_without_cuda(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(torch.version, "cuda", None)
+    program(tmp_path, "nvidia-smi", "")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    for name in ("cuda", "gpu"):
+        found = find(name)
+        assert not found.ok and found.found == f"torch {torch.__version__} is a CPU build"
+        assert found.fix.startswith("pip install") and "--index-url https://download.pytorch.org/whl/cu" in found.fix
+    monkeypatch.setenv("PATH", "")
+    assert find("cuda").fix.startswith("mend driver first, then pip install")
+    monkeypatch.setattr(torch.version, "hip", "6.4")
+    assert find("cuda").found.endswith("is built for ROCm 6.4")
+
+
+@pytest.mark.parametrize(
+    ("says", "fix"),
+    [
+        ("Found no NVIDIA driver on your system.\nPlease check", "mend driver first"),
+        ("The NVIDIA driver on your system is too old (found version 11040)", "update NVIDIA's driver, or take a"),
+        ("CUDA error: no kernel image is available for execution on the device", "update NVIDIA's driver, or take a"),
+    ],
+)
+def test_a_gpu_that_torch_cannot_use(monkeypatch: pytest.MonkeyPatch, says: str, fix: str) -> None:
+    def refuse(*args: Any, **kwargs: Any) -> None:
+        raise RuntimeError(says)
+
+    monkeypatch.setattr(torch.version, "cuda", "12.8")
+    monkeypatch.setattr(torch, "arange", refuse)
+    found = find("cuda")
+    assert not found.ok and says.splitlines()[0] in found.found and "\n" not in found.found
+    assert found.fix.startswith(fix)
+
+
+def test_no_gsplat_and_an_old_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    assert find("gsplat") == Finding("gsplat", False, "not installed", "pip install 'clod-adapter[gpu]'")
+    old: Any = ModuleType("gsplat")
+    old.__version__, old.__spec__ = "1.4.0+pt24cu124", object()
+    monkeypatch.setitem(sys.modules, "gsplat", old)
+    found = find("gsplat")
+    assert found == Finding("gsplat", False, "1.4.0+pt24cu124, 1.5.3 is needed", "pip install 'clod-adapter[gpu]'")
+
+
+@pytest.mark.parametrize("toolkit", [None, "/usr/local/cuda"])
+def test_gsplat_is_not_compiled(
+    monkeypatch: pytest.MonkeyPatch, gpu: torch.device, tmp_path: Path, toolkit: str | None
+) -> None:
+    """And the doctor does not begin to, which takes minutes."""
+    pytest.importorskip("gsplat")
+    from torch.utils import cpp_extension
+
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
+    monkeypatch.setattr(cpp_extension, "CUDA_HOME", toolkit)
+    monkeypatch.setattr(cpp_extension, "_jit_compile", lambda *_, **__: pytest.fail("compiles"))
+    found = find("gsplat")
+    assert not found.ok and "gsplat.cuda._backend" in found.fix, found
+    if toolkit:
+        assert "not compiled yet; nvcc is in /usr/local/cuda" in found.found and found.fix.startswith("python -c")
+    else:
+        assert "there is no nvcc" in found.found and found.fix.startswith("install the CUDA toolkit")
+
+
+def test_gsplat_draws(monkeypatch: pytest.MonkeyPatch, gpu: torch.device, tmp_path: Path) -> None:
+    """Its Python with kernels of torch; and with one that is broken."""
+    pytest.importorskip("gsplat")
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
+    (tmp_path / "gsplat_cuda").mkdir()
+    (tmp_path / "gsplat_cuda" / "gsplat_cuda.so").write_bytes(b"")
+    gsplat_in_torch.install(monkeypatch)
+    found = find("gsplat")
+    assert found.ok and found.found.startswith("1.5.3; its picture is the reference's"), found
+    from gsplat import rendering
+
+    real: Callable[..., Any] = rendering.rasterize_to_pixels
+    monkeypatch.setattr(rendering, "rasterize_to_pixels", lambda *a, **k: [0.9 * x for x in real(*a, **k)])
+    assert "another picture" in find("gsplat").found
+
+
+def test_gpu_rasterizer(monkeypatch: pytest.MonkeyPatch, gpu: torch.device) -> None:
+    def none(device: torch.device) -> Any:
+        raise ClodError("no rasterizer for device cuda: move the Gaussians")
+
+    assert find("gpu").ok
+    monkeypatch.setattr(rasterizers, "for_device", none)
+    found = find("gpu")
+    assert (found.ok, found.found) == (False, "no rasterizer for device cuda: move the Gaussians")
+    assert "pip install 'clod-adapter[gpu]'" in found.fix
+    monkeypatch.setattr(rasterizers, "for_device", lambda device: wrong)
+    assert "another picture" in find("gpu").found
+
+
+@pytest.mark.parametrize("fork", ["inria 2023", "inria 2024"])
+def test_inrias_forks(monkeypatch: pytest.MonkeyPatch, gpu: torch.device, fork: str) -> None:
+    installed = inria_forks.module(fork)
+    installed.__file__ = "/somewhere/diff_gaussian_rasterization/__init__.py"
+    monkeypatch.setitem(sys.modules, "diff_gaussian_rasterization", installed)
+    monkeypatch.delitem(sys.modules, "clod_adapter.integrations.inria", raising=False)
+    found = find("inria")
+    assert found.ok and found.found.startswith("/somewhere/diff_gaussian_rasterization; its picture is"), found
+    monkeypatch.undo()
+    sys.modules.pop("clod_adapter.integrations.inria", None)
+
+
+def test_no_fork_of_inrias(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "diff_gaussian_rasterization", None)
+    monkeypatch.delitem(sys.modules, "clod_adapter.integrations.inria", raising=False)
+    found = find("inria")
+    assert not found.ok and "diff_gaussian_rasterization" in found.found
+    assert found.fix.startswith("pip install --no-build-isolation git+https://github.com/graphdeco-inria/")
+
+
+def test_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert find("processes").ok and not torch.distributed.is_initialized()
+
+    def unreachable(*_: Any) -> None:
+        raise RuntimeError("gloo: no interface\nstack")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(torch.distributed, "ProcessGroupGloo", unreachable)
+        found = find("processes")
+        assert not found.ok and "no interface" in found.found and "GLOO_SOCKET_IFNAME" in found.fix
+    monkeypatch.setattr(torch.distributed, "is_available", lambda: False)
+    assert "without torch.distributed" in find("processes").found
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "fix"),
+    [
+        ("plots", "matplotlib", "clod-adapter[plots]"),
+        ("glb", "pygltflib", "clod-adapter[export]"),
+        ("demo", "skimage", "clod-adapter[demo]"),
+        ("lpips", "lpips", "clod-adapter[eval]"),
+        ("flip", "flip_evaluator", "clod-adapter[eval]"),
+    ],
+)
+def test_extras_that_are_not_installed(monkeypatch: pytest.MonkeyPatch, name: str, module: str, fix: str) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    found = find(name)
+    assert not found.ok and found.fix == f"pip install '{fix}'", found
+
+
+def test_splat_transform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CLOD_SPLAT_TRANSFORM", raising=False)
+    found = find("splat-transform")
+    assert (found.ok, found.found) == (False, "splat-transform is not installed") and "npm install" in found.fix
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}/bin")
+    program(tmp_path, "splat-transform", "echo 'splat-transform v3.6.0'")
+    assert find("splat-transform").found == "splat-transform is 3.6.0, 3.7 or newer is needed"
+    program(tmp_path, "splat-transform", 'case "$*" in *version*) echo "splat-transform v3.7.1";; *.ply) exit 3;; esac')
+    found = find("splat-transform")
+    assert not found.ok and "failed" in found.found
+    program(tmp_path, "splat-transform", 'case "$*" in *version*) echo "splat-transform v3.7.1";; esac')
+    found = find("splat-transform")
+    assert found.ok and found.found.startswith("3.7.1, without a GPU")
+
+
+def test_weights_that_are_missing_have_their_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    from clod_adapter.evaluation import perceptual
+
+    def none() -> Any:
+        raise perceptual.Unavailable("its network's weights are not at x", perceptual.WEIGHTS)
+
+    monkeypatch.setitem(perceptual.METRICS, "lpips", none)
+    assert find("lpips") == Finding("lpips", False, "its network's weights are not at x", perceptual.WEIGHTS)
+    monkeypatch.setitem(perceptual.METRICS, "lpips", lambda: lambda image, target: 0.0)
+    assert "measures 0 of equal pictures and 0 of others" in find("lpips").found
+
+
+def test_browser(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none() -> None:
+        raise webbrowser.Error("could not locate runnable browser")
+
+    monkeypatch.setattr(webbrowser, "get", none)
+    found = find("browser")
+    assert not found.ok and "clod-adapt view --no-browser" in found.fix and "ssh -L" in found.fix
+    monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.BackgroundBrowser("firefox"))
+    assert find("browser") == Finding("browser", True, "firefox")
+
+
+def test_limits_of_a_container(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(tools, "CGROUP", tmp_path)
+    threads = torch.get_num_threads()
+    unlimited = find("memory")
+    (tmp_path / "cpu.max").write_text("50000 100000\n")
+    (tmp_path / "memory.max").write_text(f"{2**30}\n")
+    (tmp_path / "memory.current").write_text(f"{2**28}\n")
+    found = find("cores")
+    if threads > 1:
+        assert found == Finding("cores", False, f"{threads} threads on 1 cores", "OMP_NUM_THREADS=1 clod-adapt ...")
+    assert unlimited.ok and find("memory").found == "0.8 GB free of 1.0 GB"
+    for name in ("cpu.max", "memory.max"):
+        (tmp_path / name).write_text("max 100000\n" if name == "cpu.max" else "max\n")
+    assert find("cores").ok and find("memory").found.split(" of ")[1] == unlimited.found.split(" of ")[1]
+
+
+def test_a_cache_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    found = find("cache")
+    assert found.ok and found.found.startswith(f"{tmp_path / 'cache' / 'clod-adapter'}; kernels in ")
+    assert not list((tmp_path / "cache" / "clod-adapter").iterdir())
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    found = find("cache")
+    assert not found.ok and found.fix.startswith("set XDG_CACHE_HOME")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    from clod_adapter._kernels import blend
+
+    monkeypatch.setattr(blend.blend, "_cache", object())
+    assert find("cache").fix.startswith("set NUMBA_CACHE_DIR")
+
+
+def test_the_miniature_tells_small_differences() -> None:
+    """A level of 255 in every pixel is another picture; rounding is none."""
+    mini = Miniature.make()
+    assert float((mini.image > 0.02).any(-1).float().mean()) > 0.3  # of the picture has something in it
+    mini.compare(mini.image + 1e-5)
+    with pytest.raises(Off, match="another picture"):
+        mini.compare(mini.image + 1 / 255)

@@ -1,0 +1,128 @@
+"""The cameras that ``export`` bakes for, and the PSNR of the file that it writes."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import clod_adapter
+from clod_adapter.cli.export import baking
+from clod_adapter.cli.export.baking import largest_within
+from clod_adapter.io.checkpoint import load
+from clod_adapter.viewpoints import viewpoint_of
+
+
+def exported(clod: Any, *words: object) -> Any:
+    done = clod("export", *words, "--json")
+    assert done.code == 0, done
+    return json.loads(done.out)
+
+
+def test_adapting_stores_the_training_cameras(capture: Any, dialled: Path) -> None:
+    model, scene = load(dialled), clod_adapter.load_scene(capture.scene)
+    assert model.gaussians.attenuation is not None and len(model.viewpoints) == len(scene.train) == 8
+    for found, view in zip(model.viewpoints, scene.train, strict=True):
+        assert found == viewpoint_of(view.camera, model.gaussians.means, model.gaussians.attenuation)
+
+
+def test_with_the_scene_it_is_for_the_training_cameras(clod: Any, capture: Any, dialled: Path) -> None:
+    report = exported(clod, dialled, "--sv", 2, "--images", capture.scene, "-o", "x.ply")
+    cameras = [view.camera for view in clod_adapter.load_scene(capture.scene).train]
+    want = clod_adapter.bake(load(dialled).gaussians, 2.0, cameras=cameras)
+    found = load("x.ply").gaussians
+    assert report["cameras"] == 8 and torch.equal(found.means, want.means)
+    torch.testing.assert_close(found.opacity_logits, want.opacity_logits)
+
+
+def without_viewpoints(path: Path, out: Path) -> Path:
+    head, end, body = path.read_bytes().partition(b"end_header\n")
+    lines = [line for line in head.splitlines(keepends=True) if not line.startswith(b"comment clod_adapter viewpoint")]
+    out.write_bytes(b"".join(lines) + end + body)
+    return out
+
+
+def test_where_no_camera_is_known_some_are_placed(
+    clod: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(baking, "PLACED", 3)
+    old = without_viewpoints(dialled, tmp_path / "old.ply")
+    report = exported(clod, old, "--sv", 2, "-o", "x.ply")
+    assert report["notes"] == [f"{old} stores no cameras, so 3 are placed; give --images, which is better"]
+    model = load(old)
+    want = clod_adapter.bake(model.gaussians, 2.0, cameras=clod_adapter.place(model.gaussians, views=3))
+    assert model.viewpoints == () and torch.equal(load("x.ply").gaussians.means, want.means)
+    assert "baked at s = 2 by clod-adapter for 3 placed cameras" in load("x.ply").comments
+
+
+def test_where_nothing_can_be_seen_no_camera_is_placed(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    model = load(without_viewpoints(dialled, tmp_path / "old.ply"))
+    faint = model.gaussians.replace(opacity_logits=model.gaussians.opacity_logits - 20)
+    clod_adapter.save("faint.ply", faint)
+    done = clod("export", "faint.ply", "--sv", 2, "-o", "x.ply")
+    assert done.code == 2 and not Path("x.ply").exists()
+    assert done.err.splitlines()[-1].startswith(
+        "clod-adapt: error: faint.ply: it stores no cameras to bake for, and no "
+    )
+    assert done.err.splitlines()[-1].endswith("; give --images")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".splat"])
+def test_a_psnr_budget_is_true_of_the_file(clod: Any, capture: Any, dialled: Path, suffix: str) -> None:
+    model, test = load(dialled), clod_adapter.load_scene(capture.scene).test
+    reference = clod_adapter.evaluation.evaluate(model.gaussians, test, [1])[0].psnr
+
+    def lost(s: float) -> float:
+        assert clod("export", dialled, "--sv", s, "--images", capture.scene, "-o", f"s{suffix}").code == 0
+        return reference - clod_adapter.evaluation.evaluate(load(f"s{suffix}").gaussians, test, [1])[0].psnr
+
+    drop = (lost(1.0) + lost(4.0)) / 2
+    report = exported(clod, dialled, "--psnr-drop", drop, "--images", capture.scene, "-o", f"x{suffix}")
+    (output,) = report["outputs"]
+    found = clod_adapter.evaluation.evaluate(load(f"x{suffix}").gaussians, test, [1])[0].psnr
+    assert output["psnr"] == pytest.approx(found, abs=1e-9) and output["views"] == len(test)
+    assert output["reference_psnr"] == pytest.approx(reference, abs=1e-9)
+    s = output["virtual_scale"]
+    assert 1 < s < 4 and reference - found <= drop < lost(min(1.011 * s, 4.0))
+
+
+def test_a_psnr_that_no_file_has(clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = baking.Photographs.lost
+    monkeypatch.setattr(baking.Photographs, "lost", lambda *words: real(*words) + 1)
+    done = clod("export", dialled, "--psnr-drop", 0.1, "--images", capture.scene, "-o", "x.ply")
+    assert done.code == 2 and not Path("x.ply").exists()
+    assert " out of reach: the file of s = 1 is " in done.err.splitlines()[-1]
+
+
+def test_without_photographs_the_figure_is_of_the_dial(clod: Any, dialled: Path) -> None:
+    report = exported(clod, dialled, "--psnr-drop", 1, "-o", "x.ply")
+    assert "psnr" not in report["outputs"][0] and any("which is of the dial" in note for note in report["notes"])
+
+
+@pytest.mark.parametrize(
+    ("lost", "drop", "largest", "want"),
+    [
+        (lambda s: s, 3.0, 8.0, 3.0),
+        (lambda s: s, 9.0, 8.0, 8.0),
+        (lambda s: s, 1.0, 8.0, 1.0),
+        (lambda s: 0.0, 0.1, 1.0, 1.0),
+        (lambda s: 1 / s if s < 2 else s, 5.0, 20.0, 5.0),
+    ],
+)
+def test_the_largest_dial_value_within(
+    lost: Callable[[float], float], drop: float, largest: float, want: float
+) -> None:
+    tried = []
+
+    def measured(s: float) -> float:
+        tried.append(s)
+        return lost(s)
+
+    found = largest_within(measured, drop, largest)
+    assert lost(found) <= drop and want / 1.01 <= found <= want
+    assert len(tried) <= 2 + math.log2(math.log(20) / math.log(1.01))

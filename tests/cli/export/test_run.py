@@ -1,0 +1,470 @@
+"""``export``: baked files, levels, streaming sets, orders and other formats, as users ask for them."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+import struct
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+
+import clod_adapter
+from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
+from clod_adapter.cli.commands.export_formats import FORMATS, PACKED, level_paths, suffix_of
+from clod_adapter.cli.shared import budgets
+from clod_adapter.errors import ClodError
+from clod_adapter.io.checkpoint import load, save
+from clod_adapter.io.formats.safetensors import read_model_safetensors
+from clod_adapter.io.formats.splat_transform import INSTALL
+from clod_adapter.io.ply.header import write_comments
+from clod_adapter.io.writers import WRITERS
+
+TOOL = """
+import json, pathlib, sys
+words = sys.argv[1:]
+if words == ["--version"]:
+    print("node:v22.1.0;splat-transform v3.7.0")
+elif words != ["--list-gpus"]:
+    out, inputs = pathlib.Path(words[-1]), [pathlib.Path(word) for word in words if word.endswith("ply")]
+    sizes = [path.stat().st_size for path in inputs if path.exists()]
+    out.write_text(json.dumps({"words": words, "sizes": sizes}))
+    BEHAVE
+"""
+
+
+@pytest.fixture
+def tool(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """A stand-in for splat-transform that notes what it was asked for, and then does as it is told."""
+
+    def make(behave: str = "pass") -> None:
+        script = tmp_path_factory.mktemp("tool") / "tool.py"
+        script.write_text(TOOL.replace("BEHAVE", behave))
+        monkeypatch.setenv("CLOD_SPLAT_TRANSFORM", shlex.join([sys.executable, str(script)]))
+
+    return make
+
+
+@pytest.fixture
+def real_tool() -> None:
+    """Skips where splat-transform is not."""
+    from clod_adapter.io.formats.splat_transform import SplatTransform
+
+    try:
+        SplatTransform.find()
+    except ClodError as error:
+        pytest.skip(str(error))
+
+
+def baked(path: Path | str, s: float) -> Any:
+    """What a dial value of a file is to be, for the cameras that the file stores."""
+    model = load(path)
+    assert model.viewpoints
+    return clod_adapter.bake(model.gaussians, s, cameras=model.viewpoints)
+
+
+def test_how_it_came_about_goes_along(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    assert clod("export", dialled, "--sv", 2, "-o", "a.spz").code == 0
+    for source, out in (("a.spz", "b.safetensors"), ("b.safetensors", "c.ply")):
+        assert clod("export", source, "-o", out).code == 0
+    assert (
+        sum(comment == "baked at s = 2 by clod-adapter for 8 training cameras" for comment in load("c.ply").comments)
+        == 1
+    )
+    assert "says         baked at s = 2" in clod("inspect", "c.ply").out
+
+
+def files(folder: Path) -> list[str]:
+    """All that is in a folder, hidden ones too."""
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether Gaussians are the same bit for bit."""
+    left, right = a.tensors(), b.tensors()
+    return left.keys() == right.keys() and all(torch.equal(left[name], right[name]) for name in left)
+
+
+def test_baking(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    done = clod("export", dialled, "--sv", 2, "-o", "plain.ply", "--json")
+    report = json.loads(done.out)
+    plain, want = load(tmp_path / "plain.ply"), baked(dialled, 2.0)
+    assert done.code == 0 and "lossy" in done.err and "baked for 8 training cameras" in done.err
+    assert f"{len(load('plain.ply').gaussians)} of 300 Gaussians, s = 2\n" in done.err
+    (output,) = report["outputs"]
+    assert output["count"] == len(plain.gaussians) == len(want) < report["base_count"] == 300
+    assert output | {"count": 0} == {
+        "file": "plain.ply", "virtual_scale": 2, "count": 0, "bytes": (tmp_path / "plain.ply").stat().st_size,
+    }  # fmt: skip
+    assert same(plain.gaussians, want) and report["notes"] == []
+    names = list(plain.vertex.dtype.names or ())
+    assert names[:6] == ["x", "y", "z", "nx", "ny", "nz"] and "sigma_d" not in names
+    assert any(comment == "baked at s = 2 by clod-adapter for 8 training cameras" for comment in plain.comments)
+
+
+def test_baking_for_a_camera(clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = ("--camera", "003", "--images", capture.scene)
+    camera = next(v.camera for v in clod_adapter.load_scene(capture.scene).train if v.camera.name == "003.png")
+    gaussians = load(dialled).gaussians
+    few, many = (int(clod_adapter.render(gaussians, camera, s).kept.sum()) for s in (4.0, 1.0))
+    n = (few + many) // 2
+    done = clod("export", dialled, "--keep", n, *there, "-o", "from_3.ply", "--json")
+    report, plain = json.loads(done.out), load("from_3.ply")
+    (output,) = report["outputs"]
+    assert report["camera"] == "003.png" and output["count"] == n == len(plain.gaussians) and few < n < many
+    want = clod_adapter.render(gaussians, camera, output["virtual_scale"])
+    shown = clod_adapter.render(plain.gaussians, camera)
+    torch.testing.assert_close(shown.image, want.image, atol=2e-5, rtol=0)
+    assert "exact from the camera of 003.png only" in done.err
+    assert any("for the camera at (" in comment for comment in plain.comments)
+    seen = []
+
+    def times(_: Any, cameras: Any, progress: Any) -> list[tuple[float, float]]:
+        seen.extend(cameras)
+        return [(1.0, 8.0), (2.0, 4.0), (4.0, 2.0)]
+
+    monkeypatch.setattr(budgets, "frame_times", times)
+    report = json.loads(clod("export", dialled, "--fps", 250, *there, "-o", "fast.ply", "--json").out)
+    assert report["outputs"][0]["virtual_scale"] == 2 and [each.name for each in seen] == ["003.png"]
+
+
+def test_a_camera_that_two_photographs_are(clod: Any, capture: Any, dialled: Path, monkeypatch: Any) -> None:
+    from clod_adapter.cli.export import baking
+
+    (first, second, *rest), notes = baking.load_cameras(capture.scene)
+    twins = [replace(first, name="a.jpg"), replace(second, name="a.png")]
+    monkeypatch.setattr(baking, "load_cameras", lambda *_: ([*twins, *rest], notes))
+    words = ("export", dialled, "--sv", 2, "--images", capture.scene, "-o", "x.ply", "--camera")
+    done = clod(*words, "a")
+    assert done.code == 2 and "--camera has 'a', which a.jpg and a.png are; give the whole name" in done.err
+    assert clod(*words, "a.png").code == 0
+    twins = [replace(first, name="images/a.jpg"), replace(second, name="a.jpg")]
+    assert clod(*words, "a.jpg").code == 0
+    assert clod(*words, "images/a").code == 0
+    twins = [replace(first, name="images/b.jpg")]  # as a transforms.json has them
+    assert clod(*words, "b.jpg").code == 0 and clod(*words, "b").code == 0
+    assert clod(*words, "c").code == 2
+
+
+def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    report = json.loads(clod("export", dialled, "--levels", "1,2.5,4", "-o", "some.set.ply", "--json").out)
+    names = ["some.set_s1.ply", "some.set_s2.5.ply", "some.set_s4.ply"]
+    assert files(tmp_path) == names == [output["file"] for output in report["outputs"]]
+    for name, s in zip(names, (1.0, 2.5, 4.0), strict=True):
+        assert same(load(name).gaussians, baked(dialled, s))
+    clod("export", dialled, "--levels", "2", "-o", "one.glb")
+    assert "one_s2.glb" in files(tmp_path)
+
+
+@pytest.mark.parametrize("failure", [ClodError("no room"), KeyboardInterrupt(), OSError(28, "No space left on device")])
+def test_levels_appear_together_or_not_at_all(
+    clod: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException
+) -> None:
+    from clod_adapter.cli.export import files
+
+    (tmp_path / "x_s1.ply").write_bytes(b"of an earlier run")
+    real, calls = files.write, []
+
+    def write(*args: Any, **options: Any) -> Any:
+        calls.append(args)
+        if len(calls) == 3:
+            raise failure
+        return real(*args, **options)
+
+    monkeypatch.setattr(files, "write", write)
+    done = clod("export", dialled, "--levels", "1,2,4", "-o", "x.ply")
+    assert done.code == (130 if isinstance(failure, KeyboardInterrupt) else 2) and "Traceback" not in done.err
+    assert files(tmp_path) == ["x_s1.ply"] and (tmp_path / "x_s1.ply").read_bytes() == b"of an earlier run"
+
+
+def test_level_names() -> None:
+    paths = level_paths(Path("a/b.c.compressed.ply"), [1.0, 2.25])
+    assert paths == [Path("a/b.c_s1.compressed.ply"), Path("a/b.c_s2.25.compressed.ply")]
+    assert suffix_of(Path("B.PLY")) == ".ply" and level_paths(Path("B.PLY"), [3.0]) == [Path("B_s3.PLY")]
+    assert suffix_of(Path("b.Compressed.Ply")) == ".compressed.ply"
+
+
+def test_every_format_is_in_the_help() -> None:
+    assert set(WRITERS) <= set(FORMATS) and not set(WRITERS) & set(PACKED)
+    for suffix, writer in WRITERS.items():
+        assert FORMATS[suffix].sigma == writer.carries_sigma, suffix
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_every_format_is_written_with_its_dial_where_it_has_room(clod: Any, dialled: Path, suffix: str) -> None:
+    words = () if FORMATS[suffix].sigma else ("--sv", 1)
+    done = clod("export", dialled, "-o", f"x{suffix}", *words, "--json")
+    (output,) = json.loads(done.out)["outputs"]
+    assert done.code == 0 and output["bytes"] == Path(f"x{suffix}").stat().st_size
+    assert output["virtual_scale"] == (None if FORMATS[suffix].sigma else 1)
+    assert ("lossy" in done.err) != FORMATS[suffix].sigma
+    if FORMATS[suffix].sigma:
+        assert output["count"] == 300
+    plain = clod("export", dialled, "-o", f"y{suffix}", "--sv", 2, "--quiet", "--json")
+    assert plain.code == 0 and plain.err == ""
+    assert json.loads(plain.out)["outputs"][0]["count"] == len(baked(dialled, 2.0))
+
+
+def test_the_dial_stays_as_it_is(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    model = load(dialled)
+    for name in ("same.ply", "same.safetensors"):
+        assert clod("export", dialled, "-o", name).code == 0
+    again = load("same.ply")
+    assert same(again.gaussians, model.gaussians) and again.gaussians.attenuation == model.gaussians.attenuation
+    assert again.calibration == model.calibration and again.notes == ()
+    assert same(read_model_safetensors("same.safetensors"), model.gaussians)
+
+
+def test_a_plain_file_is_converted(clod: Any, capture: Any) -> None:
+    report = json.loads(clod("export", capture.ply, "-o", "x.splat", "--json").out)
+    assert report["outputs"][0] == {"file": "x.splat", "virtual_scale": None, "count": 300, "bytes": 300 * 32}
+    assert "view-dependent colour is dropped" in report["notes"]
+
+
+def test_what_other_columns_there_were_is_said(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    vertex = PlyData.read(str(dialled), mmap=False)["vertex"]
+    labelled = np.empty(300, [("label", "i4"), *vertex.data.dtype.descr])
+    for name in vertex.data.dtype.names:
+        labelled[name] = vertex.data[name]
+    labelled["label"] = 7
+    PlyData([PlyElement.describe(labelled, "vertex", comments=vertex.comments)]).write(tmp_path / "labelled.ply")
+    report = json.loads(clod("export", "labelled.ply", "-o", "x.ply", "--json").out)
+    assert report["notes"] == ["columns left out: label"]
+    assert same(load("x.ply").gaussians, load(dialled).gaussians)
+
+
+def test_settings_in_columns_are_not_left_out(clod: Any, dialled: Path) -> None:
+    model = load(dialled).gaussians
+    save("hard.ply", model.replace(attenuation=replace(model.attenuation, tau=0.01, cut="hard")))  # type: ignore[type-var]
+    report = json.loads(clod("export", "hard.ply", "-o", "x.ply", "--json").out)
+    assert report["notes"] == [] and load("x.ply").vertex.dtype == load("hard.ply").vertex.dtype
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".glb", ".pt", ".safetensors"])
+def test_what_the_file_says_of_itself_goes_along(clod: Any, dialled: Path, tmp_path: Path, suffix: str) -> None:
+    data = dialled.read_bytes().replace(b"\nproperty", b"\ncomment SplatRenderMode: default\nproperty", 1)
+    (tmp_path / "said.ply").write_bytes(data)
+    assert clod("export", "said.ply", "--sv", 2, "-o", f"baked{suffix}").code == 0
+    assert clod("export", f"baked{suffix}", "-o", "again.ply").code == 0
+    header = (tmp_path / "again.ply").read_bytes().partition(b"end_header")[0].decode()
+    for line in ("baked at s = 2 by clod-adapter for 8 training cameras", "SplatRenderMode: default"):
+        assert header.count(f"comment {line}\n") == 1
+
+
+def test_far_from_0_doubles_are_noted(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    vertex = PlyData.read(str(dialled), mmap=False)["vertex"]
+    far = vertex.data.astype([(n, "f8" if n in "xyz" else t) for n, t in vertex.data.dtype.descr])
+    far["x"] += 437_000.0
+    calibration, config = load(dialled).calibration, load(dialled).gaussians.attenuation
+    assert calibration is not None
+    there = replace(calibration, viewpoints=tuple(v.moved([437_000.0, 0, 0]) for v in calibration.viewpoints))
+    comments = write_comments(config, (), calibration=there)
+    PlyData([PlyElement.describe(far, "vertex", comments=comments)]).write(tmp_path / "far.ply")
+    report = json.loads(clod("export", "far.ply", "--sv", 2, "-o", "x.ply", "--json").out)
+    assert any("x, y and z are doubles" in note for note in report["notes"])
+    want = baked("far.ply", 2.0)
+    assert (
+        len(load("x.ply").gaussians) == len(want) == len(baked(dialled, 2.0))
+        and 436_000 < load("x.ply").vertex["x"].mean() < 438_000
+    )
+
+
+def test_an_order_for_prefixes(clod: Any, dialled: Path) -> None:
+    gaussians = load(dialled).gaussians
+    rows = clod_adapter.order_by_extinction(gaussians, load(dialled).viewpoints)
+    done = clod("export", dialled, "--order", "extinction", "-o", "ordered.ply", "--json")
+    assert json.loads(done.out)["order"] == "extinction"
+    ordered = load("ordered.ply")
+    assert same(ordered.gaussians, gaussians.select(rows)) and ordered.calibration == load(dialled).calibration
+    assert any("rows in the order" in comment for comment in ordered.comments)
+    n = len(baked(dialled, 3.0))
+    assert n < 300 and clod("export", dialled, "--order", "extinction", "--keep", n, "-o", "first.ply").code == 0
+    assert torch.equal(load("first.ply").gaussians.means, gaussians.means[rows[:n]])
+
+
+def test_an_order_over_the_scenes_cameras(clod: Any, capture: Any, dialled: Path) -> None:
+    gaussians, scene = load(dialled).gaussians, clod_adapter.load_scene(capture.scene)
+    cameras = [view.camera for view in scene.train]
+    words = ("export", dialled, "--order", "extinction", "--images", capture.scene)
+    assert clod(*words, "-o", "all.ply").code == 0
+    assert same(load("all.ply").gaussians, gaussians.select(clod_adapter.order_by_extinction(gaussians, cameras)))
+    assert clod(*words, "--camera", "003", "--sv", 2, "-o", "one.ply").code == 0
+    camera = next(each for each in cameras if each.name == "003.png")
+    ordered = gaussians.select(clod_adapter.order_by_extinction(gaussians, [camera]))
+    assert same(load("one.ply").gaussians, clod_adapter.bake(ordered, 2.0, camera))
+
+
+def saved(path: Path, degree: int) -> Any:
+    """A model of that SH degree with a dial at ``path``."""
+    from scenes import gaussians
+
+    sigma = torch.linspace(0.9, 9, 50)
+    model = clod_adapter.attach(gaussians(50, degree, 4), sigma, clod_adapter.AttenuationConfig(reference_distance=3.0))
+    places = (Viewpoint(0.0, 0.0, -4.0, 1.0), Viewpoint(1.0, 0.0, 4.0, 1.0))
+    row = CalibrationRow(1.0, 40.0, 30.0, 0.9, 5.0)
+    save(path, model, calibration=Calibration((row,), 50, 1, 8, 6, "a machine", viewpoints=places))
+    return model
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_baked_files_are_the_structs_that_sibr_reads(clod: Any, tmp_path: Path, degree: int) -> None:
+    """Its loadPly takes the count from the third line, skips to end_header, and reads RichPoint<D> after that.
+
+    Position, three normals, (D + 1)^2 x 3 harmonics (channel after channel behind the first three), opacity, three
+    scales, four of the rotation: all float32, and nothing between them. D is cfg_args's, so the file's own has to stay.
+    """
+    saved(tmp_path / "model.ply", degree)
+    assert clod("export", "model.ply", "--sv", 2, "-o", "baked.ply").code == 0
+    want = baked("model.ply", 2.0)
+    data = (tmp_path / "baked.ply").read_bytes()
+    lines = data[: data.index(b"end_header\n")].split(b"\n")
+    assert lines[:2] == [b"ply", b"format binary_little_endian 1.0"]
+    count, harmonics = int(lines[2].split()[2]), 3 * (degree + 1) ** 2
+    body = data[data.index(b"end_header\n") + len(b"end_header\n") :]
+    point = struct.Struct(f"<3f3f{harmonics}f1f3f4f")
+    assert count == len(want) and len(body) == count * point.size
+    for row, values in enumerate(point.iter_unpack(body)):
+        sh = values[6 : 6 + harmonics]
+        assert values[:6] == (*want.means[row].tolist(), 0, 0, 0)
+        assert list(sh[:3]) == want.sh0[row, 0].tolist()
+        assert list(sh[3:]) == want.shN[row].T.reshape(-1).tolist()
+        rest = [want.opacity_logits[row : row + 1], want.log_scales[row], want.quats[row]]
+        assert list(values[6 + harmonics :]) == torch.cat(rest).tolist()
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_foreign_reader_finds_the_same(clod: Any, tmp_path: Path, degree: int) -> None:
+    gsply = pytest.importorskip("gsply")
+    model = saved(tmp_path / "model.ply", degree)
+    rows = clod_adapter.order_by_extinction(model, load("model.ply").viewpoints)
+    assert clod("export", "model.ply", "--sv", 2, "-o", "baked.ply").code == 0
+    assert clod("export", "model.ply", "--order", "extinction", "-o", "ordered.ply").code == 0
+    for name, want in (("baked.ply", baked("model.ply", 2.0)), ("ordered.ply", model.select(rows))):
+        read = gsply.plyread(str(tmp_path / name))
+        pairs = [
+            (read.means, want.means), (read.scales, want.log_scales), (read.quats, want.quats),
+            (read.opacities.reshape(-1), want.opacity_logits), (read.sh0, want.sh0[:, 0]),
+        ]  # fmt: skip
+        pairs += [(read.shN, want.shN)] if degree else []
+        for theirs, ours in pairs:
+            assert np.array_equal(theirs, ours.numpy())
+
+
+def test_packing(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
+    tool()
+    for suffix in PACKED:
+        done = clod("export", dialled, "--levels", "1,4", "-o", f"x{suffix}", "--json")
+        report = json.loads(done.out)
+        assert done.code == 0 and "splat-transform took" in done.err
+        assert "values are rounded, and the rows are in an order of splat-transform's" in report["notes"]
+        assert any("no GPU here" in note for note in report["notes"]) == (suffix == ".sog")
+        for output in report["outputs"]:
+            said = json.loads(Path(output["file"]).read_text())
+            assert said["words"][:5] == ["-w", "-g", "cpu", "-i", "1"] and len(said["words"]) == 7
+            assert said["words"][-1].endswith(f"packed{suffix}") and said["sizes"][0] > 92 * output["count"]
+    assert files(tmp_path) == sorted(f"x_s{s}{suffix}" for s in (1, 4) for suffix in PACKED)
+
+
+def test_a_streaming_set(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
+    tool("(out.parent / '0_0').mkdir(); (out.parent / '0_0' / 'a.webp').write_text('1234')")
+    assert clod("export", dialled, "--levels", "1,4", "--lod-meta", "--out=-o").code == 0  # no option of the tool's
+    shutil.rmtree(tmp_path / "-o")
+    (tmp_path / "out").mkdir()  # empty, and so not in the way
+    done = clod("export", dialled, "--levels", "1,2,4", "--lod-meta", "-o", "out", "--json")
+    (output,) = json.loads(done.out)["outputs"]
+    counts = [len(baked(dialled, s)) for s in (1.0, 2.0, 4.0)]
+    levels = [{"virtual_scale": s, "count": n} for s, n in zip((1, 2, 4), counts, strict=True)]
+    assert output["levels"] == levels and output["count"] == sum(counts)
+    assert files(tmp_path) == ["out", "out/0_0", "out/0_0/a.webp", "out/lod-meta.json"]
+    text = Path(output["file"]).read_text()
+    assert output["bytes"] == len(text) + 4
+    words = json.loads(text)["words"][5:]
+    assert words[1::3] == ["-l"] * 3 and words[2::3] == ["0", "1", "2"] and words[-1].endswith("/lod-meta.json")
+    done = clod("export", dialled, "--levels", "1,2", "--lod-meta", "-o", "out")
+    assert done.code == 2 and "out: is a folder that is not empty" in done.err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("-o", "."), ".: is the folder you are in; give --out the name of a new one"),
+        (("-o", "out", "--order", "extinction"), "a streaming set has an order of its own; leave out --order"),
+    ],
+)
+def test_a_streaming_set_that_cannot_be_is_refused_before_any_work(
+    clod: Any, dialled: Path, tmp_path: Path, tool: Any, monkeypatch: Any, words: tuple[str, ...], said: str
+) -> None:
+    tool()
+    monkeypatch.setattr("clod_adapter.cli.main.import_command", None)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    monkeypatch.chdir(empty)
+    done = clod("export", dialled, "--levels", "1,2", "--lod-meta", *words)
+    assert done.code == 2 and done.err.splitlines() == [f"clod-adapt: error: {said}"] and files(tmp_path) == ["empty"]
+
+
+@pytest.mark.parametrize(
+    ("behave", "code", "said"),
+    [
+        ("print('\\u2717 Error: no memory'); sys.exit(1)", 2, "splat-transform 3.7.0 failed: Error: no memory"),
+        ("import time; time.sleep(60)", 2, "splat-transform was ended, it took longer than 1 s"),
+    ],
+)
+@pytest.mark.parametrize("lod", [False, True])
+def test_where_the_tool_fails_nothing_is_left(
+    clod: Any, dialled: Path, tmp_path: Path, tool: Any, monkeypatch: Any, behave: str, code: int, said: str, lod: bool
+) -> None:
+    monkeypatch.setattr("clod_adapter.io.formats.splat_transform.LIMIT", 1.0)
+    monkeypatch.setattr("clod_adapter.io.formats.splat_transform.LIMIT_EACH", 0.0)
+    monkeypatch.setenv("PYTHONIOENCODING", "utf-8")
+    tool(behave)
+    done = clod("export", dialled, "--levels", "1,2", *(("--lod-meta", "-o", "out") if lod else ("-o", "x.sog")))
+    assert done.code == code and done.err.splitlines()[-1].endswith(said) and files(tmp_path) == []
+
+
+def test_ctrl_c_ends_the_tool_too(clod: Any, dialled: Path, tmp_path: Path, tool: Any, monkeypatch: Any) -> None:
+    tool("import time; time.sleep(60)")
+
+    def enough(seconds: float) -> str:
+        if seconds > 0.5:
+            raise KeyboardInterrupt
+        return ""
+
+    monkeypatch.setattr("clod_adapter.cli.export.files.duration", enough)
+    done = clod("export", dialled, "--levels", "1,2", "--lod-meta", "-o", "out")
+    assert done.code == 130 and files(tmp_path) == []
+
+
+@pytest.mark.parametrize("words", [("--sv", 2, "-o", "x.sog"), ("--levels", "1,2", "--lod-meta", "-o", "out")])
+def test_without_the_tool_it_is_refused_before_any_work(
+    clod: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...]
+) -> None:
+    monkeypatch.delenv("CLOD_SPLAT_TRANSFORM", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr("clod_adapter.cli.main.import_command", None)
+    done = clod("export", dialled, *words)
+    assert done.code == 2 and len(done.err.splitlines()) == 1, done
+    assert "splat-transform is not installed" in done.err and INSTALL in done.err and files(tmp_path) == []
+
+
+@pytest.mark.usefixtures("real_tool")
+def test_the_real_tool(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    counts = [len(baked(dialled, s)) for s in (1.0, 4.0)]
+    assert clod("export", dialled, "--levels", "1,4", "--lod-meta", "-o", "out").code == 0
+    meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
+    assert meta["counts"] == counts and meta["lodLevels"] == 2
+    assert all((tmp_path / "out" / name).is_file() for name in meta["filenames"])
+    for suffix in PACKED:
+        assert clod("export", dialled, "--sv", 4, "-o", f"x{suffix}").code == 0
+    data = (tmp_path / "x.compressed.ply").read_bytes()
+    assert b"packed_position" in data and f"element vertex {counts[1]}\n".encode() in data
+    assert (tmp_path / "x.sog").read_bytes().startswith(b"PK")
+    assert files(tmp_path / "out") != [] and not [name for name in files(tmp_path) if "tmp" in name]

@@ -1,0 +1,141 @@
+"""What the command says and does where a checkpoint does not stand where the cameras look."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image, ImageOps
+from scipy.spatial.transform import Rotation
+
+from clod_adapter.io.scene.load import load_scene
+from clod_adapter.render import render
+from nerfstudio_frames import APPLIED, trained
+
+FAST = ("--iters", 1, "--max-sv", 4)
+
+
+def scene_of(capture: Any, folder: Path, change: Any) -> Path:
+    """The capture's scene with its photographs changed."""
+    scene = folder / "changed"
+    (scene / "images").mkdir(parents=True)
+    (scene / "sparse").symlink_to(capture.scene / "sparse")
+    for path in (capture.scene / "images").iterdir():
+        change(Image.open(path)).save(scene / "images" / path.name)
+    return scene
+
+
+@pytest.fixture
+def turned(capture: Any, tmp_path: Path) -> Path:
+    """The checkpoint with y and z negated: half a turn about x, which is a quaternion times (0, 1, 0, 0)."""
+    g = capture.gaussians
+    w, x, y, z = g.quats.unbind(1)
+    flipped = g.replace(means=g.means * torch.tensor([1.0, -1, -1]), quats=torch.stack([-x, w, -z, y], 1))
+    return capture.write(tmp_path / "turned.ply", flipped.replace(shN=g.shN * 0))
+
+
+def test_a_base_in_other_axes_stops_before_anything_is_written(
+    clod: Any, capture: Any, turned: Path, tmp_path: Path
+) -> None:
+    done = clod(turned, "--images", capture.scene, *FAST)
+    assert done.code == 2 and [path.name for path in tmp_path.iterdir()] == [turned.name]
+    assert len([line for line in done.err.splitlines() if "does not fit" in line]) == 1
+    for said in (str(turned), str(capture.scene), "are in view", "x, y, z are the file's x, -y, -z", "--misaligned-ok"):
+        assert said in done.err, done
+
+
+def test_misaligned_ok_goes_on(clod: Any, capture: Any, turned: Path, tmp_path: Path) -> None:
+    done = clod(turned, "--images", capture.scene, *FAST, "--misaligned-ok", "--json")
+    assert done.code == 0 and "warning: " in done.err and "regardless" not in done.err, done
+    report = json.loads(done.out)
+    assert report["notes"][0].startswith("warning: ") and "x, -y, -z" in report["alignment"]["guess"]
+    assert report["alignment"]["psnr"] < report["alignment"]["mean_colour_psnr"]
+
+
+def test_a_base_that_fits_says_nothing(clod: Any, capture: Any) -> None:
+    done = clod(capture.ply, "--images", capture.scene, *FAST, "--json")
+    assert done.code == 0 and "warning" not in done.err, done
+    report = json.loads(done.out)
+    assert report["notes"] == [] and report["alignment"]["guess"] is None and report["alignment"]["explained"] == 1
+
+
+def test_far_away_with_where_both_are(clod: Any, capture: Any, tmp_path: Path) -> None:
+    random = torch.Generator().manual_seed(2)
+    lost = capture.gaussians.replace(
+        means=torch.randn(300, 3, generator=random) + 1e4, sh0=torch.randn(300, 1, 3, generator=random)
+    )
+    done = clod(capture.write(tmp_path / "lost.ply", lost), "--images", capture.scene, *FAST)
+    assert done.code == 2 and "half of it lies within" in done.err and "the cameras look at about" in done.err, done
+    assert "0% of its Gaussians are in view" in done.err
+    assert re.search(r"of \(1e\+04, 1e\+04, 1e\+04\), .* at about \(-?[\d.]+, ", done.err), done  # as in the files
+
+
+def test_a_white_background_is_named(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = capture.gaussians.select(torch.arange(300) < 40)  # so that there is a background
+    ply = capture.write(tmp_path / "few.ply", few)
+    scene = scene_of(capture, tmp_path, lambda image: image)
+    loaded = load_scene(capture.scene)
+    for view in (*loaded.train, *loaded.test):
+        pixels = render(few, view.camera, background=torch.ones(3)).pixels
+        Image.fromarray(pixels.numpy()).save(scene / "images" / view.camera.name)
+    done = clod(ply, "--images", scene, *FAST)
+    assert done.code == 2 and "over white the renders are" in done.err and "transparent PNGs" in done.err, done
+
+
+def test_another_exposure_is_noted(clod: Any, capture: Any, tmp_path: Path) -> None:
+    scene = scene_of(capture, tmp_path, lambda image: image.point(lambda value: value // 5))
+    done = clod(capture.ply, "--images", scene, *FAST)
+    assert done.code == 0 and "another exposure" in done.err, done
+
+
+def test_black_photographs_are_noted(clod: Any, capture: Any, tmp_path: Path) -> None:
+    scene = scene_of(capture, tmp_path, lambda image: ImageOps.colorize(image.convert("L"), "black", "black"))
+    done = clod(capture.ply, "--images", scene, *FAST, "--json")
+    assert done.code == 0 and "show one colour each" in done.err, done
+    assert "show one colour each" in json.loads(done.out)["notes"][0]
+
+
+def test_robustness_stops_too(clod: Any, capture: Any, turned: Path, tmp_path: Path) -> None:
+    done = clod("robustness", capture.ply, turned, "--images", capture.scene, "--max-sv", 2, "--iters", 1)
+    assert done.code == 2 and f"{turned}: does not fit" in done.err and "--misaligned-ok" in done.err, done
+    assert [path.name for path in tmp_path.iterdir()] == [turned.name]
+    words = ("--max-sv", 2, "--iters", 1, "--misaligned-ok", "--json")
+    done = clod("robustness", turned, "--images", capture.scene, *words)
+    assert done.code == 0 and "x, -y, -z" in json.loads(done.out)["notes"][0], done
+
+
+def test_nerfstudios_export_fits_with_its_transforms_beside_the_photographs(
+    clod: Any, capture: Any, tmp_path: Path
+) -> None:
+    views = load_scene(capture.scene)
+    viewmats = torch.stack([view.camera.viewmat.double() for view in (*views.train, *views.test)])
+    opengl = torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
+    turn = np.vstack([APPLIED["today"], [0, 0, 0, 1]])
+    _, written = trained(turn @ torch.linalg.inv(viewmats).numpy() @ opengl.numpy(), APPLIED["today"])
+    similarity, scale = np.array(written["transform"]), written["scale"]
+    w, x, y, z = torch.from_numpy(Rotation.from_matrix(similarity[:, :3]).as_quat()[..., [3, 0, 1, 2]]).float()
+    product = torch.stack([
+        torch.stack([w, -x, -y, -z]), torch.stack([x, w, -z, y]), torch.stack([y, z, w, -x]),
+        torch.stack([z, -y, x, w]),
+    ])  # fmt: skip
+    g, matrix = capture.gaussians, torch.from_numpy(similarity).float()
+    exported = g.replace(
+        means=scale * (g.means @ matrix[:, :3].T + matrix[:, 3]), quats=g.quats @ product.T,
+        log_scales=g.log_scales + math.log(scale), shN=g.shN * 0,
+    )  # fmt: skip
+    splat = capture.write(tmp_path / "splat.ply", exported)
+    scene = scene_of(capture, tmp_path, lambda picture: picture)
+    done = clod(splat, "--images", scene, *FAST)
+    assert done.code == 2 and "put a copy of the dataparser_transforms.json that ns-train wrote" in done.err, done
+    (scene / "dataparser_transforms.json").write_text(json.dumps(written))
+    done = clod(splat, "--images", scene, *FAST, "--json")
+    report = json.loads(done.out)
+    assert done.code == 0 and "warning" not in done.err, done
+    assert report["alignment"]["psnr"] > report["alignment"]["mean_colour_psnr"] + 6
+    assert any("frame of dataparser_transforms.json" in note for note in report["notes"])

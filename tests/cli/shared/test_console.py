@@ -1,0 +1,131 @@
+"""Progress, on a terminal and off it."""
+
+from __future__ import annotations
+
+import io
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from clod_adapter.cli.shared.console import Console, Meter, duration
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+class Closed(io.StringIO):
+    def write(self, text: str) -> int:
+        raise BrokenPipeError
+
+
+@pytest.mark.parametrize("width", [30, 80])
+def test_a_bar_fits_its_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    monkeypatch.setattr("tqdm.std._screen_shape_wrapper", lambda: lambda file: (width, 24))
+    with Console().meter("training") as meter:
+        meter.bar.delay = meter.bar.mininterval = 0
+        for step in range(1, 5):
+            meter.update(step / 4, f"{step}/4, s=1 25.81 dB 100%, s=5 21.02 dB 9%")
+    lines = terminal.getvalue().split("\r")
+    assert any("50%" in line for line in lines) and max(map(len, lines)) <= width
+    assert "\n" not in terminal.getvalue() and not lines[-1].strip()  # cleared away in the end
+
+
+def test_lines_off_a_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    monkeypatch.setattr("clod_adapter.cli.shared.console.time", SimpleNamespace(perf_counter=lambda: now))
+    meter = Meter(Console(), "training", began=0, printed=0)
+    for now in range(1, 31):
+        meter.update(now / 90, f"step {now}")
+    assert capsys.readouterr().err.splitlines() == [
+        "training  11%, 1:20 left, step 10",
+        "training  22%, 1:10 left, step 20",
+        "training  33%, 1:00 left, step 30",
+    ]
+
+
+def test_what_was_done_before_is_not_taken_for_speed(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clod_adapter.cli.shared.console.time", SimpleNamespace(perf_counter=lambda: 10.0))
+    Meter(Console(), "training", began=0, printed=0, initial=0.5).update(0.6)
+    assert capsys.readouterr().err == "training  60%, 40 s left\n"
+
+
+def test_a_slow_meter_shows_from_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    Meter(Console(), "compiling", slow=True).close()
+    Meter(Console(), "training").close()
+    assert "compiling   0%" in terminal.getvalue() and "training" not in terminal.getvalue()
+
+
+def test_status(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a terminal, while it lasts."""
+    for quiet, stream in ((False, Terminal()), (True, Terminal()), (False, io.StringIO())):
+        monkeypatch.setattr(sys, "stderr", stream)
+        with pytest.raises(KeyboardInterrupt), Console(quiet).status("reading a file ..."):
+            assert ("\rreading a file ..." in stream.getvalue()) == (stream.isatty() and not quiet)
+            raise KeyboardInterrupt
+        assert not stream.getvalue().split("\r")[-1].strip() and "\n" not in stream.getvalue()
+
+
+@pytest.mark.parametrize("stream", [Terminal, Closed])
+def test_quiet_and_closed(stream: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is written, and nothing is lost when it cannot be."""
+    monkeypatch.setattr(sys, "stderr", first := stream())
+    console = Console(quiet=stream is Terminal)
+    console.say("a line")
+    with console.status("reading"), console.meter("training") as meter:
+        meter.update(0.5)
+    console.say("another")
+    assert first.getvalue() == ""
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.04, "0.0 s"),
+        (9.94, "9.9 s"),
+        (9.96, "10 s"),
+        (59.4, "59 s"),
+        (59.7, "1:00"),
+        (125, "2:05"),
+        (3725, "1:02:05"),
+    ],
+)
+def test_duration(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def test_a_status_may_say_more(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    monkeypatch.setattr("clod_adapter.cli.shared.console.time", SimpleNamespace(perf_counter=lambda: now))
+    with Console().status("packing ...") as show:
+        for now in range(1, 31):
+            show(f"packing, {now} s")
+    assert capsys.readouterr().err.splitlines() == ["packing, 10 s", "packing, 20 s", "packing, 30 s"]
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    with Console().status("packing ...") as show:
+        show("packing, 1 s")
+    lines = terminal.getvalue().split("\r")
+    assert "packing, 1 s" in terminal.getvalue() and not lines[-1].strip() and "\n" not in terminal.getvalue()
+    with Console(quiet=True).status("packing ...") as show:
+        show("packing, 99 s")
+    assert "99" not in terminal.getvalue()
+
+
+def test_a_clock_that_is_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bars look at the clock of the day; nothing else does."""
+    hours = iter(range(1000, 0, -1))
+    monkeypatch.setattr("tqdm.std.time", lambda: 3600.0 * next(hours))
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    with Console().meter("training") as meter:
+        meter.bar.delay = 0
+        for step in range(1, 5):
+            meter.update(step / 4)
+            meter.bar.refresh()
+    assert "100%" in terminal.getvalue()

@@ -1,0 +1,114 @@
+"""Which device is picked, and what is said of a GPU that cannot be used."""
+
+from __future__ import annotations
+
+import builtins
+import sys
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from clod_adapter.cli.main import main
+from clod_adapter.cli.shared import devices
+from clod_adapter.cli.shared.console import Console
+from clod_adapter.cli.shared.devices import pick_device
+from clod_adapter.errors import ClodError
+from clod_adapter.rasterizers import cuda
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """torch has one, as far as it says."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda *_: "NVIDIA Test 1")
+    monkeypatch.setattr(devices, "_fails", lambda: None)
+
+
+def test_without_a_gpu_auto_is_the_cpu_and_says_nothing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert pick_device("auto", Console()) == pick_device("cpu", Console()) == torch.device("cpu")
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.usefixtures("gpu")
+def test_a_gpu_that_gsplat_draws_on_is_picked(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(devices, "unusable", lambda: None)
+    assert pick_device("auto", Console()) == pick_device("cuda", Console()) == torch.device("cuda", 0)
+    assert capsys.readouterr().err.splitlines() == ["on NVIDIA Test 1"] * 2
+    assert pick_device("cpu", Console()) == torch.device("cpu")
+
+
+@pytest.mark.usefixtures("gpu")
+def test_a_gpu_without_gsplat_is_named_in_a_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(devices, "unusable", lambda: "gsplat is absent: pip install gsplat==1.5.3")
+    assert pick_device("auto", Console()) == torch.device("cpu")
+    said = "on the CPU, although there is a GPU: gsplat is absent: pip install gsplat==1.5.3"
+    assert capsys.readouterr().err.splitlines() == [said]
+    with pytest.raises(ClodError, match=r"--device cuda: gsplat is absent: pip install gsplat==1.5.3; or use"):
+        pick_device("cuda", Console())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="torch computes on the GPU that is here")
+def test_a_gpu_that_torch_cannot_compute_on_is_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a compute capability that this torch has no code for, say: it is seen, and the first operation fails."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(devices, "unusable", lambda: pytest.fail("gsplat would be compiled for nothing"))
+    assert pick_device("auto", Console()) == torch.device("cpu")
+    assert "although there is a GPU: torch cannot compute on it (" in capsys.readouterr().err
+    with pytest.raises(ClodError, match=r"--device cuda: torch cannot compute on it .*doctor.*or use --device cpu"):
+        pick_device("cuda", Console())
+
+
+def test_cuda_without_a_gpu_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], capture: Any
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for build, why in ((None, "is built without CUDA: install torch from"), ("12.4", "torch sees no NVIDIA GPU")):
+        monkeypatch.setattr(torch.version, "cuda", build)
+        words = ["eval", str(capture.ply), "--images", str(capture.scene), "--device", "cuda"]
+        assert main(words) == 2
+        last = capsys.readouterr().err.strip().splitlines()[-1]
+        assert why in last and last.endswith("or use --device cpu")
+
+
+@pytest.mark.parametrize("missing", ["the package", "its kernels", "a library", "a version"])
+def test_what_gsplat_lacks(monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
+    cuda.unusable.cache_clear()
+    backend = ModuleType("gsplat.cuda._backend")
+    backend._C = None if missing == "its kernels" else SimpleNamespace()
+    package = ModuleType("gsplat.cuda")
+    package._backend = backend
+    top = ModuleType("gsplat")
+    top.__version__ = "1.4.0" if missing == "a version" else "1.5.3+pt24cu124"
+    for name, module in (("gsplat", top), ("gsplat.cuda", package), ("gsplat.cuda._backend", backend)):
+        monkeypatch.setitem(sys.modules, name, None if missing == "the package" else module)
+    real = builtins.__import__
+
+    def importing(name: str, *args: Any, **kwargs: Any) -> Any:
+        if missing == "a library" and name == "gsplat":
+            raise OSError("libcudart.so.12: cannot open shared object file")
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", importing)
+    try:
+        reason = cuda.unusable()
+    finally:
+        cuda.unusable.cache_clear()
+    assert reason is not None and "\n" not in reason
+    assert ("pip install gsplat==1.5.3" in reason) != (missing == "its kernels")
+    expected = {
+        "the package": "gsplat", "its kernels": "install nvcc", "a library": "libcudart.so.12",
+        "a version": "gsplat 1.4.0 is too old",
+    }  # fmt: skip
+    assert expected[missing] in reason

@@ -1,0 +1,72 @@
+"""Kernels are made ready before anything is timed, and compiling them is announced."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import re
+from typing import Any
+
+import numba
+import pytest
+from numba.core.dispatcher import Dispatcher
+
+import clod_adapter
+from clod_adapter import _kernels
+from clod_adapter.cli.shared.console import Console
+from clod_adapter.cli.shared.kernels import OTHER, SHARES, announced_compiling, prepare_kernels
+
+
+def kernels() -> dict[str, Dispatcher]:
+    """All that Python calls, by name; each has a cache, or none only where no folder can be written."""
+    modules = [
+        importlib.import_module(f"{_kernels.__name__}.{m.name}") for m in pkgutil.iter_modules(_kernels.__path__)
+    ]
+    found = [value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)]
+    return {d.py_func.__name__: d for d in found if not d.targetoptions.get("forceinline")}
+
+
+def test_all_that_a_job_needs_is_ready(capture: Any) -> None:
+    """Whatever the checkpoint's SH degree; of every kernel there is the one variant for these argument types."""
+    base, scene = capture.gaussians, clod_adapter.load_scene(capture.scene)
+    prepare_kernels(Console(quiet=True))
+    before = {name: len(kernel.signatures) for name, kernel in kernels().items()}
+    assert min(before.values()) >= 1, before
+    for bands in (0, 3):
+        base = base.replace(shN=base.shN[:, :bands])
+        result = clod_adapter.adapt(base, scene, clod_adapter.AdaptConfig(iters=2)).gaussians
+        clod_adapter.evaluation.evaluate(result, scene.test, [1.0, 3.0])
+    assert {name: len(kernel.signatures) for name, kernel in kernels().items()} == before
+
+
+def test_shares_are_of_kernels() -> None:
+    assert set(SHARES) - {OTHER} < set(kernels())
+    assert sum(SHARES.get(name, SHARES[OTHER]) for name in kernels()) == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_compiling_is_announced_once(kept: bool, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+    monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
+    inner = numba.njit(lambda x: x + 1)
+    function = numba.njit(lambda x: inner(x))
+    monkeypatch.setattr("clod_adapter.cli.shared.kernels.NullCache", () if kept else object)
+    with announced_compiling(Console(), {OTHER: 0.25}):
+        function(1)
+        function(1.0)
+    said, *progress = capsys.readouterr().err.splitlines()
+    why = "first run only, well under a minute" if kept else "on every run, .* set NUMBA_CACHE_DIR"
+    assert re.fullmatch(rf"compiling kernels \({why}\) \.\.\.", said)
+    assert [line.split(",")[0] for line in progress] == ["compiling  25%", "compiling  50%"]  # not of what is within
+
+
+def test_how_far_it_is_is_shown_where_it_is_known(capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+    monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
+    with announced_compiling(Console()):
+        numba.njit(lambda x: x + 1)(1)
+    assert capsys.readouterr().err == "compiling kernels (first run only, well under a minute) ...\n"
+
+
+def test_nothing_is_said_without_compiling(capsys: pytest.CaptureFixture[str]) -> None:
+    prepare_kernels(Console(quiet=True))
+    prepare_kernels(Console())
+    assert capsys.readouterr().err == ""

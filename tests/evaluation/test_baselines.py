@@ -1,0 +1,43 @@
+"""Matching counts, and the base by rank."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from clod_adapter.adapter import attach
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.evaluation.baselines import matching_dial, mean_kept, rankings
+from clod_adapter.initialization.importance import removal_error
+from clod_adapter.render import render
+from scenes import capture, gaussians, ring
+
+
+def test_matching_dial_keeps_as_many() -> None:
+    n = 5000
+    some, cameras = gaussians(n, 0, 0), ring(3, 32, 24)
+    some = attach(some, torch.linspace(0.3, 8, n), AttenuationConfig(tau=1 / 255, scene_distance=4.0, max_sv=200))
+    at_one = mean_kept(some, cameras, 1.0)
+    assert at_one == sum(int(render(some, camera).kept.sum()) for camera in cameras) / 3
+    for count in (0.9 * at_one, 1000, 250.5, 30):
+        s = matching_dial(some, cameras, count)
+        assert s > 1 and mean_kept(some, cameras, s) == pytest.approx(count, rel=1e-3, abs=0.4)
+    assert mean_kept(some, cameras, matching_dial(some, cameras, 0)) <= 1
+    assert matching_dial(some, cameras, at_one) == matching_dial(some, cameras, n) == 1
+
+
+def test_without_a_dial_there_is_nothing_to_turn() -> None:
+    assert matching_dial(gaussians(20, 0, 0), ring(1, 32, 24), 10) == 1
+
+
+def test_rankings() -> None:
+    base, scene = capture(n=60, views=4, width=24, height=18)
+    seen = []
+    orders = rankings(base, scene.train, lambda *a: seen.append(a))
+    assert seen[-1] == (len(scene.train), len(scene.train))
+    values = {"opacity": base.opacity_logits, "removal error": removal_error(base, scene.train)}
+    assert list(orders) == list(values)
+    for name, order in orders.items():
+        assert torch.equal(order.sort().values, torch.arange(60))
+        assert (values[name][order].diff() <= 0).all()
+    assert not torch.equal(*orders.values())

@@ -1,0 +1,198 @@
+"""Budgets: the counts that solved dial values really keep, and what the table's interpolation makes of known curves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from clod_adapter.adapter import attach
+from clod_adapter.calibration import Calibration, CalibrationRow
+from clod_adapter.cameras import Camera
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluation.budget import dial_for, frame_times
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.render import dial
+from scenes import gaussians, ring
+
+MAX_SV = 6.0
+
+
+def adapted(n: int, seed: int, normalizer: str = "scene") -> Gaussians:
+    """With decays for which Gaussians leave all over the dial's range, and before and behind it."""
+    generator = torch.Generator().manual_seed(seed)
+    sigma = (torch.randn(n, generator=generator) * 0.8 + 0.4).exp()
+    attenuation = AttenuationConfig(max_sv=MAX_SV, normalizer=normalizer, scene_distance=5.0)
+    return attach(gaussians(n, 0, seed), sigma, attenuation)
+
+
+def kept(some: Gaussians, cameras: Sequence[Camera], s: float) -> int:
+    return sum(int(dial(some, camera, s).keep.sum()) for camera in cameras)
+
+
+@settings(deadline=None, max_examples=30)
+@example(n=2, seed=2, views=5, share=0.25, normalizer="quantile")  # one Gaussian is at distance 1 in three views
+@given(
+    n=st.integers(2, 3000), seed=st.integers(0, 10**6), views=st.integers(1, 5), share=st.floats(0, 1),
+    normalizer=st.sampled_from(["scene", "quantile", "max"]),
+)  # fmt: skip
+def test_counts_are_exact_up_to_ties(n: int, seed: int, views: int, share: float, normalizer: str) -> None:
+    some, cameras = adapted(n, seed, normalizer), ring(views, 48, 36)
+    most, fewest = kept(some, cameras, 1.0), kept(some, cameras, MAX_SV)
+    wanted = fewest + round(share * (most - fewest))
+    if wanted == 0:
+        return
+    solved = dial_for(some, keep=wanted / views, cameras=cameras)
+    found = kept(some, cameras, solved.virtual_scale)
+    assert 1 <= solved.virtual_scale <= MAX_SV and solved.note == ""
+    # At most what was asked for; and where it is less, more would stay at the next smaller dial value in float32.
+    assert found <= wanted, (seed, found, wanted)
+    assert found == wanted or kept(some, cameras, solved.virtual_scale * (1 - 1e-6)) > wanted, (seed, found, wanted)
+    # The Gaussian whose distance is the unit is at distance 1, and its s* is the same in each view where it is that.
+    ties = 0 if normalizer == "scene" else views - 1
+    assert wanted - found <= max(1, 0.001 * wanted) + ties, (seed, found, wanted)
+
+
+def test_ties_leave_together() -> None:
+    row = adapted(6, 0)
+    same = row.replace(
+        means=torch.zeros(6, 3), opacity_logits=torch.tensor([2.0, 2, 2, 2, 3, 5]), sigma_d=torch.ones(6)
+    )
+    camera = ring(1, 48, 36)
+    solved = dial_for(same, keep=4, cameras=camera)
+    assert kept(same, camera, solved.virtual_scale) == 2
+    assert kept(same, camera, solved.virtual_scale * (1 - 1e-6)) == 6
+    assert kept(same, camera, dial_for(same, keep=1, cameras=camera).virtual_scale) == 1
+
+
+def test_a_mean_need_not_be_whole() -> None:
+    some, cameras = adapted(500, 3), ring(4, 48, 36)
+    wanted = (kept(some, cameras, 2.0) // 4) + 0.75
+    assert kept(some, cameras, dial_for(some, keep=wanted, cameras=cameras).virtual_scale) == 4 * wanted
+
+
+def test_counts_out_of_reach() -> None:
+    some, cameras = adapted(1000, 2), ring(3, 48, 36)
+    most, fewest = kept(some, cameras, 1.0) / 3, kept(some, cameras, MAX_SV) / 3
+    assert most < 1000
+    for wanted in (most + 1, 1000, 10**9):
+        solved = dial_for(some, keep=wanted, cameras=cameras)
+        assert (solved.virtual_scale, solved.note) == (1.0, f"s = 1 keeps {most:,.0f} of 1,000 already")
+    with pytest.raises(ClodError, match=f"out of reach: at s = 6, .* {fewest:,.0f} are kept"):
+        dial_for(some, keep=fewest - 1, cameras=cameras)
+
+
+def table(psnr: Sequence[float], times: Sequence[float] = ()) -> Calibration:
+    dials = [2.0**k for k in range(len(psnr))]
+    times = times or [10.0 / s for s in dials]
+    rows = tuple(CalibrationRow(s, 100 / s, p, 0.9, t) for s, p, t in zip(dials, psnr, times, strict=True))
+    return Calibration(rows, 100, 2, 64, 48, "a machine")
+
+
+@pytest.mark.parametrize(
+    ("psnr", "drop", "dial_value"),
+    [
+        ([30, 29, 28], 1, 2),
+        ([30, 29, 28], 0.5, math.sqrt(2)),  # linear in log s
+        ([30, 29, 28], 1.25, 2 * 2**0.25),
+        ([30, 30.5, 29.5], 0.25, 2 * 2**0.75),  # from s = 1, not from the best
+        ([30, 28, 29.5, 27], 1, math.sqrt(2)),  # spent where it first is
+        ([30, 29, 28], 2, 4),
+    ],
+)
+def test_psnr_drop(psnr: list[float], drop: float, dial_value: float) -> None:
+    solved = dial_for(adapted(3, 0), psnr_drop=drop, calibration=table(psnr))
+    assert solved.virtual_scale == pytest.approx(dial_value, rel=1e-12)
+
+
+def test_a_drop_that_never_comes() -> None:
+    solved = dial_for(adapted(3, 0), psnr_drop=3, calibration=table([30, 29, 28.25]))
+    assert solved.virtual_scale == 4.0 and solved.note.startswith("only 1.75 dB are lost at s = 4")
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.lists(st.floats(20, 40), min_size=1, max_size=9), st.floats(1e-3, 10))
+def test_the_drop_is_not_exceeded_before(psnr: list[float], drop: float) -> None:
+    """By the interpolation itself, written out once more, on a fine grid."""
+    s = dial_for(adapted(3, 0), psnr_drop=drop, calibration=table(psnr)).virtual_scale
+    assert 1 <= s <= 2.0 ** (len(psnr) - 1)
+    for k in range(50):
+        at = math.log2(s) * k / 49
+        left = min(int(at), len(psnr) - 2) if len(psnr) > 1 else 0
+        right = min(left + 1, len(psnr) - 1)
+        value = psnr[left] + (at - left) * (psnr[right] - psnr[left])
+        assert psnr[0] - value <= drop + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("times", "fps", "dial_value"),
+    [
+        ([20, 10, 5], 100, 2),
+        ([20, 10, 5], 1000 / 15, math.sqrt(2)),
+        ([20, 10, 12, 5], 1000 / 11, 4 * 2 ** (1 / 7)),  # reached for good, not in passing
+        ([20, 10, 5], 200, 4),
+    ],
+)
+def test_frame_rate(times: list[float], fps: float, dial_value: float) -> None:
+    calibration = table([30] * len(times), times)
+    solved = dial_for(adapted(3, 0), fps=fps, calibration=calibration)
+    assert solved.virtual_scale == pytest.approx(dial_value, rel=1e-12) and solved.note == ""
+
+
+def test_frame_rates_out_of_reach() -> None:
+    calibration = table([30] * 3, [20, 10, 5])
+    solved = dial_for(adapted(3, 0), fps=30, calibration=calibration)
+    assert (solved.virtual_scale, solved.note) == (1.0, "s = 1 draws 50 frames a second already")
+    with pytest.raises(ClodError, match="at s = 4, .* takes 5.0 ms, 200 a second"):
+        dial_for(adapted(3, 0), fps=201, calibration=calibration)
+
+
+def test_frames_are_timed_where_nothing_is_stored(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock is the dial's: a frame at s takes 8/s ms."""
+    seen: list[tuple[str, float]] = []
+    now = [0.0]
+
+    def draw(some: Gaussians, camera: Camera, s: float) -> None:
+        seen.append((camera.name, s))
+        now[0] += 0.008 / s
+
+    monkeypatch.setattr("clod_adapter.evaluation.budget.render", draw)
+    monkeypatch.setattr("clod_adapter.evaluation.budget.time.perf_counter", lambda: now[0])
+    cameras, some = ring(9, 48, 36), adapted(20, 0)
+    solved = dial_for(some, fps=250, cameras=cameras)
+    assert solved.virtual_scale == pytest.approx(2, rel=0.03)  # the curve is not a line in log s
+    assert len({name for name, _ in seen}) <= 4 and {s for _, s in seen} >= {1.0, MAX_SV}
+
+
+def test_frame_times_of_a_real_clock() -> None:
+    calls: list[tuple[int, int]] = []
+    times = frame_times(adapted(20, 0), ring(2, 48, 36), progress=lambda done, total: calls.append((done, total)))
+    assert [s for s, _ in times] == pytest.approx([MAX_SV ** (k / 5) for k in range(6)])
+    assert all(0 < taken < 1e4 for _, taken in times)
+    assert calls == [(6 * k, 24) for k in range(1, 5)]  # two cameras, twice
+    alone = adapted(20, 0).replace(attenuation=AttenuationConfig(max_sv=1.0))
+    assert len(frame_times(alone, ring(1, 48, 36))) == 1
+
+
+def test_bad_calls_are_named() -> None:
+    some, camera = adapted(5, 0), ring(1, 48, 36)
+    for budgets in ({}, {"keep": 3, "fps": 3}):
+        with pytest.raises(ClodError, match="exactly one of keep, psnr_drop and fps"):
+            dial_for(some, cameras=camera, **budgets)
+    for name in ("keep", "psnr_drop", "fps"):
+        for value in (0, -1, math.nan, math.inf):
+            with pytest.raises(ClodError, match=f"{name} is .*, it must be positive and finite"):
+                dial_for(some, cameras=camera, **{name: value})
+    with pytest.raises(ClodError, match="no sigma_d"):
+        dial_for(gaussians(3, 0, 0), keep=1, cameras=camera)
+    with pytest.raises(ClodError, match="needs the calibration table"):
+        dial_for(some, psnr_drop=1)
+    with pytest.raises(ClodError, match="no camera is given"):
+        dial_for(some, keep=1)
+    with pytest.raises(ClodError, match="a calibration or cameras"):
+        dial_for(some, fps=1)

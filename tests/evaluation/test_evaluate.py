@@ -1,0 +1,117 @@
+"""Rows of an evaluation: values that can be worked out by hand, and what an unadapted file gives."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+import pytest
+import torch
+
+from clod_adapter.adapter import attach
+from clod_adapter.attenuation import in_frustum
+from clod_adapter.cameras import View
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluation.evaluate import evaluate
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.metrics import psnr_ssim
+from clod_adapter.render import render
+from scenes import camera, gaussians, in_front, photograph, ring
+
+
+def row_of_four() -> Gaussians:
+    """At camera depths 1, 2, 4 and 8 before ``camera()``, the last far outside the image; each 1 per sigma."""
+    means = in_front(camera(), torch.tensor([[0.0, 0, 1], [0, 0, 2], [0, 0, 4], [80, 0, 8]]))
+    some = gaussians(4, 0, 0).replace(means=means, opacity_logits=torch.full((4,), 2.0))
+    return attach(some, torch.ones(4), AttenuationConfig(tau=0.01, eps=0.0))
+
+
+def test_a_black_picture_by_hand() -> None:
+    """Nothing drawn: PSNR is that of the photograph against black; its mean is over views, in dB."""
+    nothing = gaussians(5, 0, 0).replace(opacity_logits=torch.full((5,), -math.inf))
+    views = [View(camera(20, 16), torch.full((16, 20, 3), value, dtype=torch.uint8)) for value in (51, 255)]
+    (row,) = evaluate(nothing, views, [1.0])
+    assert row.psnr == pytest.approx((20 * math.log10(5) + 0) / 2, abs=1e-5)
+    ssims = [psnr_ssim(torch.zeros(16, 20, 3), view.image)[1] for view in views]
+    assert row.ssim == pytest.approx(sum(ssims) / 2)
+    assert (row.virtual_scale, row.kept, row.kept_share) == (1.0, 5.0, 1.0)
+    assert row.in_view == in_frustum(nothing.means, views[0].camera).sum()
+    assert 0 < row.frame_ms < 1000
+
+
+def test_counts_by_hand() -> None:
+    """Kept iff ``log a - (d s)^2 / 2 > log(tau s)`` with log a = -0.127: at s = 1 the two nearer than 3."""
+    view = View(camera(), torch.zeros(45, 61, 3, dtype=torch.uint8))
+    rows = evaluate(row_of_four(), [view, view], [1.0, 1.5, 3.0])
+    assert [row.kept for row in rows] == [2, 1, 0]
+    assert [row.kept_share for row in rows] == [0.5, 0.25, 0]
+    assert [row.in_view for row in rows] == [2, 1, 0]
+    (row,) = evaluate(row_of_four().replace(sigma_d=torch.full((4,), 1e3)), [view], [1.0])
+    assert (row.kept, row.in_view) == (4, 3)
+    assert rows[2].psnr == math.inf  # a black photograph of nothing
+
+
+def test_rows_are_the_renders() -> None:
+    some = attach(gaussians(200, 1, 0), torch.full((200,), 0.8), AttenuationConfig(scene_distance=4.0))
+    views = photograph(gaussians(200, 1, 0), ring(3, 32, 24))
+    seen = []
+    rows = evaluate(some, views, [1.0, 2.0], progress=lambda *a: seen.append(a), repeats=2)
+    assert seen == [(k, 6) for k in range(1, 7)]
+    for row in rows:
+        renders = [render(some, view.camera, row.virtual_scale) for view in views]
+        metrics = [psnr_ssim(r.image, view.image) for r, view in zip(renders, views, strict=True)]
+        assert row.psnr == pytest.approx(sum(m[0] for m in metrics) / 3)
+        assert row.ssim == pytest.approx(sum(m[1] for m in metrics) / 3)
+        assert row.kept == pytest.approx(sum(int(r.kept.sum()) for r in renders) / 3)
+        assert 0 < row.kept_share == row.kept / 200 < 1 and row.in_view < row.kept
+        measured = {name: getattr(row, name) for name in row.__dataclass_fields__ if name not in ("lpips", "flip")}
+        assert row.as_dict() == measured and row.lpips is row.flip is None  # not asked for
+
+
+def test_an_unadapted_file_is_the_same_at_every_dial_value() -> None:
+    base = gaussians(200, 1, 0)
+    views = photograph(gaussians(200, 1, 1), ring(2, 32, 24))
+    rows = evaluate(base, views, [1.0, 2.0, 7.0])
+    assert len({(row.psnr, row.ssim, row.kept, row.kept_share, row.in_view) for row in rows}) == 1
+    assert rows[0].kept_share == 1
+
+
+def test_of_no_gaussians() -> None:
+    view = View(camera(20, 16), torch.zeros(16, 20, 3, dtype=torch.uint8))
+    (row,) = evaluate(gaussians(0, 0, 0), [view], [2.0])
+    assert (row.kept, row.kept_share, row.in_view, row.psnr) == (0, 0, 0, math.inf)
+
+
+def test_nothing_to_learn_from() -> None:
+    """Evaluation leaves no graph behind, whatever requires a gradient."""
+    some = row_of_four()
+    some = some.replace(sigma_d=some.sigma_d.requires_grad_())
+    view = View(camera(20, 16), torch.zeros(16, 20, 3, dtype=torch.uint8))
+    (row,) = evaluate(some, [view], [1.0])
+    assert all(type(value) is float for value in (row.psnr, row.ssim, row.kept, row.frame_ms))
+
+
+def test_bad_calls_are_named() -> None:
+    view = View(camera(20, 16), torch.zeros(16, 20, 3, dtype=torch.uint8))
+    with pytest.raises(ClodError, match="no held-out views"):
+        evaluate(row_of_four(), [], [1.0])
+    with pytest.raises(ClodError, match="no dial values"):
+        evaluate(row_of_four(), [view], [])
+    with pytest.raises(ClodError, match="virtual_scale is 0.5"):
+        evaluate(row_of_four(), [view], [1.0, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("dials", "repeats", "said"),
+    [
+        ([1.0, math.nan], 1, "virtual_scale is nan"),
+        ([1.0, math.inf], 1, "virtual_scale is inf"),
+        ([1.0], 0, "repeats is 0, it must be at least 1"),
+    ],
+)
+def test_bad_calls_cost_nothing(dials: list[float], repeats: int, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[evaluate.__module__], "render", lambda *_: pytest.fail("rendered"))
+    view = View(camera(20, 16), torch.zeros(16, 20, 3, dtype=torch.uint8))
+    with pytest.raises(ClodError, match=said):
+        evaluate(row_of_four(), [view], dials, repeats=repeats)

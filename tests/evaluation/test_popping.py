@@ -1,0 +1,190 @@
+"""The measure of popping: it must tell a jump from a fade, and count nothing that the camera's motion does."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from clod_adapter.adapter import attach
+from clod_adapter.attenuation import normalized_distances
+from clod_adapter.cameras import Camera
+from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluation.popping import dial_popping, path, path_popping, sweep
+from clod_adapter.extinction import sigma_for_extinction
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.render import render
+from scenes import gaussians, ring
+
+
+def dialled(tau: float = 1 / 255, n: int = 200, **settings: object) -> Gaussians:
+    """Gaussians that fade at different dial values; scene distance 4, where the ring of cameras is."""
+    sigma = torch.linspace(0.3, 4, n)[torch.randperm(n, generator=torch.Generator().manual_seed(3))]
+    config = AttenuationConfig(**({"tau": tau, "cut": "hard", "scene_distance": 4.0} | settings))
+    return attach(gaussians(n, 1, 0, size=0.2), sigma, config)
+
+
+def test_an_even_fade_and_a_switch_by_hand() -> None:
+    """Grey rising by 1/100 a step on one of two pixels; and black that becomes grey 1/2 in one step."""
+    positions = [k / 10 for k in range(11)]
+    fade = sweep(lambda _, j: torch.tensor([[[j / 100] * 3, [0.0] * 3]]), positions)
+    assert fade.steps == 10 and fade.mean == pytest.approx(2.55 / math.sqrt(2), rel=1e-4)
+    assert fade.ratio == pytest.approx(1, abs=1e-4) and fade.persistence == pytest.approx(0.5, abs=1e-4)
+    assert fade.pixel == pytest.approx(2.55, rel=1e-4) and fade.pixel_persistence == pytest.approx(0.5, abs=1e-4)
+    switch = sweep(lambda _, j: torch.full((1, 2, 3), 0.5 * (j >= 4)), positions)
+    assert switch.largest == switch.pixel == 127.5 and switch.at == switch.pixel_at == 0.4
+    assert switch.ratio == pytest.approx(10) and switch.persistence == switch.pixel_persistence == 1
+    assert list(switch.changes) == [0, 0, 0, 127.5, *[0] * 6]
+
+
+def test_a_flicker_is_a_jump() -> None:
+    """There and back again at every step: over two steps nothing is left, which must not make it a fade."""
+    flicker = sweep(lambda _, j: torch.full((1, 1, 3), 0.2 * (j % 2)), [0, 1, 2, 3])
+    assert flicker.ratio == pytest.approx(1) and flicker.persistence == flicker.pixel_persistence == 1
+
+
+def test_what_cannot_be_seen_is_no_change() -> None:
+    """Beyond white nothing is brighter; and with no change at all there is no ratio."""
+    result = sweep(lambda _, j: torch.full((1, 1, 3), 1.0 + j), [0, 1, 2])
+    assert result.largest == result.pixel == 0 and math.isnan(result.ratio) and math.isnan(result.persistence)
+
+
+def test_a_switch_between_models_and_a_dial() -> None:
+    """The finer the steps, the larger a switch's ratio, while a dial's stays; what is left at half the step differs."""
+    some, (camera, *_) = dialled(), ring(3, 32, 24)
+    coarse = some.select(torch.arange(0, 200, 4))
+    for steps in (20, 80):
+        positions = [4 ** (k / steps) for k in range(steps + 1)]
+        images = [render(g, camera, 1.0).image for g in (some, coarse)]
+        switch = sweep(lambda _, j, s=positions, i=images: i[int(s[j] > 2.1)], positions)
+        turned = dial_popping(some, camera, 4.0, steps=steps)
+        assert switch.ratio == pytest.approx(steps) and switch.persistence == 1
+        assert 1 < turned.ratio < 5 and 0.5 <= turned.persistence < 0.6
+    assert turned.pixel < switch.pixel / 4
+
+
+def test_a_cut_at_a_visible_opacity_pops() -> None:
+    """With a threshold of a tenth what leaves is up to 40 % opaque at s = 4: pixels jump though the RMS hardly does."""
+    camera = ring(3, 32, 24)[0]
+    low, high = (dial_popping(dialled(tau), camera, 4.0, steps=100) for tau in (1e-4, 0.1))
+    assert low.pixel_persistence < 0.6 < 0.8 < high.pixel_persistence <= 1
+    assert high.pixel > 4 * low.pixel
+
+
+def test_the_dial_sweep_is_its_renders() -> None:
+    some, camera = dialled(), ring(3, 32, 24)[1]
+    seen = []
+    result = dial_popping(some, camera, 3.0, steps=4, progress=lambda *a: seen.append(a))
+    images = [render(some, camera, 3 ** (k / 4)).image.clamp(0, 1) for k in range(5)]
+    want = [255 * float((b - a).square().mean().sqrt()) for a, b in zip(images[:-1], images[1:], strict=True)]
+    assert result.changes == pytest.approx(want) and seen == [(k, 4) for k in range(1, 5)]
+    assert result.at == pytest.approx(3 ** ((want.index(max(want)) + 1) / 4))
+
+
+def test_camera_motion_alone_is_no_change() -> None:
+    some, cameras = dialled(), ring(12, 32, 24)[:3]
+    still = path_popping(some.replace(sigma_d=torch.full((200,), 1e9)), cameras, 3.0, steps=6)
+    assert still.largest == 0 and still.pixel == 0
+    moved = path_popping(some, cameras, 3.0, steps=6)
+    seen = path(cameras, 6)
+    assert 0 < moved.largest < 255 * float((render(some, seen[0], 3.0).image - render(some, seen[1], 3.0).image).std())
+
+
+def test_a_normaliser_that_jumps_pops() -> None:
+    """One far Gaussian that enters the view sets the paper's maximum, and with it every opacity, at once."""
+    some, cameras = dialled(), ring(12, 32, 24)[:3]
+    means = some.means.clone()
+    means[0] = -30 * cameras[1].position / cameras[1].position.norm()
+    results = {}
+    for kind in ("scene", "max"):
+        config = dataclasses.replace(some.attenuation, normalizer=kind)
+        results[kind] = path_popping(some.replace(means=means, attenuation=config), cameras, 3.0, steps=60)
+    assert results["scene"].persistence < 0.6 < 0.95 < results["max"].persistence
+    assert results["max"].ratio > 10 > 4 > results["scene"].ratio
+
+
+def test_path_passes_through_the_cameras_at_equal_steps() -> None:
+    cameras = ring(8, 32, 24)[:3]
+    found = path(cameras, 40)
+    assert len(found) == 41
+    for want, got in ((cameras[0], found[0]), (cameras[2], found[-1])):
+        assert torch.allclose(got.viewmat, want.viewmat, atol=1e-5)
+    centres = torch.stack([camera.position for camera in found])
+    gaps = (centres[1:] - centres[:-1]).norm(dim=1)
+    assert gaps.max() < 1.001 * gaps.median()  # one step cuts the corner at the camera in the middle
+    assert (centres - cameras[1].position).norm(dim=1).min() < 0.51 * gaps.max()
+    for camera in found:
+        assert torch.allclose(camera.viewmat[:3, :3] @ camera.viewmat[:3, :3].T, torch.eye(3), atol=1e-5)
+
+
+def test_path_of_a_camera_that_only_turns() -> None:
+    (camera, *_) = ring(8, 32, 24)
+    turn = torch.eye(4)
+    turn[:2, :2] = torch.tensor([[0.8, -0.6], [0.6, 0.8]])
+    turned = dataclasses.replace(camera, viewmat=turn @ camera.viewmat)
+    found = path([camera, turned, camera], 4)
+    half = found[1].viewmat[:3, :3] @ camera.viewmat[:3, :3].T
+    assert float(half[1, 0]) == pytest.approx(math.sin(math.asin(0.6) / 2), abs=1e-6)
+    assert torch.allclose(found[2].viewmat, turned.viewmat, atol=1e-5)
+    assert all(torch.allclose(c.position, camera.position, atol=1e-5) for c in found)
+
+
+def test_a_path_keeps_the_near_plane() -> None:
+    cameras = [dataclasses.replace(camera, near=1e-4) for camera in ring(2, 32, 24)]
+    assert {camera.near for camera in path(cameras, 5)} == {1e-4}
+
+
+def test_bad_calls_are_named() -> None:
+    some, cameras = dialled(), ring(3, 32, 24)
+    with pytest.raises(ClodError, match="max_sv is 1"):
+        dial_popping(some, cameras[0], 1.0)
+    with pytest.raises(ClodError, match="positions is 2, it must be at least 3"):
+        dial_popping(some, cameras[0], 2.0, steps=1)
+    with pytest.raises(ClodError, match="at least two cameras, not 1"):
+        path_popping(some, cameras[:1], 2.0)
+    with pytest.raises(ClodError, match="steps is 1"):
+        path(cameras, 1)
+
+
+def adversary(normalizer: str, cut: str) -> tuple[Gaussians, list[Camera]]:
+    """Four opaque white Gaussians in one place that leave together at s = 2.2, with max_sv 5 and the default tau, two
+    black ones behind them, and one far away that a camera sees once it has turned."""
+    camera = ring(1, 32, 24)[0]
+    forward, right = camera.viewmat[2, :3], camera.viewmat[0, :3]
+    means = torch.cat([torch.zeros(4, 3), torch.stack([forward, 2 * forward, 60 * forward + 40 * right])])
+    some = gaussians(7, 0, 0).replace(
+        means=means, log_scales=torch.full((7, 3), math.log(0.4)), opacity_logits=torch.full((7,), 3.0),
+        sh0=torch.tensor([1.7] * 4 + [-1.7] * 3)[:, None, None].expand(7, 1, 3),
+    )  # fmt: skip
+    config = AdaptConfig(normalizer=normalizer, cut=cut).attenuation(4.0)
+    leave = torch.tensor([2.2] * 4 + [3.0, 4.0, 5.0])
+    sigma = sigma_for_extinction(some.opacity_logits, normalized_distances(means, camera, config), leave, config)
+    turn = torch.eye(4)
+    turn[[0, 0, 2, 2], [0, 2, 0, 2]] = torch.tensor([0.8, -0.6, 0.6, 0.8])
+    return attach(some, sigma, config), [camera, dataclasses.replace(camera, viewmat=turn @ camera.viewmat)]
+
+
+def test_the_default_holds_a_bound_in_the_dial_and_the_hard_cut_does_not() -> None:
+    """What is drawn changes by at most 2.73 per unit of log s within max_sv 5; a rasterizer drops one level each."""
+    pixels = {}
+    for cut in ("soft", "hard"):
+        some, cameras = adversary("scene", cut)
+        for steps in (60, 120):
+            pixels[cut, steps] = dial_popping(some, cameras[0], 5.0, steps=steps).pixel
+            bound = 6 * (255 * 2.73 * math.log(5) / steps + 1)  # six lie behind each other
+            assert cut == "hard" or pixels[cut, steps] < bound
+    assert pixels["soft", 120] < 0.7 * pixels["soft", 60]
+    assert pixels["hard", 120] > 0.9 * pixels["hard", 60] > 30
+
+
+def test_the_default_does_not_change_as_a_camera_turns_and_the_maximum_does() -> None:
+    for normalizer in ("scene", "quantile", "max"):
+        some, cameras = adversary(normalizer, "soft")
+        pixels = [path_popping(some, cameras, 2.0, steps=steps).pixel for steps in (10, 20)]
+        if normalizer == "scene":
+            assert max(pixels) < 0.05
+        else:
+            assert pixels[1] > 0.9 * pixels[0] > 20

@@ -1,0 +1,85 @@
+"""The robustness experiment's cells: what is measured, on what, and when it counts as the same."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from clod_adapter.adapter import attach
+from clod_adapter.cameras import Scene
+from clod_adapter.config import AdaptConfig
+from clod_adapter.evaluation.evaluate import evaluate
+from clod_adapter.evaluation.robustness import adapt_at_range, baseline, distribution, most_opaque, scene_fingerprint
+from clod_adapter.training.loop import Progress
+from scenes import capture, gaussians
+
+
+def test_a_range_is_adapted_and_measured_beyond_it() -> None:
+    base, scene = capture()
+    frames: list[tuple[int, int]] = []
+    outcome = adapt_at_range(
+        base, scene, AdaptConfig(iters=20, max_sv=2), [1.0, 2.0, 4.0], fingerprint="f",
+        measured=lambda done, total: frames.append((done, total)),
+    )  # fmt: skip
+    assert [row["virtual_scale"] for row in outcome.rows] == [1, 2, 4]
+    kept = [row["kept"] for row in outcome.rows]
+    assert kept == sorted(kept, reverse=True) and kept[-1] < kept[0]
+    assert outcome.adapter is not None and outcome.adapter.attenuation.max_sv == 2 and outcome.seconds > 0
+    (again,) = evaluate(outcome.adapter.apply(base), scene.test, [2.0])
+    assert (again.psnr, again.kept) == (outcome.rows[1]["psnr"], outcome.rows[1]["kept"])
+    assert frames[-1] == (3 * len(scene.test), 3 * len(scene.test))
+
+
+def test_an_interrupted_adaptation_is_no_cell() -> None:
+    base, scene = capture()
+
+    def stop(progress: Progress) -> None:
+        if progress.phase == "train" and progress.done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        adapt_at_range(base, scene, AdaptConfig(iters=20), [1.0], fingerprint="f", follow=stop)
+
+
+def test_baseline_keeps_the_most_opaque() -> None:
+    base, scene = capture()
+    frames: list[tuple[int, int]] = []
+    outcome = baseline(attach(base, torch.full((300,), 0.1)), scene.test, (1.0, 0.5, 0.1),
+                       measured=lambda done, total: frames.append((done, total)))  # fmt: skip
+    assert [row["kept"] for row in outcome.rows] == [300, 150, 30]
+    assert [row["kept_share"] for row in outcome.rows] == [1, 0.5, 0.1]
+    (whole,) = evaluate(base, scene.test, [1.0])  # a dial that the base has plays no part
+    assert outcome.rows[0]["psnr"] == whole.psnr > outcome.rows[2]["psnr"]
+    assert outcome.adapter is None and "log10_sigma_d" not in outcome.distribution
+    assert frames == [(k + 1, 3 * len(scene.test)) for k in range(3 * len(scene.test))]
+
+
+def test_most_opaque_keeps_the_order() -> None:
+    model = gaussians(50, 1, 3)
+    few = most_opaque(model, 10)
+    threshold = few.opacities.min()
+    assert torch.equal(few.means, model.means[model.opacities >= threshold]) and len(few) == 10
+
+
+def test_distribution() -> None:
+    model = gaussians(4, 0, 0).replace(opacity_logits=torch.tensor([-9.0, 0.1, 9.0, float("inf")]))
+    sigma = torch.tensor([0.0, 1e-2, 1.0, 1e9])
+    found = distribution(attach(model, sigma))
+    opacity, log_sigma = found["opacity"], found["log10_sigma_d"]
+    for histogram in (opacity, log_sigma):
+        assert len(histogram["edges"]) == len(histogram["shares"]) + 1 and sum(histogram["shares"]) == pytest.approx(1)
+    assert (opacity["shares"][0], opacity["shares"][20], opacity["shares"][-1]) == (0.25, 0.25, 0.5)
+    assert (log_sigma["shares"][0], log_sigma["shares"][-1]) == (0.25, 0.25)
+
+
+def test_fingerprint_is_of_what_is_seen() -> None:
+    _, scene = capture()
+    _, same = capture()
+    assert scene_fingerprint(scene) == scene_fingerprint(same)
+    pixel = scene.train[0].image.clone()
+    pixel[0, 0, 0] ^= 1
+    changed = (dataclasses.replace(scene.train[0], image=pixel), *scene.train[1:])
+    others = [Scene(changed, scene.test), Scene(scene.train[1:], scene.test), Scene(scene.train, scene.train)]
+    assert len({scene_fingerprint(s) for s in (scene, *others)}) == 4

@@ -1,0 +1,191 @@
+"""The importance estimate against brute force, and the count law of the sigma_d that follows from it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from torch import Tensor
+
+from clod_adapter.attenuation import attenuate, normalized_distances
+from clod_adapter.cameras import View
+from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.extinction import extinction_scale
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization import importance
+from clod_adapter.initialization.importance import fitting_tau, removal_error, seeing, sigma_from_importance, start
+from clod_adapter.initialization.pruning_order import leaving_order
+from clod_adapter.render import splat
+from clod_adapter.viewpoints import typical_distance
+from scenes import gaussians, photograph, ring
+
+CONFIG = AttenuationConfig(tau=1 / 255, cut="hard", scene_distance=4.0)
+
+
+def changes(some: Gaussians, view: View) -> Tensor:
+    """``[N, pixels]`` what removing each Gaussian alone does to the picture. Opacity is its only factor, so
+    where nothing is clamped and no pixel ends the first order is all there is."""
+    whole, _ = splat(some, some.opacities, view.camera)
+    rows = []
+    for i in range(len(some)):
+        without = some.opacities.clone()
+        without[i] = 0
+        rows.append((splat(some, without, view.camera)[0] - whole).flatten())
+    return torch.stack(rows).double()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_estimates_the_exact_removal_error(seed: int, draws: int = 150) -> None:
+    """The mean over many draws within 5 of its standard deviations, which follow from the changes themselves.
+
+    With random signs z, ``(sum_p z_p v_p)^2`` has the mean |v|^2 and the variance 2 (|v|^4 - sum v^4).
+    """
+    some = gaussians(15, 1, seed, size=0.4)
+    some = some.replace(opacity_logits=(0.02 + 0.3 * some.opacities).logit())
+    views = photograph(some, ring(3, 16, 12))
+    v = [changes(some, view) for view in views]
+    exact = sum(x.square().sum(1) for x in v) / 3
+    variance = sum(2 * (x.square().sum(1).square() - x.pow(4).sum(1)) for x in v) / 9
+    found = torch.stack([removal_error(some, views, seed=1000 * seed + k) for k in range(draws)]).double()
+    error = (found.mean(0) - exact).abs()
+    spread = (variance / draws).sqrt()
+    assert (exact > 0).sum() > 10
+    assert (error <= 5 * spread + 1e-5 * exact.max()).all(), f"seed {seed}: {(error / spread).max():.1f} deviations"
+    assert (spread < 0.15 * exact + 1e-9).all()  # so the test could tell a factor of 2, or a missing view
+
+
+def test_is_the_mean_over_views_and_reports_them() -> None:
+    some = gaussians(100, 1, 0)
+    (view,) = photograph(some, ring(1, 20, 16))
+    seen = []
+    both = removal_error(some, [view, view], seed=3, progress=lambda *count: seen.append(count))
+    assert seen == [(1, 2), (2, 2)]
+    assert torch.equal(both, removal_error(some, [view, view], seed=3))
+    assert not torch.equal(both, removal_error(some, [view, view], seed=4))
+    assert both.shape == (100,) and not both.requires_grad and (both >= 0).all()
+    once = removal_error(some, [view], seed=3)
+    assert (both >= once / 2).all()  # the same first draw, and a second one
+
+
+def test_start_looks_at_some_of_many_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evenly spread ones, first to last; all where there are few."""
+    some, looked, counts = gaussians(50, 0, 0), [], []
+    views = photograph(some, ring(7, 12, 10))
+    monkeypatch.setattr(importance, "splat", lambda g, o, c: looked.append(c.name) or splat(g, o, c))
+    for most, expected in [(3, [0, 2, 4]), (7, range(7)), (64, range(7))]:
+        looked.clear()
+        counts.clear()
+        monkeypatch.setattr(importance, "MOST_VIEWS", most)
+        importance.start(some, views, AdaptConfig(), lambda *count: counts.append(count))
+        assert looked == [views[k].camera.name for k in expected]
+        assert counts[: len(looked)] == [("start", k + 1, len(looked)) for k in range(len(looked))]
+        assert {phase for phase, *_ in counts[len(looked) :]} == {"order"} and counts[-1] == ("order", 50, 50)
+
+
+def test_what_no_view_shows_counts_nothing() -> None:
+    some = gaussians(50, 0, 0)
+    some = some.replace(means=torch.cat([some.means[:25], some.means[25:] + 1e3]))
+    found = removal_error(some, photograph(some, ring(2, 20, 16)))
+    assert (found[25:] == 0).all() and (found[:25] > 0).any()
+    assert torch.equal(removal_error(some, []), torch.zeros(50))
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.5, 2.5])
+@pytest.mark.parametrize("share", [0.51, 0.6, 0.8, 1.0])
+def test_shares_kept_follow_the_law(share: float, exponent: float, n: int = 1000) -> None:
+    """At the distances it was made for, ``1 / (s^p + (1/share - 1) s^-p)``, to one Gaussian."""
+    g = torch.Generator().manual_seed(0)
+    some = gaussians(n, 0, 0).replace(opacity_logits=2 * torch.rand(n, generator=g))  # lasting until s = 127
+    importance, distances = torch.rand(n, generator=g), 0.1 + torch.rand(n, generator=g)
+    sigma = sigma_from_importance(some, importance, distances, CONFIG, share=share, exponent=exponent)
+    for s in (1.0, 1.2, 1.7, 2.0, 3.0, 5.0, 7.0, 20.0):
+        kept = attenuate(some.opacity_logits, sigma, distances, s, CONFIG).keep
+        want = 1 / (s**exponent + (1 / share - 1) * s**-exponent)
+        assert abs(kept.sum().item() - n * want) <= 1, f"s {s}"
+        if kept.any() and not kept.all():
+            assert importance[kept].min() > importance[~kept].max(), f"s {s}"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sigma_grows_with_importance(seed: int, n: int = 200) -> None:
+    """All else equal; and whatever the opacity, those of small importance leave first."""
+    g = torch.Generator().manual_seed(seed)
+    importance = torch.rand(n, generator=g)
+    distances, order = torch.full((n,), 0.7), importance.argsort()
+    alike = gaussians(n, 0, 0).replace(opacity_logits=torch.full((n,), 1.0))
+    sigma = sigma_from_importance(alike, importance, distances, CONFIG, share=0.7, exponent=1.5)
+    assert (sigma[order].diff() > 0).all() and sigma.isfinite().all(), f"seed {seed}"
+    some = gaussians(n, 0, seed)
+    sigma = sigma_from_importance(some, importance, distances, CONFIG, share=0.7, exponent=1.5)
+    leaves = extinction_scale(some.opacity_logits, sigma, distances, CONFIG)
+    lasting = (some.opacities * 255 * 0.99 > leaves)[order]  # the others stay until their opacity ends them
+    assert lasting.sum() > n / 2
+    assert (leaves[order][lasting].diff() >= -1e-4).all(), f"seed {seed}"
+
+
+def test_equal_importance_is_ranked_all_the_same() -> None:
+    """Nothing is known (no Gaussian in any view): the law still holds."""
+    some = gaussians(100, 0, 0).replace(opacity_logits=torch.zeros(100))
+    sigma = sigma_from_importance(some, torch.zeros(100), torch.ones(100), CONFIG, share=0.6, exponent=1.5)
+    assert abs(attenuate(some.opacity_logits, sigma, torch.ones(100), 1.0, CONFIG).keep.sum().item() - 60) <= 1
+
+
+def test_of_no_gaussians() -> None:
+    none = gaussians(0, 0, 0)
+    sigma = sigma_from_importance(none, torch.empty(0), torch.empty(0), CONFIG, share=0.6, exponent=1.5)
+    assert sigma.shape == (0,)
+
+
+def test_the_orders_of_the_start() -> None:
+    """By removal error alone the most important leaves last; with neighbours it may leave sooner."""
+    some = gaussians(200, 0, 0)
+    views = photograph(some, ring(3, 20, 16))
+    error = removal_error(some, views, seed=0)
+    by_error, by_default = (importance.start(some, views, AdaptConfig(start=name)) for name in ("error", "importance"))
+
+    def leaving(dialled: Gaussians) -> Tensor:
+        d = typical_distance(some.means, [view.camera for view in views], dialled.attenuation)
+        return extinction_scale(dialled.opacity_logits, dialled.sigma_d, d, dialled.attenuation).argsort()
+
+    assert torch.equal(leaving(by_error)[100:180], error.argsort(stable=True)[100:180])
+    order = leaving_order(some, error.sqrt() * some.opacities)
+    assert torch.equal(leaving(by_default)[100:180], order.argsort()[100:180])
+    assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
+
+
+def test_tau_is_lowered_for_faint_checkpoints_only() -> None:
+    config, error = AdaptConfig(max_sv=5.0), torch.rand(1000, generator=torch.Generator().manual_seed(0))
+    mixed = torch.linspace(0.001, 0.99, 1000)
+    assert fitting_tau(mixed, error, config) == config.tau
+    faint = torch.full((1000,), 0.01)
+    assert fitting_tau(faint, error, config) == pytest.approx(0.01 / 5 / 1.5, rel=1e-5)
+    # Nearly all opacities below tau, a few far above: the dial's end is served, the picture at s = 1 would not be.
+    some = torch.where(torch.arange(1000) < 100, 0.9, 0.012)
+    assert fitting_tau(some, torch.ones(1000), config) == pytest.approx(0.012 / 1.5)
+    assert fitting_tau(some, (some > 0.1).float(), config) == config.tau  # unless the faint ones do nothing
+    assert fitting_tau(faint, torch.zeros(1000), config) == config.tau  # nothing is visible: nothing to go by
+    assert fitting_tau(torch.zeros(10), torch.ones(10), config) > 0
+    for opacities in (mixed, faint, torch.zeros(1000)):  # never raised, however low it was asked for
+        assert fitting_tau(opacities, error, AdaptConfig(tau=1e-8)) == 1e-8
+
+
+def test_a_checkpoint_of_faint_gaussians_keeps_its_picture() -> None:
+    base = gaussians(200, 0, 0, size=0.3).replace(opacity_logits=torch.full((200,), -4.6))
+    views = photograph(base, ring(3, 24, 18))
+    dialled = start(base, views, AdaptConfig())
+    assert dialled.attenuation is not None and dialled.sigma_d is not None and dialled.attenuation.tau < 0.01 / 5
+    d = normalized_distances(base.means, views[0].camera, dialled.attenuation)
+    assert attenuate(base.opacity_logits, dialled.sigma_d, d, 1.0, dialled.attenuation).keep.float().mean() > 0.5
+
+
+def test_views_of_nothing_are_left_out() -> None:
+    some = gaussians(20, 0, 0)
+    views = photograph(some, ring(3, 24, 18))
+    back = torch.diag(torch.tensor([-1.0, 1, -1, 1]))
+    away = dataclasses.replace(views[0].camera, viewmat=back @ views[0].camera.viewmat)
+    blind = View(away, views[0].image)
+    assert seeing(some, [views[0], blind, views[1]]) == views[:2]
+    with pytest.raises(ClodError, match="in front of any of the 1 training cameras"):
+        seeing(some, [blind])

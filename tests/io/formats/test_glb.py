@@ -1,0 +1,214 @@
+from __future__ import annotations
+
+import json
+import struct
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.io.checkpoint import save
+from clod_adapter.io.formats.glb_reader import load_glb, read_glb
+from clod_adapter.io.writers import write
+from formats import ABOUT, ATTENUATION, CALIBRATION, ORIGIN, covariances, damaged, model, splat_transform, turned
+from scenes import gaussians
+
+pygltflib = pytest.importorskip("pygltflib", reason="pygltflib is not installed")
+KHR = "KHR_gaussian_splatting"
+
+
+def same(a: Gaussians, b: Gaussians) -> None:
+    assert torch.equal(a.means, b.means) and turned(a.quats, b.quats) < 1e-6
+    torch.testing.assert_close(a.log_scales, b.log_scales, atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(a.opacities, b.opacities, atol=1e-7, rtol=1e-6)
+    assert torch.equal(a.sh0, b.sh0)
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_the_same_again(tmp_path: Path, degree: int) -> None:
+    g = model(degree)
+    dropped = write(tmp_path / "a.glb", g, ABOUT, origin=ORIGIN, calibration=CALIBRATION)
+    again, card, notes = load_glb(tmp_path / "a.glb")
+    same(g, again)
+    bands = (min(degree, 3) + 1) ** 2 - 1
+    assert torch.equal(again.shN, g.shN[:, :bands]) and bool(dropped) == (degree == 4)
+    assert torch.equal(again.sigma_d, g.sigma_d) and again.attenuation == ATTENUATION
+    assert (card.origin, card.about, card.calibration, notes) == (ORIGIN, ABOUT, CALIBRATION, ())
+    assert again.opacity_logits[0] == torch.inf
+
+
+def test_as_an_independent_reader_sees_it(tmp_path: Path) -> None:
+    g = model(3)
+    write(tmp_path / "a.glb", g, origin=ORIGIN)
+    gltf = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
+    (mesh,), (node,) = gltf.meshes, gltf.nodes
+    (primitive,) = mesh.primitives
+    assert primitive.mode == pygltflib.POINTS and gltf.extensionsUsed == [KHR] and not gltf.extensionsRequired
+    assert primitive.extensions[KHR] == {
+        "kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }  # fmt: skip
+    assert gltf.asset.extras["clod_adapter"]["attenuation"]["reference_distance"] == ATTENUATION.reference_distance
+    found = {}
+    for name, number in vars(primitive.attributes).items():
+        if number is None:
+            continue
+        accessor, blob = gltf.accessors[number], gltf.binary_blob()
+        view = gltf.bufferViews[accessor.bufferView]
+        kind = {pygltflib.FLOAT: "<f4", pygltflib.UNSIGNED_BYTE: "u1"}[accessor.componentType]
+        data = blob[view.byteOffset : view.byteOffset + view.byteLength]
+        found[name] = np.frombuffer(data, kind).reshape(accessor.count, -1)
+        assert view.byteOffset % 4 == 0 and accessor.normalized in (None, name == "COLOR_0")
+        if name == "POSITION":
+            assert accessor.min == g.means.amin(0).tolist() and accessor.max == g.means.amax(0).tolist()
+    assert set(found) == {
+        "POSITION", "COLOR_0", "_SIGMA_D", f"{KHR}:ROTATION", f"{KHR}:SCALE", f"{KHR}:OPACITY",
+        *(f"{KHR}:SH_DEGREE_{d}_COEF_{k}" for d in range(4) for k in range(2 * d + 1)),
+    }  # fmt: skip
+    np.testing.assert_allclose(found[f"{KHR}:SCALE"], g.scales, rtol=1e-6)
+    np.testing.assert_allclose(found[f"{KHR}:OPACITY"][:, 0], g.opacities, rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(found[f"{KHR}:ROTATION"], axis=1), 1, rtol=1e-6)
+    assert turned(torch.from_numpy(found[f"{KHR}:ROTATION"][:, [3, 0, 1, 2]].copy()), g.quats) < 1e-6
+    np.testing.assert_array_equal(found[f"{KHR}:SH_DEGREE_2_COEF_1"], g.shN[:, 4])
+    np.testing.assert_array_equal(found["_SIGMA_D"][:, 0], g.sigma_d)
+    np.testing.assert_allclose(found["COLOR_0"][:, :3] / 255, (0.5 + SH_C0 * g.sh0[:, 0]).clamp(0, 1), atol=2.1e-3)
+    # The node turns y down into glTF's y up: (x, y, z) becomes (-x, -y, z).
+    assert node.rotation == [0, 0, 1, 0] and node.translation == [-ORIGIN[0], -ORIGIN[1], ORIGIN[2]]
+
+
+def test_what_splat_transform_writes(tmp_path: Path) -> None:
+    """Its numbers are turned into glTF's axes, its node is not; read back they are the checkpoint's."""
+    g = gaussians(40, 3, 2)
+    save(tmp_path / "a.ply", g)
+    splat_transform(tmp_path / "a.ply", tmp_path / "b.glb")
+    again, card, _ = load_glb(tmp_path / "b.glb")
+    assert torch.equal(again.means, g.means) and torch.equal(again.sh0, g.sh0)
+    torch.testing.assert_close(covariances(again), covariances(g), atol=1e-7, rtol=1e-4)
+    torch.testing.assert_close(again.opacities, g.opacities, atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(again.shN, g.shN, atol=1e-6, rtol=1e-6)
+    assert not any(card.origin)
+
+
+def rewritten(path: Path, change: Any, cut: int = 0) -> Path:
+    """The file with its JSON changed."""
+    data = path.read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    gltf = json.loads(data[20 : 20 + size])
+    change(gltf)
+    text = json.dumps(gltf).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + size : len(data) - cut]
+    out = path.with_name("changed.glb")
+    out.write_bytes(struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda g: g["accessors"][0].update(count=1 << 60), "more than the file"),
+        (lambda g: g["accessors"][0].update(count=3), "has shape"),
+        (lambda g: g["accessors"][0].update(count=-1), "is no count"),
+        (lambda g: g["accessors"][0].update(count=1.5), "is no count"),
+        (lambda g: g["bufferViews"][0].update(byteStride=0), "more than the file"),
+        (lambda g: g["bufferViews"][0].update(byteOffset=1 << 70), "more than the file"),
+        (lambda g: g["buffers"][0].update(uri="../secret"), "in another file"),
+        (lambda g: g["accessors"][0].update(sparse={}), "sparse"),
+        (lambda g: g["meshes"][0]["primitives"][0].pop("extensions"), "so it is a mesh"),
+        (lambda g: g["meshes"][0]["primitives"][0]["extensions"][KHR].update(extensions={"x": {}}), "compressed"),
+        (lambda g: g["nodes"][0].update(rotation=[0, 1, 0, 0]), "scaled or turned"),
+        (lambda g: g["nodes"][0].update(scale=[2, 2, 2]), "scaled or turned"),
+        (lambda g: g["nodes"].append({"children": [0]}), "scaled or turned"),
+        (lambda g: g["asset"]["extras"]["clod_adapter"].update(format_version=2), "too new"),
+        (lambda g: g["asset"]["extras"]["clod_adapter"]["attenuation"].update(tau=7), "tau"),
+        (lambda g: g.pop("accessors"), "damaged"),
+    ],
+)
+def test_numbers_that_are_not_to_be_trusted(tmp_path: Path, change: Any, message: str) -> None:
+    write(tmp_path / "a.glb", model(0, 5))
+    with pytest.raises(ClodError, match=message):
+        read_glb(rewritten(tmp_path / "a.glb", change))
+
+
+def test_files_of_others(tmp_path: Path) -> None:
+    """Interleaved, in short integers, moved, without a description: sigma_d then has the default settings."""
+    write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
+    path = rewritten(tmp_path / "a.glb", lambda g: g["asset"].pop("extras"))
+    again, card, notes = load_glb(path)
+    assert card.origin == ORIGIN and not notes and again.sigma_d is not None
+    assert again.attenuation == AttenuationConfig()
+    rows = np.zeros(5, [("position", "<f4", 3), ("rotation", "<i2", 4), ("opacity", "u1"), ("pad", "u1", 3)])
+    rows["position"], rows["rotation"], rows["opacity"] = np.arange(15).reshape(5, 3), [0, 0, 0, 32767], 255
+
+    def interleave(g: dict[str, Any]) -> None:
+        names, accessors = g["meshes"][0]["primitives"][0]["attributes"], g["accessors"]
+        for name, offset, kind in (("POSITION", 0, 5126), (f"{KHR}:ROTATION", 12, 5122), (f"{KHR}:OPACITY", 20, 5121)):
+            where = {"bufferView": len(g["bufferViews"]), "byteOffset": offset, "componentType": kind}
+            accessors[names[name]].update(where, normalized=kind != 5126)
+        view = {"buffer": 0, "byteOffset": g["buffers"][0]["byteLength"], "byteLength": rows.nbytes, "byteStride": 24}
+        g["bufferViews"].append(view)
+        g["nodes"][0].pop("rotation")
+
+    data = rewritten(path, interleave).read_bytes()
+    size, start = struct.unpack_from("<I", data, 12)[0], 20
+    body = data[start + size + 8 :] + rows.tobytes()
+    head = struct.pack("<4sII", b"glTF", 2, start + size + 8 + len(body)) + data[12 : start + size]
+    path.write_bytes(head + struct.pack("<II", len(body), 0x004E4942) + body)
+    g = read_glb(path)
+    np.testing.assert_array_equal(g.means, rows["position"] * [-1, -1, 1])
+    assert g.quats.tolist() == [[1, 0, 0, 0]] * 5 and torch.isposinf(g.opacity_logits).all()
+
+
+def test_a_model_of_ours_that_was_moved(tmp_path: Path) -> None:
+    """Where its node stands now is where it is, whatever its description says."""
+    write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
+    to = [-1e6, 0.0, 0.0]
+    again, card, _ = load_glb(rewritten(tmp_path / "a.glb", lambda g: g["nodes"][0].update(translation=to)))
+    assert card.origin == (1e6, 0.0, 0.0) and again.attenuation == model().attenuation
+    near = {"translation": [1.0, -2.0, 4.0]}  # no origin: float32 has digits for it
+    moved, card, _ = load_glb(rewritten(tmp_path / "a.glb", lambda g: g["nodes"][0].update(near)))
+    assert not any(card.origin)
+    torch.testing.assert_close(moved.means, again.means + torch.tensor([-1.0, 2.0, 4.0]))
+
+
+def test_what_is_not_heeded_is_said(tmp_path: Path) -> None:
+    write(tmp_path / "a.glb", model(0, 5))
+
+    def change(g: dict[str, Any]) -> None:
+        g["meshes"].append({"primitives": [*g["meshes"][0]["primitives"], {"attributes": {"POSITION": 0}}]})
+        g["meshes"][0]["primitives"][0]["extensions"][KHR]["colorSpace"] = "lin_rec709_display"
+
+    colours, others = load_glb(rewritten(tmp_path / "a.glb", change)).notes
+    assert "'lin_rec709_display'" in colours and others.startswith("1 more primitives")
+
+
+def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ClodError, match="a scale is beyond"):
+        write(tmp_path / "a.glb", model().replace(log_scales=torch.full((40, 3), 90.0)))
+    monkeypatch.setitem(sys.modules, "pygltflib", None)
+    with pytest.raises(ClodError, match=r"pip install 'clod-adapter\[export\]'"):
+        write(tmp_path / "a.glb", model())
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "a.glb").write_bytes(b"ply\n")
+    with pytest.raises(ClodError, match="no glTF binary"):
+        read_glb(tmp_path / "a.glb")
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject) -> None:
+    write(tmp_path / "a.glb", model(0, 5), calibration=CALIBRATION)
+    path = tmp_path / "damaged.glb"
+    path.write_bytes(damaged((tmp_path / "a.glb").read_bytes(), data))
+    try:
+        assert isinstance(read_glb(path), Gaussians)
+    except ClodError as error:
+        assert str(error).isprintable()

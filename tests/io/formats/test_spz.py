@@ -1,0 +1,201 @@
+from __future__ import annotations
+
+import gzip
+import struct
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.checkpoint import load
+from clod_adapter.io.formats.spz_reader import load_spz, read_spz
+from clod_adapter.io.writers import write
+from formats import ABOUT, ATTENUATION, CALIBRATION, ORIGIN, covariances, damaged, model, splat_transform, turned
+
+
+def close(g: Gaussians, again: Gaussians, harmonics: float = 2.01 / 128) -> None:
+    """To the rounding of the format."""
+    assert (again.means - g.means).abs().max() <= 2.0**-20
+    assert (again.opacities - g.opacities).abs().max() <= 0.501 / 255
+    assert (again.sh0 - g.sh0).abs().max() <= 0.51 / (0.15 * 255)
+    assert (again.log_scales - g.log_scales).abs().max() <= 0.5001 / 16
+    bands = again.shN.shape[1]
+    assert bands == min(g.shN.shape[1], 15)
+    error = (again.shN - g.shN[:, :bands].clamp(-1, 127 / 128)).abs()
+    assert not bands or error.max() <= harmonics
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_the_same_again_to_its_rounding(tmp_path: Path, degree: int) -> None:
+    g = model(degree)
+    notes = write(tmp_path / "a.spz", g, ABOUT, origin=ORIGIN, calibration=CALIBRATION)
+    assert "rounded" in notes[0] and ("above degree 3" in " ".join(notes)) == (degree == 4)
+    again, card, doubts = load_spz(tmp_path / "a.spz")
+    close(g, again)
+    assert turned(again.quats, g.quats) < 5e-3
+    assert (card.origin, card.about, card.calibration, doubts) == (ORIGIN, ABOUT, CALIBRATION, ())
+    assert again.attenuation == ATTENUATION and again.sigma_d is not None and g.sigma_d is not None
+    assert again.sigma_d[:2].tolist() == [65504, 0] and again.sigma_d[3] == 65504
+    error = (again.sigma_d - g.sigma_d).abs() / g.sigma_d
+    assert error[4:].max() <= 2.0**-11 and error[2] < 1e-3
+
+
+@pytest.mark.parametrize("typical", [250.0, 40_000.0])
+@pytest.mark.parametrize("known", [True, False])
+def test_a_dial_of_large_units_fits(tmp_path: Path, typical: float, known: bool) -> None:
+    generator = torch.Generator().manual_seed(0)
+    g = model(0)
+    assert g.sigma_d is not None
+    sigma = typical * torch.logspace(-1, 1.5, len(g))
+    means = typical * torch.nn.functional.normalize(torch.randn(len(g), 3, generator=generator))
+    config = replace(ATTENUATION, reference_distance=typical if known else 0.0)
+    write(tmp_path / "a.spz", g.replace(sigma_d=sigma, means=means, attenuation=config))
+    again, card, _ = load_spz(tmp_path / "a.spz")
+    assert card.attenuation == again.attenuation is not None and again.attenuation.scene_distance == 1
+    assert again.attenuation.eps == config.eps and (not known or again.attenuation.reference_distance == typical)
+    torch.testing.assert_close(again.sigma_d, sigma, rtol=2.0**-11, atol=0)
+
+
+def test_the_header_and_the_record(tmp_path: Path) -> None:
+    g = model(1)
+    write(tmp_path / "a.spz", g)
+    data = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    magic, version, count, degree, bits, flags, reserved = struct.unpack_from("<IIIBBBB", data)
+    assert (data[:4], version, count, degree, flags, reserved) == (b"NGSP", 3, 40, 1, 2, 0)
+    end = 16 + 40 * (9 + 1 + 3 + 3 + 4 + 9)
+    assert struct.unpack_from("<III", data, end) == (0xADBE0003, 4, 6)  # right, down, forward
+    kind, size, text = struct.unpack_from("<III", data, end + 12)
+    assert kind == 0x434C0001 and len(data) == end + 20 + size and size == 4 + text + 2 * 40
+    write(tmp_path / "b.spz", g.replace(sigma_d=None, attenuation=None))
+    plain = gzip.decompress((tmp_path / "b.spz").read_bytes())
+    assert plain == data[: end + 12]
+
+
+@pytest.mark.parametrize(("axes", "signs"), [(6, [1, 1, 1]), (4, [1, -1, -1]), (7, [-1, -1, 1])])
+def test_other_axes_are_turned(tmp_path: Path, axes: int, signs: list[int]) -> None:
+    write(tmp_path / "a.spz", model(1))
+    data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
+    struct.pack_into("<I", data, 16 + 40 * 29 + 8, axes)
+    (tmp_path / "b.spz").write_bytes(gzip.compress(data))
+    assert torch.equal(read_spz(tmp_path / "b.spz").means, read_spz(tmp_path / "a.spz").means * torch.tensor(signs))
+    struct.pack_into("<I", data, 16 + 40 * 29 + 8, 16)
+    (tmp_path / "b.spz").write_bytes(gzip.compress(data))
+    with pytest.raises(ClodError, match="axes are of kind 16"):
+        read_spz(tmp_path / "b.spz")
+
+
+def test_an_independent_reader(tmp_path: Path) -> None:
+    gsply = pytest.importorskip("gsply.spz", reason="gsply is not installed")
+    g = model(3)
+    write(tmp_path / "a.spz", g)
+    found, ours = gsply.read_spz(tmp_path / "a.spz"), read_spz(tmp_path / "a.spz")
+    np.testing.assert_allclose(found.means, ours.means, atol=1e-6)
+    np.testing.assert_allclose(found.scales, ours.log_scales, atol=1e-6)
+    np.testing.assert_allclose(found.sh0, ours.sh0[:, 0], atol=1e-5)
+    assert turned(torch.from_numpy(found.quats), ours.quats) < 1e-3
+    np.testing.assert_allclose(found.shN, ours.shN, atol=1e-6)
+    opacities = 1 / (1 + np.exp(-found.opacities.ravel().astype(np.float64)))
+    np.testing.assert_allclose(opacities, ours.opacities, atol=1.1e-3)
+
+
+def test_splat_transform_reads_it(tmp_path: Path) -> None:
+    g = model(3)
+    write(tmp_path / "a.spz", g)
+    splat_transform(tmp_path / "a.spz", tmp_path / "b.ply")
+    ours, theirs = read_spz(tmp_path / "a.spz"), load(tmp_path / "b.ply").gaussians
+    torch.testing.assert_close(theirs.means, ours.means, atol=1e-5, rtol=0)
+    torch.testing.assert_close(covariances(theirs), covariances(ours), atol=1e-6, rtol=1e-3)
+    torch.testing.assert_close(theirs.opacities, ours.opacities, atol=1.1e-3, rtol=0)
+    torch.testing.assert_close(theirs.sh0, ours.sh0, atol=1e-5, rtol=0)
+    torch.testing.assert_close(theirs.shN, ours.shN, atol=1e-5, rtol=0)
+
+
+def test_what_splat_transform_writes(tmp_path: Path) -> None:
+    g = model(3).select(torch.arange(4, 40))  # without the rotations of odd length, on which it fails
+    write(tmp_path / "a.ply", g)
+    splat_transform("--spz-version", "3", tmp_path / "a.ply", tmp_path / "b.spz")
+    again, card, notes = load_spz(tmp_path / "b.spz")
+    assert again.sigma_d is None and (card.version, notes) == ("", ())
+    assert (again.means - g.means).abs().max() <= 2.0**-13
+    close(g.replace(means=again.means), again, harmonics=8.6 / 128)
+    assert turned(again.quats, g.quats) < 5e-3
+    splat_transform(tmp_path / "a.ply", tmp_path / "c.spz")
+    with pytest.raises(ClodError, match="version 4; convert it"):
+        read_spz(tmp_path / "c.spz")
+
+
+def test_positions_use_the_bits_they_have(tmp_path: Path) -> None:
+    g = model(0)
+    for factor, step in ((1e-3, 2.0**-20), (1.0, 2.0**-20), (1e3, 2.0**-10), (5e5, 1.0)):
+        scaled = g.replace(means=g.means * factor)
+        write(tmp_path / "a.spz", scaled)
+        assert (read_spz(tmp_path / "a.spz").means - scaled.means).abs().max() <= step
+    with pytest.raises(ClodError, match="within 4,000,000 of 0"):
+        write(tmp_path / "b.spz", g.replace(means=g.means * 1e7))
+    assert not (tmp_path / "b.spz").exists()
+
+
+def test_a_few_far_ones_do_not_cost_the_rest_their_digits(tmp_path: Path) -> None:
+    """They are moved, and look the same from 0: direction, size and fading."""
+    g = model(0, 400)
+    assert g.sigma_d is not None
+    means, scales = g.means.clone(), g.log_scales.clone()
+    means[9], scales[9] = torch.tensor([3e5, -1e5, 2e3]), 9.0
+    notes = write(tmp_path / "a.spz", g.replace(means=means, log_scales=scales))
+    again = read_spz(tmp_path / "a.spz")
+    assert again.sigma_d is not None and "the 1 farthest are moved to 64 from 0" in notes[0]
+    others = torch.arange(400) != 9
+    assert (again.means - means)[others].abs().max() <= 2.0**-17
+    factor = 64 / 3e5
+    torch.testing.assert_close(again.means[9], means[9] * factor, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(again.log_scales[9], scales[9] + np.log(factor), atol=0.04, rtol=0)
+    torch.testing.assert_close(again.sigma_d[9], g.sigma_d[9] * factor, atol=0, rtol=1e-3)
+
+
+def test_version_2(tmp_path: Path) -> None:
+    """Rotations in three bytes: x, y, z of unit length with w >= 0."""
+    rows = struct.pack("<IIIBBBB", 0x5053474E, 2, 2, 0, 12, 0, 0) + bytes(18) + bytes([0, 255]) + bytes(12)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(rows + bytes([128, 128, 128, 255, 128, 128])))
+    g = read_spz(tmp_path / "a.spz")
+    assert turned(g.quats, torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0]])) < 0.02
+    assert g.opacity_logits.isfinite().all()
+
+
+def test_bombs_and_lies(tmp_path: Path) -> None:
+    path = tmp_path / "a.spz"
+    for text, message in (
+        (gzip.compress(bytes(1 << 26), mtime=0), "unpacks to more"),
+        (gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 9_999_999, 3, 12, 0, 0), mtime=0), "truncated"),
+        (
+            gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 1 << 31, 3, 12, 0, 0), mtime=0),
+            "no SPZ file of version",
+        ),
+        (gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 0, 3, 12, 0, 0), mtime=0), "no Gaussians"),
+        (gzip.compress(b"short", mtime=0), "truncated"),
+        (b"NGSP" + bytes(40), "version 4"),
+        (b"", "is no SPZ file"),
+    ):
+        path.write_bytes(text)
+        with pytest.raises(ClodError, match=message):
+            read_spz(path)
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data(), st.booleans())
+def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject, inside: bool) -> None:
+    """Of the file, or of what is compressed in it."""
+    write(tmp_path / "a.spz", model(0, 5), calibration=CALIBRATION)
+    whole = (tmp_path / "a.spz").read_bytes()
+    path = tmp_path / "damaged.spz"
+    path.write_bytes(gzip.compress(damaged(zlib.decompress(whole, 31), data)) if inside else damaged(whole, data))
+    try:
+        assert isinstance(read_spz(path), Gaussians)
+    except ClodError as error:
+        assert str(error).isprintable()

@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+import os
+import time
+import tracemalloc
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData, PlyElement
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.checkpoint import load
+from clod_adapter.io.ply.body import read_element
+from clod_adapter.io.ply.columns import inria_dtype
+from clod_adapter.io.ply.header import read_head
+
+FORMATS = ("binary_little_endian", "binary_big_endian", "ascii")
+
+
+def rows(count: int, seed: int = 0) -> np.ndarray:
+    vertex = np.zeros(count, [*inria_dtype(0).descr, ("label", "u1"), ("time", "f8")])
+    rng = np.random.default_rng(seed)
+    for name in vertex.dtype.names:
+        vertex[name] = rng.integers(0, 99, count) if name == "label" else rng.normal(size=count)
+    return vertex
+
+
+def header(form: str, count: object, before: str = "", after: str = "") -> bytes:
+    properties = "".join(f"property float {name}\n" for name in inria_dtype(0).names or ())
+    return f"ply\nformat {form} 1.0\n{before}element vertex {count}\n{properties}{after}end_header\n".encode()
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("count", [1 << 31, 1 << 62, (1 << 64) - 1, 10])
+def test_a_header_that_claims_too_much_allocates_nothing(tmp_path: Path, form: str, count: int) -> None:
+    path = tmp_path / "in.ply"
+    path.write_bytes(header(form, count) + b"0 " * 30)
+    read_head(path)  # so that nothing is imported while it is measured
+    tracemalloc.start()
+    began = time.perf_counter()
+    try:
+        with pytest.raises(ClodError, match=rf"in.ply: is truncated.*claims {count} of vertex.*the file has"):
+            load(path)
+        assert tracemalloc.get_traced_memory()[1] < 3 << 20 and time.perf_counter() - began < 1
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("count", [-1, -(1 << 31), "nan", "0x10", "1_0", "9" * 21, "9" * 5000, "2.0", "+3", ""])
+def test_counts_that_are_none(tmp_path: Path, count: object) -> None:
+    (tmp_path / "in.ply").write_bytes(header("binary_little_endian", count) + bytes(300))
+    with pytest.raises(ClodError, match="header is damaged"):
+        load(tmp_path / "in.ply")
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize(
+    "other", ["property uchar a\n", "", "property list uchar int a\n"], ids=["scalar", "nothing", "list"]
+)
+def test_other_elements_that_claim_too_much(tmp_path: Path, form: str, other: str) -> None:
+    body = "".join("0 " * 17 + "\n").encode() if form == "ascii" else bytes(17 * 4)
+    for before, after in ((f"element a {1 << 40}\n{other}", ""), ("", f"element a {1 << 40}\n{other}")):
+        (tmp_path / "in.ply").write_bytes(header(form, 1, before, after) + body)
+        began = time.perf_counter()
+        with pytest.raises(ClodError):
+            load(tmp_path / "in.ply")
+        assert time.perf_counter() - began < 1
+
+
+def test_a_header_without_an_end_is_not_searched_for_ever(tmp_path: Path) -> None:
+    (tmp_path / "in.ply").write_bytes(b"ply\nformat ascii 1.0\n" + b"comment x\n" * 200_000 + b"end_header\n")
+    with pytest.raises(ClodError, match="no end"):
+        load(tmp_path / "in.ply")
+
+
+def test_control_characters_do_not_reach_the_terminal(tmp_path: Path) -> None:
+    (tmp_path / "in.ply").write_bytes(header("ascii", 0).replace(b"element", b"comment \x1b[2J\nelement"))
+    with pytest.raises(ClodError, match="not printable ASCII"):
+        load(tmp_path / "in.ply")
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    for name in ("in.ply", "in.pt"):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(ClodError, match="not a regular file"):
+            load(tmp_path / name)
+
+
+@pytest.mark.parametrize("order", ["<", ">", "ascii"])
+def test_rows_are_those_of_plyfile(tmp_path: Path, order: str) -> None:
+    vertex = rows(50)
+    vertex["x"][:3] = np.nan, np.inf, -np.inf
+    camera = PlyElement.describe(np.zeros(3, [("fx", "f8"), ("n", "i2")]), "intrinsic")
+    face = PlyElement.describe(np.array([([0, 1],)], [("corners", "O")]), "face", val_types={"corners": "i4"})
+    text = order == "ascii"
+    elements = [camera, PlyElement.describe(vertex, "vertex"), face]
+    PlyData(elements, text=text, byte_order="=" if text else order).write(str(tmp_path / "in.ply"))
+    found = read_element(tmp_path / "in.ply", read_head(tmp_path / "in.ply"))
+    expected = PlyData.read(str(tmp_path / "in.ply"))["vertex"].data
+    assert found.dtype == vertex.dtype and found.dtype.isnative and found.flags.writeable
+    for name in vertex.dtype.names:
+        np.testing.assert_array_equal(found[name], expected[name])
+
+
+def test_lists_before_the_vertices_are_refused(tmp_path: Path) -> None:
+    before = "element face 1\nproperty list uchar int a\n"
+    (tmp_path / "in.ply").write_bytes(header("binary_little_endian", 1, before) + bytes(100))
+    with pytest.raises(ClodError, match="face has lists and stands before"):
+        load(tmp_path / "in.ply")
+
+
+@pytest.mark.parametrize("bad", ["1.0 " * 16, "1.0 " * 18, "1.0 " * 16 + "x", "1.0 " * 16 + "\u0661"])
+def test_ascii_rows_that_are_none(tmp_path: Path, bad: str) -> None:
+    good = "1.0 " * 17 + "\n"
+    (tmp_path / "in.ply").write_bytes(header("ascii", 3) + (good + bad + "\n" + good).encode())
+    with pytest.raises(ClodError, match="in.ply: damaged or truncated"):
+        load(tmp_path / "in.ply")
+
+
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+def test_values_at_the_ends_warn_of_nothing(tmp_path: Path, kind: str) -> None:
+    vertex = np.zeros(20, [(name, kind) for name in inria_dtype(0).names or ()])
+    vertex["rot_0"], vertex["opacity"] = 1, np.linspace(-3, 3, 20)
+    vertex["x"] = np.linspace(-1, 1, 20)
+    vertex["x"][:2] = -np.finfo(kind).max, np.finfo(kind).max
+    for name in ("x", "opacity", "scale_0"):  # NaNs that signal
+        vertex[name].view("u4" if kind == "f4" else "u8")[3] = 0x7F800001 if kind == "f4" else 0x7FF0000000000001
+    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(tmp_path / "in.ply"))
+    with warnings.catch_warnings(action="error"):
+        loaded = load(tmp_path / "in.ply", activated="none")
+    assert 0 < len(loaded.gaussians) < 20

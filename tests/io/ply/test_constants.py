@@ -1,0 +1,145 @@
+"""Settings as columns: what other tools leave of a PLY is read as it was written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plyfile import PlyData, PlyElement
+
+from clod_adapter.adapter import attach
+from clod_adapter.attenuation import attenuate_seen
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.inspection.report import inspect
+from clod_adapter.io.checkpoint import load, save
+from clod_adapter.io.ply.constants import dial_constants, dial_settings, simplest
+from formats import splat_transform
+from scenes import camera, gaussians
+
+USUAL = AttenuationConfig(reference_distance=3.0)
+PAPER = AttenuationConfig(tau=1 / 255, cut="hard", normalizer="max", reference_distance=3.0)
+EACH = {
+    "usual": USUAL, "tau": replace(USUAL, tau=0.013), "faint": replace(USUAL, tau=1.23457e-05),
+    "large tau": replace(USUAL, tau=0.4, max_sv=2.0), "hard": replace(USUAL, cut="hard"), "paper": PAPER,
+    "eps": replace(USUAL, eps=1e-6), "no eps": replace(USUAL, eps=0.0),
+    "quantile": replace(USUAL, normalizer="quantile"), "median": replace(USUAL, normalizer="quantile", quantile=0.5),
+}  # fmt: skip
+
+
+def model(config: AttenuationConfig) -> Gaussians:
+    some = gaussians(400, 1, 2)
+    return attach(some, torch.logspace(-1, 1.3, 400), config)
+
+
+def rewritten(path: Path) -> Path:
+    """The file as plyfile writes it without its comments."""
+    rows = PlyData.read(str(path))["vertex"].data
+    found = path.with_name("rewritten.ply")
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(found))
+    return found
+
+
+def same_dial(found: Gaussians, g: Gaussians) -> None:
+    """Bit for bit what is kept and drawn, at three dial values."""
+    assert found.sigma_d is not None and g.sigma_d is not None and found.attenuation and g.attenuation
+    for s in (1.0, 1.7, 3.1):
+        want, got = (
+            attenuate_seen(x.means, x.opacity_logits, x.sigma_d, camera(), s, x.attenuation)  # type: ignore[arg-type]
+            for x in (g, found)
+        )
+        assert torch.equal(want.keep, got.keep) and torch.equal(want.drawn, got.drawn)
+        assert 0 < want.keep.sum() < len(g) or s > 1 / g.attenuation.tau
+
+
+@pytest.mark.parametrize("name", EACH)
+def test_the_dial_survives_a_rewrite_without_comments(tmp_path: Path, name: str) -> None:
+    g = model(EACH[name])
+    save(tmp_path / "a.ply", g)
+    assert load(tmp_path / "a.ply").gaussians.attenuation == EACH[name]
+    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    assert rows.dtype.names[-1] == "sigma_d" and (name == "usual") == ("clod_" not in " ".join(rows.dtype.names))
+    same_dial(load(rewritten(tmp_path / "a.ply")).gaussians, g)
+
+
+@pytest.mark.parametrize("name", ["usual", "tau", "paper"])
+def test_the_dial_survives_splat_transform(tmp_path: Path, name: str) -> None:
+    g = model(EACH[name])
+    save(tmp_path / "a.ply", g)
+    splat_transform(tmp_path / "a.ply", tmp_path / "b.ply")
+    found = load(tmp_path / "b.ply")
+    assert not any("clod_adapter" in comment for comment in found.comments)
+    same_dial(found.gaussians, g)
+
+
+def test_comments_win_and_outputs_have_their_own_columns(tmp_path: Path) -> None:
+    exact = replace(USUAL, tau=0.0123456789012345)
+    save(tmp_path / "a.ply", model(exact))
+    base = load(tmp_path / "a.ply")
+    assert base.gaussians.attenuation == exact and base.notes == ()
+    save(tmp_path / "b.ply", base.gaussians.replace(attenuation=replace(USUAL, cut="hard")), base)
+    names = PlyData.read(str(tmp_path / "b.ply"))["vertex"].data.dtype.names
+    assert names[-2:] == ("clod_hard_cut", "sigma_d") and "clod_tau" not in names
+    assert load(rewritten(tmp_path / "b.ply")).gaussians.attenuation == AttenuationConfig(cut="hard")
+    save(tmp_path / "c.ply", base.gaussians.replace(sigma_d=None, attenuation=None), base)
+    assert "clod_tau" not in PlyData.read(str(tmp_path / "c.ply"))["vertex"].data.dtype.names
+
+
+def test_a_column_that_varies_is_refused(tmp_path: Path) -> None:
+    save(tmp_path / "a.ply", model(EACH["tau"]))
+    rows = np.array(PlyData.read(str(tmp_path / "a.ply"))["vertex"].data)
+    rows["clod_tau"][3] = 0.5
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(tmp_path / "b.ply"))
+    for read in (load, inspect):
+        with pytest.raises(ClodError, match="property clod_tau must be one value for all rows and has several"):
+            read(tmp_path / "b.ply")
+
+
+def test_a_column_that_is_no_setting_is_refused(tmp_path: Path) -> None:
+    save(tmp_path / "a.ply", model(EACH["tau"]))
+    rows = np.array(PlyData.read(str(tmp_path / "a.ply"))["vertex"].data)
+    rows["clod_tau"] = np.nan
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(tmp_path / "b.ply"))
+    with pytest.raises(ClodError, match="clod_tau"):
+        load(tmp_path / "b.ply")
+
+
+def test_inspecting_reads_the_columns(tmp_path: Path) -> None:
+    save(tmp_path / "a.ply", model(PAPER))
+    found = inspect(rewritten(tmp_path / "a.ply"))
+    assert found.splat is not None and found.splat.dial is not None and found.splat.extra == ()
+    assert found.splat.dial.attenuation == replace(PAPER, reference_distance=0.0)
+    assert any("read from columns: tau, cut, normalizer" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("name", EACH)
+def test_columns_are_the_settings(name: str) -> None:
+    found = dial_settings({key: simplest(np.float32(value)) for key, value in dial_constants(EACH[name]).items()})
+    config = EACH[name]
+    for field in ("tau", "cut", "eps", "normalizer"):
+        assert found.get(field, getattr(AttenuationConfig(), field)) == getattr(config, field)
+    assert config.normalizer != "quantile" or found["quantile"] == config.quantile
+
+
+@settings(max_examples=200)
+@given(st.integers(1, 999_999), st.integers(-12, 4))
+def test_six_digits_are_read_as_written(digits: int, power: int) -> None:
+    value = float(f"{digits}e{power}")
+    assert simplest(np.float32(value)) == value
+
+
+@settings(max_examples=200)
+@given(st.floats(2**-90, 2**90, width=32))
+def test_what_is_read_is_the_float32_that_was_stored(value: float) -> None:
+    assert np.float32(simplest(np.float32(value))) == np.float32(value)
+
+
+def test_whole_fractions_are_read_as_written() -> None:
+    for n in (3, 7, 17, 255, 1023, 65535):
+        assert simplest(np.float32(1 / n)) == 1 / n

@@ -1,0 +1,183 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+
+from clod_adapter.adapter import attach, extract
+from clod_adapter.config import FILTERS, AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.io.checkpoint import load, save
+from clod_adapter.io.ply.columns import inria_dtype
+from clod_adapter.render import render
+from scenes import camera, in_front
+
+SCALES = ("scale_0", "scale_1", "scale_2")
+
+
+def inria(count: int, extra: tuple[str, ...] = (), kind: str = "f4", seed: int = 0) -> np.ndarray:
+    """Rows as a trainer leaves them: logits on both sides of 0, small scales."""
+    vertex = np.zeros(count, [(name, kind) for name in (*(inria_dtype(0).names or ()), *extra)])
+    rng = np.random.default_rng(seed)
+    for name in vertex.dtype.names:
+        vertex[name] = rng.normal(size=count)
+    vertex["opacity"] = rng.normal(size=count) * 3
+    for name in SCALES:
+        vertex[name] = rng.normal(size=count) * 0.7 - 3
+    return vertex
+
+
+def write(path: Path, vertex: np.ndarray, comments: tuple[str, ...] = ()) -> Path:
+    PlyData([PlyElement.describe(vertex, "vertex", comments=list(comments))], byte_order="<").write(str(path))
+    return path
+
+
+def activate(vertex: np.ndarray, *what: str) -> np.ndarray:
+    vertex = vertex.copy()
+    if "opacity" in what:
+        vertex["opacity"] = 1 / (1 + np.exp(-vertex["opacity"].astype(np.float64)))
+    for name in SCALES if "scales" in what else ():
+        vertex[name] = np.exp(vertex[name].astype(np.float64))
+    return vertex
+
+
+@pytest.mark.parametrize("what", [("opacity",), ("scales",), ("opacity", "scales")], ids="+".join)
+def test_activated_values_are_asked_about_and_taken_as_said(tmp_path: Path, what: tuple[str, ...]) -> None:
+    vertex = inria(40)
+    plain = load(write(tmp_path / "plain.ply", vertex))
+    assert plain.notes == ()
+    path = write(tmp_path / "in.ply", activate(vertex, *what))
+    choice = "both" if len(what) == 2 else what[0]
+    with pytest.raises(ClodError, match=rf"in.ply: has {what[0]} from .* --activated {choice}, and .* none") as caught:
+        load(path)
+    assert all(f"{name} from" in str(caught.value) for name in what)
+    base = load(path, activated=choice)
+    torch.testing.assert_close(base.gaussians.opacity_logits, plain.gaussians.opacity_logits, atol=1e-3, rtol=1e-4)
+    torch.testing.assert_close(base.gaussians.log_scales, plain.gaussians.log_scales, atol=1e-5, rtol=1e-5)
+    assert len(base.notes) == len(what) and base.comments == base.notes
+    unchanged = load(path, activated="none")
+    np.testing.assert_array_equal(unchanged.gaussians.opacity_logits, activate(vertex, *what)["opacity"])
+    assert unchanged.notes == () and base.fingerprint == f"{choice}:{unchanged.fingerprint}"
+
+
+def test_usual_values_are_not_in_question(tmp_path: Path) -> None:
+    few = activate(inria(9), "opacity", "scales")
+    same = inria(40)
+    same["opacity"], same["scale_0"], same["scale_1"], same["scale_2"] = 0.5, 0.5, 0.5, 0.5
+    pruned = inria(200)
+    pruned = pruned[pruned["opacity"] > 0]
+    for vertex in (inria(40), few, same, pruned):
+        for activated in (None, "both", "none"):
+            loaded = load(write(tmp_path / "in.ply", vertex), activated=activated)
+            np.testing.assert_array_equal(loaded.gaussians.opacity_logits, vertex["opacity"])
+            assert loaded.notes == () and ":" not in loaded.fingerprint
+
+
+def test_opacities_at_the_ends(tmp_path: Path) -> None:
+    vertex = activate(inria(40), "opacity")
+    vertex["opacity"][:5] = 0, 1, 1.5, -0.05, np.nan  # Taming-3DGS activates by the absolute value
+    base = load(write(tmp_path / "in.ply", vertex), activated="opacity")
+    found = base.gaussians.opacities[:4]
+    assert len(base.gaussians) == 39 and base.gaussians.opacity_logits.isfinite().all()
+    torch.testing.assert_close(found, torch.tensor([0, 1, 1, 0.05]), atol=1e-7, rtol=1e-5)
+    assert "1 above 1 taken as 1" in base.notes[0]
+    with pytest.raises(ClodError, match="activated is 'yes'.*none, opacity, scales, both"):
+        load(tmp_path / "in.ply", activated="yes")  # type: ignore[arg-type]
+    vertex["opacity"] = 1
+    with pytest.raises(ClodError, match="opacity from 1 to 1"):
+        load(write(tmp_path / "in.ply", vertex))
+
+
+def test_what_this_package_wrote_is_not_in_question(tmp_path: Path) -> None:
+    """An opaque result, as every logit may be above 0 after tuning, and its adapter, bit for bit."""
+    path = write(tmp_path / "in.ply", activate(inria(40), "opacity", "scales"))
+    base = load(path, activated="both")
+    g = base.gaussians
+    tuned = attach(g.replace(opacity_logits=g.opacity_logits.abs()), torch.rand(40), AttenuationConfig())
+    adapter = extract(g, tuned, fingerprint=base.fingerprint, config={})
+    save(tmp_path / "out.ply", adapter.apply(g), base)
+    again = load(path, activated="both")
+    save(tmp_path / "again.ply", adapter.apply(again.gaussians, again.fingerprint), again)
+    assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "again.ply").read_bytes()
+    for activated in (None, "both"):
+        out = load(tmp_path / "out.ply", activated=activated)
+        torch.testing.assert_close(out.gaussians.opacity_logits, g.opacity_logits.abs(), atol=2e-2, rtol=1e-3)
+        assert out.comments[:2] == base.notes
+    with pytest.raises(ClodError, match="different base.*trained on both:"):
+        other = load(path, activated="none")
+        adapter.apply(other.gaussians, other.fingerprint)
+
+
+def mip(count: int = 40, kind: str = "f4") -> np.ndarray:
+    vertex = inria(count, ("filter_3D",), kind)
+    vertex["filter_3D"] = np.exp(np.random.default_rng(1).normal(size=count) - 2.5)
+    return vertex
+
+
+def fused(vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Scales and opacities as Mip-Splatting's renderer uses them, by its own formula, in float64."""
+    size = np.exp(np.stack([vertex[name].astype(np.float64) for name in SCALES], 1))
+    wide = size**2 + vertex["filter_3D"].astype(np.float64)[:, None] ** 2
+    opacity = 1 / (1 + np.exp(-vertex["opacity"].astype(np.float64)))
+    return np.sqrt(wide), opacity * np.sqrt((size**2).prod(1) / wide.prod(1))
+
+
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+def test_mip_splatting_is_fused(tmp_path: Path, kind: str) -> None:
+    vertex = mip(kind=kind)
+    base = load(write(tmp_path / "in.ply", vertex))
+    scales, opacities = fused(vertex)
+    np.testing.assert_allclose(base.gaussians.scales, scales, rtol=2e-6)
+    np.testing.assert_allclose(base.gaussians.opacities, opacities, rtol=2e-6)
+    assert base.comments == base.notes and "filter_3D is fused" in base.notes[0]
+    sigma_d = torch.rand(len(vertex))
+    save(tmp_path / "out.ply", attach(base.gaussians, sigma_d, AttenuationConfig()), base)
+    out = load(tmp_path / "out.ply")
+    assert "filter_3D" not in out.vertex.dtype.names and out.notes == () and base.notes[0] in out.comments
+    assert torch.equal(out.gaussians.log_scales, base.gaussians.log_scales)
+    assert torch.equal(out.gaussians.opacity_logits, base.gaussians.opacity_logits)
+    for name in inria_dtype(0).names or ():
+        if name not in (*SCALES, "opacity"):
+            np.testing.assert_array_equal(out.vertex[name], vertex[name])
+
+
+def test_mip_splatting_at_the_ends(tmp_path: Path) -> None:
+    vertex = mip()
+    vertex["filter_3D"][:9] = 0, 1e30, 1e-30, 0.1, 0.1, 0.1, np.nan, np.inf, -0.1
+    vertex["opacity"][3:6] = np.inf, 60, -90
+    vertex["scale_0"][4], vertex["scale_1"][5] = -80, -200
+    base = load(write(tmp_path / "in.ply", vertex))
+    g = base.gaussians
+    assert len(g) == len(vertex) - 2  # those with a filter that is not finite
+    assert g.opacity_logits.isfinite().all() and g.log_scales.isfinite().all()
+    assert g.opacity_logits[0] == vertex["opacity"][0] and g.opacity_logits[2] == vertex["opacity"][2]
+    scales, opacities = fused(vertex)
+    np.testing.assert_allclose(g.scales[3], scales[3], rtol=2e-6)
+    np.testing.assert_allclose(g.opacities[3], opacities[3], rtol=2e-6)
+    # In logs, where the opacity itself would be 0: a Gaussian thinner than float64 can square.
+    log = -90 - sum(np.log(scales[5]) - np.array([vertex[name][5] for name in SCALES], np.float64))
+    np.testing.assert_allclose(g.opacity_logits[5], log, rtol=1e-6)
+
+
+def test_the_picture_is_that_of_the_filtered_gaussians(tmp_path: Path) -> None:
+    """Against the same Gaussians with the filter written into them by hand; without it, it is another picture."""
+    view, vertex = camera(), mip(150)
+    depth = np.random.default_rng(3).uniform([-1, -0.8, 2], [1, 0.8, 4], (150, 3)).astype(np.float32)
+    places = in_front(view, torch.from_numpy(depth)).numpy()
+    vertex["x"], vertex["y"], vertex["z"] = places.T
+    loaded = load(write(tmp_path / "mip.ply", vertex)).gaussians
+    plain = inria(150)
+    for name in plain.dtype.names:
+        plain[name] = vertex[name]
+    unfiltered = load(write(tmp_path / "plain.ply", plain)).gaussians
+    scales, opacities = fused(vertex)
+    filtered = unfiltered.replace(
+        log_scales=torch.from_numpy(np.log(scales)).float(),
+        opacity_logits=torch.from_numpy(np.log(opacities / (1 - opacities))).float(), screen_filter=FILTERS["mip"],
+    )  # fmt: skip
+    expected = render(filtered, view).image
+    torch.testing.assert_close(render(loaded, view).image, expected, atol=2e-5, rtol=0)
+    assert (render(unfiltered, view).image - expected).abs().mean() > 0.02

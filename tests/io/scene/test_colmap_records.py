@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.scene.colmap_model import read_model
+from clod_adapter.io.scene.colmap_records import check_name, check_records
+from clod_adapter.io.scene.load import load_scene
+
+pycolmap = pytest.importorskip("pycolmap")  # which alone writes rigs, frames and text
+FORMS = ("binary", "text")
+
+
+def model(folder: Path, form: str, names: tuple[str, ...] = ("a.png", "sub/b.png")) -> Path:
+    """Images of one camera, and points that they see."""
+    reconstruction = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model="PINHOLE", params=[9, 9, 4, 3], camera_id=1, width=8, height=6)
+    reconstruction.add_camera_with_trivial_rig(camera)
+    for number, name in enumerate(names, start=1):
+        keypoints = [pycolmap.Point2D(np.array([k, number], float)) for k in range(2)]
+        image = pycolmap.Image(name=name, camera_id=1, image_id=number, points2D=keypoints)
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    for k in range(2):
+        track = pycolmap.Track([pycolmap.TrackElement(number, k) for number in range(1, len(names) + 1)])
+        reconstruction.add_point3D(np.array([k, 1, 5], float), track, np.zeros(3, np.uint8))
+    target = folder / "sparse" / "0"
+    target.mkdir(parents=True, exist_ok=True)
+    getattr(reconstruction, f"write_{form}")(str(target))
+    return target
+
+
+@settings(deadline=None, max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data(), st.sampled_from(FORMS), st.booleans())
+def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject, form: str, rigs: bool) -> None:
+    whole = model(tmp_path / form, form)
+    damaged = tmp_path / "damaged"
+    shutil.rmtree(damaged, ignore_errors=True)
+    shutil.copytree(whole, damaged)
+    for path in sorted(damaged.iterdir()):
+        if not rigs and path.stem in ("rigs", "frames"):
+            path.unlink()
+    path = data.draw(st.sampled_from(sorted(damaged.iterdir())))
+    content = bytearray(path.read_bytes())
+    if data.draw(st.booleans()):
+        del content[data.draw(st.integers(0, len(content) - 1)) :]
+    else:
+        for _ in range(data.draw(st.integers(1, 3))):
+            value = data.draw(
+                st.sampled_from([b"\xff" * 8, b"\xff" * 4, b"\0\0\0\x80", b"nan", b" ", b"-1", b"\n", b"#"])
+            )
+            at = data.draw(st.integers(0, len(content) - 1))
+            content[at : at + len(value)] = value
+    path.write_bytes(content)
+    try:
+        read_model(damaged)
+    except ClodError as error:
+        assert str(damaged) in str(error)
+
+
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])
+@pytest.mark.parametrize("count", [1 << 31, 1 << 62, (1 << 64) - 1])
+def test_counts_of_what_is_not_there(tmp_path: Path, file: str, count: int) -> None:
+    path = model(tmp_path, "binary") / f"{file}.bin"
+    path.write_bytes(count.to_bytes(8, "little") + path.read_bytes()[8:])
+    with pytest.raises(ClodError, match=f"{file}.bin: is truncated or damaged"):
+        check_records(path.parent)
+
+
+@pytest.mark.parametrize("file", ["rigs.bin", "frames.txt"])
+def test_pipes_are_not_waited_for(tmp_path: Path, file: str) -> None:
+    target = model(tmp_path, "binary")
+    (target / file).unlink(missing_ok=True)
+    os.mkfifo(target / file)
+    with pytest.raises(ClodError, match=f"{file}: .*not a regular file"):
+        read_model(target)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["a" * 300 + ".png", "a/" * 2500 + "b.png", "é" * 130, "a\x00b.png", "\x1b[2J.png", "a\nb.png", "\ud800.png"],
+)
+def test_names_that_no_file_has(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ClodError, match="is no file's name"):
+        check_name(tmp_path, name)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_long_and_steering_names_are_refused(tmp_path: Path, form: str) -> None:
+    for name in ("a" * 300 + ".png", "\x1b[2Ja.png"):
+        target = model(tmp_path, form, (name,))
+        with pytest.raises(ClodError, match="is no file's name") as caught:
+            read_model(target)
+        assert "\x1b" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["äö ü/日本 (1).png", "a.b/c d.png", "~/a.png", "$HOME.png"])
+def test_usual_and_odd_names_are_names(tmp_path: Path, name: str) -> None:
+    if not name.isascii() and sys.getfilesystemencoding() != "utf-8":
+        pytest.skip("files have ASCII names here")
+    model(tmp_path, "binary", (name,))
+    (tmp_path / "images" / name).parent.mkdir(parents=True)
+    Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "images" / name)
+    assert load_scene(tmp_path).train[0].camera.name == name
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links take rights there")
+def test_links_in_the_images_folder_are_followed(tmp_path: Path) -> None:
+    """Whoever made the folder made them, as people do with large captures; a name in a model cannot make one."""
+    model(tmp_path / "scene", "binary")
+    (tmp_path / "elsewhere" / "sub").mkdir(parents=True)
+    for name in ("a.png", "sub/b.png"):
+        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "elsewhere" / name)
+    (tmp_path / "scene" / "images").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    assert len(load_scene(tmp_path / "scene").train) == 1

@@ -1,0 +1,233 @@
+from __future__ import annotations
+
+import struct
+import threading
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.scene import images
+from clod_adapter.io.scene.images import BAND, Room, image_size, read_image
+from photographs import pixels
+
+GREY = pixels(0)[..., 0]
+
+
+def read(path: Path, width: int = 40, height: int = 30) -> tuple[np.ndarray, list[str]]:
+    image, _, notes = read_image(path, width, height, 1600)
+    assert image.mode == "RGB"
+    return np.asarray(image), [what for what, _ in notes]
+
+
+def deep_png(path: Path, values: np.ndarray) -> None:
+    """A PNG of 16 bits per channel in colour, which Pillow reads and does not write."""
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
+    parts = [(b"IHDR", struct.pack(">IIBBBBB", values.shape[1], values.shape[0], 16, 2, 0, 0, 0))]
+    parts += [(b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
+    chunks = [struct.pack(">I", len(d)) + t + d + struct.pack(">I", zlib.crc32(t + d)) for t, d in parts]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+
+
+def test_grey_and_palette(tmp_path: Path) -> None:
+    Image.fromarray(GREY).save(tmp_path / "grey.png")
+    Image.fromarray(GREY).convert("P").save(tmp_path / "palette.png")
+    Image.fromarray(GREY > 99).save(tmp_path / "bits.png")
+    for name, want in (("grey.png", GREY), ("palette.png", GREY), ("bits.png", np.where(GREY > 99, 255, 0))):
+        got, notes = read(tmp_path / name)
+        np.testing.assert_array_equal(got, np.repeat(want[..., None], 3, axis=2))
+        assert notes == []
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_grey_of_16_bits(tmp_path: Path, name: str) -> None:
+    deep = np.random.default_rng(0).integers(0, 65536, (30, 40), dtype=np.uint16)
+    deep[0, :3] = 0, 65535, 128  # the ends, and the last value that is nearest to black
+    Image.fromarray(deep).save(tmp_path / name)
+    got, _ = read(tmp_path / name)
+    np.testing.assert_array_equal(got[..., 1], np.rint(deep / 257))
+
+
+def test_colour_of_16_bits(tmp_path: Path) -> None:
+    """Pillow's own way: exact for what was 8 bits once, within a step for all else."""
+    deep_png(tmp_path / "a.png", pixels(0).astype(np.uint16) * 257)
+    np.testing.assert_array_equal(read(tmp_path / "a.png")[0], pixels(0))
+    deep = np.random.default_rng(0).integers(0, 65536, (30, 40, 3), dtype=np.uint16)
+    deep_png(tmp_path / "a.png", deep)
+    assert np.abs(read(tmp_path / "a.png")[0] - deep / 257).max() <= 1
+
+
+def test_planes_of_16_bits_are_refused(tmp_path: Path) -> None:
+    tifffile = pytest.importorskip("tifffile")
+    planes = np.moveaxis(pixels(0), 2, 0).astype(np.uint16) * 257
+    tifffile.imwrite(tmp_path / "a.tif", planes, photometric="rgb", planarconfig="separate")
+    with pytest.raises(ClodError, match="a.tif: has more than 8 bits in planes"):
+        read(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.int32])
+def test_32_bits_are_refused(tmp_path: Path, kind: type) -> None:
+    Image.fromarray(GREY.astype(kind)).save(tmp_path / "a.tif")
+    with pytest.raises(ClodError, match="a.tif: has 32 bits per channel"):
+        read(tmp_path / "a.tif")
+
+
+def test_transparency(tmp_path: Path) -> None:
+    alpha = np.where(GREY > 99, 255, 0).astype(np.uint8)
+    Image.fromarray(np.dstack([pixels(0), alpha])).save(tmp_path / "a.png")
+    got, notes = read(tmp_path / "a.png")
+    np.testing.assert_array_equal(got, pixels(0) * (GREY > 99)[..., None])
+    assert notes == ["have transparency: laid over black"]
+    Image.fromarray(np.dstack([pixels(0), np.full_like(GREY, 255)])).save(tmp_path / "a.png")
+    got, notes = read(tmp_path / "a.png")
+    np.testing.assert_array_equal(got, pixels(0))
+    assert notes == []
+    Image.fromarray(GREY).save(tmp_path / "a.png", transparency=int(GREY[0, 0]))
+    got, notes = read(tmp_path / "a.png")
+    assert got[0, 0].tolist() == [0, 0, 0] and len(notes) == 1
+
+
+def test_cmyk(tmp_path: Path) -> None:
+    smooth = np.broadcast_to(np.linspace(0, 255, 40).astype(np.uint8)[None, :, None], (30, 40, 3))
+    Image.fromarray(smooth).convert("CMYK").save(tmp_path / "a.jpg", quality=95)
+    got, notes = read(tmp_path / "a.jpg")
+    assert np.abs(got.astype(int) - smooth).max() < 12  # an inversion would be 255 away at the ends
+    assert notes == ["are CMYK: brought to RGB without their colour profile"]
+
+
+@pytest.mark.parametrize("orientation", [5, 6, 7, 8])
+def test_exif_rotation_is_applied_where_the_camera_has_the_turned_shape(tmp_path: Path, orientation: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(pixels(0)).save(tmp_path / "a.png", exif=exif)
+    as_it_is, notes = read(tmp_path / "a.png")
+    np.testing.assert_array_equal(as_it_is, pixels(0))  # as COLMAP reads it
+    assert notes == []
+    turned, notes = read(tmp_path / "a.png", 300, 400)
+    a, b = {5: (0, 0), 6: (-1, 0), 7: (-1, -1), 8: (0, -1)}[orientation]  # what is at the top left once turned
+    np.testing.assert_array_equal(turned[0, 0], pixels(0)[a, b])
+    assert turned.shape == (40, 30, 3) and notes == ["turned as their EXIF says, as the cameras have the turned shape"]
+
+
+def test_damaged_exif_is_not_looked_at_where_the_shape_fits(tmp_path: Path) -> None:
+    Image.fromarray(pixels(0)).save(tmp_path / "a.png", exif=b"Exif\0\0" + bytes(range(200)))
+    np.testing.assert_array_equal(read(tmp_path / "a.png")[0], pixels(0))
+    with pytest.raises(ClodError, match="a.png: "):
+        read(tmp_path / "a.png", 30, 40)
+
+
+def test_no_rotation_without_exif(tmp_path: Path) -> None:
+    Image.fromarray(pixels(0)).save(tmp_path / "a.png")
+    with pytest.raises(ClodError, match="a.png: is 40x30, its camera 30x40, another shape"):
+        read(tmp_path / "a.png", 30, 40)
+
+
+@pytest.mark.parametrize("content", [b"", b"no image", b"\0\0\0\x18ftypheic" + bytes(100)])
+def test_no_known_format(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.heic").write_bytes(content)
+    for what in (read, image_size):
+        with pytest.raises(ClodError, match="a.heic: cannot be decoded, .*export it as JPEG or PNG"):
+            what(tmp_path / "a.heic")
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.webp"])
+def test_cut_files(tmp_path: Path, name: str) -> None:
+    Image.fromarray(pixels(0)).save(tmp_path / name)
+    content = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(content[: len(content) * 2 // 3])
+    with pytest.raises(ClodError, match=f"{name}: cannot be decoded"):
+        read(tmp_path / name)
+
+
+def test_too_many_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Image.new("1", (60, 40)).save(tmp_path / "a.png")
+    assert 2 * Image.MAX_IMAGE_PIXELS == 178_956_970
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
+    with pytest.raises(ClodError, match="a.png: has more than the 178 million pixels"):
+        read(tmp_path / "a.png", 60, 40)
+
+
+def test_no_file(tmp_path: Path) -> None:
+    with pytest.raises(ClodError, match="a.png: cannot be decoded .*No such file"):
+        read(tmp_path / "a.png")
+
+
+def brought_down(path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int, max_width: int) -> np.ndarray:
+    monkeypatch.setattr(images, "LARGE", 1000)
+    image, size, notes = read_image(path, width, height, max_width)
+    assert size in ((width, height), (height, width)) and len(notes) == len(set(notes))
+    assert sum("which takes long: brought down first" in what for what, _ in notes) == 1
+    return np.asarray(image).astype(float)
+
+
+@pytest.mark.parametrize("kind", ["RGB", "L", "RGBA", "P", "I;16", "CMYK"])
+def test_a_large_photograph_is_brought_down_as_its_own_mean(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """By 3, so that it is at least twice as wide as what is made of it; in bands, of which the last one is cut."""
+    width, height = 200, 3 * BAND + 70
+    rgb = pixels(3, width, height)
+    image = Image.fromarray(rgb)
+    if kind == "RGBA":
+        image.putalpha(Image.fromarray(rgb[..., 0]))
+    elif kind == "I;16":
+        image = Image.fromarray(rgb[..., 0].astype(np.uint16) * 257)
+    else:
+        image = image.convert(kind)
+    path = tmp_path / ("a.tif" if kind == "CMYK" else "a.png")
+    image.save(path)
+    whole = read(path, width, height)[0].astype(float)
+    got = brought_down(path, monkeypatch, width, height, 33)
+    assert got.shape == (-(-height // 3), -(-width // 3), 3)
+    want = whole[: height // 3 * 3, : width // 3 * 3].reshape(height // 3, 3, width // 3, 3, 3).mean((1, 3))
+    assert np.abs(got[: height // 3, : width // 3] - want).max() <= 1
+
+
+def test_a_large_jpeg_is_brought_down_while_it_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ramp = np.linspace(0, 255, 400 * 300).reshape(300, 400).astype(np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(ramp).convert("RGB").save(tmp_path / "a.jpg", quality=95, exif=exif)
+    whole = read(tmp_path / "a.jpg", 300, 400)[0].astype(float)
+    loaded = []
+    convert = images._converted
+    monkeypatch.setattr(images, "_converted", lambda image, *rest: loaded.append(image.size) or convert(image, *rest))
+    got = brought_down(tmp_path / "a.jpg", monkeypatch, 300, 400, 30)  # by 5, of which 4 by the decoder
+    assert loaded == [(100, 75)] and got.shape == (100, 75, 3)
+    assert np.abs(got - whole.reshape(100, 4, 75, 4, 3).mean((1, 3))).max() < 4
+
+
+def test_another_shape_is_said_before_anything_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Image.fromarray(GREY).save(tmp_path / "a.png")
+    monkeypatch.setattr(images, "_rgb", None)
+    with pytest.raises(ClodError, match="is 40x30, its camera 30x30, another shape"):
+        read(tmp_path / "a.png", 30, 30)
+
+
+def test_room_for_pixels() -> None:
+    """Two that fit are worked on together, a third waits, and one that is too large for all comes in alone."""
+    room, order = Room(100), list[str]()
+    ready = threading.Barrier(3)
+
+    def work(name: str, pixels: int) -> None:
+        with room.of(pixels):
+            order.append(name)
+            if name in "ab":
+                ready.wait(10)
+
+    pair = [threading.Thread(target=work, args=(name, 50)) for name in "ab"]
+    for thread in pair:
+        thread.start()
+    large = threading.Thread(target=work, args=("large", 1000))
+    while len(order) < 2:
+        pass
+    large.start()
+    large.join(0.1)
+    assert sorted(order) == ["a", "b"] and large.is_alive()
+    ready.wait(10)
+    for thread in (*pair, large):
+        thread.join(10)
+    assert order[2:] == ["large"] and room.taken == 0

@@ -1,0 +1,238 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.scene.colmap import write_model
+from clod_adapter.io.scene.images import read_image
+from clod_adapter.io.scene.load import load_scene
+from photographs import as_text, camera, model_of, pixels, write_scene
+
+
+@pytest.mark.parametrize("name", ["../a.png", "sub/../../a.png", "/etc/a.png", "..\\a.png", "C:\\a.png"])
+def test_names_that_leave_the_folder_are_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "scene").mkdir()
+    model_of(tmp_path / "scene", "PINHOLE", [33, 33, 20, 15], name)
+    Image.fromarray(pixels(0)).save(tmp_path / "a.png")
+    with pytest.raises(ClodError, match="leaves the images folder"):
+        load_scene(tmp_path / "scene")
+
+
+def test_names_made_on_windows(tmp_path: Path) -> None:
+    model_of(tmp_path, "PINHOLE", [33, 33, 20, 15], "sub\\a.png")
+    (tmp_path / "images" / "sub").mkdir(parents=True)
+    Image.fromarray(pixels(0)).save(tmp_path / "images" / "sub" / "a.png")
+    assert len(load_scene(tmp_path).train) == 1
+
+
+def test_missing_images(tmp_path: Path) -> None:
+    """Named, and left out without a change to what is held out; too many are refused."""
+    names = sorted(write_scene(tmp_path, 18)[1])
+    for name in names[2:11]:
+        (tmp_path / "images" / name).unlink()
+    loaded = load_scene(tmp_path)
+    assert loaded.notes == (
+        "9 of 18 photographs are missing and left out (sub/003.png, sub/004.png, sub/005.png, ...)",
+    )
+    assert [view.camera.name for view in loaded.test] == [names[0], names[16]]  # the 8th is missing, the rest stay
+    assert [view.camera.name for view in loaded.train] == [names[1], *names[11:16], names[17]]
+    (tmp_path / "images" / names[0]).unlink()
+    said = r"10 of 18 images of the model are missing \(sub/001.png, sub/003.png, sub/004.png, \.\.\.\), more than half"
+    with pytest.raises(ClodError, match=said):
+        load_scene(tmp_path)
+
+
+def test_nothing_left_to_train_on(tmp_path: Path) -> None:
+    _, names = write_scene(tmp_path, 2)
+    (tmp_path / "images" / max(names)).unlink()
+    with pytest.raises(ClodError, match="no photograph to train on"):
+        load_scene(tmp_path)
+
+
+def test_smaller_copies_where_there_are_no_images(tmp_path: Path) -> None:
+    write_scene(tmp_path, 3)
+    (tmp_path / "images").rename(tmp_path / "images_2")
+    for name in ("images_4", "input"):
+        (tmp_path / name / "sub").mkdir(parents=True)
+    for file in (tmp_path / "images_2" / "sub").iterdir():
+        with Image.open(file) as image:
+            image.resize((8, 6)).save(tmp_path / "images_4" / "sub" / file.name)
+            image.resize((20, 15)).save(file)
+            image.save(tmp_path / "input" / "sub" / file.name)
+    loaded = load_scene(tmp_path)
+    assert loaded.notes == (
+        "the photographs are those in images_2, as there are more than in images",
+        "3 of 3 images are 20x15 where the model says 40x30: intrinsics scaled",
+    )
+    torch.testing.assert_close(loaded.test[0].camera.K[:2] * 2, camera(2, focal=30.0).K[:2])
+    for file in (tmp_path / "images_2" / "sub").iterdir():
+        file.unlink()
+    assert "images_4" in load_scene(tmp_path, max_width=10).notes[0]
+    for file in (tmp_path / "images_4" / "sub").iterdir():
+        file.unlink()
+    with pytest.raises(ClodError, match="images: 3 of 3 images of the model"):  # the raw ones are of other cameras
+        load_scene(tmp_path)
+
+
+def test_several_cameras_and_sizes(tmp_path: Path) -> None:
+    cameras = [camera(0), camera(1, 64, 48), camera(2, 30, 40)]
+    write_model(tmp_path, cameras, ["a.png", "b.png", "c.png"])
+    (tmp_path / "images").mkdir()
+    for i, name in enumerate("abc"):
+        image = Image.fromarray(pixels(i, cameras[i].width, cameras[i].height))
+        image.resize((image.width // 2, image.height // 2)).save(tmp_path / "images" / f"{name}.png")
+    loaded = load_scene(tmp_path)
+    views = [*loaded.test, *loaded.train]
+    assert [(view.camera.width, view.camera.height) for view in views] == [(20, 15), (32, 24), (15, 20)]
+    assert loaded.notes == ("3 of 3 images are 20x15 where the model says 40x30 (and 2 more): intrinsics scaled",)
+
+
+def test_two_images_of_one_name(tmp_path: Path) -> None:
+    write_scene(tmp_path, 2)
+    as_text(tmp_path)
+    listed = tmp_path / "sparse" / "0" / "images.txt"
+    listed.write_text(listed.read_text().replace("sub/001.png", "sub/002.png"))
+    with pytest.raises(ClodError, match="has image sub/002.png more than once"):
+        load_scene(tmp_path)
+
+
+def test_an_interrupted_load_reads_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_scene(tmp_path, 40)
+    read: list[Path] = []
+
+    def slowly(path: Path, width: int, height: int, max_width: int) -> object:
+        read.append(path)
+        time.sleep(0.01)
+        return read_image(path, width, height, max_width)
+
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("clod_adapter.io.scene.load.read_image", slowly)
+    with pytest.raises(KeyboardInterrupt):
+        load_scene(tmp_path, progress=stop)
+    assert len(read) < 10
+
+
+def test_wide_images_are_scaled_with_their_intrinsics(tmp_path: Path) -> None:
+    write_scene(tmp_path, 3)
+    loaded = load_scene(tmp_path, max_width=15)
+    assert loaded.notes == ("3 of 3 images scaled from 40x30 to 15x11 (Pillow bicubic, as in Inria's code)",)
+    view, names = loaded.train[0], [view.camera.name for view in loaded.train]
+    assert tuple(view.image.shape) == (11, 15, 3) and names == ["sub/002.png", "sub/003.png"]
+    original = camera(1, focal=31.0).K  # names count down: 002 is the model's second image
+    scale = torch.tensor([[15 / 40], [11 / 30], [1.0]])
+    torch.testing.assert_close(view.camera.K, original * scale)
+    expected = Image.fromarray(pixels(1)).resize((15, 11), Image.Resampling.BICUBIC)
+    np.testing.assert_array_equal(view.image, np.asarray(expected))
+    assert load_scene(tmp_path, max_width=40).notes == ()
+
+
+def test_images_of_another_size_than_the_camera(tmp_path: Path) -> None:
+    model_of(tmp_path, "PINHOLE", [330, 340, 200, 150], width=400, height=300)
+    Image.fromarray(pixels(0)).save(tmp_path / "a.png")
+    loaded = load_scene(tmp_path)
+    assert loaded.notes == ("1 of 1 images are 40x30 where the model says 400x300: intrinsics scaled",)
+    torch.testing.assert_close(loaded.train[0].camera.K, torch.tensor([[33.0, 0, 20], [0, 34, 15], [0, 0, 1]]))
+    Image.fromarray(pixels(0, 30, 40)).save(tmp_path / "a.png")
+    with pytest.raises(ClodError, match="a.png: is 30x40, its camera 400x300, another shape"):
+        load_scene(tmp_path)
+
+
+def test_progress(tmp_path: Path) -> None:
+    write_scene(tmp_path, 3)
+    seen: list[tuple[int, int]] = []
+    load_scene(tmp_path, progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_split_and_single_image(tmp_path: Path) -> None:
+    (tmp_path / "ten").mkdir()
+    (tmp_path / "one").mkdir()
+    write_scene(tmp_path / "ten")
+    loaded = load_scene(tmp_path / "ten", test_every=3)
+    assert (len(loaded.train), len(loaded.test)) == (6, 4)
+    write_scene(tmp_path / "one", 1)
+    loaded = load_scene(tmp_path / "one")
+    assert (len(loaded.train), len(loaded.test)) == (1, 0)
+    with pytest.raises(ClodError, match="test_every is 1"):
+        load_scene(tmp_path / "one", test_every=1)
+
+
+def test_what_the_scene_does_not_need(tmp_path: Path) -> None:
+    """Of each the reason, and none that the scene does need."""
+    (tmp_path / "plain").mkdir()
+    write_scene(tmp_path / "plain", 3)
+    spared = dict(load_scene(tmp_path / "plain").left_out)
+    assert set(spared) == {"undistortion", "alpha", "masks", "exposure", "scaling"}
+    assert spared["undistortion"] == "all 3 cameras are pinholes"
+    assert spared["alpha"] == "none of 3 photographs has transparency"
+    assert spared["scaling"] == "all 3 photographs are used at the size they have"
+    scaled = dict(load_scene(tmp_path / "plain", max_width=20).left_out)
+    assert "scaling" not in scaled
+    assert scaled["pixels"].startswith("kept are 0.0027 MB of the 0.0108 MB in the files")  # 3 x 20x15 and 40x30, RGB
+    (see_through := Image.fromarray(pixels(0))).putalpha(99)
+    see_through.save(tmp_path / "plain" / "images" / "sub" / "002.png")
+    assert "alpha" not in dict(load_scene(tmp_path / "plain").left_out)
+
+
+def test_undistortion_is_not_even_imported_for_pinholes(tmp_path: Path) -> None:
+    (tmp_path / "pinhole").mkdir()
+    write_scene(tmp_path / "pinhole", 2)
+    model_of(tmp_path / "lens", "SIMPLE_RADIAL", [33, 20, 15, -0.1])
+    Image.fromarray(pixels(0)).save(tmp_path / "lens" / "a.png")
+    code = (
+        "import os, sys\n"
+        "from clod_adapter import load_scene\n"
+        "for name in ('pinhole', 'lens'):\n"
+        "    spared = dict(load_scene(name).left_out)\n"
+        "    loaded = 'clod_adapter.io.scene.undistort' in sys.modules\n"
+        "    print(name, loaded, 'undistortion' in spared, os.path.exists('cache'))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.split("\n")[:2] == ["pinhole False True False", "lens True False True"]
+
+
+def test_a_photograph_in_colour_is_in_memory_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Converting what is RGB already copies it, as large as it is in the file."""
+    Image.fromarray(pixels(0, 64, 48)).save(tmp_path / "a.jpg")
+    monkeypatch.setattr(Image.Image, "convert", lambda *_, **__: pytest.fail("copies"))
+    read, *_ = read_image(tmp_path / "a.jpg", 64, 48, 1600)
+    assert read.mode == "RGB" and np.asarray(read).shape == (48, 64, 3)
+
+
+def test_only_so_many_photographs_are_decoded_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many as torch has threads, at least two; what comes out does not depend on it."""
+    write_scene(tmp_path, 12)
+    now, most = [0], [0]
+
+    def counted(path: Path, width: int, height: int, max_width: int) -> object:
+        now[0] += 1
+        most[0] = max(most[0], now[0])
+        time.sleep(0.01)
+        now[0] -= 1
+        return read_image(path, width, height, max_width)
+
+    monkeypatch.setattr("clod_adapter.io.scene.load.read_image", counted)
+    found = []
+    for threads, limit in ((1, 2), (5, 5), (99, 8)):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        most[0] = 0
+        found.append(load_scene(tmp_path))
+        assert 1 <= most[0] <= limit
+    assert most[0] > 2
+    for other in found[1:]:
+        pairs = zip((*found[0].train, *found[0].test), (*other.train, *other.test), strict=True)
+        assert all(a.image.equal(b.image) and a.camera.name == b.camera.name for a, b in pairs)

@@ -1,0 +1,246 @@
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.scene.colmap_library import pycolmap
+from clod_adapter.io.scene.load import load_scene
+from photographs import camera, model_of, pixels, pose, psnr_of, seen
+
+SHARED = {"fl_x": 30.0, "fl_y": 31.0, "cx": 19.25, "cy": 15.5, "w": 40, "h": 30}
+
+
+def to_world(seed: int) -> list[list[float]]:
+    """The pose of ``photographs.camera(seed)`` as a transforms file has it."""
+    opengl = np.diag([1.0, -1.0, -1.0, 1.0])
+    return (np.linalg.inv(pose(seed).double().numpy()) @ opengl).tolist()
+
+
+def frame(i: int, **rest: Any) -> dict[str, Any]:
+    return {"file_path": f"images/{i:03d}.png", "transform_matrix": to_world(i), **rest}
+
+
+def write(folder: Path, frames: list[Any], file: str = "transforms.json", **rest: Any) -> Path:
+    folder.mkdir(exist_ok=True)
+    (folder / file).write_text(json.dumps({**rest, "frames": frames}))
+    return folder
+
+
+def photographs(folder: Path, names: list[str]) -> None:
+    for i, name in enumerate(names):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels(i)).save(folder / name)
+
+
+def test_nerfstudio(tmp_path: Path) -> None:
+    frames = [frame(i) for i in reversed(range(10))]  # sorted by name, whatever the order in the file
+    frames[0]["fl_x"] = 33.0  # its own camera
+    write(tmp_path, frames, camera_model="OPENCV", k1=0, k2=0, p1=0, p2=0, ply_file_path="../no.ply", **SHARED)
+    photographs(tmp_path, [f"images/{i:03d}.png" for i in range(10)])
+    loaded = load_scene(tmp_path)
+    assert loaded.notes == ()
+    assert [view.camera.name for view in loaded.test] == ["images/000.png", "images/008.png"]
+    for view in (*loaded.train, *loaded.test):
+        i = int(view.camera.name[7:10])
+        torch.testing.assert_close(view.camera.viewmat, pose(i), atol=1e-5, rtol=0)
+        want = camera(i, focal=30.0).K
+        want[0, 0] = 33 if i == 9 else 30
+        torch.testing.assert_close(view.camera.K, want)
+        np.testing.assert_array_equal(view.image, pixels(i))
+
+
+def test_axes_are_opengls(tmp_path: Path) -> None:
+    """A camera at z = 4 that looks down the z axis with y up sees a point above the origin above the middle."""
+    matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
+    write(tmp_path, [{"file_path": "a.png", "transform_matrix": matrix}], **SHARED)
+    photographs(tmp_path, ["a.png"])
+    view = load_scene(tmp_path).train[0]
+    assert (view.camera.viewmat @ torch.tensor([0.5, 1.0, 0.0, 1.0])).tolist() == [0.5, -1, 4, 1]
+    assert view.camera.position.tolist() == [0, 0, 4]
+
+
+def test_blender(tmp_path: Path) -> None:
+    """Names without an extension, a field of view and no size, and files for training and testing."""
+    angle = 2 * math.atan(20 / 50)
+    for split, count in (("train", 3), ("test", 2), ("val", 1)):
+        names = [f"./{split}/r_{i}" for i in range(count)]
+        frames = [{"file_path": name, "rotation": 0.01, "transform_matrix": to_world(2)} for name in names]
+        write(tmp_path, frames, f"transforms_{split}.json", camera_angle_x=angle)
+        photographs(tmp_path, [f"{name}.png" for name in names])
+    loaded = load_scene(tmp_path)
+    assert [view.camera.name for view in loaded.train] == ["train/r_0.png", "train/r_1.png", "train/r_2.png"]
+    assert [view.camera.name for view in loaded.test] == ["test/r_0.png", "test/r_1.png"]
+    assert loaded.notes == ("held out are the photographs of transforms_test.json",)
+    torch.testing.assert_close(loaded.train[0].camera.K, torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]]))
+    (tmp_path / "transforms_test.json").unlink()
+    loaded = load_scene(tmp_path)
+    assert ([view.camera.name for view in loaded.test], len(loaded.train)) == (["train/r_0.png"], 2)
+
+
+def test_instant_ngp(tmp_path: Path) -> None:
+    """Angles in place of focal lengths; one focal length for both axes; JPEGs under names without an extension."""
+    angles = {"camera_angle_x": 1.0, "camera_angle_y": 0.8}
+    one = write(tmp_path / "one", [frame(0)], aabb_scale=16, w=40, h=30, **angles)
+    two = write(tmp_path / "two", [frame(0), {**frame(1), "file_path": "images/b.001"}], fl_x=30.0, scale=0.3)
+    photographs(one, ["images/000.png"])
+    photographs(two, ["images/000.png", "images/b.001.jpg"])
+    K = load_scene(one).train[0].camera.K
+    torch.testing.assert_close(K.diag()[:2], torch.tensor([20 / math.tan(0.5), 15 / math.tan(0.4)]))
+    view = load_scene(two).train[0]
+    assert view.camera.name == "images/b.001.jpg"
+    assert view.camera.K.tolist() == [[30, 0, 20], [0, 30, 15], [0, 0, 1]]
+
+
+LENS = {"k1": -0.15, "k2": 0.05, "p1": 0.004, "p2": -0.003}
+ROUND = {"k1": 0.03, "k2": -0.01, "k3": 0.002, "k4": 0.001}
+
+
+@pytest.mark.parametrize(
+    ("said", "model", "params"),
+    [
+        ({"camera_model": "OPENCV", **LENS}, "OPENCV", [*LENS.values()]),
+        ({**LENS, "k3": 0.02}, "FULL_OPENCV", [*LENS.values(), 0.02, 0, 0, 0]),
+        ({"camera_model": "OPENCV_FISHEYE", **ROUND}, "OPENCV_FISHEYE", [*ROUND.values()]),
+        ({"is_fisheye": True, **ROUND}, "OPENCV_FISHEYE", [*ROUND.values()]),
+    ],
+)
+def test_distortion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: dict[str, Any], model: str, params: list[float]
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    lens = pycolmap.Camera(model=model, width=160, height=120, params=[120, 122, 82, 58, *params])
+    shared = {"fl_x": 120, "fl_y": 122, "cx": 82, "cy": 58, "w": 160, "h": 120, **said}
+    scene = write(tmp_path / "scene", [{"file_path": "a.png", "transform_matrix": to_world(0)}], **shared)
+    Image.fromarray(seen(lens)).save(scene / "a.png")
+    loaded = load_scene(scene)
+    view, K = loaded.train[0], loaded.train[0].camera.K
+    size = {"width": view.camera.width, "height": view.camera.height}
+    pinhole = pycolmap.Camera(model="PINHOLE", params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], **size)
+    assert psnr_of(view.image.numpy(), seen(pinhole)) > 45
+    assert f"undistorted from {model} into" in loaded.notes[0]
+
+
+def test_the_colmap_model_is_taken_where_there_are_both(tmp_path: Path) -> None:
+    model_of(tmp_path, "PINHOLE", [33, 33, 20, 15])
+    write(tmp_path, [frame(0)], **SHARED)
+    photographs(tmp_path, ["images/a.png"])
+    loaded = load_scene(tmp_path)
+    assert loaded.notes == ("the cameras are the COLMAP model's, not those of transforms.json",)
+    assert loaded.train[0].camera.K[0, 0] == 33
+    deeper = write(tmp_path / "images", [{**frame(0), "file_path": "a"}], **SHARED)
+    assert load_scene(deeper).train[0].camera.K[0, 0] == 30  # nearer than the model beside the folder
+
+
+def test_missing_photographs_and_what_is_not_used(tmp_path: Path) -> None:
+    frames = [frame(i, mask_path="masks/0.png") for i in range(10)]
+    write(tmp_path, frames, fl_x=30.0, applied_transform=[[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
+    photographs(tmp_path, [f"images/{i:03d}.png" for i in range(10) if i != 3])
+    assert load_scene(tmp_path).notes == (
+        "transforms.json turned COLMAP's world (applied_transform): a checkpoint of the turned one is needed",
+        "the masks of transforms.json are not used",
+        "1 of 10 photographs are missing and left out (images/003.png)",
+    )
+    for i in range(4, 9):
+        (tmp_path / "images" / f"{i:03d}.png").unlink()
+    with pytest.raises(ClodError, match="6 of 10 images of transforms.json are missing"):
+        load_scene(tmp_path)
+
+
+def test_few_digits_are_rounded_rotations(tmp_path: Path) -> None:
+    rounded = np.round(to_world(5), 3).tolist()
+    write(tmp_path, [{"file_path": "a.png", "transform_matrix": rounded}], **SHARED)
+    photographs(tmp_path, ["a.png"])
+    viewmat = load_scene(tmp_path).train[0].camera.viewmat
+    torch.testing.assert_close(viewmat, pose(5), atol=0.01, rtol=0)
+    torch.testing.assert_close(viewmat[:3, :3] @ viewmat[:3, :3].T, torch.eye(3), atol=1e-6, rtol=0)
+
+
+def changed(row: int, column: int, value: float) -> dict[str, Any]:
+    matrix = np.eye(4)
+    matrix[row, column] = value
+    return {"transform_matrix": matrix.tolist()}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"file_path": "../a.png"}, "leaves the images folder"),
+        ({"file_path": "/etc/a.png"}, "leaves the images folder"),
+        ({"file_path": "C:\\a.png"}, "leaves the images folder"),
+        ({"file_path": ""}, "leaves the images folder"),
+        ({"file_path": "a\nb.png"}, "is no name"),
+        ({"file_path": "a\x1b[2J.png"}, "is no name"),
+        ({"file_path": "a\x9b2J.png"}, "is no name"),
+        ({"file_path": "a" * 5000}, "1 of 1 images .* missing"),
+        ({"file_path": 3}, "frame 0 has no file_path"),
+        ({"transform_matrix": None}, "frame a.png: transform_matrix is no 4x4 matrix"),
+        ({"transform_matrix": "none"}, "no 4x4 matrix"),
+        ({"transform_matrix": [[1, 0, 0], [0, 1, 0]]}, "no 4x4 matrix"),
+        ({"transform_matrix": [[1, 0, 0, 0], [0, 1]]}, "no 4x4 matrix"),
+        ({"transform_matrix": [[10**400, 0, 0, 0]] * 4}, "no 4x4 matrix"),
+        (changed(0, 0, math.nan), "no 4x4 matrix of finite"),
+        (changed(0, 3, 1e12), "'a.png' has a camera or pose that is not usable"),
+        (changed(0, 0, 1e200), "frame a.png: transform_matrix is no rotation"),
+        (changed(0, 0, 1.1), "no rotation"),
+        (changed(1, 1, -1), "no rotation"),
+        (changed(3, 0, 1), "no rotation"),
+        ({"fl_x": "wide"}, "fl_x is no number"),
+        ({"fl_x": math.inf}, "fl_x is no number"),
+        ({"fl_x": -30}, "neither fl_x nor camera_angle_x"),
+        ({"fl_x": 0, "camera_angle_x": 4}, "neither fl_x nor camera_angle_x"),
+        ({"w": 1e30}, "w is no number below"),
+        ({"cx": [1]}, "cx is no number"),
+        ({"k1": math.nan}, "k1 is no number"),
+        ({"k4": 0.1}, "k4 of a camera that is no fisheye"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR' is not known"),
+        ({"camera_model": {"a": 1}}, "camera_model .* is not known"),
+    ],
+)
+def test_bad_frames_are_named(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    write(tmp_path, [{"file_path": "a.png", "transform_matrix": to_world(0), **SHARED, **change}])
+    with pytest.raises(ClodError, match=said) as caught:
+        load_scene(tmp_path)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "no JSON or damaged"),
+        (b'{"frames": [', "no JSON or damaged"),
+        (b"\xff\xfe\x00", "no JSON or damaged"),
+        (b"[" * 100_000, "no JSON or damaged"),
+        (b'{"frames": ' + b"9" * 10_000 + b"}", "no JSON or damaged"),
+        (b"[]", "no list of frames"),
+        (b"3", "no list of frames"),
+        (b'{"frames": []}', "no list of frames"),
+        (b'{"frames": {}}', "no list of frames"),
+        (b'{"frames": [3]}', "frame 0 has no file_path"),
+    ],
+)
+def test_damaged_files(tmp_path: Path, content: bytes, said: str) -> None:
+    (tmp_path / "transforms.json").write_bytes(content)
+    with pytest.raises(ClodError, match=f"transforms.json: .*{said}"):
+        load_scene(tmp_path)
+
+
+def test_a_file_that_is_too_large(tmp_path: Path) -> None:
+    with (tmp_path / "transforms.json").open("wb") as file:
+        file.truncate(300 * 2**20)
+    with pytest.raises(ClodError, match="transforms.json: is larger than 256 MB"):
+        load_scene(tmp_path)
+
+
+def test_names_longer_than_file_systems_allow(tmp_path: Path) -> None:
+    for name in ("images/" + "b" * 300, "[" * 100_000, "a/" * 3000 + "b.png"):
+        write(tmp_path, [frame(0) | {"file_path": name}], camera_angle_x=0.8)  # whose size would be looked for
+        with pytest.raises(ClodError):
+            load_scene(tmp_path)

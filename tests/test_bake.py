@@ -1,0 +1,170 @@
+"""Baking: for one camera the plain Gaussians look as the dial shows them, and for several. And the dial's order."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from clod_adapter.adapter import attach
+from clod_adapter.attenuation import attenuate, normalized_distances
+from clod_adapter.bake import bake, order_by_extinction
+from clod_adapter.cameras import Camera
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluation.budget import dial_for
+from clod_adapter.extinction import extinction_scale, sigma_for_extinction
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.render import render
+from clod_adapter.viewpoints import viewpoint_of
+from scenes import camera, gaussians, ring
+
+CONFIG = AttenuationConfig(scene_distance=4.0)
+CUTS = pytest.mark.parametrize("cut", ["hard", "soft"])
+
+
+def sphere(n: int = 200, cut: str = "hard") -> Gaussians:
+    """All at the reference distance from ``camera()``."""
+    some, eye = gaussians(n, 1, 5), camera().position
+    away = some.means - eye
+    sigma = torch.rand(n, generator=torch.Generator().manual_seed(1)) * 2 + 0.1
+    return attach(
+        some.replace(means=eye + 4.0 * away / away.norm(dim=1, keepdim=True)), sigma, replace(CONFIG, cut=cut)
+    )
+
+
+def at_one_place(some: Gaussians) -> Gaussians:
+    """All at d' = 1 from ``camera()`` with a ``scene_distance`` of 4, exactly."""
+    return some.replace(means=camera().position.add(torch.tensor([0.0, 0.0, 4.0])).expand(len(some), 3))
+
+
+@CUTS
+@pytest.mark.parametrize("s", [1.0, 2.0, 4.5])
+def test_the_same_picture_for_a_camera(s: float, cut: str) -> None:
+    some = sphere(cut=cut)
+    want, baked = render(some, camera(), s), bake(some, s, camera())
+    assert baked.sigma_d is None and baked.attenuation is None and 0 < len(baked) < 200
+    assert len(baked) == want.kept.sum()
+    torch.testing.assert_close(render(baked, camera()).image, want.image, atol=2e-5, rtol=0)
+
+
+@CUTS
+def test_opacities_are_those_drawn(cut: str) -> None:
+    config = replace(CONFIG, cut=cut, tau=1 / 255)
+    logits = torch.tensor([-3.0, 0, 8, 30, math.inf, math.inf, 2.0])
+    sigma = torch.tensor([2.0, 2, 2, 2, 2, 1e9, 0.6765])  # the last between tau s and 1.5 tau s
+    some = attach(at_one_place(gaussians(7, 0, 0)).replace(opacity_logits=logits), sigma, config)
+    want = attenuate(logits, sigma, torch.ones(7), 2.0, config)
+    baked = bake(some, 2.0, camera())
+    assert len(baked) == 7 and baked.opacity_logits.isfinite().all()
+    torch.testing.assert_close(baked.opacities, want.drawn, atol=1e-7, rtol=2e-6)
+    assert (want.drawn[-1] < 0.9 * want.opacities[-1]) == (cut == "soft")
+
+
+@CUTS
+def test_a_gaussian_at_the_threshold_has_an_opacity_that_a_file_can_hold(cut: str) -> None:
+    config = AttenuationConfig(tau=0.02, cut=cut, scene_distance=4.0)
+    logits, ones = torch.linspace(-2, 6, 5000), torch.ones(5000)
+    for s in (1.0, 1.7, 3.3):
+        sigma = sigma_for_extinction(logits, ones, s * ones, config)
+        some = attach(at_one_place(gaussians(5000, 0, 0)).replace(opacity_logits=logits), sigma, config)
+        baked = bake(some, s, camera())
+        assert 0 < len(baked) < 5000 and baked.opacity_logits.isfinite().all()
+
+
+def test_a_dial_that_does_nothing_changes_nothing() -> None:
+    some = gaussians(50, 0, 1)
+    some.opacity_logits[:2] = torch.tensor([22.0, math.inf])  # more than opaque is left, no number is not
+    baked = bake(attach(some), 1.0, cameras=[camera(), camera()])
+    want = some.opacity_logits[some.opacities > 1 / 255]
+    assert (float(baked.opacity_logits[1]), float(want[1])) == (20.0, math.inf)
+    assert torch.equal(baked.opacity_logits[2:], want[2:]) and baked.opacity_logits[0] == 22
+
+
+def spread(n: int = 300, normalizer: str = "scene", cut: str = "soft") -> Gaussians:
+    """At many distances from ``camera()``, with decays at which some stay and some go."""
+    sigma = torch.rand(n, generator=torch.Generator().manual_seed(2)) * 2 + 0.1
+    return attach(gaussians(n, 1, 7), sigma, replace(CONFIG, cut=cut, normalizer=normalizer))
+
+
+@CUTS
+@pytest.mark.parametrize("normalizer", ["scene", "quantile", "max"])
+def test_for_a_camera_it_is_the_same_picture_from_there(cut: str, normalizer: str) -> None:
+    some = spread(normalizer=normalizer, cut=cut)
+    want, baked = render(some, camera(), 2.5), bake(some, 2.5, camera())
+    assert 0 < len(baked) < 300 and len(baked) == want.kept.sum()
+    torch.testing.assert_close(render(baked, camera()).image, want.image, atol=2e-5, rtol=0)
+    elsewhere = bake(some, 2.5, cameras=ring(4, 61, 45))
+    assert (render(elsewhere, camera()).image - want.image).abs().max() > 0.01  # which is what the camera is for
+
+
+def test_for_a_camera_a_count_is_exact() -> None:
+    some = spread()
+    few, many = len(bake(some, CONFIG.max_sv, camera())), len(bake(some, 1.0, camera()))
+    assert few + 10 < many
+    for wanted in range(few, many, 7):
+        s = dial_for(some, keep=wanted, cameras=[camera()]).virtual_scale
+        assert len(bake(some, s, camera())) == wanted
+
+
+@pytest.mark.parametrize("cameras", [[camera()], ring(3, 61, 45)], ids=["one", "several"])
+def test_prefixes_are_what_is_baked(cameras: list[Camera]) -> None:
+    some = spread()
+    rows = order_by_extinction(some, cameras)
+    assert torch.equal(rows.sort().values, torch.arange(300))
+    ordered = some.select(rows)
+    for s in (1.0, 1.7, 3.0):
+        kept = len(bake(some, s, cameras=cameras))
+        assert 0 < kept < 300
+        head = bake(ordered, s, cameras=cameras)
+        assert torch.equal(head.means, ordered.means[:kept])  # those kept are the first, in their order
+
+
+def test_rows_that_leave_together_stay_in_their_order() -> None:
+    some = at_one_place(gaussians(40, 0, 3))
+    same = attach(some.replace(opacity_logits=torch.zeros(40)), torch.ones(40), CONFIG)
+    assert torch.equal(order_by_extinction(same, [camera()]), torch.arange(40))
+    some = attach(some, torch.linspace(0.1, 2, 40), CONFIG)
+    order = order_by_extinction(some, [camera()])
+    scales = extinction_scale(some.opacity_logits, some.sigma_d, torch.ones(40), CONFIG)[order]
+    assert (scales.diff() <= 0).all() and scales[0] > scales[-1]
+
+
+def test_for_several_cameras_every_gaussian_has_one_distance() -> None:
+    some, cameras, s = spread(), ring(3, 61, 45), 3.0
+    assert some.sigma_d is not None and some.attenuation is not None
+    d = torch.stack([normalized_distances(some.means, each, CONFIG).log() for each in cameras]).mean(0).exp()
+    kept, shown = (attenuate(some.opacity_logits, some.sigma_d, d, x, some.attenuation) for x in (s, s**0.75))
+    baked = bake(some, s, cameras=cameras)
+    assert torch.equal(baked.means, some.means[kept.keep]) and 0 < len(baked) < 300
+    torch.testing.assert_close(baked.opacities, shown.drawn[kept.keep], atol=1e-6, rtol=1e-5)
+    places = [viewpoint_of(each, some.means, CONFIG) for each in cameras]
+    assert torch.equal(bake(some, s, cameras=places).means, baked.means)
+
+
+def test_a_count_of_the_file_is_exact() -> None:
+    some, cameras = spread(), ring(3, 61, 45)
+    few, many = (len(bake(some, s, cameras=cameras)) for s in (3.0, 1.0))
+    assert few + 10 < many
+    for wanted in range(few, many, 7):
+        s = dial_for(some, keep=wanted, cameras=cameras, baked=True).virtual_scale
+        assert len(bake(some, s, cameras=cameras)) == wanted
+
+
+def test_bad_calls_are_named() -> None:
+    with pytest.raises(ClodError, match="no sigma_d"):
+        bake(gaussians(3, 0, 0), 1.0)
+    with pytest.raises(ClodError, match="virtual_scale is 0.5"):
+        bake(sphere(), 0.5, camera())
+    with pytest.raises(ClodError, match="no Gaussian is kept at s = 200"):
+        bake(sphere(), 200.0, camera())
+    with pytest.raises(ClodError, match="either camera or cameras"):
+        bake(sphere(), 2.0)
+    with pytest.raises(ClodError, match="either camera or cameras"):
+        bake(sphere(), 2.0, camera(), cameras=[camera()])
+    with pytest.raises(ClodError, match="no camera is given"):
+        order_by_extinction(sphere(), [])
+    with pytest.raises(ClodError, match="no sigma_d, so no order"):
+        order_by_extinction(gaussians(3, 0, 0), [camera()])

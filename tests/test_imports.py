@@ -1,0 +1,209 @@
+"""The shape of the house: what may import what, what an import costs, what gets installed."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "clod_adapter"
+
+# Lowest first. A unit is a module or package of clod_adapter, of clod_adapter/io, or of cli; it imports from rows above
+# its own and from itself, never from beside it.
+ORDER: list[set[str]] = [
+    {"_support", "version", "origin"},
+    {"errors"},
+    {"_kernels", "cameras", "config"},
+    {"attenuation", "calibration", "gaussians", "losses"},
+    {"extinction", "finite", "hook", "metrics", "rasterizers", "units", "viewpoints"},
+    {"adapter", "integrations", "render"},
+    {"bake", "initialization"},
+    {"io.atomic", "io.regular", "io.rows", "io.screen_filter", "io.settings", "io.sniff", "io.writers"},
+    {"io.claims", "io.ply", "io.readers", "io.scene", "io.tensor_file"},
+    {"io.checkpoint"},
+    {"io.formats", "io.trimming"},
+    {"io.adapter_file"},
+    {"alignment", "report", "training", "viewer"},
+    {"blocks", "demo", "evaluation", "inspection"},
+    {""},  # the package itself, whose __init__ re-exports from the rows above
+    {"cli.shared"},
+    {"cli.commands"},
+    {"cli.comparisons", "cli.robustness_cells"},
+    {"cli.adapt", "cli.apply", "cli.doctor", "cli.evaluate", "cli.export", "cli.inspect", "cli.render",
+     "cli.robustness", "cli.view"},
+    {"cli.demo"},  # runs adapt
+    {"cli.main"},
+    {"__main__"},
+]  # fmt: skip
+SOURCES = sorted([*(ROOT / PACKAGE).rglob("*.py"), *(ROOT / "cli").rglob("*.py")])
+
+
+def module_of(path: Path) -> str:
+    """Dotted name below the package: ``io.checkpoint``, ``cli.main``, and an empty one for the package itself."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    parts = parts[1:] if parts[0] == PACKAGE else parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_of(path) for path in SOURCES}
+
+
+def unit_of(module: str) -> str:
+    """``io.formats`` of ``io.formats.glb``, ``training`` of ``training.loop``."""
+    parts = module.split(".")
+    return ".".join(parts[: 2 if parts[0] in ("io", "cli") else 1])
+
+
+def level_of(module: str) -> int:
+    for level, units in enumerate(ORDER):
+        if unit_of(module) in units:
+            return level
+    pytest.fail(f"{unit_of(module)} has no place: add it to ORDER of {Path(__file__).name}")
+
+
+def imports_of(path: Path, tree: ast.AST) -> list[tuple[int, str]]:
+    """Line and module, by ``module_of``'s names, of everything that a file imports from the package, at any depth."""
+    found = []
+    for node in ast.walk(tree):
+        targets: list[str] = []
+        if isinstance(node, ast.Import):
+            targets = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                here = f"{PACKAGE}.{module_of(path)}".rstrip(".").split(".")
+                cut = node.level - (path.name == "__init__.py")
+                base = ".".join((*here[: len(here) - cut], *([base] if base else [])))
+            # "from clod_adapter import io" names a module, "from clod_adapter import Gaussians" a re-export.
+            below = [f"{base}.{a.name}" for a in node.names if f"{base}.{a.name}".partition(".")[2] in MODULES]
+            targets = [*below, *([base] if len(below) < len(node.names) else [])]
+        for target in targets:
+            head, _, rest = target.partition(".")
+            if head == PACKAGE:
+                found.append((node.lineno, rest))
+            elif head == "cli":
+                found.append((node.lineno, target))
+    return found
+
+
+def circle_in(graph: dict[str, set[str]]) -> list[str]:
+    """Modules that import each other in a circle, the first also last; none where there is no circle."""
+    done, path = set[str](), list[str]()
+
+    def visit(module: str) -> list[str]:
+        if module in path:
+            return [*path[path.index(module) :], module]
+        if module in done:
+            return []
+        path.append(module)
+        for target in sorted(graph.get(module, ())):
+            if circle := visit(target):
+                return circle
+        done.add(path.pop())
+        return []
+
+    return next((circle for module in sorted(graph) if (circle := visit(module))), [])
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_fall(path: Path) -> None:
+    own = module_of(path)
+    for line, target in imports_of(path, ast.parse(path.read_text(encoding="utf-8"))):
+        allowed = unit_of(target) == unit_of(own) or level_of(target) < level_of(own)
+        assert allowed, f"{path.relative_to(ROOT)}:{line} imports {target}, which is not below it"
+
+
+def test_no_file_imports_itself_by_way_of_others() -> None:
+    graph = {
+        module_of(path): {target for _, target in imports_of(path, ast.parse(path.read_text(encoding="utf-8")))}
+        for path in SOURCES
+    }
+    # A file of a package imports the package, whose __init__ runs first; that is no circle unless it imports back.
+    graph = {module: targets - {module} for module, targets in graph.items()}
+    assert not circle_in(graph), " -> ".join(circle_in(graph))
+
+
+def test_a_circle_is_found() -> None:
+    assert circle_in({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
+    assert circle_in({"a": {"b", "c"}, "b": {"c"}}) == []
+
+
+def test_the_top_level_fits_on_a_screen() -> None:
+    modules = sorted(path.name for path in (ROOT / PACKAGE).glob("*.py"))
+    assert len(modules) <= 20, f"{len(modules)} modules, put one into a package: {modules}"
+
+
+@pytest.mark.parametrize(
+    ("where", "source", "want"),
+    [
+        ("clod_adapter/render.py", "from clod_adapter.io.checkpoint import load", ["io.checkpoint"]),
+        ("clod_adapter/render.py", "def f():\n    import clod_adapter.adapter as a", ["adapter"]),
+        (
+            "clod_adapter/render.py",
+            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from .cameras import Camera",
+            ["cameras"],
+        ),
+        (
+            "clod_adapter/io/checkpoint.py",
+            "from . import atomic\nfrom .. import cameras\nfrom ..errors import ClodError",
+            ["io.atomic", "cameras", "errors"],
+        ),
+        ("clod_adapter/io/__init__.py", "from .checkpoint import load", ["io.checkpoint"]),
+        ("clod_adapter/render.py", "from clod_adapter import Gaussians, config", ["config", ""]),
+        ("clod_adapter/render.py", "import torch, cli.main", ["cli.main"]),
+        ("cli/adapt/run.py", "from ..shared import files\nfrom . import plan", ["cli.shared.files", "cli.adapt.plan"]),
+    ],
+)  # fmt: skip
+def test_every_way_of_importing_is_seen(where: str, source: str, want: list[str]) -> None:
+    assert [target for _, target in imports_of(ROOT / where, ast.parse(source))] == want
+
+
+def test_package_only_re_exports() -> None:
+    tree = ast.parse((ROOT / PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+    defined = [n.name for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)]
+    assert set(defined) <= {"__getattr__", "__dir__"}, f"{PACKAGE}/__init__.py defines {defined}"
+
+
+def test_import_is_light(tmp_path: Path) -> None:
+    heavy = ["torch", "numpy", "numba", "gsplat", "pycolmap", "plyfile", "matplotlib", "skimage"]
+    code = f"import sys, {PACKAGE}; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_names_of_the_package(tmp_path: Path) -> None:
+    """They are imported on first use, and functions stay functions where a submodule has the same name."""
+    code = (
+        f"import {PACKAGE} as package, {PACKAGE}.render, {PACKAGE}.bake\n"
+        "kinds = {name: type(getattr(package, name)).__name__ for name in package.__all__}\n"
+        "assert set(kinds.values()) == {'type', 'function'}, kinds\n"
+        "assert set(package.__all__) <= set(dir(package))\n"
+        "assert not hasattr(package, 'nonsense')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_package_is_installed() -> None:
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
+    folders = {f"{PACKAGE}.{module_of(path)}".rstrip(".") for path in SOURCES if path.name == "__init__.py"}
+    assert set(listed) == folders, "list the package in pyproject.toml, [tool.setuptools] packages"
+    homeless = [str(p.relative_to(ROOT)) for p in SOURCES if not (p.parent / "__init__.py").exists()]
+    assert not homeless, f"in a folder without __init__.py: {homeless}"
+
+
+def test_no_machine_paths() -> None:
+    if shutil.which("git") is None or not (ROOT / ".git").exists():
+        pytest.skip("not a git checkout, so there is no list of tracked files")
+    listing = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    files = subprocess.run(listing, cwd=ROOT, capture_output=True, check=True).stdout.decode().split("\0")
+    pattern = re.compile(rb"(?<![\w./~-])/(?:work|root)/")
+    found = [name for name in files if name and (ROOT / name).is_file() and pattern.search((ROOT / name).read_bytes())]
+    assert not found, f"absolute paths of somebody's machine in {found}"

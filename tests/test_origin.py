@@ -1,0 +1,109 @@
+"""Scenes far from 0: nothing of them may be lost on the way in, and the way out leads back to where they were."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+
+import clod_adapter as clod
+from clod_adapter.io.scene.colmap import load_points
+from clod_adapter.origin import NOWHERE, origin_of
+from photographs import write_scene
+from scenes import gaussians
+
+UTM = np.array([437_123.25, -4_481_010.5, 1_000.0])
+
+
+def rows(means: np.ndarray, kind: str = "f8") -> np.ndarray:
+    table = np.zeros(len(means), [(axis, kind) for axis in "xyz"])
+    for axis, column in zip("xyz", means.T, strict=True):
+        table[axis] = column
+    return table
+
+
+def moved(path: Path, out: Path, kind: str) -> Path:
+    """The file's coordinates UTM away, as columns of ``kind``."""
+    old = PlyData.read(str(path))["vertex"].data
+    new = old.astype([(name, kind if name in "xyz" else old.dtype[name]) for name in old.dtype.names])
+    for axis, by in zip("xyz", UTM, strict=True):
+        new[axis] = old[axis].astype("f8") + by
+    PlyData([PlyElement.describe(new, "vertex")], byte_order="<").write(str(out))
+    return out
+
+
+def test_only_what_is_far_has_an_origin() -> None:
+    near = np.random.default_rng(0).normal(size=(500, 3))
+    assert origin_of(rows(near)) == origin_of(rows(near + 40)) == NOWHERE
+    assert origin_of(rows(near[:1] + UTM)) == NOWHERE  # of one Gaussian there is no telling what is far
+    assert origin_of(rows(np.zeros((0, 3)))) == origin_of(rows(np.full((3, 3), np.nan))) == NOWHERE
+    with_floater = np.concatenate([near, [[1e9, 0, 0]]])
+    assert origin_of(rows(with_floater)) == NOWHERE
+    assert np.abs(np.array(origin_of(rows(with_floater + UTM))) - UTM).max() < 5
+
+
+def test_a_spread_of_next_to_nothing() -> None:
+    line = np.array([[1.0, 0.0, 0.0]] * 100)
+    line[:, 2] = np.linspace(0, 1e-320, 100)
+    assert origin_of(rows(line)) == (1.0, 0.0, 0.0)
+    line[:, 2] = np.linspace(0, 1e-9, 100)
+    assert origin_of(rows(line))[0] == 1.0
+
+
+def test_no_origin_is_minus_nothing() -> None:
+    origin = origin_of(rows(np.random.default_rng(0).normal(size=(500, 3)) * [1, 1, 1e-3] + [1e6, -0.1, -1e-4]))
+    assert origin[0] > 9e5 and [str(value) for value in origin[1:]] == ["0.0", "0.0"]
+
+
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+def test_reading_loses_nothing_and_writing_leads_back(tmp_path: Path, kind: str) -> None:
+    base = gaussians(200, 1, 0)
+    clod.save(tmp_path / "near.ply", base)
+    far = clod.load(moved(tmp_path / "near.ply", tmp_path / "far.ply", kind))
+    stored = np.stack([far.vertex[axis].astype("f8") for axis in "xyz"], 1)
+    np.testing.assert_allclose(far.gaussians.means.double().numpy() + far.origin, stored, rtol=0, atol=3e-7)
+    if kind == "f8":  # the picture is that of the scene near 0
+        apart = (far.gaussians.means - base.means).double().numpy() + far.origin - UTM
+        assert np.abs(apart).max() < 1e-6
+    else:
+        assert (far.gaussians.means.double().numpy() + far.origin == stored).all()
+    assert "far from 0" in far.notes[-1]
+    tuned = far.gaussians.means.clone()
+    tuned[:50] += 1e-4
+    clod.save(tmp_path / "out.ply", clod.attach(far.gaussians.replace(means=tuned)), far)
+    out = PlyData.read(str(tmp_path / "out.ply"))["vertex"].data
+    written = np.stack([out[axis] for axis in "xyz"], 1)
+    assert written.dtype == np.float64 and (written[50:] == stored[50:]).all()
+    np.testing.assert_allclose(written[:50], tuned[:50].double().numpy() + far.origin, rtol=0, atol=1e-9)
+    again = clod.load(tmp_path / "out.ply", origin=far.origin)
+    assert again.gaussians.means.equal(tuned) and again.origin == far.origin
+
+
+def test_an_adapter_knows_the_origin(tmp_path: Path) -> None:
+    clod.save(tmp_path / "near.ply", gaussians(200, 1, 0))
+    far = clod.load(moved(tmp_path / "near.ply", tmp_path / "far.ply", "f4"))
+    adapted = clod.attach(far.gaussians.replace(means=far.gaussians.means * 1e5))  # kept as values, not differences
+    about = {"fingerprint": far.fingerprint, "config": {}, "origin": far.origin}
+    clod.save_adapter(tmp_path / "far.safetensors", clod.extract(far.gaussians, adapted, **about))
+    adapter = clod.load_adapter(tmp_path / "far.safetensors")
+    assert adapter.origin == far.origin
+    assert adapter.apply(clod.load(tmp_path / "far.ply", origin=adapter.origin).gaussians).means.equal(adapted.means)
+
+
+def test_cameras_follow(tmp_path: Path) -> None:
+    """A georeferenced model, which COLMAP stores in float64, has the cameras it had near 0."""
+    pycolmap = pytest.importorskip("pycolmap")  # which alone moves models
+    for name in ("near", "far"):
+        (tmp_path / name).mkdir()
+        write_scene(tmp_path / name, 4)
+    near = clod.load_scene(tmp_path / "near")
+    model = pycolmap.Reconstruction(str(tmp_path / "near" / "sparse" / "0"))
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), UTM))
+    model.write_binary(str(tmp_path / "far" / "sparse" / "0"))
+    far = clod.load_scene(tmp_path / "far", origin=tuple(UTM))
+    for a, b in zip((*near.train, *near.test), (*far.train, *far.test), strict=True):
+        torch.testing.assert_close(b.camera.viewmat, a.camera.viewmat, rtol=0, atol=1e-6)
+    assert load_points(tmp_path / "far", tuple(UTM)).shape[1] == 3

@@ -1,0 +1,145 @@
+"""What a scene needs, on scenes where it is known."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from clod_adapter.adapter import attach
+from clod_adapter.cameras import Scene
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization import importance
+from clod_adapter.initialization.importance import removal_error
+from clod_adapter.render import render
+from clod_adapter.training import ablation
+from clod_adapter.training.ablation import band_losses, effect, largest_change, seen
+from scenes import capture, gaussians, photograph, ring
+
+LIMIT = 0.02
+
+
+@pytest.fixture(scope="module")
+def captured() -> tuple[Gaussians, Scene]:
+    return capture()
+
+
+def with_bands(base: Gaussians, *sizes: float) -> Gaussians:
+    """Degree 3, its bands of these sizes."""
+    random = torch.Generator().manual_seed(5)
+    bands = [size * torch.randn(len(base), 2 * d + 1, 3, generator=random) for d, size in enumerate(sizes, 1)]
+    return base.replace(shN=torch.cat(bands, 1))
+
+
+def test_bands_that_matter_and_bands_that_do_not() -> None:
+    truth = with_bands(gaussians(200, 0, 3), 0.3, 1e-4, 1e-5)
+    views = photograph(truth, ring(4, 48, 36))
+    found = list(band_losses(truth, views, LIMIT))
+    assert [degree for degree, _ in found] == [3, 2, 1]
+    assert found[0][1] < LIMIT and found[1][1] < LIMIT and found[2][1] > 1
+    # From where one matters on, nothing below it is looked at: whether its going does harm or good.
+    strong = with_bands(truth, 0.3, 1e-4, 0.3)
+    ((degree, loss),) = band_losses(strong, photograph(strong, ring(4, 48, 36)), LIMIT)
+    assert degree == 3 and loss > 1
+    ((degree, loss),) = band_losses(strong, views, LIMIT)
+    assert degree == 3 and loss > 1
+
+
+def test_a_view_that_gains_makes_up_for_none_that_loses() -> None:
+    truth = with_bands(gaussians(200, 0, 3), 0.3, 1e-4, 0.3)
+    cameras = ring(4, 48, 36)
+    views = (*photograph(truth, cameras[:2]), *photograph(truth.without_bands(2), cameras[2:]))
+    ((_, change),) = band_losses(truth, views, LIMIT)
+    of_each = [loss for view in views for _, loss in band_losses(truth, [view], LIMIT)]
+    assert change == pytest.approx(sum(of_each) / 4) and min(of_each) > 1
+
+
+def test_empty_bands_are_worth_nothing(captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch) -> None:
+    base, scene = captured
+    assert dict(band_losses(with_bands(base, 0.3, 0, 0), scene.train, LIMIT)).keys() == {1, 2, 3}
+    monkeypatch.setattr(ablation, "render", lambda *_: pytest.fail("rendered for nothing"))
+    assert list(band_losses(with_bands(base, 0, 0, 0), scene.train, LIMIT)) == [(3, 0.0), (2, 0.0), (1, 0.0)]
+    assert list(band_losses(base.without_bands(0), scene.train, LIMIT)) == []
+
+
+def hidden() -> tuple[Gaussians, Scene, torch.Tensor]:
+    """An opaque shell, Gaussians in it, some out of every picture, some too faint to be drawn, and others around."""
+    base = gaussians(70, 1, 2, size=0.1)
+    means, logs, logits = base.means.clone(), base.log_scales.clone(), base.opacity_logits.clone()
+    around = 2 * math.pi * torch.arange(24) / 24
+    means[:24] = torch.stack([around.sin(), torch.zeros(24), around.cos()], 1)
+    logs[:24], logits[:24] = math.log(0.8), 9.0
+    means[24:32], logs[24:32] = 0.05 * means[24:32], math.log(0.02)
+    means[32:40] += torch.tensor([0.0, 80.0, 0.0])
+    logits[40:46] = -8.0
+    base = base.replace(means=means, log_scales=logs, opacity_logits=logits)
+    views = photograph(base, ring(6, 40, 30))
+    everyone = torch.arange(len(base))
+    with torch.no_grad():
+        pictures = [render(base, view.camera).image for view in views]
+        matters = [
+            any(
+                not torch.equal(picture, render(base.select(everyone != row), view.camera).image)
+                for picture, view in zip(pictures, views, strict=True)
+            )
+            for row in range(len(base))
+        ]
+    return base, Scene(views, ()), torch.tensor(matters)
+
+
+def test_seen_is_what_changes_a_pixel_when_it_goes() -> None:
+    base, scene, matters = hidden()
+    found = seen(base, scene.train, removal_error(base, scene.train), seed=0)
+    assert found.tolist() == matters.tolist()
+    assert not found[24:46].any() and found[:24].all() and found[46:].any()
+    change, lost = largest_change(base, base.select(found), scene.train)
+    assert change < 1e-6 and abs(lost) < 1e-6  # all of them at once, too
+
+
+def test_what_is_opaque_all_over_is_seen() -> None:
+    """Its alpha is clamped in every pixel and has no derivative, and the picture is all its own."""
+    base = gaussians(70, 1, 2, size=0.1)
+    means, logs, logits = base.means.clone(), base.log_scales.clone(), base.opacity_logits.clone()
+    means[0], logs[0], logits[0] = 0.0, math.log(100.0), math.inf
+    base = base.replace(means=means, log_scales=logs, opacity_logits=logits)
+    views = photograph(base, ring(3, 40, 30))
+    error = removal_error(base, views)
+    assert error[0] == 0 and largest_change(base, base.select(torch.arange(70) > 0), views)[0] > 0.1
+    assert seen(base, views, error, seed=0)[0]
+
+
+def test_views_beyond_those_of_the_start_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which Gaussians are seen does not hang on which views the start looks at; those are not looked at again."""
+    base, scene, matters = hidden()
+    monkeypatch.setattr(ablation, "MOST_VIEWS", 2)
+    told: list[tuple[int, int]] = []
+    error = removal_error(base, importance.spread(scene.train, 2))
+    found = seen(base, scene.train, error, 0, lambda done, total: told.append((done, total)))
+    assert (error > 0).sum() < found.sum()
+    assert found.tolist() == matters.tolist() and told == [(k, 4) for k in range(1, 5)]
+
+
+def test_the_largest_change(captured: tuple[Gaussians, Scene]) -> None:
+    base, scene = captured
+    assert largest_change(base, base, scene.train) == (0.0, 0.0)
+    less = base.select(torch.arange(len(base)) % 2 == 0)
+    change, lost = largest_change(base, less, scene.train[:1])
+    with torch.no_grad():
+        images = [render(g, scene.train[0].camera).image.clamp(0, 1) for g in (base, less)]
+    assert change == float((images[0] - images[1]).abs().max()) > 0.1 and lost > 1
+
+
+def test_the_effect_of_a_move(captured: tuple[Gaussians, Scene]) -> None:
+    base, scene = captured
+    before = attach(base)
+    same = effect("sh0", before, before, scene.train, [5.0, 1.0], LIMIT)
+    assert same == (0.0, 5.0)
+    for by in (0.2, -0.2):  # harm and use alike
+        moved, s = effect("sh0", before, before.replace(sh0=base.sh0 + by), scene.train, [5.0, 1.0], LIMIT)
+        assert moved > LIMIT and s == 5.0
+    little, _ = effect("sh0", before, before.replace(sh0=base.sh0 + 1e-7), scene.train, [5.0, 1.0], LIMIT)
+    assert 0 <= little < LIMIT
+    # The others' moves are no part of it.
+    other = before.replace(means=base.means + 0.1)
+    assert effect("sh0", before, other, scene.train, [1.0], LIMIT) == (0.0, 1.0)

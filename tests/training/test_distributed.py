@@ -1,0 +1,88 @@
+"""What processes exchange. Here a group of one; tests/cli/test_processes.py has real ones, and their losses."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+import torch.distributed as dist
+
+from clod_adapter.config import AdaptConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.training import distributed
+from clod_adapter.training.distributed import PeerLost, Peers, joined
+from clod_adapter.training.loop import adapt
+from clod_adapter.training.objective import Pull
+from scenes import capture
+
+
+@pytest.fixture
+def peers() -> Iterator[Peers]:
+    with joined(dist.HashStore(), 0, 1) as peers:
+        yield peers
+
+
+def test_one_alone_exchanges_with_itself(peers: Peers) -> None:
+    pull = Pull({"means": torch.randn(5, 3), "sigma": torch.randn(5)}, torch.rand(5) < 0.5, 0.25)
+    summed = peers.sum(replace(pull, gradients={name: g.clone() for name, g in pull.gradients.items()}))
+    assert summed.loss == pull.loss and torch.equal(summed.kept, pull.kept)
+    assert all(torch.equal(summed.gradients[name], gradient) for name, gradient in pull.gradients.items())
+    assert peers.share([1, 2, 3]) == [1, 2, 3]
+    assert peers.agree(0.25, True) == (0.25, True) and peers.agree(1.5, False) == (1.5, False)
+    assert peers.broadcast({"a": [1]}) == {"a": [1]}
+    assert peers.waiting > 0 and peers.exchanging > 0
+
+
+def test_adapting_with_nobody_else_changes_no_bit(peers: Peers) -> None:
+    base, scene = capture(n=60, views=4)
+    config = AdaptConfig(iters=3, batch=2)
+    want, found = adapt(base, scene, config), adapt(base, scene, config, peers=peers)
+    for name, tensor in want.gaussians.tensors().items():
+        assert torch.equal(found.gaussians.tensors()[name], tensor), name
+    assert found.waiting > 0 and want.waiting == want.exchanging == 0 and found.lost is None
+
+
+def test_a_view_for_each_process(peers: Peers) -> None:
+    peers.size = 3
+    with pytest.raises(ClodError, match="batch is 2, it must be at least 3, a view for each of the processes"):
+        adapt(*capture(n=20, views=4), AdaptConfig(batch=2), peers=peers)
+
+
+def test_what_is_sent_arrives() -> None:
+    """Tensors of any kind, within anything that pickles; empty ones, as shN of degree 0, and views of others."""
+    base, scene = capture(n=10, views=2)
+    sent = (base.replace(shN=base.shN[:, :0]), scene, {"a": torch.arange(6).view(2, 3).t(), "b": torch.tensor(True)})
+    tensors: list[torch.Tensor] = []
+    pickled = distributed._without_tensors(sent, tensors)
+    assert len(pickled) < 4000 and all(tensor.is_contiguous() for tensor in tensors)
+    gaussians, views, more = distributed._with_tensors(pickled, [tensor.clone() for tensor in tensors])
+    for name, tensor in sent[0].tensors().items():
+        assert torch.equal(gaussians.tensors()[name], tensor), name
+    assert views.train[0].camera.name == scene.train[0].camera.name
+    assert torch.equal(views.test[0].image, scene.test[0].image)
+    assert torch.equal(more["a"], sent[2]["a"]) and more["b"].dtype == torch.bool
+
+
+def test_a_loss_is_told_from_other_errors() -> None:
+    with pytest.raises(PeerLost, match=r"gone \(Connection closed by peer \[127.0.0.1\]:1\)$"), distributed._losses():
+        raise RuntimeError("[/a/b/pair.cc:547] Connection closed by peer [127.0.0.1]:1. This may be caused by\nmore")
+    with pytest.raises(torch.OutOfMemoryError), distributed._losses():
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+
+def test_connecting_prints_nothing(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    """Of some versions of torch gloo does, from C++, into what --json prints."""
+    connect = dist.init_process_group
+
+    def noisy(*words: Any, **more: Any) -> None:
+        os.write(1, b"[Gloo] Rank 0 is connected\n")
+        connect(*words, **more)
+
+    monkeypatch.setattr(dist, "init_process_group", noisy)
+    with joined(dist.HashStore(), 0, 1):
+        os.write(1, b"after\n")
+    assert capfd.readouterr().out == "after\n"

@@ -1,0 +1,103 @@
+"""Training states on disk: the same bits come back, and what is something else is named."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.training import state_file
+from clod_adapter.training.state import TrainingState
+from clod_adapter.training.state_file import load_state, save_state
+
+BELONGS = {"config": {"seed": 2**63 - 1, "lr": 0.1}, "base": "abc"}
+
+
+@pytest.fixture
+def state() -> TrainingState:
+    random = np.random.default_rng(5)
+    random.integers(10, dtype=np.int32)  # leaves half a number in the generator
+    return TrainingState(
+        tensors={
+            "parameter.means": torch.tensor([[-0.0, 1e-45, math.inf], [math.nan, 1 / 3, 2.0]]),
+            "steps.means": torch.tensor([3, 7], dtype=torch.int32),
+            "mean.means": torch.zeros(3, 2).T,  # not contiguous
+        },
+        attenuation=AttenuationConfig(tau=0.01 + 0.02, scene_distance=1e-7), random=random.bit_generator.state,
+        order=(4, 0, 2), loss=0.1, averaged=2, steps=9, seconds=1 / 3, start_seconds=7.0,
+    )  # fmt: skip
+
+
+def test_the_same_bits_come_back(tmp_path: Path, state: TrainingState) -> None:
+    save_state(tmp_path / "state", state, BELONGS)
+    found, belongs = load_state(tmp_path / "state")
+    assert belongs == BELONGS and found.tensors.keys() == state.tensors.keys()
+    for name, value in state.tensors.items():
+        assert found.tensors[name].dtype == value.dtype
+        assert torch.equal(found.tensors[name].view(torch.int32), value.contiguous().view(torch.int32)), name
+    assert {**vars(found), "tensors": 0} == {**vars(state), "tensors": 0}
+    one, other = np.random.default_rng(0), np.random.default_rng(0)
+    one.bit_generator.state, other.bit_generator.state = found.random, state.random
+    assert one.integers(100, size=5, dtype=np.int32).tolist() == other.integers(100, size=5, dtype=np.int32).tolist()
+
+
+def test_what_is_no_state_is_named(tmp_path: Path, state: TrainingState) -> None:
+    good, bad = tmp_path / "good", tmp_path / "bad"
+    save_state(good, state, BELONGS)
+    bad.write_bytes(good.read_bytes()[:-5])
+    assert_refused(bad)
+    bad.write_bytes(b"ply")
+    assert_refused(bad)
+    save_file(load_file(good), bad)  # an adapter, say
+    assert_refused(bad)
+    with pytest.raises(ClodError, match="cannot be read.*No such file"):
+        load_state(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"steps": None},
+        {"steps": "9"},
+        {"steps": 9.0},
+        {"loss": True},
+        {"seconds": math.nan},
+        {"order": [1.0]},
+        {"order": 3},
+        {"random": "x"},
+        {"attenuation": {"tau": 7}},
+        {"belongs": 1},
+        {"more": 1.0},
+        None,
+    ],
+    ids=str,
+)
+def test_a_damaged_description(tmp_path: Path, state: TrainingState, changes: dict[str, Any] | None) -> None:
+    save_state(tmp_path / "good", state, BELONGS)
+    with safe_open(tmp_path / "good", framework="pt") as file:
+        about = json.loads(file.metadata()[state_file.KEY])
+    text = "[]" if changes is None else json.dumps(about | changes)
+    save_file(load_file(tmp_path / "good"), tmp_path / "bad", {state_file.KEY: text})
+    assert_refused(tmp_path / "bad")
+
+
+def assert_refused(path: Path) -> None:
+    with pytest.raises(ClodError, match="is no training state or damaged") as caught:
+        load_state(path)
+    assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.resume.safetensors")
+    with pytest.raises(ClodError, match="not a regular file"):
+        load_state(tmp_path / "pipe.resume.safetensors")

@@ -1,0 +1,222 @@
+"""The count law: its values, the gradient of the square, and that it brings the counts to it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from clod_adapter.attenuation import attenuate
+from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.training.optimizer import RowAdam
+from clod_adapter.training.target_count import (
+    count_gradient,
+    count_law,
+    count_slope,
+    law_quota,
+    paper_count,
+    soft_count,
+)
+
+CONFIG = AdaptConfig(max_sv=6.0)
+ATTENUATION = CONFIG.attenuation(1.0)
+N = 2000
+
+
+def some(seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Opacity logits, log sigma_d and normalised distances."""
+    generator = torch.Generator().manual_seed(seed)
+    logits, log_sigma, d = (torch.randn(N, generator=generator) for _ in range(3))
+    return 2 * logits + 1, log_sigma * 0.8, (0.3 * d).exp()
+
+
+def test_the_law() -> None:
+    for share, exponent in ((0.62, 1.5), (0.8, 1.0), (1.0, 2.0)):
+        assert count_law(1.0, share, exponent) == pytest.approx(share)
+        values = [count_law(s, share, exponent) for s in np.linspace(1, 20, 200)]
+        assert all(b < a for a, b in zip(values, values[1:], strict=False))
+        assert count_law(1e4, share, exponent) == pytest.approx(1e4**-exponent, rel=1e-4)
+    assert count_law(3.0, 1.0, 1.5) == pytest.approx(3**-1.5)  # with a share of 1 the paper's target throughout
+    assert count_law(2.0, 0.62, 1.5) / 2**-1.5 == pytest.approx(0.93, abs=0.005)
+    assert count_law(3.0, 0.62, 1.5) / 3**-1.5 == pytest.approx(0.98, abs=0.005)
+
+
+def gradient(logits: Tensor, log_sigma: Tensor, d: Tensor, s: float, **changes: float) -> Tensor:
+    dialled = attenuate(logits, log_sigma.exp(), d, s, ATTENUATION)
+    return count_gradient(dialled, logits, s, ATTENUATION.tau, 0.1, dataclasses.replace(CONFIG, **changes))
+
+
+def test_the_gradient_is_that_of_the_square() -> None:
+    logits, log_sigma, d = some()
+    for s in (1.0, 2.5, 6.0):
+        dialled = attenuate(logits, log_sigma.exp(), d, s, ATTENUATION)
+        slope = count_slope(logits, dialled.log_opacities, s, ATTENUATION.tau, CONFIG.temperature)
+        law = count_law(s, CONFIG.start_share, CONFIG.exponent)
+        excess = float(dialled.keep.float().mean()) / law - 1
+        want = 0.1 * 2 * CONFIG.reg_weight * excess / law * slope
+        torch.testing.assert_close(gradient(logits, log_sigma, d, s), want)
+
+
+def test_too_many_are_pressed_down_and_too_few_lifted() -> None:
+    logits, log_sigma, d = some()
+    many, few = log_sigma + 3, log_sigma - 2
+    for s in (1.5, 6.0):
+        assert gradient(logits, many, d, s).max() > 0 >= -gradient(logits, many, d, s).min()
+        assert gradient(logits, few, d, s).min() < 0 and gradient(logits, few, d, s).max() <= 0
+        assert (gradient(logits, log_sigma, d, s, reg_weight=0.0) == 0).all()
+
+
+@pytest.mark.parametrize("start", [-1.0, 0.7])
+def test_without_any_picture_the_counts_come_to_the_law(start: float) -> None:
+    """From too few, and from too many, in the optimiser's steps: Gaussians far from the cut feel little.
+
+    Steps of constant size end where the last few lead, by up to a quarter from the law, so they shrink, as in training.
+    Ten orders of the dial values then end within 0.07 of it.
+    """
+    logits, log_sigma, d = some()
+    # Opaque enough that the law can be met: what is fainter than tau s stays nowhere.
+    logits, log_sigma = logits.clamp(min=-1.5) + 1, log_sigma + start
+    random = np.random.default_rng(0)
+
+    def worst(log_sigma: Tensor) -> float:
+        """Largest departure of the shares kept from the law, as a logarithm."""
+        found = []
+        for s in (1.0, 1.4, 2.0, 3.1, 4.5, 6.0):
+            eta = float(attenuate(logits, log_sigma.exp(), d, s, ATTENUATION).keep.float().mean())
+            found.append(abs(math.log(eta / count_law(s, CONFIG.start_share, CONFIG.exponent))))
+        return max(found)
+
+    assert worst(log_sigma) > 0.3
+    optimizer, rows = RowAdam({"log_sigma": log_sigma}), torch.ones(N, dtype=torch.bool)
+    for step in range(1500):
+        slope = gradient(logits, log_sigma, d, 6.0 ** random.random())
+        rate = 0.03 * 0.02 ** (max(step - 1000, 0) / 500)
+        optimizer.step({"log_sigma": slope}, rows, {"log_sigma": rate})
+    assert worst(log_sigma) < 0.2
+
+
+def test_the_last_gaussian_is_not_pressed_out() -> None:
+    """Of one Gaussian the law would keep a tenth; one that is left stays unpressed."""
+    config = AdaptConfig()
+    logits, sigma, d = torch.tensor([4.0]), torch.tensor([5.0]), torch.tensor([1.0])
+    dialled = attenuate(logits, sigma, d, 5.0, config.attenuation(1.0))
+    assert bool(dialled.keep.all())
+    assert count_gradient(dialled, logits, 5.0, config.tau, 1.0, config).item() == 0
+
+
+def test_soft_count_is_hard_forward_and_soft_backward() -> None:
+    tau, scale, temperature = 1 / 255, 2.0, 0.5
+    logs = torch.tensor([-math.inf, -30.0, -5.0, -4.8, -1.0, 0.0], dtype=torch.float64, requires_grad=True)
+    count = soft_count(logs, scale, tau, temperature)
+    assert count.shape == () and count.item() == 3 / 6
+    (grad,) = torch.autograd.grad(3 * count, logs)
+    plain = torch.sigmoid((logs - math.log(tau * scale)) / temperature).mean()
+    (want,) = torch.autograd.grad(3 * plain, logs)
+    torch.testing.assert_close(grad[1:], want[1:])
+    assert grad[0] == 0
+    assert soft_count(torch.empty(0), scale, tau, temperature).item() == 0
+
+
+def test_count_slope_is_that_of_the_soft_count() -> None:
+    """Where 2 u > 1; below that it is as if 2 u were 1, so that who is not touched yet can be."""
+    tau, s, temperature = 0.02, 2.0, 0.5
+    logits = torch.linspace(-5, 5, 200, dtype=torch.float64)
+    d, log_sigma = torch.linspace(0.1, 1, 200, dtype=torch.float64), torch.linspace(-1, 2, 200, dtype=torch.float64)
+    log_sigma = log_sigma[torch.randperm(200, generator=torch.Generator().manual_seed(0))].requires_grad_()
+    out = attenuate(logits, log_sigma.exp(), d, s, AttenuationConfig(tau=tau, eps=0.0))
+    (want,) = torch.autograd.grad(soft_count(out.log_opacities, s, tau, temperature), log_sigma)
+    logs = out.log_opacities.detach()
+    got = count_slope(logits, logs, s, tau, temperature)
+    touched = 2 * (torch.nn.functional.logsigmoid(logits) - logs)
+    assert 20 < int((touched > 1).sum()) < 180
+    torch.testing.assert_close(got[touched > 1], want[touched > 1])
+    q = torch.sigmoid((logs - math.log(tau * s)) / temperature)
+    torch.testing.assert_close(got[touched <= 1], (q * (1 - q) / (temperature * 200))[touched <= 1])
+    gone = count_slope(torch.zeros(2), torch.tensor([-math.inf, -1e30]), s, tau, temperature)
+    assert gone.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("temperature", [0.02, 0.15, 1.0])
+def test_the_slope_of_the_soft_count_matches_mpmath(dtype: torch.dtype, temperature: float) -> None:
+    """On both sides of the threshold alike: q (1 - q) is not formed as a difference."""
+    tau, s, eps = 0.02, 3.0, torch.finfo(dtype).eps
+    threshold = mpmath.log(mpmath.mpf(tau) * s)
+    logs = torch.tensor([-8.0, -4.5, -2.9, -2.8125, -2.5, -2.0, -1.0, -0.5, 0.0], dtype=dtype, requires_grad=True)
+    (got,) = torch.autograd.grad(soft_count(logs, s, tau, temperature), logs)
+    by_log_sigma = count_slope(torch.full_like(logs, math.inf), logs.detach(), s, tau, temperature)
+    for log, g, b in zip(logs.tolist(), got.tolist(), by_log_sigma.tolist(), strict=True):
+        z = (mpmath.mpf(log) - threshold) / temperature
+        q, other = 1 / (1 + mpmath.exp(-z)), 1 / (1 + mpmath.exp(z))
+        want = q * other / (temperature * len(logs))
+        allowed = 6 + float(abs(threshold) / (2 * temperature) + 1.5 * abs(z))
+        assert abs(g - want) <= allowed * eps * want + torch.finfo(dtype).tiny
+        assert abs(b - want * max(-2 * log, 1)) <= (allowed + 2) * eps * b + torch.finfo(dtype).tiny
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+def test_counts_at_the_edges(dtype: torch.dtype) -> None:
+    """Never NaN, 0 where log a'' is -inf; a half's slope is float32's."""
+    tau, s = 0.5, 2.0  # log(tau s) is 0: a log a'' stands exactly on the threshold
+    logs = torch.tensor([-math.inf, -math.inf, -math.inf, 0.0, -0.0, -200.0, -1e4], dtype=dtype, requires_grad=True)
+    logits = torch.tensor([-math.inf, 0.0, math.inf, math.inf, 200.0, -200.0, 1.0], dtype=dtype)
+    for temperature in (5e-324, 1e-300, 1e-40, 1e-6, 0.15, 1e6, 1e300):
+        (grad,) = torch.autograd.grad(soft_count(logs, s, tau, temperature), logs)
+        slope = count_slope(logits, logs.detach(), s, tau, temperature)
+        assert not grad.isnan().any() and slope.isfinite().all() and (slope >= 0).all()
+        assert (grad[:3] == 0).all() and (slope[:3] == 0).all()
+    wide = count_slope(logits.to(slope.dtype), logs.detach().to(slope.dtype), s, tau, 0.15)
+    assert slope.dtype == torch.promote_types(dtype, torch.float32)
+    assert torch.equal(count_slope(logits, logs.detach(), s, tau, 0.15), wide)
+
+
+def test_whoever_has_left_is_called_back_from_any_depth() -> None:
+    """Only while too few are kept: where a'' is 0 at every dial value nothing else has a slope."""
+    logits, _, d = some()
+    for gone in (-9.2, -100.0):  # the floor that training has, and 0
+        assert (gradient(logits, torch.full((N,), gone), d, 2.0) < 0).all()
+    mixed = torch.where(torch.arange(N) % 2 == 0, 5.0, -9.2)  # half stay, where the law at s = 6 asks for 7 %
+    assert (gradient(logits, mixed, d, 6.0) >= 0).all() and (gradient(logits, mixed, d, 6.0)[1::2] == 0).all()
+
+
+def test_from_nobody_the_counts_come_to_the_law() -> None:
+    """Every sigma at the floor that training has: each of them comes back, and then they leave one by one."""
+    logits, _, d = some()
+    logits, log_sigma = logits.clamp(min=-1.5) + 1, torch.full((N,), math.log(1e-4))
+    optimizer, rows, random = (
+        RowAdam({"log_sigma": log_sigma}),
+        torch.ones(N, dtype=torch.bool),
+        np.random.default_rng(0),
+    )
+    for step in range(600):
+        slopes = gradient(logits, log_sigma, d, 1.0) + gradient(logits, log_sigma, d, 6.0 ** random.random())
+        optimizer.step({"log_sigma": slopes}, rows, {"log_sigma": 0.1 * 0.1 ** (step / 600)})
+    kept = float(attenuate(logits, log_sigma.exp(), d, 1.0, ATTENUATION).keep.float().mean())
+    assert kept == pytest.approx(CONFIG.start_share, rel=0.1)
+    assert (log_sigma > math.log(1e-4) + 2).all()
+
+
+@pytest.mark.parametrize("form", ["law", "paper"])
+@pytest.mark.parametrize("s", [1.0, 3.0])
+def test_shares_of_more_than_are_here(form: str, s: float) -> None:
+    """Gaussians that are left out because they are never drawn count as if they were here and gone."""
+    config = AdaptConfig(count_term=form)
+    random = torch.Generator().manual_seed(1)
+    logits = torch.cat([torch.randn(40, generator=random), torch.full((25,), -40.0)])
+    found = []
+    for count, total in ((65, None), (40, 65)):
+        sigma = (0.5 + torch.rand(65, generator=torch.Generator().manual_seed(2)))[:count].requires_grad_()
+        dialled = attenuate(logits[:count], sigma, torch.full((count,), 0.1), s, AttenuationConfig(tau=0.02))
+        if form == "paper":
+            paper_count(dialled, s, 0.02, config, total).backward()
+            found.append(sigma.grad[:40])
+        else:
+            quota = law_quota(s, count, config, total)
+            found.append(count_gradient(dialled, logits[:count], s, 0.02, 0.3, config, quota)[:40])
+    assert found[0].abs().max() > 0 or (form, s) == ("paper", 1.0)
+    assert torch.allclose(*found, rtol=1e-5, atol=0)
