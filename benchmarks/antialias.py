@@ -91,7 +91,7 @@ def row(gaussians: clod.Gaussians, scene: clod.Scene) -> dict[str, Any]:
 def adapted(gaussians: clod.Gaussians, scene: clod.Scene, drawn: str, iters: int, teacher: str) -> dict[str, Any]:
     """What adapting with one filter comes to, drawn with the same; to photographs, or to the file's own pictures."""
     start = gaussians.replace(screen_filter=FILTERS[drawn])
-    own = clod.imagine(start, clod.place(start)) if teacher == "checkpoint" else scene
+    own = clod.render_pseudo_views(start, clod.place_cameras(start)) if teacher == "checkpoint" else scene
     result = clod.adapt(start, own, clod.AdaptConfig(max_sv=5, iters=iters))
     rows = [
         {"s": r.virtual_scale, "psnr": round(r.psnr, 2), "kept": round(r.kept)}

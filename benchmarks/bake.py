@@ -63,7 +63,7 @@ def measure(model: str, scene: str, label: str) -> None:
     cameras: dict[str, Sequence[clod.Camera | Viewpoint]] = {
         "images": training,
         "stored": [viewpoint_of(camera, adapted.means, config) for camera in spread(training, VIEWPOINTS)],
-        "placed": clod.place(adapted, views=PLACED),
+        "placed": clod.place_cameras(adapted, views=PLACED),
     }
 
     def psnr(gaussians: clod.Gaussians) -> float:

@@ -92,7 +92,7 @@ def timed_step(draw: Callable[[], Tensor], leaves: list[Tensor], weights: Tensor
 
 
 def ours(workload: Workload) -> tuple[Callable[[], Tensor], list[Tensor]]:
-    """Draws the workload with our rasterizer; and the leaves that gradients go to."""
+    """ViewSampler the workload with our rasterizer; and the leaves that gradients go to."""
     leaves = {name: value.clone().requires_grad_() for name, value in workload.parameters().items()}
     background = torch.zeros(3)
     return lambda: cpu.rasterize(**leaves, camera=workload.camera, background=background)[0], list(leaves.values())

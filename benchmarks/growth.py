@@ -57,13 +57,13 @@ SAID = {
 # The order of leaving by itself, on the model as adapting has it: within the report it is a part of "start".
 ORDER = """
 import sys, time, torch
-from clod_adapter.collapse import leaving_order
+from clod_adapter.collapse import pruning_order
 from clod_adapter.io.ply import load
 g = load(sys.argv[1]).gaussians
 worth = torch.rand(len(g), generator=torch.Generator().manual_seed(0)) ** 4
-leaving_order(g.select(torch.arange(min(len(g), 1000))), worth[:1000])
+pruning_order(g.select(torch.arange(min(len(g), 1000))), worth[:1000])
 began, cpu = time.perf_counter(), time.process_time()
-leaving_order(g, worth)
+pruning_order(g, worth)
 print(time.perf_counter() - began, time.process_time() - cpu)
 """
 
@@ -381,8 +381,8 @@ def fill_in(name: str, text: str) -> None:
 
 # What is assumed of the city on paper, and of machines; the rest is measured.
 CITY, PHOTOGRAPHS, SIZE = 100_000_000, 20_000, 1600 * 1000 / 1e6  # Gaussians; how many, of so many megapixels
-BORDER = 0.2  # Gaussians around a chunk that go along frozen, of its own
-CHUNK_STEPS, LOOKED_AT, HELD_OUT = 1500, 64, 64  # of a chunk; photographs for its start, and to measure it on
+BORDER = 0.2  # Gaussians around a block that go along frozen, of its own
+BLOCK_STEPS, LOOKED_AT, HELD_OUT = 1500, 64, 64  # of a block; photographs for its start, and to measure it on
 FOR_IMAGES = 0.25  # of the memory, as decoded photographs
 CORES_OF_A_JOB, CORE_HOUR = 2, 0.05  # as measured; dollars
 GPU_TIMES, GPU_HOUR = 30, 3.0  # times as fast as the two cores, all told; dollars
@@ -390,25 +390,25 @@ MEMORIES = (8, 16, 32, 64)  # GB for a job
 
 
 def on_paper(rows: Sequence[dict[str, Any]]) -> str:
-    """The city in chunks, for jobs of some memory: how many, how long, at what price. Markdown."""
+    """The city in blocks, for jobs of some memory: how many, how long, at what price. Markdown."""
     each, rest = bytes_a_gaussian(rows, "adapt")
-    lines = ["| a job's memory, GB | Gaussians in a chunk | chunks | hours a chunk, of them training | core-hours | "
+    lines = ["| a job's memory, GB | Gaussians in a block | blocks | hours a block, of them training | core-hours | "
              "hours on 64 cores | dollars | on one assumed GPU: hours | dollars |", "|---" * 9 + "|"]  # fmt: skip
     for memory in MEMORIES:
         room = int(((1 - FOR_IMAGES) * memory * 1e9 - rest) / each)
-        chunks = math.ceil(CITY * (1 + BORDER) / room)
-        training, other = chunk_seconds(rows, room)
+        blocks = math.ceil(CITY * (1 + BORDER) / room)
+        training, other = block_seconds(rows, room)
         hours = (training + other) / 3600
-        core_hours, gpu_hours = chunks * hours * CORES_OF_A_JOB, chunks * hours / GPU_TIMES
+        core_hours, gpu_hours = blocks * hours * CORES_OF_A_JOB, blocks * hours / GPU_TIMES
         lines.append(
-            f"| {memory} | {room / 1e6:.1f} million | {chunks} | {hours:.2f}, {training / 3600:.2f} | {core_hours:.0f} "
+            f"| {memory} | {room / 1e6:.1f} million | {blocks} | {hours:.2f}, {training / 3600:.2f} | {core_hours:.0f} "
             f"| {core_hours / 64:.1f} | {core_hours * CORE_HOUR:.1f} | {gpu_hours:.1f} | {gpu_hours * GPU_HOUR:.1f} |"
         )
     return "\n".join(lines)
 
 
-def chunk_seconds(rows: Sequence[dict[str, Any]], count: int) -> tuple[float, float]:
-    """Training, and everything else, for a chunk of so many Gaussians on the machine of the rows.
+def block_seconds(rows: Sequence[dict[str, Any]], count: int) -> tuple[float, float]:
+    """Training, and everything else, for a block of so many Gaussians on the machine of the rows.
 
     In proportion from the largest city that was measured, the order of leaving by n log n; a megapixel more of a
     photograph adds to each view what it does in the series over sizes.
@@ -431,7 +431,7 @@ def chunk_seconds(rows: Sequence[dict[str, Any]], count: int) -> tuple[float, fl
     evaluate = phase_of(row, "evaluate") / held_out * share + larger * a_megapixel("evaluate", split(FEW)[1])
     order = phase_of(row, "order") * share * math.log(count) / math.log(n)
     fixed = (phase_of(row, "load") + 2 * phase_of(row, "write")) * share
-    return CHUNK_STEPS * step, LOOKED_AT * importance + HELD_OUT * evaluate + order + fixed
+    return BLOCK_STEPS * step, LOOKED_AT * importance + HELD_OUT * evaluate + order + fixed
 
 
 def split(images: int) -> tuple[int, int]:

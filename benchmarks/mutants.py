@@ -325,7 +325,7 @@ def _number(data: bytearray, chance: random.Random) -> None:
     data[place : place + size] = number.to_bytes(size, chance.choice(("little", "little", "big")))
 
 
-def _chunk(data: bytearray, chance: random.Random) -> None:
+def _block(data: bytearray, chance: random.Random) -> None:
     """Copies a part over another, or between."""
     start, place, size = _place(data, chance), _place(data, chance), chance.choice((4, 16, 64, 256))
     data[place : place + (size if chance.random() < 0.5 else 0)] = data[start : start + size]
@@ -361,4 +361,4 @@ INSIDE = {
     ".spz": lambda data, chance: unpacked(data, chance, damage),
     ".glb": lambda data, chance: described(data, chance, damage, _replace),
 }  # fmt: skip
-WAYS = (_flip, _truncate, _drop, _insert, _word, _number, _number, _chunk, _line, _line)
+WAYS = (_flip, _truncate, _drop, _insert, _word, _number, _number, _block, _line, _line)

@@ -24,7 +24,7 @@ from adapt import at_shares
 from common import RESULTS, append, capture
 
 import clod_adapter as clod
-from clod_adapter.training.pseudo_views import complement, imagine, place, typical_reach
+from clod_adapter.training.pseudo_views import add_pseudo_views, place_cameras, render_pseudo_views, typical_reach
 
 FILE = "nophoto.jsonl"
 KINDS = ("photographs", "teacher", "placed", "complemented")
@@ -61,11 +61,11 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
         # Of the views to train on alone; none is held out of them.
         views = clod.Scene(tuple(_own(base, view.camera) for view in photographs.train), ())
     if kind == "placed":
-        cameras = place(base, seed=config.seed)
-        views = imagine(base, cameras)
+        cameras = place_cameras(base, seed=config.seed)
+        views = render_pseudo_views(base, cameras)
         placement = distances(cameras, [view.camera for view in photographs.train], typical_reach(base))
     if kind == "complemented":
-        views, config = complement(base, photographs, config)
+        views, config = add_pseudo_views(base, photographs, config)
     seconds = time.perf_counter() - began
     adapted = clod.adapt(base, views, config)
     rows = clod.evaluate(adapted.gaussians, photographs.test, [s for s in DIALS if s <= config.max_sv])
@@ -80,7 +80,7 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
 
 
 def _own(base: clod.Gaussians, camera: clod.Camera) -> clod.View:
-    return imagine(base, [camera]).train[0]
+    return render_pseudo_views(base, [camera]).train[0]
 
 
 def distances(placed: list[clod.Camera], real: list[clod.Camera], reach: float) -> dict[str, list[float]]:

@@ -31,7 +31,7 @@ import clod_adapter as clod
 from clod_adapter.cameras import Camera, Scene, View, in_its_unit
 from clod_adapter.gaussians import SH_C0
 from clod_adapter.io.scene.colmap import write_model
-from clod_adapter.training.pseudo_views import complement
+from clod_adapter.training.pseudo_views import add_pseudo_views
 
 CAPTURE, STEPS, ALLOWED = "ci_banana", 200, 0.3
 RATIO = math.log(1e6)
@@ -256,7 +256,7 @@ def refusal(**settings: Any) -> str:
 
 def run(name: str, case: Case) -> dict[str, Any]:
     started = time.perf_counter()
-    scene, config = complement(case.base, case.scene, clod.AdaptConfig(**{"iters": STEPS, **case.settings}))
+    scene, config = add_pseudo_views(case.base, case.scene, clod.AdaptConfig(**{"iters": STEPS, **case.settings}))
     adapted = clod.adapt(case.base, scene, config)
     seconds = time.perf_counter() - started
     result = clod.extract(case.base, adapted.gaussians, fingerprint="", config={}).apply(case.base)

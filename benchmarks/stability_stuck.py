@@ -30,7 +30,7 @@ from clod_adapter.initialization.importance import sigma_from_importance
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import render
 from clod_adapter.training.loop import _Run
-from clod_adapter.training.target_count import count_gradient, count_law, soft_count
+from clod_adapter.training.target_count import count_gradient, soft_count, target_curve
 
 FROZEN = {f"lr_{name}": 0.0 for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
 CONFIG = AdaptConfig(**FROZEN)
@@ -121,7 +121,7 @@ def objective(run: _Run) -> float:
     for s in DIALS:
         shown = render(found, view.camera, s)
         weight = (1 - config.weight_slope * s / config.max_sv) ** 2
-        off = float(shown.kept.float().mean()) / count_law(s, config.start_share, config.exponent) - 1
+        off = float(shown.kept.float().mean()) / target_curve(s, config.start_share, config.exponent) - 1
         total += weight * float(photometric_loss(shown.image, view.image)) * (1 + config.reg_weight * off**2)
     return total / len(DIALS)
 

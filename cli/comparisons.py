@@ -29,7 +29,7 @@ Job = tuple[str, Gaussians, Tensor | None, float]
 
 
 @dataclass
-class Instruments:
+class Comparisons:
     """Runs what was asked for; what is finished when Ctrl-C ends it is kept.
 
     Attributes:

@@ -11,7 +11,7 @@ from clod_adapter.evaluation.perceptual import available_metrics
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.version import package_version
 
-from .comparisons import Instruments
+from .comparisons import Comparisons
 from .shared.antialiasing import with_filter
 from .shared.budgets import solve_dials
 from .shared.console import Console
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     if interrupted and not rows:
         raise KeyboardInterrupt
     print(table(rows))
-    instruments = Instruments(model.gaussians, scene, perceptual, console)
+    instruments = Comparisons(model.gaussians, scene, perceptual, console)
     if not interrupted:
         with watch.time("instruments"):
             interrupted = instruments.run(rows, base, others, args.popping)

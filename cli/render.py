@@ -18,7 +18,7 @@ from clod_adapter.cameras import View
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.claims import claimed
+from clod_adapter.io.claims import output_lock
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
 from clod_adapter.version import package_version
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     gaussians, pictures, interrupted = model.gaussians.without_empty_bands(), [], False
     make_folder(out)
     try:
-        with claimed(out / "pictures", of=out), console.meter("render") as meter:
+        with output_lock(out / "pictures", of=out), console.meter("render") as meter:
             for picture in draw(gaussians, views, dials, out, args.beside):
                 pictures.append(picture)
                 meter.update(len(pictures) / len(views), f"{len(pictures)}/{len(views)}")

@@ -15,7 +15,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.robustness import Outcome, adapt_at_range, baseline, scene_fingerprint
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.claims import claimed
+from clod_adapter.io.claims import output_lock
 from clod_adapter.report.robustness_figure import robustness_figure
 from clod_adapter.training.loop import Progress
 from clod_adapter.version import package_version
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     make_folder(folder)  # only now: what cannot be read, or does not fit, leaves none behind
     make_folder(folder / "cells")
     check_outputs(outputs.values(), args.ply, args.images)
-    with claimed(outputs["json"], of=folder), stop.listening():
+    with output_lock(outputs["json"], of=folder), stop.listening():
         with watch.time("cells"):
             interrupted = run_cells(missing, scene, found, console, stop)
         if not found:

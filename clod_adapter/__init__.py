@@ -37,10 +37,10 @@ if TYPE_CHECKING:
     from clod_adapter.io.scene.load import load_scene
     from clod_adapter.render import Rendering, render
     from clod_adapter.training.loop import Adapted, adapt
-    from clod_adapter.training.objective import Part
-    from clod_adapter.training.plan import Decision, Overrule, Plan
+    from clod_adapter.training.objective import TrainableSubset
+    from clod_adapter.training.plan import Decision, Override, Plan
     from clod_adapter.training.planner import make_plan
-    from clod_adapter.training.pseudo_views import imagine, place
+    from clod_adapter.training.pseudo_views import place_cameras, render_pseudo_views
 
 # Imported on first use: torch takes a second or two, which the command's --help and most of its errors do without.
 on_first_use(__name__, {
@@ -57,9 +57,9 @@ on_first_use(__name__, {
     "io.adapter_file": ("load_adapter", "save_adapter"),
     "io.scene.load": ("load_scene",),
     "io.checkpoint": ("Checkpoint", "load", "save"),
-    "training.objective": ("Part",),
-    "training.pseudo_views": ("imagine", "place"),
-    "training.plan": ("Decision", "Overrule", "Plan"),
+    "training.objective": ("TrainableSubset",),
+    "training.pseudo_views": ("render_pseudo_views", "place_cameras"),
+    "training.plan": ("Decision", "Override", "Plan"),
     "training.planner": ("make_plan",),
     "render": ("Rendering", "render"),
     "training.loop": ("Adapted", "adapt"),
@@ -67,7 +67,8 @@ on_first_use(__name__, {
 
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
-    "Decision", "DialValue", "Gaussians", "Hook", "Overrule", "Part", "Plan", "Rendering", "Scene", "ScreenFilter",
-    "View", "adapt", "attach", "bake", "detach", "dial_for", "evaluate", "extract", "imagine", "load", "load_adapter",
-    "load_scene", "make_plan", "order_by_extinction", "place", "render", "save", "save_adapter",
+    "Decision", "DialValue", "Gaussians", "Hook", "Override", "Plan", "Rendering", "Scene", "ScreenFilter",
+    "TrainableSubset", "View", "adapt", "attach", "bake", "detach", "dial_for", "evaluate", "extract", "load",
+    "load_adapter", "load_scene", "make_plan", "order_by_extinction", "place_cameras", "render",
+    "render_pseudo_views", "save", "save_adapter",
 ]  # fmt: skip

@@ -22,7 +22,7 @@ from clod_adapter.alignment.check import check_alignment
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.blocks.divide import divide
 from clod_adapter.blocks.targets import target
-from clod_adapter.blocks.train import adapt_chunk, merge
+from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.cameras import Camera, Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.baselines import matching_dial, mean_kept, rankings
@@ -35,7 +35,7 @@ from clod_adapter.rasterizers import cpu, cuda
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.planner import make_plan
-from clod_adapter.training.pseudo_views import imagine, place
+from clod_adapter.training.pseudo_views import place_cameras, render_pseudo_views
 from clod_adapter.training.target_count import count_gradient, paper_count
 from fake_gpu import fake_gpu
 from scenes import capture, gaussians, ring
@@ -143,11 +143,11 @@ def test_frame_times(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_placed_cameras_are_those_of_the_cpu(setup: Setup) -> None:
-    placed = [place(model, views=1) for model in (setup.there, setup.own)]
+    placed = [place_cameras(model, views=1) for model in (setup.there, setup.own)]
     torch.testing.assert_close(placed[0][0].viewmat, placed[1][0].viewmat, rtol=1e-3, atol=1e-3)
     assert placed[0][0].viewmat.device.type == "cpu"
     small = replace(placed[0][0], K=placed[0][0].K / 31, width=16, height=12)
-    pictures = imagine(setup.there, [small]).train
+    pictures = render_pseudo_views(setup.there, [small]).train
     assert all(view.image.device.type == "cpu" for view in pictures)
 
 
@@ -194,12 +194,12 @@ def test_a_training_is_that_of_the_cpu(setup: Setup) -> None:
         assert float((mine.tensors()[name].cpu() - value).abs().median()) <= 1e-4, name
 
 
-def test_a_chunk(setup: Setup) -> None:
+def test_a_block(setup: Setup) -> None:
     views, config = setup.scene.train[:2], replace(CONFIG, iters=2)
     division = divide(setup.there.replace(sigma_d=None, attenuation=None), views, config, 2)
     aimed = target(division.begun, 25, views[0])
-    assert aimed.device.type == "cpu" and aimed.dtype == torch.uint8  # photographs of a whole chunk
-    learned = [adapt_chunk(division, views, config, block)[0] for block in range(2)]
+    assert aimed.device.type == "cpu" and aimed.dtype == torch.uint8  # photographs of a whole block
+    learned = [adapt_block(division, views, config, block)[0] for block in range(2)]
     merged = merge(division, learned)
     assert merged.means.device == setup.device and bool(merged.sigma_d.isfinite().all())
 

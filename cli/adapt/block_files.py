@@ -1,4 +1,4 @@
-"""The files of a run in chunks, where it goes on from in whichever process: their names, and what is in them."""
+"""The files of a run in blocks, where it goes on from in whichever process: their names, and what is in them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.blocks.divide import DIALS, Division
-from clod_adapter.blocks.file import checked, damaged, load_chunk, save_chunk
+from clod_adapter.blocks.file import checked, damaged, load_block, save_block
 from clod_adapter.blocks.train import Learned
 from clod_adapter.cameras import View
 from clod_adapter.config import AttenuationConfig
@@ -22,13 +22,13 @@ from clod_adapter.io.atomic import remove_leftovers
 
 
 @dataclass
-class ChunkFiles:
+class BlockFiles:
     """Beside ``ply``, the output.
 
     Attributes:
         belongs: what the files of this run say that they are of; with the start read or written, of that start too,
             as jobs that made one each, on unlike machines, may have cut the scene unlike.
-        count: of chunks; 0 before there is a start.
+        count: of blocks; 0 before there is a start.
     """
 
     ply: Path
@@ -39,17 +39,17 @@ class ChunkFiles:
     def start(self) -> Path:
         return self.ply.with_suffix(".start.safetensors")
 
-    def chunk(self, block: int, number: int) -> Path:
-        """What a chunk learns in a pass, 1 or 2."""
-        return self.ply.with_suffix(f".chunk{block + 1}.pass{number}.safetensors")
+    def block(self, block: int, number: int) -> Path:
+        """What a block learns in a pass, 1 or 2."""
+        return self.ply.with_suffix(f".block{block + 1}.pass{number}.safetensors")
 
     def state(self, block: int, number: int) -> Path:
-        """What a chunk's training can be resumed from."""
-        return self.chunk(block, number).with_suffix(".resume.safetensors")
+        """What a block's training can be resumed from."""
+        return self.block(block, number).with_suffix(".resume.safetensors")
 
     def missing(self, number: int) -> list[int]:
-        """The chunks, from 1, whose pass is not done."""
-        return [block + 1 for block in range(self.count) if not self.chunk(block, number).exists()]
+        """The blocks, from 1, whose pass is not done."""
+        return [block + 1 for block in range(self.count) if not self.block(block, number).exists()]
 
     def save_start(self, division: Division) -> None:
         """Writes a division, unless another job was quicker."""
@@ -58,7 +58,7 @@ class ChunkFiles:
         assert division.begun.sigma_d is not None
         tensors = {"sigma_d": division.begun.sigma_d, "block": division.block, "seen": division.seen}
         about = {"extent": division.extent, "attenuation": division.begun.attenuation}
-        save_chunk(self.start, tensors | {"kept": division.kept}, about, self.belongs)
+        save_block(self.start, tensors | {"kept": division.kept}, about, self.belongs)
 
     def load_start(self, base: Gaussians, views: Sequence[View]) -> Division:
         """The division of the file.
@@ -66,7 +66,7 @@ class ChunkFiles:
         Raises:
             ClodError: it cannot be read, is damaged, or of another run.
         """
-        tensors, about = load_chunk(self.start, self.belongs)
+        tensors, about = load_block(self.start, self.belongs)
         device = base.means.device
         count = tensors["seen"].shape[-1] if "seen" in tensors and tensors["seen"].dim() else 0
         shapes = {
@@ -75,7 +75,7 @@ class ChunkFiles:
         }  # fmt: skip
         checked(self.start, tensors, shapes)
         if tensors["block"].unique().tolist() != list(range(count)):
-            raise ClodError(f"{self.start}: a chunk has no Gaussians; remove it to have it made anew")
+            raise ClodError(f"{self.start}: a block has no Gaussians; remove it to have it made anew")
         with damaged(self.start):
             settings, extent = AttenuationConfig(**about["attenuation"]), float(about["extent"])
         self.belongs, self.count = self.belongs | {"start": _digest(tensors)}, count
@@ -84,16 +84,16 @@ class ChunkFiles:
 
     def save_learned(self, learned: Learned, block: int, number: int) -> None:
         about = {"steps": learned.steps, "seconds": learned.seconds}
-        save_chunk(self.chunk(block, number), learned.values, about, self._of(block, number))
+        save_block(self.block(block, number), learned.values, about, self._of(block, number))
 
     def load_learned(self, division: Division, block: int, number: int) -> Learned:
-        """What a chunk has learned in a pass.
+        """What a block has learned in a pass.
 
         Raises:
-            ClodError: the file cannot be read, is damaged, or of another run, start, chunk or pass.
+            ClodError: the file cannot be read, is damaged, or of another run, start, block or pass.
         """
-        path, rows = self.chunk(block, number), division.rows(block)
-        values, about = load_chunk(path, self._of(block, number))
+        path, rows = self.block(block, number), division.rows(block)
+        values, about = load_block(path, self._of(block, number))
         shapes = {name: (t.dtype, (len(rows), *t.shape[1:])) for name, t in division.begun.tensors().items()}
         checked(path, values, {n: shape for n, shape in shapes.items() if n in values or n == "sigma_d"})
         with damaged(path):
@@ -101,12 +101,12 @@ class ChunkFiles:
         return Learned(rows, {name: value.to(rows.device) for name, value in values.items()}, steps, seconds)
 
     def _of(self, block: int, number: int) -> dict[str, Any]:
-        return self.belongs | {"chunk": f"{block + 1} of {self.count}, pass {number}"}
+        return self.belongs | {"block": f"{block + 1} of {self.count}, pass {number}"}
 
     def remove(self) -> None:
         """Removes the files of this run, and what killed jobs have left of them."""
         each = [(block, number) for block in range(self.count) for number in (1, 2)]
-        for path in (self.start, *(name(*one) for one in each for name in (self.chunk, self.state))):
+        for path in (self.start, *(name(*one) for one in each for name in (self.block, self.state))):
             path.unlink(missing_ok=True)
             remove_leftovers(path)
 

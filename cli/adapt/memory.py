@@ -6,7 +6,7 @@ import argparse
 import math
 from dataclasses import replace
 
-from clod_adapter.blocks.memory import IMAGES, MemoryPlan, Needs, in_words, make_plan, parse_size
+from clod_adapter.blocks.memory import IMAGES, MemoryEstimate, MemoryPlan, in_words, parse_size, plan_for_limit
 from clod_adapter.cameras import Scene, StoredView
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import Checkpoint, load
@@ -32,12 +32,12 @@ def plan_memory(args: argparse.Namespace, base: Checkpoint, scene: Scene, consol
     pixels = [view.camera.width * view.camera.height for view in views]
     attributes = sum(tensor.element_size() * tensor.numel() for tensor in gaussians.tensors().values())
     made = sum(3 * size for view, size in zip(views, pixels, strict=True) if not isinstance(view, StoredView))
-    needs = Needs(
+    needs = MemoryEstimate(
         len(gaussians), math.ceil(attributes / len(gaussians)), base.vertex.dtype.itemsize,
         images=3 * sum(pixels) - made, pixels=max(pixels), pictures=made,
     )  # fmt: skip
-    plan = make_plan(needs, parse_size(args.memory))
-    how = "the whole at once" if plan.chunks == 1 else f"in {plan.chunks} chunks"
+    plan = plan_for_limit(needs, parse_size(args.memory))
+    how = "the whole at once" if plan.blocks == 1 else f"in {plan.blocks} blocks"
     console.say(f"memory: {in_words(plan.peak)} of {in_words(plan.limit)}, {how}; at most, with the program's own:")
     for name, what in (
         ("base", "reading the checkpoint"), ("start", "the start, of the whole scene"), ("train", "training"),

@@ -12,16 +12,21 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers.cpu import release_memory
-from clod_adapter.training.plan import Decision, Overrule, Plan
+from clod_adapter.training.plan import Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
 
 from ..shared.console import Console
-from .progress import Follower
+from .progress import ProgressDisplay
 from .resume import BEGUN, Saver
 
 
 def decide(
-    args: argparse.Namespace, base: Gaussians, scene: Scene, config: AdaptConfig, follower: Follower, saver: Saver
+    args: argparse.Namespace,
+    base: Gaussians,
+    scene: Scene,
+    config: AdaptConfig,
+    follower: ProgressDisplay,
+    saver: Saver,
 ) -> Plan:
     """Makes the plan and prints it.
 
@@ -30,7 +35,7 @@ def decide(
         KeyboardInterrupt: Ctrl-C while it was made.
     """
     _settle(args, saver)
-    overrule = Overrule(frozenset(args.keep_in), frozenset(args.leave_out))
+    overrule = Override(frozenset(args.keep_in), frozenset(args.leave_out))
     plan = make_plan(base, scene, config, overrule, follower, resumed=saver.frozen)
     saver.belongs["frozen"] = plan.frozen
     follower.close()

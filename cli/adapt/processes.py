@@ -21,15 +21,15 @@ from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.training.distributed import PATIENCE, PeerLost, Peers, joined
+from clod_adapter.training.distributed import PATIENCE, ProcessGroup, ProcessLost, joined
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.objective import Part
+from clod_adapter.training.objective import TrainableSubset
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted, Progress, TrainingState
 
 from ..shared.interrupts import GracefulStop
 from ..shared.launch import Launch, launched
-from .progress import Follower
+from .progress import ProgressDisplay
 
 BACKENDS = {"cpu": "gloo", "cuda": "nccl"}  # what processes talk by, by where they train
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class Job:
     views: tuple[View, ...]
     config: AdaptConfig
     state: TrainingState | None
-    part: Part
+    part: TrainableSubset
     device: str
 
     @classmethod
@@ -71,7 +71,7 @@ def leading() -> Iterator[None]:
 
 
 @contextmanager
-def together(make_job: Callable[[], Job], follower: Follower) -> Iterator[Peers | None]:
+def together(make_job: Callable[[], Job], follower: ProgressDisplay) -> Iterator[ProcessGroup | None]:
     """The processes to train with, which then do so too; None where this one is alone, and no job is made.
 
     Raises:
@@ -89,7 +89,7 @@ def together(make_job: Callable[[], Job], follower: Follower) -> Iterator[Peers 
             peers.broadcast(job)
             del job
             yield peers
-    except PeerLost as error:
+    except ProcessLost as error:
         if follower.stop.requests:  # which the others have heard of too
             raise KeyboardInterrupt from error
         raise ClodError(f"{explain(str(error))}; nothing was learned by then, so start again") from error
@@ -104,7 +104,7 @@ def take_part() -> None:
                 return
             try:
                 _train_along(number, launch, stop)
-            except PeerLost:
+            except ProcessLost:
                 continue  # the first one says so; where it is the one that is gone, the launcher does
 
 
@@ -158,7 +158,7 @@ def _giving_reasons(rank: int) -> Iterator[None]:
     """Leaves word of what ends this process; to be left before the others notice that it does."""
     try:
         yield
-    except PeerLost:
+    except ProcessLost:
         raise
     except Exception as error:
         with suppress(RuntimeError):

@@ -27,7 +27,7 @@ LABELS = {
 }  # fmt: skip
 
 
-class Follower:
+class ProgressDisplay:
     """The progress callback of ``adapt``.
 
     Args:

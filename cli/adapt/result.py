@@ -25,7 +25,7 @@ from ..shared.interrupts import GracefulStop, listen_no_more
 from ..shared.measure import measure
 from ..shared.pages import AdaptPage
 from ..shared.report import Stopwatch, machine, report_dials, table, write_report
-from .blocks import Chunked
+from .blocks import Blocked
 from .files import write, write_measured
 from .memory import with_rows
 from .processes import describe_processes, explain, hurried
@@ -54,7 +54,7 @@ class Run:
     """One run, as its steps share it.
 
     Attributes:
-        memory, chunked: how ``--memory`` is spent, and the run in chunks, where the whole does not fit.
+        memory, blocked: how ``--memory`` is spent, and the run in blocks, where the whole does not fit.
         base_rows: the base at dial 1; none where nothing is held out.
         notes: for the report.
     """
@@ -66,7 +66,7 @@ class Run:
     stop: GracefulStop
     saver: Saver
     memory: MemoryPlan | None = None
-    chunked: Chunked | None = None
+    blocked: Blocked | None = None
     base_rows: list[Row] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -110,7 +110,7 @@ def hand_out(run: Run, inputs: Inputs, plan: Plan | None, adapted: Adapted) -> O
     if adapted.held:
         run.note(f"{adapted.held:,} Gaussians stayed where they were in some steps: their gradients were not finite")
     result = adapter.apply(gaussians)
-    inputs = replace(inputs, base=with_rows(base, run.args) if run.chunked else base)
+    inputs = replace(inputs, base=with_rows(base, run.args) if run.blocked else base)
     report = describe_run(run, inputs, plan, adapted, adapter, result)
     with run.console.status(f"writing {run.outputs.ply} ..."):
         write(inputs.base, adapter, result, run.outputs, report)
@@ -178,8 +178,8 @@ def finish(run: Run, outcome: Outcome, page: AdaptPage | None) -> dict[str, Any]
     else:
         write_report(run.outputs.report, report)
     run.saver.close(finished=not adapted.interrupted and not cut_short)
-    if run.chunked and not cut_short:
-        run.chunked.remove()
+    if run.blocked and not cut_short:
+        run.blocked.remove()
     if page and not cut_short and not late.requests:  # after the report, which no failure of the page is to cost
         add_page(run, outcome, page)
     print_summary(run.outputs, table(rows, run.base_rows, plain) if rows else "", run.args, run.watch)

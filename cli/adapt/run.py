@@ -13,7 +13,7 @@ from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import check_config
 from clod_adapter.io.atomic import remove_leftovers
-from clod_adapter.io.claims import claimed
+from clod_adapter.io.claims import output_lock
 from clod_adapter.rasterizers.cpu import release_memory
 from clod_adapter.training.loop import Adapted, Progress
 from clod_adapter.training.plan import Plan
@@ -25,24 +25,24 @@ from ..shared.antialiasing import with_filter
 from ..shared.console import Console, duration
 from ..shared.devices import on_device, pick_device
 from ..shared.files import Outputs
-from ..shared.inputs import complement_scene, place_scene, read_checkpoint, read_scene
+from ..shared.inputs import place_scene, read_checkpoint, read_scene, with_pseudo_views
 from ..shared.interrupts import GracefulStop
 from ..shared.kernels import prepare_kernels
 from ..shared.launch import launched
 from ..shared.measure import measure
 from ..shared.pages import AdaptPage
 from ..shared.report import Stopwatch
-from .blocks import Chunked
+from .blocks import Blocked
 from .memory import image_cache, plan_memory, without_rows
 from .plan import decide
 from .processes import Job, together
-from .progress import Follower
+from .progress import ProgressDisplay
 from .result import Inputs, Outcome, Run, finish, hand_out
 from .resume import Saver
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    with claimed(Outputs.of(args.ply, args.out).ply, shared=args.chunk is not None):
+    with output_lock(Outputs.of(args.ply, args.out).ply, shared=args.block is not None):
         return adapt(args)
 
 
@@ -51,14 +51,14 @@ def adapt(args: argparse.Namespace) -> dict[str, Any]:
     now, config = begin(args)
     inputs = read_inputs(args, config, now.console, now.watch)
     now.memory = plan_memory(args, inputs.base, inputs.scene, now.console)
-    now.chunked = Chunked.of(
+    now.blocked = Blocked.of(
         args, now.outputs, now.memory, inputs.base, inputs.scene, inputs.config, now.console, now.stop
     )
     gaussians, scene = inputs.base.gaussians, inputs.scene
-    if now.chunked:
+    if now.blocked:
         inputs = replace(inputs, base=without_rows(inputs.base))
-        if args.chunk:
-            return now.chunked.alone(gaussians, scene, inputs.config)
+        if args.block:
+            return now.blocked.alone(gaussians, scene, inputs.config)
     else:
         now.saver.belong(gaussians, scene, args.ply, args.images or "those placed for it")
     with now.watch.time("evaluate"):
@@ -83,7 +83,7 @@ def begin(args: argparse.Namespace) -> tuple[Run, AdaptConfig]:
     check_config(asdict(config))
     for path in vars(outputs).values():
         remove_leftovers(path)
-    resume = args.resume and (not args.memory or outputs.state.exists())  # chunks have files of their own
+    resume = args.resume and (not args.memory or outputs.state.exists())  # blocks have files of their own
     return Run(args, outputs, console, Stopwatch(), stop, Saver(outputs.state, resume, config, console, stop)), config
 
 
@@ -110,7 +110,7 @@ def read_inputs(args: argparse.Namespace, config: AdaptConfig, console: Console,
             return Inputs(base, place_scene(base.gaussians, config.seed, console), config, None, [])
     with watch.time("evaluate"):
         alignment, notes = require_alignment(base, photographs, args, console)
-        scene, config = complement_scene(base.gaussians, photographs, config, console)
+        scene, config = with_pseudo_views(base.gaussians, photographs, config, console)
     return Inputs(base, scene, config, alignment, notes)
 
 
@@ -136,13 +136,13 @@ def look_at_base(
 
 
 def learn_and_write(run: Run, inputs: Inputs, page: AdaptPage | None) -> Outcome:
-    """Plans and trains, in chunks without a plan, which looks at all Gaussians at once; writes what came of it."""
+    """Plans and trains, in blocks without a plan, which looks at all Gaussians at once; writes what came of it."""
     gaussians, scene, config, plan = inputs.base.gaussians, inputs.scene, inputs.config, None
-    if run.chunked:
-        adapted = run.chunked.all(gaussians, scene, config)
+    if run.blocked:
+        adapted = run.blocked.all(gaussians, scene, config)
     else:
         base_row = run.base_rows[0] if run.base_rows else None
-        follower = Follower(run.console, run.stop, gaussians, scene.test, config.max_sv, base_row)
+        follower = ProgressDisplay(run.console, run.stop, gaussians, scene.test, config.max_sv, base_row)
         plan = decide(run.args, gaussians, scene, config, follower, run.saver)
         adapted = train(gaussians, scene, plan, follower, run.saver, page)
     release_memory()  # of the training, before its outcome is copied and written
@@ -150,7 +150,7 @@ def learn_and_write(run: Run, inputs: Inputs, page: AdaptPage | None) -> Outcome
 
 
 def train(
-    base: Gaussians, scene: Scene, plan: Plan, follower: Follower, saver: Saver, page: AdaptPage | None = None
+    base: Gaussians, scene: Scene, plan: Plan, follower: ProgressDisplay, saver: Saver, page: AdaptPage | None = None
 ) -> Adapted:
     """Adapts as planned while the user watches. Raises KeyboardInterrupt when there is nothing worth writing."""
     console, watching = follower.console, page.watching(follower) if page else follower

@@ -59,10 +59,10 @@ def adapt_options(parser: ArgumentParser) -> None:
         "-o", "--out", metavar="OUT.ply", help="output (default: PLY's name with _clod, in this folder)"
     )
     parser.add_argument(
-        "--memory", metavar="SIZE", help="stay below this, as in 8GB: where the whole does not fit, train it in chunks"
+        "--memory", metavar="SIZE", help="stay below this, as in 8GB: where the whole does not fit, train it in blocks"
     )
     parser.add_argument(
-        "--chunk", metavar="N", help="do only the start, or only chunk N, of a run with --memory; without it the same "
+        "--block", metavar="N", help="do only the start, or only block N, of a run with --memory; without it the same "
         "command does what is missing, and puts all together",
     )  # fmt: skip
     parser.add_argument("--resume", action="store_true", help="go on with the same command where it was interrupted")
@@ -99,14 +99,14 @@ def check_memory(args: Namespace) -> None:
         parse_size(args.memory)
         if launched().size > 1:
             raise ClodError(
-                "--memory is for one process: leave out torchrun, and give jobs of their own each a --chunk"
+                "--memory is for one process: leave out torchrun, and give jobs of their own each a --block"
             )
-    if args.chunk is None:
+    if args.block is None:
         return
     if args.memory is None:
-        raise ClodError("--chunk is of a run in chunks, which --memory makes; give it too")
-    if args.chunk != "start" and not (args.chunk.isascii() and args.chunk.isdigit() and int(args.chunk) >= 1):
-        raise ClodError(f"--chunk is {args.chunk!r}; give start, or the number of a chunk, from 1")
+        raise ClodError("--block is of a run in blocks, which --memory makes; give it too")
+    if args.block != "start" and not (args.block.isascii() and args.block.isdigit() and int(args.block) >= 1):
+        raise ClodError(f"--block is {args.block!r}; give start, or the number of a block, from 1")
 
 
 ADAPT = Command(
@@ -156,10 +156,10 @@ undisturbed (on as many threads). Without such a file it starts from the
 beginning, and says so; the finished run removes it. No file has its final name
 before it is whole.
 
---memory 8GB plans what every phase takes, prints it, and adapts in chunks what
+--memory 8GB plans what every phase takes, prints it, and adapts in blocks what
 does not fit: blocks of the scene, each with the views that see it, in two
-passes. Chunks can be jobs: with --chunk start, and then --chunk 1 and so on
-(once for each pass), in any order; the same command without --chunk does what
+passes. Blocks can be jobs: with --block start, and then --block 1 and so on
+(once for each pass), in any order; the same command without --block does what
 is missing and writes the outputs, the same ones. Killed, it is repeated.
 
 torchrun starts several processes, on one machine or many, which train together:

@@ -13,7 +13,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.poses import load_cameras
-from clod_adapter.training.pseudo_views import place
+from clod_adapter.training.pseudo_views import place_cameras
 
 from ..shared.console import Console
 from ..shared.inputs import read_scene
@@ -60,7 +60,7 @@ def find_target(args: argparse.Namespace, model: Checkpoint, console: Console) -
 def _placed(model: Checkpoint, console: Console) -> tuple[Target, list[str]]:
     try:
         with console.meter("placing cameras") as meter:
-            cameras = place(
+            cameras = place_cameras(
                 model.gaussians, views=PLACED, progress=lambda n, of: meter.update(n / of, f"{n}/{of}")
             )  # fmt: skip
     except ClodError as error:

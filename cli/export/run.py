@@ -12,7 +12,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.claims import claimed
+from clod_adapter.io.claims import output_lock
 from clod_adapter.io.ply.columns import MASKS, SIGMA, inria_dtype
 from clod_adapter.io.ply.constants import PREFIX
 from clod_adapter.io.scene.poses import load_cameras
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     notes += [*more, *left_out(model), *filter_notes(args, export.gaussians, dials)]
     for note in notes:
         console.say(note)
-    with claimed(out):
+    with output_lock(out):
         if args.lod_meta:
             outputs, lost = write_set(export, out, dials)
         else:

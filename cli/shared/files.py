@@ -32,11 +32,11 @@ class Outputs:
         return self.ply.with_suffix(".resume.safetensors")
 
     def check(self, inputs: Sequence[str], scene: str | None, more: Sequence[Path]) -> None:
-        """``check_outputs`` for them, the states and chunks of a run, and ``more``."""
+        """``check_outputs`` for them, the states and blocks of a run, and ``more``."""
         check_ply_name(self.ply, "--out")
         check_outputs([self.ply], inputs, scene, beside=[self.adapter, self.report, *more])
-        chunks = self.ply.parent.glob(f"{escape(self.ply.stem)}.*.safetensors")  # which are looked into when found
-        check_no_input([self.state, *chunks], inputs, scene)
+        blocks = self.ply.parent.glob(f"{escape(self.ply.stem)}.*.safetensors")  # which are looked into when found
+        check_no_input([self.state, *blocks], inputs, scene)
 
     def names(self) -> dict[str, str]:
         return {name: str(path) for name, path in vars(self).items()}

@@ -120,7 +120,7 @@ class Miniature:
         return {name: tensor.to(device) for name, tensor in self.arguments.items()}
 
     def drawn_by(self, rasterize: Rasterizer, device: Any) -> str:
-        """Draws it on a device and says how near the reference that is; raises Off where it is not near."""
+        """ViewSampler it on a device and says how near the reference that is; raises Off where it is not near."""
         import torch
 
         image, _ = rasterize(**self.on(device), camera=self.camera, background=torch.zeros(3, device=device))

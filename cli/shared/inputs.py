@@ -12,7 +12,7 @@ from clod_adapter.io.ply.values import Activated
 from clod_adapter.io.scene.image_cache import ImageCache
 from clod_adapter.io.scene.load import load_scene
 from clod_adapter.origin import Origin
-from clod_adapter.training.pseudo_views import complement, imagine, place
+from clod_adapter.training.pseudo_views import add_pseudo_views, place_cameras, render_pseudo_views
 
 from .console import Console
 from .files import size
@@ -49,12 +49,12 @@ def read_scene(folder: str, console: Console, origin: Origin, cache: ImageCache 
     return scene
 
 
-def complement_scene(
+def with_pseudo_views(
     gaussians: Gaussians, scene: Scene, config: AdaptConfig, console: Console
 ) -> tuple[Scene, AdaptConfig]:
-    """What ``placement.complement`` makes of few photographs, and says so."""
+    """What ``placement.add_pseudo_views`` makes of few photographs, and says so."""
     with console.status("looking for places of cameras ..."):
-        more, lighter = complement(gaussians, scene, config)
+        more, lighter = add_pseudo_views(gaussians, scene, config)
     for note in more.notes[len(scene.notes) :]:
         console.note(note)
     return more, lighter
@@ -63,11 +63,13 @@ def complement_scene(
 def place_scene(gaussians: Gaussians, seed: int, console: Console) -> Scene:
     """Without photographs: places cameras, takes the checkpoint's own pictures, and says so."""
     with console.meter("placing cameras") as meter:
-        cameras = place(
+        cameras = place_cameras(
             gaussians, seed=seed, progress=lambda done, total: meter.update(done / total, f"{done}/{total}")
         )
     with console.meter("pictures") as meter:
-        scene = imagine(gaussians, cameras, progress=lambda done, total: meter.update(done / total, f"{done}/{total}"))
+        scene = render_pseudo_views(
+            gaussians, cameras, progress=lambda done, total: meter.update(done / total, f"{done}/{total}")
+        )
     for note in scene.notes:
         console.say(note)
     return scene

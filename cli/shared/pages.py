@@ -14,7 +14,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.claims import claimed
+from clod_adapter.io.claims import output_lock
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
 from clod_adapter.report.page import Picture
@@ -106,7 +106,7 @@ def _write(
     training: dict[str, Any] | None = None,
 ) -> dict[str, str]:
     try:
-        with claimed(path), console.status(f"writing {path} ..."):
+        with output_lock(path), console.status(f"writing {path} ..."):
             frames, others = pictures(model, base, scene.test, own_teacher(report))
             written = write_tradeoff_report(path, jsonable(report), frames, others, jsonable(training))
     except KeyboardInterrupt:

@@ -126,7 +126,7 @@ def divide(
     if begun.attenuation.normalizer != "scene":
         raise ClodError(
             f"the checkpoint's dial has the normaliser {begun.attenuation.normalizer}, whose distances depend on all "
-            "Gaussians in view: it cannot be trained in chunks; adapt it whole"
+            "Gaussians in view: it cannot be trained in blocks; adapt it whole"
         )
     seen, kept = torch.empty(len(views), count), torch.empty(len(views), DIALS)
     for k, view in enumerate(views):
@@ -144,7 +144,7 @@ def check_divisible(config: AdaptConfig) -> None:
     """Raises the ClodError of settings that need all of a scene at once."""
     if config.count_term == "paper" or config.normalizer != "scene":
         raise ClodError(
-            "the paper's form cannot be trained in chunks: its count and its distances are of all Gaussians at once; "
+            "the paper's form cannot be trained in blocks: its count and its distances are of all Gaussians at once; "
             "leave out --form paper, or --memory"
         )
 

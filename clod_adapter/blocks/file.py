@@ -1,6 +1,6 @@
 """What jobs on one scene hand to each other, as safetensors files: the division they begin from, and what each learned.
 
-One JSON document under the metadata key ``clod_adapter_chunk`` says which run a file is of.
+One JSON document under the metadata key ``clod_adapter_block`` says which run a file is of.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.regular import refuse_irregular
 from clod_adapter.io.tensor_file import read_tensors
 
-KEY = "clod_adapter_chunk"
+KEY = "clod_adapter_block"
 
 
-def save_chunk(path: Path, tensors: dict[str, Tensor], about: dict[str, Any], belongs: dict[str, Any]) -> None:
+def save_block(path: Path, tensors: dict[str, Tensor], about: dict[str, Any], belongs: dict[str, Any]) -> None:
     """Writes tensors and what is said of them; loading gives the same bits.
 
     Args:
@@ -42,7 +42,7 @@ def save_chunk(path: Path, tensors: dict[str, Tensor], about: dict[str, Any], be
         temporary.write_bytes(save({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, metadata))
 
 
-def load_chunk(path: Path, belongs: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def load_block(path: Path, belongs: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The tensors and what is said of them.
 
     Raises:
@@ -74,7 +74,7 @@ def damaged(path: Path) -> Iterator[None]:
     except MemoryError:  # of a file that is whole
         raise
     except Exception as error:  # SafetensorError, and whatever a crafted file provokes
-        raise ClodError(f"{path}: is no chunk or damaged ({error!r}); remove it to have it made anew") from error
+        raise ClodError(f"{path}: is no block or damaged ({error!r}); remove it to have it made anew") from error
 
 
 def checked(path: Path, tensors: dict[str, Tensor], shapes: dict[str, tuple[torch.dtype, tuple[int, ...]]]) -> None:

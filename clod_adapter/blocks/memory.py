@@ -1,6 +1,6 @@
-"""What an adaptation takes in memory, and in how many chunks it stays below a limit.
+"""What an adaptation takes in memory, and in how many blocks it stays below a limit.
 
-The bytes a Gaussian are measured ones (docs/chunks.md), for the CPU rasterizer and float32 throughout; each is the
+The bytes a Gaussian are measured ones (docs/blocks.md), for the CPU rasterizer and float32 throughout; each is the
 largest that the phase had at once. What is drawn beside a block depends on where the cameras are; a plan takes it to be
 everything.
 """
@@ -18,14 +18,14 @@ PIXEL = 260  # a pixel: picture, photograph, their maps and gradients, lists of 
 DRAWN = 640  # a Gaussian that is drawn, beside its attributes: scratch of the rasterizer, gradients
 TRAINED = 640  # one that is trained, on top: its copy, moments, mean, and the saving of all that
 ORDERED = 560  # one whose place in the order of leaving is looked for
-MERGED = 130  # one, while chunks are trained: what the pass before has made of it, and what this one has so far
+MERGED = 130  # one, while blocks are trained: what the pass before has made of it, and what this one has so far
 WRITTEN = 560  # one that is written: what changed, and the rows of the file
 IMAGES = 1 / 8  # of the limit, the share that photographs may take
-MOST_CHUNKS = 1024
+MOST_BLOCKS = 1024
 
 
 @dataclass(frozen=True)
-class Needs:
+class MemoryEstimate:
     """What a scene is, as far as memory goes.
 
     Attributes:
@@ -47,14 +47,14 @@ class MemoryPlan:
     """How a scene is adapted below a limit; all in bytes.
 
     Attributes:
-        chunks: 1 where the whole fits.
-        cache: what photographs may take, and of a chunk its own pictures once more.
+        blocks: 1 where the whole fits.
+        cache: what photographs may take, and of a block its own pictures once more.
         base, start, train, write: the most that is in memory at a time, in all: when the checkpoint is read, while it
             is ranked, in training, and when it is written.
     """
 
     limit: int
-    chunks: int
+    blocks: int
     cache: int
     base: int
     start: int
@@ -66,47 +66,47 @@ class MemoryPlan:
         return max(self.base, self.start, self.train, self.write)
 
 
-def make_plan(needs: Needs, limit: int) -> MemoryPlan:
-    """The fewest chunks with which nothing takes more than ``limit`` bytes.
+def plan_for_limit(needs: MemoryEstimate, limit: int) -> MemoryPlan:
+    """The fewest blocks with which nothing takes more than ``limit`` bytes.
 
     Raises:
-        ClodError: however many chunks, it takes more; says how much.
+        ClodError: however many blocks, it takes more; says how much.
     """
-    most = min(MOST_CHUNKS, max(needs.count, 1))
-    plans = (_plan(needs, limit, chunks) for chunks in range(1, most + 1))
+    most = min(MOST_BLOCKS, max(needs.count, 1))
+    plans = (_plan(needs, limit, blocks) for blocks in range(1, most + 1))
     plan = next((plan for plan in plans if plan.peak <= limit), _plan(needs, limit, 1))
     if plan.peak > limit:
         raise ClodError(
             f"--memory is {in_words(limit)}, and {needs.count:,} Gaussians take at least {in_words(least(needs))}, "
-            "however small the chunks; give that"
+            "however small the blocks; give that"
         )
     return plan
 
 
-def least(needs: Needs) -> int:
+def least(needs: MemoryEstimate) -> int:
     """The smallest limit that there is a plan for, bytes, rounded up to a tenth of a gigabyte."""
-    limit, most = 100_000_000, min(MOST_CHUNKS, max(needs.count, 1))
-    while min(_plan(needs, limit, chunks).peak for chunks in (1, most)) > limit:
+    limit, most = 100_000_000, min(MOST_BLOCKS, max(needs.count, 1))
+    while min(_plan(needs, limit, blocks).peak for blocks in (1, most)) > limit:
         limit += 100_000_000
     return limit
 
 
-def _plan(needs: Needs, limit: int, chunks: int) -> MemoryPlan:
+def _plan(needs: MemoryEstimate, limit: int, blocks: int) -> MemoryPlan:
     count, cache = needs.count, min(needs.images, int(IMAGES * limit))
     always = PROCESS + cache + needs.pictures + PIXEL * needs.pixels
-    if chunks > 1:  # a chunk's pictures are its own
+    if blocks > 1:  # a block's pictures are its own
         cache = min(needs.images + needs.pictures, int(IMAGES * limit))
         always += cache
-    if chunks == 1:  # the file's rows stay in memory
+    if blocks == 1:  # the file's rows stay in memory
         held = needs.row + needs.attributes
         train = always + count * (held + DRAWN + TRAINED)
     else:
         held = needs.attributes + 8
-        train = always + count * (held + MERGED + needs.attributes + DRAWN) + math.ceil(count / chunks) * TRAINED
+        train = always + count * (held + MERGED + needs.attributes + DRAWN) + math.ceil(count / blocks) * TRAINED
     base = PROCESS + count * (needs.row + 2 * needs.attributes)
     start = always + count * (held + max(DRAWN, ORDERED))
     write = always + count * (needs.attributes + needs.row + WRITTEN)
-    return MemoryPlan(limit, chunks, cache, *(math.ceil(bytes) for bytes in (base, start, train, write)))
+    return MemoryPlan(limit, blocks, cache, *(math.ceil(bytes) for bytes in (base, start, train, write)))
 
 
 def in_words(count: float) -> str:

@@ -18,7 +18,7 @@ from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.importance import spread
 from clod_adapter.losses import unit
 from clod_adapter.render import splat
-from clod_adapter.training.target_count import Quota, count_law
+from clod_adapter.training.target_count import TargetShare, target_curve
 
 LEFT_OUT = 1e-3  # of a picture, the share that those Gaussians may show that are left out of it
 CONTEXT_VIEWS = 32  # that are looked at for what a block is drawn with, at most
@@ -65,8 +65,8 @@ def _least_shown(shown: Tensor) -> Tensor:
     return ordered[few - 1] if few else shown.new_zeros(())
 
 
-class Quotas:
-    """What the count law asks of one block: ``objective.Part.quota``.
+class TargetShares:
+    """What the count law asks of one block: ``objective.TrainableSubset.quota``.
 
     Undivided, the law presses with ``loss (eta / law - 1) / (law N)`` on each of all N Gaussians. Here ``eta / law`` is
     taken to be what the block keeps by what it should: ``law N`` times its part of those that the start keeps in this
@@ -97,13 +97,13 @@ class Quotas:
             if progress:
                 progress(len(self._of), len(numbers))
 
-    def __call__(self, view: View, virtual_scale: float, loss: float) -> Quota:
+    def __call__(self, view: View, virtual_scale: float, loss: float) -> TargetShare:
         config, (parts, stands_for) = self.config, self._of[id(view)]
         at = math.log(virtual_scale) / math.log(config.max_sv) * (DIALS - 1)
         part = float(np.interp(at, np.arange(DIALS), parts))
-        law = count_law(virtual_scale, config.start_share, config.exponent)
+        law = target_curve(virtual_scale, config.start_share, config.exponent)
         wanted = max(law * self.all * part, 1.0)
-        return Quota(wanted / self.count, stands_for * self.count / (law * self.all))
+        return TargetShare(wanted / self.count, stands_for * self.count / (law * self.all))
 
 
 @torch.no_grad()

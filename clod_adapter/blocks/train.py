@@ -4,7 +4,7 @@ In a first pass each block is trained against the *checkpoint* of the others: th
 every dial value, which is what their own training aims at, and the block's pictures to be are the photographs as far as
 it can answer for them (``target``). So no block makes up for what another one will. (Against the others' start, at the
 same dial value, each brightens what all have faded: pictures of the merged result were 8 to 11 dB worse,
-docs/chunks.md.) In a second pass each goes on beside the others as the first has left them, at the dial, which brings
+docs/blocks.md.) In a second pass each goes on beside the others as the first has left them, at the dial, which brings
 the blocks into accord. Within a pass the jobs are independent, and their order does not matter; what they learn
 is put together by rows.
 
@@ -15,7 +15,7 @@ What an undivided run has for all of the scene, a block has its share of:
 - A block takes as many steps as the undivided run takes of the views that see it, so that each Gaussian is stepped as
   often. All blocks together take more, as a view may see several.
 - The count law is of all Gaussians. A block is asked for its own share of the Gaussians that the start keeps in the
-  same view at the same dial value, as far as those add up to the law (``Quotas``).
+  same view at the same dial value, as far as those add up to the law (``TargetShares``).
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from torch import Tensor
 
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.blocks.divide import Division
-from clod_adapter.blocks.targets import Quotas, beside, config_of, target
+from clod_adapter.blocks.targets import TargetShares, beside, config_of, target
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.scene.image_cache import ImageCache
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.objective import Part
+from clod_adapter.training.objective import TrainableSubset
 from clod_adapter.training.state import Adapted, Progress, TrainingState
 
 
@@ -57,7 +57,7 @@ class Learned:
     seconds: float
 
 
-def adapt_chunk(
+def adapt_block(
     division: Division,
     views: Sequence[View],
     config: AdaptConfig,
@@ -90,8 +90,8 @@ def adapt_chunk(
     gaussians = scene.select(torch.cat([rows, beside(division, block, own, after, _told(progress, "beside", scene))]))
     if after is None:
         own = _aimed(gaussians, len(rows), own, cache, _told(progress, "targets", scene))
-    quotas = Quotas(division, block, own, config, first=after is None, progress=_told(progress, "quotas", scene))
-    part = Part(len(rows), division.extent, quotas, rest_in_full=after is None)
+    quotas = TargetShares(division, block, own, config, first=after is None, progress=_told(progress, "quotas", scene))
+    part = TrainableSubset(len(rows), division.extent, quotas, rest_in_full=after is None)
     settings = config_of(division, block, config, first=after is None)
     adapted = adapt(gaussians, Scene(tuple(own), ()), settings, progress, resume, part=part)
     return _learned(division, rows, adapted)
@@ -138,7 +138,7 @@ def merge(division: Division, learned: Sequence[Learned]) -> Gaussians:
     for part in learned:
         times[part.rows] += 1
     if not bool((times == 1).all()):
-        raise ClodError(f"{int((times != 1).sum())} Gaussians are in no chunk or in two; give each chunk once")
+        raise ClodError(f"{int((times != 1).sum())} Gaussians are in no block or in two; give each block once")
     merged = {}
     for name in (*ATTRIBUTES, "sigma_d"):
         if any(name in part.values for part in learned):

@@ -17,7 +17,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.finite import bad_rows, largest_colour
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.pruning_order import leaving_order
+from clod_adapter.initialization.pruning_order import pruning_order
 from clod_adapter.render import splat
 from clod_adapter.units import in_world_units, known_distance, with_distance
 from clod_adapter.viewpoints import typical_distance
@@ -69,7 +69,7 @@ def start(
     importance = error
     if config.start == "importance":
         order = partial(progress, "order") if progress else None
-        importance = leaving_order(base, error.sqrt() * base.opacities, order)
+        importance = pruning_order(base, error.sqrt() * base.opacities, order)
     distances = typical_distance(base.means, [view.camera for view in views], attenuation)
     sigma = sigma_from_importance(
         base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent
@@ -190,7 +190,7 @@ def sigma_from_importance(
     """``[N]`` sigma_d with which the share kept follows the count law from the start, before any training.
 
     Gaussians are ranked by importance. The one at rank fraction r (0 the most important) leaves
-    where ``counting.count_law`` falls to r. Ranks beyond ``share`` leave before s = 1.
+    where ``counting.target_curve`` falls to r. Ranks beyond ``share`` leave before s = 1.
 
     Args:
         importance: ``[N]``, larger stays longer.

@@ -24,7 +24,7 @@ CROWD = 64  # Gaussians exactly in one place, from which on they are moved apart
 JITTER = 1e-6  # by so much of their size: a k-d tree cannot part them, and compares each with all others
 
 
-def leaving_order(gaussians: Gaussians, worth: Tensor, progress: Callable[[int, int], None] | None = None) -> Tensor:
+def pruning_order(gaussians: Gaussians, worth: Tensor, progress: Callable[[int, int], None] | None = None) -> Tensor:
     """``[N]`` int64, how many leave before each Gaussian: half-edge collapse, as for the levels of a mesh.
 
     In rounds, what losing Gaussian i costs is ``w_i min_j (|c_i - c_j|^2 + COLOUR_FLOOR^2 + APART r^2 / (r^2 + (l_i +

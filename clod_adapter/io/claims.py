@@ -20,7 +20,7 @@ NOT_HERE = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.E
 
 
 @contextmanager
-def claimed(final: Path, *, of: Path | None = None, shared: bool = False) -> Iterator[None]:
+def output_lock(final: Path, *, of: Path | None = None, shared: bool = False) -> Iterator[None]:
     """Within, no other process is within for the same ``final``.
 
     The lock is that of a hidden file beside ``final`` (``flock``), so it ends with the process, however that ends. On

@@ -19,7 +19,7 @@ MARKERS = "oDs^vPX"
 
 
 def write_png(path: str | Path, draw: Draw) -> None:
-    """Draws a chart into a file.
+    """ViewSampler a chart into a file.
 
     Raises:
         ClodError: matplotlib is missing, or the file cannot be written.

@@ -13,7 +13,7 @@ PANELS = ("PSNR (dB)", "SSIM", "opacity", "decay sigma_d (log scale)")
 
 
 def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], title: str) -> None:
-    """Draws a row of four panels a checkpoint: PSNR and SSIM against Gaussians kept, opacity, sigma_d.
+    """ViewSampler a row of four panels a checkpoint: PSNR and SSIM against Gaussians kept, opacity, sigma_d.
 
     Args:
         path: the picture to write; its suffix chooses the format.

@@ -184,7 +184,7 @@ def _rows(series: Sequence[Series]) -> str:
 
 def _plan(report: Mapping[str, Any]) -> str:
     """What of the checkpoint the scene did not need."""
-    decisions = (report.get("plan") or {}).get("decisions", ())  # none of a training in chunks
+    decisions = (report.get("plan") or {}).get("decisions", ())  # none of a training in blocks
     rows = [[made[name] for name in ("what", "verdict", "measured", "why")] for made in decisions]
     return page.section("Plan", page.table(("what", "decision", "by", "which"), [("", rows)])) if rows else ""
 

@@ -23,7 +23,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from clod_adapter.errors import ClodError
-from clod_adapter.training.objective import Pull
+from clod_adapter.training.objective import GradientSum
 
 if TYPE_CHECKING:
     from torch.distributed.distributed_c10d import Store
@@ -34,15 +34,15 @@ T = TypeVar("T")
 PATIENCE = timedelta(minutes=10)
 
 
-class PeerLost(ClodError):
+class ProcessLost(ClodError):
     """A process that trained along is gone, or says nothing any more."""
 
 
-class Peers:
+class ProcessGroup:
     """This process among those that train together: the default group of ``torch.distributed``.
 
-    What the methods exchange has to be asked for by all processes, in the same order. They raise PeerLost where one of
-    them is gone; nothing more can be exchanged then.
+    All processes call the methods in the same order. They raise ProcessLost where one of them is gone; nothing more
+    can be exchanged then.
 
     Attributes:
         rank, size: which one this is, from 0, and how many there are.
@@ -63,7 +63,7 @@ class Peers:
         self._meet(said, "MAX")
         return float(said[0]), not said[1]
 
-    def sum(self, pull: Pull) -> Pull:
+    def sum(self, pull: GradientSum) -> GradientSum:
         """The sum of all processes' pulls; takes the place of this one's, tensor by tensor."""
         loss = torch.tensor([pull.loss], dtype=torch.float64)
         self._meet(loss)
@@ -78,7 +78,7 @@ class Peers:
                 work.wait()
             if kept.is_cuda:
                 torch.cuda.synchronize()  # NCCL's own wait returns at once, and its time would be another's
-        return Pull(gradients, kept.bool(), float(loss))
+        return GradientSum(gradients, kept.bool(), float(loss))
 
     def broadcast(self, value: T) -> T:
         """The first process's value, with its tensors on the CPU; what the others give is not looked at."""
@@ -111,7 +111,7 @@ class Peers:
 
 
 @contextmanager
-def joined(store: Store, rank: int, size: int) -> Iterator[Peers]:
+def joined(store: Store, rank: int, size: int) -> Iterator[ProcessGroup]:
     """Within, this process trains with the others that enter with the same ``store``: gloo on CPUs, NCCL on GPUs."""
     nccl = torch.cuda.is_available() and dist.is_nccl_available()
     with _losses(), _silent_stdout():
@@ -119,7 +119,7 @@ def joined(store: Store, rank: int, size: int) -> Iterator[Peers]:
             "cpu:gloo,cuda:nccl" if nccl else "gloo", store=store, rank=rank, world_size=size, timeout=PATIENCE
         )
     try:
-        yield Peers()
+        yield ProcessGroup()
     finally:
         dist.destroy_process_group()
 
@@ -143,14 +143,14 @@ def _silent_stdout() -> Iterator[None]:
 
 @contextmanager
 def _losses() -> Iterator[None]:
-    """The backends' errors, which are RuntimeErrors, as PeerLost."""
+    """The backends' errors, which are RuntimeErrors, as ProcessLost."""
     try:
         yield
-    except (torch.cuda.OutOfMemoryError, PeerLost):
+    except (torch.cuda.OutOfMemoryError, ProcessLost):
         raise
     except RuntimeError as error:
         what = re.sub(r"^\[[^]]*\] *", "", str(error).partition("\n")[0]).partition(". ")[0]
-        raise PeerLost(f"a process that trained along is gone ({what})") from error
+        raise ProcessLost(f"a process that trained along is gone ({what})") from error
 
 
 def _without_tensors(value: Any, tensors: list[Tensor]) -> bytes:

@@ -18,11 +18,11 @@ from clod_adapter.errors import ClodError
 from clod_adapter.finite import LossNotFinite, largest_colour, require_finite, spoilt_rows
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import for_training, seeing, start
-from clod_adapter.training.distributed import PeerLost, Peers
-from clod_adapter.training.objective import Objective, Part, Pull
+from clod_adapter.training.distributed import ProcessGroup, ProcessLost
+from clod_adapter.training.objective import GradientSum, Objective, TrainableSubset
 from clod_adapter.training.optimizer import RowAdam, add_to_mean
 from clod_adapter.training.state import Adapted, Progress, StateRefused, TrainingState
-from clod_adapter.training.view_sampler import Draws
+from clod_adapter.training.view_sampler import ViewSampler
 from clod_adapter.units import in_world_units, with_distance
 
 __all__ = ["Adapted", "Progress", "TrainingState", "adapt"]
@@ -39,8 +39,8 @@ def adapt(
     progress: Callable[[Progress], None] | None = None,
     resume: TrainingState | None = None,
     *,
-    part: Part | None = None,
-    peers: Peers | None = None,
+    part: TrainableSubset | None = None,
+    peers: ProcessGroup | None = None,
 ) -> Adapted:
     """Learns sigma_d for ``base`` on the training views of ``scene``, and updates the rest lightly.
 
@@ -126,11 +126,11 @@ class _Run:
         views: tuple[View, ...],
         config: AdaptConfig,
         progress: Callable[[Progress], None] | None,
-        part: Part | None = None,
-        peers: Peers | None = None,
+        part: TrainableSubset | None = None,
+        peers: ProcessGroup | None = None,
     ):
-        self.config, self.progress, self.peers, self.draws = config, progress, peers, Draws(views, config)
-        part = part or Part(len(start))
+        self.config, self.progress, self.peers, self.draws = config, progress, peers, ViewSampler(views, config)
+        part = part or TrainableSubset(len(start))
         assert start.sigma_d is not None and start.attenuation is not None
         # Cameras all in one place say nothing of the scene's unit; the distances in their pictures do.
         extent = part.extent or camera_extent([view.camera for view in views]) or start.attenuation.scene_distance
@@ -180,7 +180,7 @@ class _Run:
                 going = self._tell()
         except KeyboardInterrupt:
             going = False
-        except PeerLost as error:
+        except ProcessLost as error:
             going, lost = False, str(error)
             self._tell(lost)
         except LossNotFinite as error:
@@ -252,7 +252,7 @@ class _Run:
         dial: Any = {"sigma_d": sigma, "attenuation": self.objective.attenuation}
         return in_world_units(Gaussians(**values, **dial, screen_filter=self.objective.screen_filter))
 
-    def _pull(self) -> Pull:
+    def _pull(self) -> GradientSum:
         """Of the next views; those of a batch that other processes have are pulled by them.
 
         Where that fails the state is as after the last step, with these views still to come, and is told.
@@ -268,7 +268,7 @@ class _Run:
             return pull
         except Exception as error:
             self.draws.restore(*before)
-            if self.done > 0 and not isinstance(error, PeerLost):  # which is told by who ends the run
+            if self.done > 0 and not isinstance(error, ProcessLost):  # which is told by who ends the run
                 self._tell(str(error) or type(error).__name__)
             raise
 

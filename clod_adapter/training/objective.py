@@ -18,14 +18,14 @@ from clod_adapter.config import CLASSIC, AdaptConfig, AttenuationConfig, ScreenF
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import splat
-from clod_adapter.training.target_count import Quota, count_gradient, law_quota, paper_count
+from clod_adapter.training.target_count import TargetShare, count_gradient, paper_count, target_share
 
 # Sigma stays where the equation still tells values apart; below, a Gaussian would be gone for good.
 SIGMA_RANGE = (1e-4, SIGMA_MAX)
 
 
 @dataclass(frozen=True)
-class Part:
+class TrainableSubset:
     """What is trained of a scene, where that is not all of it.
 
     Attributes:
@@ -34,18 +34,18 @@ class Part:
         quota: gives, for a view, a dial value and the loss there, what the count term asks of the trained rows; by
             default the law.
         rest_in_full: the others are drawn as if they had no dial, and not at the dial too.
-        total: what the law is a share of, where there are more than those trained (``counting.law_quota``).
+        total: what the law is a share of, where there are more than those trained (``counting.target_share``).
     """
 
     trained: int
     extent: float | None = None
-    quota: Callable[[View, float, float], Quota] | None = None
+    quota: Callable[[View, float, float], TargetShare] | None = None
     rest_in_full: bool = False
     total: int | None = None
 
 
 @dataclass
-class Pull:
+class GradientSum:
     """What views ask of the parameters; of several, their sum.
 
     Attributes:
@@ -58,9 +58,9 @@ class Pull:
     kept: Tensor
     loss: float
 
-    def __add__(self, other: Pull) -> Pull:
+    def __add__(self, other: GradientSum) -> GradientSum:
         gradients = {name: mine + other.gradients[name] for name, mine in self.gradients.items()}
-        return Pull(gradients, self.kept | other.kept, self.loss + other.loss)
+        return GradientSum(gradients, self.kept | other.kept, self.loss + other.loss)
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Objective:
     config: AdaptConfig
     attenuation: AttenuationConfig
     tuned: tuple[str, ...]
-    part: Part
+    part: TrainableSubset
     screen_filter: ScreenFilter = CLASSIC
 
     @property
@@ -113,11 +113,11 @@ class Objective:
         sigma = sigma_d.detach().float().clamp(*SIGMA_RANGE)
         return sigma if self.config.parameter == "linear" else sigma.log()
 
-    def pull(self, parameters: dict[str, Tensor], draws: Sequence[tuple[View, list[float]]]) -> Pull:
+    def pull(self, parameters: dict[str, Tensor], draws: Sequence[tuple[View, list[float]]]) -> GradientSum:
         """The sum over ``draws``, each a view and the dial values it is rendered at."""
-        return reduce(Pull.__add__, (self._pull_of(parameters, view, dials) for view, dials in draws))
+        return reduce(GradientSum.__add__, (self._pull_of(parameters, view, dials) for view, dials in draws))
 
-    def _pull_of(self, parameters: dict[str, Tensor], view: View, dials: list[float]) -> Pull:
+    def _pull_of(self, parameters: dict[str, Tensor], view: View, dials: list[float]) -> GradientSum:
         config, tau, first = self.config, self.attenuation.tau, slice(self.trained)
         dialled_rows = first if self.part.rest_in_full else slice(None)
         leaves = {name: parameters[name].detach().requires_grad_(name in self.stepped) for name in parameters}
@@ -152,11 +152,11 @@ class Objective:
         found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
         gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}
         count = count if config.parameter == "log" else count / decay.detach()[first]
-        return Pull(gradients | {self.decay: gradients[self.decay] + count}, kept, losses[0])
+        return GradientSum(gradients | {self.decay: gradients[self.decay] + count}, kept, losses[0])
 
-    def _quota(self, view: View, s: float, loss: float) -> Quota:
+    def _quota(self, view: View, s: float, loss: float) -> TargetShare:
         part = self.part
-        return part.quota(view, s, loss) if part.quota else law_quota(s, self.trained, self.config, part.total)
+        return part.quota(view, s, loss) if part.quota else target_share(s, self.trained, self.config, part.total)
 
     def _weight(self, s: float, *, alone: bool) -> float:
         """w_s, times ``full_weight`` at the s = 1 that goes with another dial value."""

@@ -15,9 +15,9 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.training.ablation import largest_change
-from clod_adapter.training.distributed import Peers
+from clod_adapter.training.distributed import ProcessGroup
 from clod_adapter.training.loop import Adapted, adapt
-from clod_adapter.training.objective import Part
+from clod_adapter.training.objective import TrainableSubset
 from clod_adapter.training.state import Progress, TrainingState
 
 RATES = {
@@ -35,7 +35,7 @@ class Decision:
         verdict: "kept" or "left out", of an attribute "trained" or "frozen".
         number: what was measured, in ``unit``; None where nothing was.
         why: what the number is, or the reason without one.
-        name: which of NAMES ``Overrule`` has it by; empty where there is nothing to choose.
+        name: which of NAMES ``Override`` has it by; empty where there is nothing to choose.
     """
 
     what: str
@@ -54,7 +54,7 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Overrule:
+class Override:
     """What is decided beforehand, whatever its numbers: any of NAMES.
 
     Raises:
@@ -105,16 +105,16 @@ class Plan:
         return trim(self.start, self.kept, None)
 
     @property
-    def part(self) -> Part:
+    def part(self) -> TrainableSubset:
         """For ``train.adapt`` of ``lean``: the count law remains a share of all Gaussians."""
-        return Part(len(self.start) if self.kept is None else int(self.kept.sum()), total=len(self.start))
+        return TrainableSubset(len(self.start) if self.kept is None else int(self.kept.sum()), total=len(self.start))
 
     def adapt(
         self,
         scene: Scene,
         progress: Callable[[Progress], None] | None = None,
         resume: TrainingState | None = None,
-        peers: Peers | None = None,
+        peers: ProcessGroup | None = None,
     ) -> Adapted:
         """``train.adapt`` of what is to be trained; the count law remains a share of all Gaussians."""
         if resume is None and self.begun:  # and let go of it, which is as large as all that is trained

@@ -17,7 +17,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, removal_error, seeing, spread, start
 from clod_adapter.training.ablation import band_losses, effect, seen
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.plan import FIELDS, RATES, Decision, Overrule, Plan, freezing
+from clod_adapter.training.plan import FIELDS, RATES, Decision, Override, Plan, freezing
 from clod_adapter.training.state import Progress, TrainingState
 
 LIMIT = 0.02  # dB: what is left out is worth less than this to the training views
@@ -30,7 +30,7 @@ def make_plan(
     base: Gaussians,
     scene: Scene,
     config: AdaptConfig | None = None,
-    overrule: Overrule | None = None,
+    overrule: Override | None = None,
     progress: Callable[[Progress], None] | None = None,
     *,
     resumed: Collection[str] | None = None,
@@ -48,14 +48,14 @@ def make_plan(
         ClodError: as ``train.adapt``.
         KeyboardInterrupt: ``progress`` raised one.
     """
-    return _Planner(base, scene, config or AdaptConfig(), overrule or Overrule(), progress).plan(resumed)
+    return _Planner(base, scene, config or AdaptConfig(), overrule or Override(), progress).plan(resumed)
 
 
 class _Planner:
     """Makes one plan."""
 
     def __init__(
-        self, base: Gaussians, scene: Scene, config: AdaptConfig, overrule: Overrule,
+        self, base: Gaussians, scene: Scene, config: AdaptConfig, overrule: Override,
         progress: Callable[[Progress], None] | None,
     ) -> None:  # fmt: skip
         self.base, self.scene, self.config, self.overrule, self.progress = base, scene, config, overrule, progress

@@ -52,7 +52,7 @@ class Candidate:
     score: float
 
 
-def place(
+def place_cameras(
     gaussians: Gaussians,
     *,
     views: int = VIEWS,
@@ -97,7 +97,7 @@ def place(
 
 
 @torch.no_grad()
-def imagine(
+def render_pseudo_views(
     gaussians: Gaussians, cameras: list[Camera], *, progress: Callable[[int, int], None] | None = None
 ) -> Scene:
     """The scene of ``cameras`` with the checkpoint's own pictures as photographs; every 8th is held out.
@@ -122,7 +122,7 @@ def imagine(
     return Scene(train, test, (note,))
 
 
-def complement(gaussians: Gaussians, scene: Scene, config: AdaptConfig) -> tuple[Scene, AdaptConfig]:
+def add_pseudo_views(gaussians: Gaussians, scene: Scene, config: AdaptConfig) -> tuple[Scene, AdaptConfig]:
     """What to adapt with where there are fewer than FEW photographs to train on; otherwise what was given.
 
     So few do not show all that the checkpoint knows, and what they do not show would be lost. They get OWN pictures of
@@ -134,7 +134,9 @@ def complement(gaussians: Gaussians, scene: Scene, config: AdaptConfig) -> tuple
     if not 0 < len(scene.train) < FEW:
         return scene, config
     try:
-        placed = imagine(gaussians, place(gaussians, views=OWN, seed=config.seed, field=_field(scene.train[0].camera)))
+        placed = render_pseudo_views(
+            gaussians, place_cameras(gaussians, views=OWN, seed=config.seed, field=_field(scene.train[0].camera))
+        )
         own = (*placed.train, *placed.test)
         added = f"{len(own)} of the checkpoint's own pictures from placed cameras are added"
     except ClodError as error:

@@ -84,7 +84,7 @@ class Progress:
     """Where an adaptation stands; handed to the progress callback.
 
     Attributes:
-        phase: "start" (a view a step), "order" (a Gaussian a step: who leaves before whom) or "train"; of a chunk
+        phase: "start" (a view a step), "order" (a Gaussian a step: who leaves before whom) or "train"; of a block
             also "beside", "targets" and "quotas" (a view a step).
         done, total: steps of the phase.
         seconds: since training began; before it, since the adaptation did.
@@ -118,7 +118,7 @@ class Adapted:
             count from its first beginning.
         interrupted: a KeyboardInterrupt, the loss of a process, or a loss that is not finite ended it early.
         lost: which process was lost; failed: which step's loss was not finite.
-        waiting, exchanging: of these seconds, in this call, those spent on other processes (``distributed.Peers``).
+        waiting, exchanging: of these seconds, in this call, those spent on other processes (``ProcessGroup``).
         held: Gaussians that some step of this call did not move, as their gradients were not finite.
     """
 

@@ -18,7 +18,7 @@ from clod_adapter.config import AdaptConfig
 LIFT = 1e-3
 
 
-class Quota(NamedTuple):
+class TargetShare(NamedTuple):
     """What the count term asks of some Gaussians at one dial value.
 
     Attributes:
@@ -30,7 +30,7 @@ class Quota(NamedTuple):
     weight: float
 
 
-def count_law(virtual_scale: float, share: float, exponent: float) -> float:
+def target_curve(virtual_scale: float, share: float, exponent: float) -> float:
     """The share of all Gaussians to keep at a dial value s: ``1 / (s^p + (1/share - 1) s^-p)``.
 
     ``share`` at s = 1, and soon the paper's target ``s^-p`` (section 3.3, p = 1.5): with a share of 0.62, 7 % below it
@@ -40,21 +40,21 @@ def count_law(virtual_scale: float, share: float, exponent: float) -> float:
     return 1 / (power + (1 / share - 1) / power)
 
 
-def law_quota(virtual_scale: float, count: int, config: AdaptConfig, total: int | None = None) -> Quota:
-    """What the count law asks of ``count`` Gaussians: ``count_law``, and never that the last one goes.
+def target_share(virtual_scale: float, count: int, config: AdaptConfig, total: int | None = None) -> TargetShare:
+    """What the count law asks of ``count`` Gaussians: ``target_curve``, and never that the last one goes.
 
     Args:
         total: what the law is a share of, also Gaussians that are not here because no view sees them: more than the
             ``count`` there are may be asked for. By default ``count``.
     """
     total = total or max(count, 1)
-    law = max(count_law(virtual_scale, config.start_share, config.exponent), 1 / total) * (total / max(count, 1))
-    return Quota(law, 1 / law)
+    law = max(target_curve(virtual_scale, config.start_share, config.exponent), 1 / total) * (total / max(count, 1))
+    return TargetShare(law, 1 / law)
 
 
 def count_gradient(
     dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, loss: float, config: AdaptConfig,
-    quota: Quota | None = None,
+    quota: TargetShare | None = None,
 ) -> Tensor:  # fmt: skip
     """``[N]`` what the count term adds to the gradient of log sigma_d at one dial value; opacities are held.
 
@@ -68,7 +68,7 @@ def count_gradient(
     Args:
         quota: what is asked of them in place of the law, where they are not all that there are.
     """
-    quota = quota or law_quota(virtual_scale, len(opacity_logits), config)
+    quota = quota or target_share(virtual_scale, len(opacity_logits), config)
     eta = float(dialled.keep.sum()) / len(opacity_logits)
     pressure = 2 * loss * config.reg_weight * (eta / quota.share - 1) * quota.weight
     slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, config.temperature)
@@ -83,7 +83,7 @@ def paper_count(
     """0-d, the paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2`` (section 3.3); eta is ``soft_count``.
 
     Args:
-        total: what eta is a share of, as in ``law_quota``.
+        total: what eta is a share of, as in ``target_share``.
     """
     count = soft_count(dialled.log_opacities, virtual_scale, tau, config.temperature)
     count = count * (len(dialled.log_opacities) / (total or len(dialled.log_opacities)))

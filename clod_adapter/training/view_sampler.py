@@ -12,8 +12,8 @@ from clod_adapter.errors import ClodError
 from clod_adapter.training.state import OTHER_RUN
 
 
-class Draws:
-    """Draws for as long as it is asked, the same in every process that has the same seed.
+class ViewSampler:
+    """ViewSampler for as long as it is asked, the same in every process that has the same seed.
 
     Attributes:
         order: the views to come in this round, by number, the next one last.

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clod_adapter.blocks.memory import MOST_CHUNKS, Needs, in_words, least, make_plan, parse_size
+from clod_adapter.blocks.memory import MOST_BLOCKS, MemoryEstimate, in_words, least, parse_size, plan_for_limit
 from clod_adapter.errors import ClodError
 
-CITY = Needs(2_000_000, 236, 248, 60 * 960 * 540 * 3, 960 * 540)
+CITY = MemoryEstimate(2_000_000, 236, 248, 60 * 960 * 540 * 3, 960 * 540)
 
 
 @pytest.mark.parametrize(
@@ -32,45 +32,45 @@ def test_what_is_no_size_is_refused(text: str) -> None:
 
 
 def test_what_fits_is_left_whole() -> None:
-    plan = make_plan(CITY, 8 * 10**9)
-    assert plan.chunks == 1 and plan.peak <= 8 * 10**9 and plan.cache == CITY.images
+    plan = plan_for_limit(CITY, 8 * 10**9)
+    assert plan.blocks == 1 and plan.peak <= 8 * 10**9 and plan.cache == CITY.images
 
 
 def test_what_does_not_is_cut_as_little_as_needed() -> None:
-    counts = [make_plan(CITY, limit).chunks for limit in range(least(CITY), 5 * 10**9, 10**8)]
+    counts = [plan_for_limit(CITY, limit).blocks for limit in range(least(CITY), 5 * 10**9, 10**8)]
     assert counts == sorted(counts, reverse=True) and counts[0] > 2 and counts[-1] == 1
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 10**7), st.sampled_from([56, 236]), st.integers(0, 10**10), st.integers(1, 10**7))
 def test_the_least_is_enough_and_less_is_not(count: int, attributes: int, images: int, pixels: int) -> None:
-    needs = Needs(count, attributes, attributes + 12, images, pixels)
+    needs = MemoryEstimate(count, attributes, attributes + 12, images, pixels)
     limit = least(needs)
-    plan = make_plan(needs, limit)
-    assert plan.peak <= limit and 1 <= plan.chunks <= min(count, MOST_CHUNKS)
+    plan = plan_for_limit(needs, limit)
+    assert plan.peak <= limit and 1 <= plan.blocks <= min(count, MOST_BLOCKS)
     if limit > 10**8:
         with pytest.raises(ClodError, match="take at least .* give that"):
-            make_plan(needs, limit - 10**8)
+            plan_for_limit(needs, limit - 10**8)
 
 
 def test_too_little_says_the_least() -> None:
     with pytest.raises(ClodError) as error:
-        make_plan(CITY, 10**9)
+        plan_for_limit(CITY, 10**9)
     assert f"--memory is 1 GB, and 2,000,000 Gaussians take at least {in_words(least(CITY))}" in str(error.value)
-    assert make_plan(CITY, parse_size(in_words(least(CITY)).replace(" ", ""))).chunks > 1
+    assert plan_for_limit(CITY, parse_size(in_words(least(CITY)).replace(" ", ""))).blocks > 1
 
 
 def test_the_least_in_words_is_enough() -> None:
     """Also where three digits would say too little: 123.4 GB."""
     for count in (90_000_000, 91_234_567, 1_000_000_000):
         needs = replace(CITY, count=count)
-        assert make_plan(needs, parse_size(in_words(least(needs)).replace(" ", ""))).chunks > 1
+        assert plan_for_limit(needs, parse_size(in_words(least(needs)).replace(" ", ""))).blocks > 1
 
 
 def test_pictures_that_cannot_be_read_again_stay() -> None:
-    """They are in every phase but the first, beside a chunk's own of them."""
-    plan = make_plan(CITY, 8 * 10**9)
-    made = make_plan(replace(CITY, images=0, pictures=CITY.images), 8 * 10**9)
+    """They are in every phase but the first, beside a block's own of them."""
+    plan = plan_for_limit(CITY, 8 * 10**9)
+    made = plan_for_limit(replace(CITY, images=0, pictures=CITY.images), 8 * 10**9)
     assert (made.cache, made.start, made.train) == (0, plan.start, plan.train)
     tight = least(CITY)
-    assert make_plan(replace(CITY, images=0, pictures=CITY.images), tight + 10**8).cache > 0
+    assert plan_for_limit(replace(CITY, images=0, pictures=CITY.images), tight + 10**8).cache > 0

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clod_adapter.blocks.divide import Division, coverage, divide, split
-from clod_adapter.blocks.targets import LEFT_OUT, Quotas, beside, config_of, target
-from clod_adapter.blocks.train import Learned, adapt_chunk, merge
+from clod_adapter.blocks.targets import LEFT_OUT, TargetShares, beside, config_of, target
+from clod_adapter.blocks.train import Learned, adapt_block, merge
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
@@ -22,7 +22,7 @@ from clod_adapter.initialization.importance import start
 from clod_adapter.render import render
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.state import Progress, TrainingState
-from clod_adapter.training.target_count import count_law
+from clod_adapter.training.target_count import target_curve
 from scenes import capture, gaussians
 
 CONFIG = AdaptConfig(iters=120)
@@ -42,14 +42,14 @@ def divided(captured: tuple[Gaussians, Scene]) -> Division:
 
 @pytest.fixture(scope="module")
 def learned(captured: tuple[Gaussians, Scene], divided: Division) -> list[Learned]:
-    return [adapt_chunk(divided, captured[1].train, CONFIG, block)[0] for block in range(BLOCKS)]
+    return [adapt_block(divided, captured[1].train, CONFIG, block)[0] for block in range(BLOCKS)]
 
 
 @pytest.fixture(scope="module")
 def whole(captured: tuple[Gaussians, Scene], divided: Division, learned: list[Learned]) -> Gaussians:
     """After both passes."""
     first, views = merge(divided, learned), captured[1].train
-    return merge(divided, [adapt_chunk(divided, views, CONFIG, block, after=first)[0] for block in range(BLOCKS)])
+    return merge(divided, [adapt_block(divided, views, CONFIG, block, after=first)[0] for block in range(BLOCKS)])
 
 
 @settings(max_examples=60, deadline=None)
@@ -143,11 +143,11 @@ def test_quotas_add_up_to_the_law(divided: Division, captured: tuple[Gaussians, 
     """And where each block answers for its part of the loss, they press on each Gaussian as the whole's law does."""
     views, count = captured[1].train, len(captured[0])
     for first in (True, False):
-        quotas = [Quotas(divided, block, views, CONFIG, first=first) for block in range(BLOCKS)]
+        quotas = [TargetShares(divided, block, views, CONFIG, first=first) for block in range(BLOCKS)]
         for k, view in enumerate(views[:2]):
             for s in (1.0, 1.7, 3.0, CONFIG.max_sv):
                 asked = [quota(view, s, 0.1) for quota in quotas]
-                law = count_law(s, CONFIG.start_share, CONFIG.exponent)
+                law = target_curve(s, CONFIG.start_share, CONFIG.exponent)
                 wanted = sum(q.share * len(divided.rows(block)) for block, q in enumerate(asked))
                 assert wanted == pytest.approx(law * count, rel=0.05)
                 for block, q in enumerate(asked):
@@ -174,16 +174,16 @@ def test_merging_takes_each_row_from_its_block(divided: Division, learned: list[
             assert torch.equal(getattr(whole, name)[part.rows], values), name
             assert not torch.equal(values, getattr(divided.begun, name)[part.rows]), name
     assert torch.equal(whole.shN, divided.begun.shN)
-    with pytest.raises(ClodError, match="in no chunk or in two"):
+    with pytest.raises(ClodError, match="in no block or in two"):
         merge(divided, learned[1:])
-    with pytest.raises(ClodError, match="in no chunk or in two"):
+    with pytest.raises(ClodError, match="in no block or in two"):
         merge(divided, [*learned, learned[0]])
 
 
 def test_no_seams(captured: tuple[Gaussians, Scene], divided: Division, whole: Gaussians) -> None:
     """Every picture here is across all borders, through a cloud that hides nothing: the hardest there is.
 
-    benchmarks/chunks.py measures it on captures.
+    benchmarks/blocks.py measures it on captures.
     """
     base, scene = captured
     undivided = adapt(base, scene, CONFIG).gaussians
@@ -203,7 +203,7 @@ def test_the_second_pass_brings_blocks_into_accord(
     assert sum(row.psnr for row in second) > sum(row.psnr for row in first) + 0.5
 
 
-def test_a_chunk_goes_on_with_the_same_bits(
+def test_a_block_goes_on_with_the_same_bits(
     captured: tuple[Gaussians, Scene], divided: Division, learned: list[Learned]
 ) -> None:
     states: list[TrainingState] = []
@@ -213,15 +213,15 @@ def test_a_chunk_goes_on_with_the_same_bits(
             states.append(copy.deepcopy(progress.state()))
 
     views = captured[1].train
-    once, _ = adapt_chunk(divided, views, CONFIG, 1, progress=keep)
-    again, outcome = adapt_chunk(divided, views, CONFIG, 1, resume=states[0])
+    once, _ = adapt_block(divided, views, CONFIG, 1, progress=keep)
+    again, outcome = adapt_block(divided, views, CONFIG, 1, resume=states[0])
     assert outcome.steps == 0.75 * divided.steps(1, CONFIG)
     for part in (again, learned[1]):
         assert part.values.keys() == once.values.keys()
         assert all(torch.equal(value, once.values[name]) for name, value in part.values.items())
 
 
-def test_chunks_have_seeds_of_their_own(divided: Division) -> None:
+def test_blocks_have_seeds_of_their_own(divided: Division) -> None:
     whole = replace(CONFIG, seed=2**63 - 1)
     seeds = {config_of(divided, k, whole, first=first).seed for k in range(BLOCKS) for first in (True, False)}
     assert len(seeds) == 2 * BLOCKS and whole.seed not in seeds
@@ -238,7 +238,7 @@ def test_a_block_that_no_view_sees_stays(captured: tuple[Gaussians, Scene], draw
     division = divide(base.replace(means=means), [view], CONFIG, 3)
     behind = int(division.block[0])
     assert division.views(behind) == [] and division.steps(behind, CONFIG) == 0
-    part, outcome = adapt_chunk(division, [view], CONFIG, behind)
+    part, outcome = adapt_block(division, [view], CONFIG, behind)
     assert (part.steps, outcome.steps, list(part.values)) == (0, 0, ["sigma_d"])
     assert torch.equal(part.values["sigma_d"], division.begun.sigma_d[division.rows(behind)])
 
@@ -246,14 +246,14 @@ def test_a_block_that_no_view_sees_stays(captured: tuple[Gaussians, Scene], draw
 def test_every_wait_is_told(captured: tuple[Gaussians, Scene], divided: Division) -> None:
     told: list[tuple[str, int, int]] = []
     views = captured[1].train
-    adapt_chunk(divided, views, replace(CONFIG, iters=1), 0, progress=lambda p: told.append((p.phase, p.done, p.total)))
+    adapt_block(divided, views, replace(CONFIG, iters=1), 0, progress=lambda p: told.append((p.phase, p.done, p.total)))
     for phase in ("beside", "targets", "quotas"):
         assert [one[1:] for one in told if one[0] == phase] == [(k + 1, len(views)) for k in range(len(views))]
 
 
 def test_what_needs_all_gaussians_at_once_is_refused(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
-    with pytest.raises(ClodError, match="the paper's form cannot be trained in chunks"):
+    with pytest.raises(ClodError, match="the paper's form cannot be trained in blocks"):
         divide(base, scene.train, AdaptConfig.paper(), 2)
     begun = start(base, scene.train, CONFIG)
     dialled = begun.replace(attenuation=replace(begun.attenuation, normalizer="max"))

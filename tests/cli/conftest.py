@@ -57,7 +57,8 @@ def spawn() -> Callable[..., subprocess.Popen[str]]:
     """Starts ``clod-adapt`` with these words in a process of its own, with a progress line every ``line_every`` s."""
 
     def start(*words: object, cwd: Path, line_every: float = 10) -> subprocess.Popen[str]:
-        code = f"import sys; from clod_adapter.cli import console, main; console.LINE_EVERY = {line_every}"
+        code = "import sys; from clod_adapter.cli import main; from clod_adapter.cli.shared import console; "
+        code += f"console.LINE_EVERY = {line_every}"
         command = [sys.executable, "-c", f"{code}; sys.exit(main.main())", *map(str, words)]
         return subprocess.Popen(command, cwd=cwd, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 

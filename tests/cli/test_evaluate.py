@@ -34,7 +34,7 @@ def test_base_by_rank(clod: Any, capture: Any, adapted: Path) -> None:
     assert all(entry["row"]["kept_share"] == entry["row"]["kept"] / 300 for entry in report["ranked"])
     base, views = clod_adapter.load(capture.ply).gaussians, clod_adapter.load_scene(capture.scene).test
     top = base.opacity_logits.argsort(descending=True)[: round(kept[4])]
-    (want,) = clod_adapter.evaluation.evaluate(base.select(top), views, [1.0])
+    (want,) = clod_adapter.evaluate(base.select(top), views, [1.0])
     assert report["ranked"][2]["row"]["psnr"] == pytest.approx(want.psnr, abs=1e-4)
     block = done.err[done.err.index("cut to the same counts by rank") :].splitlines()[2:]
     by = ["opacity", "removal"]  # and error

@@ -17,7 +17,7 @@ import torch
 
 import clod_adapter
 from clod_adapter.cli.adapt import files, result
-from clod_adapter.cli.adapt.progress import Follower
+from clod_adapter.cli.adapt.progress import ProgressDisplay
 from clod_adapter.cli.shared import pages
 from clod_adapter.errors import ClodError
 from clod_adapter.training.loop import Progress
@@ -94,15 +94,15 @@ def test_an_error_of_what_follows_the_training(
     clod: Any, words: list[Any], whole: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Such as the page, or the look at the held-out views."""
-    call = Follower.__call__
+    call = ProgressDisplay.__call__
 
-    def failing(self: Follower, progress: Progress) -> None:
+    def failing(self: ProgressDisplay, progress: Progress) -> None:
         call(self, progress)
         if progress.phase == "train" and progress.done == 7:
             fail()
 
     with monkeypatch.context() as patch:
-        patch.setattr(Follower, "__call__", failing)
+        patch.setattr(ProgressDisplay, "__call__", failing)
         done = clod(*words)
     assert done.code == 1 and names(tmp_path) == [STATE] and "goes on from step 7" in done.err, done
     assert_goes_on(clod, words, tmp_path, 7, whole)
@@ -189,15 +189,15 @@ def test_a_folder_that_is_gone(
     (tmp_path / "out").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     words = [capture.ply, "--images", capture.scene, *TINY, "out/dial.ply"]
-    call = Follower.__call__
+    call = ProgressDisplay.__call__
 
-    def removing(self: Follower, progress: Progress) -> None:
+    def removing(self: ProgressDisplay, progress: Progress) -> None:
         call(self, progress)
         if progress.phase == "train" and progress.done == 4:
             shutil.rmtree("out")
 
     with monkeypatch.context() as patch:
-        patch.setattr(Follower, "__call__", removing)
+        patch.setattr(ProgressDisplay, "__call__", removing)
         done = clod(*words)
     (kept,) = tmp_path.glob(f"temporary/*/{STATE}")
     said = f"step {ITERS} is in {kept}: move it to out/{STATE}, and --resume goes on from there"

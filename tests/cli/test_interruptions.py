@@ -47,9 +47,12 @@ SERVER = """
 import json, os, signal, sys, tempfile
 import torch
 torch.set_num_threads(1)  # a process that forks must have no threads
-from clod_adapter.cli import adapt, console, main, resume
-from clod_adapter.cli.console import Console
-from clod_adapter.cli.kernels import prepare_kernels
+from clod_adapter.cli import main
+from clod_adapter.cli.adapt import resume
+from clod_adapter.cli.adapt import run as adapt
+from clod_adapter.cli.shared import console
+from clod_adapter.cli.shared.console import Console
+from clod_adapter.cli.shared.kernels import prepare_kernels
 prepare_kernels(Console(quiet=True))
 print("ready", flush=True)
 for line in sys.stdin:
@@ -452,7 +455,7 @@ def test_a_state_that_cannot_be_saved_costs_a_warning(
 def test_resuming_without_photographs(
     clod: Any, capture: Any, tmp_path: Path, broken_off: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(inputs, "place", partial(inputs.place, views=4))
+    monkeypatch.setattr(inputs, "place_cameras", partial(inputs.place_cameras, views=4))
     words = (capture.ply, "--iters", 3, "--max-sv", 2, "--out")
     assert clod(*words, "whole.ply", "--quiet").code == 0
     broken_off(*words, "dial.ply")

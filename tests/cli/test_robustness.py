@@ -69,7 +69,7 @@ def test_every_checkpoint_at_every_range(run: Any, clod: Any, tmp_path: Path) ->
     # A cell's adapter gives the model that was measured.
     assert clod("apply", "plain.ply", "robustness/cells/plain_sv3.safetensors", "-o", "x.ply").code == 0
     scene = clod_adapter.load_scene(report["scene"])
-    (again,) = clod_adapter.evaluation.evaluate(clod_adapter.load("x.ply").gaussians, scene.test, [3.0])
+    (again,) = clod_adapter.evaluate(clod_adapter.load("x.ply").gaussians, scene.test, [3.0])
     assert again.psnr == at(report["cells"][2], 3)["psnr"]
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from clod_adapter.cli.main import main
 from clod_adapter.config import AdaptConfig
-from clod_adapter.training.target_count import count_law
+from clod_adapter.training.target_count import target_curve
 from fences import ROOT
 
 DOCS, RESULTS = ROOT / "docs", ROOT / "benchmarks" / "results"
@@ -119,7 +119,7 @@ def test_the_law_is_what_training_presses_towards() -> None:
     config = AdaptConfig()
     (dials, law) = next(rows for rows in tables(DOCS / "equation.md") if rows[0][0] == "s")
     for s, share in zip(dials[1:], law[1:], strict=True):
-        assert share == f"{count_law(float(s), config.start_share, config.exponent):.0%}".replace("%", " %")
+        assert share == f"{target_curve(float(s), config.start_share, config.exponent):.0%}".replace("%", " %")
 
 
 def test_the_keys_are_those_of_the_viewer() -> None:

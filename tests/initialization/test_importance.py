@@ -16,7 +16,7 @@ from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization import importance
 from clod_adapter.initialization.importance import fitting_tau, removal_error, seeing, sigma_from_importance, start
-from clod_adapter.initialization.pruning_order import leaving_order
+from clod_adapter.initialization.pruning_order import pruning_order
 from clod_adapter.render import splat
 from clod_adapter.viewpoints import typical_distance
 from scenes import gaussians, photograph, ring
@@ -150,7 +150,7 @@ def test_the_orders_of_the_start() -> None:
         return extinction_scale(dialled.opacity_logits, dialled.sigma_d, d, dialled.attenuation).argsort()
 
     assert torch.equal(leaving(by_error)[100:180], error.argsort(stable=True)[100:180])
-    order = leaving_order(some, error.sqrt() * some.opacities)
+    order = pruning_order(some, error.sqrt() * some.opacities)
     assert torch.equal(leaving(by_default)[100:180], order.argsort()[100:180])
     assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
-from clod_adapter.initialization.pruning_order import APART, COLOUR_FLOOR, LEAVING, NEIGHBOURS, _apart, leaving_order
+from clod_adapter.initialization.pruning_order import APART, COLOUR_FLOOR, LEAVING, NEIGHBOURS, _apart, pruning_order
 from scenes import gaussians
 
 
@@ -45,12 +45,12 @@ def plainly(some: Gaussians, worth: Tensor) -> list[int]:
 def test_is_that_of_the_plain_twin(n: int, seed: int) -> None:
     some = gaussians(n, 1, seed)
     worth = torch.rand(n, generator=torch.Generator().manual_seed(seed))
-    assert leaving_order(some, worth).argsort().tolist() == plainly(some, worth), f"n {n}, seed {seed}"
+    assert pruning_order(some, worth).argsort().tolist() == plainly(some, worth), f"n {n}, seed {seed}"
 
 
 @pytest.mark.parametrize("n", [0, 1])
 def test_of_none_and_of_one(n: int) -> None:
-    assert leaving_order(gaussians(n, 0, 0), torch.ones(n)).tolist() == list(range(n))
+    assert pruning_order(gaussians(n, 0, 0), torch.ones(n)).tolist() == list(range(n))
 
 
 def test_one_of_two_alike_leaves_before_a_single_one_that_is_worth_less() -> None:
@@ -60,33 +60,33 @@ def test_one_of_two_alike_leaves_before_a_single_one_that_is_worth_less() -> Non
     three = three.replace(
         means=means, sh0=three.sh0[:1].expand(3, 1, 3).contiguous(), log_scales=torch.full((3, 3), -2.0)
     )
-    order = leaving_order(three, torch.tensor([1.0, 1.1, 0.9]))
+    order = pruning_order(three, torch.tensor([1.0, 1.1, 0.9]))
     assert order.tolist() == [0, 2, 1]
 
 
 def test_does_not_depend_on_the_order_of_the_rows() -> None:
     some, worth = gaussians(80, 1, 4), torch.rand(80, generator=torch.Generator().manual_seed(4))
     rows = torch.randperm(80, generator=torch.Generator().manual_seed(5))
-    assert torch.equal(leaving_order(some.select(rows), worth[rows]), leaving_order(some, worth)[rows])
+    assert torch.equal(pruning_order(some.select(rows), worth[rows]), pruning_order(some, worth)[rows])
 
 
 def test_all_in_one_place_and_of_no_worth() -> None:
     """Ties, and nothing to divide by: a permutation nevertheless."""
     some = gaussians(50, 0, 0)
     some = some.replace(means=torch.zeros(50, 3), log_scales=torch.full((50, 3), -400.0))
-    assert sorted(leaving_order(some, torch.zeros(50)).tolist()) == list(range(50))
+    assert sorted(pruning_order(some, torch.zeros(50)).tolist()) == list(range(50))
 
 
 def test_reports_its_progress() -> None:
     seen: list[tuple[int, int]] = []
-    leaving_order(gaussians(100, 0, 0), torch.ones(100), lambda *count: seen.append(count))
+    pruning_order(gaussians(100, 0, 0), torch.ones(100), lambda *count: seen.append(count))
     assert seen == sorted(seen) and 0 < seen[0][0] < 50 and seen[-1] == (100, 100)
 
 
 def test_many_in_one_place_take_few_rounds() -> None:
     some, seen = gaussians(2000, 0, 0), []
     some = some.replace(means=torch.zeros(2000, 3), sh0=torch.zeros(2000, 1, 3))
-    order = leaving_order(some, torch.zeros(2000), lambda *count: seen.append(count))
+    order = pruning_order(some, torch.zeros(2000), lambda *count: seen.append(count))
     assert sorted(order.tolist()) == list(range(2000)) and len(seen) < 300
 
 
@@ -99,7 +99,7 @@ def test_many_in_one_place_are_moved_apart() -> None:
     spread = np.random.default_rng(0).normal(size=(200, 3))
     assert _apart(spread, sizes) is spread
     some = gaussians(300, 0, 0)
-    order = leaving_order(some.replace(means=torch.full_like(some.means, 0.3)), torch.rand(300))
+    order = pruning_order(some.replace(means=torch.full_like(some.means, 0.3)), torch.rand(300))
     assert order.sort().values.equal(torch.arange(300))
 
 
@@ -108,6 +108,6 @@ def test_what_is_not_finite() -> None:
     some = gaussians(20, 0, 0)
     odd = some.replace(sh0=some.sh0.index_fill(0, torch.tensor([3, 4]), math.inf))
     odd = odd.replace(log_scales=some.log_scales.index_fill(0, torch.tensor([5]), math.nan))
-    assert sorted(leaving_order(odd, torch.rand(20)).tolist()) == list(range(20))
+    assert sorted(pruning_order(odd, torch.rand(20)).tolist()) == list(range(20))
     with pytest.raises(ClodError, match="means are not all finite"):
-        leaving_order(some.replace(means=some.means.index_fill(0, torch.tensor([3]), math.nan)), torch.rand(20))
+        pruning_order(some.replace(means=some.means.index_fill(0, torch.tensor([3]), math.nan)), torch.rand(20))

@@ -9,31 +9,31 @@ import pytest
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import remove_leftovers
-from clod_adapter.io.claims import claimed
+from clod_adapter.io.claims import output_lock
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="locks are those of POSIX")
 
 
 def test_one_at_a_time(tmp_path: Path) -> None:
     final = tmp_path / "out.ply"
-    with claimed(final), claimed(tmp_path / "other.ply"):
+    with output_lock(final), output_lock(tmp_path / "other.ply"):
         remove_leftovers(final)  # which a second run would do, had it not been refused
         said = rf"out.ply: another run \(process {os.getpid()}\) is writing it; wait for that"
-        with pytest.raises(ClodError, match=said), claimed(final):
+        with pytest.raises(ClodError, match=said), output_lock(final):
             raise AssertionError("the body must not run")
-        with pytest.raises(ClodError, match="^all: another run"), claimed(final, of=Path("all"), shared=True):
+        with pytest.raises(ClodError, match="^all: another run"), output_lock(final, of=Path("all"), shared=True):
             raise AssertionError("the body must not run")
     assert os.listdir(tmp_path) == []
-    with claimed(final):
+    with output_lock(final):
         pass
 
 
 def test_jobs_share_it(tmp_path: Path) -> None:
     final = tmp_path / "out.ply"
-    with claimed(final, shared=True):
-        with claimed(final, shared=True):
+    with output_lock(final, shared=True):
+        with output_lock(final, shared=True):
             pass
-        with pytest.raises(ClodError, match="another run"), claimed(final):
+        with pytest.raises(ClodError, match="another run"), output_lock(final):
             raise AssertionError("the body must not run")
     assert os.listdir(tmp_path) == []
 
@@ -41,12 +41,12 @@ def test_jobs_share_it(tmp_path: Path) -> None:
 def test_a_killed_holder_holds_nothing(tmp_path: Path) -> None:
     final = tmp_path / "out.ply"
     code = (
-        "import os, sys; from pathlib import Path; from clod_adapter.io.claims import claimed\n"
-        "with claimed(Path(sys.argv[1])): os.kill(os.getpid(), 9)"
+        "import os, sys; from pathlib import Path; from clod_adapter.io.claims import output_lock\n"
+        "with output_lock(Path(sys.argv[1])): os.kill(os.getpid(), 9)"
     )
     assert subprocess.run([sys.executable, "-c", code, str(final)], check=False).returncode == -9
     assert len(os.listdir(tmp_path)) == 1
-    with claimed(final):
+    with output_lock(final):
         pass
     assert os.listdir(tmp_path) == []
 
@@ -58,7 +58,7 @@ def test_a_file_system_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyP
         raise OSError(95, "Operation not supported")
 
     monkeypatch.setattr(fcntl, "flock", refuse)
-    with claimed(tmp_path / "out.ply"), claimed(tmp_path / "out.ply"):
+    with output_lock(tmp_path / "out.ply"), output_lock(tmp_path / "out.ply"):
         assert os.listdir(tmp_path) == []
 
 
@@ -75,6 +75,10 @@ def test_the_last_holder_may_remove_the_file_meanwhile(tmp_path: Path, monkeypat
             removed[0].unlink()
 
     monkeypatch.setattr(fcntl, "flock", late)
-    with claimed(tmp_path / "out.ply"), pytest.raises(ClodError, match="another run"), claimed(tmp_path / "out.ply"):
+    with (
+        output_lock(tmp_path / "out.ply"),
+        pytest.raises(ClodError, match="another run"),
+        output_lock(tmp_path / "out.ply"),
+    ):
         raise AssertionError("the body must not run")
     assert removed and os.listdir(tmp_path) == []

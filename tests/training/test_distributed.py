@@ -14,20 +14,20 @@ import torch.distributed as dist
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.training import distributed
-from clod_adapter.training.distributed import PeerLost, Peers, joined
+from clod_adapter.training.distributed import ProcessGroup, ProcessLost, joined
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.objective import Pull
+from clod_adapter.training.objective import GradientSum
 from scenes import capture
 
 
 @pytest.fixture
-def peers() -> Iterator[Peers]:
+def peers() -> Iterator[ProcessGroup]:
     with joined(dist.HashStore(), 0, 1) as peers:
         yield peers
 
 
-def test_one_alone_exchanges_with_itself(peers: Peers) -> None:
-    pull = Pull({"means": torch.randn(5, 3), "sigma": torch.randn(5)}, torch.rand(5) < 0.5, 0.25)
+def test_one_alone_exchanges_with_itself(peers: ProcessGroup) -> None:
+    pull = GradientSum({"means": torch.randn(5, 3), "sigma": torch.randn(5)}, torch.rand(5) < 0.5, 0.25)
     summed = peers.sum(replace(pull, gradients={name: g.clone() for name, g in pull.gradients.items()}))
     assert summed.loss == pull.loss and torch.equal(summed.kept, pull.kept)
     assert all(torch.equal(summed.gradients[name], gradient) for name, gradient in pull.gradients.items())
@@ -37,7 +37,7 @@ def test_one_alone_exchanges_with_itself(peers: Peers) -> None:
     assert peers.waiting > 0 and peers.exchanging > 0
 
 
-def test_adapting_with_nobody_else_changes_no_bit(peers: Peers) -> None:
+def test_adapting_with_nobody_else_changes_no_bit(peers: ProcessGroup) -> None:
     base, scene = capture(n=60, views=4)
     config = AdaptConfig(iters=3, batch=2)
     want, found = adapt(base, scene, config), adapt(base, scene, config, peers=peers)
@@ -46,7 +46,7 @@ def test_adapting_with_nobody_else_changes_no_bit(peers: Peers) -> None:
     assert found.waiting > 0 and want.waiting == want.exchanging == 0 and found.lost is None
 
 
-def test_a_view_for_each_process(peers: Peers) -> None:
+def test_a_view_for_each_process(peers: ProcessGroup) -> None:
     peers.size = 3
     with pytest.raises(ClodError, match="batch is 2, it must be at least 3, a view for each of the processes"):
         adapt(*capture(n=20, views=4), AdaptConfig(batch=2), peers=peers)
@@ -68,7 +68,10 @@ def test_what_is_sent_arrives() -> None:
 
 
 def test_a_loss_is_told_from_other_errors() -> None:
-    with pytest.raises(PeerLost, match=r"gone \(Connection closed by peer \[127.0.0.1\]:1\)$"), distributed._losses():
+    with (
+        pytest.raises(ProcessLost, match=r"gone \(Connection closed by peer \[127.0.0.1\]:1\)$"),
+        distributed._losses(),
+    ):
         raise RuntimeError("[/a/b/pair.cc:547] Connection closed by peer [127.0.0.1]:1. This may be caused by\nmore")
     with pytest.raises(torch.OutOfMemoryError), distributed._losses():
         raise torch.OutOfMemoryError("CUDA out of memory")

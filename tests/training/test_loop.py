@@ -27,7 +27,7 @@ from clod_adapter.losses import photometric_loss
 from clod_adapter.render import render, splat
 from clod_adapter.training import loop, objective
 from clod_adapter.training.loop import Adapted, Progress, TrainingState, adapt
-from clod_adapter.training.objective import Part
+from clod_adapter.training.objective import TrainableSubset
 from scenes import capture, gaussians, photograph, ring
 
 SCALES = (1.0, 1.5, 2.0, 3.0, 5.0)
@@ -196,7 +196,7 @@ def test_rows_that_are_only_drawn_keep_their_units_when_resumed(
     base, scene = captured
     settings = AttenuationConfig(scene_distance=distance, reference_distance=4.0)
     base = attach(base, torch.linspace(0.3, 3, len(base)) * 4 / distance, settings)
-    part, states = Part(len(base) // 2), dict[int, TrainingState]()
+    part, states = TrainableSubset(len(base) // 2), dict[int, TrainingState]()
     whole = adapt(base, scene, config_of(iters=4), states_of({2}, states), part=part)
     again = adapt(base, scene, config_of(iters=4), None, states[2], part=part)
     assert_equal(again.gaussians, whole.gaussians)
@@ -363,13 +363,13 @@ def test_only_the_first_rows_are_trained(captured: tuple[Gaussians, Scene]) -> N
             states.append(copy.deepcopy(progress.state()))
 
     config = config_of(iters=20, average=0.5)
-    found = adapt(begun, scene, config, keep, part=Part(few)).gaussians
+    found = adapt(begun, scene, config, keep, part=TrainableSubset(few)).gaussians
     for name, value in found.tensors().items():
         rounding = 1e-6 if name == "sigma_d" else 0.0  # its logarithm is what training holds
         torch.testing.assert_close(value[few:], begun.tensors()[name][few:], rtol=rounding, atol=0.0)
         assert not torch.equal(value[:few], begun.tensors()[name][:few]), name
-    assert_equal(adapt(begun, scene, config, None, states[0], part=Part(few)).gaussians, found)
-    without = adapt(begun.select(torch.arange(few)), scene, config, part=Part(few)).gaussians
+    assert_equal(adapt(begun, scene, config, None, states[0], part=TrainableSubset(few)).gaussians, found)
+    without = adapt(begun.select(torch.arange(few)), scene, config, part=TrainableSubset(few)).gaussians
     assert not torch.equal(without.sh0, found.sh0[:few])
 
 

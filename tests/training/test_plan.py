@@ -20,7 +20,7 @@ from clod_adapter.render import render
 from clod_adapter.training import planner
 from clod_adapter.training.loop import Progress, adapt
 from clod_adapter.training.objective import Objective
-from clod_adapter.training.plan import NAMES, RATES, Decision, Overrule, Plan
+from clod_adapter.training.plan import NAMES, RATES, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
 from scenes import capture, photograph
 
@@ -107,7 +107,7 @@ def test_the_counts_stay_shares_of_all(captured: tuple[Gaussians, Scene]) -> Non
     """With a third of the file unseen the dial keeps as many as it would with it trained along."""
     base, scene = with_unseen(captured[0], 150)[0], captured[1]
     config = replace(CONFIG, iters=80)
-    plan = make_plan(base, scene, config, Overrule(keep=ALL - {"unseen"}))
+    plan = make_plan(base, scene, config, Override(keep=ALL - {"unseen"}))
     left_out = plan.whole(base, plan.adapt(scene).gaussians)
     trained = adapt(base, scene, config).gaussians
     for s in (2.0, 4.0):
@@ -130,13 +130,13 @@ def test_bands_both_ways(captured: tuple[Gaussians, Scene]) -> None:
 def test_empty_bands_are_one_line(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     empty = base.replace(shN=torch.zeros(len(base), 15, 3))
-    plan = make_plan(empty, scene, CONFIG, Overrule(keep=ALL - {"bands"}))
+    plan = make_plan(empty, scene, CONFIG, Override(keep=ALL - {"bands"}))
     assert plan.decisions[0].what == "SH band 1 to 3" and plan.decisions[0].number == 0 and plan.sh_degree == 0
     assert not any("SH" in decision.what for decision in plan.decisions[1:])
 
 
-@pytest.mark.parametrize("overrule", [Overrule(), Overrule(keep=ALL), Overrule(leave_out=frozenset({"bands"}))])
-def test_no_bands_are_neither_kept_nor_left_out_as_asked(captured: tuple[Gaussians, Scene], overrule: Overrule) -> None:
+@pytest.mark.parametrize("overrule", [Override(), Override(keep=ALL), Override(leave_out=frozenset({"bands"}))])
+def test_no_bands_are_neither_kept_nor_left_out_as_asked(captured: tuple[Gaussians, Scene], overrule: Override) -> None:
     base, scene = captured
     plan = make_plan(base.without_bands(0), scene, CONFIG, overrule)
     assert plan.decisions[0] == Decision("SH bands", "left out", None, "", "there are none")
@@ -185,9 +185,9 @@ def test_each_decision_can_be_overruled(
     base, scene = with_unseen(captured[0])[0], captured[1]
     for measure in ("band_losses", "effect"):
         monkeypatch.setattr(planner, measure, lambda *_: pytest.fail("measured what is settled"))
-    kept = make_plan(base, scene, CONFIG, Overrule(keep=ALL))
+    kept = make_plan(base, scene, CONFIG, Override(keep=ALL))
     assert kept.kept is None and kept.sh_degree == 1 and kept.frozen == () and not kept.begun
-    gone = make_plan(base, scene, CONFIG, Overrule(ALL - {name}, frozenset({name})))
+    gone = make_plan(base, scene, CONFIG, Override(ALL - {name}, frozenset({name})))
     expected = {"bands": ((), 0, False), "unseen": ((), 1, True)}.get(name, ((name,), 1, False))
     assert (gone.frozen, gone.sh_degree, gone.kept is not None) == expected
     (verdict,) = {decision.verdict for decision in gone.decisions if decision.name == name}
@@ -197,9 +197,9 @@ def test_each_decision_can_be_overruled(
 
 def test_misuse() -> None:
     with pytest.raises(ClodError, match=r"'colour' is nothing that a plan decides; it decides bands, unseen, means"):
-        Overrule(keep=frozenset({"colour"}))
+        Override(keep=frozenset({"colour"}))
     with pytest.raises(ClodError, match="'quats' is to be both kept and left out"):
-        Overrule(frozenset({"quats", "bands"}), frozenset({"quats"}))
+        Override(frozenset({"quats", "bands"}), frozenset({"quats"}))
     base, scene = capture(20)
     with pytest.raises(ClodError, match="no training views"):
         make_plan(base, Scene((), scene.test))
@@ -211,9 +211,9 @@ def test_a_base_with_a_dial_is_not_searched(captured: tuple[Gaussians, Scene]) -
     """What its dial leaves out shows others."""
     base, scene = with_unseen(captured[0])[0], captured[1]
     adapted = adapt(base, scene, replace(CONFIG, iters=5)).gaussians
-    assert make_plan(adapted, scene, CONFIG, Overrule(keep=ALL - {"unseen"})).kept is None
-    assert make_plan(attach(base), scene, CONFIG, Overrule(keep=ALL - {"unseen"})).kept is not None
-    assert make_plan(adapted, scene, CONFIG, Overrule(ALL - {"unseen"}, frozenset({"unseen"}))).kept is not None
+    assert make_plan(adapted, scene, CONFIG, Override(keep=ALL - {"unseen"})).kept is None
+    assert make_plan(attach(base), scene, CONFIG, Override(keep=ALL - {"unseen"})).kept is not None
+    assert make_plan(adapted, scene, CONFIG, Override(ALL - {"unseen"}, frozenset({"unseen"}))).kept is not None
 
 
 @pytest.mark.parametrize("begin", ["constant", "identity"])
@@ -221,9 +221,9 @@ def test_a_start_with_which_none_leave_leaves_none_out(captured: tuple[Gaussians
     """At s > 1 they would show as they were, what hid them having left."""
     base, before = with_unseen(captured[0])
     config = replace(CONFIG, start=begin)
-    plan = make_plan(base, captured[1], config, Overrule(keep=ALL - {"unseen"}))
+    plan = make_plan(base, captured[1], config, Override(keep=ALL - {"unseen"}))
     assert plan.kept is None and plan.decisions[1].name == "unseen" and "not looked for" in plan.decisions[1].why
-    asked = make_plan(base, captured[1], config, Overrule(ALL - {"unseen"}, frozenset({"unseen"})))
+    asked = make_plan(base, captured[1], config, Override(ALL - {"unseen"}, frozenset({"unseen"})))
     assert asked.kept is not None and not asked.kept[~before].any()
 
 
@@ -237,7 +237,7 @@ def test_a_checkpoint_that_shows_nothing(captured: tuple[Gaussians, Scene]) -> N
 def test_what_reading_left_out_is_told(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     read = replace(scene, left_out=(("undistortion", "the cameras are pinholes"),))
-    plan = make_plan(base, read, CONFIG, Overrule(keep=ALL))
+    plan = make_plan(base, read, CONFIG, Override(keep=ALL))
     assert plan.decisions[-1] == Decision("undistortion", "left out", None, "", "the cameras are pinholes")
 
 
@@ -271,7 +271,7 @@ def test_a_probe_that_fails_leaves_the_failure_to_the_training(
 def test_going_on_with_what_was_frozen(captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch) -> None:
     base, scene = with_unseen(captured[0])[0], captured[1]
     config = replace(CONFIG, lr_scales=0.0)
-    first = make_plan(base, scene, config, Overrule(leave_out=frozenset({"means"})))
+    first = make_plan(base, scene, config, Override(leave_out=frozenset({"means"})))
     states: list[Any] = []
 
     def stop(now: Progress) -> None:

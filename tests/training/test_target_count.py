@@ -16,11 +16,11 @@ from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.target_count import (
     count_gradient,
-    count_law,
     count_slope,
-    law_quota,
     paper_count,
     soft_count,
+    target_curve,
+    target_share,
 )
 
 CONFIG = AdaptConfig(max_sv=6.0)
@@ -37,13 +37,13 @@ def some(seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
 
 def test_the_law() -> None:
     for share, exponent in ((0.62, 1.5), (0.8, 1.0), (1.0, 2.0)):
-        assert count_law(1.0, share, exponent) == pytest.approx(share)
-        values = [count_law(s, share, exponent) for s in np.linspace(1, 20, 200)]
+        assert target_curve(1.0, share, exponent) == pytest.approx(share)
+        values = [target_curve(s, share, exponent) for s in np.linspace(1, 20, 200)]
         assert all(b < a for a, b in zip(values, values[1:], strict=False))
-        assert count_law(1e4, share, exponent) == pytest.approx(1e4**-exponent, rel=1e-4)
-    assert count_law(3.0, 1.0, 1.5) == pytest.approx(3**-1.5)  # with a share of 1 the paper's target throughout
-    assert count_law(2.0, 0.62, 1.5) / 2**-1.5 == pytest.approx(0.93, abs=0.005)
-    assert count_law(3.0, 0.62, 1.5) / 3**-1.5 == pytest.approx(0.98, abs=0.005)
+        assert target_curve(1e4, share, exponent) == pytest.approx(1e4**-exponent, rel=1e-4)
+    assert target_curve(3.0, 1.0, 1.5) == pytest.approx(3**-1.5)  # with a share of 1 the paper's target throughout
+    assert target_curve(2.0, 0.62, 1.5) / 2**-1.5 == pytest.approx(0.93, abs=0.005)
+    assert target_curve(3.0, 0.62, 1.5) / 3**-1.5 == pytest.approx(0.98, abs=0.005)
 
 
 def gradient(logits: Tensor, log_sigma: Tensor, d: Tensor, s: float, **changes: float) -> Tensor:
@@ -56,7 +56,7 @@ def test_the_gradient_is_that_of_the_square() -> None:
     for s in (1.0, 2.5, 6.0):
         dialled = attenuate(logits, log_sigma.exp(), d, s, ATTENUATION)
         slope = count_slope(logits, dialled.log_opacities, s, ATTENUATION.tau, CONFIG.temperature)
-        law = count_law(s, CONFIG.start_share, CONFIG.exponent)
+        law = target_curve(s, CONFIG.start_share, CONFIG.exponent)
         excess = float(dialled.keep.float().mean()) / law - 1
         want = 0.1 * 2 * CONFIG.reg_weight * excess / law * slope
         torch.testing.assert_close(gradient(logits, log_sigma, d, s), want)
@@ -88,7 +88,7 @@ def test_without_any_picture_the_counts_come_to_the_law(start: float) -> None:
         found = []
         for s in (1.0, 1.4, 2.0, 3.1, 4.5, 6.0):
             eta = float(attenuate(logits, log_sigma.exp(), d, s, ATTENUATION).keep.float().mean())
-            found.append(abs(math.log(eta / count_law(s, CONFIG.start_share, CONFIG.exponent))))
+            found.append(abs(math.log(eta / target_curve(s, CONFIG.start_share, CONFIG.exponent))))
         return max(found)
 
     assert worst(log_sigma) > 0.3
@@ -216,7 +216,7 @@ def test_shares_of_more_than_are_here(form: str, s: float) -> None:
             paper_count(dialled, s, 0.02, config, total).backward()
             found.append(sigma.grad[:40])
         else:
-            quota = law_quota(s, count, config, total)
+            quota = target_share(s, count, config, total)
             found.append(count_gradient(dialled, logits[:count], s, 0.02, 0.3, config, quota)[:40])
     assert found[0].abs().max() > 0 or (form, s) == ("paper", 1.0)
     assert torch.allclose(*found, rtol=1e-5, atol=0)

@@ -19,7 +19,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.formats.arrays import arrays_of, colours_of, normalized, scales_of, sigmoid
-from clod_adapter.io.formats.metadata import KEY, write_card
+from clod_adapter.io.formats.metadata import KEY, write_metadata
 from clod_adapter.origin import NOWHERE, Origin
 from clod_adapter.version import package_version
 
@@ -62,7 +62,7 @@ def write_glb(
         nodes=[pygltflib.Node(mesh=0, rotation=HALF_TURN, translation=_in_gltf(origin))],
         buffers=[pygltflib.Buffer(byteLength=size)],
     )  # fmt: skip
-    gltf.asset.extras = {KEY: write_card(gaussians, about, origin, calibration)}
+    gltf.asset.extras = {KEY: write_metadata(gaussians, about, origin, calibration)}
     offset = 0
     for index, (name, array) in enumerate(columns.items()):
         view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": pygltflib.ARRAY_BUFFER}

@@ -30,7 +30,7 @@ _LONGEST = 1 << 16  # letters of a description's lines; a PLY's header has to ha
 
 
 @dataclass(frozen=True)
-class Card:
+class Metadata:
     """What a file says about its Gaussians.
 
     Attributes:
@@ -54,11 +54,11 @@ class Model(NamedTuple):
     """What a file holds: its Gaussians as they are in it, what it says about them, and notes on both."""
 
     gaussians: Gaussians
-    card: Card
+    card: Metadata
     notes: tuple[str, ...] = ()
 
 
-def write_card(
+def write_metadata(
     gaussians: Gaussians, about: Sequence[str] = (), origin: Origin = NOWHERE, calibration: Calibration | None = None
 ) -> dict[str, Any]:
     """Plain JSON; ``read_card`` gives it back. The arguments are those of ``writers.write``."""
@@ -75,12 +75,12 @@ def write_card(
     return values
 
 
-def card_text(values: dict[str, Any]) -> str:
+def metadata_text(values: dict[str, Any]) -> str:
     """The document in one order, so that equal models give equal files."""
     return json.dumps(values, sort_keys=True, allow_nan=False)
 
 
-def read_card(path: Path, text: str | bytes | dict[str, Any] | None, total: int) -> tuple[Card, list[str]]:
+def read_card(path: Path, text: str | bytes | dict[str, Any] | None, total: int) -> tuple[Metadata, list[str]]:
     """The document of a file, parsed or not, and notes; an empty card where there is none.
 
     A calibration that is damaged, or of another number of Gaussians than ``total``, is left out with a note.
@@ -89,7 +89,7 @@ def read_card(path: Path, text: str | bytes | dict[str, Any] | None, total: int)
         ClodError: it is damaged, of another kind, or of a newer format.
     """
     if text is None:
-        return Card(), []
+        return Metadata(), []
     try:
         values = text if isinstance(text, dict) else json.loads(text)
         if values["format"] != FORMAT:
@@ -102,7 +102,7 @@ def read_card(path: Path, text: str | bytes | dict[str, Any] | None, total: int)
         if sum(map(len, about)) + len(version) > _LONGEST:
             raise ClodError(f"its description has more than {_LONGEST:,} letters; export the file again")
         calibration, notes = _calibration(values, total)
-        return Card(
+        return Metadata(
             attenuation=_attenuation(values["attenuation"], notes) if "attenuation" in values else None,
             calibration=calibration,
             origin=parse_origin(values.get("origin", NOWHERE)),
@@ -116,7 +116,7 @@ def read_card(path: Path, text: str | bytes | dict[str, Any] | None, total: int)
         raise ClodError(f"{path}: its description is damaged ({error!r:.80}); export the file again") from error
 
 
-def settings_of(card: Card) -> AttenuationConfig:
+def settings_of(card: Metadata) -> AttenuationConfig:
     """How the file's sigma_d is to be read: by the defaults, of earlier versions in a description without settings."""
     unsaid = AttenuationConfig(**as_before({})[0]) if card.version else AttenuationConfig()
     return card.attenuation or unsaid

@@ -12,7 +12,7 @@ from clod_adapter.calibration import Calibration
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.formats.arrays import arrays_of, gaussians_of
-from clod_adapter.io.formats.metadata import KEY, Model, card_text, read_card, settings_of, write_card
+from clod_adapter.io.formats.metadata import KEY, Model, metadata_text, read_card, settings_of, write_metadata
 from clod_adapter.io.formats.pt import FRAME, NAMES, read_splats
 from clod_adapter.io.ply.columns import SIGMA
 from clod_adapter.origin import NOWHERE, Origin
@@ -32,7 +32,7 @@ def write_pt(
     splats = {name: torch.from_numpy(arrays[ours]) for name, ours in NAMES.items()}
     if SIGMA in arrays:
         splats[SIGMA] = torch.from_numpy(arrays[SIGMA])
-    text = card_text(write_card(gaussians, about, origin, calibration))
+    text = metadata_text(write_metadata(gaussians, about, origin, calibration))
     # By way of memory, as the entries of a file are named after it, and this one's name is temporary.
     buffer = io.BytesIO()
     torch.save({"step": 0, "splats": splats, KEY: text}, buffer)

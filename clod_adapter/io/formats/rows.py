@@ -9,7 +9,7 @@ import numpy as np
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.formats.converted import check_converted, read_converted
-from clod_adapter.io.formats.metadata import KEY, Card
+from clod_adapter.io.formats.metadata import KEY, Metadata
 from clod_adapter.io.formats.pt import check_pt
 from clod_adapter.io.ply.columns import SIGMA, rows_of
 from clod_adapter.io.ply.header import PREFIX, write_comments
@@ -104,7 +104,7 @@ def _fields(vertex: np.ndarray) -> list[tuple[str, np.dtype]]:
     return [(name, vertex.dtype[name]) for name in vertex.dtype.names or ()]
 
 
-def _comments(card: Card) -> tuple[str, ...]:
+def _comments(card: Metadata) -> tuple[str, ...]:
     """The description as the header of a PLY has it: printable ASCII, and of ours only what a card says."""
     about = ["".join(c if c.isascii() and c.isprintable() else "?" for c in line) for line in card.about]
     if card.attenuation is None and not card.version:

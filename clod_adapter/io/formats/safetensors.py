@@ -16,7 +16,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.formats.arrays import arrays_of, gaussians_of
-from clod_adapter.io.formats.metadata import KEY, Model, card_text, read_card, settings_of, write_card
+from clod_adapter.io.formats.metadata import KEY, Model, metadata_text, read_card, settings_of, write_metadata
 from clod_adapter.io.tensor_file import load_tensors
 from clod_adapter.origin import NOWHERE, Origin
 
@@ -34,7 +34,7 @@ def write_safetensors(
     """Writes every value as it is; ``writers.write`` has the arguments and errors."""
     path = Path(path)
     arrays = arrays_of(path, gaussians)
-    metadata = {KEY: card_text(write_card(gaussians, about, origin, calibration))}
+    metadata = {KEY: metadata_text(write_metadata(gaussians, about, origin, calibration))}
     with atomic_path(path) as temporary:
         # Not save_file, which makes files that only their owner can read.
         temporary.write_bytes(save(arrays, metadata))

@@ -28,7 +28,7 @@ from clod_adapter.io.formats.arrays import (
     scales_of,
     sigmoid,
 )
-from clod_adapter.io.formats.metadata import Card, Model
+from clod_adapter.io.formats.metadata import Metadata, Model
 from clod_adapter.origin import NOWHERE, Origin
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
@@ -86,4 +86,4 @@ def load_splat(path: str | Path) -> Model:
         "opacity_logits": logits_of_bytes(rows["rgba"][:, 3]), "shN": np.zeros((len(rows), 0, 3)),
         "sh0": ((rgba[:, None, :3] / 255) - 0.5) / SH_C0,
     }  # fmt: skip
-    return Model(gaussians_of(path, arrays, None), Card())
+    return Model(gaussians_of(path, arrays, None), Metadata())

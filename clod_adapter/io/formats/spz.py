@@ -32,7 +32,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.formats.arrays import arrays_of, bytes_of, normalized, sigmoid
-from clod_adapter.io.formats.metadata import card_text, write_card
+from clod_adapter.io.formats.metadata import metadata_text, write_metadata
 from clod_adapter.origin import NOWHERE, Origin
 from clod_adapter.units import estimated_distance, known_distance, with_distance
 
@@ -81,7 +81,7 @@ def write_spz(
     parts = [header, *_packed(arrays, bits, degree), struct.pack("<III", AXES, 4, RDF)]
     says = (gaussians.sigma_d is not None, any(origin), calibration is not None, about, screen_filter != CLASSIC)
     if any(says):
-        text = card_text(write_card(gaussians, about, origin, calibration)).encode()
+        text = metadata_text(write_metadata(gaussians, about, origin, calibration)).encode()
         sigma = np.clip(arrays.get("sigma_d", np.zeros(0)), -_SIGMA_MOST, _SIGMA_MOST).astype("<f2").tobytes()
         parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(sigma), len(text)) + text + sigma)
     with atomic_path(path) as temporary:

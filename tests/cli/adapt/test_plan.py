@@ -158,22 +158,22 @@ def test_the_options_name_what_the_plan_decides() -> None:
 def test_an_interrupt_leaves_nothing(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: str
 ) -> None:
-    from clod_adapter.cli.adapt.progress import Follower
+    from clod_adapter.cli.adapt.progress import ProgressDisplay
 
-    follow = Follower.__call__
+    follow = ProgressDisplay.__call__
 
-    def interrupted(self: Follower, now: Progress) -> None:
+    def interrupted(self: ProgressDisplay, now: Progress) -> None:
         self.stop.requests += now.phase == phase
         follow(self, now)
 
-    monkeypatch.setattr(Follower, "__call__", interrupted)
+    monkeypatch.setattr(ProgressDisplay, "__call__", interrupted)
     done = clod(capture.ply, "--images", capture.scene, *TINY)
     assert done.code == 130 and "plan:" not in done.err and names(tmp_path) == [], done
 
 
 def test_resuming_what_the_plan_froze(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The attributes are judged once: what was frozen stays so, and the end is the same."""
-    from clod_adapter.cli.adapt.progress import Follower
+    from clod_adapter.cli.adapt.progress import ProgressDisplay
 
     def quats_do_nothing(name: str, *rest: Any) -> tuple[float, float]:
         return (0.0, 1.0) if name == "quats" else effect(name, *rest)
@@ -182,14 +182,14 @@ def test_resuming_what_the_plan_froze(clod: Any, capture: Any, tmp_path: Path, m
     words = (capture.ply, "--images", capture.scene, *TINY)
     assert clod(*words).code == 0 and decisions(tmp_path)["quats"]["verdict"] == "frozen"
     want = clod_adapter.load(tmp_path / "dial.ply").gaussians
-    follow = Follower.__call__
+    follow = ProgressDisplay.__call__
     with monkeypatch.context() as patch:
 
-        def interrupted(self: Follower, now: Progress) -> None:
+        def interrupted(self: ProgressDisplay, now: Progress) -> None:
             self.stop.requests += now.phase == "train" and now.done == 12
             follow(self, now)
 
-        patch.setattr(Follower, "__call__", interrupted)
+        patch.setattr(ProgressDisplay, "__call__", interrupted)
         assert "--resume goes on from step 12" in clod(*words).err
     monkeypatch.setattr(planner, "effect", lambda *_: pytest.fail("judged again"))
     with monkeypatch.context() as patch:

@@ -34,9 +34,11 @@ SERVER = """
 import json, os, signal, sys
 import torch
 torch.set_num_threads(1)  # a process that forks must have no threads
-from clod_adapter.cli import adapt, main, processes, resume
-from clod_adapter.cli.console import Console
-from clod_adapter.cli.kernels import prepare_kernels
+from clod_adapter.cli import main
+from clod_adapter.cli.adapt import processes, resume
+from clod_adapter.cli.adapt import run as adapt
+from clod_adapter.cli.shared.console import Console
+from clod_adapter.cli.shared.kernels import prepare_kernels
 prepare_kernels(Console(quiet=True))
 print("ready", flush=True)
 for line in sys.stdin:
@@ -223,7 +225,7 @@ def test_the_second_is_killed(server: Server, words: list[Any], tmp_path: Path) 
 def test_the_launcher_s_signals_end_no_writing(server: Server, words: list[Any], tmp_path: Path) -> None:
     """It sends one for the loss, and others pass theirs on: while the files are written, and right to the end."""
     pressed = (
-        "import argparse; from clod_adapter.cli import outcome\n"
+        "import argparse; from clod_adapter.cli.adapt import result as outcome\n"
         "def pressing(real):\n"
         "    def call(*arguments, **more):\n"
         "        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGTERM): signal.raise_signal(number)\n"
@@ -271,12 +273,12 @@ def test_a_loss_within_a_step_loses_none(server: Server, words: list[Any], alone
 def test_a_loss_before_the_first_step(server: Server, words: list[Any], tmp_path: Path) -> None:
     """There is nothing to write then; here for want of a second GPU."""
     on_gpus = (
-        "real = processes.Peers.broadcast\n"
+        "real = processes.ProcessGroup.broadcast\n"
         "def broadcast(*arguments):\n"
         "    job = real(*arguments)\n"
         "    object.__setattr__(job, 'device', 'cuda')\n"
         "    return job\n"
-        "processes.Peers.broadcast = broadcast; torch.cuda.device_count = lambda: 1"
+        "processes.ProcessGroup.broadcast = broadcast; torch.cuda.device_count = lambda: 1"
     )
     run = server.start(tmp_path / "run", *words, *TINY, before={1: on_gpus})
     assert run.wait() == [2, 2] and run.log(1) == "" and list(run.folder.iterdir()) == [], run.log(0)

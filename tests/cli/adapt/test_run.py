@@ -114,7 +114,7 @@ def test_the_plain_row_is_the_file_without_its_dial(clod: Any, capture: Any, tmp
     clod(capture.ply, "--images", capture.scene, *TINY)
     report = json.loads((tmp_path / "dial.json").read_text())
     adapted, views = clod_adapter.load(tmp_path / "dial.ply").gaussians, clod_adapter.load_scene(capture.scene).test
-    (want,) = clod_adapter.evaluation.evaluate(clod_adapter.detach(adapted), views, [1.0])
+    (want,) = clod_adapter.evaluate(clod_adapter.detach(adapted), views, [1.0])
     assert {**report["detached_row"], "frame_ms": 0} == {**want.as_dict(), "frame_ms": 0}
     assert report["detached_row"]["kept"] == 300
 

@@ -55,7 +55,7 @@ def test_where_no_camera_is_known_some_are_placed(
     report = exported(clod, old, "--sv", 2, "-o", "x.ply")
     assert report["notes"] == [f"{old} stores no cameras, so 3 are placed; give --images, which is better"]
     model = load(old)
-    want = clod_adapter.bake(model.gaussians, 2.0, cameras=clod_adapter.place(model.gaussians, views=3))
+    want = clod_adapter.bake(model.gaussians, 2.0, cameras=clod_adapter.place_cameras(model.gaussians, views=3))
     assert model.viewpoints == () and torch.equal(load("x.ply").gaussians.means, want.means)
     assert "baked at s = 2 by clod-adapter for 3 placed cameras" in load("x.ply").comments
 
@@ -75,16 +75,16 @@ def test_where_nothing_can_be_seen_no_camera_is_placed(clod: Any, dialled: Path,
 @pytest.mark.parametrize("suffix", [".ply", ".splat"])
 def test_a_psnr_budget_is_true_of_the_file(clod: Any, capture: Any, dialled: Path, suffix: str) -> None:
     model, test = load(dialled), clod_adapter.load_scene(capture.scene).test
-    reference = clod_adapter.evaluation.evaluate(model.gaussians, test, [1])[0].psnr
+    reference = clod_adapter.evaluate(model.gaussians, test, [1])[0].psnr
 
     def lost(s: float) -> float:
         assert clod("export", dialled, "--sv", s, "--images", capture.scene, "-o", f"s{suffix}").code == 0
-        return reference - clod_adapter.evaluation.evaluate(load(f"s{suffix}").gaussians, test, [1])[0].psnr
+        return reference - clod_adapter.evaluate(load(f"s{suffix}").gaussians, test, [1])[0].psnr
 
     drop = (lost(1.0) + lost(4.0)) / 2
     report = exported(clod, dialled, "--psnr-drop", drop, "--images", capture.scene, "-o", f"x{suffix}")
     (output,) = report["outputs"]
-    found = clod_adapter.evaluation.evaluate(load(f"x{suffix}").gaussians, test, [1])[0].psnr
+    found = clod_adapter.evaluate(load(f"x{suffix}").gaussians, test, [1])[0].psnr
     assert output["psnr"] == pytest.approx(found, abs=1e-9) and output["views"] == len(test)
     assert output["reference_psnr"] == pytest.approx(reference, abs=1e-9)
     s = output["virtual_scale"]

@@ -168,10 +168,10 @@ def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
 def test_levels_appear_together_or_not_at_all(
     clod: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException
 ) -> None:
-    from clod_adapter.cli.export import files
+    from clod_adapter.cli.export import files as export_files
 
     (tmp_path / "x_s1.ply").write_bytes(b"of an earlier run")
-    real, calls = files.write, []
+    real, calls = export_files.write, []
 
     def write(*args: Any, **options: Any) -> Any:
         calls.append(args)
@@ -179,7 +179,7 @@ def test_levels_appear_together_or_not_at_all(
             raise failure
         return real(*args, **options)
 
-    monkeypatch.setattr(files, "write", write)
+    monkeypatch.setattr(export_files, "write", write)
     done = clod("export", dialled, "--levels", "1,2,4", "-o", "x.ply")
     assert done.code == (130 if isinstance(failure, KeyboardInterrupt) else 2) and "Traceback" not in done.err
     assert files(tmp_path) == ["x_s1.ply"] and (tmp_path / "x_s1.ply").read_bytes() == b"of an earlier run"

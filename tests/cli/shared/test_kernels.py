@@ -35,7 +35,7 @@ def test_all_that_a_job_needs_is_ready(capture: Any) -> None:
     for bands in (0, 3):
         base = base.replace(shN=base.shN[:, :bands])
         result = clod_adapter.adapt(base, scene, clod_adapter.AdaptConfig(iters=2)).gaussians
-        clod_adapter.evaluation.evaluate(result, scene.test, [1.0, 3.0])
+        clod_adapter.evaluate(result, scene.test, [1.0, 3.0])
     assert {name: len(kernel.signatures) for name, kernel in kernels().items()} == before
 
 

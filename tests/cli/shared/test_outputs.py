@@ -80,8 +80,8 @@ def test_a_transforms_file_beside_the_photographs(clod: Any, work: Path) -> None
     )  # fmt: skip
 
 
-def test_a_state_or_chunk_that_is_an_input(clod: Any, work: Path) -> None:
-    for name in ("x.resume.safetensors", "x.start.safetensors", "x.chunk1.pass1.safetensors"):
+def test_a_state_or_block_that_is_an_input(clod: Any, work: Path) -> None:
+    for name in ("x.resume.safetensors", "x.start.safetensors", "x.block1.pass1.safetensors"):
         assert clod("export", "dial.ply", "-o", name).code == 0
         refused(clod, work, f"{name}: {INPUT}", name, "--images", "scene", *TINY, "--memory", "8GB", "-o", "x.ply")
         (work / name).unlink()

@@ -176,7 +176,7 @@ def test_damaged_text_is_never_another_exception(tmp_path: Path, plain: Any, tex
 def test_it_stands_in_where_pycolmap_is_missing() -> None:
     code = (
         "import sys; sys.modules['pycolmap'] = None\n"
-        "from clod_adapter.io import colmap_plain, scene, colmap_library\n"
+        "from clod_adapter.io.scene import colmap_plain, load, colmap_library\n"
         "assert colmap_library.pycolmap is colmap_plain"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

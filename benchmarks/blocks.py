@@ -1,12 +1,12 @@
-"""Adapting in chunks: do its pictures have seams, and does it stay within its memory?
+"""Adapting in blocks: do its pictures have seams, and does it stay within its memory?
 
-Seams: a capture adapted whole, whole with another seed, and in chunks of forced number; each against the photographs
+Seams: a capture adapted whole, whole with another seed, and in blocks of forced number; each against the photographs
 and against the first, at s = 1, 3, 5, on the held-out views, on all of their pixels and on those across a border
 between blocks (where no block has SOLE of the pixel). Memory: the command on a synthetic city, with and without
 --memory, in a process of its own whose largest resident size the system tells.
 
-    python benchmarks/chunks.py seams                  # hours on two cores; --iters 300 for a quick look
-    python benchmarks/chunks.py memory                 # 2 million Gaussians, 60 photographs of 960x540
+    python benchmarks/blocks.py seams                  # hours on two cores; --iters 300 for a quick look
+    python benchmarks/blocks.py memory                 # 2 million Gaussians, 60 photographs of 960x540
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from common import append, capture
 
 from clod_adapter.blocks.divide import Division, divide
 from clod_adapter.blocks.targets import target
-from clod_adapter.blocks.train import adapt_chunk, merge
+from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
@@ -102,22 +102,22 @@ def seams(args: argparse.Namespace) -> None:
         whole = adapt(base.gaussians, scene, config).gaussians
         seconds = time.perf_counter() - began
         again = adapt(base.gaussians, scene, replace(config, seed=1)).gaussians
-        for count in args.chunks:
+        for count in args.blocks:
             division = divide(base.gaussians, views, config, count)
             masks = borders(division, scene.test)
             share = float(torch.stack([mask.float().mean() for mask in masks]).mean())
-            about = {"what": "seams", "scene": name, "iters": args.iters, "chunks": count, "border_pixels": share}
-            if count == args.chunks[0]:
+            about = {"what": "seams", "scene": name, "iters": args.iters, "blocks": count, "border_pixels": share}
+            if count == args.blocks[0]:
                 row = {"label": "whole, another seed", "seconds": seconds}
-                append("chunks.jsonl", {**about, **row, "rows": compare(again, whole, scene.test, masks)})
+                append("blocks.jsonl", {**about, **row, "rows": compare(again, whole, scene.test, masks)})
             after = None
             for number in (1, 2):
                 began = time.perf_counter()
-                parts = [adapt_chunk(division, views, config, k, after=after)[0] for k in range(count)]
+                parts = [adapt_block(division, views, config, k, after=after)[0] for k in range(count)]
                 after = merge(division, parts)
                 row = {"label": f"pass {number}", "seconds": time.perf_counter() - began}
                 row |= {"steps": [part.steps for part in parts]}
-                append("chunks.jsonl", {**about, **row, "rows": compare(after, whole, scene.test, masks)})
+                append("blocks.jsonl", {**about, **row, "rows": compare(after, whole, scene.test, masks)})
 
 
 def memory(args: argparse.Namespace) -> None:
@@ -141,7 +141,7 @@ def memory(args: argparse.Namespace) -> None:
             row = {"what": "memory", "count": args.count, "images": args.images, "memory": limit, "iters": args.iters}
             row |= {"peak_bytes": usage.ru_maxrss * 1024, "seconds": time.perf_counter() - began}
             row |= {"plan": found.get("memory"), "steps": found["steps"], "rows": found["rows"]}
-            append("chunks.jsonl", row | {"times": found["seconds"]})
+            append("blocks.jsonl", row | {"times": found["seconds"]})
 
 
 def main() -> None:
@@ -149,7 +149,7 @@ def main() -> None:
     commands = parser.add_subparsers(required=True)
     one = commands.add_parser("seams")
     one.add_argument("--scenes", nargs="+", default=["plush_half", "bonsai146"])
-    one.add_argument("--chunks", type=int, nargs="+", default=[4, 8])
+    one.add_argument("--blocks", type=int, nargs="+", default=[4, 8])
     one.add_argument("--iters", type=int, default=AdaptConfig().iters)
     one.set_defaults(run=seams)
     other = commands.add_parser("memory")
