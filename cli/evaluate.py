@@ -9,9 +9,10 @@ from typing import Any
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.perceptual import available_metrics
 from clod_adapter.io.checkpoint import Checkpoint
+from clod_adapter.progress import Stopped
 from clod_adapter.version import package_version
 
-from .comparisons import Comparisons
+from .comparisons import Comparisons, compare
 from .shared.antialiasing import with_filter
 from .shared.budgets import solve_dials
 from .shared.console import Console
@@ -54,19 +55,20 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     with watch.time("evaluate"):
         rows, interrupted = measure(model.gaussians, scene.test, dials, console, metrics=perceptual)
     if interrupted and not rows:
-        raise KeyboardInterrupt
+        raise Stopped("stopped before the first row")
     print(table(rows))
-    instruments = Comparisons(model.gaussians, scene, perceptual, console)
+    comparisons = Comparisons()
     if not interrupted:
-        with watch.time("instruments"):
-            interrupted = instruments.run(rows, base, others, args.popping)
-    print(instruments.text(), end="")
+        with watch.time("comparisons"):
+            comparisons = compare(model.gaussians, rows, base, others, scene, perceptual, console, args.popping)
+        interrupted = comparisons.interrupted
+    print(comparisons.text(), end="")
     report: dict[str, Any] = {
         "command": "eval", "version": package_version(), "model": args.model, "scene": args.images,
         "base_count": len(model.gaussians), "sh_degree": model.gaussians.sh_degree, "views": len(scene.test),
-        "rows": [row.as_dict() for row in rows], "base": args.base, **instruments.report(),
+        "rows": [row.as_dict() for row in rows], "base": args.base, **comparisons.report(),
         "interrupted": interrupted, "attenuation": asdict(attenuation) if attenuation else None,
-        "notes": [*model.notes, *scene.notes, *notes, *instruments.notes], "machine": machine(),
+        "notes": [*model.notes, *scene.notes, *notes, *comparisons.notes], "machine": machine(),
         "device": str(model.gaussians.means.device), "seconds": watch.report(),
     }  # fmt: skip
     return report | write_eval_page(args, report, model.gaussians, base, scene, console)

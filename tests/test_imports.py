@@ -22,7 +22,7 @@ ORDER: list[set[str]] = [
     {"errors"},
     {"_kernels", "cameras", "config"},
     {"attenuation", "calibration", "gaussians", "losses"},
-    {"extinction", "finite", "hook", "metrics", "rasterizers", "units", "viewpoints"},
+    {"extinction", "finite", "hook", "metrics", "progress", "rasterizers", "units", "viewpoints"},
     {"adapter", "integrations", "render"},
     {"bake", "initialization"},
     {"io.atomic", "io.regular", "io.rows", "io.screen_filter", "io.settings", "io.sniff", "io.writers"},

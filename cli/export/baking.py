@@ -13,6 +13,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.poses import load_cameras
+from clod_adapter.progress import Stopped
 from clod_adapter.training.pseudo_views import place_cameras
 
 from ..shared.console import Console
@@ -60,9 +61,7 @@ def find_target(args: argparse.Namespace, model: Checkpoint, console: Console) -
 def _placed(model: Checkpoint, console: Console) -> tuple[Target, list[str]]:
     try:
         with console.meter("placing cameras") as meter:
-            cameras = place_cameras(
-                model.gaussians, views=PLACED, progress=lambda n, of: meter.update(n / of, f"{n}/{of}")
-            )  # fmt: skip
+            cameras = place_cameras(model.gaussians, views=PLACED, progress=meter)
     except ClodError as error:
         raise ClodError(f"{model.path}: it stores no cameras to bake for, and {error}; give --images") from error
     note = f"{model.path} stores no cameras, so {len(cameras)} are placed; give --images, which is better"
@@ -117,7 +116,7 @@ def measure_drop(
 def _psnr(gaussians: Gaussians, views: Sequence[View], console: Console, label: str) -> float:
     rows, interrupted = measure(gaussians, views, [1.0], console, label)
     if interrupted:
-        raise KeyboardInterrupt
+        raise Stopped("stopped during measurement")
     return rows[0].psnr
 
 

@@ -78,9 +78,7 @@ def time_frames(
     """``budget.frame_times``, with its progress, and a note on how long frames take."""
     prepare_kernels(console, model.gaussians.means.device, training=False)
     with console.meter("timing") as meter:
-        times = frame_times(
-            model.gaussians, cameras, progress=lambda done, total: meter.update(done / total, f"{done}/{total}")
-        )
+        times = frame_times(model.gaussians, cameras, progress=meter)
     (first, slow), (last, fast) = times[0], times[-1]
     return times, [f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}"]
 

@@ -13,6 +13,7 @@ from clod_adapter.cameras import Camera, Scene, View
 from clod_adapter.config import CLASSIC, AdaptConfig, ScreenFilter
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Stopped
 from clod_adapter.training.loop import adapt
 
 from .console import Console, Meter
@@ -41,8 +42,8 @@ def prepare_kernels(
         evaluate(one, [view], [1.0])
         if training:
             adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0))
-            if adapted.interrupted:  # it keeps what it has, and that is nothing here
-                raise KeyboardInterrupt
+            if adapted.interrupted:
+                raise Stopped("stopped while the kernels were compiled")
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.importance import start
+from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
 
 UNSEEN = 0.005  # of what all views show of a block, the share that those it is not trained on may show
@@ -108,13 +109,13 @@ def divide(
     views: Sequence[View],
     config: AdaptConfig,
     count: int,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Listener | None = None,
 ) -> Division:
     """Splits a scene into ``count`` blocks and takes the start, of the whole scene, that all of them begin from.
 
     Args:
         views: ``importance.seeing`` of the training views.
-        progress: as ``importance.start`` calls it, and with "blocks" and the number of views looked at, and of all.
+        progress: called in the phases of ``importance.start``, and in ``Phase.COVERAGE`` after each view.
 
     Raises:
         ClodError: the settings are some that blocks cannot be trained with, or there are fewer Gaussians than blocks.
@@ -133,8 +134,7 @@ def divide(
         shown = coverage(begun, begun.opacities, _smaller(view.camera)).double()
         seen[k] = (shown.new_zeros(count).index_add_(0, block.long(), shown) / shown.sum().clamp(min=1e-9)).float()
         kept[k] = torch.tensor(kept_counts(begun, view, dial_grid(config)))
-        if progress:
-            progress("blocks", k + 1, len(views))
+        tell(progress, Phase.COVERAGE, k + 1, len(views))
     begun = base.replace(sigma_d=begun.sigma_d, attenuation=begun.attenuation)
     extent = camera_extent([view.camera for view in views]) or begun.attenuation.reference_distance  # type: ignore[union-attr]
     return Division(begun, block, seen, kept, extent)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.importance import spread
 from clod_adapter.losses import unit
+from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
 from clod_adapter.training.target_count import TargetShare, target_curve
 
@@ -32,7 +33,7 @@ def beside(
     block: int,
     views: Sequence[View],
     after: Gaussians | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Listener | None = None,
 ) -> Tensor:
     """``[m]`` int64, ascending: the other Gaussians, but for those that show too little in any of the views.
 
@@ -53,8 +54,7 @@ def beside(
             opacities = dialled if after else torch.where(own, dialled, scene.opacities)
             shown = coverage(scene, opacities, view.camera)
             drawn |= shown > _least_shown(shown)
-        if progress:
-            progress(k + 1, len(views))
+        tell(progress, Phase.CONTEXT, k + 1, len(views))
     return (drawn & ~own).nonzero()[:, 0]
 
 
@@ -83,7 +83,7 @@ class TargetShares:
         config: AdaptConfig,
         *,
         first: bool,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Listener | None = None,
     ) -> None:
         self.views, self.config, self.all = tuple(views), config, len(division.begun)
         rows, numbers, dials = division.rows(block), division.views(block), dial_grid(config)
@@ -94,8 +94,7 @@ class TargetShares:
             parts = np.array(kept_counts(own, view, dials)) / division.kept[k].clamp(min=1).numpy()
             stands_for = each / max(float(division.seen[k, block]), LEAST_SEEN) if first else each
             self._of[id(view)] = parts, stands_for
-            if progress:
-                progress(len(self._of), len(numbers))
+            tell(progress, Phase.TARGET_COUNTS, len(self._of), len(numbers))
 
     def __call__(self, view: View, virtual_scale: float, loss: float) -> TargetShare:
         config, (parts, stands_for) = self.config, self._of[id(view)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from statistics import fmean
 
 import torch
@@ -13,6 +13,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, removal_error, spread
+from clod_adapter.progress import Listener
 from clod_adapter.render import dial
 
 
@@ -32,16 +33,14 @@ def matching_dial(gaussians: Gaussians, cameras: Sequence[Camera], count: float)
         return gaussians.attenuation.max_sv
 
 
-def rankings(
-    base: Gaussians, views: Sequence[View], progress: Callable[[int, int], None] | None = None
-) -> dict[str, Tensor]:
+def rankings(base: Gaussians, views: Sequence[View], progress: Listener | None = None) -> dict[str, Tensor]:
     """``[N]`` indices of the Gaussians of an unadapted base, the ones to keep longest first, by two rules.
 
     ``opacity``: the stored one. ``removal error``: the error that removing it alone would cause in up to 64 of the
     training views, evenly spread (``importance.removal_error``). ``base.select(order[:n])`` is the base at n Gaussians.
 
     Args:
-        progress: called with (views done, views in all).
+        progress: called in ``Phase.IMPORTANCE`` after each view.
     """
     removal = removal_error(base, spread(views, MOST_VIEWS), progress=progress)
     return {"opacity": by_opacity(base), "removal error": removal.argsort(descending=True, stable=True)}

@@ -36,9 +36,8 @@ from clod_adapter.cameras import Camera
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import dial, render, splat
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -72,13 +71,17 @@ class Popping:
 
 
 @torch.no_grad()
-def sweep(show: Callable[[int, int], Tensor], positions: Sequence[float], progress: Progress | None = None) -> Popping:
+def sweep(show: Callable[[int, int], Tensor], positions: Sequence[float], progress: Listener | None = None) -> Popping:
     """The measure itself, of anything that can be shown.
 
     Args:
         show: ``show(k, j)`` is the picture ``[H, W, 3]`` from the camera of step k of the Gaussians as at step j.
         positions: where the steps are, at least three.
-        progress: called with (steps done, steps in all).
+        progress: called in ``Phase.POPPING`` after each step.
+
+    Raises:
+        ClodError: fewer than three positions.
+        Stopped: ``progress`` returned False.
     """
     require(len(positions) >= 3, "number of positions", len(positions), "at least 3")
     once, twice = [], []
@@ -87,8 +90,7 @@ def sweep(show: Callable[[int, int], Tensor], positions: Sequence[float], progre
         once.append(_change(new - show(k, k - 1).clamp(0, 1)))
         if k >= 2:
             twice.append(_change(new - show(k, k - 2).clamp(0, 1)))
-        if progress:
-            progress(k, len(positions) - 1)
+        tell(progress, Phase.POPPING, k, len(positions) - 1)
     changes, pixels = zip(*once, strict=True)
     wide_changes, wide_pixels = zip(*twice, strict=True)
     largest, pixel, mean = max(changes), max(pixels), math.fsum(changes) / len(changes)
@@ -101,7 +103,7 @@ def sweep(show: Callable[[int, int], Tensor], positions: Sequence[float], progre
 
 
 def dial_popping(
-    gaussians: Gaussians, camera: Camera, max_sv: float, *, steps: int = 200, progress: Progress | None = None
+    gaussians: Gaussians, camera: Camera, max_sv: float, *, steps: int = 200, progress: Listener | None = None
 ) -> Popping:
     """Turns the dial from 1 to ``max_sv`` before a camera that stands still, in steps of equal ratio.
 
@@ -122,7 +124,7 @@ def path_popping(
     virtual_scale: float,
     *,
     steps: int = 200,
-    progress: Progress | None = None,
+    progress: Listener | None = None,
 ) -> Popping:
     """Moves through the ``cameras`` at a fixed dial value, in steps of equal length (``path``).
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import TypeVar
 
 import torch
@@ -18,6 +17,7 @@ from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.finite import bad_rows, largest_colour
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.pruning_order import pruning_order
+from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
 from clod_adapter.units import in_world_units, known_distance, with_distance
 from clod_adapter.viewpoints import typical_distance
@@ -40,7 +40,7 @@ def start(
     base: Gaussians,
     views: Sequence[View],
     config: AdaptConfig,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Listener | None = None,
     error: Tensor | None = None,
 ) -> Gaussians:
     """The Gaussians with a sigma_d to train from, by what they do in up to MOST_VIEWS of the views, evenly spread.
@@ -49,8 +49,7 @@ def start(
     ``max_sv``; one that does nothing (``SIGMA_MAX`` throughout, as ``attach`` makes it) counts as none.
 
     Args:
-        progress: called with "start" and the number of views done, and of those that are looked at in all; then with
-            "order" and the number of Gaussians whose place is known, and of all of them.
+        progress: called in ``Phase.IMPORTANCE`` after each view, and then in ``Phase.PRUNING_ORDER``.
         error: ``[N]`` from ``removal_error``, of these views and seed, where it is known already.
     """
     if base.attenuation is not None and has_dial(base):
@@ -63,13 +62,11 @@ def start(
         constant = torch.full_like(base.means[:, 0], value)
         return in_world_units(base.replace(sigma_d=constant, attenuation=attenuation))
     if error is None:
-        looked = partial(progress, "start") if progress else None
-        error = removal_error(base, views, seed=config.seed, progress=looked)
+        error = removal_error(base, views, seed=config.seed, progress=progress)
     attenuation = dataclasses.replace(attenuation, tau=fitting_tau(base.opacities, error, config))
     importance = error
     if config.start == "importance":
-        order = partial(progress, "order") if progress else None
-        importance = pruning_order(base, error.sqrt() * base.opacities, order)
+        importance = pruning_order(base, error.sqrt() * base.opacities, progress)
     distances = typical_distance(base.means, [view.camera for view in views], attenuation)
     sigma = sigma_from_importance(
         base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent
@@ -146,7 +143,7 @@ def scene_distance(base: Gaussians, views: Sequence[View], quantile: float) -> f
 
 
 def removal_error(
-    gaussians: Gaussians, views: Sequence[View], *, seed: int = 0, progress: Callable[[int, int], None] | None = None
+    gaussians: Gaussians, views: Sequence[View], *, seed: int = 0, progress: Listener | None = None
 ) -> Tensor:
     """``[N]`` estimate of the squared picture error that removing each Gaussian alone would cause.
 
@@ -156,7 +153,7 @@ def removal_error(
     Gauss-Newton matrix). Works with every differentiable rasterizer.
 
     Args:
-        progress: called with the number of views done after each, and of all of them.
+        progress: called in ``Phase.IMPORTANCE`` after each view.
 
     Raises:
         ClodError: an error is not finite, as colours overflow in the pictures.
@@ -170,8 +167,7 @@ def removal_error(
         signs = drawn.to(image.device).to(image) * 2 - 1
         (gradient,) = torch.autograd.grad((image * signs).sum(), opacities)  # as grad_outputs they would import sympy
         total += (gradient * opacities.detach()).square()
-        if progress:
-            progress(done, len(views))
+        tell(progress, Phase.IMPORTANCE, done, len(views))
     if (bad := bad_rows(total)) is not None:
         much = f"what removing {int(bad.sum()):,} of the Gaussians does to the pictures is not finite"
         raise ClodError(f"{much}; {largest_colour(gaussians)}")

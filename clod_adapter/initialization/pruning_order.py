@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -11,6 +9,7 @@ from torch import Tensor
 from clod_adapter._kernels import threads
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.progress import Listener, Phase, tell
 
 NEIGHBOURS = 8
 LEAVING = 0.25  # of those left, a round
@@ -24,7 +23,7 @@ CROWD = 64  # Gaussians exactly in one place, from which on they are moved apart
 JITTER = 1e-6  # by so much of their size: a k-d tree cannot part them, and compares each with all others
 
 
-def pruning_order(gaussians: Gaussians, worth: Tensor, progress: Callable[[int, int], None] | None = None) -> Tensor:
+def pruning_order(gaussians: Gaussians, worth: Tensor, progress: Listener | None = None) -> Tensor:
     """``[N]`` int64, how many leave before each Gaussian: half-edge collapse, as for the levels of a mesh.
 
     In rounds, what losing Gaussian i costs is ``w_i min_j (|c_i - c_j|^2 + COLOUR_FLOOR^2 + APART r^2 / (r^2 + (l_i +
@@ -38,7 +37,7 @@ def pruning_order(gaussians: Gaussians, worth: Tensor, progress: Callable[[int, 
 
     Args:
         worth: ``[N]`` >= 0, what each is worth by itself.
-        progress: called with the number of Gaussians whose place is known, and of all of them.
+        progress: called after each round, in ``Phase.PRUNING_ORDER``, with the Gaussians ordered so far.
 
     Raises:
         ClodError: a centre is not finite.
@@ -59,11 +58,9 @@ def pruning_order(gaussians: Gaussians, worth: Tensor, progress: Callable[[int, 
         order[left[leaving]] = gone + np.arange(len(leaving))
         gone += len(leaving)
         left = np.delete(left, leaving)
-        if progress:
-            progress(gone, count)
+        tell(progress, Phase.PRUNING_ORDER, gone, count)
     order[left] = gone
-    if progress:
-        progress(count, count)
+    tell(progress, Phase.PRUNING_ORDER, count, count)
     return torch.from_numpy(order).to(worth.device)
 
 
