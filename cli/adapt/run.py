@@ -14,7 +14,7 @@ from clod_adapter.io.claims import output_lock
 from clod_adapter.progress import Progress
 from clod_adapter.rasterizers.cpu import release_memory
 from clod_adapter.training.plan import Plan
-from clod_adapter.training.state import Adapted, StateRefused
+from clod_adapter.training.state import Adapted, StateRefused, TrainingState
 
 from ..shared.console import duration
 from ..shared.files import Outputs
@@ -53,10 +53,11 @@ def adapt_whole(setup: Setup, inputs: Inputs) -> dict[str, Any]:
     with setup.stop.listening():  # until training has ended, so that a Ctrl-C loses nothing
         display = show_progress(setup, inputs)
         plan, run_of = decide(setup, inputs, display, run_of)
+        states, plan = [setup.resumed.state if setup.resumed else plan.begun], replace(plan, begun=None)
         page = make_page(setup, inputs)
         saver = Saver(setup.outputs.state, run_of, setup.resumed, setup.console, setup.stop)
         with saver.rescuing():
-            plan, adapted = train(setup, inputs, [plan], display, saver, page)
+            adapted = train(setup, inputs, plan, states, display, saver, page)
             result = make_result(setup, inputs, plan, adapted)
     with saver.rescuing():
         return finish(setup, inputs, result, page, lambda complete: saver.close(complete))
@@ -88,20 +89,19 @@ def make_page(setup: Setup, inputs: Inputs) -> AdaptPage | None:
 
 
 def train(
-    setup: Setup, inputs: Inputs, plans: list[Plan], display: ProgressDisplay, saver: Saver, page: AdaptPage | None
-) -> tuple[Plan, Adapted]:
-    """Trains as planned; returns the plan without its state, and the result for all Gaussians.
+    setup: Setup, inputs: Inputs, plan: Plan, states: list[TrainingState | None], display: ProgressDisplay,
+    saver: Saver, page: AdaptPage | None,
+) -> Adapted:  # fmt: skip
+    """Trains as planned; returns the result for all Gaussians.
 
     Args:
-        plans: the plan, which is removed: its state is freed once training has copied it.
+        states: the state to start from, which is removed: it is freed once training has copied it.
 
     Raises:
         ClodError: the state to resume from does not fit.
         KeyboardInterrupt: a second Ctrl-C.
     """
     base, console, scene = inputs.base.gaussians, setup.console, inputs.scene
-    states = [setup.resumed.state if setup.resumed else plans[0].begun]
-    plan = replace(plans.pop(), begun=None)
 
     def show(now: Progress) -> bool:
         part = now.gaussians
@@ -123,4 +123,4 @@ def train(
     how = "ended after" if adapted.failed else "interrupted after" if adapted.interrupted else "trained"
     console.say(f"{how} {adapted.steps} steps, {duration(adapted.seconds)}")
     release_memory()
-    return plan, adapted
+    return adapted

@@ -120,8 +120,9 @@ class Plan:
         group: ProcessGroup | None = None,
     ) -> Adapted:
         """``loop.adapt`` of ``lean``, from ``resume`` or ``begun``."""
-        state = self.begun if resume is None else resume
-        return adapt(self.lean, scene, self.config, progress, state, subset=self.subset, group=group)
+        states = [self.begun if resume is None else resume]
+        del resume  # so that the state, if it is the caller's last reference, is freed once training has copied it
+        return adapt(self.lean, scene, self.config, progress, states.pop(), subset=self.subset, group=group)
 
     def whole(self, base: Gaussians, lean: Gaussians) -> Gaussians:
         """``lean`` after training, together with what was left out: the base's values and the initial sigma_d.

@@ -114,6 +114,6 @@ def test_goes_on_with_what_was_interrupted(
         patch.setattr(resume, "package_version", lambda: "0.0.7")
         done = clod("demo")
     assert done.code == 2 and f"{state.relative_to(tmp_path)}: is of version" in done.err, done
-    assert "remove it to start afresh" in done.err and "--resume" not in done.err and state.exists()
+    assert "delete it to start over" in done.err and "--resume" not in done.err and state.exists()
     done = clod("demo", "--json")
     assert done.code == 0 and json.loads(done.out)["resumed_from"] == 1 and not state.exists(), done

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +103,7 @@ def test_interrupt_keeps_what_is_measured(
     def evaluate(*args: Any, **rest: Any) -> Any:
         calls.append(args)
         if len(calls) == 3:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
         return real(*args, **rest)
 
     monkeypatch.setattr(comparisons, "evaluate", evaluate)

@@ -112,10 +112,10 @@ def test_what_is_not_finite_or_not_visible_plays_no_part(blob: clod.Gaussians) -
 
 def test_progress_reaches_the_end(blob: clod.Gaussians) -> None:
     seen: list[tuple[int, int]] = []
-    cameras = place_cameras(blob, views=3, progress=lambda *at: seen.append(at))
+    cameras = place_cameras(blob, views=3, progress=lambda now: seen.append((now.done, now.total)))
     assert seen[-1][0] == seen[-1][1] == len(seen)
     seen.clear()
-    render_pseudo_views(blob, cameras, progress=lambda *at: seen.append(at))
+    render_pseudo_views(blob, cameras, progress=lambda now: seen.append((now.done, now.total)))
     assert seen == [(1, 3), (2, 3), (3, 3)]
 
 

@@ -109,9 +109,9 @@ def test_robustness_finds_out_for_each(clod: Any, capture: Any, trained: tuple[P
     assert done.code == 0 and "trained with antialiasing" in done.err
     assert max(row["psnr"] for row in report["cells"][0]["rows"]) > 45
     again = clod(*words)
-    assert "2 of 2 cells are there already" in again.err
+    assert "2 of 2 cells are done already" in again.err
     other = clod(*words, "--antialiasing", "off")
-    assert "cells are there already" not in other.err
+    assert "cells are done already" not in other.err
     assert max(row["psnr"] for row in json.loads(other.out)["cells"][0]["rows"]) < 35
 
 
