@@ -37,7 +37,7 @@ def test_base_by_rank(clod: Any, capture: Any, adapted: Path) -> None:
     top = base.opacity_logits.argsort(descending=True)[: round(kept[4])]
     (want,) = clod_adapter.evaluate(base.select(top), views, [1.0])
     assert report["ranked"][2]["row"]["psnr"] == pytest.approx(want.psnr, abs=1e-4)
-    block = done.err[done.err.index("cut to the same counts by rank") :].splitlines()[2:]
+    block = done.err[done.err.index("pruned to the same counts") :].splitlines()[2:]
     by = ["opacity", "removal"]  # and error
     assert [line.split()[0] for line in block[:7]] == ["base", "s=1", *by, "s=4", *by]
     assert report["against"] == [] and report["popping"] == []
@@ -56,7 +56,7 @@ def test_against_at_matched_counts(clod: Any, capture: Any, adapted: Path, tmp_p
     assert note in done.err and "at most" in note
     for own, row in zip(report["against"][2:], report["rows"], strict=True):  # with itself: the same rows again
         assert own["theirs"]["psnr"] == row["psnr"] and own["ours"]["kept"] == pytest.approx(row["kept"], rel=2e-3)
-    assert "the dial value that keeps as many" in done.err
+    assert "the dial value with the same count" in done.err
 
 
 def test_against_files_of_one_name(clod: Any, capture: Any, adapted: Path, tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_popping(clod: Any, capture: Any, adapted: Path) -> None:
 def test_no_dial_does_not_pop(clod: Any, capture: Any) -> None:
     done = clod("eval", capture.ply, "--images", capture.scene, "--sv", 1, 2, "--popping", "--json")
     report = json.loads(done.out)
-    assert done.code == 0 and report["popping"] == [] and any("no popping" in note for note in report["notes"])
+    assert done.code == 0 and report["popping"] == [] and any("popping is not measured" in note for note in report["notes"])
 
 
 def test_interrupt_keeps_what_is_measured(

@@ -188,7 +188,7 @@ def test_cells_must_be_a_folder_that_can_be_written(
 def test_the_scene_is_looked_at_once(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     calls, real = [], command.scene_fingerprint
     monkeypatch.setattr(command, "scene_fingerprint", lambda scene: calls.append(scene) or real(scene))
-    monkeypatch.setattr(command, "run_cells", lambda *_: True)
+    monkeypatch.setattr(command, "run_cells", lambda *_: {})
     assert run().code == 130 and len(calls) == 1
 
 

@@ -168,7 +168,7 @@ def test_what_fits_is_as_without(clod: Callable[..., Any], capture: Any, tmp_pat
     for name, more in (("a", []), ("b", ["--memory", "8GB"])):
         done = clod(*given, "--out", f"{name}.ply", *more)
         assert done.code == 0
-    assert "the whole at once" in done.err and "training" in done.err
+    assert "the whole scene at once" in done.err and "training" in done.err
     assert outputs(tmp_path, "a") == outputs(tmp_path, "b")
 
 
@@ -182,7 +182,7 @@ def test_another_limit_goes_on_with_no_other_blocks(
             memory_option, "plan_for_limit", lambda *args, n=blocks: replace(plan_for_limit(*args), blocks=n)
         )
         done = adapt("a.ply")
-        assert done.code == 2 and f"is of a run in 3 blocks, and --memory 8GB makes {blocks}; give" in done.err
+        assert done.code == 2 and f"is of a run in 3 blocks, and --memory 8GB makes {blocks}; use" in done.err
     assert not (tmp_path / "a.ply").exists()
 
 

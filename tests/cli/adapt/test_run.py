@@ -340,7 +340,7 @@ def test_without_photographs(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert len(report["notes"]) == 1 and report["notes"][0] in done.err
     assert re.match(r"no photographs: 84 pseudo views to train on, 12 held out, 496x368, ", report["notes"][0])
     assert "held-out photographs" not in done.err and "other coordinates" not in done.err
-    assert re.search(r"where there are any:\n  clod-adapt eval dial.ply --images DIR --sv 1 4$", done.err, re.M)
+    assert re.search(r"if there are any:\n  clod-adapt eval dial.ply --images DIR --sv 1 4$", done.err, re.M)
     # The teacher is the base itself, but for the rounding to bytes.
     assert report["base_rows"][0]["psnr"] > 50 > report["rows"][-1]["psnr"] and len(report["rows"]) == 7
     assert clod("apply", capture.ply, "dial.safetensors", "-o", "same.ply").code == 0
