@@ -57,7 +57,7 @@ def test_pictures_that_were_not_drawn_are_not_reported(
     (tmp_path / "demo").mkdir()
     (tmp_path / "demo" / "dial.png").write_text("an earlier run's of clod_adapter")
     done = clod("demo", "--json")
-    assert done.code == 0 and json.loads(done.out)["pictures"] == {} and "no pictures" in done.err
+    assert done.code == 0 and json.loads(done.out)["pictures"] == {} and "no figures" in done.err
     assert not any((tmp_path / "demo" / name).exists() for name in PICTURES)
 
 

@@ -92,7 +92,11 @@ def test_popping(clod: Any, capture: Any, adapted: Path) -> None:
 def test_no_dial_does_not_pop(clod: Any, capture: Any) -> None:
     done = clod("eval", capture.ply, "--images", capture.scene, "--sv", 1, 2, "--popping", "--json")
     report = json.loads(done.out)
-    assert done.code == 0 and report["popping"] == [] and any("popping is not measured" in note for note in report["notes"])
+    assert (
+        done.code == 0
+        and report["popping"] == []
+        and any("popping is not measured" in note for note in report["notes"])
+    )
 
 
 def test_interrupt_keeps_what_is_measured(

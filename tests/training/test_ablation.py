@@ -115,7 +115,7 @@ def test_views_beyond_those_of_the_start_count(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(ablation, "MOST_VIEWS", 2)
     told: list[tuple[int, int]] = []
     error = removal_error(base, importance.spread(scene.train, 2))
-    found = seen(base, scene.train, error, 0, lambda done, total: told.append((done, total)))
+    found = seen(base, scene.train, error, 0, lambda now: told.append((now.done, now.total)))
     assert (error > 0).sum() < found.sum()
     assert found.tolist() == matters.tolist() and told == [(k, 4) for k in range(1, 5)]
 

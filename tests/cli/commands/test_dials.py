@@ -175,7 +175,7 @@ def test_names_that_would_collide_keep_their_suffix(capture: Any) -> None:
 def test_dial_values_beyond_the_trained_ones_are_noted(clod: Any, capture: Any, dialled: Path) -> None:
     for words in (("render", dialled, "--images", capture.scene, "-o", "out"), ("export", dialled, "-o", "plain.ply")):
         (note,) = json.loads(clod(*words, "--sv", 4.5, "--json").out)["notes"]
-        assert note == "trained up to s = 4; beyond that nothing was learned"
+        assert note == "trained up to s = 4; larger dial values were not trained"
 
 
 def test_baking_to_a_budget(clod: Any, dialled: Path, tmp_path: Path) -> None:
