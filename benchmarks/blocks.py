@@ -28,12 +28,12 @@ from city import write_city
 from common import append, capture
 
 from clod_adapter.blocks.divide import Division, divide
-from clod_adapter.blocks.targets import target
+from clod_adapter.blocks.targets import target_image
 from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import seeing
+from clod_adapter.initialization.importance import usable_views
 from clod_adapter.io.checkpoint import load
 from clod_adapter.io.scene.load import load_scene
 from clod_adapter.render import render
@@ -57,7 +57,7 @@ def borders(division: Division, views: tuple[View, ...]) -> list[torch.Tensor]:
         for block in range(division.count):
             rows = division.rows(block)
             ordered = black.select(torch.cat([rows, (division.block != block).nonzero()[:, 0]]))
-            largest = largest.maximum(target(ordered, len(rows), white)[..., 0] / 255)
+            largest = largest.maximum(target_image(ordered, len(rows), white)[..., 0] / 255)
         found.append(largest < SOLE)
     return found
 
@@ -97,7 +97,7 @@ def seams(args: argparse.Namespace) -> None:
         folder = capture(name)
         base = load(folder / "pretrained.ply")
         scene = load_scene(folder, origin=base.origin)
-        config, views = AdaptConfig(iters=args.iters), seeing(base.gaussians, scene.train)
+        config, views = AdaptConfig(iters=args.iters), usable_views(base.gaussians, scene.train)
         began = time.perf_counter()
         whole = adapt(base.gaussians, scene, config).gaussians
         seconds = time.perf_counter() - began

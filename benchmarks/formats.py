@@ -3,7 +3,7 @@
     python benchmarks/formats.py plush_half
     python benchmarks/formats.py --table                  # the rows as a Markdown table
 
-A checkpoint gets a sigma_d without training (``importance.start``), is written in each format that carries one and
+A checkpoint gets a sigma_d without training (``importance.initialize``), is written in each format that carries one and
 read again; the pictures are of the dial at s, means over the held-out views, against those of the PLY. ``.splat``
 carries none: what is baked at s goes through it, and is compared with what is baked at s in the PLY. PSNR is between
 floating-point pictures, and null where they are equal. Each format adds one row to ``results/formats.jsonl``.
@@ -26,7 +26,7 @@ import torch
 from common import RESULTS, append, capture
 
 import clod_adapter as clod
-from clod_adapter.initialization.importance import seeing, start
+from clod_adapter.initialization.importance import initialize, usable_views
 from clod_adapter.io.formats.models import load_model
 from clod_adapter.io.writers import WRITERS, write
 
@@ -49,7 +49,7 @@ def main() -> None:
 def run(scene: str, config: clod.AdaptConfig) -> None:
     base = clod.load(capture(scene) / "pretrained.ply").gaussians
     photographs = clod.load_scene(capture(scene))
-    model = start(base, seeing(base, photographs.train), config, lambda *_: None)
+    model = initialize(base, usable_views(base, photographs.train), config, lambda *_: None)
     cameras = [view.camera for view in photographs.test]
     baked = {s: clod.bake(model, s, cameras=[view.camera for view in photographs.train]) for s in DIALS}
     for suffix, writer in WRITERS.items():

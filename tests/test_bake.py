@@ -9,16 +9,16 @@ import pytest
 import torch
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import attenuate, normalized_distances
+from clod_adapter.attenuation import attenuate
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.distances import normalized_distances, viewpoint_of
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for
 from clod_adapter.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
-from clod_adapter.viewpoints import viewpoint_of
 from scenes import camera, gaussians, ring
 
 CONFIG = AttenuationConfig(scene_distance=4.0)
@@ -166,5 +166,5 @@ def test_bad_calls_are_named() -> None:
         bake(sphere(), 2.0, camera(), cameras=[camera()])
     with pytest.raises(ClodError, match="no camera is given"):
         order_by_extinction(sphere(), [])
-    with pytest.raises(ClodError, match="no sigma_d, so no order"):
+    with pytest.raises(ClodError, match="no pruning order"):
         order_by_extinction(gaussians(3, 0, 0), [camera()])

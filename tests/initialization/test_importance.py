@@ -8,17 +8,23 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import attenuate, normalized_distances
+from clod_adapter.attenuation import attenuate
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.distances import normalized_distances, typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization import importance
-from clod_adapter.initialization.importance import fitting_tau, removal_error, seeing, sigma_from_importance, start
+from clod_adapter.initialization.importance import (
+    fitting_tau,
+    initialize,
+    removal_error,
+    sigma_from_importance,
+    usable_views,
+)
 from clod_adapter.initialization.pruning_order import pruning_order
 from clod_adapter.render import splat
-from clod_adapter.viewpoints import typical_distance
 from scenes import gaussians, photograph, ring
 
 CONFIG = AttenuationConfig(tau=1 / 255, cut="hard", scene_distance=4.0)
@@ -78,7 +84,7 @@ def test_start_looks_at_some_of_many_views(monkeypatch: pytest.MonkeyPatch) -> N
         looked.clear()
         counts.clear()
         monkeypatch.setattr(importance, "MOST_VIEWS", most)
-        importance.start(some, views, AdaptConfig(), lambda *count: counts.append(count))
+        importance.initialize(some, views, AdaptConfig(), lambda *count: counts.append(count))
         assert looked == [views[k].camera.name for k in expected]
         assert counts[: len(looked)] == [("start", k + 1, len(looked)) for k in range(len(looked))]
         assert {phase for phase, *_ in counts[len(looked) :]} == {"order"} and counts[-1] == ("order", 50, 50)
@@ -143,7 +149,9 @@ def test_the_orders_of_the_start() -> None:
     some = gaussians(200, 0, 0)
     views = photograph(some, ring(3, 20, 16))
     error = removal_error(some, views, seed=0)
-    by_error, by_default = (importance.start(some, views, AdaptConfig(start=name)) for name in ("error", "importance"))
+    by_error, by_default = (
+        importance.initialize(some, views, AdaptConfig(start=name)) for name in ("error", "importance")
+    )
 
     def leaving(dialled: Gaussians) -> Tensor:
         d = typical_distance(some.means, [view.camera for view in views], dialled.attenuation)
@@ -174,7 +182,7 @@ def test_tau_is_lowered_for_faint_checkpoints_only() -> None:
 def test_a_checkpoint_of_faint_gaussians_keeps_its_picture() -> None:
     base = gaussians(200, 0, 0, size=0.3).replace(opacity_logits=torch.full((200,), -4.6))
     views = photograph(base, ring(3, 24, 18))
-    dialled = start(base, views, AdaptConfig())
+    dialled = initialize(base, views, AdaptConfig())
     assert dialled.attenuation is not None and dialled.sigma_d is not None and dialled.attenuation.tau < 0.01 / 5
     d = normalized_distances(base.means, views[0].camera, dialled.attenuation)
     assert attenuate(base.opacity_logits, dialled.sigma_d, d, 1.0, dialled.attenuation).keep.float().mean() > 0.5
@@ -186,6 +194,6 @@ def test_views_of_nothing_are_left_out() -> None:
     back = torch.diag(torch.tensor([-1.0, 1, -1, 1]))
     away = dataclasses.replace(views[0].camera, viewmat=back @ views[0].camera.viewmat)
     blind = View(away, views[0].image)
-    assert seeing(some, [views[0], blind, views[1]]) == views[:2]
+    assert usable_views(some, [views[0], blind, views[1]]) == views[:2]
     with pytest.raises(ClodError, match="in front of any of the 1 training cameras"):
-        seeing(some, [blind])
+        usable_views(some, [blind])
