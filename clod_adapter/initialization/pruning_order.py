@@ -30,10 +30,11 @@ def pruning_order(
     """``[N]`` int64, how many Gaussians are removed before each: half-edge collapse, as for the levels of a mesh.
 
     In rounds. Removing Gaussian i costs the minimum over its NEIGHBOURS nearest centres j of
-    ``w_i (|c_i - c_j|^2 + COLOUR_FLOOR^2 + APART r^2 / (r^2 + (l_i + l_j)^2))``, with w the importance, c the colours of
-    SH degree 0, r the distance of the centres, l the largest scales. The cheapest REMOVED of them are removed, except those whose j is cheaper or which are the j of a
-    removed one; their importance w is added to that of j. Ranking by importance alone thins out plain surfaces, whose
-    Gaussians have little importance each, until none is left there to grow into the gaps.
+    ``w_i (|c_i - c_j|^2 + COLOUR_FLOOR^2 + APART r^2 / (r^2 + (l_i + l_j)^2))``, with w the importance, c the colours
+    of SH degree 0, r the distance of the centres and l the largest scales. The cheapest REMOVED of them are removed,
+    except those whose j is cheaper or which are the j of a removed one; their importance is added to that of j.
+    Ranking by importance alone thins out plain surfaces, whose Gaussians have little importance each, until none is
+    left there to grow into the gaps.
 
     Source: half-edge collapse (Kobbelt, Campagna and Seidel 1998) with distances between Gaussians in place of
     quadrics; measured in docs/method.md.
