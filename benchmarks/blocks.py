@@ -50,7 +50,7 @@ def db(error: float) -> float:
 @torch.no_grad()
 def borders(division: Division, views: tuple[View, ...]) -> list[torch.Tensor]:
     """For each view ``[H, W]`` bool: no block has SOLE of the pixel. By ``target`` of a white photograph on black."""
-    black = division.begun.replace(sh0=torch.full_like(division.begun.sh0, -10), shN=division.begun.shN[:, :0])
+    black = division.initial.replace(sh0=torch.full_like(division.initial.sh0, -10), shN=division.initial.shN[:, :0])
     found = []
     for view in views:
         white, largest = View(view.camera, torch.full_like(view.image, 255)), torch.zeros(view.image.shape[:2])

@@ -286,8 +286,8 @@ def test_monotone_in_sigma(
     out = attenuate(logits, sigma, distances, scale, config(eps=eps))
     slack = 4 * torch.finfo(dtype).eps
     assert (out.opacities.diff() >= -slack * out.opacities[1:]).all()
-    leaves = extinction_scale(logits, sigma, distances, config(eps=eps))
-    assert (leaves.diff() >= -8 * slack * leaves[1:]).all()
+    culled_at = extinction_scale(logits, sigma, distances, config(eps=eps))
+    assert (culled_at.diff() >= -8 * slack * culled_at[1:]).all()
 
 
 def test_bad_calls_are_named() -> None:

@@ -122,7 +122,7 @@ def test_prefixes_are_what_is_baked(cameras: list[Camera]) -> None:
         assert torch.equal(head.means, ordered.means[:kept])  # those kept are the first, in their order
 
 
-def test_rows_that_leave_together_stay_in_their_order() -> None:
+def test_rows_with_equal_extinction_stay_in_order() -> None:
     some = at_one_place(gaussians(40, 0, 3))
     same = attach(some.replace(opacity_logits=torch.zeros(40)), torch.ones(40), CONFIG)
     assert torch.equal(order_by_extinction(same, [camera()]), torch.arange(40))

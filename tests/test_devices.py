@@ -197,7 +197,7 @@ def test_a_training_is_that_of_the_cpu(setup: Setup) -> None:
 def test_a_block(setup: Setup) -> None:
     views, config = setup.scene.train[:2], replace(CONFIG, iters=2)
     division = divide(setup.there.replace(sigma_d=None, attenuation=None), views, config, 2)
-    aimed = target_image(division.begun, 25, views[0])
+    aimed = target_image(division.initial, 25, views[0])
     assert aimed.device.type == "cpu" and aimed.dtype == torch.uint8  # photographs of a whole block
     learned = [adapt_block(division, views, config, block)[0] for block in range(2)]
     merged = merge(division, learned)

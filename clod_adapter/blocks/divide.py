@@ -28,14 +28,14 @@ class Division:
     """A scene divided into blocks, with its initialization.
 
     Attributes:
-        begun: the Gaussians with the initial sigma_d.
+        initial: the Gaussians with the initial sigma_d.
         block: ``[N]`` int16, the block of each Gaussian.
         seen: ``[V, B]`` float32, the share of each view's image that each block covers.
         kept: ``[V, DIALS]`` float32, Gaussians that the initialization keeps in each view, at even steps of log s.
         extent: of all cameras, world units.
     """
 
-    begun: Gaussians
+    initial: Gaussians
     block: Tensor
     seen: Tensor
     kept: Tensor
@@ -121,23 +121,23 @@ def divide(
     """
     check_divisible(config)
     block = split(base.means, count)
-    begun = initialize(base.without_empty_bands(), views, config, progress)
-    assert begun.attenuation is not None
-    if begun.attenuation.normalizer != "scene":
+    initial = initialize(base.without_empty_bands(), views, config, progress)
+    assert initial.attenuation is not None
+    if initial.attenuation.normalizer != "scene":
         raise ClodError(
-            f"the checkpoint's dial has the normaliser {begun.attenuation.normalizer}, whose distances depend on all "
+            f"the checkpoint's dial has the normaliser {initial.attenuation.normalizer}, whose distances depend on all "
             "Gaussians in view: it cannot be trained in blocks; adapt it whole"
         )
     seen, kept = torch.empty(len(views), count), torch.empty(len(views), DIALS)
     for k, view in enumerate(views):
-        shown = coverage(begun, begun.opacities, _smaller(view.camera)).double()
+        shown = coverage(initial, initial.opacities, _smaller(view.camera)).double()
         seen[k] = (shown.new_zeros(count).index_add_(0, block.long(), shown) / shown.sum().clamp(min=1e-9)).float()
-        kept[k] = torch.tensor(kept_counts(begun, view, dial_grid(config)))
+        kept[k] = torch.tensor(kept_counts(initial, view, dial_grid(config)))
         if progress:
             progress("blocks", k + 1, len(views))
-    begun = base.replace(sigma_d=begun.sigma_d, attenuation=begun.attenuation)
-    extent = camera_extent([view.camera for view in views]) or begun.attenuation.reference_distance  # type: ignore[union-attr]
-    return Division(begun, block, seen, kept, extent)
+    initial = base.replace(sigma_d=initial.sigma_d, attenuation=initial.attenuation)
+    extent = camera_extent([view.camera for view in views]) or initial.attenuation.reference_distance  # type: ignore[union-attr]
+    return Division(initial, block, seen, kept, extent)
 
 
 def check_divisible(config: AdaptConfig) -> None:

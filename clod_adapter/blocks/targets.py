@@ -45,7 +45,7 @@ def context_rows(
         after: in the second pass, the scene after the first; other blocks are then drawn at the dial.
     """
     own = division.block == block
-    scene = after or division.begun
+    scene = after or division.initial
     assert scene.attenuation is not None
     drawn, views = torch.zeros_like(own), spread(views, CONTEXT_VIEWS)
     for k, view in enumerate(views):
@@ -88,12 +88,12 @@ def with_target_shares(
     Args:
         views: those of ``division.views(block)``, in that order.
     """
-    numbers, dials, own = division.views(block), dial_grid(config), division.begun.select(division.rows(block))
+    numbers, dials, own = division.views(block), dial_grid(config), division.initial.select(division.rows(block))
     each, found = len(division.seen) / len(numbers), list[TargetView]()
     for view, k in zip(views, numbers, strict=True):
         parts = np.array(kept_counts(own, view, dials)) / division.kept[k].clamp(min=1).numpy()
         stands_for = each / max(float(division.seen[k, block]), LEAST_SEEN) if first else each
-        share = partial(_target_share, config, parts, stands_for, len(own), len(division.begun))
+        share = partial(_target_share, config, parts, stands_for, len(own), len(division.initial))
         found.append(TargetView(view, share))
         if progress:
             progress(len(found), len(numbers))

@@ -82,7 +82,7 @@ def adapt_block(
         The trained rows, and the result of ``training.loop.adapt``, whose first Gaussians are those of the block. A
         block that no view sees stays unchanged.
     """
-    scene = after or division.begun
+    scene = after or division.initial
     rows, own = division.rows(block), [views[k] for k in division.views(block)]
     if not own:
         unseen = scene.select(rows)
@@ -103,7 +103,7 @@ def _learned(division: Division, rows: Tensor, adapted: Adapted) -> tuple[Learne
     values = {name: value[: len(rows)] for name, value in adapted.gaussians.tensors().items()}
     changed = {
         name: value.clone() for name, value in values.items()
-        if name == "sigma_d" or not torch.equal(value, getattr(division.begun, name)[rows])
+        if name == "sigma_d" or not torch.equal(value, getattr(division.initial, name)[rows])
     }  # fmt: skip
     return Learned(rows, changed, adapted.steps, adapted.seconds), adapted
 
@@ -144,8 +144,8 @@ def merge(division: Division, learned: Sequence[Learned]) -> Gaussians:
     merged = {}
     for name in (*ATTRIBUTES, "sigma_d"):
         if any(name in part.values for part in learned):
-            merged[name] = getattr(division.begun, name).clone()
+            merged[name] = getattr(division.initial, name).clone()
             for part in learned:
                 if name in part.values:
                     merged[name][part.rows] = part.values[name]
-    return division.begun.replace(**merged)
+    return division.initial.replace(**merged)

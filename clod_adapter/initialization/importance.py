@@ -78,12 +78,12 @@ def initialize(
     return in_world_units(base.replace(sigma_d=sigma, attenuation=attenuation))
 
 
-def for_training(begun: Gaussians, views: Sequence[View], config: AdaptConfig) -> Gaussians:
-    """``begun`` with sigma_d in units of the scene's typical distance, measured in the views where it is unknown."""
-    assert begun.attenuation is not None
-    known = known_distance(begun.attenuation) or scene_distance(begun, spread(views, MOST_VIEWS), config.quantile)
-    own = dataclasses.replace(begun.attenuation, reference_distance=known)
-    return with_distance(begun.replace(attenuation=own), known)
+def for_training(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> Gaussians:
+    """``initial`` with sigma_d in units of the scene's typical distance, measured in the views where it is unknown."""
+    assert initial.attenuation is not None
+    known = known_distance(initial.attenuation) or scene_distance(initial, spread(views, MOST_VIEWS), config.quantile)
+    own = dataclasses.replace(initial.attenuation, reference_distance=known)
+    return with_distance(initial.replace(attenuation=own), known)
 
 
 def has_dial(base: Gaussians) -> bool:

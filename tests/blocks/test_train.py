@@ -135,7 +135,7 @@ def test_rows_left_out_of_the_context_are_not_needed(captured: tuple[Gaussians, 
 def test_the_initialization_is_that_of_the_whole_scene(divided: Division, captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     whole = initialize(base, scene.train, CONFIG)
-    assert torch.equal(divided.begun.sigma_d, whole.sigma_d) and divided.begun.attenuation == whole.attenuation
+    assert torch.equal(divided.initial.sigma_d, whole.sigma_d) and divided.initial.attenuation == whole.attenuation
     assert divided.extent == camera_extent([view.camera for view in scene.train])
 
 
@@ -147,12 +147,12 @@ def test_target_shares_add_up_to_the_curve(divided: Division, captured: tuple[Ga
         for k in range(2):
             for s in (1.0, 1.7, 3.0, CONFIG.max_sv):
                 asked = [block[k].target_share(s) for block in shown]
-                law = target_curve(s, CONFIG.start_share, CONFIG.exponent)
+                share = target_curve(s, CONFIG.start_share, CONFIG.exponent)
                 wanted = sum(q.share * len(divided.rows(block)) for block, q in enumerate(asked))
-                assert wanted == pytest.approx(law * count, rel=0.05)
+                assert wanted == pytest.approx(share * count, rel=0.05)
                 for block, q in enumerate(asked):
                     loss = float(divided.seen[k, block]) if first else 1.0
-                    assert loss * q.weight / len(divided.rows(block)) == pytest.approx(1 / (law * count))
+                    assert loss * q.weight / len(divided.rows(block)) == pytest.approx(1 / (share * count))
 
 
 def test_targets_ask_for_the_whole_error_once(captured: tuple[Gaussians, Scene], divided: Division) -> None:
@@ -172,8 +172,8 @@ def test_merging_takes_each_row_from_its_block(divided: Division, learned: list[
     for part in learned:
         for name, values in part.values.items():
             assert torch.equal(getattr(whole, name)[part.rows], values), name
-            assert not torch.equal(values, getattr(divided.begun, name)[part.rows]), name
-    assert torch.equal(whole.shN, divided.begun.shN)
+            assert not torch.equal(values, getattr(divided.initial, name)[part.rows]), name
+    assert torch.equal(whole.shN, divided.initial.shN)
     with pytest.raises(ClodError, match="in no block or in two"):
         merge(divided, learned[1:])
     with pytest.raises(ClodError, match="in no block or in two"):
@@ -188,7 +188,7 @@ def test_no_seams(captured: tuple[Gaussians, Scene], divided: Division, whole: G
     base, scene = captured
     undivided = adapt(base, scene, CONFIG).gaussians
     dials = (1.0, 3.0, 5.0)
-    begun = evaluate(divided.begun, scene.test, dials)
+    begun = evaluate(divided.initial, scene.test, dials)
     for before, one, other in zip(begun, *(evaluate(g, scene.test, dials) for g in (undivided, whole)), strict=True):
         gained = (other.psnr - before.psnr) / (one.psnr - before.psnr)
         assert gained > 0.7, f"s {one.virtual_scale}"
@@ -240,7 +240,7 @@ def test_a_block_that_no_view_sees_stays(captured: tuple[Gaussians, Scene], draw
     assert division.views(behind) == [] and division.steps(behind, CONFIG) == 0
     part, outcome = adapt_block(division, [view], CONFIG, behind)
     assert (part.steps, outcome.steps, list(part.values)) == (0, 0, ["sigma_d"])
-    assert torch.equal(part.values["sigma_d"], division.begun.sigma_d[division.rows(behind)])
+    assert torch.equal(part.values["sigma_d"], division.initial.sigma_d[division.rows(behind)])
 
 
 def test_every_wait_is_told(captured: tuple[Gaussians, Scene], divided: Division) -> None:

@@ -1,4 +1,4 @@
-"""The importance estimate against brute force, and the count law of the sigma_d that follows from it."""
+"""The importance estimate against brute force, and the counts kept with the sigma_d that follows from it."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_is_the_mean_over_views_and_reports_them() -> None:
     assert (both >= once / 2).all()  # the same first draw, and a second one
 
 
-def test_start_looks_at_some_of_many_views(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_initialization_renders_some_of_many_views(monkeypatch: pytest.MonkeyPatch) -> None:
     """Evenly spread ones, first to last; all where there are few."""
     some, looked, counts = gaussians(50, 0, 0), [], []
     views = photograph(some, ring(7, 12, 10))
@@ -100,7 +100,7 @@ def test_what_no_view_shows_counts_nothing() -> None:
 
 @pytest.mark.parametrize("exponent", [1.0, 1.5, 2.5])
 @pytest.mark.parametrize("share", [0.51, 0.6, 0.8, 1.0])
-def test_shares_kept_follow_the_law(share: float, exponent: float, n: int = 1000) -> None:
+def test_shares_kept_follow_the_curve(share: float, exponent: float, n: int = 1000) -> None:
     """At the distances it was made for, ``1 / (s^p + (1/share - 1) s^-p)``, to one Gaussian."""
     g = torch.Generator().manual_seed(0)
     some = gaussians(n, 0, 0).replace(opacity_logits=2 * torch.rand(n, generator=g))  # lasting until s = 127
@@ -116,7 +116,7 @@ def test_shares_kept_follow_the_law(share: float, exponent: float, n: int = 1000
 
 @pytest.mark.parametrize("seed", range(3))
 def test_sigma_grows_with_importance(seed: int, n: int = 200) -> None:
-    """All else equal; and whatever the opacity, those of small importance leave first."""
+    """All else equal; and whatever the opacity, those of small importance are culled first."""
     g = torch.Generator().manual_seed(seed)
     importance = torch.rand(n, generator=g)
     distances, order = torch.full((n,), 0.7), importance.argsort()
@@ -125,14 +125,16 @@ def test_sigma_grows_with_importance(seed: int, n: int = 200) -> None:
     assert (sigma[order].diff() > 0).all() and sigma.isfinite().all(), f"seed {seed}"
     some = gaussians(n, 0, seed)
     sigma = sigma_from_importance(some, importance, distances, CONFIG, share=0.7, exponent=1.5)
-    leaves = extinction_scale(some.opacity_logits, sigma, distances, CONFIG)
-    lasting = (some.opacities * 255 * 0.99 > leaves)[order]  # the others stay until their opacity ends them
+    culled_at = extinction_scale(some.opacity_logits, sigma, distances, CONFIG)
+    lasting = (some.opacities * 255 * 0.99 > culled_at)[
+        order
+    ]  # the others are kept for as long as their opacity allows
     assert lasting.sum() > n / 2
-    assert (leaves[order][lasting].diff() >= -1e-4).all(), f"seed {seed}"
+    assert (culled_at[order][lasting].diff() >= -1e-4).all(), f"seed {seed}"
 
 
 def test_equal_importance_is_ranked_all_the_same() -> None:
-    """Nothing is known (no Gaussian in any view): the law still holds."""
+    """Nothing is known (no Gaussian in any view): the counts still follow the curve."""
     some = gaussians(100, 0, 0).replace(opacity_logits=torch.zeros(100))
     sigma = sigma_from_importance(some, torch.zeros(100), torch.ones(100), CONFIG, share=0.6, exponent=1.5)
     assert abs(attenuate(some.opacity_logits, sigma, torch.ones(100), 1.0, CONFIG).keep.sum().item() - 60) <= 1
@@ -144,8 +146,8 @@ def test_of_no_gaussians() -> None:
     assert sigma.shape == (0,)
 
 
-def test_the_orders_of_the_start() -> None:
-    """By removal error alone the most important leaves last; with neighbours it may leave sooner."""
+def test_the_orders_of_the_initialization() -> None:
+    """By removal error alone the most important is culled last; with neighbours it may be culled earlier."""
     some = gaussians(200, 0, 0)
     views = photograph(some, ring(3, 20, 16))
     error = removal_error(some, views, seed=0)

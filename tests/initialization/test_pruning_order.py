@@ -60,7 +60,7 @@ def test_of_none_and_of_one(n: int) -> None:
     assert pruning_order(gaussians(n, 0, 0), torch.ones(n)).tolist() == list(range(n))
 
 
-def test_one_of_two_alike_leaves_before_a_single_one_that_is_worth_less() -> None:
+def test_one_of_two_alike_is_removed_before_a_single_less_important_one() -> None:
     """And by worth alone both would stay: that is what the order is for."""
     three = gaussians(3, 0, 0)
     means = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [5.0, 0, 0]])
