@@ -92,7 +92,7 @@ def cell(row: Mapping[str, Any]) -> str:
 def test_the_pruned_checkpoint_is_as_measured() -> None:
     with (RESULTS / "robustness.csv").open(encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if row["max_sv"] == "5.0"]
-    (page,) = [table for table in tables(DOCS / "from_maskgaussian.md") if table[0] == ["dial", "3DGS", "mask-pruned"]]
+    (page,) = [table for table in tables(DOCS / "from_other_methods.md") if table[0] == ["dial", "3DGS", "mask-pruned"]]
     for name, *written in page[1:]:
         found = [row for row in rows if f"s = {float(row['virtual_scale']):g}" == name]
         assert [row["checkpoint"] for row in found] == ["pretrained", "pretrained_mask"]
