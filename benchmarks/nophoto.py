@@ -14,14 +14,13 @@ cameras stand from the real ones, which the method never sees.
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 from dataclasses import asdict
 
 import torch
 from adapt import at_shares
-from common import RESULTS, append, capture
+from common import append, arguments, checkpoint, stored, table
+from common import photographs as photographs_of
 
 import clod_adapter as clod
 from clod_adapter.training.pseudo_views import add_pseudo_views, place_cameras, render_pseudo_views, typical_reach
@@ -32,25 +31,21 @@ DIALS = (1.0, 2.0, 3.0, 5.0, 7.0)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__, table=print_table)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS[:3])
     parser.add_argument("--few", type=int, metavar="K", help="of the photographs to train on, only K, evenly spread")
     parser.add_argument("--iters", type=int, default=clod.AdaptConfig().iters)
     parser.add_argument("--max-sv", type=float, default=7.0)
     parser.add_argument("--seed", type=int, default=0, help="of the training and of the placement")
-    parser.add_argument("--table", action="store_true", help="print the rows there are")
     args = parser.parse_args()
-    if args.table:
-        print_table()
     for scene in args.scenes:
         for kind in args.kinds:
             run(scene, kind, clod.AdaptConfig(iters=args.iters, seed=args.seed, max_sv=args.max_sv), args.few)
 
 
 def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> None:
-    base = clod.load(capture(scene) / "pretrained.ply").gaussians
-    photographs = clod.load_scene(capture(scene))
+    base, photographs = checkpoint(scene).gaussians, photographs_of(scene)
     if few:
         train = photographs.train[:: max(len(photographs.train) // few, 1)][:few]
         photographs = clod.Scene(train, photographs.test)
@@ -101,15 +96,15 @@ def distances(placed: list[clod.Camera], real: list[clod.Camera], reach: float) 
 
 
 def print_table() -> None:
-    print("| scene | steps | photographs | views | base | " + " | ".join(f"s = {s:g}" for s in DIALS) + " | 12 % |")
-    print("|---" * (6 + len(DIALS)) + "|")
-    for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
-        row = json.loads(line)
+    lines = []
+    for row in stored(FILE):
         cells = [f"{r['psnr']:.2f} @ {r['kept_share']:.1%}" for r in row["rows"]]
         cells += [""] * (len(DIALS) - len(cells))
         cells.append(next((f"{r['psnr']:.2f}" for r in row.get("at_shares", []) if r["share"] == 0.12), ""))
-        head = [row["scene"], str(row["steps"]), str(row.get("photographs", "all")), row["kind"]]
-        print("| " + " | ".join([*head, f"{row['base']['psnr']:.2f}", *cells]) + " |")
+        head = [row["scene"], row["steps"], row.get("photographs", "all"), row["kind"], f"{row['base']['psnr']:.2f}"]
+        lines.append([*head, *cells])
+    heads = ["scene", "steps", "photographs", "views", "base", *(f"s = {s:g}" for s in DIALS), "12 %"]
+    print(table(heads, lines))
 
 
 if __name__ == "__main__":
