@@ -12,7 +12,6 @@ results/antialias.jsonl.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +21,7 @@ from typing import Any
 import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 
 # isort: split
-from common import append, capture
+from common import append, arguments, capture, checkpoint, photographs
 from tuning import Tuning, tune
 
 from clod_adapter.alignment.screen_filter import compare_filters
@@ -39,7 +38,7 @@ DIALS = (1.0, 2.0, 3.0, 5.0)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*", default=list(CLASSIC_FILES))
     parser.add_argument("--iters", type=int, default=800, help="steps that a stand-in is tuned for")
     parser.add_argument("--adapt", type=int, default=400, help="steps that a stand-in is adapted for")
@@ -48,7 +47,7 @@ def main() -> None:
     with TemporaryDirectory() as temporary:
         folder = args.keep or Path(temporary)
         for name in args.scenes:
-            scene = clod.load_scene(capture(name))
+            scene = photographs(name)
             for file in CLASSIC_FILES[name]:
                 base = clod.load(capture(name) / file)
                 append(FILE, {"scene": name, "file": file, "trained": "off", **row(base.gaussians, scene)})
@@ -62,7 +61,7 @@ def main() -> None:
 
 def standins(name: str, scene: clod.Scene, iters: int, folder: Path) -> Iterator[tuple[str, clod.Gaussians]]:
     """By the filter that they were trained with; without a word on it, as such files come."""
-    base = clod.load(capture(name) / "pretrained.ply")
+    base = checkpoint(name)
     for trained in ("on", "mip"):
         path = folder / f"{name}_{trained}_{iters}.ply"
         if not path.exists():

@@ -11,21 +11,18 @@ between blocks (where no block has SOLE of the pixel). Memory: the command on a 
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import os
-import subprocess
-import sys
 import tempfile
 import time
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from city import write_city
-from common import append, capture
+from common import COMMAND, Process, append, arguments, checkpoint, photographs
 
 from clod_adapter.blocks.divide import Division, divide
 from clod_adapter.blocks.targets import target
@@ -34,8 +31,6 @@ from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import seeing
-from clod_adapter.io.checkpoint import load
-from clod_adapter.io.scene.load import load_scene
 from clod_adapter.render import render
 from clod_adapter.training.loop import adapt
 
@@ -92,11 +87,9 @@ def compare(
     return rows
 
 
-def seams(args: argparse.Namespace) -> None:
+def seams(args: Namespace) -> None:
     for name in args.scenes:
-        folder = capture(name)
-        base = load(folder / "pretrained.ply")
-        scene = load_scene(folder, origin=base.origin)
+        base, scene = checkpoint(name), photographs(name)
         config, views = AdaptConfig(iters=args.iters), seeing(base.gaussians, scene.train)
         began = time.perf_counter()
         whole = adapt(base.gaussians, scene, config).gaussians
@@ -120,32 +113,24 @@ def seams(args: argparse.Namespace) -> None:
                 append("blocks.jsonl", {**about, **row, "rows": compare(after, whole, scene.test, masks)})
 
 
-def memory(args: argparse.Namespace) -> None:
+def memory(args: Namespace) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(args.city or Path(temporary) / "city")
         if not (folder / "city.ply").exists():
             write_city(folder, args.count, args.images, 960, 540)
         for limit in args.memory:
-            words = [str(folder / "city.ply"), "--images", str(folder), "--iters", str(args.iters), "--quiet"]
-            words += [] if limit == "none" else ["--memory", limit]
-            words += ["--out", str(Path(temporary) / "out.ply")]
-            code = "import sys; from clod_adapter.cli.main import main; sys.exit(main(sys.argv[1:]))"
-            began = time.perf_counter()
-            process = subprocess.Popen([sys.executable, "-c", code, *words, "--json"], stdout=subprocess.PIPE)
-            assert process.stdout is not None
-            report = process.stdout.read()
-            _, status, usage = os.wait4(process.pid, 0)
-            if status:
-                sys.exit(f"--memory {limit} failed")
-            found = json.loads(report)
+            words = [folder / "city.ply", "--images", folder, "--iters", args.iters, "--quiet"]
+            words += ["--out", Path(temporary) / "out.ply", *(() if limit == "none" else ("--memory", limit))]
+            process = Process([*COMMAND, *words, "--json"])
+            found = json.loads(process.out)
             row = {"what": "memory", "count": args.count, "images": args.images, "memory": limit, "iters": args.iters}
-            row |= {"peak_bytes": usage.ru_maxrss * 1024, "seconds": time.perf_counter() - began}
+            row |= {"peak_bytes": process.peak_bytes, "seconds": process.seconds}
             row |= {"plan": found.get("memory"), "steps": found["steps"], "rows": found["rows"]}
             append("blocks.jsonl", row | {"times": found["seconds"]})
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     commands = parser.add_subparsers(required=True)
     one = commands.add_parser("seams")
     one.add_argument("--scenes", nargs="+", default=["plush_half", "bonsai146"])

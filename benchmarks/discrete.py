@@ -11,14 +11,13 @@ differs. A row with the numbers is added to ``results/discrete.jsonl``.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from common import ROOT, append
+from common import ROOT, append, arguments
 from torch import Tensor
 
 import clod_adapter as clod
@@ -55,7 +54,7 @@ class Sweep:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("model", help="an adapted PLY")
     parser.add_argument("images", help="its scene: photographs and COLMAP model")
     parser.add_argument("--view", type=int, default=0, help="which of the held-out views (default: the first)")

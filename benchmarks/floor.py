@@ -11,7 +11,6 @@ and sets the vector operations that the blending loops need (counted in their so
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -26,7 +25,7 @@ import contenders
 import numpy as np
 import torch
 import workloads
-from common import append
+from common import append, arguments
 from numba import float32
 
 from clod_adapter._kernels import threads
@@ -99,8 +98,7 @@ def row(name: str, draw: Callable[[], torch.Tensor], pairs: int, rate: float, re
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--record", action="store_true", help=f"add the rows to results/{FILE}")
+    parser = arguments(__doc__, record=FILE)
     args = parser.parse_args()
     torch.set_num_threads(THREADS)
     for name in workloads.SIZES:

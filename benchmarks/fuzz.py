@@ -13,7 +13,6 @@ made. Failures are printed, with the command that repeats them.
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import os
@@ -32,7 +31,7 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 
 # isort: split
 import torch
-from common import append
+from common import append, arguments
 from mutants import FORMATS, Input, make, mutate, write, write_images
 
 from clod_adapter.cli.adapt.resume import Saver
@@ -215,13 +214,12 @@ def again(kind: str, seed: int, number: int, folder: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__, record=FILE)
     parser.add_argument("--cases", type=int, default=200_000, help="over all formats; of states a twentieth more")
     parser.add_argument("--format", choices=FORMATS, help="this one alone")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--case", type=int, help="this one alone, in this process")
     parser.add_argument("--keep", type=Path, default=Path("case"), help="with --case: where its files go")
-    parser.add_argument("--record", action="store_true", help=f"add a row to results/{FILE}")
     args = parser.parse_args()
     torch.set_num_threads(1)
     if args.case is not None:

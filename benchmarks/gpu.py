@@ -15,14 +15,12 @@ Each adds rows to ``results/gpu.jsonl``. Where there is no GPU, plain is this pa
 
 from __future__ import annotations
 
-import argparse
 import os
 import resource
 import subprocess
 import sys
 import tempfile
 import time
-import xml.etree.ElementTree as xml
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -31,7 +29,7 @@ from typing import Any
 
 import torch
 from city import city, city_cameras, perturb
-from common import ROOT, append, capture
+from common import ROOT, append, arguments, checkpoint, outcomes, photographs
 from torch import Tensor
 
 import clod_adapter as clod
@@ -44,8 +42,8 @@ from clod_adapter.render import dial, splat
 CHECKS = ("tests", "plush", "city")
 DIALS = (1.0, 3.0, 7.0)
 TESTS = (
-    "tests/rasterizers", "tests/integrations/test_gsplat.py", "tests/test_devices.py", "tests/test_optimizer.py",
-    "tests/test_fusing.py",
+    "tests/rasterizers", "tests/integrations/test_gsplat.py", "tests/test_devices.py",
+    "tests/training/test_optimizer.py", "tests/_support/test_fusing.py",
 )  # fmt: skip
 
 
@@ -72,7 +70,7 @@ SMALL = Size(count=3000, width=64, height=48, views=4, steps=3, plush_steps=3, r
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("--device", choices=["cuda", "cpu"], default="cuda")
     parser.add_argument("--small", action="store_true", help="a tiny city, also in place of plush_half, and few tests")
     parser.add_argument("--only", nargs="+", choices=CHECKS, default=CHECKS)
@@ -103,12 +101,9 @@ def run_tests(small: bool) -> dict[str, Any]:
         report, began = Path(folder) / "report.xml", time.perf_counter()
         command = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-q", f"--junitxml={report}", *TESTS, *few]
         subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)})
-        cases = list(xml.parse(report).getroot().iter("testcase"))
-        kinds = {"failed": ("failure", "error"), "skipped": ("skipped",)}
-        found = {k: [c for c in cases if any(c.find(tag) is not None for tag in tags)] for k, tags in kinds.items()}
-    bad = [f"{case.get('classname')}::{case.get('name')}" for case in found["failed"]]
-    counts = {kind: len(listed) for kind, listed in found.items()}
-    return {"cases": len(cases), **counts, "failures": bad, "seconds": round(time.perf_counter() - began, 1)}
+        found = outcomes(report)
+    cases = found.pop("passed") + found["failed"] + found["skipped"]
+    return {"cases": cases, **found, "seconds": round(time.perf_counter() - began, 1)}
 
 
 def adapt_plush(device: torch.device, size: Size, small: bool) -> list[dict[str, Any]]:
@@ -116,8 +111,7 @@ def adapt_plush(device: torch.device, size: Size, small: bool) -> list[dict[str,
     if small:
         base, scene = synthetic(size, torch.device("cpu"))
     else:
-        folder = capture("plush_half")
-        base, scene = clod.load(folder / "pretrained.ply").gaussians, clod.load_scene(folder)
+        base, scene = checkpoint("plush_half").gaussians, photographs("plush_half")
     config = clod.AdaptConfig(**({"iters": size.plush_steps} if size.plush_steps else {}))
     rows = []
     for place in dict.fromkeys([device, torch.device("cpu")]):

@@ -9,7 +9,6 @@ in training. The saves are flushed to the disk of ``--folder``. ``load_seconds``
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -18,7 +17,7 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 
 # isort: split
 import torch
-from common import append, capture
+from common import append, arguments, checkpoint, photographs
 
 from clod_adapter.cli.adapt.resume import Saver
 from clod_adapter.cli.shared.console import Console
@@ -30,7 +29,7 @@ THREADS = 2
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*", default=["plush_half"])
     parser.add_argument("--iters", type=int, default=300)
     parser.add_argument("--folder", help="where to save (default: a temporary folder)")
@@ -42,13 +41,12 @@ def main() -> None:
 
 
 def measure(scene: str, config: clod.AdaptConfig, path: Path) -> None:
-    base = clod.load(capture(scene) / "pretrained.ply")
-    photographs = clod.load_scene(capture(scene))
+    base, views = checkpoint(scene), photographs(scene)
     saver = Saver(path, False, config, Console(), GracefulStop())
     began = time.perf_counter()
-    saver.belong(base.gaussians, photographs, scene, scene)
+    saver.belong(base.gaussians, views, scene, scene)
     digest_seconds = time.perf_counter() - began
-    adapted = clod.adapt(base.gaussians, photographs, config, saver.watching(lambda progress: None))
+    adapted = clod.adapt(base.gaussians, views, config, saver.watching(lambda progress: None))
     saver.keep()
     began = time.perf_counter()
     load_state(path)

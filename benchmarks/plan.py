@@ -69,7 +69,8 @@ def run(scene: str, options: list[str]) -> dict[str, Any]:
         "steps": report["steps"], "seed": report["config"]["seed"], "base_count": report["base_count"],
         "wall_seconds": round(process.seconds, 2), "seconds": report["seconds"], "plan": report["plan"],
         "ply_mb": report["ply_bytes"] / 1e6, "adapter_mb": report["adapter_bytes"] / 1e6,
-        "peak_mb": process.peak_bytes / 1024e3, "base_psnr": report["base_rows"][0]["psnr"] if report["base_rows"] else None,
+        "peak_mb": process.peak_bytes / 1024e3,
+        "base_psnr": report["base_rows"][0]["psnr"] if report["base_rows"] else None,
         "rows": [row for row in report["rows"] if row["virtual_scale"] in DIALS],
     }  # fmt: skip
 

@@ -12,12 +12,12 @@ those that the first process spent in waiting for the other and in moving and su
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
 import sys
 import tempfile
+from argparse import SUPPRESS, Namespace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -26,7 +26,7 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 
 # isort: split
 import torch
-from common import append, capture
+from common import append, arguments, checkpoint, photographs
 
 from clod_adapter.training.distributed import joined
 
@@ -37,13 +37,13 @@ SPENT = ("start_seconds", "seconds", "waiting", "exchanging")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*", default=["plush_half"])
     parser.add_argument("--views", type=int, default=1500, help="that each of the three sees")
     parser.add_argument("--speed-steps", type=int, default=60)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--part", nargs=3, metavar=("SCENE", "CONFIG", "FILE"), help=argparse.SUPPRESS)
+    parser.add_argument("--part", nargs=3, metavar=("SCENE", "CONFIG", "FILE"), help=SUPPRESS)
     args = parser.parse_args()
     if args.part:
         take_part(args.part[0], clod.AdaptConfig(**json.loads(args.part[1])), Path(args.part[2]))
@@ -53,12 +53,12 @@ def main() -> None:
         measure(scene, args)
 
 
-def measure(scene: str, args: argparse.Namespace) -> None:
+def measure(scene: str, args: Namespace) -> None:
     single = {"iters": args.views, "batch": 1, "seed": args.seed}
     double = {"iters": args.views // 2, "batch": 2, "seed": args.seed}
     runs = {"batch 1": (1, single), "batch 2": (1, double), "batch 2, two processes": (2, double)}
     outcomes, quality = {}, {}
-    test = clod.load_scene(capture(scene)).test
+    test = photographs(scene).test
     for label, (processes, config) in runs.items():
         outcomes[label], spent = run(scene, processes, config)
         quality[label] = {"steps": config["iters"], **spent, "rows": rows_of(outcomes[label], test)}
@@ -102,17 +102,17 @@ def run(scene: str, processes: int, config: dict[str, Any]) -> tuple[clod.Gaussi
 
 def take_part(scene: str, config: clod.AdaptConfig, file: Path) -> None:
     """What each of the processes does; the first one writes what came of it."""
-    base, photographs = clod.load(capture(scene) / "pretrained.ply").gaussians, clod.load_scene(capture(scene))
+    base, views = checkpoint(scene).gaussians, photographs(scene)
     if "RANK" in os.environ:
         from torch.distributed.rendezvous import rendezvous
 
         with joined(*next(iter(rendezvous("env://")))) as peers:
             peers.agree(0.0, True)  # both have read and compiled before a clock runs
-            adapted = clod.adapt(base, photographs, config, peers=peers)
+            adapted = clod.adapt(base, views, config, peers=peers)
         if peers.rank > 0:
             return
     else:
-        adapted = clod.adapt(base, photographs, config)
+        adapted = clod.adapt(base, views, config)
     torch.save((adapted.gaussians, {name: getattr(adapted, name) for name in SPENT}), file)
 
 

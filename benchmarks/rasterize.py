@@ -15,11 +15,11 @@ object a row and nothing else to stdout; ``--record`` adds the rows to ``results
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
 import tempfile
+from argparse import Namespace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -32,7 +32,7 @@ import contenders
 import peer_gsplat
 import torch
 import workloads
-from common import ROOT, append
+from common import ROOT, append, arguments
 from contenders import SHARES, THREADS, Worker
 
 from clod_adapter.cli.shared.report import jsonable
@@ -46,9 +46,8 @@ Row = dict[str, Any]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__, record=FILE)
     parser.add_argument("--json", action="store_true", help="a JSON list on stdout, and nothing else")
-    parser.add_argument("--record", action="store_true", help=f"add the rows to results/{FILE}")
     parser.add_argument("--workloads", nargs="+", choices=workloads.SIZES, default=list(workloads.SIZES))
     parser.add_argument("--repeats", type=int, default=15, help="of ours and the yardstick (default: %(default)s)")
     parser.add_argument("--skip-gsplat", action="store_true")
@@ -69,7 +68,7 @@ def main() -> None:
         append(FILE, {"benchmark": "rasterize", "kind": kind, **row})
 
 
-def speed(args: argparse.Namespace) -> list[Row]:
+def speed(args: Namespace) -> list[Row]:
     """All times of each workload."""
     with tempfile.TemporaryDirectory() as folder:
         library = contenders.build_yardstick(args.yardstick, Path(folder))

@@ -11,14 +11,13 @@ many steps; at s = 1 it is the whole base, tuned. Each run adds a row to ``resul
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from collections.abc import Callable, Sequence
 from statistics import fmean
 from typing import Any
 
-from common import RESULTS, ROOT, append, capture
+from common import CACHE, RESULTS, ROOT, append, arguments, checkpoint, photographs
+from common import stored as stored_rows
 
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
@@ -48,7 +47,7 @@ LABELS = {"ours": "ours, one file", "paper": "the paper's form, one file", "spec
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("scene", help="a folder of the shared data")
     parser.add_argument("--methods", nargs="+", choices=LABELS, default=list(LABELS))
     parser.add_argument("--iters", nargs="+", type=int, default=list(ITERS))
@@ -71,8 +70,7 @@ class Contest:
 
     def __init__(self, scene: str, max_sv: float) -> None:
         self.scene, self.max_sv, self.console = scene, max_sv, Console()
-        self.base = clod.load(capture(scene) / "pretrained.ply")
-        self.photographs = clod.load_scene(capture(scene))
+        self.base, self.photographs = checkpoint(scene), photographs(scene)
         self.dials = sorted({1.0, min(3.0, max_sv), max_sv})
         self.base_row = clod.evaluate(self.base.gaussians, self.photographs.test, [1.0])[0]
 
@@ -105,7 +103,7 @@ class Contest:
         for s, count in zip(self.dials, self.counts(), strict=True):
             start, merging = self.base.gaussians, 0.0
             if s > 1:
-                start, merging = Merger.find(ROOT / "benchmarks" / "cache").merge(self.base, count)
+                start, merging = Merger.find(CACHE).merge(self.base, count)
             tuned = self.watched(
                 f"specialist for {len(start):,}, {iters} steps",
                 lambda follow, start=start: tune(
@@ -131,9 +129,7 @@ class Contest:
 
 
 def stored(scene: str, max_sv: float) -> list[dict[str, Any]]:
-    path = RESULTS / FILE
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    return [row for row in map(json.loads, lines) if (row["scene"], row["max_sv"]) == (scene, max_sv)]
+    return [row for row in stored_rows(FILE) if (row["scene"], row["max_sv"]) == (scene, max_sv)]
 
 
 def plot(scene: str, max_sv: float) -> None:

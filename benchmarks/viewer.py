@@ -11,9 +11,7 @@ software, and say nothing of a device with a GPU. Rows are added to ``results/vi
 
 from __future__ import annotations
 
-import argparse
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -22,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import ROOT, append, capture
+from common import CACHE, COMMAND, ROOT, Process, append, arguments, capture
 
 import clod_adapter as clod
 from clod_adapter.adapter import detach
@@ -39,20 +37,18 @@ CAPTURES = ("plush_half", "bonsai146")
 DIALS = (1.0, 3.0, 5.0)
 CAMERAS = 4
 MANY = 500_000
-CACHE = ROOT / "benchmarks" / "cache"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("captures", nargs="*", default=[*CAPTURES, "many"], help="captures, or many (default: all)")
     parser.add_argument("--pack", action="store_true", help="also the size of the page that splat-transform packs")
     args = parser.parse_args()
     with browser.launch() as chromium:
         for name in args.captures:
             with tempfile.TemporaryDirectory() as folder:
-                row = (
-                    many(chromium, Path(folder)) if name == "many" else measure(chromium, name, Path(folder), args.pack)
-                )
+                made = name == "many"
+                row = many(chromium, Path(folder)) if made else measure(chromium, name, Path(folder), args.pack)
             append(FILE, row)
             print(summary(row))
 
@@ -136,7 +132,7 @@ def adapted(name: str) -> Path:
     if not path.exists():
         CACHE.mkdir(exist_ok=True)
         words = [capture(name) / "pretrained.ply", "--images", capture(name), "--max-sv", 5, "--iters", 100, "-o", path]
-        subprocess.run([sys.executable, "-m", "clod_adapter.cli.main", *map(str, words)], check=True)
+        Process([*COMMAND, *words])
     return path
 
 
