@@ -117,7 +117,7 @@ def trained(config: AdaptConfig, start: Tensor, steps: int, *, floor: bool = Tru
 @torch.no_grad()
 def objective(run: _Run) -> float:
     """What training minimises, at dial values evenly spread, for sigma_d as it would be handed out."""
-    (view,), config, found, total = run.views, run.config, run.gaussians(), 0.0
+    (view,), config, found, total = run.draws.views, run.config, run.gaussians(), 0.0
     for s in DIALS:
         shown = render(found, view.camera, s)
         weight = (1 - config.weight_slope * s / config.max_sv) ** 2
@@ -131,7 +131,7 @@ def stuck(run: _Run) -> int:
 
     Who has left at every dial value needs a lift while nobody is kept, who does not fade a press while everybody is.
     """
-    p, config, camera, reading = run.parameters, run.config, run.views[0].camera, run.objective.attenuation
+    p, config, camera, reading = run.parameters, run.config, run.draws.views[0].camera, run.objective.attenuation
     distances = normalized_distances(p["means"], camera, reading)
     seen = out = lifted = pressed = torch.zeros(len(distances), dtype=torch.bool)
     for s in DIALS:
