@@ -32,7 +32,8 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 # isort: split
 import torch
 from common import append, arguments
-from mutants import FORMATS, Input, make, mutate, write, write_images
+from damage import mutate
+from mutants import FORMATS, Input, make, write, write_images
 
 from clod_adapter.cli.adapt.resume import Saver
 from clod_adapter.cli.shared.console import Console
