@@ -1,14 +1,14 @@
-"""Adapts real checkpoints and writes what came of it: quality, count and time per dial value.
+"""Quality, count and seconds of adapted checkpoints, by dial value.
 
     python benchmarks/adapt.py plush_half bonsai146 ci_banana plush_half/pretrained_mask
     python benchmarks/adapt.py plush_half bonsai146 --set max_sv=14.0 --label "max_sv 14" --seeds 0 1 2
     python benchmarks/adapt.py plush_half --ablations      # one row for each choice in docs/method.md
-    python benchmarks/adapt.py plush_half bonsai146 --leave-out    # one for each in docs/performance.md
+    python benchmarks/adapt.py plush_half bonsai146 --leave-out    # the rows of docs/performance.md
     python benchmarks/adapt.py --table                     # the rows as a Markdown table
-    python benchmarks/adapt.py plush_half --questions      # the ablations' rows, a table a question
+    python benchmarks/adapt.py plush_half --questions      # the rows of the ablations, one table per question
 
-A scene is a folder of the shared data, with a checkpoint's name where it is not ``pretrained``. Each run
-adds one row to ``results/adapt.jsonl``: the settings, the commit, the machine, the base and the dial.
+A scene is a folder of the shared data, followed by the name of the checkpoint where it is not ``pretrained``. Each run
+adds one row to ``results/adapt.jsonl``: settings, commit, machine, the base and the dial.
 """
 
 from __future__ import annotations

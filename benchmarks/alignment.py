@@ -1,10 +1,10 @@
-"""The check before training: what stops, what passes, whether the frame is told, and in what time.
+"""The alignment check before training: which inputs it stops, which frame it guesses, and its CPU seconds.
 
     python benchmarks/alignment.py [SCENE ...]
 
-Checkpoints of the shared captures against their own photographs, then against cameras that are moved as other tools
-would have them, against another scene's, and against photographs of another exposure; and checkpoints moved into the
-frames that gsplat's and nerfstudio's trainers normalise to. One row a case in results/alignment.jsonl.
+The inputs are checkpoints of the shared captures with their own photographs, with cameras transformed as other tools
+transform them, with another scene's checkpoint and with another exposure; and checkpoints in the normalised frames of
+gsplat's and nerfstudio's trainers. Each case adds a row to ``results/alignment.jsonl``.
 """
 
 from __future__ import annotations
