@@ -1,20 +1,18 @@
-"""How good a plain file is beside the dial that it is baked from, at the same count.
+"""PSNR of baked plain files against the dial, at equal counts.
 
     clod-adapt ci_banana/pretrained.ply --images ci_banana --max-sv 5 --iters 400 -o clod.ply
     python benchmarks/bake.py clod.ply ci_banana
     python benchmarks/bake.py --table                      # the rows as a Markdown table
 
-The model is an adapted file of the capture. At each dial value the count is the dial's mean over the held-out views,
-and PSNR is on these. Files of that count, or of the nearest one that a dial value has, are baked for:
+The model is an adapted file of the capture. The count at a dial value is the dial's mean over the held-out views. Files
+of that count, or of the nearest count that a dial value has, are baked for:
 
-- ``d' = 1``: one distance for all Gaussians, ``scene_distance``, with the opacities of the dial value itself, as
-  earlier versions did;
+- ``d' = 1``: one distance for all Gaussians, with the opacities of the dial value, as earlier versions baked;
 - ``images``: all training cameras, as ``clod-adapt export --images`` does;
-- ``stored``: those that adapting stores in the file;
-- ``placed``: those that are placed where nothing is known.
+- ``stored``: the viewpoints that adapting stores in the file;
+- ``placed``: placed cameras.
 
-``at s`` is a file for all training cameras at the dial value itself, with the count that it then has. Each run adds a
-row to ``results/bake.jsonl``.
+``at s`` is baked for all training cameras at the dial value itself. Each run adds a row to ``results/bake.jsonl``.
 """
 
 from __future__ import annotations

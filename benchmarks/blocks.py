@@ -1,12 +1,11 @@
-"""Adapting in blocks: do its pictures have seams, and does it stay within its memory?
-
-Seams: a capture adapted whole, whole with another seed, and in blocks of forced number; each against the photographs
-and against the first, at s = 1, 3, 5, on the held-out views, on all of their pixels and on those across a border
-between blocks (where no block has SOLE of the pixel). Memory: the command on a synthetic city, with and without
---memory, in a process of its own whose largest resident size the system tells.
+"""Adapting in blocks: differences at block borders, and peak memory.
 
     python benchmarks/blocks.py seams                  # hours on two cores; --iters 300 for a quick look
     python benchmarks/blocks.py memory                 # 2 million Gaussians, 60 photographs of 960x540
+
+``seams`` adapts a capture whole, whole with another seed, and in a fixed number of blocks. It compares each with the
+photographs and with the first at s = 1, 3, 5 on the held-out views: on all pixels, and on the pixels at a border, where
+no block contributes SOLE. ``memory`` runs the command on a synthetic city with and without --memory.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
-"""A synthetic city of any number of Gaussians: streets, houses with windows, trees, cars, fields and a sky.
+"""A synthetic city of any number of Gaussians: streets, houses, trees, cars, fields and a sky.
 
     python benchmarks/city.py OUT --count 1000000 --images 24 --size 800 500   # OUT/city.ply and a COLMAP scene
 
-It stands in for captures that are too large to come with a repository. As with those, more Gaussians are more city: the
-number of blocks grows with the count and the density stays, about 5 Gaussians a square metre of surface. Surfaces are
-covered by thin Gaussians that lie in them, at a size that closes them whatever the count, a fifth of them as a coarser
-layer; colours have detail down to single Gaussians, and all SH bands are in use.
+It replaces captures that are too large for a repository. More Gaussians make a larger city at the same density of about
+5 per square metre of surface. Thin Gaussians cover the surfaces, a fifth of them as a coarser layer; colours vary from
+one Gaussian to the next, and all SH degrees are used.
 
 World axes: x right, y DOWN, z into the picture, in metres; the ground is y = 0.
 """
@@ -18,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from city_points import FIELD, Points, cover, facing, higher_bands, shade, surround
+from city_points import FIELD, Points, cover, facing, higher_degrees, shade, surround
 from city_surfaces import PITCH, blocks, build, extent
 from common import arguments
 from PIL import Image
@@ -64,7 +63,7 @@ def city(count: int, *, seed: int = 0, sh_degree: int = 3) -> Gaussians:
         log_scales=torch.from_numpy(log_scales.astype(np.float32)),
         opacity_logits=torch.from_numpy(logits.astype(np.float32)),
         sh0=torch.from_numpy((shaded - 0.5) / np.float32(SH_C0))[:, None],
-        shN=torch.from_numpy(higher_bands(points, shaded, sh_degree, random)),
+        shN=torch.from_numpy(higher_degrees(points, shaded, sh_degree, random)),
     )
 
 
@@ -133,7 +132,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: 
 
 
 def perturb(truth: Gaussians, seed: int = 0) -> Gaussians:
-    """A checkpoint as training might have left it: the truth a little blurred and off, in place; it is the result."""
+    """A checkpoint with the errors of training: the truth slightly blurred and displaced. In place; returned."""
     generator = torch.Generator().manual_seed(seed)
     size = truth.log_scales[:, :2].mean(1, keepdim=True).exp()
     for name, by in PERTURBED.items():
@@ -148,7 +147,7 @@ def write_city(
     folder: str | Path, count: int, images: int, width: int, height: int, *, where: Where = "mixed", seed: int = 0,
     sh_degree: int = 3,
 ) -> None:  # fmt: skip
-    """A checkpoint ``folder/city.ply`` and photographs of what it should be, as a COLMAP scene in the folder.
+    """Writes a perturbed checkpoint ``folder/city.ply`` and photographs of the truth as a COLMAP scene.
 
     Args:
         folder: does not exist or is empty; it appears when everything in it is complete.

@@ -34,7 +34,7 @@ FIELDS = np.array([[0.42, 0.48, 0.25], [0.55, 0.52, 0.30], [0.30, 0.40, 0.22], [
 
 @dataclass(frozen=True)
 class Points:
-    """N places for Gaussians: where, facing where, how far apart, of which kind and colour, each ``[N, ...]``."""
+    """N positions of Gaussians, with normal, spacing, kind and colour, each ``[N, ...]``."""
 
     position: np.ndarray
     normal: np.ndarray
@@ -144,15 +144,15 @@ def facing(normal: np.ndarray, random: np.random.Generator) -> np.ndarray:
     return np.stack([w * c, i * c + j * s, j * c - i * s, w * s], 1).astype(np.float32)
 
 
-def higher_bands(points: Points, color: np.ndarray, degree: int, random: np.random.Generator) -> np.ndarray:
-    """``[N, K-1, 3]`` float32: a lobe where the sun is mirrored, stronger on glass, and noise as training leaves it."""
+def higher_degrees(points: Points, color: np.ndarray, degree: int, random: np.random.Generator) -> np.ndarray:
+    """``[N, K-1, 3]`` float32: a lobe where the sun is mirrored, stronger on glass, and noise."""
     k = SH_COUNTS[degree]
-    bands = np.empty((len(color), k - 1, 3), np.float32)
+    coefficients = np.empty((len(color), k - 1, 3), np.float32)
     if k == 1:
-        return bands
+        return coefficients
     sun = (SUN / np.linalg.norm(SUN)).astype(np.float32)
-    band = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)[1:]
-    fall = (0.9**band / (1 + band)).astype(np.float32)[:, None]
+    degrees = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)[1:]
+    fall = (0.9**degrees / (1 + degrees)).astype(np.float32)[:, None]
     for at in range(0, len(color), 500_000):
         rows = slice(at, at + 500_000)
         normal = points.normal[rows]
@@ -160,5 +160,5 @@ def higher_bands(points: Points, color: np.ndarray, degree: int, random: np.rand
         lobe = sh_basis(torch.from_numpy(-mirrored)).numpy()[:, 1:k, None]
         shine = np.where(color[rows].mean(1) < 0.3, 0.35, 0.1).astype(np.float32)[:, None, None]
         noise = random.standard_normal((len(normal), k - 1, 3), np.float32)
-        bands[rows] = fall * (shine * lobe + 0.03 * noise)
-    return bands
+        coefficients[rows] = fall * (shine * lobe + 0.03 * noise)
+    return coefficients

@@ -24,7 +24,7 @@ class Surfaces:
     """R rectangles, or ellipsoids where the kind is TREE.
 
     Attributes:
-        origin, u, v: ``[R, 3]`` a corner and the edges that leave it; of a tree the centre and, in u, the radii.
+        origin, u, v: ``[R, 3]`` a corner and its two edges; of a tree the centre and, in u, the radii.
         normal: ``[R, 3]`` outward, unit length.
         kind: ``[R]`` ASPHALT to TREE.
         color: ``[R, 3]`` sRGB in [0, 1].

@@ -1,15 +1,13 @@
-"""What is left of the dial once another tool has rewritten an adapted PLY without its header's comments.
+"""The dial of an adapted PLY after another tool has rewritten the file without the header's comments.
 
     python benchmarks/constants.py plush_half --iters 200
     python benchmarks/constants.py --table                  # the rows as a Markdown table
 
 A checkpoint is adapted with each of some settings and saved. The held-out views are measured at each dial value on the
-file as it was written, as plyfile writes it without comments, and as splat-transform does where it is installed; and on
-a file as earlier versions wrote it, with sigma_d in units of the typical distance, rewritten likewise. ``same`` says
-whether all numbers, and who is kept in each view, are those of the file as it was written; ``note`` is what loading it
-says.
-
-Each setting adds a row to ``results/constants.jsonl``.
+file as written, as plyfile rewrites it without comments, as splat-transform rewrites it where that is installed, and on
+the format of earlier versions, with sigma_d in units of the typical distance. ``same``: all numbers and kept Gaussians
+equal those of the file as written. ``note``: the message on loading. Each setting adds a row to
+``results/constants.jsonl``.
 """
 
 from __future__ import annotations
@@ -44,7 +42,7 @@ SETTINGS: dict[str, clod.AdaptConfig] = {
 
 def main() -> None:
     parser = arguments(__doc__, table=print_table)
-    parser.add_argument("scenes", nargs="*", help="captures beside the checkout")
+    parser.add_argument("scenes", nargs="*", help="captures of the shared data")
     parser.add_argument("--iters", type=int, default=200)
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=[*SETTINGS])
     args = parser.parse_args()
@@ -72,7 +70,7 @@ def measure(scene: str, name: str, iters: int) -> dict[str, Any]:
 
 
 def rewritten(folder: Path, result: clod.Gaussians) -> Iterator[tuple[str, Path]]:
-    """The file that stands there as tools leave it, and one as earlier versions wrote it."""
+    """(tool, file): the saved file rewritten by each tool, and in the format of earlier versions."""
     model = PlyData.read(str(folder / "model.ply"))["vertex"].data
     PlyData([PlyElement.describe(model, "vertex")], byte_order="<").write(str(folder / "plyfile.ply"))
     yield "plyfile", folder / "plyfile.ply"
@@ -92,7 +90,7 @@ def rewritten(folder: Path, result: clod.Gaussians) -> Iterator[tuple[str, Path]
 
 
 def look(path: Path, views: Sequence[clod.View]) -> dict[str, Any]:
-    """The held-out views at each dial value: numbers, who is kept, and what loading says."""
+    """The held-out views at each dial value: numbers, kept Gaussians, and the message on loading."""
     model = clod.load(path)
     rows = clod.evaluate(model.gaussians, views, DIALS)
     kept = [render(model.gaussians, view.camera, s).kept for view in views for s in DIALS]

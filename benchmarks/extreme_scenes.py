@@ -28,7 +28,7 @@ RATIO = math.log(1e6)
 
 @dataclass(frozen=True)
 class Case:
-    """What is adapted, and with which settings beside 200 steps."""
+    """A base, its scene, and settings besides the number of steps."""
 
     base: clod.Gaussians
     scene: Scene
@@ -49,7 +49,7 @@ def similar(scale: float) -> Change:
 
 
 def one_view_in(scale: float) -> Change:
-    """A single training image, and the same in other units: one camera says nothing of how large a scene is."""
+    """A single training image, and the same in other units: one camera does not define the size of a scene."""
 
     def change(base: clod.Gaussians, scene: Scene) -> Case:
         case = similar(scale)(base, scene)

@@ -1,12 +1,11 @@
-"""How far the blending is from what the processor could do at best.
+"""The time of the blending against a lower bound from the processor's peak rate.
 
     python benchmarks/floor.py [--record]
 
-Counts the pairs of a Gaussian and a pixel that are blended, and the blocks of 4x4 pixels that are looked at for
-them; measures the processor's peak rate of vector operations (independent multiply-adds of 16 floats, all threads);
-and sets the vector operations that the blending loops need (counted in their source, listed below) against it.
-``floor_ms`` is the time of the blended pairs alone, 16 to a vector, at peak, with no memory and nothing else;
-``blocks_ms`` the same for the blocks, in which some lanes are idle. Beside them the measured times, in one run.
+Counts the blended pairs of a Gaussian and a pixel, and the blocks of 4x4 pixels that are visited for them; measures the
+peak rate of vector operations (independent multiply-adds of 16 floats, all threads); and divides the vector operations
+of the blending loops, counted in their source, by that rate. ``floor_ms`` is the time of the blended pairs alone, 16 to
+a vector; ``blocks_ms`` that of the blocks, in which some lanes are idle. ``measured_ms`` is measured in the same run.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""What each file format keeps: bytes a Gaussian, seconds, the error of sigma_d, and the pictures beside the PLY's.
+"""Each file format: bytes per Gaussian, seconds, the error of sigma_d, and PSNR against the PLY.
 
     python benchmarks/formats.py plush_half
     python benchmarks/formats.py --table                  # the rows as a Markdown table
 
-A checkpoint gets a sigma_d without training (``importance.start``), is written in each format that carries one and
-read again; the pictures are of the dial at s, means over the held-out views, against those of the PLY. ``.splat``
-carries none: what is baked at s goes through it, and is compared with what is baked at s in the PLY. PSNR is between
-floating-point pictures, and null where they are equal. Each format adds one row to ``results/formats.jsonl``.
+A checkpoint gets a sigma_d without training (``importance.start``), is written in each format that stores one and read
+again. PSNR is between the renders at s and those of the PLY, as means over the held-out views, in floating point; null
+where they are equal. ``.splat`` stores no sigma_d: a model baked at s is written and compared. Each format adds one row
+to ``results/formats.jsonl``.
 """
 
 from __future__ import annotations

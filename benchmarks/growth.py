@@ -1,16 +1,15 @@
-"""Time and memory of the commands against the number of Gaussians, and of adapting against photographs.
+"""Time and memory of the commands by the number of Gaussians, and of adapting by the photographs.
 
     python benchmarks/growth.py                            # all of it: some 15 minutes, 12 GB of memory, 8 GB of disk
     python benchmarks/growth.py --sizes 10000 100000       # some sizes
     python benchmarks/growth.py --only inspect view        # some commands
-    python benchmarks/growth.py --plot                     # nothing is run: the picture and the page of the rows
+    python benchmarks/growth.py --plot                     # runs nothing: the picture and the tables of the rows
 
-Each command is run as a user runs it, in a process of its own, on cities (``city.py``) that are made once and kept in
-benchmarks/cache. From outside come wall and CPU seconds and the resident memory, every 20 ms; from what the command
-says on stderr and in its report, the phases that they belong to. A run on a city of 1000 Gaussians is the floor: what
-starting up costs. Rows go to results/growth.jsonl; the last one of a kind counts. docs/images/growth.png shows them,
-and docs/growth.md has them as tables, with what follows for a city of 100 million. Exponents are least squares in
-logarithms, of the seconds above the floor, from 100k Gaussians on.
+Runs each command in its own process on cities (``city.py``) that are made once and kept in benchmarks/cache. Measures
+wall and CPU seconds and resident memory, sampled every 20 ms, by phase. A city of 1000 Gaussians gives the start-up
+cost. Rows go to results/growth.jsonl; the last row of a kind counts. Writes docs/images/growth.png and the tables of
+docs/growth.md, with an estimate for a city of 100 million. Exponents are least squares in logarithms of the seconds
+above the start-up cost, from 100k Gaussians on.
 """
 
 from __future__ import annotations

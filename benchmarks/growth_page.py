@@ -59,7 +59,7 @@ def on_paper(rows: Sequence[Row]) -> str:
 def block_seconds(rows: Sequence[Row], count: int) -> tuple[float, float]:
     """Training, and everything else, for a block of so many Gaussians on the machine of the rows.
 
-    In proportion from the largest city that was measured, the order of leaving by n log n; a megapixel more of a
+    In proportion from the largest city that was measured, the pruning order by n log n; a megapixel more of a
     photograph adds to each view what it does in the series over sizes.
     """
     row = over_count(rows, "adapt")[-1]
@@ -125,7 +125,7 @@ def line(axes: Any, points: Sequence[tuple[float, float]], colour: str, label: s
 
 
 def guide(axes: Any, rows: Sequence[Row]) -> None:
-    """What n log n would be, through the last point of the order of leaving."""
+    """What n log n would be, through the last point of the pruning order."""
     points = seconds_of(rows, "adapt", "order")
     if points:
         n, seconds = points[-1]

@@ -1,4 +1,4 @@
-"""What the rows of growth.py show: exponents of time, bytes per Gaussian, and their tables for docs/growth.md."""
+"""Exponents of time and bytes per Gaussian from the rows of growth.py, and their tables for docs/growth.md."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ PHASES = ("load", "importance", "order", "step", "evaluate", "write")
 
 
 def cpu_of(rows: Sequence[Row], command: str, phase: str = "") -> list[tuple[float, float]]:
-    """(Gaussians, CPU seconds) of a command, or of a phase of adapting: these hardly know who else is at work."""
+    """(Gaussians, CPU seconds) of a command, or of a phase of adapting: less affected by other work on the machine."""
     return [
         (row["gaussians"], phase_cpu(row, phase))
         for row in over_count(rows, command)
@@ -100,7 +100,7 @@ def tables(rows: Sequence[Row]) -> str:
     head = "| | " + " | ".join(f"{size:,}" for size in sizes) + " | exponent | last two | exponent of CPU |"
     busy = max(row["busy"] for row in rows)
     lines = [f"**Preliminary**: the machine's load was up to {busy:.0f} while these rows were taken, so wall times are "
-             "several times too long; the CPU's and memory stand.", ""] if busy > BUSY else []  # fmt: skip
+             "several times too long; CPU times and memory are not affected.", ""] if busy > BUSY else []  # fmt: skip
     lines += [head, "|---" * (len(sizes) + 4) + "|"]
     cases = [(command, "") for command in COMMANDS] + [("adapt", phase) for phase in PHASES]
     for command, phase in cases:
@@ -109,7 +109,7 @@ def tables(rows: Sequence[Row]) -> str:
         cells = [f"{dict(points)[size]:.3g}" if size in dict(points) else "" for size in sizes]
         powers = " | ".join(f"{power:.2f}" for power in (fitted, last, growth(cpu_of(rows, command, phase))[0]))
         lines.append(f"| {phase or command} | {' | '.join(cells)} | {powers} |")
-    lines += ["", "| | peak, GB | | bytes a Gaussian | besides, MB |", "|---|---|---|---|---|"]
+    lines += ["", "| | peak, GB | | bytes per Gaussian | fixed, MB |", "|---|---|---|---|---|"]
     for command in COMMANDS:
         each, rest = bytes_a_gaussian(rows, command)
         peaks = [f"{row['gaussians']:,}: {row['peak_bytes'] / 1e9:.2f}" for row in over_count(rows, command)[-2:]]
@@ -118,7 +118,7 @@ def tables(rows: Sequence[Row]) -> str:
         peaks = row["phase_peaks"]
         lines += ["", f"| adapt, {row['gaussians']:,}: up to | {' | '.join(peaks)} |", "|---" * (len(peaks) + 1) + "|"]
         per = " | ".join(f"{peak / row['gaussians']:,.0f}" for peak in peaks.values())
-        lines.append(f"| resident bytes a Gaussian | {per} |")
+        lines.append(f"| resident bytes per Gaussian | {per} |")
     for series, name, x in (("images", "photographs", photographs), ("shapes", "megapixels", megapixels)):
         chosen = sorted((row for row in rows if row["series"] == series), key=x)
         lines += ["", f"| adapt over {name} | seconds | start | step | evaluate | load | peak, GB |", "|---" * 7 + "|"]

@@ -1,10 +1,10 @@
-"""What it costs to save the training's state now and then, and to resume from it.
+"""The cost of saving the training state, and of resuming from it.
 
     python benchmarks/interruptions.py                       # plush_half, 300 steps
     python benchmarks/interruptions.py bonsai146 --iters 1500
 
-An adaptation as ``clod-adapt`` runs it, with its saver: ``saving_share`` is the time spent in saving, of the time spent
-in training. The saves are flushed to the disk of ``--folder``. ``load_seconds`` is what reading the last state takes.
+Adapts as ``clod-adapt`` does, with its saver. ``saving_share`` is the share of the training time that saving takes. The
+states are flushed to the disk of ``--folder``. ``load_seconds`` is the time to read the last state.
 """
 
 from __future__ import annotations

@@ -188,10 +188,10 @@ def _transforms(folder: Path) -> list[Input]:
 def _pts(folder: Path) -> list[Input]:
     """As gsplat's trainer writes it, of SH degree 1 and 0."""
     inputs = []
-    for bands in (3, 0):
+    for coefficients in (3, 0):
         shapes = {
             "means": (4, 3), "quats": (4, 4), "scales": (4, 3), "opacities": (4,), "sh0": (4, 1, 3),
-            "shN": (4, bands, 3),
+            "shN": (4, coefficients, 3),
         }  # fmt: skip
         out = io.BytesIO()
         torch.save({"step": 29999, "splats": {name: torch.randn(shape) for name, shape in shapes.items()}}, out)

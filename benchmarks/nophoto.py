@@ -1,15 +1,14 @@
-"""What training with few photographs, or none, costs: one checkpoint adapted on kinds of views, judged on photographs.
+"""Quality after adapting with few photographs or none, on real held-out photographs.
 
     python benchmarks/nophoto.py plush_half bonsai146 ci_banana
     python benchmarks/nophoto.py plush_half --iters 600 --kinds photographs placed
     python benchmarks/nophoto.py plush_half --few 4 --iters 300 --max-sv 5 --kinds photographs complemented
     python benchmarks/nophoto.py --table                  # the rows as a Markdown table
 
-The kinds: ``photographs`` (real cameras, real pictures), ``teacher`` (real cameras, the checkpoint's own pictures:
-what is lost with the photographs alone), ``placed`` (placed cameras, its own pictures: what is lost with the
-cameras too) and ``complemented`` (few photographs, and placed cameras beside them, as clod-adapt does it). The judges
-are always the real held-out photographs. Each run adds one row to ``results/nophoto.jsonl``, with how far the placed
-cameras stand from the real ones, which the method never sees.
+The kinds of views: ``photographs`` (real cameras and photographs), ``teacher`` (real cameras, renders of the
+checkpoint), ``placed`` (placed cameras, renders of the checkpoint) and ``complemented`` (few photographs and pseudo
+views, as clod-adapt combines them). Each run adds one row to ``results/nophoto.jsonl``, with the distances between
+placed and real cameras.
 """
 
 from __future__ import annotations

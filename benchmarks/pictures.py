@@ -3,8 +3,8 @@
     clod-adapt demo                  # makes demo/base.ply, demo/gallery.ply and demo/capture
     python benchmarks/pictures.py    # docs/images/viewer.webp and docs/images/report.webp
 
-The viewer: a held-out view with the wipe between the dial's end and the checkpoint; without the time of a frame, which
-is that of WebGL in software here. The report: the top of the page that ``clod-adapt eval --report`` writes.
+The viewer shows a held-out view with the wipe between the dial's end and the checkpoint, without its frame time, which
+would be that of WebGL in software. The report is the top of the page that ``clod-adapt eval --report`` writes.
 """
 
 from __future__ import annotations

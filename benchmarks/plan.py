@@ -1,12 +1,12 @@
-"""What the plan saves and costs: the same command with everything in, with the plan, and with --trim.
+"""Savings and cost of the plan: the command with everything included, with the plan, and with --trim.
 
-    python benchmarks/plan.py                               # every scene of the shared data: one row a run
+    python benchmarks/plan.py                               # every scene of the shared data, one row per run
     python benchmarks/plan.py ci_banana --iters 300 --label short
-    python benchmarks/plan.py plush_half ci_banana --attributes  # what each attribute buys, and what the plan said
+    python benchmarks/plan.py plush_half ci_banana --attributes  # the gain of each attribute, and the plan's decision
     python benchmarks/plan.py --table                       # the last rows as Markdown, for docs/plan.md
 
-A scene is a folder of the shared data, with a checkpoint's name where it is not ``pretrained``, or a file without
-photographs. Each run is a process of its own, so that its peak of memory is. Rows go to ``results/plan.jsonl``.
+A scene is a folder of the shared data, followed by the name of the checkpoint where it is not ``pretrained``, or a file
+without photographs. Each run is a process of its own. Rows go to ``results/plan.jsonl``.
 """
 
 from __future__ import annotations

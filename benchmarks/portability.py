@@ -102,7 +102,7 @@ def run(name: str, tests: Sequence[str], parallel: Sequence[str] = PARALLEL) -> 
         report = Path(outer) / "report.xml"
         words = [*condition.prefix, str(python), "-m", "pytest", *parallel, f"--junitxml={report}", *tests]
         environment = {key: value.format(work=work) for key, value in condition.environment.items()}
-        environment["CLOD_SHARED_DATA"] = str(SHARED)  # which is not beside a clone
+        environment["CLOD_SHARED_DATA"] = str(SHARED)  # the default is relative to the checkout
         began = time.perf_counter()
         done = subprocess.run(
             words, cwd=root, env=os.environ | environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -116,7 +116,7 @@ def run(name: str, tests: Sequence[str], parallel: Sequence[str] = PARALLEL) -> 
 
 
 def clone(work: Path) -> tuple[Path, Path]:
-    """The last commit in a folder of its own, and the Python of an environment that has it beside what this one has."""
+    """A clone of the last commit, and the Python of an environment with it and this environment's packages."""
     root = work / ROOT.name
     subprocess.run(["git", "clone", "--quiet", str(ROOT), str(root)], check=True)
     subprocess.run([sys.executable, "-m", "venv", str(root / ".venv")], check=True)

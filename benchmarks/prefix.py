@@ -1,15 +1,14 @@
-"""What a renderer that draws the first n rows of a file shows, by the order of the rows.
+"""PSNR of the first n rows of a file, by the order of its rows.
 
     python benchmarks/prefix.py plush_clod.ply plush_half --base pretrained
     python benchmarks/prefix.py --table                    # the rows as a Markdown table
 
-The model is an adapted file of the capture. At each dial value the counts are the mean over the held-out views, and
-what is drawn of that many Gaussians is measured on them. First the dial itself, and a file of that count baked for the
-training cameras; then prefixes of files whose rows are in an order, drawn as such a renderer draws them, with the
-opacities that stand in the file:
+The model is an adapted file of the capture. The count at a dial value is the dial's mean over the held-out views. At
+each count: ``dial``; ``baked``, a file baked for the training cameras; and prefixes of ordered files, drawn with the
+opacities in the file:
 
-- ``extinction``: by falling s* for the training cameras, what ``clod-adapt export --order extinction --images`` writes;
-- ``extinction, s = 1 baked``: the same with ``--sv 1``, so faded a little, and shorter;
+- ``extinction``: by falling s* for the training cameras, as ``clod-adapt export --order extinction --images`` writes;
+- ``extinction, s = 1 baked``: the same with ``--sv 1``, slightly faded and shorter;
 - ``own``, ``opacity``, ``removal error``: the adapted file as it is, by falling opacity, by falling removal error;
 - ``base, ...``: the untouched checkpoint in the adapted one's order of extinction, by opacity, by removal error.
 

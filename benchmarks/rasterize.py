@@ -1,16 +1,15 @@
-"""Times the CPU rasterizer beside its peers, and compares it with a float64 reference.
+"""Times of the CPU rasterizer and of two others, and its agreement with a float64 reference.
 
     python benchmarks/rasterize.py                     # times on W1 and W2, of fewer Gaussians too
     python benchmarks/rasterize.py --json --skip-gsplat
     python benchmarks/rasterize.py --accuracy          # image and gradients against float64 instead
     python benchmarks/rasterize.py --extreme           # times of scenes that are unlike any capture instead
 
-The peers are the yardstick (a hand-written C++ kernel in the shared folder, built with g++) and gsplat (see
-``peer_gsplat.py``); the fields of what is absent are null. Each runs in a process of its own with 2 threads,
-all in turn step by step, so that the machine's drift hits all alike. Times are medians in milliseconds:
-``forward_ms`` and ``both_ms`` of one step with all gradients, ``render_ms`` of a frame without gradients.
-Memory is what the steps add to a warm process at most, gradients included. ``--json`` prints a list with an
-object a row and nothing else to stdout; ``--record`` adds the rows to ``results/rasterize.jsonl``.
+The others are the yardstick (a hand-written C++ kernel in the shared folder, built with g++) and gsplat (see
+``peer_gsplat.py``); fields of an absent one are null. Each runs in its own process with 2 threads, all in turn step by
+step, so that drift of the machine affects all alike. Times are medians in milliseconds: ``forward_ms`` and ``both_ms``
+of one step with all gradients, ``render_ms`` of a frame without gradients. Memory is the peak of the steps beyond a
+warm process, gradients included. ``--json`` prints a list of the rows and nothing else to stdout.
 """
 
 from __future__ import annotations

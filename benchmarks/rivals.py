@@ -1,17 +1,15 @@
-"""What else could be done with a checkpoint and its photographs, at the counts the dial is judged at.
+"""Other methods on the same checkpoint and photographs, at fixed shares of the base's Gaussians.
 
     python benchmarks/rivals.py plush_half bonsai146 --only merging ranking
     python benchmarks/rivals.py plush_half bonsai146 --iters 1500 --seed 0 1 2
     python benchmarks/rivals.py plush_half --only specialist --shares 0.12 --seconds 100
     python benchmarks/rivals.py --table                    # the rows as a Markdown table
 
-The rivals, each on the same base and photographs, at shares of the base's Gaussians:
-
-- ``merging``: ``splat-transform --decimate``, training-free; a file a count;
-- ``specialist``: the merged file, then tuned for that count alone; a file a count;
-- ``tuned``: the untouched base tuned as long, all of it;
+- ``merging``: ``splat-transform --decimate``, without training, one file per count;
+- ``specialist``: the merged file, tuned for that count alone, one file per count;
+- ``tuned``: the whole base, tuned for as many steps;
 - ``prefix``: one file whose prefixes are the counts, tuned with random prefixes (tuning.tune);
-- ``ranking``: the same without any tuning, ordered by opacity, by contribution and by removal error.
+- ``ranking``: prefixes without tuning, ordered by opacity, by contribution and by removal error.
 
 A scene is named as for adapt.py. Each run adds a row to ``results/rivals.jsonl``.
 """

@@ -1,11 +1,11 @@
-"""The dial's equation against mpmath at 50 digits, and the formula as it stands in the paper beside it.
+"""The dial's equation and the paper's formula against mpmath at 50 digits.
 
-Inputs are rounded to their dtype first, and the reference (exact.py) is of exactly these numbers; tau, s, epsilon and
-the temperature are Python's floats. Random points of the reference are compared with mpmath alone: ``reference`` rows.
+Inputs are rounded to their dtype; the reference (exact.py) is of exactly these numbers. tau, s, epsilon and the
+temperature are Python's floats. ``reference`` rows compare random points of the reference with mpmath alone.
 
-Errors are in units of the eps of the result's dtype: float32's for half-precision inputs, as there all is computed in
-float32, but the half's own for their gradients, which are rounded to it. What lies below the smallest normal number may
-be off by that number. The paper's formula is computed in the inputs' dtype, and fails where it is NaN, infinite, 0 in
+Errors are in units of the eps of the result's dtype: float32's for half-precision inputs, which are computed in
+float32, but the half's own for their gradients, which are rounded to it. Results below the smallest normal number may
+be off by that number. The paper's formula is computed in the inputs' dtype. It fails where it is NaN, infinite, 0 in
 place of a normal number, or off by more than 1,000 of that dtype's eps.
 """
 
@@ -81,7 +81,7 @@ def check_opacities(tallies: Tallies, case: Case) -> None:
 def check_drawn(tallies: Tallies, case: Case, place: str) -> None:
     """What either cut draws, and the soft one's gradient by sigma_d.
 
-    By ``x = log(a'' / tau s)``, a difference of logarithms: nothing is asked of who is kept within their rounding.
+    By ``x = log(a'' / tau s)``, a difference of logarithms. Points within rounding of the threshold are not compared.
     """
     dtype, s, tau = tallies.dtype, case.s, case.tau
     level = wide([exact.log_threshold(tau, s)])[0]
@@ -198,7 +198,7 @@ def check_counts(tallies: Tallies) -> None:
 
 
 def check_reference(tallies: Tallies) -> None:
-    """The way references are put together, beside mpmath alone."""
+    """The combined reference against mpmath alone."""
     random, (logits, sigmas, distances) = np.random.default_rng(4), exact.axes_of("float64")
     axes = logits[:-2], sigmas, distances, exact.SCALES, exact.TAUS, exact.EPSILONS
     for _ in range(1500):
@@ -238,7 +238,7 @@ def check(part: str, dtype: str) -> list[dict[str, Any]]:
 
 
 def measure() -> list[dict[str, Any]]:
-    """A row per quantity and dtype, on two processes; leaves with a message where long double is float64."""
+    """A row per quantity and dtype, on two processes; exits with a message where long double is float64."""
     if np.finfo(Wide).eps > 1e-18:
         sys.exit("numpy's long double is no wider than float64 on this machine: run it on x86")
     jobs = [*itertools.product(("opacities", "rest"), DTYPES), ("reference", "float64")]

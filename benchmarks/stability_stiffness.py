@@ -1,11 +1,11 @@
-"""Stiffness: which optimiser, parameter and step size find sigma_d where its values span eight decades.
+"""Stiffness: optimisers, parameters and step sizes on values of sigma_d that span eight decades.
 
-The slope of the equation goes as 1/sigma. Three measurements, all with the package's own equation, count law, schedule
-and mean of the last steps:
+The slope of the equation goes as 1/sigma. All measurements use the package's equation, target-count curve, schedule and
+mean of the last steps:
 
-- ``equation``: Gaussians at distances over eight decades, whose right sigma_d is known and keeps the count law. The
-  picture is the opacity each is drawn with, its loss the mean square of what the right ones are drawn with less that.
-  Starts are wrong by up to four decades each way. Every optimiser gets the same gradient: the picture's and the law's.
+- ``equation``: Gaussians at distances over eight decades with known sigma_d that meets the target count. The loss is
+  the mean square difference of the drawn opacities from the right ones. Starts are off by up to four decades each way.
+  Every optimiser gets the same gradient, of the loss and of the count term.
 - ``stuck`` and ``training``: the same through the training step itself (``stability_stuck.py``).
 """
 

@@ -1,11 +1,11 @@
-"""Where a training step's time goes, on real checkpoints.
+"""Time of a training step by section and kernel, on real checkpoints.
 
     python benchmarks/step.py                  # plush_half and bonsai146
     python benchmarks/step.py plush_half --record --label before
 
-Wall time by section and by kernel, means over the steps after the first few, with the default settings at the
-start of training. ``splat_share`` is what the rasterizer takes of a step, forward and backward. A row says
-which commit of the package was imported, so an older one is measured by putting it first on PYTHONPATH.
+Wall times are means over the steps after the first few, with the default settings at the start of training.
+``splat_share`` is the rasterizer's share of a step, forward and backward. A row names the commit of the imported
+package: to measure another one, put it first on PYTHONPATH.
 """
 
 from __future__ import annotations

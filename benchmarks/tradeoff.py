@@ -2,11 +2,11 @@
 
     python benchmarks/tradeoff.py plush_half                  # all methods at all budgets, an hour or so
     python benchmarks/tradeoff.py plush_half --methods ours paper --iters 150 300 --seeds 0 1 2
-    python benchmarks/tradeoff.py plush_half --plot           # the rows there are: docs/error_vs_time.html, and its PNG
+    python benchmarks/tradeoff.py plush_half --plot           # docs/error_vs_time.html and its PNG of the stored rows
 
-A budget is a number of steps, each a run of its own with its own schedule. A specialist is made for one count, which
-is what ours keeps at that dial value in its longest run (so run ours first): the base merged to it, then tuned as
-many steps; at s = 1 it is the whole base, tuned. Each run adds a row to ``results/tradeoff.jsonl``.
+A budget is a number of steps; each is a run of its own with its own schedule. A specialist is made for one count, which
+ours keeps at that dial value in its longest run (so run ours first): the base merged to it, then tuned for as many
+steps; at s = 1 the whole base, tuned. Each run adds a row to ``results/tradeoff.jsonl``.
 """
 
 from __future__ import annotations

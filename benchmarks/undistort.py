@@ -1,4 +1,4 @@
-"""What a distorted lens costs: loading photographs that are to be undistorted, at first and again from the cache.
+"""Time to load photographs that need undistortion: the first time, and again from the cache.
 
 python benchmarks/undistort.py              # 24 photographs of 4000x3000 in a temporary folder; a minute
 python benchmarks/undistort.py --record     # and a row in results/undistort.jsonl

@@ -1,12 +1,12 @@
-"""The page in a headless Chromium against our own renderer: picture, counts, loading times, sizes.
+"""The page in a headless Chromium against clod_adapter.render: pictures, counts, loading times, sizes.
 
-    python benchmarks/viewer.py                      # plush_half, bonsai146 and 500,000 made-up Gaussians
+    python benchmarks/viewer.py                      # plush_half, bonsai146 and 500,000 random Gaussians
     python benchmarks/viewer.py plush_half --pack    # also the one-file page packed by splat-transform; minutes
 
-Each capture's checkpoint is given a dial first, in 100 steps (kept in ``benchmarks/cache``): pictures are compared, not
-their quality. At some held-out cameras and dial values, and with the equation off: dB between the browser's picture and
-that of ``clod_adapter.render``, and the counts. Times are wall times until the first frame is drawn, with WebGL in
-software, and say nothing of a device with a GPU. Rows are added to ``results/viewer.jsonl``.
+Each capture's checkpoint is first adapted for 100 steps (kept in ``benchmarks/cache``), enough to compare pictures. At
+some held-out cameras and dial values, and with the equation off: PSNR between the browser's picture and
+``clod_adapter.render``, and the counts. Times are wall times to the first frame with WebGL in software; they do not
+predict those of a device with a GPU. Rows are added to ``results/viewer.jsonl``.
 """
 
 from __future__ import annotations
