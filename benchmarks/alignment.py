@@ -20,7 +20,6 @@ import torch
 from common import append, arguments, capture, checkpoint, photographs
 from torch import Tensor
 
-import clod_adapter as clod
 from clod_adapter.alignment.check import DOUBTFUL, check_alignment
 from clod_adapter.alignment.search import guess_frame
 from clod_adapter.cameras import View

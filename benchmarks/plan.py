@@ -2,7 +2,6 @@
 
     python benchmarks/plan.py                               # every scene of the shared data, one row per run
     python benchmarks/plan.py ci_banana --iters 300 --label short
-    python benchmarks/plan.py plush_half ci_banana --attributes  # the gain of each attribute, and the plan's decision
     python benchmarks/plan.py --table                       # the last rows as Markdown, for docs/plan.md
 
 A scene is a folder of the shared data, followed by the name of the checkpoint where it is not ``pretrained``, or a file
@@ -28,8 +27,6 @@ SCENES = (
 )  # fmt: skip
 DIALS = (1.0, 3.0, 5.0)
 WAYS = {"everything": ["--with", *NAMES], "plan": [], "plan, trimmed": ["--trim"]}
-SHORT = 300  # steps of the runs that judge attributes
-ATTRIBUTES = NAMES[2:]
 
 
 def main() -> None:
@@ -37,18 +34,12 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", default=SCENES)
     parser.add_argument("--iters", type=int, default=1500)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--attributes", action="store_true", help=f"one attribute frozen at a time, {SHORT} steps")
     parser.add_argument("--label", default="default", help="what the rows are for")
     args = parser.parse_args()
-    ways, iters = WAYS, args.iters
-    if args.attributes:
-        ways = {"plan": ["--with", "unseen", "bands"]}
-        ways |= {f"without {name}": ["--with", "unseen", "bands", "--without", name] for name in ATTRIBUTES}
-        iters = SHORT
     for scene in args.scenes:
-        for way, options in ways.items():
+        for way, options in WAYS.items():
             for seed in args.seeds:
-                words = ["--iters", str(iters), "--seed", str(seed), *options]
+                words = ["--iters", str(args.iters), "--seed", str(seed), *options]
                 about = {"benchmark": "plan", "scene": scene, "way": way, "label": args.label}
                 append(FILE, about | run(scene, words))
 

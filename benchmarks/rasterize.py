@@ -1,7 +1,7 @@
 """Times of the CPU rasterizer and of two others, and its agreement with a float64 reference.
 
     python benchmarks/rasterize.py                     # times on W1 and W2, of fewer Gaussians too
-    python benchmarks/rasterize.py --json --skip-gsplat
+    python benchmarks/rasterize.py --skip-gsplat
     python benchmarks/rasterize.py --accuracy          # image and gradients against float64 instead
     python benchmarks/rasterize.py --extreme           # times of scenes that are unlike any capture instead
 
@@ -9,12 +9,11 @@ The others are the yardstick (a hand-written C++ kernel in the shared folder, bu
 ``peer_gsplat.py``); fields of an absent one are null. Each runs in its own process with 2 threads, all in turn step by
 step, so that drift of the machine affects all alike. Times are medians in milliseconds: ``forward_ms`` and ``both_ms``
 of one step with all gradients, ``render_ms`` of a frame without gradients. Memory is the peak of the steps beyond a
-warm process, gradients included. ``--json`` prints a list of the rows and nothing else to stdout.
+warm process, gradients included.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import tempfile
@@ -34,8 +33,6 @@ import workloads
 from common import ROOT, append, arguments
 from contenders import SHARES, THREADS, Worker
 
-from clod_adapter.cli.shared.report import jsonable
-
 FILE = "rasterize.jsonl"
 YARDSTICK = Path(os.environ.get("CLOD_YARDSTICK", ROOT.parent / "shared" / "yardstick"))
 WARM = 2  # first repeats that do not count
@@ -46,7 +43,6 @@ Row = dict[str, Any]
 
 def main() -> None:
     parser = arguments(__doc__, record=FILE)
-    parser.add_argument("--json", action="store_true", help="a JSON list on stdout, and nothing else")
     parser.add_argument("--workloads", nargs="+", choices=workloads.SIZES, default=list(workloads.SIZES))
     parser.add_argument("--repeats", type=int, default=15, help="of ours and the yardstick (default: %(default)s)")
     parser.add_argument("--skip-gsplat", action="store_true")
@@ -62,7 +58,7 @@ def main() -> None:
         kind, table, rows = "extreme", extreme_table, extreme()
     else:
         kind, table, rows = "speed", speed_table, speed(args)
-    print(json.dumps(jsonable(rows), indent=1) if args.json else table(rows), flush=True)
+    print(table(rows), flush=True)
     for row in rows if args.record else []:
         append(FILE, {"benchmark": "rasterize", "kind": kind, **row})
 
