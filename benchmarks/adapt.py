@@ -86,7 +86,7 @@ QUESTIONS: dict[str, dict[str, dict[str, object]]] = {
 ABLATIONS = {label: changed for rows in QUESTIONS.values() for label, changed in rows.items()}
 
 
-# What a step can leave out, at three lengths each: held-out error against time.
+# Steps without some attributes, at three lengths each: held-out error against time.
 GEOMETRY = {"lr_means": 0.0, "lr_quats": 0.0, "lr_scales": 0.0}
 LEAVE_OUT: dict[str, dict[str, object]] = {
     f"{label}, {iters} steps": {"iters": iters, **changed}
@@ -99,12 +99,12 @@ def main() -> None:
     parser = arguments(__doc__, table=print_table)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--ablations", action="store_true", help=f"every choice by itself, {ABLATION}")
-    parser.add_argument("--only", nargs="+", metavar="LABEL", choices=ABLATIONS, default=ABLATIONS, help="of these")
-    parser.add_argument("--leave-out", action="store_true", help="what a step can leave out, at three lengths each")
+    parser.add_argument("--only", nargs="+", metavar="LABEL", choices=ABLATIONS, default=ABLATIONS, help="some choices")
+    parser.add_argument("--leave-out", action="store_true", help="steps without some attributes, at three lengths each")
     parser.add_argument("--questions", action="store_true", help="print a table for each question, of the scenes")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a field of AdaptConfig")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--label", default="default", help="what the row is for")
+    parser.add_argument("--label", default="default", help="name of the row")
     args = parser.parse_args()
     if args.questions:
         for scene in args.scenes:
@@ -134,7 +134,7 @@ def groups() -> dict[tuple[str, str, int], list[dict[str, Any]]]:
 
 
 def cells_of(rows: list[dict[str, Any]]) -> list[str]:
-    """s = 1, the matched shares, and between what the counts lie, relative to s^-1.5, from s = 2 on."""
+    """PSNR at s = 1 and the matched shares; the range of counts relative to s^-1.5 from s = 2 on."""
     first = fmean(row["rows"][0]["psnr"] for row in rows), fmean(row["rows"][0]["kept_share"] for row in rows)
     cells = [f"{first[0]:.2f} @ {first[1]:.0%}"]
     for share in SHARES:
@@ -174,7 +174,7 @@ def print_questions(scene: str) -> None:
 
 
 def make_config(changed: dict[str, Any], seed: int) -> clod.AdaptConfig:
-    """Ours, or the paper's form, with what is changed of it."""
+    """Ours, or the paper's form, with these fields changed."""
     changed = {"seed": seed, **changed}
     return clod.AdaptConfig.paper(**changed) if changed.pop("paper", False) else clod.AdaptConfig(**changed)
 

@@ -35,7 +35,7 @@ Fields = dict[str, Tensor]
 
 
 class Drawn(NamedTuple):
-    """Gaussians on the image, front to back: what alphas and colours come from."""
+    """Projected Gaussians, front to back."""
 
     centres: Tensor
     conics: Tensor
@@ -79,7 +79,7 @@ def compare(name: str) -> dict[str, Any]:
 
 
 def apart(found: Tensor, expected: Tensor) -> float:
-    """The length of the difference, in lengths of what was expected."""
+    """The length of the difference, relative to that of the expected value."""
     return ((found - expected).norm() / expected.norm()).item()
 
 

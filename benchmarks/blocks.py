@@ -141,7 +141,7 @@ def main() -> None:
     other.add_argument("--images", type=int, default=60)
     other.add_argument("--iters", type=int, default=40)
     other.add_argument("--memory", nargs="+", default=["none", "8GB", "3.5GB"], help="limits, none for without one")
-    other.add_argument("--city", help="a folder that benchmarks/city.py made (default: made, and removed)")
+    other.add_argument("--city", help="a folder that benchmarks/city.py made (default: a temporary one)")
     other.set_defaults(run=memory)
     args = parser.parse_args()
     args.run(args)

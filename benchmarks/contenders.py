@@ -62,7 +62,7 @@ def _serve(pipe: Any, make: Callable[..., Jobs], arguments: tuple[Any, ...]) -> 
     torch.set_num_threads(THREADS)
     jobs = make(*arguments)
     with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)  # what is free already must not hide what the steps take
+        ctypes.CDLL(None).malloc_trim(0)  # memory that is free already must not hide that of the steps
     before = _memory("VmRSS")
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak starts anew

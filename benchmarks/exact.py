@@ -32,7 +32,7 @@ TEMPERATURES = [1e-300, 1e-30, 1e-6, 1e-3, 0.02, 0.15, 0.5, 1.0, 10.0, 1e6]
 
 
 class Case(NamedTuple):
-    """Gaussians at one dial value: columns of inputs, and of what mpmath makes of them."""
+    """Gaussians at one dial value: columns of inputs, and of mpmath's results."""
 
     logits: Array
     sigma: Array

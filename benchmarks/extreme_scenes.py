@@ -83,7 +83,7 @@ def all_in_one_place(base: clod.Gaussians, scene: Scene) -> Case:
 
 
 def behind(base: clod.Gaussians, scene: Scene) -> Case:
-    """A third of the training cameras look away from everything; what they photograph is black."""
+    """A third of the training cameras look away from the scene; their photographs are black."""
 
     def away(view: View) -> View:
         back = torch.diag(torch.tensor([-1.0, 1, -1]))

@@ -108,7 +108,7 @@ def place(kind: str, folder: Path) -> Path:
 
 
 def result_of(kind: str, folder: Path, case: Input, number: int, watch: Watch) -> str:
-    """ "read", "refused", or what went wrong."""
+    """ "read", "refused", or a description of the failure."""
     watch.seen.clear()
     watch.on = True
     try:

@@ -69,7 +69,7 @@ def main() -> None:
 def measure(sizes: Sequence[int], only: Sequence[str]) -> None:
     """Runs, and appends the rows."""
     CITIES.mkdir(parents=True, exist_ok=True)
-    run_adapt(scene(FLOOR, IMAGES, WIDTH, HEIGHT))  # compiles what is not yet compiled
+    run_adapt(scene(FLOOR, IMAGES, WIDTH, HEIGHT))  # compiles the kernels
     for count in sorted({FLOOR, *sizes}):
         folder = scene(count, IMAGES, WIDTH, HEIGHT)
         if "adapt" in only or not dial_of(folder).exists():

@@ -39,7 +39,7 @@ MEMORIES = (8, 16, 32, 64)  # GB for a job
 
 
 def on_paper(rows: Sequence[Row]) -> str:
-    """The city in blocks, for jobs of some memory: how many, how long, at what price. Markdown."""
+    """The city in blocks for jobs of a given memory: number of blocks, hours, price. Markdown."""
     each, rest = bytes_a_gaussian(rows, "adapt")
     lines = ["| a job's memory, GB | Gaussians in a block | blocks | hours a block, of them training | core-hours | "
              "hours on 64 cores | dollars | on one assumed GPU: hours | dollars |", "|---" * 9 + "|"]  # fmt: skip

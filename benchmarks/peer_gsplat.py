@@ -1,4 +1,4 @@
-"""gsplat 1.5.3 on a CPU: its own torch code, with plain torch in place of what it has only in CUDA.
+"""gsplat 1.5.3 on a CPU: its own torch code, with plain torch in place of its CUDA-only functions.
 
 Timed by ``rasterize.py``; not part of the library. gsplat's ``rasterization()`` fails without its CUDA
 library. Its ``_rasterization()`` does all that is differentiated in torch, but calls four functions of

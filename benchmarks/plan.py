@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", default=SCENES)
     parser.add_argument("--iters", type=int, default=1500)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--label", default="default", help="what the rows are for")
+    parser.add_argument("--label", default="default", help="name of the rows")
     args = parser.parse_args()
     for scene in args.scenes:
         for way, options in WAYS.items():

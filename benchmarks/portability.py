@@ -138,7 +138,7 @@ def last_line(text: str) -> str:
 
 
 def packages() -> dict[str, str]:
-    """The versions that are installed of what pyproject.toml lists as needed to run."""
+    """Installed versions of the dependencies in pyproject.toml, without extras."""
     needed = [line for line in requires("clod-adapter") or [] if "extra ==" not in line]
     found = {}
     for name in (name for line in needed for name in re.findall(r"^[\w.-]+", line)):

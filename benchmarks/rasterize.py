@@ -118,7 +118,7 @@ def middle(times: list[float], peer: str) -> float | None:
 
 
 def kept_rows(frames: list[list[float]]) -> list[Row]:
-    """Frames of the most opaque Gaussians, and what share of the full frame's time they take."""
+    """Frames of the most opaque Gaussians, and their share of the full frame's time."""
     ways = [(way, share) for way in ("rows removed", "opacity 0") for share in SHARES]
     times = [middle(list(column), "ours") for column in zip(*frames, strict=True)]
     return [

@@ -155,7 +155,7 @@ def fit(
 
 
 def _gradients(task: Problem, x: Tensor, log: bool, other: int) -> Tensor:
-    """``[runs, N]``: of the picture at dial value 1 and another one, and what the count law adds, by ``x``."""
+    """``[runs, N]``: gradient by ``x`` of the loss at dial value 1 and another one, and of the count term."""
     settings, n, total, pull = CONFIG.attenuation(1.0), len(task.start), torch.zeros(()), torch.zeros_like(x)
     leaf = x.requires_grad_()
     sigma = (leaf.exp() if log else leaf).flatten()

@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--iters", nargs="+", type=int, default=list(ITERS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--max-sv", type=float, default=5.0)
-    parser.add_argument("--plot", action="store_true", help="only draw the rows there are")
+    parser.add_argument("--plot", action="store_true", help="only draw the stored rows")
     args = parser.parse_args()
     if args.plot:
         plot(args.scene, args.max_sv)
@@ -66,7 +66,7 @@ def main() -> None:
 
 
 class Contest:
-    """One scene, and what is run on it."""
+    """The runs on one scene."""
 
     def __init__(self, scene: str, max_sv: float) -> None:
         self.scene, self.max_sv, self.console = scene, max_sv, Console()
@@ -151,7 +151,7 @@ def plot(scene: str, max_sv: float) -> None:
 
 
 def write(scene: str, max_sv: float, rows: list[dict[str, Any]], dials: list[float]) -> None:
-    """The page: what was run on what, a chart a dial value, and every number in a table."""
+    """The page: settings, one chart per dial value, and a table of all numbers."""
     base = rows[-1]["base"]
     given = f"{scene}, {base['kept']:,.0f} Gaussians, {base['psnr']:.2f} dB on held-out photographs"
     body = [page.paragraph(text.format(given=given), kind) for text, kind in READING]
