@@ -3,10 +3,10 @@
     python benchmarks/formats.py plush_half
     python benchmarks/formats.py --table                  # the rows as a Markdown table
 
-A checkpoint gets a sigma_d without training (``importance.initialize``), is written in each format that stores one and read
-again. PSNR is between the renders at s and those of the PLY, as means over the held-out views, in floating point; null
-where they are equal. ``.splat`` stores no sigma_d: a model baked at s is written and compared. Each format adds one row
-to ``results/formats.jsonl``.
+A checkpoint gets a sigma_d without training (``importance.initialize``), is written in each format that stores one and
+read again. PSNR is between the renders at s and those of the PLY, as means over the held-out views, in floating point;
+null where they are equal. ``.splat`` stores no sigma_d: a model baked at s is written and compared. Each format adds
+one row to ``results/formats.jsonl``.
 """
 
 from __future__ import annotations
