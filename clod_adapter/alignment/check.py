@@ -136,4 +136,5 @@ def compare(gaussians: Gaussians, view: View) -> Tensor | None:
 
 
 def _decibels(error: float) -> float:
-    return -10 * math.log10(error) if error > 0 else math.inf
+    """PSNR of a mean squared error: infinite for 0, NaN for NaN."""
+    return math.inf if error == 0 else -10 * math.log10(error)

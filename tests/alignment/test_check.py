@@ -14,6 +14,7 @@ from torch import Tensor
 
 import clod_adapter
 import scenes
+from clod_adapter.alignment import check
 from clod_adapter.alignment.check import FLAT, check_alignment
 from clod_adapter.alignment.frames import NERFSTUDIO_TURNS, focus_of, into_file, known_frames
 from clod_adapter.alignment.search import guess_frame
@@ -125,6 +126,12 @@ def test_few_views_and_one_gaussian(pair: tuple[Gaussians, list[View]], count: i
     stray = truth.replace(means=torch.full((1, 3), 50.0))
     lost = check_alignment(stray, seen)
     assert not lost.fits and guess_frame(stray, seen, lost) is None or count == 2
+
+
+def test_a_render_with_nan_does_not_fit(pair: tuple[Gaussians, list[View]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(check, "compare", lambda *_: torch.full((5,), math.nan))
+    found = check_alignment(*pair)
+    assert math.isnan(found.psnr) and math.isnan(found.margin) and not found.fits
 
 
 def test_nothing_to_show_does_not_fit(pair: tuple[Gaussians, list[View]]) -> None:
