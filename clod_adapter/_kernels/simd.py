@@ -1,12 +1,12 @@
 """Sixteen-lane float vectors for Numba, as LLVM vectors.
 
-Numba's loop vectoriser gives up on the splatting loops (aliasing, masks), so the kernels say what
-they mean: ``F32x16`` is LLVM's ``<16 x float>`` and ``Mask16`` its ``<16 x i1>``. LLVM lowers them
-to one AVX-512, two AVX or four SSE/NEON registers, whichever the processor has.
+Numba's loop vectoriser does not vectorise the splatting loops (aliasing, masks), so the kernels use explicit vectors:
+``F32x16`` is LLVM's ``<16 x float>`` and ``Mask16`` its ``<16 x i1>``. LLVM lowers them to one AVX-512, two AVX or four
+SSE/NEON registers, whichever the processor has.
 
 Vectors are made by ``splat`` and ``load`` and combined by ``+ - *``, ``fma``, ``vmin``, comparisons
 ``ge``, ``gt``, ``eq``, and ``select``. Loads and stores take a 1-D contiguous
-float32 array, or a pointer to one, and the index of the first lane; nothing checks the bounds.
+float32 array, or a pointer to one, and the index of the first lane; bounds are not checked.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ def _extremum(predicate: str):  # type: ignore[no-untyped-def]
     return operation
 
 
-# Where one is NaN, the second is the result.
+# If one is NaN, the result is the second.
 vmin, vmax = _extremum("<"), _extremum(">")
 
 
@@ -273,7 +273,7 @@ _TINY = 0x3F3504F3  # bits of sqrt(1/2)
 
 @intrinsic
 def log2(typingctx, x):  # type: ignore[no-untyped-def]
-    """``log2(x)`` of positive normal numbers, to 1e-7 beside its own rounding; 0 at 1."""
+    """``log2(x)`` of positive normal numbers, to 1e-7 plus its own rounding; 0 at 1."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         def whole(value):  # type: ignore[no-untyped-def]
