@@ -107,7 +107,7 @@ class ScreenFilter:
         return next((name for name, known in FILTERS.items() if known == self), None)
 
     @property
-    def says(self) -> str:
+    def description(self) -> str:
         """Description for messages."""
         return f"{self.variance:g} px^2 of blur, opacities {'' if self.compensate else 'not '}compensated for it"
 

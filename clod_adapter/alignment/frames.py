@@ -36,11 +36,11 @@ class Frame:
     """A candidate frame of the file.
 
     Attributes:
-        says: description and remedy, for messages.
+        description: cause and remedy, for messages.
         viewmats: ``[V, 4, 4]`` the cameras in that frame.
     """
 
-    says: str
+    description: str
     viewmats: Tensor
 
 
@@ -109,8 +109,8 @@ def _axes(viewmats: Tensor) -> Iterator[Frame]:
                 continue
             names = ", ".join(("-" if sign < 0 else "") + "xyz"[axis] for sign, axis in zip(signs, order, strict=True))
             mirrored = " (mirrored)" if torch.linalg.det(rotation) < 0 else ""
-            says = f"the cameras' x, y, z are the file's {names}{mirrored}: export it without that turn"
-            yield Frame(says, into_file(viewmats, rotation, 1.0, viewmats.new_zeros(3)))
+            description = f"the cameras' x, y, z are the file's {names}{mirrored}: export it without that turn"
+            yield Frame(description, into_file(viewmats, rotation, 1.0, viewmats.new_zeros(3)))
 
 
 def _nerfstudio(viewmats: Tensor) -> Iterator[Frame]:

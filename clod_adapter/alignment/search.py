@@ -35,11 +35,11 @@ class Guess:
     """A frame in which the checkpoint fits.
 
     Attributes:
-        says: description and remedy, for messages.
+        description: cause and remedy, for messages.
         psnr: dB, pooled, of the renders in that frame.
     """
 
-    says: str
+    description: str
     psnr: float
 
 
@@ -64,7 +64,7 @@ def guess_frame(
     def measured(frame: Frame) -> Guess | None:
         psnr = check_alignment(gaussians, _moved(views, frame.viewmats)).psnr
         enough = max(found.mean_colour_psnr + BETTER_THAN_MEAN, found.psnr + CLEAR)
-        return Guess(frame.says, psnr) if psnr >= enough else None
+        return Guess(frame.description, psnr) if psnr >= enough else None
 
     known = measured(max(known_frames(viewmats, points), key=lambda frame: small.score(frame.viewmats)))
     if known:
@@ -113,7 +113,7 @@ def _search(small: _Stage, fine: _Stage, viewmats: Tensor) -> Frame | None:
     if score < LOWEST_CORRELATION:
         return None
     _, place = _climb(fine, viewmats, place, focus, unit, (0.01, 0.001))
-    return Frame(place.says(unit), place.seen_from(viewmats))
+    return Frame(place.description(unit), place.seen_from(viewmats))
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class _Place:
         factors = (1 + step, 1 / (1 + step))
         return moves + [_Place(self.scale * by, focus - by * (focus - self.offset)) for by in factors]
 
-    def says(self, unit: float) -> str:
+    def description(self, unit: float) -> str:
         parts = []
         if abs(math.log(self.scale)) > 0.02:
             larger = self.scale > 1

@@ -133,15 +133,17 @@ def _tiles(series: Sequence[Series]) -> list[tuple[str, str, str]]:
     found = []
     for one in series:
         if _is_base(one):
-            found.append(("base, unadapted", f"{one.rows[0]['psnr']:.2f} dB", _beside(one.rows[0])))
+            found.append(("base, unadapted", f"{one.rows[0]['psnr']:.2f} dB", _count_and_time(one.rows[0])))
     if series and series[0].dial:
         rows = sorted(series[0].rows, key=lambda row: row["virtual_scale"])
         picked = dict.fromkeys((0, len(rows) // 2, len(rows) - 1))
-        found += [(f"s = {rows[k]['virtual_scale']:g}", f"{rows[k]['psnr']:.2f} dB", _beside(rows[k])) for k in picked]
+        found += [
+            (f"s = {rows[k]['virtual_scale']:g}", f"{rows[k]['psnr']:.2f} dB", _count_and_time(rows[k])) for k in picked
+        ]
     return found
 
 
-def _beside(row: Mapping[str, Any]) -> str:
+def _count_and_time(row: Mapping[str, Any]) -> str:
     return f"{row['kept']:,.0f} Gaussians, {row['frame_ms']:.1f} ms"
 
 
