@@ -5,9 +5,10 @@ from __future__ import annotations
 from numba import float32, int64
 
 from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.elementary import vsqrt
 from clod_adapter._kernels.pointers import pointer, scratch
 from clod_adapter._kernels.rows import load_rows, store_rows
-from clod_adapter._kernels.simd import f32x16, load, vsqrt
+from clod_adapter._kernels.simd import f32x16, load
 
 ONE = float32(1)
 

@@ -43,9 +43,10 @@ from clod_adapter._kernels.conventions import (
     T_MIN,
     TILE,
 )
+from clod_adapter._kernels.elementary import exp2
 from clod_adapter._kernels.pointers import fetch_add, pointer, prefetch, scratch
 from clod_adapter._kernels.rows import store_sums
-from clod_adapter._kernels.simd import anywhere, both, but_not, exp2, fma, ge, gt, load, select, splat, store, vmin
+from clod_adapter._kernels.simd import anywhere, both, but_not, fma, ge, gt, load, select, splat, store, vmin
 
 
 @part

@@ -8,7 +8,8 @@ from numba import float32, uint64
 from clod_adapter._kernels.bits import set_spans
 from clod_adapter._kernels.compiling import part
 from clod_adapter._kernels.conventions import DET, HALF, MX, MY, QA, QB, QC, REACH, RX, SLACK, TILE, X0, X1, Y0, Y1
-from clod_adapter._kernels.simd import both, eq, ge, load, select, splat, vceil, vfloor, vmax, vmin, vsqrt
+from clod_adapter._kernels.elementary import vceil, vfloor, vsqrt
+from clod_adapter._kernels.simd import both, eq, ge, load, select, splat, vmax, vmin
 
 BLOCK = 4
 ACROSS = TILE // BLOCK

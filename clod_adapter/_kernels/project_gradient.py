@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from numba import float32, int64
 
+from clod_adapter._kernels.colors import load_sh, view_direction
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.conventions import (
     BLUR,
@@ -33,7 +34,7 @@ from clod_adapter._kernels.conventions import (
     ZERO,
 )
 from clod_adapter._kernels.pointers import pointer, scratch
-from clod_adapter._kernels.project import covariance, load_sh, view_direction
+from clod_adapter._kernels.project import covariance
 from clod_adapter._kernels.rows import load_rows, store_rows
 from clod_adapter._kernels.sh import C0, sh_basis, sh_basis_gradient
 from clod_adapter._kernels.simd import eq, f32x16, gt, load, select, splat, store, vmax, vmin
