@@ -16,12 +16,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 GSPLAT = (
-    "it is in the frame that gsplat's trainer normalises the world to: train it with --no-normalize-world-space, or "
-    "apply the inverse of its parser's transform to it"
+    "the checkpoint is in the normalized frame of gsplat's trainer: train with --no-normalize-world-space, or apply "
+    "the inverse of the parser's transform"
 )
 NERFSTUDIO = (
-    "it is in the frame that nerfstudio normalises the world to: put a copy of the dataparser_transforms.json that "
-    "ns-train wrote beside its config.yml into the scene's folder"
+    "the checkpoint is in the normalized frame of nerfstudio: copy dataparser_transforms.json, which ns-train writes "
+    "to the folder of config.yml, into the scene's folder"
 )
 # Rotations of COLMAP's world in nerfstudio's readers before normalization: none, the current one, the older one.
 NERFSTUDIO_TURNS = (
@@ -109,7 +109,9 @@ def _axes(viewmats: Tensor) -> Iterator[Frame]:
                 continue
             names = ", ".join(("-" if sign < 0 else "") + "xyz"[axis] for sign, axis in zip(signs, order, strict=True))
             mirrored = " (mirrored)" if torch.linalg.det(rotation) < 0 else ""
-            description = f"the cameras' x, y, z are the file's {names}{mirrored}: export it without that turn"
+            description = (
+                f"the cameras' x, y, z are the file's {names}{mirrored}: export the checkpoint without that rotation"
+            )
             yield Frame(description, into_file(viewmats, rotation, 1.0, viewmats.new_zeros(3)))
 
 

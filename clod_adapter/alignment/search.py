@@ -140,7 +140,7 @@ class _Place:
             parts.append(f"{self.scale if larger else 1 / self.scale:.3g} times {'larger' if larger else 'smaller'}")
         if float(self.offset.norm()) > 0.02 * unit:
             parts.append("moved by (" + ", ".join(f"{value:.3g}" for value in self.offset.tolist()) + ")")
-        return f"the file would have to be {' and '.join(parts) or 'moved a little'}: export it in the cameras' frame"
+        return f"the file should be {' and '.join(parts) or 'moved slightly'}: export it in the cameras' frame"
 
 
 def _climb(

@@ -197,11 +197,8 @@ def test_a_turn_is_told_from_all_others(pair: tuple[Gaussians, list[View]]) -> N
     for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)):
         rotation = torch.diag(EYE.new_tensor(signs)) @ EYE[list(order)]
         moved = torch.stack([v.camera.viewmat.double() for v in in_world(views, 1.0, rotation, NONE)])
-        near = [
-            f
-            for f in known_frames(moved)
-            if "cameras' x" in f.description and (f.viewmats - viewmats).abs().max() < 1e-4
-        ]
+        turned = [frame.viewmats for frame in known_frames(moved) if "cameras' x" in frame.description]
+        near = [found for found in turned if (found - viewmats).abs().max() < 1e-4]
         assert len(near) == (0 if rotation.equal(EYE) else 1)
 
 
