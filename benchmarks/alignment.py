@@ -55,7 +55,7 @@ def row(gaussians: Gaussians, views: list[View], points: Tensor) -> dict[str, ob
     guess = guess_frame(gaussians, views, found, points) if suspect else None
     numbers = {key: round(value, 3) for key, value in found.as_dict().items()}
     return {
-        "stops": not found.fits or guess is not None, **numbers, "guess": guess and guess.says,
+        "stops": not found.fits or guess is not None, **numbers, "guess": guess and guess.description,
         "guess_psnr": guess and round(guess.psnr, 2), "check_cpu_s": round(checked - began, 2),
         "guess_cpu_s": round(time.process_time() - checked, 2) if suspect else None,
     }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Compiled CPU kernels. Everything in here is imported on first use, never by ``import clod_adapter``."""
+"""Compiled CPU kernels, imported on first use, not by ``import clod_adapter``."""
 
 # gsplat's conventions, for all rasterizers: alpha below which nothing is drawn, largest alpha, and the transmittance at
 # which a pixel ends.
