@@ -12,18 +12,17 @@ import pytest
 
 import clod_adapter
 from clod_adapter.config import AdaptConfig
-from clod_adapter.io.formats.splat_transform import VARIABLE
 from fences import LANGUAGES, PAGES, ROOT, SHELL, STEPS, blocks, parse, run, skipped, spoken
 
 IDS = [str(page.relative_to(ROOT)) for page in PAGES]
 
 
+@pytest.mark.usefixtures("without_splat_transform")
 @pytest.mark.parametrize("page", PAGES, ids=IDS)
 def test_blocks_run_in_the_order_of_the_page(page: Path, desk: Path, tmp_path: Path, monkeypatch: Any) -> None:
-    """Trainings are short, and splat-transform is hidden: other tests run it."""
+    """Trainings are short."""
     shutil.copytree(desk, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv(VARIABLE, "absent")
     monkeypatch.setattr(clod_adapter, "AdaptConfig", short)
     names: dict[str, Any] = {"__name__": "__main__"}
     for block in blocks(page):

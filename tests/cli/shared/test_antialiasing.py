@@ -115,6 +115,7 @@ def test_robustness_finds_out_for_each(clod: Any, capture: Any, trained: tuple[P
     assert max(row["psnr"] for row in json.loads(other.out)["cells"][0]["rows"]) < 35
 
 
+@pytest.mark.usefixtures("without_splat_transform")
 @pytest.mark.parametrize("out", ["a.ply", "a.spz", "a.html", "a.splat"])
 def test_exports_carry_it_or_say_that_they_do_not(clod: Any, trained: tuple[Path, Path], out: str) -> None:
     done = clod("export", trained[0], "-o", out, "--antialiasing", "on", "--json")
