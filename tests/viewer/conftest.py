@@ -83,9 +83,9 @@ def files(tmp_path: Path) -> Files:
 
 @pytest.fixture(scope="session")
 def gaussians() -> Gaussians:
-    """800 Gaussians of SH degree 1 with a dial."""
-    plain = scenes.gaussians(800, 1, 5)
-    sigma_d = torch.linspace(0.05, 6, 800)
+    """400 Gaussians of SH degree 1 with a dial."""
+    plain = scenes.gaussians(400, 1, 5)
+    sigma_d = torch.linspace(0.05, 6, 400)
     return plain.replace(sigma_d=sigma_d, attenuation=AttenuationConfig(tau=0.02, cut="soft", scene_distance=3.0))
 
 

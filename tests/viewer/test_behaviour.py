@@ -28,10 +28,10 @@ def test_a_file_without_sigma_d_says_why_there_is_no_dial(show: Any, files: Any,
     assert shown.page.is_disabled("#dial") and shown.page.is_disabled("#target") and shown.page.is_disabled("#equation")
     said = shown.text("#no-dial")
     assert "plain.ply has no sigma_d" in said and "clod-adapt plain.ply" in said
-    assert shown.counts() == {"total": 800, "kept": 800, "drawn": shown.counts()["drawn"]}
+    assert shown.counts() == {"total": 400, "kept": 400, "drawn": shown.counts()["drawn"]}
     assert shown.picture().max() > 50
     shown.page.keyboard.press("]")
-    assert shown.counts()["kept"] == 800
+    assert shown.counts()["kept"] == 400
 
 
 def test_a_model_that_cannot_be_fetched_is_an_error(tab: Any, files: Any, gaussians: Gaussians) -> None:
@@ -78,13 +78,13 @@ def test_one_file_holds_more_than_one_text_node_may(
     tab: Any, files: Any, gaussians: Gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The data goes on in further elements."""
-    monkeypatch.setattr(page, "LETTERS", 40_000)
+    monkeypatch.setattr(page, "LETTERS", 20_000)
     monkeypatch.setattr(payload, "ROWS", 100)
     write_page(tmp_path / "page.html", clod_adapter.load(files.save(gaussians)))
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert text.count('id="clod-model"') > 2
     shown = Shown(tab).ready((tmp_path / "page.html").as_uri())
-    assert shown.counts()["total"] == 800 and shown.errors == []
+    assert shown.counts()["total"] == 400 and shown.errors == []
 
 
 def test_one_file_needs_no_network(chromium: Any, show: Any, files: Any, gaussians: Gaussians, tmp_path: Path) -> None:

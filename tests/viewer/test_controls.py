@@ -30,17 +30,17 @@ def test_keys_move_the_dial(show: Any, files: Any, gaussians: Gaussians) -> None
     shown.page.keyboard.press("Home")
     assert shown.counts()["kept"] == full
     shown.page.keyboard.press("e")
-    assert shown.counts()["kept"] == 800 and not shown.page.is_checked("#equation")
+    assert shown.counts()["kept"] == 400 and not shown.page.is_checked("#equation")
 
 
 def test_a_count_is_kept_to(show: Any, files: Any, gaussians: Gaussians) -> None:
     shown, camera = show(files.save(gaussians), viewport={"width": 640, "height": 600}), scenes.camera(320, 240)
     shown.camera(camera)
-    wanted = clod_adapter.dial_for(gaussians, keep=300, cameras=[camera]).virtual_scale
-    shown.page.fill("#target", "300")
+    wanted = clod_adapter.dial_for(gaussians, keep=150, cameras=[camera]).virtual_scale
+    shown.page.fill("#target", "150")
     shown.page.keyboard.press("Enter")
     shown.until("document.getElementById('dial-value').textContent !== 's = 1.00'")
-    assert shown.counts()["kept"] == 300
+    assert shown.counts()["kept"] == 150
     assert shown.text("#dial-value") == f"s = {wanted:.2f}"
 
 

@@ -97,13 +97,13 @@ def test_the_box_takes_counts_alone_and_the_same_again(show: Any, files: Any, ga
         assert "A number of Gaussians" in target(shown, text) and shown.text("#dial-value") == "s = 1.00"
     assert "keeps" in target(shown, "1,000,000")
     shown.run("clod.setEquation(false)")
-    assert "keeps 300 in this view" in target(shown, "300")
-    assert shown.counts()["kept"] == 300 and shown.page.is_checked("#equation")
+    assert "keeps 150 in this view" in target(shown, "150")
+    assert shown.counts()["kept"] == 150 and shown.page.is_checked("#equation")
     shown.run("clod.setDial(1)")
     shown.page.evaluate("document.getElementById('target-note').textContent = ''")
     shown.page.keyboard.press("Enter")
     shown.until("document.getElementById('target-note').textContent !== ''")
-    assert shown.counts()["kept"] == 300
+    assert shown.counts()["kept"] == 150
 
 
 def test_a_link_without_its_comparison_shows_none(show: Any, files: Any, plain: Gaussians) -> None:

@@ -101,6 +101,7 @@ def test_what_a_run_is_resumed_by_depends_on_the_filter(trained: tuple[Path, Pat
     assert len({_fingerprint(some.replace(screen_filter=each)) for each in FILTERS.values()}) == len(FILTERS)
 
 
+@pytest.mark.usefixtures("blank_figure")
 def test_robustness_finds_out_for_each(clod: Any, capture: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
     ply, scene = trained
     words = ("robustness", ply, "--images", scene, "--max-sv", 1, "--iters", 2, "-o", tmp_path / "rob", "--json")
