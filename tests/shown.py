@@ -24,6 +24,7 @@ from clod_adapter.viewer.payload import page_config
 from clod_adapter.viewer.server import Server
 
 SIZE = {"width": 400, "height": 320}
+TALL = {"width": 640, "height": 600}  # the whole panel is shown
 WITHIN = 45.0  # dB between the page and our renderer
 COUNTS = 1e-3  # of the count
 SECONDS = 10  # until waiting ends
@@ -101,6 +102,20 @@ def drop(shown: Shown, name: str, data: bytes) -> None:
         document.body.dispatchEvent(new DragEvent("drop", { dataTransfer: all, bubbles: true, cancelable: true }));
     }"""
     shown.page.evaluate(script, [name, base64.b64encode(data).decode()])
+
+
+def fold(shown: Shown, open: bool) -> None:
+    """Shows the whole panel, in a tab that has room for it, or its upper part."""
+    shown.page.set_viewport_size(TALL if open else SIZE)
+    expanded = json.dumps(str(open).lower())
+    script = f"fold => fold.getAttribute('aria-expanded') === {expanded} || fold.click()"
+    shown.page.eval_on_selector("#fold", script)
+
+
+def take(shown: Shown, path: Path) -> None:
+    """Shows another file in the tab, by the page's own function, and waits until it is drawn."""
+    script = "clod.load(Uint8Array.from(atob(given[1]), (letter) => letter.charCodeAt(0)).buffer, given[0])"
+    shown.run(script, [path.name, base64.b64encode(path.read_bytes()).decode()])
 
 
 @contextmanager

@@ -16,7 +16,7 @@ import clod_adapter
 import scenes
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
-from shown import SIZE, Shown, serve
+from shown import SIZE, Shown, fold, serve, take
 
 
 @pytest.fixture
@@ -93,3 +93,31 @@ def gaussians() -> Gaussians:
 def plain(gaussians: Gaussians) -> Gaussians:
     """The same without a dial."""
     return gaussians.replace(sigma_d=None, attenuation=None)
+
+
+@pytest.fixture(scope="session")
+def model(gaussians: Gaussians, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of ``gaussians``."""
+    path = tmp_path_factory.mktemp("viewer") / "model.ply"
+    clod_adapter.save(path, gaussians)
+    return path
+
+
+@pytest.fixture(scope="session")
+def tab_of_model(tabs: Any, model: Path) -> Iterator[Shown]:
+    """A tab with that file, for ``shown``."""
+    with serve(model) as url:
+        shown = Shown(tabs.new_page())
+        shown.page.set_viewport_size(SIZE)
+        yield shown.ready(url)
+        shown.page.close()
+
+
+@pytest.fixture
+def shown(tab_of_model: Shown, model: Path) -> Iterator[Shown]:
+    """One tab for all tests that need no server of their own: reset to ``model``, as opening one takes a second."""
+    fold(tab_of_model, False)
+    tab_of_model.page.evaluate("document.activeElement.blur(), document.getElementById('target').value = ''")
+    take(tab_of_model, model)
+    yield tab_of_model
+    assert tab_of_model.errors == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +31,9 @@ def test_a_file_without_sigma_d_says_why_there_is_no_dial(show: Any, files: Any,
     assert shown.picture().max() > 50
     shown.page.keyboard.press("]")
     assert shown.counts()["kept"] == 400
+    shown.page.evaluate("location.hash = '#wipe=0.5&other=3&dial=3'")  # a link to a comparison that is not there
+    shown.until("document.getElementById('compare').value === 'off'")
+    assert shown.page.is_hidden("#wipe")
 
 
 def test_a_model_that_cannot_be_fetched_is_an_error(tab: Any, files: Any, gaussians: Gaussians) -> None:
@@ -102,16 +104,13 @@ def test_one_file_needs_no_network(chromium: Any, show: Any, files: Any, gaussia
         assert [url for url in alone.asked if not url.startswith(("file:", "blob:", "data:"))] == []
 
 
-@pytest.mark.parametrize(("scheme", "width"), [("light", 360), ("dark", 1280)])
-def test_the_page_fits(
-    show: Any, files: Any, gaussians: Gaussians, plain: Gaussians, artefacts: Path, scheme: str, width: int
-) -> None:
-    shown = show(
-        files.save(gaussians), "--base", files.save(plain, "base.ply"), viewport={"width": width, "height": 640}
-    )
-    shown.page.emulate_media(color_scheme=scheme)
+def test_the_page_fits(show: Any, model: Path, files: Any, plain: Gaussians, artefacts: Path) -> None:
+    shown = show(model, "--base", files.save(plain, "base.ply"))
     shown.run("clod.setWipe(0.5, 'base')")
-    shown.page.screenshot(path=artefacts / f"page_{scheme}_{width}.png")
-    assert shown.page.evaluate("document.documentElement.scrollWidth") <= width
-    box = json.loads(shown.page.evaluate("JSON.stringify(document.getElementById('panel').getBoundingClientRect())"))
-    assert box["left"] >= 0 and box["right"] <= width and box["top"] >= 0 and box["bottom"] <= 640
+    for scheme, width in (("light", 360), ("dark", 1280)):
+        shown.page.set_viewport_size({"width": width, "height": 640})
+        shown.page.emulate_media(color_scheme=scheme)
+        shown.page.screenshot(path=artefacts / f"page_{scheme}_{width}.png")
+        assert shown.page.evaluate("document.documentElement.scrollWidth") <= width
+        box = shown.page.evaluate("document.getElementById('panel').getBoundingClientRect().toJSON()")
+        assert box["left"] >= 0 and box["right"] <= width and box["top"] >= 0 and box["bottom"] <= 640

@@ -12,10 +12,10 @@ import clod_adapter
 import scenes
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.scene.colmap import write_model
+from shown import TALL, Shown, fold
 
 
-def test_keys_move_the_dial(show: Any, files: Any, gaussians: Gaussians) -> None:
-    shown = show(files.save(gaussians))
+def test_keys_move_the_dial(shown: Shown) -> None:
     assert shown.text("#dial-value") == "s = 1.00"
     full = shown.counts()["kept"]
     for _ in range(10):
@@ -33,8 +33,9 @@ def test_keys_move_the_dial(show: Any, files: Any, gaussians: Gaussians) -> None
     assert shown.counts()["kept"] == 400 and not shown.page.is_checked("#equation")
 
 
-def test_a_count_is_kept_to(show: Any, files: Any, gaussians: Gaussians) -> None:
-    shown, camera = show(files.save(gaussians), viewport={"width": 640, "height": 600}), scenes.camera(320, 240)
+def test_a_count_is_kept_to(shown: Shown, gaussians: Gaussians) -> None:
+    camera = scenes.camera(320, 240)
+    fold(shown, True)
     shown.camera(camera)
     wanted = clod_adapter.dial_for(gaussians, keep=150, cameras=[camera]).virtual_scale
     shown.page.fill("#target", "150")
@@ -44,8 +45,7 @@ def test_a_count_is_kept_to(show: Any, files: Any, gaussians: Gaussians) -> None
     assert shown.text("#dial-value") == f"s = {wanted:.2f}"
 
 
-def test_pointer_and_wheel_move_the_camera(show: Any, files: Any, gaussians: Gaussians) -> None:
-    shown = show(files.save(gaussians))
+def test_pointer_and_wheel_move_the_camera(shown: Shown) -> None:
     pictures = [shown.picture()]
     mouse = shown.page.mouse
     mouse.move(100, 60)
@@ -62,8 +62,8 @@ def test_pointer_and_wheel_move_the_camera(show: Any, files: Any, gaussians: Gau
     assert np.array_equal(pictures[0], pictures[-1])
 
 
-def test_touch_moves_the_camera(chromium: Any, show: Any, files: Any, gaussians: Gaussians) -> None:
-    shown = show(files.save(gaussians), context=chromium.new_context(has_touch=True))
+def test_touch_moves_the_camera(chromium: Any, show: Any, model: Path) -> None:
+    shown = show(model, context=chromium.new_context(has_touch=True))
     protocol = shown.page.context.new_cdp_session(shown.page)
 
     def touch(kind: str, *points: tuple[int, int]) -> None:
@@ -79,31 +79,21 @@ def test_touch_moves_the_camera(chromium: Any, show: Any, files: Any, gaussians:
         assert np.abs(pictures[-1].astype(int) - pictures[-2]).mean() > 1
 
 
-def test_cameras_of_the_scene(show: Any, files: Any, gaussians: Gaussians, tmp_path: Path) -> None:
+def test_cameras_of_the_scene(show: Any, model: Path, tmp_path: Path) -> None:
+    """By keys, and by name in the list, which shows none once the camera is moved."""
     cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))]
     write_model(tmp_path, cameras, [camera.name for camera in cameras])
-    shown = show(files.save(gaussians), "--images", tmp_path)
+    shown = show(model, "--images", tmp_path, viewport=TALL)
     views = []
-    for key in ("", "n", "n", "n", "p"):
+    for key, name in (("", 0), ("n", 1), ("n", 2), ("n", 0), ("p", 2)):
         if key:
             shown.page.keyboard.press(key)
+        assert shown.page.input_value("#camera") == f"{name}.jpg"
         views.append(shown.picture())
     same = [[bool(np.abs(a.astype(int) - b).mean() < 0.5) for b in views] for a in views]
     assert same[0] == [True, False, False, True, False] and same[2] == [False, False, True, False, True]
-
-
-def test_a_link_restores_the_view(show: Any, files: Any, gaussians: Gaussians, plain: Gaussians) -> None:
-    words = [files.save(gaussians), "--base", files.save(plain, "base.ply")]
-    shown = show(*words)
-    for script in ("clod.setDial(2.5)", "clod.setWipe(0.3, 'base')"):
-        shown.run(script)
-    shown.page.mouse.move(100, 60)
-    shown.page.mouse.down()
-    shown.page.mouse.move(160, 90, steps=3)
-    shown.page.mouse.up()
-    shown.page.keyboard.press("l")
-    shown.until("location.hash !== ''")
-    again = show(*words, address=shown.page.evaluate("location.hash"))
-    assert again.text("#dial-value") == "s = 2.50" and again.counts() == shown.counts()
-    assert np.abs(shown.picture().astype(int) - again.picture()).mean() < 0.05  # the link has seven digits
-    assert again.page.input_value("#compare") == "base"
+    shown.page.select_option("#camera", "1.jpg")
+    assert np.array_equal(shown.picture(), views[1])
+    shown.page.mouse.move(500, 60)
+    shown.page.mouse.wheel(0, 200)
+    shown.until("document.getElementById('camera').selectedIndex === -1")

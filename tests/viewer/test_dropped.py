@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from plyfile import PlyData, PlyElement
 
 import clod_adapter
@@ -21,15 +20,7 @@ from shown import Shown, assert_same, drop
 CAMERA = scenes.camera(320, 240)
 
 
-@pytest.fixture
-def shown(show: Any, files: Any, plain: Gaussians) -> Shown:
-    """The page of a file without a dial, seen through CAMERA."""
-    page: Shown = show(files.save(plain, "plain.ply"))
-    page.camera(CAMERA)
-    return page
-
-
-def take(shown: Shown, path: Path, dial: float) -> None:
+def fall(shown: Shown, path: Path, dial: float) -> None:
     """Drops a file and waits until it is drawn."""
     drop(shown, path.name, path.read_bytes())
     shown.until(f"document.title === '{path.name}'")
@@ -40,8 +31,8 @@ def take(shown: Shown, path: Path, dial: float) -> None:
 def test_every_ply_layout_gives_the_same_picture(
     shown: Shown, files: Any, gaussians: Gaussians, artefacts: Path
 ) -> None:
-    path = files.save(gaussians)
-    take(shown, path, 2.0)
+    path = files.save(gaussians, "usual.ply")
+    fall(shown, path, 2.0)
     wanted = shown.picture()
     assert_same(shown, render(gaussians, CAMERA, 2.0), artefacts / "dropped.png")
     vertex = PlyData.read(str(path), mmap=False)["vertex"]
@@ -55,7 +46,7 @@ def test_every_ply_layout_gives_the_same_picture(
         rows = doubles if name == "doubles.ply" else vertex.data
         element = PlyElement.describe(rows, "vertex", comments=vertex.comments)
         PlyData([element], **options).write(str(files.folder / name))
-        take(shown, files.folder / name, 2.0)
+        fall(shown, files.folder / name, 2.0)
         assert shown.page.is_enabled("#dial") and np.array_equal(shown.picture(), wanted), name
 
 
@@ -72,7 +63,7 @@ def test_settings_are_read_without_comments(shown: Shown, files: Any, gaussians:
         rows = PlyData.read(str(files.save(model)), mmap=False)["vertex"].data
         path = files.folder / name
         PlyData([PlyElement.describe(rows, "vertex", comments=comments)], byte_order="<").write(str(path))
-        take(shown, path, 1.5)
+        fall(shown, path, 1.5)
         wanted = render(clod_adapter.load(path).gaussians if comments else model, CAMERA, 1.5)
         assert 0 < int(wanted.kept.sum()) < 400
         assert_same(shown, wanted, artefacts / f"bare_{name}.png")
@@ -93,13 +84,12 @@ def test_the_screen_filter_of_the_file_is_used(
             path.write_bytes(re.sub(gone, b"", path.read_bytes()))
         found = clod_adapter.load(path).gaussians
         assert found.screen_filter == FILTERS[name]
-        take(shown, path, 1.0)
+        fall(shown, path, 1.0)
         assert_same(shown, render(found, CAMERA), artefacts / f"filter_{form}.png")
 
 
-def test_a_broken_file_is_an_error_and_leaves_the_picture(show: Any, files: Any, gaussians: Gaussians) -> None:
-    path = files.save(gaussians)
-    data = path.read_bytes()
+def test_a_broken_file_is_an_error_and_leaves_the_picture(shown: Shown, model: Path) -> None:
+    data = model.read_bytes()
     broken = (
         ("cut.ply", data[:-100], "truncated"),
         ("head.ply", data[:300], "truncated"),
@@ -107,7 +97,6 @@ def test_a_broken_file_is_an_error_and_leaves_the_picture(show: Any, files: Any,
         ("empty.ply", b"", "empty"),
         ("mesh.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "mesh"),
     )
-    shown = show(path)
     before = shown.picture()
     for name, bad, said in broken:
         drop(shown, name, bad)

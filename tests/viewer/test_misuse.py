@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import gzip
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,7 @@ import torch
 
 import scenes
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.scene.colmap import write_model
-from shown import Shown, serve
-
-TALL = {"width": 640, "height": 600}  # the whole panel is shown
+from shown import Shown, fold, serve, take
 
 DROP = """([name, data, wait, fails]) => {
     const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
@@ -43,18 +39,16 @@ def target(shown: Shown, text: str) -> str:
     return shown.text("#target-note")
 
 
-def test_of_files_dropped_at_once_the_last_is_shown(show: Any, files: Any, gaussians: Gaussians) -> None:
-    path, one = files.save(gaussians), files.save(scenes.gaussians(9, 0, 1), "nine.ply")
-    shown = show(path)
-    drop(shown, "slow.ply", path.read_bytes(), wait=200)
+def test_of_files_dropped_at_once_the_last_is_shown(shown: Shown, files: Any, model: Path) -> None:
+    one = files.save(scenes.gaussians(9, 0, 1), "nine.ply")
+    drop(shown, "slow.ply", model.read_bytes(), wait=200)
     drop(shown, "nine.ply", one.read_bytes())
     shown.until("document.title === 'nine.ply'")
     shown.page.wait_for_timeout(400)
     assert shown.text("#title") == "nine.ply" and shown.counts()["total"] == 9
 
 
-def test_what_no_reader_foresaw_is_said_in_words(show: Any, files: Any, gaussians: Gaussians) -> None:
-    shown = show(files.save(gaussians))
+def test_what_no_reader_foresaw_is_said_in_words(shown: Shown) -> None:
     drop(shown, "folder", b"", fails=True)
     shown.until("!document.getElementById('message').hidden")
     assert "folder" in shown.text("#message") and "cannot read it" in shown.text("#message")
@@ -67,9 +61,8 @@ def test_what_no_reader_foresaw_is_said_in_words(show: Any, files: Any, gaussian
         assert "it is damaged, or too large" in shown.text("#message")
 
 
-def test_a_key_is_let_go_whatever_shift_made_of_it(show: Any, files: Any, gaussians: Gaussians) -> None:
+def test_a_key_is_let_go_whatever_shift_made_of_it(shown: Shown) -> None:
     """On many keyboards + is Shift and =, and Shift may be let go first."""
-    shown = show(files.save(gaussians))
     shown.page.evaluate("""() => {
         const press = (kind, key) => new KeyboardEvent(kind, { key, code: "Equal", bubbles: true });
         const canvas = document.getElementById("canvas");
@@ -80,8 +73,8 @@ def test_a_key_is_let_go_whatever_shift_made_of_it(show: Any, files: Any, gaussi
     assert np.array_equal(shown.picture(), before)
 
 
-def test_letters_move_from_the_dial_too_and_are_text_in_a_text(show: Any, files: Any, gaussians: Gaussians) -> None:
-    shown = show(files.save(gaussians), viewport=TALL)
+def test_letters_move_from_the_dial_too_and_are_text_in_a_text(shown: Shown) -> None:
+    fold(shown, True)
     before = shown.picture()
     shown.page.focus("#target")
     shown.page.keyboard.type("wasdech0")
@@ -91,8 +84,8 @@ def test_letters_move_from_the_dial_too_and_are_text_in_a_text(show: Any, files:
     assert not np.array_equal(shown.picture(), before)
 
 
-def test_the_box_takes_counts_alone_and_the_same_again(show: Any, files: Any, gaussians: Gaussians) -> None:
-    shown = show(files.save(gaussians), viewport=TALL)
+def test_the_box_takes_counts_alone_and_the_same_again(shown: Shown) -> None:
+    fold(shown, True)
     for text in ("0", "-5", "1.5", "many"):
         assert "A number of Gaussians" in target(shown, text) and shown.text("#dial-value") == "s = 1.00"
     assert "keeps" in target(shown, "1,000,000")
@@ -106,30 +99,9 @@ def test_the_box_takes_counts_alone_and_the_same_again(show: Any, files: Any, ga
     assert shown.counts()["kept"] == 150
 
 
-def test_a_link_without_its_comparison_shows_none(show: Any, files: Any, plain: Gaussians) -> None:
-    shown = show(files.save(plain), address="#wipe=0.5&other=3&dial=3")
-    assert shown.page.is_hidden("#wipe") and shown.page.input_value("#compare") == "off"
-
-
-def test_cameras_can_be_chosen_by_name(show: Any, files: Any, gaussians: Gaussians, tmp_path: Path) -> None:
-    cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))]
-    write_model(tmp_path, cameras, [camera.name for camera in cameras])
-    shown = show(files.save(gaussians), "--images", tmp_path, viewport=TALL)
-    assert shown.page.input_value("#camera") == "0.jpg"
-    shown.page.keyboard.press("n")
-    assert shown.page.input_value("#camera") == "1.jpg"
-    wanted = shown.picture()
-    shown.page.keyboard.press("p")
-    shown.page.select_option("#camera", "1.jpg")
-    assert np.array_equal(shown.picture(), wanted)
-    shown.page.mouse.move(500, 60)
-    shown.page.mouse.wheel(0, 200)
-    shown.until("document.getElementById('camera').selectedIndex === -1")
-
-
-def test_one_gaussian_is_seen_whole(show: Any, files: Any) -> None:
-    lone = scenes.gaussians(1, 0, 5).replace(opacity_logits=torch.tensor([5.0]))
-    picture = show(files.save(lone)).picture().max(2)
+def test_one_gaussian_is_seen_whole(shown: Shown, files: Any) -> None:
+    take(shown, files.save(scenes.gaussians(1, 0, 5).replace(opacity_logits=torch.tensor([5.0])), "one.ply"))
+    picture = shown.picture().max(2)
     assert picture.max() > 20 and (picture[0].max(), picture[-1].max()) == (0, 0)
 
 

@@ -15,7 +15,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, AttenuationConfig, ScreenFilter
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
-from shown import assert_alike, assert_same, drop
+from shown import Shown, assert_alike, assert_same, take
 
 SOFT = AttenuationConfig(tau=0.02, cut="soft", scene_distance=3.0)
 
@@ -30,9 +30,9 @@ def dialled(degree: int, attenuation: AttenuationConfig = SOFT, n: int = 1500) -
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_at_dial_values_and_without_the_equation(show: Any, files: Any, artefacts: Path, degree: int) -> None:
+def test_at_dial_values_and_without_the_equation(shown: Shown, files: Any, artefacts: Path, degree: int) -> None:
     gaussians, camera = dialled(degree), scenes.camera(320, 240)
-    shown = show(files.save(gaussians))
+    take(shown, files.save(gaussians))
     shown.camera(camera)
     for s in (1.0, 3.0):
         shown.run("clod.setDial(given)", s)
@@ -59,7 +59,7 @@ def test_settings_and_screen_filters(
     classic = classic.replace(log_scales=classic.log_scales - 2.0)
     gaussians, camera = classic.replace(screen_filter=screen_filter), scenes.camera(320, 240)
     name = f"{attenuation.normalizer}_{screen_filter.variance}"
-    shown = show(files.save(gaussians), "--base", files.save(classic, "classic.ply"), "--sv", 2)
+    shown = show(files.save(gaussians), "--sv", 2)
     shown.camera(camera)
     wanted = render(gaussians, camera, 2.0)
     assert 0.05 < wanted.kept.float().mean() < 0.95
@@ -68,10 +68,10 @@ def test_settings_and_screen_filters(
         assert_alike(shown.picture(), render(classic, camera, 2.0).pixels.numpy(), artefacts / "classic.png")
 
 
-def test_through_cameras_of_other_shapes(show: Any, files: Any, artefacts: Path) -> None:
+def test_through_cameras_of_other_shapes(shown: Shown, files: Any, artefacts: Path) -> None:
     """Upright, with the principal point in a corner, and in a unit so small that its near plane is nearer."""
     gaussians = dialled(0)
-    shown = show(files.save(gaussians))
+    take(shown, files.save(gaussians))
     for k, camera in enumerate([scenes.camera(180, 240, fov=100), scenes.camera(320, 240, off_centre=(0.1, 0.9))]):
         shown.camera(camera)
         assert_same(shown, render(gaussians, camera), artefacts / f"shape{k}.png")
@@ -83,8 +83,7 @@ def test_through_cameras_of_other_shapes(show: Any, files: Any, artefacts: Path)
     viewmat = scenes.camera().viewmat.clone()
     viewmat[:3, 3] *= size
     near = Camera(viewmat, scenes.camera(320, 240).K, 320, 240, near=0.01 * size)
-    drop(shown, "small.ply", files.save(small, "small.ply").read_bytes())
-    shown.until("document.title === 'small.ply'")
+    take(shown, files.save(small, "small.ply"))
     shown.camera(near)
     assert_same(shown, render(small, near), artefacts / "small.png")
 
