@@ -10,13 +10,13 @@ from typing import Any
 
 from clod_adapter.blocks.divide import Division, check_divisible, divide
 from clod_adapter.blocks.memory import MemoryPlan
-from clod_adapter.blocks.targets import config_of
+from clod_adapter.blocks.targets import block_config
 from clod_adapter.blocks.train import Learned, adapt_block, merge
 from clod_adapter.cameras import View
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.robustness import scene_fingerprint
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import seeing
+from clod_adapter.initialization.importance import usable_views
 from clod_adapter.io.scene.image_cache import ImageCache
 from clod_adapter.progress import Phase, Stopped
 from clod_adapter.rasterizers.cpu import release_memory
@@ -154,7 +154,7 @@ class Blocks:
             Stopped: Ctrl-C.
         """
         console, base, path = self.setup.console, inputs.base.gaussians, self.files.start
-        views, exists = seeing(base, inputs.scene.train), path.exists()
+        views, exists = usable_views(base, inputs.scene.train), path.exists()
         if not exists:
             with self._display(Phase.TRAINING) as display:
                 made = divide(base, views, inputs.config, self.plan.blocks, display)
@@ -185,7 +185,7 @@ class Blocks:
         if files.block(job.block, job.number).exists():
             return BlockResult(files.load_learned(division, job.block, job.number))
         name = job.name(division)
-        own = config_of(division, job.block, inputs.config, first=job.number == 1)
+        own = block_config(division, job.block, inputs.config, first=job.number == 1)
         path = files.state(job.block, job.number)
         resumed = find_state(path, path.exists(), own, console)
         of = f"{files.run_of['checkpoint']}, {files.run_of['start']}, {name}"

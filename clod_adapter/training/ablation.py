@@ -11,9 +11,9 @@ from torch import Tensor
 from clod_adapter.cameras import View
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, removal_error, spread
-from clod_adapter.metrics import psnr
+from clod_adapter.losses import psnr
 from clod_adapter.progress import Listener, Phase, tell
-from clod_adapter.rasterizers.reference import ALPHA_MAX
+from clod_adapter.rasterizers import ALPHA_MAX
 from clod_adapter.render import render
 
 
@@ -46,12 +46,12 @@ def seen(base: Gaussians, views: Sequence[View], error: Tensor, seed: int, progr
     has no derivative: Gaussians that opaque count as seen. Views that ``error`` was computed from are not used again.
 
     Args:
-        error: ``[N]`` the ``removal_error`` of ``spread(views, MOST_VIEWS)``, as ``importance.start`` takes it.
+        error: ``[N]`` the ``removal_error`` of ``spread(views, MOST_VIEWS)``, as ``importance.initialize`` takes it.
         seed: of the signs.
         progress: called in ``Phase.IMPORTANCE`` after each of the other views.
     """
-    chosen = {id(view) for view in spread(views, MOST_VIEWS)}
-    others = [view for view in views if id(view) not in chosen]
+    rendered = set(spread(range(len(views)), MOST_VIEWS))
+    others = [view for k, view in enumerate(views) if k not in rendered]
     moves = (error > 0) | (removal_error(base, others, seed=seed, progress=progress) > 0)
     return moves | (base.opacities > ALPHA_MAX)
 

@@ -12,7 +12,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.finite import LossNotFinite, largest_colour, require_finite
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import for_training, seeing, start
+from clod_adapter.initialization.importance import for_training, initialize, usable_views
 from clod_adapter.progress import Listener, Phase, Progress
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost
 from clod_adapter.training.interrupts import DeferredInterrupt
@@ -78,7 +78,7 @@ def adapt(
     began = time.perf_counter()
     # Empty higher SH degrees that are not tuned stay empty, so they are not rendered.
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
-    views = seeing(base, scene.train)
+    views = usable_views(base, scene.train)
     begun = _initialized(lean, views, config, progress, group) if resume is None else _initialized_from(lean, resume)
     trainer = Trainer(begun, views, config, subset, group)
     trainer.empty_sh = None if lean is base else base.shN.clone()
@@ -107,7 +107,7 @@ def _initialized(
     group: ProcessGroup | None,
 ) -> Gaussians:  # fmt: skip
     """The Gaussians with the initial sigma_d, the same bits in all processes."""
-    begun = for_training(start(lean, views, config, progress), views, config)
+    begun = for_training(initialize(lean, views, config, progress), views, config)
     if group:
         own = {"sigma_d": begun.sigma_d, "attenuation": begun.attenuation}
         begun = begun.replace(**group.broadcast(own)).to(begun.means.device)

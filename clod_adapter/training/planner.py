@@ -14,7 +14,7 @@ from torch import Tensor
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, removal_error, seeing, spread, start
+from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, initialize, removal_error, spread, usable_views
 from clod_adapter.progress import Listener, Phase, Progress, Stopped, tell, within
 from clod_adapter.training.ablation import effect, seen, sh_degree_losses
 from clod_adapter.training.loop import adapt
@@ -61,7 +61,7 @@ class _Planner:
         self.base, self.scene, self.config, self.override, self.progress = base, scene, config, override, progress
         if not scene.train or not len(base):
             adapt(base, scene, config)  # raises the ClodError
-        self.views = seeing(base, scene.train)
+        self.views = usable_views(base, scene.train)
         self.decisions: list[Decision] = []
         self.seconds: dict[str, float] = {}
 
@@ -71,7 +71,7 @@ class _Planner:
         few = self.base.without_bands(degree)
         kept, error = self._unseen(few)
         with self._time("start"):
-            begun = start(few, self.views, self.config, self.progress, error=error)
+            begun = initialize(few, self.views, self.config, self.progress, error=error)
         plan = Plan((), begun, kept, degree, self.config)
         with self._time("probe"):
             plan = self._attributes(plan, resumed)

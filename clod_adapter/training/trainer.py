@@ -97,7 +97,7 @@ class Trainer:
         before = self.sampler.state()
         samples = [self.sampler.draw() for _ in range(self.config.batch)]
         try:
-            found = self.objective.pull(self.parameters, self.group.share(samples) if self.group else samples)
+            found = self.objective.gradient_sum(self.parameters, self.group.share(samples) if self.group else samples)
             found = self.group.sum(found) if self.group else found
             if not math.isfinite(found.loss):
                 names = ", ".join(view.camera.name or "a view without a name" for view, _ in samples)
