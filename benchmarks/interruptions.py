@@ -19,9 +19,6 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 import torch
 from common import append, arguments, checkpoint, photographs
 
-from clod_adapter.cli.adapt.resume import Saver
-from clod_adapter.cli.shared.console import Console
-from clod_adapter.cli.shared.interrupts import GracefulStop
 from clod_adapter.training.state_file import load_state
 
 FILE = "resume.jsonl"
@@ -42,11 +39,10 @@ def main() -> None:
 
 def measure(scene: str, config: clod.AdaptConfig, path: Path) -> None:
     base, views = checkpoint(scene), photographs(scene)
-    saver = Saver(path, False, config, Console(), GracefulStop())
     began = time.perf_counter()
     saver.belong(base.gaussians, views, scene, scene)
     digest_seconds = time.perf_counter() - began
-    adapted = clod.adapt(base.gaussians, views, config, saver.watching(lambda progress: None))
+    adapted = clod.adapt(base.gaussians, views, config, saver.saving(lambda progress: None))
     saver.keep()
     began = time.perf_counter()
     load_state(path)

@@ -19,12 +19,12 @@ from clod_adapter.render import dial
 
 @torch.no_grad()
 def mean_kept(gaussians: Gaussians, cameras: Sequence[Camera], virtual_scale: float) -> float:
-    """Gaussians that the dial leaves in, mean over the cameras; nothing is rendered."""
+    """Gaussians kept at a dial value, mean over the cameras; without rendering."""
     return fmean(int(dial(gaussians, camera, virtual_scale).keep.sum()) for camera in cameras)
 
 
 def matching_dial(gaussians: Gaussians, cameras: Sequence[Camera], count: float) -> float:
-    """The dial value that keeps ``count`` on average: 1 without a dial or where that keeps no more, max_sv at most."""
+    """The dial value that keeps ``count`` on average, clamped to [1, max_sv]; 1 without a dial."""
     if gaussians.attenuation is None:
         return 1.0
     try:
@@ -34,10 +34,10 @@ def matching_dial(gaussians: Gaussians, cameras: Sequence[Camera], count: float)
 
 
 def rankings(base: Gaussians, views: Sequence[View], progress: Listener | None = None) -> dict[str, Tensor]:
-    """``[N]`` indices of the Gaussians of an unadapted base, the ones to keep longest first, by two rules.
+    """``[N]`` indices of the Gaussians of an unadapted base, most important first, by two rankings.
 
-    ``opacity``: the stored one. ``removal error``: the error that removing it alone would cause in up to 64 of the
-    training views, evenly spread (``importance.removal_error``). ``base.select(order[:n])`` is the base at n Gaussians.
+    ``opacity``: as stored. ``removal error``: the image error of removing the Gaussian alone, in up to 64 evenly
+    spread training views (``importance.removal_error``). ``base.select(order[:n])`` is the base pruned to n Gaussians.
 
     Args:
         progress: called in ``Phase.IMPORTANCE`` after each view.
@@ -47,5 +47,5 @@ def rankings(base: Gaussians, views: Sequence[View], progress: Listener | None =
 
 
 def by_opacity(gaussians: Gaussians) -> Tensor:
-    """``[N]`` indices, the most opaque first; equals in their order."""
+    """``[N]`` indices, the most opaque first; stable."""
     return gaussians.opacity_logits.argsort(descending=True, stable=True)

@@ -50,6 +50,7 @@ class Trainer:
         tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
         self.objective = Objective(config, start.attenuation, tuple(tuned), subset, start.screen_filter)
         self.decay, self.stepped = self.objective.decay, self.objective.stepped
+        self.decay_range = self.objective.decay_range
         self.rates = rates | {self.decay: config.lr_sigma * math.sqrt(config.batch)}
         own = {"dtype": torch.float32, "memory_format": torch.contiguous_format}
         self.parameters = {
@@ -82,7 +83,7 @@ class Trainer:
         everywhere = {self.decay} | ({"opacity_logits"} if self.config.count_term == "paper" else set())
         for rows, names in ((found.kept & finite, set(self.stepped) - everywhere), (finite, everywhere)):
             self.optimizer.step({name: found.gradients[name] for name in self.stepped if name in names}, rows, rates)
-        self.parameters[self.decay].clamp_(*self.objective.decay_range)
+        self.parameters[self.decay].clamp_(*self.decay_range)
         if share_done >= 1 - self.config.average:  # the optimizer continues from the parameters, not from the mean
             self.averaged += 1
             add_to_mean(self.mean, self._trained(), self.averaged)
