@@ -40,7 +40,10 @@ def main() -> None:
 def measure(scene: str, config: clod.AdaptConfig, path: Path) -> None:
     base, views = checkpoint(scene), photographs(scene)
     began = time.perf_counter()
-    saver.belong(base.gaussians, views, scene, scene)
+    names = argparse.Namespace(ply=scene, images=scene)
+    saver = Saver(
+        path, identify(None, base.gaussians, views, config, names, Console()), None, Console(), GracefulStop()
+    )
     digest_seconds = time.perf_counter() - began
     adapted = clod.adapt(base.gaussians, views, config, saver.saving(lambda progress: None))
     saver.keep()

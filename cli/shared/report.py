@@ -127,8 +127,8 @@ def popping_table(results: Sequence[tuple[str, Popping]]) -> str:
     """A table of popping measurements, with an explanation."""
     width = max(len(moved) for moved, _ in results)
     lines = [
-        "popping: change of the image per step, in levels of 255 (RMS over the image, largest change of a pixel). Halving",
-        "the step halves the largest change of a fade (0.5), but not that of a jump (1.0):",
+        "popping: change of the image per step, in levels of 255 (RMS over the image, largest change of a pixel).",
+        "Halving the step halves the largest change of a fade (0.5), but not that of a jump (1.0):",
         f"{'what moves':>{width}}  steps     mean  largest     at  / mean  halved   pixel  halved",
     ]
     for moved, p in results:
