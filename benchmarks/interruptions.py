@@ -9,6 +9,7 @@ states are flushed to the disk of ``--folder``. ``load_seconds`` is the time to 
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -19,6 +20,9 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 import torch
 from common import append, arguments, checkpoint, photographs
 
+from clod_adapter.cli.adapt.resume import Saver, identify
+from clod_adapter.cli.shared.console import Console
+from clod_adapter.cli.shared.interrupts import GracefulStop
 from clod_adapter.training.state_file import load_state
 
 FILE = "resume.jsonl"
