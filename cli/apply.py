@@ -1,4 +1,4 @@
-"""``clod-adapt apply``: an adapter and its base make the extended file again."""
+"""``clod-adapt apply``: rebuilds the adapted file from the checkpoint and an adapter."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         raise ClodError(f"{args.base}: {error}") from error
     rows = trimmed(base, adapter.kept, adapter.sh_degree)
     save(args.out, adapted, rows, version=adapter.version, calibration=adapter.calibration)
-    print(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with their dial")
+    print(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with sigma_d")
     return {
         "command": "apply", "version": package_version(), "base": args.base, "adapter": args.adapter,
         "base_count": adapter.base_count, "changed": sorted(adapter.updates), "notes": base.notes,

@@ -161,12 +161,12 @@ def test_interrupted_rendering_leaves_what_is_finished(
 
 
 def test_names_that_would_collide_keep_their_suffix(capture: Any) -> None:
-    from clod_adapter.cli.render import files
+    from clod_adapter.cli.render import image_names
 
     view = clod_adapter.load_scene(capture.scene).test[0]
 
     def of(*names: str) -> list[str]:
-        return [str(p) for p in files([replace(view, camera=replace(view.camera, name=name)) for name in names])]
+        return [str(p) for p in image_names([replace(view, camera=replace(view.camera, name=name)) for name in names])]
 
     assert of("a.jpg", "b/a.jpg", "c\\a.JPG") == ["a.png", "b/a.png", "c/a.png"]
     assert of("a.jpg", "a.png") == ["a.jpg.png", "a.png.png"]
