@@ -31,8 +31,8 @@ def adapt_options(parser: ArgumentParser) -> None:
     )  # fmt: skip
     given.add_argument(
         "--images", metavar="DIR",
-        help="scene folder: photographs in DIR/images with a COLMAP model in DIR/sparse/0, or DIR/transforms.json of "
-        "nerfstudio or instant-ngp (default: none, see below)",
+        help="scene folder: images/ with a COLMAP model in sparse/0, or a transforms.json of nerfstudio or instant-ngp "
+        "(default: none, see below)",
     )  # fmt: skip
     add_activated(given)
     add_antialiasing(given)
@@ -111,60 +111,50 @@ rendering: s = 1 is full quality; at s about s^-1.5 of the Gaussians are drawn.
 outputs (existing files are replaced):
   OUT.ply          the splat with sigma_d, and a calibration in its header: dial
                    value, count, PSNR, SSIM and frame time
-  OUT.safetensors  the adapter: the changed values; "clod-adapt apply" rebuilds
-                   OUT.ply from it and PLY
+  OUT.safetensors  the adapter: "clod-adapt apply" rebuilds OUT.ply from it
   OUT.json         the report: settings, machine, times, and quality on held-out
                    photographs (every 8th by name) per dial value
   OUT.html, OUT_rendering.png, OUT_adapting.png
-                   with --report, a self-contained page and its charts; needs
+                   with --report: a self-contained page and its charts; needs
                    pip install 'clod-adapter[plots]'
-Each file appears only when it is complete. The same seed gives the same
-Gaussians, bit for bit.
+The same seed gives the same Gaussians, bit for bit.
 
 without --images:
-  The command places cameras around the scene and renders the target images from
-  the checkpoint itself; all quality numbers are relative to the checkpoint.
-  Photographs give a better result.
+  Cameras are placed, and the checkpoint itself renders the target images: all
+  quality numbers are relative to it. Photographs give a better result.
 
 plan:
-  Before training the command prints a plan: action, measured effect, and the
-  option that overrides it. It excludes higher SH degrees (bands) if training
-  views change by less than 0.02 dB without them, and Gaussians (unseen) that
-  change no pixel of a training view. It freezes an attribute that can improve
-  the views by less than 0.02 dB, if there are at least 300 steps. Excluded
-  values are written to OUT.ply unchanged, or with --trim not at all.
+  Printed before training: action, measured effect, option that overrides it.
+  Higher SH degrees (bands) are excluded if training views change by less than
+  0.02 dB without them, Gaussians (unseen) if they change no pixel of a training
+  view. An attribute is frozen if tuning it gains less than 0.02 dB (from 300
+  steps). Excluded values are in OUT.ply unchanged, or with --trim not at all.
 
 alignment:
-  Renders of eight views are compared with the photographs first. If the mean
-  colour of a photograph fits better than the render, or another frame (axes,
-  scale, offset, normalised frame) or background does, the command stops and
-  says which. --misaligned-ok turns this into a warning.
+  Renders of eight views are compared with the photographs. If the photographs'
+  mean colours, another frame (axes, scale, offset, normalised) or a white
+  background fit better, the command stops and says which.
 
 interruption:
   Ctrl-C or SIGTERM while training finishes the step and writes the result so
-  far (exit code 0, "interrupted": true in the report); a second one aborts.
-  While measuring it skips the rest; while writing it waits for the end. A
-  background job of a script ignores Ctrl-C; use SIGTERM.
-  Training saves its state in OUT.resume.safetensors, for at most 2 % of the
-  time, or in the temporary folder where the output cannot be written. After
-  Ctrl-C, a crash or a full disk, the same command with --resume continues there
-  and gives the same Gaussians, bit for bit (on as many threads). A finished run
-  removes the state.
+  far (exit code 0, "interrupted": true); a second one aborts. While measuring
+  it skips the rest; while writing it has no effect.
+  Training saves its state in OUT.resume.safetensors (at most 2 % of the time),
+  or in the temporary folder if that fails. After Ctrl-C, a crash or a full disk
+  the same command with --resume continues and gives the same Gaussians, bit for
+  bit (on as many threads).
 
-large scenes and several processes:
-  --memory 8GB plans the memory of every phase and splits a scene that does not
-  fit in blocks, trained in two passes. Blocks can be separate jobs: --block
-  start, then --block N for each block, once per pass, in any order. The same
-  command without --block does what is missing and writes the outputs; repeat it
-  if it was killed.
-  torchrun starts processes that train together, each on a part of the views of
-  a step. The result is that of one process with the same --batch, up to
-  rounding.
+large scenes, several processes:
+  --memory 8GB plans the memory of every phase and trains a scene that does not
+  fit in blocks, in two passes. Blocks can be separate jobs: --block start, then
+  --block N for each block, once per pass, in any order. The same command
+  without --block does the rest and writes the outputs.
+  Processes of torchrun train together, each on a part of a step's views; the
+  result is that of one process with the same --batch, up to rounding.
 
-exit codes: 0 written; 1 a loss that is not finite ended training early (the
-result until then is written), or a fault of this program (a traceback); 2 bad
-input or a full disk, one line on stderr, no output; 130 interrupted before
-there was a result, or aborted
+exit codes: 0 written; 1 loss not finite (the result until then is written), or
+a fault of this program; 2 bad input or a full disk; 130 interrupted without a
+result
 
 examples:
   clod-adapt garden.ply --images garden --max-sv 5

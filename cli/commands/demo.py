@@ -18,9 +18,9 @@ DEMO = Command(
     description="""\
 Run all steps on a scene that comes with the package.
 
-Ray-traces a small gallery, trains a plain checkpoint on it, adapts that,
-measures it on held-out views and draws two pictures. Takes a few minutes on two
-cores without a GPU; later runs reuse the gallery and the checkpoint.
+Ray-traces a gallery, trains a checkpoint on it, adapts and measures that, and
+draws two pictures. Takes a few minutes on two CPU cores; later runs reuse the
+gallery and the checkpoint.
 """,
     usage="[--out DIR] [options]",
     epilog="""\

@@ -28,8 +28,8 @@ metric measured, a file was packed. Only the browser is not opened.
   cores, memory, cache
                  limits of this process, and folders for cached files
 
-The command installs and downloads nothing and does not compile gsplat. It
-leaves only the compiled CPU kernels, on the first run.
+Nothing is installed or downloaded, and gsplat is not compiled; the first run
+leaves the compiled CPU kernels.
 
 exit codes: 0 cpu or gpu works; 1 neither does
 

@@ -37,7 +37,7 @@ def evaluate_options(parser: ArgumentParser) -> None:
     )
     add_device(measuring, "render")
     output = parser.add_argument_group("output")
-    output.add_argument("--report", metavar="OUT.html", help="also write a page, and its charts next to it")
+    output.add_argument("--report", metavar="OUT.html", help="also write a self-contained page, and its charts")
 
 
 def check_evaluate(args: Namespace) -> None:
@@ -67,40 +67,32 @@ EVALUATE = Command(
 {BUDGETS}
 columns, over the held-out photographs (every 8th by name):
   PSNR, SSIM  means against the photographs
-  kept        Gaussians kept at this dial value, and their share of all
-  in view     Gaussians kept whose centre is in the image
+  kept        Gaussians kept, and their share of all
+  in view     of these, the ones with their centre in the image
   frame ms    median time to render an image
-  LPIPS, FLIP LPIPS with AlexNet and mean FLIP, if installed by
-              pip install 'clod-adapter[eval]' (LPIPS also needs the network's
-              weights, which are not downloaded here)
-A file without a dial gives the same at every value.
+  LPIPS, FLIP LPIPS (AlexNet) and mean FLIP, with the packages of
+              pip install 'clod-adapter[eval]' and LPIPS's network weights
 
---base adds two rows per dial value: the base, not tuned, reduced to as many
-Gaussians by opacity, and by removal error (the error in the training views
-without that Gaussian). --against measures a file with a dial at every dial
-value; MODEL.ply keeps as many Gaussians, at most its count at s = 1.
+--base adds two rows per dial value: the base without tuning, reduced to as many
+Gaussians by opacity, and by removal error (the error in the training views when
+one Gaussian is removed). --against measures a file with a dial at every dial
+value, and MODEL.ply at as many Gaussians, or at s = 1.
 
 --popping turns the dial from 1 to the largest S in 200 equal ratios at two
-held-out cameras, and moves through five neighbouring cameras in 200 steps at
-that S, where it counts only the change that the dial causes. It prints the RMS
-change of the image per step (levels of 255), the ratio of largest to mean
-(1 is even, 200 a single jump), and the share of the largest change that is left
-when the step is halved (0.5 for a fade, 1.0 for a jump).
+held-out cameras, and moves through five cameras in 200 steps at that S, where
+only the dial's changes count. Printed are the RMS change per step (of 255), the
+ratio of largest to mean (1 even, 200 a single jump), and the share of the
+largest left when the step is halved (0.5 a fade, 1.0 a jump).
 
---report writes a self-contained page: a held-out view with a dial slider, error
-against frame time, all rows and settings; and OUT_rendering.png.
-
-Ctrl-C skips dial values that are not finished (exit code 0, "interrupted":
-true), or before the first one ends without output (exit code 130).
+Ctrl-C skips unfinished dial values (exit code 0, "interrupted": true; 130 if
+none is finished).
 
 examples:
   clod-adapt eval garden_clod.ply --images garden
-  clod-adapt eval garden.ply --images garden --sv 1
   clod-adapt eval garden_clod.ply --images garden --sv 1 4 --json > eval.json
   clod-adapt eval garden_clod.ply --images garden --base garden.ply --popping
   clod-adapt eval garden_clod.ply --images garden --against merged.ply cut.ply
   clod-adapt eval garden_clod.ply --images garden --keep 500000 200000
-  clod-adapt eval garden_clod.ply --images garden --report garden.html
 """,
     add_arguments=evaluate_options,
     check=check_evaluate,

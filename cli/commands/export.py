@@ -146,53 +146,43 @@ can store it, or with one dial value baked in.
 formats, by the suffix of OUT:
   suffix           dial  values
 {format_table()}
-Without a dial value nothing is baked: the dial is kept, a plain MODEL is
-converted. Columns that Inria's layout does not have are dropped.
+Without a dial value nothing is baked. Columns that Inria's layout does not have
+are dropped.
 
 baking:
-  A baked file contains the Gaussians kept at one dial value, with fixed
-  opacities: this is lossy and cannot be undone, so keep MODEL. The dial depends
-  on the distance to the camera; baking takes each Gaussian's mean distance to
-  the training cameras of --images, else to up to 16 stored in MODEL, else to 16
-  placed automatically (at worst 0.5 dB lower). For training cameras, files
-  measured 0.05 dB below to 0.6 dB above the dial at equal counts, with --max-sv
-  5 (benchmarks/bake.py). With --camera the file is exact at that camera.
+  A baked file has the Gaussians of one dial value, with fixed opacities. This
+  is lossy; keep MODEL. The dial depends on the distance to the camera; baking
+  takes each Gaussian's mean distance to the training cameras of --images, else
+  to those stored in MODEL, else to 16 placed ones (at worst 0.5 dB lower).
+  With --camera the file is exact at that camera.
 
 budgets:
   --keep is exact: OUT has N Gaussians. With --images, --psnr-drop finds the
   smallest file that measures at most DB below MODEL at s = 1 on the held-out
   photographs (splat-transform's rounding is measured afterwards), and --fps
-  times frames of MODEL. Without --images both use the calibration in MODEL; its
-  frame times are those of the machine in the note.
+  times frames of MODEL. Without --images both use the calibration in MODEL.
 
-levels:
+levels and order:
   --levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on, all or none. With
-  --lod-meta OUT is a new or empty folder with lod-meta.json, level 0 the
-  finest, and the chunks that a streaming viewer loads.
-
-order:
-  --order extinction is for renderers that draw the first n rows: for any n they
-  are the rows that --keep n writes, drawn with the stored opacities. On two
-  captures that measured 0.1 to 0.6 dB below the dial at many rows, up to 0.8
-  above it at few (benchmarks/prefix.py), and it pops where the dial fades.
+  --lod-meta OUT is a new folder with lod-meta.json, level 0 the finest, and the
+  chunks that a streaming viewer loads.
+  --order extinction is for renderers that draw the first n rows: for any n
+  these are the rows of --keep n, with the opacities of the file. They pop
+  where the dial fades.
 
 other tools:
-  SIBR reads a baked .ply; it takes the SH degree, up to 3, from sh_degree in
-  cfg_args next to the file. Released versions do not show degree 0.
-  .html is the page of "clod-adapt view" in one file, without network access;
-  --sv or a budget sets its initial dial value.
+  SIBR reads a baked .ply of SH degree 1 to 3, and takes the degree from
+  sh_degree in cfg_args next to the file.
+  .html is the page of "clod-adapt view" in one file; --sv or a budget sets its
+  initial dial value.
   .sog, .compressed.ply and --lod-meta need splat-transform 3.7 with Node 22, on
-  the PATH or in CLOD_SPLAT_TRANSFORM. In a separate folder:
-    npm install node@22 @playcanvas/splat-transform@3.7
-    PATH=$PWD/node_modules/node/bin:$PWD/node_modules/.bin:$PATH
-  Without a GPU it takes minutes for the SH of 100,000 Gaussians in .sog.
+  the PATH or in CLOD_SPLAT_TRANSFORM; "clod-adapt doctor" prints how to install
+  it. Without a GPU, 100,000 Gaussians take minutes for .sog.
 
 examples:
   clod-adapt export garden_clod.ply --sv 2 -o garden_s2.ply
   clod-adapt export garden_clod.ply --keep 200000 -o garden_200k.ply
   clod-adapt export garden_clod.ply --psnr-drop 0.2 --images garden -o small.ply
-  clod-adapt export garden_clod.ply --sv 3 --camera a.jpg --images garden \\
-      -o from_a.ply
   clod-adapt export garden_clod.ply -o garden.glb
   clod-adapt export garden_clod.ply --images garden -o garden.html
   clod-adapt export garden_clod.ply --levels 1,2,4,7 --lod-meta -o garden_lod

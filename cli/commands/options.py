@@ -13,23 +13,21 @@ if TYPE_CHECKING:
 def add_activated(options: _ActionsContainer) -> None:
     options.add_argument(
         "--activated", choices=["none", "opacity", "scales", "both"],
-        help="values that the file stores after activation: opacities after the sigmoid, scales after exp; required "
-        "where a file looks so",
+        help="values that the file stores after activation (sigmoid of opacities, exp of scales)",
     )  # fmt: skip
 
 
 def add_antialiasing(options: _ActionsContainer, photographs: bool = True) -> None:
-    otherwise = "else compares renders with the photographs" if photographs else "else off"
+    otherwise = "by the photographs" if photographs else "off"
     options.add_argument(
         "--antialiasing", choices=["auto", *FILTERS], default="auto",
-        help="the screen-space filter that the checkpoint was trained with: off; on (gsplat's rasterize_mode "
-        "antialiased, Inria's --antialiasing); mip (Mip-Splatting); auto reads it from the file, "
-        f"{otherwise} (default: auto)",
+        help="screen-space filter of the training: off, on (gsplat's rasterize_mode antialiased, Inria's "
+        f"--antialiasing), mip (Mip-Splatting), or auto: as the file says, else {otherwise} (default: auto)",
     )  # fmt: skip
 
 
 def add_device(options: _ActionsContainer, what: str) -> None:
-    usual = "auto is the NVIDIA GPU if gsplat works on it, else the CPU (default: auto)"
+    usual = "auto: the NVIDIA GPU if gsplat works on it, else the CPU (default: auto)"
     options.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto", help=f"where to {what}; {usual}")
 
 

@@ -31,10 +31,10 @@ def make_parser(command: Command, prog: str) -> Parser:
     )  # fmt: skip
     command.add_arguments(parser)
     parser.general = parser.add_argument_group("general")
-    parser.general.add_argument("-h", "--help", action="help", help="show this text and exit")
+    parser.general.add_argument("-h", "--help", action="help", help="show this text")
     if parser.get_default("quiet") is None:
-        parser.general.add_argument("--quiet", action="store_true", help="print no progress and no notes")
+        parser.general.add_argument("--quiet", action="store_true", help="no progress, no notes")
     parser.general.add_argument(
-        "--json", action="store_true", help="print one JSON object on stdout, all else on stderr"
+        "--json", action="store_true", help="one JSON object on stdout"
     )
     return parser

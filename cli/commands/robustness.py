@@ -57,27 +57,25 @@ ROBUSTNESS = Command(
     module="robustness",
     summary="Adapt checkpoints at several ranges, and plot them.",
     description="""\
-Run the robustness experiment of CLoD-GS: adapt any checkpoint at several ranges.
+Run the robustness experiment of CLoD-GS: checkpoints adapted at several ranges.
 
-Adapts each checkpoint (say a plain and a mask-pruned one of the same scene) at
-each --max-sv and measures all at the same dial values on the held-out
-photographs, also beyond the trained range. The baseline of each is the
+Adapts each checkpoint at each --max-sv and measures all at the same dial values
+on the held-out photographs, also beyond the trained range. The baseline is the
 checkpoint itself, pruned to its most opaque Gaussians without tuning.
 """,
     usage="PLY [PLY ...] --images DIR [options]",
     epilog="""\
 outputs in DIR:
-  robustness.png   one row per checkpoint: PSNR and SSIM against Gaussians kept,
-                   histograms of opacity and sigma_d; one line per range
-  robustness.csv   one line per measurement
-  robustness.json  measurements, settings, machine and histograms
-  cells/           per adaptation its adapter and rows; "clod-adapt apply PLY
-                   cells/NAME_sv5.safetensors -o NAME_sv5.ply" makes the model
+  robustness.png   PSNR and SSIM against Gaussians kept, histograms of opacity
+                   and sigma_d; one row per checkpoint, one line per range
+  robustness.csv, robustness.json
+                   the measurements; with settings and histograms
+  cells/           adapter and rows of each adaptation; "clod-adapt apply" makes
+                   a model of PLY and its adapter
 
-The same command resumes: it skips cells on disk that have the same files,
-photographs, settings and version. Ctrl-C drops the current cell and writes the
-finished ones (exit code 0, "interrupted": true; 130 if there are none). Remove
-DIR to start over.
+The same command resumes: it skips finished cells with the same files, settings
+and version. Ctrl-C drops the current cell and writes the finished ones (exit
+code 0, "interrupted": true; 130 if there are none). Remove DIR to start over.
 
 example:
   clod-adapt robustness 3dgs.ply mask.ply --images garden --max-sv 1 3 5 7

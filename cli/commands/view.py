@@ -47,20 +47,16 @@ runs until Ctrl-C.
 """,
     usage="MODEL.ply [--base BASE.ply] [--images DIR] [options]",
     epilog="""\
-The page shows the number of Gaussians kept and the frame time, switches the
-attenuation off and on, and compares two dial values, or MODEL.ply and BASE.ply,
-on the two sides of a line. Drop another file on the page to open it. The
-address holds the view, and can be reopened on the same port.
-
-With --images the page can jump between the scene's cameras; photographs are not
-needed. Without it the first view looks at the middle of the scene.
+The page shows the Gaussians kept and the frame time, switches the attenuation
+on and off, and compares two dial values, or MODEL.ply and BASE.ply, on the two
+sides of a line. Drop another file on the page to open it. The address holds the
+view. With --images the page can jump between the scene's cameras.
 
 Other machines cannot reach the page, and it loads nothing from the network. To
 see it from another machine, forward the port (-t passes Ctrl-C on):
   ssh -t -L 8000:127.0.0.1:8000 HOST \\
       clod-adapt view MODEL.ply --no-browser --port 8000
-To send the page to somebody, write it to a file:
-  clod-adapt export MODEL.ply -o page.html
+"clod-adapt export MODEL.ply -o page.html" writes the page to a file.
 
 --json prints its object at the start: {"url": ..., ...}.
 
@@ -69,7 +65,6 @@ exit codes: 0 ended by Ctrl-C or SIGTERM; 2 bad input, or the port is in use
 examples:
   clod-adapt view garden_clod.ply
   clod-adapt view garden_clod.ply --base garden.ply --images garden --sv 3
-  clod-adapt view garden.ply --no-browser --port 8000
 """,
     add_arguments=view_options,
     check=check_view,

@@ -17,13 +17,10 @@ OPTIONS: tuple[tuple[str, str, type, str], ...] = (
 BUDGETS = """\
 budgets, each solved for a dial value:
   --keep       exact; s = 1 keeps fewer Gaussians than the file has
-  --psnr-drop  from the calibration in the file's header, which clod-adapt
-               measured on held-out photographs, or without photographs against
-               the checkpoint, as a note says
+  --psnr-drop  from the calibration in the file's header
   --fps        times some frames first; depends on machine, image size and load
-If s = 1 meets a count or frame rate, the result is s = 1 with a note. A drop
-beyond the calibration gives its largest dial value. A count or frame rate that
-the largest trained dial value does not reach is an error.
+If s = 1 meets the budget, or the largest trained dial value loses less than DB,
+that is the result. A count or frame rate that is out of reach is an error.
 """
 
 
