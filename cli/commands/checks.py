@@ -22,7 +22,7 @@ def page_files(path: Path, charts: list[str]) -> list[Path]:
     """The files of a page and its charts; refuses a page that cannot be written."""
     check_matplotlib()
     if path.suffix.lower() != ".html":
-        raise ClodError(f"{path}: --report is an HTML page, so its name must end in .html")
+        raise ClodError(f"{path}: --report names the page to write, so it must end in .html")
     return [path, *(chart_file(path, name) for name in charts)]
 
 

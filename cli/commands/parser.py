@@ -34,7 +34,5 @@ def make_parser(command: Command, prog: str) -> Parser:
     parser.general.add_argument("-h", "--help", action="help", help="show this text")
     if parser.get_default("quiet") is None:
         parser.general.add_argument("--quiet", action="store_true", help="no progress, no notes")
-    parser.general.add_argument(
-        "--json", action="store_true", help="one JSON object on stdout"
-    )
+    parser.general.add_argument("--json", action="store_true", help="one JSON object on stdout")
     return parser

@@ -44,7 +44,7 @@ class Outputs:
 
 def check_ply_name(path: Path, option: str) -> None:
     if path.suffix.lower() != ".ply":
-        raise ClodError(f"{path}: {option} is a PLY file, so its name must end in .ply")
+        raise ClodError(f"{path}: {option} names the PLY to write, so it must end in .ply")
 
 
 def make_folder(folder: Path) -> None:

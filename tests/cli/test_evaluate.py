@@ -171,5 +171,5 @@ def test_base_must_be_unadapted(clod: Any, capture: Any, adapted: Path) -> None:
     done = clod("eval", adapted, "--images", capture.scene, "--base", adapted)
     assert (done.code, done.out) == (2, "")
     assert done.err.startswith(f"clod-adapt: error: {adapted}: has a dial (sigma_d); give --base the checkpoint")
-    assert done.err.rstrip().endswith("or give it to --against")
+    assert done.err.rstrip().endswith("or use --against")
     assert len(done.err.splitlines()) == 1

@@ -17,7 +17,7 @@ def test_an_error_of_the_system_is_one_line(clod: Any, capture: Any, monkeypatch
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device", "some/file")
 
-    monkeypatch.setattr("clod_adapter.cli.evaluate.read_scene", full)
+    monkeypatch.setattr("clod_adapter.cli.shared.models.read_scene", full)
     done = clod("eval", capture.ply, "--images", capture.scene)
     assert (done.code, done.out) == (2, ""), done
     assert done.err.splitlines()[-1].startswith("clod-adapt: error: some/file: No space left on device; check")
@@ -70,7 +70,7 @@ def test_ctrl_c_within_compiled_code(clod: Any, capture: Any, monkeypatch: pytes
         def read(*_: object, cause: BaseException | None = cause) -> None:
             raise SystemError("returned a result with an exception set") from cause
 
-        monkeypatch.setattr("clod_adapter.cli.evaluate.read_checkpoint", read)
+        monkeypatch.setattr("clod_adapter.cli.shared.models.read_checkpoint", read)
         done = clod("eval", capture.ply, "--images", capture.scene)
         assert done.code == code and last in done.err.splitlines()[-1], done
 
@@ -81,7 +81,7 @@ def test_an_unknown_error_is_a_traceback_and_where_to_report_it(
     def fail(*_: object) -> None:
         raise ZeroDivisionError("of ours")
 
-    monkeypatch.setattr("clod_adapter.cli.evaluate.read_checkpoint", fail)
+    monkeypatch.setattr("clod_adapter.cli.shared.models.read_checkpoint", fail)
     done = clod("eval", capture.ply, "--images", capture.scene, "--json", "--quiet")
     lines = done.err.splitlines()
     assert done.code == 1 and done.out == "" and lines[0] == "Traceback (most recent call last):", done

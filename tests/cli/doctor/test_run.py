@@ -112,18 +112,16 @@ def test_nothing_draws(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rasterizers, "for_device", lambda device: wrong)
     monkeypatch.setattr(run, "PROBES", {name: run.PROBES[name] for name in ("torch", "cpu", "gpu")})
     done = clod("doctor")
-    assert (
-        done.code == 1
-        and done.out.splitlines()[-1] == "no rendering backend works: fix torch first, then the CPU backend"
-    )
+    last = "no rendering backend works: fix torch first, then the CPU backend"
+    assert done.code == 1 and done.out.splitlines()[-1] == last
 
 
 def test_any_error_is_a_result() -> None:
-    def look() -> str:
+    def probe() -> str:
         print("chatter")
         raise MemoryError("no room\nand more")
 
-    assert Check.run("x", look) == Check("x", False, "failed with MemoryError: no room")
+    assert Check.run("x", probe) == Check("x", False, "failed with MemoryError: no room")
     compiled = SystemError("returned a result with an exception set")  # as Numba hands on a Ctrl-C
     compiled.__cause__ = KeyboardInterrupt()
     for interrupt in (KeyboardInterrupt(), compiled):
