@@ -19,7 +19,7 @@ from .shared.budgets import solve_dials
 from .shared.console import Console
 from .shared.kernels import prepare_kernels
 from .shared.measure import choose_dials, measure
-from .shared.models import read_inputs
+from .shared.models import read_model_and_scene
 from .shared.pages import write_eval_page
 from .shared.report import Stopwatch, machine, table
 
@@ -62,7 +62,7 @@ def prepare_inputs(
     """The model, the files of --base and --against by path, and the scene; all with their screen-space filters."""
     with watch.time("load"):
         paths = [*([args.base] if args.base else []), *args.against]
-        model, others, scene, device = read_inputs(args, console, paths)
+        model, others, scene, device = read_model_and_scene(args, console, paths)
     if not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
     with watch.time("kernels"):

@@ -29,7 +29,7 @@ from .shared.console import Console
 from .shared.files import make_folder
 from .shared.kernels import prepare_kernels
 from .shared.measure import choose_dials
-from .shared.models import read_inputs
+from .shared.models import read_model_and_scene
 from .shared.outputs import check_no_input, check_ours
 from .shared.report import Stopwatch
 from .shared.views import pick_views
@@ -47,7 +47,7 @@ class Written:
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
-    model, _, scene, device = read_inputs(args, console)
+    model, _, scene, device = read_model_and_scene(args, console)
     prepare_kernels(console, device, training=False)
     model = with_filter(model, args, console, [*scene.test, *scene.train])
     views = pick_views(scene, args.views)

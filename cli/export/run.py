@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     notes += [*more, *dropped_columns(model), *filter_notes(args, export.gaussians, dials)]
     for note in notes:
         console.say(note)
-    outputs, losses = write_outputs(args, export, dials)
+    outputs, losses = write_export(args, export, dials)
     if photographs:
         losses += add_psnr(outputs[0], export, photographs, args.psnr_drop[0])
     losses = list(dict.fromkeys(losses))
@@ -125,7 +125,7 @@ def filter_notes(args: argparse.Namespace, gaussians: Gaussians, dials: list[flo
     return [f"trained antialiased ({gaussians.screen_filter.says}): most readers need an option for it: {options}"]
 
 
-def write_outputs(
+def write_export(
     args: argparse.Namespace, export: Export, dials: list[float] | None
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Writes all files of the command; a description of each, and notes."""

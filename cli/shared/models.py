@@ -15,7 +15,7 @@ from .devices import on_device, pick_device
 from .inputs import read_checkpoint, read_scene
 
 
-def read_inputs(
+def read_model_and_scene(
     args: argparse.Namespace, console: Console, others: Sequence[str] = ()
 ) -> tuple[Checkpoint, dict[str, Checkpoint], Scene, torch.device]:
     """The model of ``args``, other files by path, the scene, and the device that the Gaussians are on.
