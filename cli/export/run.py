@@ -122,7 +122,9 @@ def filter_notes(args: argparse.Namespace, gaussians: Gaussians, dials: list[flo
     if not gaussians.screen_filter.compensate or dialled or suffix in STORE_FILTER:
         return []
     options = 'antiAlias in PlayCanvas, rasterize_mode="antialiased" in gsplat'
-    return [f"trained antialiased ({gaussians.screen_filter.says}): most readers need an option for it: {options}"]
+    return [
+        f"trained antialiased ({gaussians.screen_filter.description}): most readers need an option for it: {options}"
+    ]
 
 
 def write_export(

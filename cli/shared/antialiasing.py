@@ -29,7 +29,7 @@ def with_filter(
         given = FILTERS[args.antialiasing]
         if given == gaussians.screen_filter or not checkpoint.filter_known:
             return replace(checkpoint, gaussians=gaussians.replace(screen_filter=given))
-        stored = gaussians.screen_filter.says
+        stored = gaussians.screen_filter.description
         note = f"{checkpoint.path}: rendered {WORDS[args.antialiasing]} (--antialiasing); the file has {stored}"
         return _noted(checkpoint, given, note, console)
     if checkpoint.filter_known or not views:

@@ -1,1 +1,1 @@
-"""Compiled CPU kernels. Everything in here is imported on first use, never by ``import clod_adapter``."""
+"""Compiled CPU kernels, imported on first use, not by ``import clod_adapter``."""

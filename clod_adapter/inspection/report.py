@@ -244,7 +244,7 @@ def _oddities(splat: Splat, doubts: dict[str, tuple[float, float]]) -> list[Oddi
     wide = [name for name, kind in splat.columns if kind == "float64"]
     note("double_precision", len(wide), f"{{count}} properties are double: {_list(wide)}")
     if splat.screen_filter.compensate:
-        found.append(Oddity("antialiased", 0, f"trained antialiased, and drawn so: {splat.screen_filter.says}"))
+        found.append(Oddity("antialiased", 0, f"trained antialiased, and drawn so: {splat.screen_filter.description}"))
     return found
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from clod_adapter.cameras import View
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, removal_error, spread
-from clod_adapter.metrics import psnr
+from clod_adapter.losses import psnr
 from clod_adapter.rasterizers.reference import ALPHA_MAX
 from clod_adapter.render import render
 
