@@ -136,7 +136,7 @@ def test_nerfstudios_export_fits_with_its_transforms_beside_the_photographs(
     splat = capture.write(tmp_path / "splat.ply", exported)
     scene = scene_of(capture, tmp_path, lambda picture: picture)
     done = clod(splat, "--images", scene, *FAST)
-    assert done.code == 2 and "put a copy of the dataparser_transforms.json that ns-train wrote" in done.err, done
+    assert done.code == 2 and "copy dataparser_transforms.json, which ns-train writes" in done.err, done
     (scene / "dataparser_transforms.json").write_text(json.dumps(written))
     done = clod(splat, "--images", scene, *FAST, "--json")
     report = json.loads(done.out)
