@@ -28,9 +28,9 @@ from clod_adapter.attenuation import attenuate
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cli.export.baking import PLACED
 from clod_adapter.cli.shared.budgets import VIEWPOINTS
+from clod_adapter.distances import viewpoint_of
 from clod_adapter.extinction import extinction_scale
 from clod_adapter.initialization.importance import spread
-from clod_adapter.viewpoints import viewpoint_of
 
 FILE = "bake.jsonl"
 DIALS = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)

@@ -24,12 +24,12 @@ from city import write_city
 from common import COMMAND, Process, append, arguments, checkpoint, photographs
 
 from clod_adapter.blocks.divide import Division, divide
-from clod_adapter.blocks.targets import target
+from clod_adapter.blocks.targets import target_image
 from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import seeing
+from clod_adapter.initialization.importance import usable_views
 from clod_adapter.render import render
 from clod_adapter.training.loop import adapt
 
@@ -44,14 +44,14 @@ def db(error: float) -> float:
 @torch.no_grad()
 def borders(division: Division, views: tuple[View, ...]) -> list[torch.Tensor]:
     """For each view ``[H, W]`` bool: no block has SOLE of the pixel. By ``target`` of a white photograph on black."""
-    black = division.begun.replace(sh0=torch.full_like(division.begun.sh0, -10), shN=division.begun.shN[:, :0])
+    black = division.initial.replace(sh0=torch.full_like(division.initial.sh0, -10), shN=division.initial.shN[:, :0])
     found = []
     for view in views:
         white, largest = View(view.camera, torch.full_like(view.image, 255)), torch.zeros(view.image.shape[:2])
         for block in range(division.count):
             rows = division.rows(block)
             ordered = black.select(torch.cat([rows, (division.block != block).nonzero()[:, 0]]))
-            largest = largest.maximum(target(ordered, len(rows), white)[..., 0] / 255)
+            largest = largest.maximum(target_image(ordered, len(rows), white)[..., 0] / 255)
         found.append(largest < SOLE)
     return found
 
@@ -89,7 +89,7 @@ def compare(
 def seams(args: Namespace) -> None:
     for name in args.scenes:
         base, scene = checkpoint(name), photographs(name)
-        config, views = AdaptConfig(iters=args.iters), seeing(base.gaussians, scene.train)
+        config, views = AdaptConfig(iters=args.iters), usable_views(base.gaussians, scene.train)
         began = time.perf_counter()
         whole = adapt(base.gaussians, scene, config).gaussians
         seconds = time.perf_counter() - began

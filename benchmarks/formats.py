@@ -3,10 +3,10 @@
     python benchmarks/formats.py plush_half
     python benchmarks/formats.py --table                  # the rows as a Markdown table
 
-A checkpoint gets a sigma_d without training (``importance.start``), is written in each format that stores one and read
-again. PSNR is between the renders at s and those of the PLY, as means over the held-out views, in floating point; null
-where they are equal. ``.splat`` stores no sigma_d: a model baked at s is written and compared. Each format adds one row
-to ``results/formats.jsonl``.
+A checkpoint gets a sigma_d without training (``importance.initialize``), is written in each format that stores one and
+read again. PSNR is between the renders at s and those of the PLY, as means over the held-out views, in floating point;
+null where they are equal. ``.splat`` stores no sigma_d: a model baked at s is written and compared. Each format adds
+one row to ``results/formats.jsonl``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import torch
 from common import append, arguments, checkpoint, photographs, stored, table
 
 import clod_adapter as clod
-from clod_adapter.initialization.importance import seeing, start
+from clod_adapter.initialization.importance import initialize, usable_views
 from clod_adapter.io.formats.models import load_model
 from clod_adapter.io.writers import WRITERS, write
 
@@ -42,7 +42,7 @@ def main() -> None:
 
 def run(scene: str, config: clod.AdaptConfig) -> None:
     base, views = checkpoint(scene).gaussians, photographs(scene)
-    model = start(base, seeing(base, views.train), config, lambda *_: None)
+    model = initialize(base, usable_views(base, views.train), config, lambda *_: None)
     cameras = [view.camera for view in views.test]
     baked = {s: clod.bake(model, s, cameras=[view.camera for view in views.train]) for s in DIALS}
     for suffix, writer in WRITERS.items():

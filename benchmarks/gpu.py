@@ -33,8 +33,9 @@ from common import ROOT, append, arguments, checkpoint, outcomes, photographs
 from torch import Tensor
 
 import clod_adapter as clod
-from clod_adapter.attenuation import attenuate, attenuate_seen, normalized_distances
+from clod_adapter.attenuation import attenuate
 from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.distances import normalized_distances
 from clod_adapter.metrics import psnr
 from clod_adapter.rasterizers import cuda, wait_for
 from clod_adapter.render import dial, splat
@@ -229,7 +230,7 @@ def compaction(model: clod.Gaussians, s: float) -> Callable[[Camera], Any]:
 def one_pass_differs(model: clod.Gaussians, camera: Camera, s: float) -> dict[str, float]:
     """Compiled formula and plain one: the largest difference of drawn opacities, and Gaussians that only one keeps."""
     assert model.sigma_d is not None and model.attenuation is not None
-    fused = attenuate_seen(model.means, model.opacity_logits, model.sigma_d, camera, s, model.attenuation)
+    fused = attenuate(model.opacity_logits, model.sigma_d, (model.means, camera), s, model.attenuation)
     on_cpu = model.to("cpu")
     assert on_cpu.sigma_d is not None
     d = normalized_distances(on_cpu.means, camera, model.attenuation)

@@ -28,9 +28,9 @@ from common import table
 from torch import Tensor
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import normalized_distances
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CUTS, NORMALIZERS, AdaptConfig, AttenuationConfig
+from clod_adapter.distances import normalized_distances
 from clod_adapter.evaluation.popping import dial_popping, path, path_popping
 from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.gaussians import SH_C0, Gaussians

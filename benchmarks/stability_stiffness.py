@@ -28,7 +28,8 @@ from stability_stuck import CONFIG, DIALS, STUCK_STEPS, TRAINING_STEPS, scene, s
 from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
-from clod_adapter.attenuation import Attenuated, attenuate, normalized_distances
+from clod_adapter.attenuation import Attenuated, attenuate
+from clod_adapter.distances import normalized_distances
 from clod_adapter.report.style import BLUE, GREEN, ORANGE, PURPLE, QUIET
 from clod_adapter.training.objective import SIGMA_RANGE
 from clod_adapter.training.optimizer import RowAdam

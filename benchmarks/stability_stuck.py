@@ -22,9 +22,10 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances
+from clod_adapter.attenuation import SIGMA_MAX, attenuate
 from clod_adapter.cameras import Camera, View
 from clod_adapter.config import AdaptConfig
+from clod_adapter.distances import normalized_distances
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import sigma_from_importance
 from clod_adapter.losses import photometric_loss
@@ -141,7 +142,7 @@ def stuck(run: _Run) -> int:
         seen = seen | (torch.autograd.grad(now.drawn.sum(), x, retain_graph=True)[0] != 0)
         if s == 1:
             out = ~now.keep
-        if run.objective.has_law:
+        if run.objective.has_target_count:
             none, all_ = (
                 count_gradient(now._replace(keep=kept), p["opacity_logits"], s, reading.tau, 1.0, config)
                 for kept in (torch.zeros_like(now.keep), torch.ones_like(now.keep))

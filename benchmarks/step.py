@@ -22,7 +22,7 @@ import torch
 from common import append, arguments, checkpoint, photographs
 
 from clod_adapter._kernels import threads
-from clod_adapter.initialization.importance import for_training, start
+from clod_adapter.initialization.importance import for_training, initialize
 from clod_adapter.rasterizers import cpu
 from clod_adapter.training import loop, objective, optimizer
 
@@ -78,7 +78,7 @@ def profile(scene: str, steps: int, clock: Clock, warm: int = 5) -> dict[str, An
     """Milliseconds a step, in all and by section."""
     base, views = checkpoint(scene).gaussians, photographs(scene).train
     config = clod.AdaptConfig()
-    begun = for_training(start(base, views, config), views, config)
+    begun = for_training(initialize(base, views, config), views, config)
     run = loop._Run(begun, views, config, None)
     for _ in range(warm):
         run.step(0.0)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from numba import float32
 
-# Smallest and largest alpha, and the transmittance at which a pixel ends.
-ALPHA_MIN, ALPHA_MAX, T_MIN = (float32(v) for v in (1 / 255, 0.999, 1e-4))
+import clod_adapter._kernels as limits
+
+ALPHA_MIN, ALPHA_MAX, T_MIN = (float32(v) for v in (limits.ALPHA_MIN, limits.ALPHA_MAX, limits.T_MIN))
 LOG2E, LOG2_255, TWO_LN2 = float32(1.4426950408889634), float32(7.994353436858858), float32(1.3862943611198906)
 HALF, ZERO, ONE, TWO = float32(0.5), float32(0), float32(1), float32(2)
 HUGE = float32(3e38)  # larger values are dropped as not finite

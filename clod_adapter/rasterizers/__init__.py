@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 
 from clod_adapter.errors import ClodError
-from clod_adapter.rasterizers.protocol import Rasterizer, wait_for
+from clod_adapter.rasterizers.protocol import ALPHA_MAX, Rasterizer, wait_for
 
-__all__ = ["Rasterizer", "for_device", "wait_for"]
+__all__ = ["ALPHA_MAX", "Rasterizer", "for_device", "wait_for"]
 
 
 def for_device(device: torch.device) -> Rasterizer:

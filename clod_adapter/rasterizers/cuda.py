@@ -26,9 +26,9 @@ from torch.autograd.function import once_differentiable
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.errors import ClodError
-from clod_adapter.rasterizers.protocol import require_float32
+from clod_adapter.rasterizers.protocol import ALPHA_MIN, require_float32
 
-ALPHA_MIN, TILE = 1 / 255, 16
+TILE = 16
 OLDEST, INSTALL = (1, 5, 3), "pip install gsplat==1.5.3"
 
 

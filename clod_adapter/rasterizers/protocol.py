@@ -7,9 +7,12 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from clod_adapter._kernels import ALPHA_MAX, ALPHA_MIN, T_MIN
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.errors import ClodError
+
+__all__ = ["ALPHA_MAX", "ALPHA_MIN", "T_MIN", "Rasterizer", "require_float32", "wait_for"]
 
 
 class Rasterizer(Protocol):

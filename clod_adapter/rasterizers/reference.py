@@ -13,8 +13,7 @@ from torch import Tensor
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.gaussians import SH_C0
-
-ALPHA_MIN, ALPHA_MAX, T_MIN = 1 / 255, 0.999, 1e-4
+from clod_adapter.rasterizers.protocol import ALPHA_MAX, ALPHA_MIN, T_MIN
 
 
 def rasterize(

@@ -154,10 +154,7 @@ def test_trained_on_white(pair: tuple[Gaussians, list[View]]) -> None:
 
 CASES = [
     ("file's x, -y, -z: ", 1.0, FLIP, NONE),
-    ("file's x, -z, y: ", 1.0, EYE.new_tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), NONE),
-    ("file's z, x, y: ", 1.0, EYE[[2, 0, 1]], NONE),
     ("(mirrored)", 1.0, torch.diag(EYE.new_tensor([-1.0, 1, 1])), NONE),
-    ("9.7 times larger: ", 9.7, EYE, NONE),
     ("20 times smaller: ", 0.05, EYE, NONE),
     ("moved by (30, -20, 10): ", 1.0, EYE, EYE.new_tensor([30.0, -20, 10])),
     ("4 times larger and moved by (", 4.0, EYE, EYE.new_tensor([3.0, -2, 1])),
@@ -264,7 +261,7 @@ def test_focus() -> None:
     assert torch.isfinite(focus_of(viewmats[:1])).all()
 
 
-@pytest.mark.parametrize("name", ["plush_half", "ci_banana", "bonsai146"])
+@pytest.mark.parametrize("name", ["plush_half", "ci_banana"])
 def test_real_files_fit_and_others_do_not(shared_data: Callable[[str], Path], name: str) -> None:
     base = clod_adapter.load(shared_data(f"{name}/pretrained.ply")).gaussians
     views = everything(clod_adapter.load_scene(shared_data(name)))

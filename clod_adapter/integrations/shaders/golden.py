@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from clod_adapter.attenuation import attenuate_activated
+from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.extinction import extinction_scale
 
@@ -54,7 +54,7 @@ def _results(row: list[Any]) -> tuple[float, float]:
     *values, scale, eps, tau, soft = row
     config = AttenuationConfig(tau=tau, eps=eps, cut="soft" if soft else "hard", max_sv=1)
     opacity, sigma, distance = (torch.tensor([value], dtype=torch.float64) for value in values)
-    result = attenuate_activated(opacity, sigma, distance, scale, config)
+    result = attenuate(opacity, sigma, distance, scale, config, activated=True)
     return float(result.opacities), float(result.drawn)
 
 
