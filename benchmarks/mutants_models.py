@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 import clod_adapter as clod
-from clod_adapter.io.writers import WRITERS, write
+from clod_adapter.io.file_formats import FORMATS, WRITABLE, write
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from packing import write_packed  # noqa: E402
@@ -20,7 +20,7 @@ from packing import write_packed  # noqa: E402
 Input = dict[str, bytes]
 Damage = Callable[[bytearray, random.Random], None]
 COUNT = 6
-SUFFIXES = [suffix for suffix in WRITERS if suffix != ".ply"]
+SUFFIXES = [suffix for suffix in WRITABLE if suffix != ".ply"]
 
 
 def model_inputs(folder: Path, base: clod.Gaussians) -> list[Input]:
@@ -28,7 +28,7 @@ def model_inputs(folder: Path, base: clod.Gaussians) -> list[Input]:
     dial = clod.attach(base, torch.rand(len(base)) + 0.1, clod.AttenuationConfig())
     inputs = []
     for suffix in SUFFIXES:
-        for gaussians in (base, dial)[: 1 + WRITERS[suffix].carries_sigma]:
+        for gaussians in (base, dial)[: 1 + FORMATS[suffix].carries_sigma]:
             write(folder / f"whole{suffix}", gaussians, ("a comment",))
             inputs.append({f"whole{suffix}": (folder / f"whole{suffix}").read_bytes()})
     packed = write_packed(folder / "whole.compressed.ply", base)

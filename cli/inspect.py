@@ -18,7 +18,7 @@ from .shared.files import size
 
 WIDTH = 13  # of the names at the left
 MOST_ROWS = 8  # of a calibration: the first and last are always shown
-MOST_LINES = 6  # of oddities, of what is left out, and of what the file says
+MOST_LINES = 6  # of anomalies, of what is left out, and of the comments
 LONGEST = 100  # letters of a comment, of which a file may have any number
 
 
@@ -38,7 +38,7 @@ def lines_of(found: Inspection) -> list[str]:
         lines += splat_lines(found.splat)
     if found.about is not None:
         lines += tensor_lines(found.about)
-    lines += _block("odd", [oddity.says for oddity in found.oddities])
+    lines += _block("odd", [anomaly.says for anomaly in found.anomalies])
     lines += _block("left out", found.left_out)
     warnings = [note.removeprefix(WARNING) for note in found.notes if note.startswith(WARNING)]
     lines += _block("note", [note for note in found.notes if not note.startswith(WARNING)])

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory, TemporaryFile
 from typing import TYPE_CHECKING
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.caches import user_caches
+from clod_adapter.io.scene.folder import user_caches
 
 from ..shared.browsers import find_browser
 from ..shared.findings import Look, Miniature, Off, first_line
@@ -42,7 +42,7 @@ def plots() -> str:
 def glb() -> str:
     """A file is written and read again."""
     from clod_adapter.io.checkpoint import load
-    from clod_adapter.io.writers import write
+    from clod_adapter.io.file_formats import write
 
     gaussians = _gaussians()
     try:
@@ -58,8 +58,8 @@ def glb() -> str:
 
 def splat_transform() -> str:
     """A file is packed."""
+    from clod_adapter.io.file_formats import write
     from clod_adapter.io.formats.splat_transform import HELP, SplatTransform
-    from clod_adapter.io.writers import write
 
     try:
         tool = SplatTransform.find()

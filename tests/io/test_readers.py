@@ -8,7 +8,7 @@ import pytest
 from clod_adapter.adapter import attach
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import blank, load, save
-from clod_adapter.io.readers import PLY, READERS, check_readable, file_has_dial, reader_of
+from clod_adapter.io.file_formats import PLY, READERS, check_readable, file_has_dial, reader_of
 from scenes import gaussians
 
 

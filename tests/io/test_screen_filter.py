@@ -16,11 +16,10 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.formats.models import load_model
+from clod_adapter.io.file_formats import load_model, write
 from clod_adapter.io.formats.spz_reader import load_spz
 from clod_adapter.io.ply.constants import filter_constants, filter_of
 from clod_adapter.io.screen_filter import is_antialiased, likely, parse_words, tagged, words_of
-from clod_adapter.io.writers import write
 from formats import model
 
 OTHER = ScreenFilter(variance=0.123456789, compensate=True)

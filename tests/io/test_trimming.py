@@ -10,9 +10,8 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from clod_adapter.adapter import trim
-from clod_adapter.io.checkpoint import Checkpoint, blank, load, save
+from clod_adapter.io.checkpoint import Checkpoint, blank, load, save, trimmed
 from clod_adapter.io.ply.columns import rows_of
-from clod_adapter.io.trimming import trimmed
 from scenes import gaussians
 
 

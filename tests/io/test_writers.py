@@ -10,14 +10,13 @@ import torch
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load
-from clod_adapter.io.formats.models import LOADERS, load_model
-from clod_adapter.io.writers import WRITERS, write, writer_of
+from clod_adapter.io.file_formats import LOADERS, WRITERS, load_model, write, writer_of
 from formats import model
 from scenes import gaussians
 
 
 def test_the_table_is_light() -> None:
-    code = "import sys, clod_adapter.io.writers; print('torch' in sys.modules)"
+    code = "import sys, clod_adapter.io.file_formats; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 

@@ -17,7 +17,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, AttenuationConfig, ScreenFilter
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import load
-from clod_adapter.io.writers import write
+from clod_adapter.io.file_formats import write
 from clod_adapter.render import Rendering, render
 from shown import drop
 

@@ -2,8 +2,8 @@
 
 One POINTS primitive, every attribute float32: activated opacities and scales, rotations of unit length as xyzw,
 spherical harmonics up to degree 3 with a VEC3 for each coefficient, and 8-bit ``COLOR_0`` for readers without the
-extension. The numbers are those of the checkpoint: glTF's y is up and its x goes left, so the node turns them half way
-round z, and moves them where they have an origin. ``asset.extras.clod_adapter`` is the description (``card``).
+extension. The values are the checkpoint's: glTF's y is up and its x goes left, so the node has a half turn
+about z, and a translation where there is an origin. ``asset.extras.clod_adapter`` holds the document (``metadata``).
 """
 
 from __future__ import annotations
@@ -39,19 +39,18 @@ def coefficient(degree: int, index: int) -> str:
 
 
 def write_glb(
-    path: str | Path,
+    path: Path,
     gaussians: Gaussians,
     about: Sequence[str] = (),
     *,
     origin: Origin = NOWHERE,
     calibration: Calibration | None = None,
 ) -> tuple[str, ...]:
-    """Writes to float32's rounding of the activations; ``writers.write`` has the arguments and errors."""
+    """Writes with float32's rounding of the activations; arguments and errors as ``file_formats.write``."""
     try:
         import pygltflib
     except ModuleNotFoundError as error:
         raise ClodError(f"{path}: .glb needs pygltflib; install it: pip install 'clod-adapter[export]'") from error
-    path = Path(path)
     columns, dropped = _columns(path, gaussians)
     size = sum(array.nbytes for array in columns.values())
     if size >= _LIMIT - (1 << 20):
@@ -88,7 +87,7 @@ def _in_gltf(origin: Origin) -> list[float] | None:
 
 
 def _columns(path: Path, gaussians: Gaussians) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """The attributes, and what the extension has no room for."""
+    """The attributes, and a line for what the extension does not store."""
     arrays = arrays_of(path, gaussians)
     scales = scales_of(path, arrays["log_scales"])
     opacities = sigmoid(arrays["opacity_logits"]).astype(np.float32)

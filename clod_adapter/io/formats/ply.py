@@ -1,4 +1,4 @@
-"""PLY files of Gaussians that come from no file: Inria's layout, and ``sigma_d`` where they have it."""
+"""Writes Gaussians without a base as a PLY: Inria's layout, and ``sigma_d`` where they have it."""
 
 from __future__ import annotations
 
@@ -16,19 +16,15 @@ from clod_adapter.origin import NOWHERE, Origin
 
 
 def write_ply(
-    path: str | Path,
+    path: Path,
     gaussians: Gaussians,
     about: Sequence[str] = (),
     *,
     origin: Origin = NOWHERE,
     calibration: Calibration | None = None,
 ) -> tuple[str, ...]:
-    """Writes every value as it is (but opacity = +inf), ``about`` as comments; ``writers.write`` has the arguments.
-
-    Raises:
-        ClodError: as ``ply.save``, or a rotation is zero.
-    """
-    arrays_of(Path(path), gaussians)  # which refuses what load would drop
+    """Writes every value unchanged but opacity = +inf, ``about`` as comments; else as ``file_formats.write``."""
+    arrays_of(path, gaussians)  # refuses rows that load would drop
     base = replace(blank(len(gaussians), gaussians.sh_degree, origin), comments=tuple(about))
     opaque = gaussians.opacity_logits == torch.inf
     finite = torch.where(opaque, torch.full_like(gaussians.opacity_logits, OPAQUE), gaussians.opacity_logits)

@@ -11,8 +11,8 @@ know; most do not even read so far. Two are written:
 - Adobe's of the axes, which says that they are a checkpoint's (x right, y down, z ahead). The format's own are
   OpenGL's, but the reference's ``ply_to_spz``, splat-transform, SuperSplat and gsply all leave those of the PLY, so
   that turned numbers would be upside down in them;
-- ours, ``RECORD``: the length of the description (``card``) as uint32, the description, then sigma_d as float16, which
-  keeps it to 5e-4. What is larger than there is room for becomes the largest, 65504, which is no decay: it takes less
+- ours, ``RECORD``: the length of the JSON document (``metadata``) as uint32, the document, then sigma_d as float16, to
+  5e-4. What is larger than there is room for becomes the largest, 65504, which is no decay: it takes less
   than ``(d' s)^2 1.2e-10`` of an opacity.
 """
 
@@ -52,14 +52,14 @@ _FAR = 100.0  # world units: a typical distance from which on some sigma_d that 
 
 
 def write_spz(
-    path: str | Path,
+    path: Path,
     gaussians: Gaussians,
     about: Sequence[str] = (),
     *,
     origin: Origin = NOWHERE,
     calibration: Calibration | None = None,
 ) -> tuple[str, ...]:
-    """Writes to the format's 8 bits or so; ``writers.write`` has the arguments and errors.
+    """Writes with the format's quantisation, about 8 bits; arguments and errors as ``file_formats.write``.
 
     Positions have as many of their 24 bits for the fraction as they leave, 20 at most. A few Gaussians at an enormous
     distance, as many checkpoints have them, would leave the rest too few: see ``_nearer``.
@@ -67,7 +67,7 @@ def write_spz(
     Raises:
         ClodError: more than 10,000,000 Gaussians, or a scene that reaches farther than 4,000,000, besides.
     """
-    path, gaussians = Path(path), _within_float16(gaussians)
+    gaussians = _within_float16(gaussians)
     arrays, bits, moved = _nearer(arrays_of(path, gaussians))
     if len(gaussians) > MOST or bits < 1:
         raise ClodError(
@@ -79,8 +79,7 @@ def write_spz(
     flags = EXTENDED | (ANTIALIASED if screen_filter.compensate else 0)
     header = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, bits, flags, 0)
     parts = [header, *_packed(arrays, bits, degree), struct.pack("<III", AXES, 4, RDF)]
-    says = (gaussians.sigma_d is not None, any(origin), calibration is not None, about, screen_filter != CLASSIC)
-    if any(says):
+    if gaussians.sigma_d is not None or any(origin) or calibration is not None or about or screen_filter != CLASSIC:
         text = metadata_text(write_metadata(gaussians, about, origin, calibration)).encode()
         sigma = np.clip(arrays.get("sigma_d", np.zeros(0)), -_SIGMA_MOST, _SIGMA_MOST).astype("<f2").tobytes()
         parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(sigma), len(text)) + text + sigma)

@@ -18,9 +18,8 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.ply.columns import SIGMA, column_map, read_table
 from clod_adapter.io.ply.constants import PREFIX
+from clod_adapter.io.ply.rows import ROWS
 from clod_adapter.origin import AXES, Origin, relative
-
-ROWS = 4096  # in a block
 
 
 def write_rows(
@@ -34,7 +33,7 @@ def write_rows(
         vertex: ``[N]`` the base's rows, of which ``gaussians`` are the Gaussians.
         origin: what the means are relative to; where it is not 0 coordinates become doubles.
         comments: of the element, in the header.
-        constants: by name, float columns of one value each (``ply_constants``); those of the base do not go along.
+        constants: by name, float columns of one value each (``constants``); those of the base are dropped.
 
     Raises:
         ClodError: a new value is not finite.

@@ -9,7 +9,8 @@ import numpy as np
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap_library import pycolmap
-from clod_adapter.io.scene.colmap_records import check_name, check_records
+from clod_adapter.io.scene.colmap_records import check_records
+from clod_adapter.io.scene.folder import name_parts
 from clod_adapter.io.scene.posed import PosedImage, check_posed
 
 
@@ -24,7 +25,7 @@ def read_model(model: Path) -> tuple[list[PosedImage], list[str]]:
         reconstruction = pycolmap.Reconstruction(str(model))
         images = sorted(reconstruction.images.values(), key=lambda image: image.name)
         for image in images:
-            check_name(model, image.name)
+            name_parts(image.name, model)
         posed = [_posed_image(model, image) for image in images if image.has_pose]
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -15,8 +15,8 @@ from PIL import Image, PngImagePlugin
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.scene.caches import user_caches
 from clod_adapter.io.scene.colmap_library import pycolmap
+from clod_adapter.io.scene.folder import user_caches
 from clod_adapter.io.scene.images import Photograph
 from clod_adapter.io.scene.posed import PosedImage
 

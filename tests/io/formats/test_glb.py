@@ -16,8 +16,8 @@ from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.checkpoint import save
+from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.glb_reader import load_glb, read_glb
-from clod_adapter.io.writers import write
 from formats import ABOUT, ATTENUATION, CALIBRATION, ORIGIN, covariances, damaged, model, splat_transform, turned
 from scenes import gaussians
 

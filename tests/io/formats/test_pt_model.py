@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import load
+from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.pt_model import load_pt
-from clod_adapter.io.writers import write
 from formats import ABOUT, CALIBRATION, ORIGIN, damaged, model
 
 NAMES = {"scales": "log_scales", "opacities": "opacity_logits"}

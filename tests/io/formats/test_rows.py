@@ -20,9 +20,16 @@ from clod_adapter.errors import ClodError
 from clod_adapter.inspection.report import inspect
 from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.formats.models import LOADERS, load_model
-from clod_adapter.io.readers import MODEL, READERS, check_readable, file_has_dial
-from clod_adapter.io.writers import WRITERS, write
+from clod_adapter.io.file_formats import (
+    LOADERS,
+    MODEL,
+    READERS,
+    WRITERS,
+    check_readable,
+    file_has_dial,
+    load_model,
+    write,
+)
 from formats import ABOUT, CALIBRATION, ORIGIN, model
 
 EXACT = (".safetensors", ".pt")
@@ -116,7 +123,7 @@ def test_the_check_does_without_torch(tmp_path: Path, suffix: str) -> None:
     write(tmp_path / f"a{suffix}", model(0).replace(sigma_d=None, attenuation=None))
     path = json.dumps(str(tmp_path / f"a{suffix}"))
     code = (
-        "import sys, pathlib, clod_adapter.io.readers as r; "
+        "import sys, pathlib, clod_adapter.io.file_formats as r; "
         f"r.check_readable(pathlib.Path({path})); sys.exit('torch' in sys.modules)"
     )
     root = Path(__file__).resolve().parents[2]

@@ -13,8 +13,8 @@ from clod_adapter.adapter import extract
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
+from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.safetensors import load_safetensors, read_model_safetensors
-from clod_adapter.io.writers import write
 from formats import ABOUT, ATTENUATION, CALIBRATION, ORIGIN, damaged, model
 from scenes import gaussians
 

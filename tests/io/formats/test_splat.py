@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.checkpoint import load
+from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.splat import read_splat
-from clod_adapter.io.writers import write
 from formats import ORIGIN, damaged, model, rows_by_place, splat_transform, turned
 
 

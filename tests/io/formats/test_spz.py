@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import load
+from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.spz_reader import load_spz, read_spz
-from clod_adapter.io.writers import write
 from formats import ABOUT, ATTENUATION, CALIBRATION, ORIGIN, covariances, damaged, model, splat_transform, turned
 
 
