@@ -100,6 +100,9 @@ def change_document(path: Path, change: Callable[[dict[str, Any]], object]) -> P
         data = path.read_bytes()
         head = [line for line in data.split(b"end_header\n")[0].decode().splitlines() if "clod_adapter" not in line]
         values = stored_settings(load(path).comments)
+        if "screen_filter" in values:
+            words = values["screen_filter"].split()
+            values["screen_filter"] = dict(zip(("variance", "compensate"), words, strict=True))
         change(values)
         at = next(k for k, line in enumerate(head) if line.startswith("element vertex")) + 1
         head[at:at] = [f"comment clod_adapter {line}" for line in _comments(values)]

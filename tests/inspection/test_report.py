@@ -41,7 +41,7 @@ def table(n: int = 300, degree: int = 1, seed: int = 0) -> np.ndarray:
     """Rows in Inria's layout, unit quaternions, with something in every column that is used."""
     g = scenes.gaussians(n, degree, seed)
     g = g.replace(quats=torch.nn.functional.normalize(g.quats))
-    return rows_of({name: tensor.numpy() for name, tensor in g.tensors().items()}, degree)
+    return rows_of({name: tensor.numpy() for name, tensor in g.tensors().items()})
 
 
 def write(path: Path, vertex: np.ndarray, *, comments: tuple[str, ...] = (), order: str = "<") -> Path:
@@ -271,7 +271,7 @@ def test_other_formats(tmp_path: Path) -> None:
         ("a.ply", b"version https://git-lfs.github.com/spec/v1\n", "Git LFS pointer"),
         ("a.ckpt", b"PK\x03\x04", "Nerfstudio"),
         ("a.safetensors", b"version https://git-lfs.github.com/spec/v1\n", "Git LFS pointer"),
-        ("a.safetensors", b"xxxxxxxxxxxxxxxx", "no safetensors file or damaged"),
+        ("a.safetensors", b"xxxxxxxxxxxxxxxx", "not a safetensors file, or damaged"),
         ("a.pt", b"PK\x03\x04", "damaged or truncated"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "mesh or a point"),
     ],

@@ -32,8 +32,8 @@ def check_converted(path: Path, version: str = "") -> SplatTransform:
         ) from error
 
 
-def load_converted(path: Path) -> Model:
-    """The Gaussians of the PLY that splat-transform converts the file to.
+def load_converted(path: Path, version: str = "") -> Model:
+    """The Gaussians of the PLY that splat-transform converts the file to; ``version`` as in ``check_converted``.
 
     Raises:
         ClodError: splat-transform is missing, or cannot read the file.
@@ -43,7 +43,7 @@ def load_converted(path: Path) -> Model:
     from clod_adapter.io.ply.rows import read_ply
     from clod_adapter.io.settings import Metadata
 
-    tool = check_converted(path)
+    tool = check_converted(path, version)
     with TemporaryDirectory() as folder:
         converted = Path(folder) / "converted.ply"
         try:

@@ -37,7 +37,7 @@ def load_spz(path: Path) -> Model:
     """
     whole = read_whole(path)
     if whole.startswith(MAGIC.to_bytes(4, "little")):
-        return load_converted(path)
+        return load_converted(path, " of version 4")
     data = _unpacked(path, whole)
     magic, version, count, degree, bits, flags, _ = HEADER.unpack_from(data)
     if magic != MAGIC or version not in (2, 3) or degree not in SH_COUNTS or bits > 24 or count > MOST:
