@@ -34,6 +34,14 @@ class Model(NamedTuple):
     sha256: str = ""
 
 
+class History(NamedTuple):
+    """Of Gaussians that are written: lines on it, what their means are relative to, and their calibration."""
+
+    about: tuple[str, ...] = ()
+    origin: Origin = NOWHERE
+    calibration: Calibration | None = None
+
+
 class Format(NamedTuple):
     """A format: functions by module and name under ``clod_adapter.io``, imported when they are called.
 
@@ -41,7 +49,8 @@ class Format(NamedTuple):
         read: a path to a ``Model``; of the PLY, to ``PlyRows``.
         check: refuses, by the first bytes and without torch, a file that is not of the format.
         has_dial: whether a file has a sigma_d; "" where none can.
-        write: called as ``write``; "" where the format is only read.
+        write: called with path, Gaussians in world units and a ``History``; gives a line for each loss; "" where the
+            format is only read.
         carries_sigma: whether sigma_d and its settings are written.
     """
 
@@ -137,11 +146,10 @@ def write(
         raise ClodError(f"{path}: {Path(path).suffix} has no room for sigma_d; choose a dial value to bake")
     from clod_adapter.units import in_world_units  # here: the table needs no torch
 
-    return _call(
-        FORMATS[suffix].write, Path(path), in_world_units(gaussians), about, origin=origin, calibration=calibration
-    )
+    history = History(tuple(about), origin, calibration)
+    return _call(FORMATS[suffix].write, Path(path), in_world_units(gaussians), history)
 
 
-def _call(function: str, *args: Any, **options: Any) -> Any:
+def _call(function: str, *args: Any) -> Any:
     module, name = function.rsplit(".", 1)
-    return getattr(import_module(f"clod_adapter.io.{module}"), name)(*args, **options)
+    return getattr(import_module(f"clod_adapter.io.{module}"), name)(*args)

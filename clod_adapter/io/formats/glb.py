@@ -8,19 +8,18 @@ about z, and a translation where there is an origin. ``asset.extras.clod_adapter
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from clod_adapter.calibration import Calibration
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.file_formats import History
 from clod_adapter.io.formats.arrays import arrays_of, colours_of, normalized, scales_of, sigmoid
 from clod_adapter.io.formats.metadata import KEY, write_metadata
-from clod_adapter.origin import NOWHERE, Origin
+from clod_adapter.origin import Origin
 from clod_adapter.version import package_version
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -38,14 +37,7 @@ def coefficient(degree: int, index: int) -> str:
     return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}"
 
 
-def write_glb(
-    path: Path,
-    gaussians: Gaussians,
-    about: Sequence[str] = (),
-    *,
-    origin: Origin = NOWHERE,
-    calibration: Calibration | None = None,
-) -> tuple[str, ...]:
+def write_glb(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
     """Writes with float32's rounding of the activations; arguments and errors as ``file_formats.write``."""
     try:
         import pygltflib
@@ -58,10 +50,10 @@ def write_glb(
     gltf = pygltflib.GLTF2(
         asset=pygltflib.Asset(generator=f"clod-adapter {package_version()}"),
         extensionsUsed=[EXTENSION], scene=0, scenes=[pygltflib.Scene(nodes=[0])],
-        nodes=[pygltflib.Node(mesh=0, rotation=HALF_TURN, translation=_in_gltf(origin))],
+        nodes=[pygltflib.Node(mesh=0, rotation=HALF_TURN, translation=_in_gltf(history.origin))],
         buffers=[pygltflib.Buffer(byteLength=size)],
     )  # fmt: skip
-    gltf.asset.extras = {KEY: write_metadata(gaussians, about, origin, calibration)}
+    gltf.asset.extras = {KEY: write_metadata(gaussians, history)}
     offset = 0
     for index, (name, array) in enumerate(columns.items()):
         view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": pygltflib.ARRAY_BUFFER}

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clod_adapter.calibration import Calibration
 from clod_adapter.errors import ClodError
+from clod_adapter.io.file_formats import History
 from clod_adapter.io.settings import DAMAGE, Metadata, damaged, document, read_metadata, stored_values
-from clod_adapter.origin import NOWHERE, Origin
 
 if TYPE_CHECKING:
     from clod_adapter.gaussians import Gaussians
@@ -19,12 +17,10 @@ KEY = "clod_adapter"
 FORMAT, FORMAT_VERSION = "clod-model", 1
 
 
-def write_metadata(
-    gaussians: Gaussians, about: Sequence[str] = (), origin: Origin = NOWHERE, calibration: Calibration | None = None
-) -> dict[str, Any]:
-    """Plain JSON that ``parse_metadata`` inverts; the arguments are those of ``file_formats.write``."""
-    values = stored_values(gaussians.attenuation, gaussians.screen_filter, origin, calibration)
-    return document(FORMAT, FORMAT_VERSION) | values | ({"about": list(about)} if about else {})
+def write_metadata(gaussians: Gaussians, history: History) -> dict[str, Any]:
+    """Plain JSON that ``parse_metadata`` inverts."""
+    values = stored_values(gaussians.attenuation, gaussians.screen_filter, history.origin, history.calibration)
+    return document(FORMAT, FORMAT_VERSION) | values | ({"about": list(history.about)} if history.about else {})
 
 
 def metadata_text(values: dict[str, Any]) -> str:

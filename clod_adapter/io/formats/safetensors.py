@@ -6,35 +6,25 @@ Tensors, float32: those of ``Gaussians`` by their names there. The metadata key 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from safetensors.numpy import save
 
-from clod_adapter.calibration import Calibration
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.file_formats import Model
+from clod_adapter.io.file_formats import History, Model
 from clod_adapter.io.formats.arrays import arrays_of, gaussians_of
 from clod_adapter.io.formats.metadata import KEY, metadata_text, parse_metadata, write_metadata
 from clod_adapter.io.tensor_file import load_tensors
-from clod_adapter.origin import NOWHERE, Origin
 
 _NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 
 
-def write_safetensors(
-    path: Path,
-    gaussians: Gaussians,
-    about: Sequence[str] = (),
-    *,
-    origin: Origin = NOWHERE,
-    calibration: Calibration | None = None,
-) -> tuple[str, ...]:
+def write_safetensors(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
     """Writes every value unchanged; arguments and errors as ``file_formats.write``."""
     arrays = arrays_of(path, gaussians)
-    metadata = {KEY: metadata_text(write_metadata(gaussians, about, origin, calibration))}
+    metadata = {KEY: metadata_text(write_metadata(gaussians, history))}
     with atomic_path(path) as temporary:
         # Not save_file, which makes files that only their owner can read.
         temporary.write_bytes(save(arrays, metadata))

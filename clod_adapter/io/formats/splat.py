@@ -7,16 +7,14 @@ and most opaque come first (by volume times opacity), as viewers draw what has a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from clod_adapter.calibration import Calibration
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.file_formats import Model
+from clod_adapter.io.file_formats import History, Model
 from clod_adapter.io.formats.arrays import (
     arrays_of,
     bytes_of,
@@ -31,20 +29,12 @@ from clod_adapter.io.formats.arrays import (
     sigmoid,
 )
 from clod_adapter.io.settings import Metadata
-from clod_adapter.origin import NOWHERE, Origin
 
 QUANTISED = "quantised: colours, opacities and rotations in 8 bits, no view-dependent colour"
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
 
-def write_splat(
-    path: Path,
-    gaussians: Gaussians,
-    about: Sequence[str] = (),
-    *,
-    origin: Origin = NOWHERE,
-    calibration: Calibration | None = None,
-) -> tuple[str, ...]:
+def write_splat(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
     """Writes Gaussians without a dial, and no text; arguments and errors as ``file_formats.write``."""
     arrays = arrays_of(path, gaussians)
     scales = scales_of(path, arrays["log_scales"])
@@ -60,7 +50,7 @@ def write_splat(
         temporary.write_bytes(rows[order].tobytes())
     notes = ["colours, opacities and rotations are rounded to 8 bits, and the rows are in another order"]
     notes += ["view-dependent colour is dropped"] if arrays["shN"].any() else []
-    return (*notes, *(["the origin is dropped: coordinates are relative to it"] if any(origin) else []))
+    return (*notes, *(["the origin is dropped: coordinates are relative to it"] if any(history.origin) else []))
 
 
 def load_splat(path: Path) -> Model:

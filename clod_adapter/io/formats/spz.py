@@ -21,19 +21,17 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.file_formats import History
 from clod_adapter.io.formats.arrays import arrays_of, bytes_of, normalized, sigmoid
 from clod_adapter.io.formats.metadata import metadata_text, write_metadata
-from clod_adapter.origin import NOWHERE, Origin
 from clod_adapter.units import estimated_distance, known_distance, with_distance
 
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
@@ -51,14 +49,7 @@ _SIGMA_MOST = float(np.finfo(np.float16).max)
 _FAR = 100.0  # world units: a typical distance from which on some sigma_d that fade at high dial values are beyond that
 
 
-def write_spz(
-    path: Path,
-    gaussians: Gaussians,
-    about: Sequence[str] = (),
-    *,
-    origin: Origin = NOWHERE,
-    calibration: Calibration | None = None,
-) -> tuple[str, ...]:
+def write_spz(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
     """Writes with the format's quantisation, about 8 bits; arguments and errors as ``file_formats.write``.
 
     Positions have as many of their 24 bits for the fraction as they leave, 20 at most. A few Gaussians at an enormous
@@ -79,8 +70,8 @@ def write_spz(
     flags = EXTENDED | (ANTIALIASED if screen_filter.compensate else 0)
     header = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, bits, flags, 0)
     parts = [header, *_packed(arrays, bits, degree), struct.pack("<III", AXES, 4, RDF)]
-    if gaussians.sigma_d is not None or any(origin) or calibration is not None or about or screen_filter != CLASSIC:
-        text = metadata_text(write_metadata(gaussians, about, origin, calibration)).encode()
+    if gaussians.sigma_d is not None or history != History() or screen_filter != CLASSIC:
+        text = metadata_text(write_metadata(gaussians, history)).encode()
         sigma = np.clip(arrays.get("sigma_d", np.zeros(0)), -_SIGMA_MOST, _SIGMA_MOST).astype("<f2").tobytes()
         parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(sigma), len(text)) + text + sigma)
     with atomic_path(path) as temporary:

@@ -24,8 +24,7 @@ from clod_adapter.cli.shared import budgets
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import FORMATS as FILE_FORMATS
-from clod_adapter.io.file_formats import WRITABLE
-from clod_adapter.io.formats.safetensors import read_model_safetensors
+from clod_adapter.io.file_formats import WRITABLE, read_model
 from clod_adapter.io.formats.splat_transform import INSTALL
 from clod_adapter.io.ply.header import write_comments
 
@@ -221,7 +220,7 @@ def test_the_dial_stays_as_it_is(clod: Any, dialled: Path, tmp_path: Path) -> No
     again = load("same.ply")
     assert same(again.gaussians, model.gaussians) and again.gaussians.attenuation == model.gaussians.attenuation
     assert again.calibration == model.calibration and again.notes == ()
-    assert same(read_model_safetensors("same.safetensors"), model.gaussians)
+    assert same(read_model("same.safetensors").gaussians, model.gaussians)
 
 
 def test_a_plain_file_is_converted(clod: Any, capture: Any) -> None:
