@@ -1,7 +1,7 @@
-"""The rows of an output: the base's with the values that changed written in, constants, and last ``sigma_d``.
+"""The rows of an output: the base's with changed values, constant columns, and last ``sigma_d``.
 
-They are made and written some thousands at a time, so that no second copy of a large file is ever held, and because
-picking columns out of rows that stay in the processor's cache is several times as fast.
+Rows are written in blocks that fit in the processor's cache, which is several times as fast, and a large file is never
+held twice.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Refusing damaged COLMAP models before COLMAP reads them, which trusts its files."""
+"""Refuses damaged COLMAP models before COLMAP, which trusts its files, reads them."""
 
 from __future__ import annotations
 

@@ -172,7 +172,7 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("export PLY -o x.ply --order extinction", "base.ply: has no sigma_d, so there is no order to put its rows in"),
         ("export text.ply -o x.glb", "text.ply: is not a PLY"),
         ("apply PLY missing.safetensors -o x.ply", "missing.safetensors: .*No such file"),
-        ("apply PLY text.ply -o x.ply", "text.ply: is no safetensors file"),
+        ("apply PLY text.ply -o x.ply", "text.ply: is not a safetensors file"),
         ("apply mine.ply text.ply -o mine.ply", "mine.ply: is an input file"),
         ("apply PLY text.ply -o text.ply", "text.ply: is an input file"),
         ("apply PLY text.ply -o x.splat", "x.splat: .*must end in .ply"),
