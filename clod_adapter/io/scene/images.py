@@ -50,8 +50,8 @@ _ORIENTATION, _BITS, _PLANES = 0x0112, 258, 284  # tags of EXIF and TIFF
 def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Image.Image, tuple[int, int], list[Note]]:
     """The file as 8-bit RGB in the shape of its camera, its size in the file, and notes on the changes.
 
-    16 bits per channel are reduced to 8, grey becomes RGB, transparency is composited over black. Colour profiles
-    are not applied. The EXIF rotation is not either, as COLMAP does not, unless the photograph has its camera's shape only
+    16 bits per channel are reduced to 8, grey becomes RGB, transparency is composited over black. Colour profiles are
+    not applied. The EXIF rotation is not either, as COLMAP does not, unless the photograph has its camera's shape only
     once it is turned: then the model was made from turned copies.
 
     A photograph of more than LARGE pixels is first reduced by an integer factor, to ``2 max_width`` or more: a JPEG

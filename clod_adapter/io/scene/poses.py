@@ -10,7 +10,7 @@ import torch
 
 from clod_adapter.cameras import Camera, camera_extent, near_plane
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap_model import read_model
+from clod_adapter.io.scene.colmap import read_model
 from clod_adapter.io.scene.dataparser import trained_frame
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.io.scene.posed import TEST_EVERY, held_out

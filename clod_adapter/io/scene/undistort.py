@@ -67,7 +67,7 @@ def cache_folder(scene: Path) -> Path:
 def kept(folder: Path, image: PosedImage, path: Path, max_width: int, make: Callable[[], Photograph]) -> Photograph:
     """The result of ``make``, from ``folder`` where an earlier run has cached it.
 
-    One PNG for each photograph, written atomically. Its name is a hash of all that it depends on: the photograph's path,
+    One PNG for each photograph, written atomically. Its name is a hash of its inputs: the photograph's path,
     size and modification time, the camera, ``max_width`` and the libraries' versions.
     """
     state, camera = path.stat(), image.camera

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap_model import read_model
+from clod_adapter.io.scene.colmap import read_model
 from clod_adapter.io.scene.colmap_records import check_records
 from clod_adapter.io.scene.load import load_scene
 
