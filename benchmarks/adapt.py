@@ -1,27 +1,25 @@
-"""Adapts real checkpoints and writes what came of it: quality, count and time per dial value.
+"""Quality, count and seconds of adapted checkpoints, by dial value.
 
     python benchmarks/adapt.py plush_half bonsai146 ci_banana plush_half/pretrained_mask
     python benchmarks/adapt.py plush_half bonsai146 --set max_sv=14.0 --label "max_sv 14" --seeds 0 1 2
     python benchmarks/adapt.py plush_half --ablations      # one row for each choice in docs/method.md
-    python benchmarks/adapt.py plush_half bonsai146 --leave-out    # one for each in docs/performance.md
+    python benchmarks/adapt.py plush_half bonsai146 --leave-out    # the rows of docs/performance.md
     python benchmarks/adapt.py --table                     # the rows as a Markdown table
-    python benchmarks/adapt.py plush_half --questions      # the ablations' rows, a table a question
+    python benchmarks/adapt.py plush_half --questions      # the rows of the ablations, one table per question
 
-A scene is a folder of the shared data, with a checkpoint's name where it is not ``pretrained``. Each run
-adds one row to ``results/adapt.jsonl``: the settings, the commit, the machine, the base and the dial.
+A scene is a folder of the shared data, followed by the name of the checkpoint where it is not ``pretrained``. Each run
+adds one row to ``results/adapt.jsonl``: settings, commit, machine, the base and the dial.
 """
 
 from __future__ import annotations
 
-import argparse
 import ast
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from statistics import fmean
 from typing import Any
 
-from common import RESULTS, append, capture
+from common import append, arguments, checkpoint, photographs, stored, table
 
 import clod_adapter as clod
 from clod_adapter.evaluation.popping import dial_popping, path_popping
@@ -88,7 +86,7 @@ QUESTIONS: dict[str, dict[str, dict[str, object]]] = {
 ABLATIONS = {label: changed for rows in QUESTIONS.values() for label, changed in rows.items()}
 
 
-# What a step can leave out, at three lengths each: held-out error against time.
+# Steps without some attributes, at three lengths each: held-out error against time.
 GEOMETRY = {"lr_means": 0.0, "lr_quats": 0.0, "lr_scales": 0.0}
 LEAVE_OUT: dict[str, dict[str, object]] = {
     f"{label}, {iters} steps": {"iters": iters, **changed}
@@ -98,19 +96,16 @@ LEAVE_OUT: dict[str, dict[str, object]] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__, table=print_table)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--ablations", action="store_true", help=f"every choice by itself, {ABLATION}")
-    parser.add_argument("--only", nargs="+", metavar="LABEL", choices=ABLATIONS, default=ABLATIONS, help="of these")
-    parser.add_argument("--leave-out", action="store_true", help="what a step can leave out, at three lengths each")
-    parser.add_argument("--table", action="store_true", help="print the rows there are")
+    parser.add_argument("--only", nargs="+", metavar="LABEL", choices=ABLATIONS, default=ABLATIONS, help="some choices")
+    parser.add_argument("--leave-out", action="store_true", help="steps without some attributes, at three lengths each")
     parser.add_argument("--questions", action="store_true", help="print a table for each question, of the scenes")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a field of AdaptConfig")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--label", default="default", help="what the row is for")
+    parser.add_argument("--label", default="default", help="name of the row")
     args = parser.parse_args()
-    if args.table:
-        print_table()
     if args.questions:
         for scene in args.scenes:
             print_questions(scene)
@@ -126,20 +121,20 @@ def main() -> None:
                 run(scene, label, make_config(changed, seed), changed, popping=args.ablations)
 
 
-def stored() -> dict[tuple[str, str, int], list[dict[str, Any]]]:
+def groups() -> dict[tuple[str, str, int], list[dict[str, Any]]]:
     """The last row of each seed, by scene, label and steps; rows of before the matched shares are left out."""
     last = {}
-    for row in map(json.loads, (RESULTS / FILE).read_text(encoding="utf-8").splitlines()):
+    for row in stored(FILE):
         if "at_shares" in row:
             last[row["scene"], row["label"], row["steps"], row["config"]["seed"]] = row
-    groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    found: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for (scene, label, steps, _), row in last.items():
-        groups.setdefault((scene, label, steps), []).append(row)
-    return groups
+        found.setdefault((scene, label, steps), []).append(row)
+    return found
 
 
 def cells_of(rows: list[dict[str, Any]]) -> list[str]:
-    """s = 1, the matched shares, and between what the counts lie, relative to s^-1.5, from s = 2 on."""
+    """PSNR at s = 1 and the matched shares; the range of counts relative to s^-1.5 from s = 2 on."""
     first = fmean(row["rows"][0]["psnr"] for row in rows), fmean(row["rows"][0]["kept_share"] for row in rows)
     cells = [f"{first[0]:.2f} @ {first[1]:.0%}"]
     for share in SHARES:
@@ -154,31 +149,32 @@ HEADS = ["s = 1", *(f"{share:.0%}" for share in SHARES), "counts / law"]
 
 def print_table() -> None:
     """PSNR at s = 1 and at the matched shares, means over the seeds, a line a setting."""
-    heads = ["scene", "what", "steps", "seeds", "seconds", "base", *HEADS]
-    print(f"| {' | '.join(heads)} |\n{'|---' * len(heads)}|")
-    for (scene, label, steps), rows in stored().items():
+    lines = []
+    for (scene, label, steps), rows in groups().items():
         seconds = fmean(row["start_seconds"] + row["train_seconds"] for row in rows)
-        head = [scene, label, str(steps), str(len(rows)), f"{seconds:.0f}", f"{rows[0]['base']['psnr']:.2f}"]
-        print("| " + " | ".join(head + cells_of(rows)) + " |")
+        head = [scene, label, steps, len(rows), f"{seconds:.0f}", f"{rows[0]['base']['psnr']:.2f}"]
+        lines.append([*head, *cells_of(rows)])
+    print(table(["scene", "settings", "steps", "seeds", "seconds", "base", *HEADS], lines))
 
 
 def print_questions(scene: str) -> None:
     """A table a question, ours and the paper's form above each, with the popping measures."""
-    groups, heads = stored(), ["what", *HEADS, "dial: jump", "path: jump"]
+    all_rows = groups()
     for question, settings in QUESTIONS.items():
-        print(f"\n### {question.capitalize()}\n\n| {' | '.join(heads)} |\n{'|---' * len(heads)}|")
+        lines = []
         for label in {**QUESTIONS["form"], **settings}:
-            rows = groups.get((scene, label, int(str(ABLATION["iters"]))), [])
+            rows = all_rows.get((scene, label, int(str(ABLATION["iters"]))), [])
             # Of other defaults than today's a row would be no neighbour of the rest.
             changed = {**ABLATION, **ABLATIONS[label]}
             rows = [r for r in rows if r["config"] == asdict(make_config(changed, r["config"]["seed"]))]
             if rows:
                 popping = [f"{rows[-1]['popping'][what]['largest']:.2f}" for what in ("dial", "path")]
-                print("| " + " | ".join([label, *cells_of(rows), *popping]) + " |")
+                lines.append([label, *cells_of(rows), *popping])
+        print(f"\n### {question.capitalize()}\n\n{table(['settings', *HEADS, 'dial: jump', 'path: jump'], lines)}")
 
 
 def make_config(changed: dict[str, Any], seed: int) -> clod.AdaptConfig:
-    """Ours, or the paper's form, with what is changed of it."""
+    """Ours, or the paper's form, with these fields changed."""
     changed = {"seed": seed, **changed}
     return clod.AdaptConfig.paper(**changed) if changed.pop("paper", False) else clod.AdaptConfig(**changed)
 
@@ -192,21 +188,19 @@ def _setting(text: str) -> tuple[str, object]:
 
 
 def run(scene: str, label: str, config: clod.AdaptConfig, changed: dict[str, object], popping: bool) -> None:
-    folder, _, checkpoint = scene.partition("/")
-    base = clod.load(capture(folder) / f"{checkpoint or 'pretrained'}.ply")
-    photographs = clod.load_scene(capture(folder))
+    base, views = checkpoint(scene), photographs(scene)
     dials = sorted({s for s in DIALS if s < config.max_sv} | {config.max_sv})
-    base_row = clod.evaluate(base.gaussians, photographs.test, [1.0])[0]
-    adapted = clod.adapt(base.gaussians, photographs, config)
+    base_row = clod.evaluate(base.gaussians, views.test, [1.0])[0]
+    adapted = clod.adapt(base.gaussians, views, config)
     adapter = clod.extract(base.gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config))
     result = adapter.apply(base.gaussians)
-    rows = clod.evaluate(result, photographs.test, dials)
+    rows = clod.evaluate(result, views.test, dials)
     append(FILE, {
         "benchmark": "adapt", "scene": scene, "label": label, "changed": changed, "config": asdict(config),
         "base_count": len(base.gaussians), "base": base_row.as_dict(), "rows": [row.as_dict() for row in rows],
-        "at_shares": at_shares(result, photographs.test), "steps": adapted.steps,
+        "at_shares": at_shares(result, views.test), "steps": adapted.steps,
         "start_seconds": round(adapted.start_seconds, 2), "train_seconds": round(adapted.seconds, 2),
-        "popping": jumps(result, photographs) if popping else None,
+        "popping": jumps(result, views.test) if popping else None,
     })  # fmt: skip
 
 
@@ -223,10 +217,10 @@ def at_shares(model: clod.Gaussians, views: Sequence[clod.View]) -> list[dict[st
     return found
 
 
-def jumps(model: clod.Gaussians, photographs: clod.Scene) -> dict[str, dict[str, float]]:
+def jumps(model: clod.Gaussians, views: Sequence[clod.View]) -> dict[str, dict[str, float]]:
     """How evenly the picture changes as the dial turns, and as the camera moves at a dial value of 3."""
     assert model.attenuation is not None
-    cameras = [view.camera for view in photographs.test[:4]]
+    cameras = [view.camera for view in views[:4]]
     measured = {
         "dial": dial_popping(model, cameras[0], model.attenuation.max_sv, steps=DIAL_STEPS),
         "path": path_popping(model, cameras, 3.0, steps=PATH_STEPS),

@@ -1,13 +1,13 @@
 """Image and gradients of the CPU rasterizer against ``rasterizers/reference.py`` in float64, patch by patch.
 
-The reference weighs every Gaussian at every pixel. Here it gets, for each patch of 16x16 pixels, only those
-whose ellipse of alpha 1/255 reaches the patch's pixels (the others' weight is exactly 0), so that memory
-stays small; the patches' gradients are summed and carried through the projection once.
+The reference weighs every Gaussian at every pixel. To save memory, each patch of 16x16 pixels gets only the Gaussians
+whose ellipse of alpha 1/255 reaches it; the weight of all others is exactly 0. The gradients of the patches are summed
+and carried through the projection once.
 
-Float32 may take a decision the other way: whether an alpha is at least 1/255, whether a pixel ends at the
-transmittance 1e-4, which of two Gaussians is in front. A pixel is *unsure* where the reference comes within
-a small relative margin of such a turn. Elsewhere the image has to agree within IMAGE; each gradient, of a
-loss over all pixels and of one over the sure pixels, within GRADIENT of its length.
+Float32 rounding may change a decision: whether an alpha reaches 1/255, whether a pixel ends at transmittance 1e-4,
+which of two Gaussians is in front. A pixel is *unsure* where the reference is within a small relative margin of such a
+decision. Elsewhere the image has to agree within IMAGE. Each gradient has to agree within GRADIENT of its length, for a
+loss over all pixels and for a loss over the sure pixels.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Fields = dict[str, Tensor]
 
 
 class Drawn(NamedTuple):
-    """Gaussians on the image, front to back: what alphas and colours come from."""
+    """Projected Gaussians, front to back."""
 
     centres: Tensor
     conics: Tensor
@@ -79,7 +79,7 @@ def compare(name: str) -> dict[str, Any]:
 
 
 def apart(found: Tensor, expected: Tensor) -> float:
-    """The length of the difference, in lengths of what was expected."""
+    """The length of the difference, relative to that of the expected value."""
     return ((found - expected).norm() / expected.norm()).item()
 
 

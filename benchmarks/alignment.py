@@ -1,16 +1,15 @@
-"""The check before training: what stops, what passes, whether the frame is told, and in what time.
+"""The alignment check before training: which inputs it stops, which frame it guesses, and its CPU seconds.
 
     python benchmarks/alignment.py [SCENE ...]
 
-Checkpoints of the shared captures against their own photographs, then against cameras that are moved as other tools
-would have them, against another scene's, and against photographs of another exposure; and checkpoints moved into the
-frames that gsplat's and nerfstudio's trainers normalise to. One row a case in results/alignment.jsonl.
+The inputs are checkpoints of the shared captures with their own photographs, with cameras transformed as other tools
+transform them, with another scene's checkpoint and with another exposure; and checkpoints in the normalised frames of
+gsplat's and nerfstudio's trainers. Each case adds a row to ``results/alignment.jsonl``.
 """
 
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,10 +17,9 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import torch
-from common import append, capture
+from common import append, arguments, capture, checkpoint, photographs
 from torch import Tensor
 
-import clod_adapter as clod
 from clod_adapter.alignment.check import DOUBTFUL, check_alignment
 from clod_adapter.alignment.search import guess_frame
 from clod_adapter.cameras import View
@@ -35,10 +33,12 @@ Case = tuple[str, Gaussians, list[View]]
 
 
 def main() -> None:
-    names = sys.argv[1:] or SCENES
-    loaded = {name: clod.load(capture(name) / "pretrained.ply").gaussians for name in SCENES}
+    parser = arguments(__doc__)
+    parser.add_argument("scenes", nargs="*", metavar="SCENE", default=SCENES)
+    names = parser.parse_args().scenes
+    loaded = {name: checkpoint(name).gaussians for name in SCENES}
     for name in names:
-        scene = clod.load_scene(capture(name))
+        scene = photographs(name)
         views, points = [*scene.test, *scene.train], load_points(capture(name))
         check_alignment(loaded[name], views)  # compiled and warm
         others: list[Case] = [(f"the file of {other}", loaded[other], views) for other in SCENES if other != name]
@@ -47,7 +47,7 @@ def main() -> None:
 
 
 def row(gaussians: Gaussians, views: list[View], points: Tensor) -> dict[str, object]:
-    """Seconds are the processor's, of all threads: others may be at work on the machine."""
+    """CPU seconds of all threads, which other work on the machine affects less."""
     began = time.process_time()
     found = check_alignment(gaussians, views)
     checked = time.process_time()
@@ -55,7 +55,7 @@ def row(gaussians: Gaussians, views: list[View], points: Tensor) -> dict[str, ob
     guess = guess_frame(gaussians, views, found, points) if suspect else None
     numbers = {key: round(value, 3) for key, value in found.as_dict().items()}
     return {
-        "stops": not found.fits or guess is not None, **numbers, "guess": guess and guess.says,
+        "stops": not found.fits or guess is not None, **numbers, "guess": guess and guess.description,
         "guess_psnr": guess and round(guess.psnr, 2), "check_cpu_s": round(checked - began, 2),
         "guess_cpu_s": round(time.process_time() - checked, 2) if suspect else None,
     }  # fmt: skip
@@ -135,7 +135,7 @@ def turning(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def gsplat(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """What its example trainer's parser does with ``normalize_world_space``; poses are camera to world."""
+    """gsplat's example trainer with ``normalize_world_space``; poses are camera to world."""
     rotation = turning(-poses[:, :3, 1].mean(0), np.array([0.0, -1, 0]))
     centres, forward = poses[:, :3, 3] @ rotation.T, poses[:, :3, 2] @ rotation.T
     nearest = centres - np.einsum("vi,vi,vj->vj", forward, centres, forward)
@@ -152,7 +152,7 @@ def gsplat(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def nerfstudio(poses: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Its default ``auto_orient_and_center_poses`` and scaling, after a turn of COLMAP's world."""
+    """nerfstudio's default ``auto_orient_and_center_poses`` and scaling, after a turn of COLMAP's world."""
     rotation = turning(turn @ -poses[:, :3, 1].mean(0), np.array([0.0, 0, 1])) @ turn
     centres = poses[:, :3, 3] @ rotation.T
     return similarity(rotation, 1 / np.abs(centres - centres.mean(0)).max(), -centres.mean(0))

@@ -1,18 +1,16 @@
-"""Checkpoints drawn with the filter that they were trained with, and with another one: quality, and what is found out.
+"""Quality of checkpoints drawn with the screen-space filter of their training and with others.
 
     python benchmarks/antialias.py [--iters 800] [--adapt 400] [--keep DIR] [SCENE ...]
 
-No capture here has a checkpoint that was trained antialiased, so stand-ins are made: each scene's checkpoint, whose
-attributes are tuned on its training photographs at full detail with gsplat's antialiasing ("on") and Mip-Splatting's
-("mip"). Of these and of the classic checkpoints a row each: PSNR of the held-out photographs with each filter, and
-what ``compare_filters`` chooses (its views are of both kinds, as the command's are). Then one stand-in of each scene is
-adapted with the right filter and with the classic one, to photographs and to its own pictures. Rows in
-results/antialias.jsonl.
+No capture has a checkpoint that was trained antialiased. Substitutes are each scene's checkpoint with its attributes
+tuned on the training photographs with gsplat's antialiasing ("on") and with Mip-Splatting's filter ("mip"). Each
+checkpoint adds a row with the held-out PSNR of each filter and the choice of ``compare_filters``. One substitute of
+each scene is also adapted with the right filter and with the classic one, to photographs and to its own renders. Rows
+go to ``results/antialias.jsonl``.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +20,7 @@ from typing import Any
 import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 
 # isort: split
-from common import append, capture
+from common import append, arguments, capture, checkpoint, photographs
 from tuning import Tuning, tune
 
 from clod_adapter.alignment.screen_filter import compare_filters
@@ -39,16 +37,16 @@ DIALS = (1.0, 2.0, 3.0, 5.0)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*", default=list(CLASSIC_FILES))
-    parser.add_argument("--iters", type=int, default=800, help="steps that a stand-in is tuned for")
-    parser.add_argument("--adapt", type=int, default=400, help="steps that a stand-in is adapted for")
-    parser.add_argument("--keep", type=Path, help="a folder of stand-ins, made or used again")
+    parser.add_argument("--iters", type=int, default=800, help="steps that a substitute is tuned for")
+    parser.add_argument("--adapt", type=int, default=400, help="steps that a substitute is adapted for")
+    parser.add_argument("--keep", type=Path, help="a folder that keeps the substitutes for other runs")
     args = parser.parse_args()
     with TemporaryDirectory() as temporary:
         folder = args.keep or Path(temporary)
         for name in args.scenes:
-            scene = clod.load_scene(capture(name))
+            scene = photographs(name)
             for file in CLASSIC_FILES[name]:
                 base = clod.load(capture(name) / file)
                 append(FILE, {"scene": name, "file": file, "trained": "off", **row(base.gaussians, scene)})
@@ -61,8 +59,8 @@ def main() -> None:
 
 
 def standins(name: str, scene: clod.Scene, iters: int, folder: Path) -> Iterator[tuple[str, clod.Gaussians]]:
-    """By the filter that they were trained with; without a word on it, as such files come."""
-    base = clod.load(capture(name) / "pretrained.ply")
+    """(filter of the training, checkpoint) of each substitute; its file does not name the filter, as is usual."""
+    base = checkpoint(name)
     for trained in ("on", "mip"):
         path = folder / f"{name}_{trained}_{iters}.ply"
         if not path.exists():
@@ -73,7 +71,7 @@ def standins(name: str, scene: clod.Scene, iters: int, folder: Path) -> Iterator
 
 
 def row(gaussians: clod.Gaussians, scene: clod.Scene) -> dict[str, Any]:
-    """PSNR of the held-out photographs with each filter, and what the photographs say; seconds are the processor's."""
+    """Held-out PSNR with each filter, and the choice of ``compare_filters`` with its CPU seconds."""
     psnr = {
         name: round(evaluate(gaussians.replace(screen_filter=each), scene.test, [1.0])[0].psnr, 2)
         for name, each in FILTERS.items()
@@ -89,7 +87,7 @@ def row(gaussians: clod.Gaussians, scene: clod.Scene) -> dict[str, Any]:
 
 
 def adapted(gaussians: clod.Gaussians, scene: clod.Scene, drawn: str, iters: int, teacher: str) -> dict[str, Any]:
-    """What adapting with one filter comes to, drawn with the same; to photographs, or to the file's own pictures."""
+    """Adapted and drawn with one filter; the teacher is the photographs, or renders of the checkpoint."""
     start = gaussians.replace(screen_filter=FILTERS[drawn])
     own = clod.render_pseudo_views(start, clod.place_cameras(start)) if teacher == "checkpoint" else scene
     result = clod.adapt(start, own, clod.AdaptConfig(max_sv=5, iters=iters))

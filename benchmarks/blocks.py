@@ -1,41 +1,35 @@
-"""Adapting in blocks: do its pictures have seams, and does it stay within its memory?
-
-Seams: a capture adapted whole, whole with another seed, and in blocks of forced number; each against the photographs
-and against the first, at s = 1, 3, 5, on the held-out views, on all of their pixels and on those across a border
-between blocks (where no block has SOLE of the pixel). Memory: the command on a synthetic city, with and without
---memory, in a process of its own whose largest resident size the system tells.
+"""Adapting in blocks: differences at block borders, and peak memory.
 
     python benchmarks/blocks.py seams                  # hours on two cores; --iters 300 for a quick look
     python benchmarks/blocks.py memory                 # 2 million Gaussians, 60 photographs of 960x540
+
+``seams`` adapts a capture whole, whole with another seed, and in a fixed number of blocks. It compares each with the
+photographs and with the first at s = 1, 3, 5 on the held-out views: on all pixels, and on the pixels at a border, where
+no block contributes SOLE. ``memory`` runs the command on a synthetic city with and without --memory.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import os
-import subprocess
-import sys
 import tempfile
 import time
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from city import write_city
-from common import append, capture
+from common import COMMAND, Process, append, arguments, checkpoint, photographs
 
 from clod_adapter.blocks.divide import Division, divide
-from clod_adapter.blocks.targets import target
+from clod_adapter.blocks.targets import target_image
 from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import seeing
-from clod_adapter.io.checkpoint import load
-from clod_adapter.io.scene.load import load_scene
+from clod_adapter.initialization.importance import usable_views
 from clod_adapter.render import render
 from clod_adapter.training.loop import adapt
 
@@ -50,14 +44,14 @@ def db(error: float) -> float:
 @torch.no_grad()
 def borders(division: Division, views: tuple[View, ...]) -> list[torch.Tensor]:
     """For each view ``[H, W]`` bool: no block has SOLE of the pixel. By ``target`` of a white photograph on black."""
-    black = division.begun.replace(sh0=torch.full_like(division.begun.sh0, -10), shN=division.begun.shN[:, :0])
+    black = division.initial.replace(sh0=torch.full_like(division.initial.sh0, -10), shN=division.initial.shN[:, :0])
     found = []
     for view in views:
         white, largest = View(view.camera, torch.full_like(view.image, 255)), torch.zeros(view.image.shape[:2])
         for block in range(division.count):
             rows = division.rows(block)
             ordered = black.select(torch.cat([rows, (division.block != block).nonzero()[:, 0]]))
-            largest = largest.maximum(target(ordered, len(rows), white)[..., 0] / 255)
+            largest = largest.maximum(target_image(ordered, len(rows), white)[..., 0] / 255)
         found.append(largest < SOLE)
     return found
 
@@ -92,12 +86,10 @@ def compare(
     return rows
 
 
-def seams(args: argparse.Namespace) -> None:
+def seams(args: Namespace) -> None:
     for name in args.scenes:
-        folder = capture(name)
-        base = load(folder / "pretrained.ply")
-        scene = load_scene(folder, origin=base.origin)
-        config, views = AdaptConfig(iters=args.iters), seeing(base.gaussians, scene.train)
+        base, scene = checkpoint(name), photographs(name)
+        config, views = AdaptConfig(iters=args.iters), usable_views(base.gaussians, scene.train)
         began = time.perf_counter()
         whole = adapt(base.gaussians, scene, config).gaussians
         seconds = time.perf_counter() - began
@@ -120,32 +112,24 @@ def seams(args: argparse.Namespace) -> None:
                 append("blocks.jsonl", {**about, **row, "rows": compare(after, whole, scene.test, masks)})
 
 
-def memory(args: argparse.Namespace) -> None:
+def memory(args: Namespace) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(args.city or Path(temporary) / "city")
         if not (folder / "city.ply").exists():
             write_city(folder, args.count, args.images, 960, 540)
         for limit in args.memory:
-            words = [str(folder / "city.ply"), "--images", str(folder), "--iters", str(args.iters), "--quiet"]
-            words += [] if limit == "none" else ["--memory", limit]
-            words += ["--out", str(Path(temporary) / "out.ply")]
-            code = "import sys; from clod_adapter.cli.main import main; sys.exit(main(sys.argv[1:]))"
-            began = time.perf_counter()
-            process = subprocess.Popen([sys.executable, "-c", code, *words, "--json"], stdout=subprocess.PIPE)
-            assert process.stdout is not None
-            report = process.stdout.read()
-            _, status, usage = os.wait4(process.pid, 0)
-            if status:
-                sys.exit(f"--memory {limit} failed")
-            found = json.loads(report)
+            words = [folder / "city.ply", "--images", folder, "--iters", args.iters, "--quiet"]
+            words += ["--out", Path(temporary) / "out.ply", *(() if limit == "none" else ("--memory", limit))]
+            process = Process([*COMMAND, *words, "--json"])
+            found = json.loads(process.out)
             row = {"what": "memory", "count": args.count, "images": args.images, "memory": limit, "iters": args.iters}
-            row |= {"peak_bytes": usage.ru_maxrss * 1024, "seconds": time.perf_counter() - began}
+            row |= {"peak_bytes": process.peak_bytes, "seconds": process.seconds}
             row |= {"plan": found.get("memory"), "steps": found["steps"], "rows": found["rows"]}
             append("blocks.jsonl", row | {"times": found["seconds"]})
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     commands = parser.add_subparsers(required=True)
     one = commands.add_parser("seams")
     one.add_argument("--scenes", nargs="+", default=["plush_half", "bonsai146"])
@@ -157,7 +141,7 @@ def main() -> None:
     other.add_argument("--images", type=int, default=60)
     other.add_argument("--iters", type=int, default=40)
     other.add_argument("--memory", nargs="+", default=["none", "8GB", "3.5GB"], help="limits, none for without one")
-    other.add_argument("--city", help="a folder that benchmarks/city.py made (default: made, and removed)")
+    other.add_argument("--city", help="a folder that benchmarks/city.py made (default: a temporary one)")
     other.set_defaults(run=memory)
     args = parser.parse_args()
     args.run(args)

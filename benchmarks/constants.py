@@ -1,29 +1,25 @@
-"""What is left of the dial once another tool has rewritten an adapted PLY without its header's comments.
+"""The dial of an adapted PLY after another tool has rewritten the file without the header's comments.
 
     python benchmarks/constants.py plush_half --iters 200
     python benchmarks/constants.py --table                  # the rows as a Markdown table
 
 A checkpoint is adapted with each of some settings and saved. The held-out views are measured at each dial value on the
-file as it was written, as plyfile writes it without comments, and as splat-transform does where it is installed; and on
-a file as earlier versions wrote it, with sigma_d in units of the typical distance, rewritten likewise. ``same`` says
-whether all numbers, and who is kept in each view, are those of the file as it was written; ``note`` is what loading it
-says.
-
-Each setting adds a row to ``results/constants.jsonl``.
+file as written, as plyfile rewrites it without comments, as splat-transform rewrites it where that is installed, and on
+the format of earlier versions, with sigma_d in units of the typical distance. ``same``: all numbers and kept Gaussians
+equal those of the file as written. ``note``: the message on loading. Each setting adds a row to
+``results/constants.jsonl``.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
-from common import RESULTS, append, capture
+from common import append, arguments, checkpoint, photographs, stored, table
 from plyfile import PlyData, PlyElement
 
 import clod_adapter as clod
@@ -45,40 +41,36 @@ SETTINGS: dict[str, clod.AdaptConfig] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="*", help="captures beside the checkout")
+    parser = arguments(__doc__, table=print_table)
+    parser.add_argument("scenes", nargs="*", help="captures of the shared data")
     parser.add_argument("--iters", type=int, default=200)
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=[*SETTINGS])
-    parser.add_argument("--table", action="store_true", help="print the rows there are")
     args = parser.parse_args()
     for scene in args.scenes:
         for name in args.settings:
-            append(
-                FILE, {"benchmark": "constants", "scene": scene, "settings": name, **measure(scene, name, args.iters)}
-            )
-    if args.table:
-        print_table()
+            about = {"benchmark": "constants", "scene": scene, "settings": name}
+            append(FILE, about | measure(scene, name, args.iters))
 
 
 def measure(scene: str, name: str, iters: int) -> dict[str, Any]:
-    base, photographs = clod.load(capture(scene) / "pretrained.ply"), clod.load_scene(capture(scene))
+    base, scenery = checkpoint(scene), photographs(scene)
     config = clod.AdaptConfig(**{**asdict(SETTINGS[name]), "iters": iters})
-    result = clod.adapt(base.gaussians, photographs, config).gaussians
+    result = clod.adapt(base.gaussians, scenery, config).gaussians
     found: dict[str, Any] = {}
     with TemporaryDirectory() as folder:
         clod.save(Path(folder) / "model.ply", result, base)
-        wanted = look(Path(folder) / "model.ply", photographs)
+        wanted = look(Path(folder) / "model.ply", scenery.test)
         for tool, path in rewritten(Path(folder), result):
-            got = look(path, photographs)
+            got = look(path, scenery.test)
             found[tool] = {"same": got["rows"] == wanted["rows"] and torch.equal(got["kept"], wanted["kept"]),
                            "rows": got["rows"], "note": got["note"]}  # fmt: skip
-    return {"config": asdict(config), "gaussians": len(result), "views": len(photographs.test),
+    return {"config": asdict(config), "gaussians": len(result), "views": len(scenery.test),
             "reference_distance": result.attenuation and result.attenuation.reference_distance,
             "written": wanted["rows"], **found}  # fmt: skip
 
 
 def rewritten(folder: Path, result: clod.Gaussians) -> Iterator[tuple[str, Path]]:
-    """The file that stands there as tools leave it, and one as earlier versions wrote it."""
+    """(tool, file): the saved file rewritten by each tool, and in the format of earlier versions."""
     model = PlyData.read(str(folder / "model.ply"))["vertex"].data
     PlyData([PlyElement.describe(model, "vertex")], byte_order="<").write(str(folder / "plyfile.ply"))
     yield "plyfile", folder / "plyfile.ply"
@@ -97,27 +89,26 @@ def rewritten(folder: Path, result: clod.Gaussians) -> Iterator[tuple[str, Path]
         yield "plyfile, of an earlier version", folder / "earlier.ply"
 
 
-def look(path: Path, photographs: clod.Scene) -> dict[str, Any]:
-    """The held-out views at each dial value: numbers, who is kept, and what loading says."""
-    checkpoint = clod.load(path)
-    rows = clod.evaluate(checkpoint.gaussians, photographs.test, DIALS)
-    kept = [render(checkpoint.gaussians, view.camera, s).kept for view in photographs.test for s in DIALS]
+def look(path: Path, views: Sequence[clod.View]) -> dict[str, Any]:
+    """The held-out views at each dial value: numbers, kept Gaussians, and the message on loading."""
+    model = clod.load(path)
+    rows = clod.evaluate(model.gaussians, views, DIALS)
+    kept = [render(model.gaussians, view.camera, s).kept for view in views for s in DIALS]
     numbers = [{"virtual_scale": r.virtual_scale, "psnr": r.psnr, "ssim": r.ssim, "kept": r.kept} for r in rows]
-    return {"rows": numbers, "kept": torch.stack(kept), "note": "; ".join(checkpoint.notes)}
+    return {"rows": numbers, "kept": torch.stack(kept), "note": "; ".join(model.notes)}
 
 
 def print_table() -> None:
     """A line for each file, with PSNR @ share kept at each dial value."""
-    print("| scene, settings | file | same | " + " | ".join(f"s = {s:g}" for s in DIALS) + " | said |")
-    print("|---" * (4 + len(DIALS)) + "|")
-    for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
-        row: dict[str, Any] = json.loads(line)
+    lines = []
+    for row in stored(FILE):
         files = {"as written": {"same": "", "rows": row["written"], "note": ""}}
         files |= {name: value for name, value in row.items() if isinstance(value, dict) and "same" in value}
         for name, file in files.items():
             cells = [f"{r['psnr']:.2f} @ {r['kept'] / row['gaussians']:.1%}" for r in file["rows"]]
             said = "warning" if file["note"].startswith(WARNING) else "note" if file["note"] else ""
-            print(f"| {row['scene']}, {row['settings']} | {name} | {file['same']} | {' | '.join(cells)} | {said} |")
+            lines.append([f"{row['scene']}, {row['settings']}", name, file["same"], *cells, said])
+    print(table(["scene, settings", "file", "same", *(f"s = {s:g}" for s in DIALS), "message"], lines))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What ``rasterize.py`` times, each in a process of its own: ours, the yardstick and gsplat."""
+"""The rasterizers that ``rasterize.py`` times, each in its own process: this package, the yardstick and gsplat."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ Jobs = dict[str, Callable[[], Any]]
 
 
 class Worker:
-    """A rasterizer in a process of its own: what its libraries set there and what it allocates is its own.
+    """A rasterizer in a process of its own, so that its libraries and memory do not affect the others.
 
-    The yardstick's library, for one, makes its process flush denormal numbers. A worker that died answers None.
+    The yardstick's library, for example, makes its process flush denormal numbers. A dead worker returns None.
     """
 
     def __init__(self, title: str, make: Callable[..., Jobs], *arguments: Any) -> None:
@@ -62,7 +62,7 @@ def _serve(pipe: Any, make: Callable[..., Jobs], arguments: tuple[Any, ...]) -> 
     torch.set_num_threads(THREADS)
     jobs = make(*arguments)
     with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)  # what is free already must not hide what the steps take
+        ctypes.CDLL(None).malloc_trim(0)  # memory that is free already must not hide that of the steps
     before = _memory("VmRSS")
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak starts anew
@@ -72,7 +72,7 @@ def _serve(pipe: Any, make: Callable[..., Jobs], arguments: tuple[Any, ...]) -> 
 
 
 def _memory(field: str) -> float:
-    """Megabytes, from what Linux says of this process; 0 elsewhere."""
+    """Megabytes of a field of /proc/self/status; 0 where there is none."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
             if line.startswith(field):
@@ -92,7 +92,7 @@ def timed_step(draw: Callable[[], Tensor], leaves: list[Tensor], weights: Tensor
 
 
 def ours(workload: Workload) -> tuple[Callable[[], Tensor], list[Tensor]]:
-    """ViewSampler the workload with our rasterizer; and the leaves that gradients go to."""
+    """A function that draws the workload with our rasterizer, and the leaves of its gradients."""
     leaves = {name: value.clone().requires_grad_() for name, value in workload.parameters().items()}
     background = torch.zeros(3)
     return lambda: cpu.rasterize(**leaves, camera=workload.camera, background=background)[0], list(leaves.values())
@@ -161,9 +161,9 @@ def gsplat_jobs(name: str) -> Jobs:
 
 
 def build_yardstick(source: Path, folder: Path) -> Path | None:
-    """The yardstick's library, built as its ``measure.py`` does; None where that cannot be done.
+    """The yardstick's library, built as its ``measure.py`` does; None where its source or g++ is absent.
 
-    Leaves with a message where it would time other scenes than ours.
+    Exits with a message where its scenes differ from ours.
     """
     if not (source / "kernel.cpp").is_file() or not shutil.which("g++"):
         print(f"the yardstick is left out: there is no {source / 'kernel.cpp'}, or no g++", file=sys.stderr)

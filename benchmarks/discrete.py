@@ -1,24 +1,22 @@
-"""Discrete against continuous: two levels and a hard switch against one file and its dial, and the jump measured.
+"""Two levels of detail with a hard switch against one file with its dial: a picture and the measured jump.
 
     clod-adapt demo                                      # makes demo/gallery.ply and demo/capture
     python benchmarks/discrete.py demo/gallery.ply demo/capture --view 0
 
-The picture, docs/images/discrete_vs_continuous.png, is as the paper's: one held-out view in four strips, from least
-detail to most, of two levels and of one file. Below it a sweep from most to least: PSNR, and the change from frame to
-frame. The two levels are the file itself at its dial's ends, written out as two files would be: nothing but the switch
-differs. A row with the numbers is added to ``results/discrete.jsonl``.
+docs/images/discrete_vs_continuous.png shows a held-out view in four strips from least to most detail, for two levels
+and for one file; below it PSNR and the change from frame to frame over a sweep. The two levels are the file at both
+ends of its dial, so that they differ in the switch alone. Adds a row to ``results/discrete.jsonl``.
 """
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from common import ROOT, append
+from common import ROOT, append, arguments
 from torch import Tensor
 
 import clod_adapter as clod
@@ -55,7 +53,7 @@ class Sweep:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("model", help="an adapted PLY")
     parser.add_argument("images", help="its scene: photographs and COLMAP model")
     parser.add_argument("--view", type=int, default=0, help="which of the held-out views (default: the first)")
@@ -89,7 +87,7 @@ def sweep(gaussians: clod.Gaussians, view: clod.View, frames: int) -> Sweep:
 
 
 def hard_switch(dial: Sweep) -> Sweep:
-    """The same way with the two levels at its ends only, changed half way."""
+    """The same sweep with the two levels of its ends only, switched half way."""
     half = len(dial.dials) // 2
     at = [0] * half + [len(dial.dials) - 1] * (len(dial.dials) - half)
     return Sweep(dial.dials, dial.images[at], [dial.kept[k] for k in at], [dial.psnr[k] for k in at])

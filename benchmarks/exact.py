@@ -1,7 +1,7 @@
-"""The dial's equation at 50 digits, the points at which it is compared, and the formula as it stands in the paper.
+"""The dial's equation at 50 digits, the points of comparison, and the paper's formula.
 
-What depends on few inputs (log a, ``u = (d s)^2 / 2v`` and its exponential, the slope, ``log(tau s)``) comes from
-mpmath; it is put together in numpy's long double, whose 64 bits are 2,000 times as fine as float64's.
+mpmath evaluates the functions of few inputs (log a, ``u = (d s)^2 / 2v`` and its exponential, the slope,
+``log(tau s)``). numpy's long double combines them; its 64 bits are 2,000 times as fine as float64's.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TEMPERATURES = [1e-300, 1e-30, 1e-6, 1e-3, 0.02, 0.15, 0.5, 1.0, 10.0, 1e6]
 
 
 class Case(NamedTuple):
-    """Gaussians at one dial value: columns of inputs, and of what mpmath makes of them."""
+    """Gaussians at one dial value: columns of inputs, and of mpmath's results."""
 
     logits: Array
     sigma: Array

@@ -1,18 +1,16 @@
-"""What each file format keeps: bytes a Gaussian, seconds, the error of sigma_d, and the pictures beside the PLY's.
+"""Each file format: bytes per Gaussian, seconds, the error of sigma_d, and PSNR against the PLY.
 
     python benchmarks/formats.py plush_half
     python benchmarks/formats.py --table                  # the rows as a Markdown table
 
-A checkpoint gets a sigma_d without training (``importance.start``), is written in each format that carries one and
-read again; the pictures are of the dial at s, means over the held-out views, against those of the PLY. ``.splat``
-carries none: what is baked at s goes through it, and is compared with what is baked at s in the PLY. PSNR is between
-floating-point pictures, and null where they are equal. Each format adds one row to ``results/formats.jsonl``.
+A checkpoint gets a sigma_d without training (``importance.initialize``), is written in each format that stores one and
+read again. PSNR is between the renders at s and those of the PLY, as means over the held-out views, in floating point;
+null where they are equal. ``.splat`` stores no sigma_d: a model baked at s is written and compared. Each format adds
+one row to ``results/formats.jsonl``.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import tempfile
 import time
@@ -23,10 +21,10 @@ from statistics import fmean, median
 from typing import Any
 
 import torch
-from common import RESULTS, append, capture
+from common import append, arguments, checkpoint, photographs, stored, table
 
 import clod_adapter as clod
-from clod_adapter.initialization.importance import seeing, start
+from clod_adapter.initialization.importance import initialize, usable_views
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, read_model, write
 
 FILE = "formats.jsonl"
@@ -35,22 +33,17 @@ REPEATS = 5
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__, table=print_table)
     parser.add_argument("scenes", nargs="*")
-    parser.add_argument("--table", action="store_true", help="print the rows there are")
-    args = parser.parse_args()
-    if args.table:
-        print_table()
-    for scene in args.scenes:
+    for scene in parser.parse_args().scenes:
         run(scene, clod.AdaptConfig(max_sv=max(DIALS)))
 
 
 def run(scene: str, config: clod.AdaptConfig) -> None:
-    base = clod.load(capture(scene) / "pretrained.ply").gaussians
-    photographs = clod.load_scene(capture(scene))
-    model = start(base, seeing(base, photographs.train), config, lambda *_: None)
-    cameras = [view.camera for view in photographs.test]
-    baked = {s: clod.bake(model, s, cameras=[view.camera for view in photographs.train]) for s in DIALS}
+    base, views = checkpoint(scene).gaussians, photographs(scene)
+    model = initialize(base, usable_views(base, views.train), config, lambda *_: None)
+    cameras = [view.camera for view in views.test]
+    baked = {s: clod.bake(model, s, cameras=[view.camera for view in views.train]) for s in DIALS}
     for suffix in WRITABLE:
         sources = {s: model if FORMATS[suffix].carries_sigma else baked[s] for s in DIALS}
         row: dict[str, Any] = {}
@@ -124,16 +117,16 @@ def pictures(
 
 
 def print_table() -> None:
-    rows = [json.loads(line) for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines()]
-    print("| scene | format | bytes | write | read | sigma_d, decay error | PSNR s = 1 | s = 5 |")
-    print("|---|---|---|---|---|---|---|---|")
-    for row in rows:
-        pictures = ["equal" if row[f"s{s:g}"]["psnr"] is None else f"{row[f's{s:g}']['psnr']:.1f} dB" for s in DIALS]
-        error = "none carried" if row["sigma_error"] is None else f"{row['sigma_error']:.1g}, {row['decay_error']:.1g}"
-        print(
-            f"| {row['scene']} | {row['suffix']} | {row['bytes_per_gaussian']:.1f} | {row['write_seconds']:.2f} s "
-            f"| {row['read_seconds']:.2f} s | {error} | {' | '.join(pictures)} |"
-        )
+    lines = []
+    for row in stored(FILE):
+        psnr = [row[f"s{s:g}"]["psnr"] for s in DIALS]
+        error = "no sigma_d" if row["sigma_error"] is None else f"{row['sigma_error']:.1g}, {row['decay_error']:.1g}"
+        lines.append([
+            row["scene"], row["suffix"], f"{row['bytes_per_gaussian']:.1f}", f"{row['write_seconds']:.2f} s",
+            f"{row['read_seconds']:.2f} s", error, *("equal" if p is None else f"{p:.1f} dB" for p in psnr),
+        ])  # fmt: skip
+    heads = ["scene", "format", "bytes", "write", "read", "sigma_d, decay error", "PSNR s = 1", "s = 5"]
+    print(table(heads, lines))
 
 
 if __name__ == "__main__":

@@ -1,19 +1,18 @@
-"""Damaged files of every format that is read: each must be read, or refused with ClodError, soon and in little memory.
+"""Damaged files of every input format: each must be read, or refused with ClodError, quickly and in little memory.
 
     python benchmarks/fuzz.py                                # 200,000 cases over all formats, some minutes
     python benchmarks/fuzz.py --cases 20000 --format colmap --seed 3 --record
-    python benchmarks/fuzz.py --format ply --seed 0 --case 4711 --keep /tmp/it    # one again, its files kept
+    python benchmarks/fuzz.py --format ply --seed 0 --case 4711 --keep /tmp/it    # one case, its files kept
 
-A case is an undamaged input (mutants.py), damaged at random from its seed and number. Anything else than those two
-outcomes is a failure: another exception, a process that dies (COLMAP is C++) or takes more than LIMIT_S, more than
-LIMIT_MB of memory beyond what reading undamaged inputs takes, an allocation that was refused, a warning, a message of
-several lines or without the file's name, a file opened outside of the case's folder, a program started, a connection
-made. Failures are printed, with the command that repeats them.
+A case is an input (mutants.py) that is damaged (damage.py) at random from its seed and number. A failure is any other
+result: another exception, a process that dies (COLMAP is C++) or takes more than LIMIT_S, more than LIMIT_MB of memory
+beyond that of undamaged inputs, a refused allocation, a warning, a message of several lines or without the file's name,
+a file opened outside of the case's folder, a program started, a connection made. Each failure is printed with the
+command that repeats it.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import os
@@ -32,8 +31,9 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 
 # isort: split
 import torch
-from common import append
-from mutants import FORMATS, Input, make, mutate, write, write_images
+from common import append, arguments
+from damage import mutate
+from mutants import FORMATS, Input, make, write, write_images
 
 from clod_adapter.cli.adapt.resume import Saver
 from clod_adapter.cli.shared.console import Console
@@ -47,13 +47,13 @@ BATCH = 5000  # cases a process
 MANY = 50  # processes that died, after which a format is given up
 SHARES = {"ply": 0.3, "safetensors": 0.15, "colmap": 0.2, "transforms": 0.1, "pt": 0.05, "models": 0.2, "states": 0.05}
 HARMFUL = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect", "ctypes.dlopen")
-# What a process tells the one that watches it, in shared memory.
+# Fields of the shared memory of a worker and its parent.
 CASE, READ, REFUSED, SLOWEST_US, SLOWEST, EXTRA_KB = range(6)
 
 
 @dataclass
 class Tally:
-    """The outcome of a format."""
+    """The result of a format."""
 
     cases: int
     read: int = 0
@@ -65,7 +65,7 @@ class Tally:
 
 
 class Watch:
-    """What Python opens and starts while a case is read."""
+    """Files opened and programs started while a case is read."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.on, self.seen = str(folder), False, [""][:0]
@@ -107,8 +107,8 @@ def place(kind: str, folder: Path) -> Path:
     return target
 
 
-def outcome(kind: str, folder: Path, case: Input, number: int, watch: Watch) -> str:
-    """ "read", "refused", or what went wrong."""
+def result_of(kind: str, folder: Path, case: Input, number: int, watch: Watch) -> str:
+    """ "read", "refused", or a description of the failure."""
     watch.seen.clear()
     watch.on = True
     try:
@@ -130,7 +130,7 @@ def outcome(kind: str, folder: Path, case: Input, number: int, watch: Watch) -> 
 
 
 def work(kind: str, inputs: list[Input], seed: int, cases: range, folder: Path, shared: Any, failures: Path) -> None:
-    """A batch of cases, in a process of its own with little memory; outcomes go to ``shared`` and ``failures``."""
+    """A batch of cases, in a process of its own with little memory; results go to ``shared`` and ``failures``."""
     watch, target = Watch(folder), place(kind, folder)
     os.environ["XDG_CACHE_HOME"] = str(folder / "cache")  # where load_scene puts undistorted photographs
     for case in inputs:
@@ -144,7 +144,7 @@ def work(kind: str, inputs: list[Input], seed: int, cases: range, folder: Path, 
         case = damaged(kind, inputs, seed, number)
         write(case, target)
         began = time.perf_counter()
-        result = outcome(kind, folder, case, number, watch)
+        result = result_of(kind, folder, case, number, watch)
         microseconds = int((time.perf_counter() - began) * 1e6)
         extra = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
         if extra - shared[EXTRA_KB] > LIMIT_MB * 1024:
@@ -160,7 +160,7 @@ def work(kind: str, inputs: list[Input], seed: int, cases: range, folder: Path, 
 
 
 def run(kind: str, seed: int, cases: int, folder: Path) -> Tally:
-    """All cases of a format, batch by batch; a process that dies or hangs costs the case it was at."""
+    """All cases of a format, batch by batch; a process that dies or hangs loses its current case."""
     tally, inputs = Tally(cases), make(kind, folder)
     write_images(folder / "case" / "images")
     failures, fork = folder / "failures.jsonl", multiprocessing.get_context("fork")
@@ -215,13 +215,12 @@ def again(kind: str, seed: int, number: int, folder: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__, record=FILE)
     parser.add_argument("--cases", type=int, default=200_000, help="over all formats; of states a twentieth more")
     parser.add_argument("--format", choices=FORMATS, help="this one alone")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--case", type=int, help="this one alone, in this process")
     parser.add_argument("--keep", type=Path, default=Path("case"), help="with --case: where its files go")
-    parser.add_argument("--record", action="store_true", help=f"add a row to results/{FILE}")
     args = parser.parse_args()
     torch.set_num_threads(1)
     if args.case is not None:

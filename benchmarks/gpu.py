@@ -1,28 +1,26 @@
-"""All that is to be checked where there is an NVIDIA GPU, by one command; and, small, on the CPU, so that it can be.
+"""All checks for an NVIDIA GPU in one command; with small sizes they also run on the CPU.
 
     python benchmarks/gpu.py                         # needs torch with CUDA, gsplat 1.5.3 and the shared data
     python benchmarks/gpu.py --device cpu --small    # the same code, in seconds
     python benchmarks/gpu.py --only city --count 2000000
 
-``tests``: the contract of every backend, the integration with gsplat, the optimiser and the compiled formula.
-``plush``: plush_half adapted on the GPU and on the CPU with the same settings: seconds, and quality on held-out views.
-``city``: a synthetic city adapted (peak memory), then frames near and far at s = 1, 3, 7 beside plain gsplat, packed
-and not, on the same file in the same run, in turn: their times, the share that the dial takes (attenuation, cut and
-compaction), and PSNR against the full picture and against the truth.
+``tests``: the contract of every backend, the gsplat integration, the optimiser and the compiled formula.
+``plush``: plush_half adapted on the GPU and on the CPU with the same settings: seconds, and held-out quality.
+``city``: a synthetic city adapted (peak memory), then near and far frames at s = 1, 3, 7 in turn with plain gsplat,
+packed and not, on the same file: times, the dial's share (attenuation, culling and compaction), PSNR against the full
+render and against the truth.
 
-Each adds rows to ``results/gpu.jsonl``. Where there is no GPU, plain is this package's CPU rasterizer without the dial.
+Each adds rows to ``results/gpu.jsonl``. Without a GPU, plain is this package's CPU rasterizer without the dial.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import resource
 import subprocess
 import sys
 import tempfile
 import time
-import xml.etree.ElementTree as xml
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -31,12 +29,13 @@ from typing import Any
 
 import torch
 from city import city, city_cameras, perturb
-from common import ROOT, append, capture
+from common import ROOT, append, arguments, checkpoint, outcomes, photographs
 from torch import Tensor
 
 import clod_adapter as clod
-from clod_adapter.attenuation import attenuate, attenuate_seen, normalized_distances
+from clod_adapter.attenuation import attenuate
 from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.distances import normalized_distances
 from clod_adapter.metrics import psnr
 from clod_adapter.rasterizers import cuda, wait_for
 from clod_adapter.render import dial, splat
@@ -44,8 +43,8 @@ from clod_adapter.render import dial, splat
 CHECKS = ("tests", "plush", "city")
 DIALS = (1.0, 3.0, 7.0)
 TESTS = (
-    "tests/rasterizers", "tests/integrations/test_gsplat.py", "tests/test_devices.py", "tests/test_optimizer.py",
-    "tests/test_fusing.py",
+    "tests/rasterizers", "tests/integrations/test_gsplat.py", "tests/test_devices.py",
+    "tests/training/test_optimizer.py", "tests/_support/test_fusing.py",
 )  # fmt: skip
 
 
@@ -72,7 +71,7 @@ SMALL = Size(count=3000, width=64, height=48, views=4, steps=3, plush_steps=3, r
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("--device", choices=["cuda", "cpu"], default="cuda")
     parser.add_argument("--small", action="store_true", help="a tiny city, also in place of plush_half, and few tests")
     parser.add_argument("--only", nargs="+", choices=CHECKS, default=CHECKS)
@@ -97,18 +96,15 @@ def main() -> None:
 
 
 def run_tests(small: bool) -> dict[str, Any]:
-    """Counts of pytest's outcomes, and the names of what failed."""
+    """Counts of passed, failed and skipped tests, and the names of failed ones."""
     few = ["-k", "test_for_device or test_no_gaussians"] if small else []
     with tempfile.TemporaryDirectory() as folder:
         report, began = Path(folder) / "report.xml", time.perf_counter()
         command = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-q", f"--junitxml={report}", *TESTS, *few]
         subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)})
-        cases = list(xml.parse(report).getroot().iter("testcase"))
-        kinds = {"failed": ("failure", "error"), "skipped": ("skipped",)}
-        found = {k: [c for c in cases if any(c.find(tag) is not None for tag in tags)] for k, tags in kinds.items()}
-    bad = [f"{case.get('classname')}::{case.get('name')}" for case in found["failed"]]
-    counts = {kind: len(listed) for kind, listed in found.items()}
-    return {"cases": len(cases), **counts, "failures": bad, "seconds": round(time.perf_counter() - began, 1)}
+        found = outcomes(report)
+    cases = found.pop("passed") + found["failed"] + found["skipped"]
+    return {"cases": cases, **found, "seconds": round(time.perf_counter() - began, 1)}
 
 
 def adapt_plush(device: torch.device, size: Size, small: bool) -> list[dict[str, Any]]:
@@ -116,13 +112,12 @@ def adapt_plush(device: torch.device, size: Size, small: bool) -> list[dict[str,
     if small:
         base, scene = synthetic(size, torch.device("cpu"))
     else:
-        folder = capture("plush_half")
-        base, scene = clod.load(folder / "pretrained.ply").gaussians, clod.load_scene(folder)
+        base, scene = checkpoint("plush_half").gaussians, photographs("plush_half")
     config = clod.AdaptConfig(**({"iters": size.plush_steps} if size.plush_steps else {}))
     rows = []
     for place in dict.fromkeys([device, torch.device("cpu")]):
         own = base.to(place)
-        warm = clod.AdaptConfig(iters=1)  # kernels compiled and loaded before the clock starts; its seconds are told
+        warm = clod.AdaptConfig(iters=1)  # compiles and loads kernels before the clock starts; timed separately
         began = time.perf_counter()
         clod.adapt(own, Scene(scene.train[:1], ()), warm)
         warm_seconds = time.perf_counter() - began
@@ -162,7 +157,7 @@ def measure_city(device: torch.device, size: Size) -> list[dict[str, Any]]:
 
 @torch.no_grad()
 def frames(model: clod.Gaussians, views: list[View], where: str, s: float, repeats: int) -> dict[str, Any]:
-    """Medians in milliseconds, ours and plain in turn, over the views; and what each picture is worth."""
+    """Medians in milliseconds, ours and plain in turn, over the views; and PSNR of the pictures."""
     device, plain = model.means.device, plain_frames(model)
     jobs: dict[str, Callable[[Camera], Any]] = {
         "ours": lambda camera: clod.render(model, camera, s).image,
@@ -220,7 +215,7 @@ def plain_frames(model: clod.Gaussians) -> dict[str, Callable[[Camera], Tensor]]
 
 
 def compaction(model: clod.Gaussians, s: float) -> Callable[[Camera], Any]:
-    """What leaving the cut rows out takes, of opacities that are there."""
+    """Removal of the culled rows, given the opacities."""
     scales = model.scales
     drawn: dict[str, Tensor] = {}
 
@@ -233,9 +228,9 @@ def compaction(model: clod.Gaussians, s: float) -> Callable[[Camera], Any]:
 
 
 def one_pass_differs(model: clod.Gaussians, camera: Camera, s: float) -> dict[str, float]:
-    """Compiled formula and plain one: the largest difference of what is drawn, and Gaussians that only one keeps."""
+    """Compiled formula and plain one: the largest difference of drawn opacities, and Gaussians that only one keeps."""
     assert model.sigma_d is not None and model.attenuation is not None
-    fused = attenuate_seen(model.means, model.opacity_logits, model.sigma_d, camera, s, model.attenuation)
+    fused = attenuate(model.opacity_logits, model.sigma_d, (model.means, camera), s, model.attenuation)
     on_cpu = model.to("cpu")
     assert on_cpu.sigma_d is not None
     d = normalized_distances(on_cpu.means, camera, model.attenuation)
@@ -245,7 +240,7 @@ def one_pass_differs(model: clod.Gaussians, camera: Camera, s: float) -> dict[st
 
 
 def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, Scene]:
-    """A city as training might have left it, and photographs of what it should be."""
+    """A perturbed city, and photographs of the unperturbed one."""
     truth = city(size.count)
     cameras = city_cameras(2 * size.views, size.width, size.height, where="mixed", count=size.count)
     views = photograph(truth, cameras, device)

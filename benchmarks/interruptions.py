@@ -1,15 +1,14 @@
-"""What it costs to save the training's state now and then, and to resume from it.
+"""The cost of saving the training state, and of resuming from it.
 
     python benchmarks/interruptions.py                       # plush_half, 300 steps
     python benchmarks/interruptions.py bonsai146 --iters 1500
 
-An adaptation as ``clod-adapt`` runs it, with its saver: ``saving_share`` is the time spent in saving, of the time spent
-in training. The saves are flushed to the disk of ``--folder``. ``load_seconds`` is what reading the last state takes.
+Adapts as ``clod-adapt`` does, with its saver. ``saving_share`` is the share of the training time that saving takes. The
+states are flushed to the disk of ``--folder``. ``load_seconds`` is the time to read the last state.
 """
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -18,7 +17,7 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 
 # isort: split
 import torch
-from common import append, capture
+from common import append, arguments, checkpoint, photographs
 
 from clod_adapter.cli.adapt.resume import Saver
 from clod_adapter.cli.shared.console import Console
@@ -30,7 +29,7 @@ THREADS = 2
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*", default=["plush_half"])
     parser.add_argument("--iters", type=int, default=300)
     parser.add_argument("--folder", help="where to save (default: a temporary folder)")
@@ -42,13 +41,12 @@ def main() -> None:
 
 
 def measure(scene: str, config: clod.AdaptConfig, path: Path) -> None:
-    base = clod.load(capture(scene) / "pretrained.ply")
-    photographs = clod.load_scene(capture(scene))
+    base, views = checkpoint(scene), photographs(scene)
     saver = Saver(path, False, config, Console(), GracefulStop())
     began = time.perf_counter()
-    saver.belong(base.gaussians, photographs, scene, scene)
+    saver.belong(base.gaussians, views, scene, scene)
     digest_seconds = time.perf_counter() - began
-    adapted = clod.adapt(base.gaussians, photographs, config, saver.watching(lambda progress: None))
+    adapted = clod.adapt(base.gaussians, views, config, saver.watching(lambda progress: None))
     saver.keep()
     began = time.perf_counter()
     load_state(path)

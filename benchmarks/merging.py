@@ -1,4 +1,4 @@
-"""Merging, the training-free rival: ``splat-transform --decimate`` (NanoGS's pairwise merging), its files cached."""
+"""Merging without training: ``splat-transform --decimate`` (NanoGS's pairwise merging), with a cache of its files."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ TIMEOUT = 3600.0  # seconds
 
 @dataclass(frozen=True)
 class Merger:
-    """The tool, and the folder that keeps what it made.
+    """The tool, and a cache of its files.
 
     Attributes:
-        tool: splat-transform; files of another version are not taken for its own.
+        tool: splat-transform; files of another version are not used.
         cache: the folder, made when needed.
     """
 
@@ -33,7 +33,7 @@ class Merger:
 
     @classmethod
     def find(cls, cache: Path) -> Merger:
-        """The tool that is here; leaves with the install line where it is missing or too old."""
+        """The installed tool; exits with the install command where it is missing or too old."""
         try:
             return cls(replace(SplatTransform.find(), gpu=False), cache)
         except clod.ClodError as error:

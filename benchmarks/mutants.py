@@ -1,7 +1,7 @@
-"""Inputs for fuzz.py: small whole files as their own writers make them, and ways to damage them.
+"""Inputs for fuzz.py: small undamaged files as their own writers make them.
 
-An input is the files of one format by name. Where the shared data is present, the first rows of its checkpoints and the
-first records of its models are among them.
+An input is the files of one format by name. Where the shared data is present, the first rows of its checkpoints are
+among them.
 """
 
 from __future__ import annotations
@@ -9,31 +9,33 @@ from __future__ import annotations
 import io
 import itertools
 import json
-import random
 import re
 import shutil
-import zipfile
+import sys
 from collections.abc import Callable
-from copy import deepcopy
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
 import torch
-from common import SHARED
-from mutants_models import described, model_inputs, unpacked
+from common import ROOT, SHARED
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
 import clod_adapter as clod
 from clod_adapter.io.adapter_file import save_adapter
+from clod_adapter.io.file_formats import FORMATS as FILE_FORMATS
+from clod_adapter.io.file_formats import WRITABLE
+from clod_adapter.io.file_formats import write as write_model
 from clod_adapter.io.ply.columns import inria_dtype
 from clod_adapter.io.ply.header import read_head
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.state_file import save_state
 from clod_adapter.version import package_version
+
+sys.path.insert(0, str(ROOT / "tests"))
+from packing import write_packed  # noqa: E402
 
 Input = dict[str, bytes]
 FORMATS = ("ply", "safetensors", "states", "colmap", "transforms", "pt", "models")
@@ -49,8 +51,7 @@ def make(kind: str, folder: Path) -> list[Input]:
     """The undamaged inputs of a format; ``folder`` is for files on the way."""
     makers: dict[str, Callable[[Path], list[Input]]] = {
         "ply": _plys, "safetensors": _adapters, "states": _states, "colmap": _models, "transforms": _transforms,
-        "pt": _pts,
-        "models": lambda folder: model_inputs(folder, _base(folder).gaussians),
+        "pt": _pts, "models": _whole_models,
     }  # fmt: skip
     return makers[kind](folder)
 
@@ -188,10 +189,10 @@ def _transforms(folder: Path) -> list[Input]:
 def _pts(folder: Path) -> list[Input]:
     """As gsplat's trainer writes it, of SH degree 1 and 0."""
     inputs = []
-    for bands in (3, 0):
+    for coefficients in (3, 0):
         shapes = {
             "means": (4, 3), "quats": (4, 4), "scales": (4, 3), "opacities": (4,), "sh0": (4, 1, 3),
-            "shN": (4, bands, 3),
+            "shN": (4, coefficients, 3),
         }  # fmt: skip
         out = io.BytesIO()
         torch.save({"step": 29999, "splats": {name: torch.randn(shape) for name, shape in shapes.items()}}, out)
@@ -199,166 +200,14 @@ def _pts(folder: Path) -> list[Input]:
     return inputs
 
 
-VALUES: tuple[Any, ...] = (
-    None, True, -1, 0, 1 << 31, 1 << 63, 1 << 200, 1e308, float("nan"), float("inf"), "", "x", "nan", "a\nb", "\x1b",
-    [], {}, [1], {"a": 1}, [None, None], "[" * 100000, 0.5, "F64", [2**62, 2**62], [0, 2**63], 1e-300, 1e9, -0.5,
-    "../a.png", "/etc/passwd", "images/a", "OPENCV_FISHEYE", "x" * 300,
-)  # fmt: skip
-NUMBERS = (0, 1, 2, 255, 1 << 15, 1 << 16, 1 << 24, (1 << 31) - 1, 1 << 31, (1 << 32) - 1, 1 << 40, 1 << 62)
-NUMBERS += ((1 << 63) - 1, 1 << 63, (1 << 64) - 1)
-WORDS = (
-    b"nan", b"inf", b"-inf", b"-1", b"1e999", b"-0", b"0x10", b"1_0", b"", b" ", b"\n", b"\r", b"\r\n", b"\0", b"\xff",
-    b"../", b"../../etc/passwd", b"/etc/passwd\0", b"C:\\", b"..\\..\\", b"\\\\host\\x", b"~/", b"a" * 5000, b"\x1b[2J",
-    b"b" * 300,
-    b"element vertex", b"property float x", b"property list uchar int x", b"end_header",
-    b"comment clod_adapter tau nan",
-    b"ascii", b"binary_big_endian", b"double", b"uchar", b"PINHOLE", b"OPENCV", b"#", b"{", b"}", b"[" * 2000, b"null",
-    b"99999999999999999999", *(str(number).encode() for number in NUMBERS),
-)  # fmt: skip
-
-
-def mutate(case: Input, others: list[Input], chance: random.Random) -> Input:
-    """Damages one of the files, or two, in one to four ways."""
-    whole, case = case, dict(case)
-    for _ in range(chance.choice((1, 1, 1, 2))):
-        name = chance.choice(sorted(case))
-        data = bytearray(case[name])
-        inside = INSIDE.get(Path(name).suffix)
-        if inside and case[name] is whole[name] and chance.random() < 0.5:
-            data = inside(bytes(data), chance)
-        else:
-            damage(data, chance)
-        case[name] = bytes(data)
-    if chance.random() < 0.02 and len(case) > 1:  # files missing, or of another model
-        del case[chance.choice(sorted(case))]
-    if chance.random() < 0.02 and len(case) > 1:
-        other = chance.choice(others)
-        case |= {name: other[name] for name in chance.sample(sorted(other), 1)}
-    return case
-
-
-def damage(data: bytearray, chance: random.Random) -> None:
-    for _ in range(chance.choice((1, 1, 2, 4))):
-        chance.choice(WAYS)(data, chance)
-
-
-def _describe(data: bytes, chance: random.Random) -> bytearray:
-    """A safetensors file whose description is damaged: as text, or a value in it, the lengths right again."""
-    size = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + size])
-    (key,) = header["__metadata__"]
-    about = json.loads(header["__metadata__"][key])
-    if chance.random() < 0.3:
-        text = bytearray(json.dumps(about).encode())
-        damage(text, chance)
-        header["__metadata__"][key] = text.decode("latin1")
-    else:
-        _replace(header if chance.random() < 0.2 else about, chance)
-        if isinstance(header.get("__metadata__"), dict):
-            header["__metadata__"][key] = json.dumps(about)
-    changed = json.dumps(header).encode()
-    return bytearray(len(changed).to_bytes(8, "little") + changed + data[8 + size :])
-
-
-def _document(data: bytes, chance: random.Random) -> bytearray:
-    """JSON with some of its values replaced."""
-    document = json.loads(data)
-    for _ in range(chance.choice((1, 1, 2, 4))):
-        _replace(document, chance)
-    return bytearray(json.dumps(document).encode())
-
-
-def _replace(where: Any, chance: random.Random) -> None:
-    """Puts another value somewhere into a JSON document."""
-    while True:
-        key = chance.choice(sorted(where) if isinstance(where, dict) else range(len(where)))
-        if not isinstance(where[key], dict | list) or not where[key] or chance.random() < 0.3:
-            break
-        where = where[key]
-    where[key] = deepcopy(chance.choice(VALUES))
-
-
-def _repack(data: bytes, chance: random.Random) -> bytearray:
-    """A zip archive one of whose entries is damaged, its checksum right again."""
-    out = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(out, "w") as new:
-        names = old.namelist()
-        chosen = chance.choice([name for name in names if name.endswith("data.pkl")] * 3 + names)
-        for name in names:
-            entry = bytearray(old.read(name))
-            if name == chosen:
-                damage(entry, chance)
-            new.writestr(name, bytes(entry))
-    return bytearray(out.getvalue())
-
-
-def _flip(data: bytearray, chance: random.Random) -> None:
-    for _ in range(chance.choice((1, 1, 3, 8))):
-        if data:
-            data[_place(data, chance)] ^= 1 << chance.randrange(8)
-
-
-def _truncate(data: bytearray, chance: random.Random) -> None:
-    del data[_place(data, chance) :]
-
-
-def _drop(data: bytearray, chance: random.Random) -> None:
-    start = _place(data, chance)
-    del data[start : start + chance.choice((1, 2, 4, 8, 64))]
-
-
-def _insert(data: bytearray, chance: random.Random) -> None:
-    place = _place(data, chance)
-    data[place:place] = chance.randbytes(chance.choice((1, 4, 8, 100)))
-
-
-def _word(data: bytearray, chance: random.Random) -> None:
-    """A telling word over what is there, or between."""
-    place, word = _place(data, chance), chance.choice(WORDS)
-    data[place : place + (len(word) if chance.random() < 0.5 else 0)] = word
-
-
-def _number(data: bytearray, chance: random.Random) -> None:
-    """An extreme integer, as 1, 2, 4 or 8 bytes of either order."""
-    size, place = chance.choice((1, 2, 4, 8)), _place(data, chance)
-    number = chance.choice(NUMBERS) % (1 << 8 * size)
-    data[place : place + size] = number.to_bytes(size, chance.choice(("little", "little", "big")))
-
-
-def _block(data: bytearray, chance: random.Random) -> None:
-    """Copies a part over another, or between."""
-    start, place, size = _place(data, chance), _place(data, chance), chance.choice((4, 16, 64, 256))
-    data[place : place + (size if chance.random() < 0.5 else 0)] = data[start : start + size]
-
-
-def _line(data: bytearray, chance: random.Random) -> None:
-    """Among the lines that text begins with: drops, doubles or swaps one, or changes a word of it."""
-    end = data.find(b"end_header")
-    text, rest = (bytes(data[:end]), bytes(data[end:])) if end > 0 else (bytes(data), b"")
-    lines = text.split(b"\n")
-    at, other = chance.randrange(len(lines)), chance.randrange(len(lines))
-    way = chance.randrange(5)
-    if way == 0:
-        del lines[at]
-    elif way == 1:
-        lines.insert(other, lines[at])
-    elif way == 2:
-        lines[at], lines[other] = lines[other], lines[at]
-    else:
-        words = lines[at].split(b" ")
-        words[chance.randrange(len(words))] = chance.choice(WORDS)
-        lines[at] = b" ".join(words)
-    data[:] = b"\n".join(lines) + rest
-
-
-def _place(data: bytearray, chance: random.Random) -> int:
-    """Anywhere, but every third time near the start, where the counts are."""
-    return chance.randrange(max(1, min(len(data), 200) if chance.random() < 0.33 else len(data)))
-
-
-INSIDE = {
-    ".safetensors": _describe, ".pt": _repack, ".json": _document,
-    ".spz": lambda data, chance: unpacked(data, chance, damage),
-    ".glb": lambda data, chance: described(data, chance, damage, _replace),
-}  # fmt: skip
-WAYS = (_flip, _truncate, _drop, _insert, _word, _number, _number, _block, _line, _line)
+def _whole_models(folder: Path) -> list[Input]:
+    """Each format that holds a whole model, without and, where it has room, with a dial; and a compressed PLY."""
+    base = _base(folder).gaussians
+    dial = clod.attach(base, torch.rand(len(base)) + 0.1, clod.AttenuationConfig())
+    inputs = []
+    for suffix in (suffix for suffix in WRITABLE if suffix != ".ply"):
+        for gaussians in (base, dial)[: 1 + FILE_FORMATS[suffix].carries_sigma]:
+            write_model(folder / f"whole{suffix}", gaussians, ("a comment",))
+            inputs.append({f"whole{suffix}": (folder / f"whole{suffix}").read_bytes()})
+    packed = write_packed(folder / "whole.compressed.ply", base)
+    return [*inputs, {packed.name: packed.read_bytes()}]

@@ -1,27 +1,25 @@
-"""What training with few photographs, or none, costs: one checkpoint adapted on kinds of views, judged on photographs.
+"""Quality after adapting with few photographs or none, on real held-out photographs.
 
     python benchmarks/nophoto.py plush_half bonsai146 ci_banana
     python benchmarks/nophoto.py plush_half --iters 600 --kinds photographs placed
     python benchmarks/nophoto.py plush_half --few 4 --iters 300 --max-sv 5 --kinds photographs complemented
     python benchmarks/nophoto.py --table                  # the rows as a Markdown table
 
-The kinds: ``photographs`` (real cameras, real pictures), ``teacher`` (real cameras, the checkpoint's own pictures:
-what is lost with the photographs alone), ``placed`` (placed cameras, its own pictures: what is lost with the
-cameras too) and ``complemented`` (few photographs, and placed cameras beside them, as clod-adapt does it). The judges
-are always the real held-out photographs. Each run adds one row to ``results/nophoto.jsonl``, with how far the placed
-cameras stand from the real ones, which the method never sees.
+The kinds of views: ``photographs`` (real cameras and photographs), ``teacher`` (real cameras, renders of the
+checkpoint), ``placed`` (placed cameras, renders of the checkpoint) and ``complemented`` (few photographs and pseudo
+views, as clod-adapt combines them). Each run adds one row to ``results/nophoto.jsonl``, with the distances between
+placed and real cameras.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 from dataclasses import asdict
 
 import torch
 from adapt import at_shares
-from common import RESULTS, append, capture
+from common import append, arguments, checkpoint, stored, table
+from common import photographs as photographs_of
 
 import clod_adapter as clod
 from clod_adapter.training.pseudo_views import add_pseudo_views, place_cameras, render_pseudo_views, typical_reach
@@ -32,25 +30,21 @@ DIALS = (1.0, 2.0, 3.0, 5.0, 7.0)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__, table=print_table)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS[:3])
     parser.add_argument("--few", type=int, metavar="K", help="of the photographs to train on, only K, evenly spread")
     parser.add_argument("--iters", type=int, default=clod.AdaptConfig().iters)
     parser.add_argument("--max-sv", type=float, default=7.0)
     parser.add_argument("--seed", type=int, default=0, help="of the training and of the placement")
-    parser.add_argument("--table", action="store_true", help="print the rows there are")
     args = parser.parse_args()
-    if args.table:
-        print_table()
     for scene in args.scenes:
         for kind in args.kinds:
             run(scene, kind, clod.AdaptConfig(iters=args.iters, seed=args.seed, max_sv=args.max_sv), args.few)
 
 
 def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> None:
-    base = clod.load(capture(scene) / "pretrained.ply").gaussians
-    photographs = clod.load_scene(capture(scene))
+    base, photographs = checkpoint(scene).gaussians, photographs_of(scene)
     if few:
         train = photographs.train[:: max(len(photographs.train) // few, 1)][:few]
         photographs = clod.Scene(train, photographs.test)
@@ -101,15 +95,15 @@ def distances(placed: list[clod.Camera], real: list[clod.Camera], reach: float) 
 
 
 def print_table() -> None:
-    print("| scene | steps | photographs | views | base | " + " | ".join(f"s = {s:g}" for s in DIALS) + " | 12 % |")
-    print("|---" * (6 + len(DIALS)) + "|")
-    for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
-        row = json.loads(line)
+    lines = []
+    for row in stored(FILE):
         cells = [f"{r['psnr']:.2f} @ {r['kept_share']:.1%}" for r in row["rows"]]
         cells += [""] * (len(DIALS) - len(cells))
         cells.append(next((f"{r['psnr']:.2f}" for r in row.get("at_shares", []) if r["share"] == 0.12), ""))
-        head = [row["scene"], str(row["steps"]), str(row.get("photographs", "all")), row["kind"]]
-        print("| " + " | ".join([*head, f"{row['base']['psnr']:.2f}", *cells]) + " |")
+        head = [row["scene"], row["steps"], row.get("photographs", "all"), row["kind"], f"{row['base']['psnr']:.2f}"]
+        lines.append([*head, *cells])
+    heads = ["scene", "steps", "photographs", "views", "base", *(f"s = {s:g}" for s in DIALS), "12 %"]
+    print(table(heads, lines))
 
 
 if __name__ == "__main__":

@@ -1,14 +1,13 @@
-"""gsplat 1.5.3 on a CPU: its own torch code, with plain torch in place of what it has only in CUDA.
+"""gsplat 1.5.3 on a CPU: its own torch code, with plain torch in place of its CUDA-only functions.
 
-A peer for ``rasterize.py`` to time, no part of the library. gsplat's ``rasterization()`` fails without its CUDA
-library. Its ``_rasterization()`` does all that is differentiated in torch, but asks the CUDA library for four things
-and nerfacc, which has no CPU path either, for two. This file answers those six calls and changes nothing else.
+Timed by ``rasterize.py``; not part of the library. gsplat's ``rasterization()`` fails without its CUDA
+library. Its ``_rasterization()`` does all that is differentiated in torch, but calls four functions of
+the CUDA library and two of nerfacc, which has no CPU path either. This file replaces those six calls and nothing else.
 
 Runs as gsplat wrote it:
     ``rendering._rasterization``: the whole frame, from the covariances to the background;
     ``_torch_impl._quat_scale_to_covar_preci``, ``_fully_fused_projection``, ``_rasterize_to_pixels``, ``accumulate``;
-    ``_torch_impl._spherical_harmonics`` and ``_isect_offset_encode``, its own torch twins of two of the CUDA functions;
-    ``_torch_impl._isect_tiles``, likewise, where ``render`` is told ``own_tiles=True``.
+    ``_torch_impl._spherical_harmonics`` and ``_isect_offset_encode``, its own torch twins of two of the CUDA functions.
 
 Shimmed here:
     ``isect_tiles``: gsplat's torch twin is a Python loop over Gaussians and their tiles, which would double the
@@ -50,12 +49,12 @@ def available() -> str | None:
 
 def render(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor, viewmat: Tensor, K: Tensor,
-    width: int, height: int, background: Tensor, *, own_tiles: bool = False,
+    width: int, height: int, background: Tensor,
 ) -> Tensor:  # fmt: skip
-    """The image ``[H, W, 3]``, not clamped; ``sh`` is ``[N, K, 3]``, all bands; ``own_tiles`` is explained above."""
+    """The image ``[H, W, 3]``, not clamped; ``sh`` is ``[N, K, 3]``."""
     from gsplat import rendering
 
-    with _patched(own_tiles):
+    with _patched():
         colors, _, _ = rendering._rasterization(
             means, quats, scales, opacities, sh, viewmat[None], K[None], width, height, near_plane=0.01, eps2d=0.3,
             tile_size=16, sh_degree=math.isqrt(sh.shape[1]) - 1, backgrounds=background[None],
@@ -64,13 +63,13 @@ def render(
 
 
 @contextmanager
-def _patched(own_tiles: bool) -> Iterator[None]:
+def _patched() -> Iterator[None]:
     """While it lasts, gsplat finds the shims where it looks for its CUDA functions and for nerfacc."""
     from gsplat import rendering
     from gsplat.cuda import _torch_impl, _wrapper
 
     def isect_tiles(*args: Any, packed: bool, n_images: int, image_ids: None, gaussian_ids: None) -> Any:
-        return (_torch_impl._isect_tiles if own_tiles else _isect_tiles)(*args)
+        return _isect_tiles(*args)
 
     def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor) -> Tensor:
         return _torch_impl._spherical_harmonics(degree, dirs, coeffs)  # the mask only saves work

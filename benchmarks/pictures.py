@@ -3,13 +3,12 @@
     clod-adapt demo                  # makes demo/base.ply, demo/gallery.ply and demo/capture
     python benchmarks/pictures.py    # docs/images/viewer.webp and docs/images/report.webp
 
-The viewer: a held-out view with the wipe between the dial's end and the checkpoint; without the time of a frame, which
-is that of WebGL in software here. The report: the top of the page that ``clod-adapt eval --report`` writes.
+The viewer shows a held-out view with the wipe between the dial's end and the checkpoint, without its frame time, which
+would be that of WebGL in software. The report is the top of the page that ``clod-adapt eval --report`` writes.
 """
 
 from __future__ import annotations
 
-import argparse
 import io
 import subprocess
 import sys
@@ -17,7 +16,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from common import ROOT
+from common import COMMAND, ROOT, arguments
 from PIL import Image
 
 import clod_adapter as clod
@@ -35,7 +34,7 @@ DIAL = 5.0
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("demo", nargs="?", default="demo", help="the folder of clod-adapt demo (default: demo)")
     folder = Path(parser.parse_args().demo)
     with browser.launch() as chromium:
@@ -64,7 +63,7 @@ def report(chromium: Any, folder: Path) -> bytes:
     with tempfile.TemporaryDirectory() as made, chromium.new_context(viewport=TALL, color_scheme="light") as context:
         out = Path(made) / "gallery.html"
         words = ["eval", "gallery.ply", "--images", "capture", "--base", "base.ply", "--report", str(out), "--quiet"]
-        command = [sys.executable, "-m", "clod_adapter.cli.main", *words]
+        command = [*COMMAND, *words]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder)  # names without a folder on the page
         page = context.new_page()
         page.goto(out.as_uri())

@@ -1,28 +1,24 @@
-"""What the plan saves and costs: the same command with everything in, with the plan, and with --trim.
+"""Savings and cost of the plan: the command with everything included, with the plan, and with --trim.
 
-    python benchmarks/plan.py                               # every scene of the shared data: one row a run
+    python benchmarks/plan.py                               # every scene of the shared data, one row per run
     python benchmarks/plan.py ci_banana --iters 300 --label short
-    python benchmarks/plan.py plush_half ci_banana --attributes  # what each attribute buys, and what the plan said
     python benchmarks/plan.py --table                       # the last rows as Markdown, for docs/plan.md
 
-A scene is a folder of the shared data, with a checkpoint's name where it is not ``pretrained``, or a file without
-photographs. Each run is a process of its own, so that its peak of memory is. Rows go to ``results/plan.jsonl``.
+A scene is a folder of the shared data, followed by the name of the checkpoint where it is not ``pretrained``, or a file
+without photographs. Each run is a process of its own. Rows go to ``results/plan.jsonl``.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
-from common import RESULTS, SHARED, append
+from common import COMMAND, SHARED, Process, append, arguments, stored, table
 
-from clod_adapter.cli.commands.plan import NAMES
+from clod_adapter.training.plan import NAMES
 
 FILE = "plan.jsonl"
 SCENES = (
@@ -31,34 +27,21 @@ SCENES = (
 )  # fmt: skip
 DIALS = (1.0, 3.0, 5.0)
 WAYS = {"everything": ["--with", *NAMES], "plan": [], "plan, trimmed": ["--trim"]}
-SHORT = 300  # steps of the runs that judge attributes
-ATTRIBUTES = NAMES[2:]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__, table=print_table)
     parser.add_argument("scenes", nargs="*", default=SCENES)
     parser.add_argument("--iters", type=int, default=1500)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--attributes", action="store_true", help=f"one attribute frozen at a time, {SHORT} steps")
-    parser.add_argument("--label", default="default", help="what the rows are for")
-    parser.add_argument("--table", action="store_true", help="print the rows there are")
+    parser.add_argument("--label", default="default", help="name of the rows")
     args = parser.parse_args()
-    if args.table:
-        print_table()
-        return
-    ways, iters = WAYS, args.iters
-    if args.attributes:
-        ways = {"plan": ["--with", "unseen", "bands"]}
-        ways |= {f"without {name}": ["--with", "unseen", "bands", "--without", name] for name in ATTRIBUTES}
-        iters = SHORT
     for scene in args.scenes:
-        for way, options in ways.items():
+        for way, options in WAYS.items():
             for seed in args.seeds:
-                words = ["--iters", str(iters), "--seed", str(seed), *options]
-                append(
-                    FILE, {"benchmark": "plan", "scene": scene, "way": way, "label": args.label, **run(scene, words)}
-                )
+                words = ["--iters", str(args.iters), "--seed", str(seed), *options]
+                about = {"benchmark": "plan", "scene": scene, "way": way, "label": args.label}
+                append(FILE, about | run(scene, words))
 
 
 def run(scene: str, options: list[str]) -> dict[str, Any]:
@@ -71,21 +54,14 @@ def run(scene: str, options: list[str]) -> dict[str, Any]:
         source, words = SHARED / folder / f"{checkpoint or 'pretrained'}.ply", ["--images", str(SHARED / folder)]
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "dial.ply"
-        code = "import sys; from clod_adapter.cli.main import main; sys.exit(main())"
-        command = [sys.executable, "-c", code, str(source), *words, *options, "--out", str(out), "--quiet"]
-        began = time.perf_counter()
-        nowhere = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
-        child = os.posix_spawn(sys.executable, command, os.environ, file_actions=nowhere)
-        _, status, used = os.wait4(child, 0)
-        seconds = time.perf_counter() - began
-        if status:
-            sys.exit(f"{' '.join(command)} failed")
+        process = Process([*COMMAND, source, *words, *options, "--out", out, "--quiet"])
         report = json.loads(out.with_suffix(".json").read_text())
     return {
         "steps": report["steps"], "seed": report["config"]["seed"], "base_count": report["base_count"],
-        "wall_seconds": round(seconds, 2), "seconds": report["seconds"], "plan": report["plan"],
+        "wall_seconds": round(process.seconds, 2), "seconds": report["seconds"], "plan": report["plan"],
         "ply_mb": report["ply_bytes"] / 1e6, "adapter_mb": report["adapter_bytes"] / 1e6,
-        "peak_mb": used.ru_maxrss / 1e3, "base_psnr": report["base_rows"][0]["psnr"] if report["base_rows"] else None,
+        "peak_mb": process.peak_bytes / 1024e3,
+        "base_psnr": report["base_rows"][0]["psnr"] if report["base_rows"] else None,
         "rows": [row for row in report["rows"] if row["virtual_scale"] in DIALS],
     }  # fmt: skip
 
@@ -93,22 +69,19 @@ def run(scene: str, options: list[str]) -> dict[str, Any]:
 def print_table() -> None:
     """The last row of each scene, way and number of steps."""
     last: dict[tuple[str, int, str], dict[str, Any]] = {}
-    for row in map(json.loads, (RESULTS / FILE).read_text(encoding="utf-8").splitlines()):
+    for row in stored(FILE):
         if row["label"] == "default":
             last[row["scene"], row["steps"], row["way"]] = row
-    heads = ["scene", "steps", "way", "plan s", "start s", "train s", "PLY MB", "adapter MB", "peak MB"]
-    heads += [f"dB at {s:g} (kept)" for s in DIALS]
-    print(f"| {' | '.join(heads)} |\n|---|---:|---|{'---:|' * (len(heads) - 3)}")
+    lines, decisions = [], []
     for (scene, steps, way), row in last.items():
-        times = [row["seconds"][phase] for phase in ("plan", "start", "train")]
-        cells = [scene, str(steps), way, *(f"{t:.1f}" for t in times)]
-        cells += [f"{row['ply_mb']:.1f}", f"{row['adapter_mb']:.2f}", f"{row['peak_mb']:.0f}"]
-        cells += [f"{r['psnr']:.2f} ({r['kept']:,.0f})" for r in row["rows"]]
-        print("| " + " | ".join(cells) + " |")
-    print("\n| scene | what | decision | number |\n|---|---|---|---:|")
-    for (scene, _, way), row in last.items():
+        times = [f"{row['seconds'][phase]:.1f}" for phase in ("plan", "start", "train")]
+        sizes = [f"{row['ply_mb']:.1f}", f"{row['adapter_mb']:.2f}", f"{row['peak_mb']:.0f}"]
+        lines.append([scene, steps, way, *times, *sizes, *(f"{r['psnr']:.2f} ({r['kept']:,.0f})" for r in row["rows"])])
         for made in row["plan"]["decisions"] if way == "plan, trimmed" else ():
-            print(f"| {scene} | {made['what']} | {made['verdict']} | {made['measured']} {made['why']} |")
+            decisions.append([scene, made["what"], made["verdict"], f"{made['measured']} {made['why']}"])
+    heads = ["scene", "steps", "run", "plan s", "start s", "train s", "PLY MB", "adapter MB", "peak MB"]
+    print(table([*heads, *(f"dB at {s:g} (kept)" for s in DIALS)], lines, 3), end="\n\n")
+    print(table(["scene", "item", "decision", "number"], decisions))
 
 
 if __name__ == "__main__":

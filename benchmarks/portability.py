@@ -24,7 +24,6 @@ exit code is 1 where a test failed or a condition could not be had. The conditio
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import subprocess
@@ -39,9 +38,8 @@ from functools import reduce
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
-from common import ROOT, SHARED, append
+from common import ROOT, SHARED, append, arguments, outcomes
 
 FILE = "portability.jsonl"
 SPACED = os.fsdecode("a folder, spàced".encode())  # under an ASCII locale too
@@ -104,21 +102,21 @@ def run(name: str, tests: Sequence[str], parallel: Sequence[str] = PARALLEL) -> 
         report = Path(outer) / "report.xml"
         words = [*condition.prefix, str(python), "-m", "pytest", *parallel, f"--junitxml={report}", *tests]
         environment = {key: value.format(work=work) for key, value in condition.environment.items()}
-        environment["CLOD_SHARED_DATA"] = str(SHARED)  # which is not beside a clone
+        environment["CLOD_SHARED_DATA"] = str(SHARED)  # the default is relative to the checkout
         began = time.perf_counter()
         done = subprocess.run(
             words, cwd=root, env=os.environ | environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             errors="replace", check=False,
         )  # fmt: skip
         seconds = round(time.perf_counter() - began, 1)
-        found = counts(report) if report.exists() else {"failures": [last_line(done.stdout)]}
+        found = outcomes(report) if report.exists() else {"failures": [last_line(done.stdout)]}
     if done.returncode != 0 and not found["failures"]:
         found["failures"] = [f"exit code {done.returncode}: {last_line(done.stdout)}"]
     return {"passed": 0, "failed": 1, "skipped": 0, **found, "seconds": seconds}
 
 
 def clone(work: Path) -> tuple[Path, Path]:
-    """The last commit in a folder of its own, and the Python of an environment that has it beside what this one has."""
+    """A clone of the last commit, and the Python of an environment with it and this environment's packages."""
     root = work / ROOT.name
     subprocess.run(["git", "clone", "--quiet", str(ROOT), str(root)], check=True)
     subprocess.run([sys.executable, "-m", "venv", str(root / ".venv")], check=True)
@@ -135,22 +133,12 @@ def site_packages() -> str:
     return "\n".join(path for path in sys.path if Path(path) == own or Path(path).name == "site-packages")
 
 
-def counts(report: Path) -> dict[str, Any]:
-    """The counts of a JUnit report, and the names of the tests that failed."""
-    (suite,) = ElementTree.parse(report).getroot().iter("testsuite")
-    bad = [case for case in suite.iter("testcase") if any(case.findall(kind) for kind in ("failure", "error"))]
-    skipped = int(suite.attrib["skipped"])
-    names = sorted({f"{case.get('classname')}::{case.get('name')}" for case in bad})
-    total = len(list(suite.iter("testcase")))
-    return {"passed": total - len(bad) - skipped, "failed": len(bad), "skipped": skipped, "failures": names}
-
-
 def last_line(text: str) -> str:
     return next((line for line in reversed(text.splitlines()) if line.strip()), "no output")
 
 
 def packages() -> dict[str, str]:
-    """The versions that are installed of what pyproject.toml lists as needed to run."""
+    """Installed versions of the dependencies in pyproject.toml, without extras."""
     needed = [line for line in requires("clod-adapter") or [] if "extra ==" not in line]
     found = {}
     for name in (name for line in needed for name in re.findall(r"^[\w.-]+", line)):
@@ -160,10 +148,9 @@ def packages() -> dict[str, str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__, record=FILE)
     parser.add_argument("conditions", nargs="*", help="default: each of them; a+b is both at once")
     parser.add_argument("--tests", nargs="+", default=[], metavar="PATH", help="default: all of them")
-    parser.add_argument("--record", action="store_true", help=f"add a row for each to results/{FILE}")
     args = parser.parse_args()
     if unknown := {each for name in args.conditions for each in name.split("+")} - set(CONDITIONS):
         parser.error(f"there is no condition {', '.join(sorted(unknown))}; there are {', '.join(CONDITIONS)}")

@@ -1,15 +1,14 @@
-"""What a renderer that draws the first n rows of a file shows, by the order of the rows.
+"""PSNR of the first n rows of a file, by the order of its rows.
 
     python benchmarks/prefix.py plush_clod.ply plush_half --base pretrained
     python benchmarks/prefix.py --table                    # the rows as a Markdown table
 
-The model is an adapted file of the capture. At each dial value the counts are the mean over the held-out views, and
-what is drawn of that many Gaussians is measured on them. First the dial itself, and a file of that count baked for the
-training cameras; then prefixes of files whose rows are in an order, drawn as such a renderer draws them, with the
-opacities that stand in the file:
+The model is an adapted file of the capture. The count at a dial value is the dial's mean over the held-out views. At
+each count: ``dial``; ``baked``, a file baked for the training cameras; and prefixes of ordered files, drawn with the
+opacities in the file:
 
-- ``extinction``: by falling s* for the training cameras, what ``clod-adapt export --order extinction --images`` writes;
-- ``extinction, s = 1 baked``: the same with ``--sv 1``, so faded a little, and shorter;
+- ``extinction``: by falling s* for the training cameras, as ``clod-adapt export --order extinction --images`` writes;
+- ``extinction, s = 1 baked``: the same with ``--sv 1``, slightly faded and shorter;
 - ``own``, ``opacity``, ``removal error``: the adapted file as it is, by falling opacity, by falling removal error;
 - ``base, ...``: the untouched checkpoint in the adapted one's order of extinction, by opacity, by removal error.
 
@@ -19,14 +18,10 @@ order by the mean of log s* over the training cameras. Each run adds a row to ``
 
 from __future__ import annotations
 
-import argparse
-import json
 from pathlib import Path
-from typing import Any
 
 import torch
-from common import RESULTS, append, capture
-from torch import Tensor
+from common import append, arguments, checkpoint, falling, photographs, stored, table
 
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
@@ -37,29 +32,24 @@ DIALS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", nargs="?", help="an adapted PLY")
-    parser.add_argument("scene", nargs="?", help="its capture")
+    parser = arguments(__doc__, table=print_table)
+    parser.add_argument("model", help="an adapted PLY")
+    parser.add_argument("scene", help="its capture")
     parser.add_argument("--base", default="pretrained", help="the capture's checkpoint that was adapted")
-    parser.add_argument("--table", action="store_true", help="print the rows there are")
     args = parser.parse_args()
-    if args.model and args.scene:
-        measure(args.model, args.scene, args.base)
-    if args.table:
-        print_table()
+    measure(args.model, args.scene, args.base)
 
 
-def measure(model: str, scene: str, checkpoint: str) -> None:
-    adapted, base = clod.load(model).gaussians, clod.load(capture(scene) / f"{checkpoint}.ply").gaussians
-    photographs, console = clod.load_scene(capture(scene)), Console()
-    held_out = photographs.test
+def measure(model: str, scene: str, base_name: str) -> None:
+    adapted, base = clod.load(model).gaussians, checkpoint(f"{scene}/{base_name}").gaussians
+    views, console = photographs(scene), Console()
 
     def psnr(gaussians: clod.Gaussians, what: str, s: float = 1.0) -> tuple[float, float]:
-        row = clod.evaluate(gaussians, held_out, [s])[0]
+        row = clod.evaluate(gaussians, views.test, [s])[0]
         console.say(f"{what}: {row.psnr:.2f} dB with {row.kept:,.0f}")
         return row.psnr, row.kept
 
-    ordered, cameras = orders(adapted, base, photographs.train), [view.camera for view in photographs.train]
+    ordered, cameras = orders(adapted, base, views.train), [view.camera for view in views.train]
     rows = []
     for s in [s for s in DIALS if adapted.attenuation and s <= adapted.attenuation.max_sv]:
         found, kept = psnr(adapted, f"dial {s:g}", s)
@@ -93,24 +83,18 @@ def orders(adapted: clod.Gaussians, base: clod.Gaussians, views: tuple[clod.View
     }
 
 
-def falling(worth: Tensor) -> Tensor:
-    return worth.argsort(descending=True, stable=True)
-
-
 def head(gaussians: clod.Gaussians, count: int) -> clod.Gaussians:
     return gaussians.select(torch.arange(count))
 
 
 def print_table() -> None:
     """PSNR on the held-out views, a line for an order and a column for a count."""
-    for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
-        row: dict[str, Any] = json.loads(line)
+    for row in stored(FILE):
         print(f"\n{row['scene']}, {row['model']}: all {row['gaussians']:,} unfaded {row['all']['adapted']:.2f} dB")
-        print("| drawn | " + " | ".join(f"{point['count']:,}" for point in row["rows"]) + " |")
-        print("|---" * (1 + len(row["rows"])) + "|")
-        for what in row["rows"][0]["psnr"]:
-            cells = [f"{value:.2f}" if (value := point["psnr"][what]) is not None else "-" for point in row["rows"]]
-            print(f"| {what} | " + " | ".join(cells) + " |")
+        points = row["rows"]
+        lines = [[name, *("-" if (value := point["psnr"][name]) is None else f"{value:.2f}" for point in points)]
+                 for name in points[0]["psnr"]]  # fmt: skip
+        print(table(["drawn", *(f"{point['count']:,}" for point in points)], lines))
 
 
 if __name__ == "__main__":

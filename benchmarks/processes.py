@@ -1,23 +1,23 @@
-"""Several processes against one: are they equal, how fast are they, and what does a larger batch cost.
+"""Adapting in several processes against one: equality, speed, and the quality of a larger batch.
 
-    python benchmarks/processes.py plush_half bonsai146             # 1,500 views each, at the end three times 60 steps
+    python benchmarks/processes.py plush_half bonsai146             # 1,500 views each, then three times 60 steps
     python benchmarks/processes.py plush_half --views 300 --repeats 1
 
-Three adaptations of as many views: a view a step; two views a step in one process with two threads; two views a step
-in two processes with a thread each, which torchrun starts and gloo connects. ``quality`` has the held-out PSNR of each,
-``largest_difference`` that between the outcomes of the last two, by attribute. ``speed`` has the seconds of both over
-``--speed-steps`` steps, in turn and ``--repeats`` times: before training (the importance), in training, and of this
-those that the first process spent in waiting for the other and in moving and summing gradients.
+Three adaptations with the same number of views: one view per step; two views per step in one process with two threads;
+two views per step in two processes with one thread each, started by torchrun and connected by gloo. ``quality`` has the
+held-out PSNR of each, ``largest_difference`` the difference between the last two, by attribute. ``speed`` has medians
+of the seconds of both over ``--speed-steps`` steps: importance, training, and of training the first process's seconds
+of waiting for the other and of moving and summing gradients.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
 import sys
 import tempfile
+from argparse import SUPPRESS, Namespace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -26,7 +26,7 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 
 # isort: split
 import torch
-from common import append, capture
+from common import append, arguments, checkpoint, photographs
 
 from clod_adapter.training.distributed import joined
 
@@ -37,13 +37,13 @@ SPENT = ("start_seconds", "seconds", "waiting", "exchanging")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*", default=["plush_half"])
-    parser.add_argument("--views", type=int, default=1500, help="that each of the three sees")
+    parser.add_argument("--views", type=int, default=1500, help="of each of the three runs")
     parser.add_argument("--speed-steps", type=int, default=60)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--part", nargs=3, metavar=("SCENE", "CONFIG", "FILE"), help=argparse.SUPPRESS)
+    parser.add_argument("--part", nargs=3, metavar=("SCENE", "CONFIG", "FILE"), help=SUPPRESS)
     args = parser.parse_args()
     if args.part:
         take_part(args.part[0], clod.AdaptConfig(**json.loads(args.part[1])), Path(args.part[2]))
@@ -53,16 +53,16 @@ def main() -> None:
         measure(scene, args)
 
 
-def measure(scene: str, args: argparse.Namespace) -> None:
+def measure(scene: str, args: Namespace) -> None:
     single = {"iters": args.views, "batch": 1, "seed": args.seed}
     double = {"iters": args.views // 2, "batch": 2, "seed": args.seed}
     runs = {"batch 1": (1, single), "batch 2": (1, double), "batch 2, two processes": (2, double)}
-    outcomes, quality = {}, {}
-    test = clod.load_scene(capture(scene)).test
+    results, quality = {}, {}
+    test = photographs(scene).test
     for label, (processes, config) in runs.items():
-        outcomes[label], spent = run(scene, processes, config)
-        quality[label] = {"steps": config["iters"], **spent, "rows": rows_of(outcomes[label], test)}
-    one, two = outcomes["batch 2"].tensors(), outcomes["batch 2, two processes"].tensors()
+        results[label], spent = run(scene, processes, config)
+        quality[label] = {"steps": config["iters"], **spent, "rows": rows_of(results[label], test)}
+    one, two = results["batch 2"].tensors(), results["batch 2, two processes"].tensors()
     append(FILE, {
         "benchmark": "processes", "scene": scene, "views": args.views, "seed": args.seed,
         "gaussians": len(one["means"]), "quality": quality,
@@ -90,29 +90,29 @@ def rows_of(gaussians: clod.Gaussians, test: Any) -> list[dict[str, float]]:
 
 
 def run(scene: str, processes: int, config: dict[str, Any]) -> tuple[clod.Gaussians, dict[str, float]]:
-    """The outcome of an adaptation in processes of their own that share the cores, and what it took."""
+    """The result of an adaptation in processes that share the cores, and its seconds."""
     launcher = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)]
     environment = {**os.environ, "OMP_NUM_THREADS": str(CORES // processes)}
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "outcome.pt"
+        file = Path(folder) / "result.pt"
         part = [__file__, "--part", scene, json.dumps(config), str(file)]
         subprocess.run([sys.executable, *(launcher if processes > 1 else []), *part], env=environment, check=True)
         return torch.load(file, weights_only=False)
 
 
 def take_part(scene: str, config: clod.AdaptConfig, file: Path) -> None:
-    """What each of the processes does; the first one writes what came of it."""
-    base, photographs = clod.load(capture(scene) / "pretrained.ply").gaussians, clod.load_scene(capture(scene))
+    """The work of each process; the first one writes the result."""
+    base, views = checkpoint(scene).gaussians, photographs(scene)
     if "RANK" in os.environ:
         from torch.distributed.rendezvous import rendezvous
 
         with joined(*next(iter(rendezvous("env://")))) as peers:
             peers.agree(0.0, True)  # both have read and compiled before a clock runs
-            adapted = clod.adapt(base, photographs, config, peers=peers)
+            adapted = clod.adapt(base, views, config, peers=peers)
         if peers.rank > 0:
             return
     else:
-        adapted = clod.adapt(base, photographs, config)
+        adapted = clod.adapt(base, views, config)
     torch.save((adapted.gaussians, {name: getattr(adapted, name) for name in SPENT}), file)
 
 

@@ -1,25 +1,23 @@
-"""Times the CPU rasterizer beside its peers, and compares it with a float64 reference.
+"""Times of the CPU rasterizer and of two others, and its agreement with a float64 reference.
 
     python benchmarks/rasterize.py                     # times on W1 and W2, of fewer Gaussians too
-    python benchmarks/rasterize.py --json --skip-gsplat
+    python benchmarks/rasterize.py --skip-gsplat
     python benchmarks/rasterize.py --accuracy          # image and gradients against float64 instead
     python benchmarks/rasterize.py --extreme           # times of scenes that are unlike any capture instead
 
-The peers are the yardstick (a hand-written C++ kernel in the shared folder, built with g++) and gsplat (see
-``peer_gsplat.py``); the fields of what is absent are null. Each runs in a process of its own with 2 threads,
-all in turn step by step, so that the machine's drift hits all alike. Times are medians in milliseconds:
-``forward_ms`` and ``both_ms`` of one step with all gradients, ``render_ms`` of a frame without gradients.
-Memory is what the steps add to a warm process at most, gradients included. ``--json`` prints a list with an
-object a row and nothing else to stdout; ``--record`` adds the rows to ``results/rasterize.jsonl``.
+The others are the yardstick (a hand-written C++ kernel in the shared folder, built with g++) and gsplat (see
+``peer_gsplat.py``); fields of an absent one are null. Each runs in its own process with 2 threads, all in turn step by
+step, so that drift of the machine affects all alike. Times are medians in milliseconds: ``forward_ms`` and ``both_ms``
+of one step with all gradients, ``render_ms`` of a frame without gradients. Memory is the peak of the steps beyond a
+warm process, gradients included.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import sys
 import tempfile
+from argparse import Namespace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -32,10 +30,8 @@ import contenders
 import peer_gsplat
 import torch
 import workloads
-from common import ROOT, append
+from common import ROOT, append, arguments
 from contenders import SHARES, THREADS, Worker
-
-from clod_adapter.cli.shared.report import jsonable
 
 FILE = "rasterize.jsonl"
 YARDSTICK = Path(os.environ.get("CLOD_YARDSTICK", ROOT.parent / "shared" / "yardstick"))
@@ -46,9 +42,7 @@ Row = dict[str, Any]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="a JSON list on stdout, and nothing else")
-    parser.add_argument("--record", action="store_true", help=f"add the rows to results/{FILE}")
+    parser = arguments(__doc__, record=FILE)
     parser.add_argument("--workloads", nargs="+", choices=workloads.SIZES, default=list(workloads.SIZES))
     parser.add_argument("--repeats", type=int, default=15, help="of ours and the yardstick (default: %(default)s)")
     parser.add_argument("--skip-gsplat", action="store_true")
@@ -64,12 +58,12 @@ def main() -> None:
         kind, table, rows = "extreme", extreme_table, extreme()
     else:
         kind, table, rows = "speed", speed_table, speed(args)
-    print(json.dumps(jsonable(rows), indent=1) if args.json else table(rows), flush=True)
+    print(table(rows), flush=True)
     for row in rows if args.record else []:
         append(FILE, {"benchmark": "rasterize", "kind": kind, **row})
 
 
-def speed(args: argparse.Namespace) -> list[Row]:
+def speed(args: Namespace) -> list[Row]:
     """All times of each workload."""
     with tempfile.TemporaryDirectory() as folder:
         library = contenders.build_yardstick(args.yardstick, Path(folder))
@@ -124,7 +118,7 @@ def middle(times: list[float], peer: str) -> float | None:
 
 
 def kept_rows(frames: list[list[float]]) -> list[Row]:
-    """Frames of the most opaque Gaussians, and what share of the full frame's time they take."""
+    """Frames of the most opaque Gaussians, and their share of the full frame's time."""
     ways = [(way, share) for way in ("rows removed", "opacity 0") for share in SHARES]
     times = [middle(list(column), "ours") for column in zip(*frames, strict=True)]
     return [

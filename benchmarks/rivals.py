@@ -1,17 +1,15 @@
-"""What else could be done with a checkpoint and its photographs, at the counts the dial is judged at.
+"""Other methods on the same checkpoint and photographs, at fixed shares of the base's Gaussians.
 
     python benchmarks/rivals.py plush_half bonsai146 --only merging ranking
     python benchmarks/rivals.py plush_half bonsai146 --iters 1500 --seed 0 1 2
     python benchmarks/rivals.py plush_half --only specialist --shares 0.12 --seconds 100
     python benchmarks/rivals.py --table                    # the rows as a Markdown table
 
-The rivals, each on the same base and photographs, at shares of the base's Gaussians:
-
-- ``merging``: ``splat-transform --decimate``, training-free; a file a count;
-- ``specialist``: the merged file, then tuned for that count alone; a file a count;
-- ``tuned``: the untouched base tuned as long, all of it;
+- ``merging``: ``splat-transform --decimate``, without training, one file per count;
+- ``specialist``: the merged file, tuned for that count alone, one file per count;
+- ``tuned``: the whole base, tuned for as many steps;
 - ``prefix``: one file whose prefixes are the counts, tuned with random prefixes (tuning.tune);
-- ``ranking``: the same without any tuning, ordered by opacity, by contribution and by removal error.
+- ``ranking``: prefixes without tuning, ordered by opacity, by contribution and by removal error.
 
 A scene is named as for adapt.py. Each run adds a row to ``results/rivals.jsonl``.
 """
@@ -20,13 +18,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
 from dataclasses import asdict
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
-from common import RESULTS, ROOT, append, capture
+from common import CACHE, append, arguments, checkpoint, falling, photographs, stored, table
 from merging import Merger
 from torch import Tensor
 from tuning import RATES, Tuning, tune
@@ -44,7 +42,7 @@ ORDERS = ("opacity", "contribution", "removal error")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__, table=print_table)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--only", nargs="+", choices=RIVALS, default=RIVALS, help="some of the rivals")
     parser.add_argument("--shares", nargs="+", type=float, default=SHARES, help="of the base's Gaussians")
@@ -54,11 +52,8 @@ def main() -> None:
     parser.add_argument("--draw", choices=("uniform", "log"), default="log", help="how prefixes' shares are drawn")
     parser.add_argument("--order", choices=ORDERS, default="removal error", help="of the prefixes")
     parser.add_argument("--set", nargs="+", default=[], metavar="RATE=VALUE", help=f"a rate: {', '.join(RATES)}, final")
-    parser.add_argument("--cache", type=Path, default=ROOT / "benchmarks" / "cache", help="keeps the merged files")
-    parser.add_argument("--table", action="store_true", help="print the rows there are")
+    parser.add_argument("--cache", type=Path, default=CACHE, help="keeps the merged files")
     args = parser.parse_args()
-    if args.table:
-        print_table()
     if args.iters is None and args.seconds is None:
         args.iters = 1500
     for scene in args.scenes:
@@ -71,10 +66,8 @@ class Contest:
     """One scene and its rivals; each method adds its rows."""
 
     def __init__(self, scene: str, args: argparse.Namespace) -> None:
-        folder, _, checkpoint = scene.partition("/")
         self.scene, self.args, self.console = scene, args, Console()
-        self.base = clod.load(capture(folder) / f"{checkpoint or 'pretrained'}.ply")
-        self.photographs = clod.load_scene(capture(folder))
+        self.base, self.photographs = checkpoint(scene), photographs(scene)
         self.counts = {share: max(round(share * len(self.base.gaussians)), 1) for share in args.shares}
         self.base_row = self.measure(self.base.gaussians, 1.0)
 
@@ -158,7 +151,7 @@ class Contest:
             worth = contribution(gaussians, views)
         else:
             worth = removal_error(gaussians, views, seed=seed)
-        return worth.argsort(descending=True, stable=True)
+        return falling(worth)
 
 
 def head(gaussians: clod.Gaussians, count: int) -> clod.Gaussians:
@@ -184,27 +177,21 @@ def print_table() -> None:
     """PSNR per share, a line for a rival at one length of tuning: the mean over seeds, of a seed the last row."""
     shares = (1.0, *SHARES)
     groups: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
-    for line in (RESULTS / FILE).read_text(encoding="utf-8").splitlines():
-        row = json.loads(line)
+    for row in stored(FILE):
         config = row.get("config", {"seed": 0})
-        key = (row["scene"], row["rival"], row["label"], json.dumps({**config, "seed": 0, "shares": row_shares(row)}))
+        at = [point["share"] for point in row["rows"]]
+        key = row["scene"], row["rival"], row["label"], json.dumps({**config, "seed": 0, "shares": at})
         groups.setdefault(key, {})[config["seed"]] = row
-    print("| scene | what | seeds | steps | seconds | base | " + " | ".join(f"{share:.0%}" for share in shares) + " |")
-    print("|---" * (6 + len(shares)) + "|")
+    lines = []
     for (scene, rival, label, _), seeds in groups.items():
         rows = list(seeds.values())
-        trained = "steps" in rows[0]
-        steps = f"{statistics.fmean(row['steps'] for row in rows):.0f}" if trained else "-"
-        seconds = f"{statistics.fmean(row['train_seconds'] for row in rows):.0f}" if trained else "-"
-        cells = [scene, f"{rival}: {label}", str(len(rows)), steps, seconds, f"{rows[0]['base']['psnr']:.2f}"]
-        for share in shares:
-            values = [point["psnr"] for row in rows for point in row["rows"] if point["share"] == share]
-            cells.append(f"{statistics.fmean(values):.2f}" if values else "")
-        print("| " + " | ".join(cells) + " |")
-
-
-def row_shares(row: dict[str, Any]) -> list[float]:
-    return [point["share"] for point in row["rows"]]
+        times = [
+            f"{fmean(row[name] for row in rows):.0f}" if name in rows[0] else "-" for name in ("steps", "train_seconds")
+        ]
+        values = [[p["psnr"] for row in rows for p in row["rows"] if p["share"] == share] for share in shares]
+        cells = [f"{fmean(found):.2f}" if found else "" for found in values]
+        lines.append([scene, f"{rival}: {label}", len(rows), *times, f"{rows[0]['base']['psnr']:.2f}", *cells])
+    print(table(["scene", "rival", "seeds", "steps", "seconds", "base", *(f"{share:.0%}" for share in shares)], lines))
 
 
 if __name__ == "__main__":

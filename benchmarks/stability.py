@@ -1,78 +1,61 @@
-"""Numerical stability: the equation against 50 digits, stiff starts, extreme scenes, popping. All of docs/stability.md.
+"""Numerical stability: the equation against 50 digits, stiffness, extreme scenes, popping. For docs/stability.md.
 
-    python benchmarks/stability.py                   # everything, then docs/stability.md and its pictures
+    python benchmarks/stability.py                   # everything, then the tables and the pictures
     python benchmarks/stability.py --only scenes     # one part; the rows of the others stay
-    python benchmarks/stability.py --page            # the page and the pictures again, from the rows there are
+    python benchmarks/stability.py --page            # the tables and the pictures again, from the stored rows
 
-Rows go to ``results/stability.jsonl``, where they replace those of the parts that were run.
+Rows go to ``results/stability.jsonl``, where they replace those of the parts that were run. The tables of
+docs/stability.md are printed, its pictures are written.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
-from typing import Any
 
 import stability_equation
+import stability_plots
 import stability_popping
 import stability_scenes
 import stability_stiffness
-from common import RESULTS, ROOT, commit
+from common import RESULTS, ROOT, Row, about, arguments, stored
 
-from clod_adapter.cli.shared.report import jsonable, machine
+from clod_adapter.cli.shared.report import jsonable
 
-FILE, PAGE, IMAGES = RESULTS / "stability.jsonl", ROOT / "docs" / "stability.md", ROOT / "docs" / "images"
+FILE, IMAGES = "stability.jsonl", ROOT / "docs" / "images"
 PARTS = {
-    "equation": stability_equation,
-    "stiffness": stability_stiffness,
-    "scenes": stability_scenes,
+    "equation": stability_equation, "stiffness": stability_stiffness, "scenes": stability_scenes,
     "popping": stability_popping,
-}
-Rows = list[dict[str, Any]]
-HEAD = """\
-# Numerical stability
-
-What was tried, what it gave, and what it is worth. Everything here is written by `python benchmarks/stability.py`
-({seconds} on two cores; the rows are in `benchmarks/results/stability.jsonl`, commit {commit}). The extreme scenes need
-a real capture (`CLOD_SHARED_DATA`); the rest needs nothing.
-"""
+}  # fmt: skip
+PLOTS = {"stiffness": stability_plots.stiffness, "popping": stability_plots.popping}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), help="parts to run")
-    parser.add_argument("--page", action="store_true", help="run nothing, write the page from the rows there are")
+    parser.add_argument("--page", action="store_true", help="run nothing, print the tables of the stored rows")
     args = parser.parse_args()
-    rows = stored()
+    rows = {part: [row for row in stored(FILE) if row["part"] == part] for part in PARTS}
     for part in () if args.page else args.only:
         started = time.perf_counter()
         found = PARTS[part].measure()
-        about = {"commit": commit(), "machine": machine(), "part_seconds": round(time.perf_counter() - started, 1)}
-        rows[part] = [jsonable({**about, **row}) for row in found]
+        head = {**about(), "part_seconds": round(time.perf_counter() - started, 1)}
+        rows[part] = [jsonable({**head, **row}) for row in found]
         lines = [json.dumps(row) for part in PARTS for row in rows[part]]
-        FILE.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        print(f"{part}: {about['part_seconds']} s", flush=True)
-    write_page(rows)
+        (RESULTS / FILE).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    for part in args.only:
+        if rows[part]:
+            show(part, rows[part])
 
 
-def stored() -> dict[str, Rows]:
-    """The rows there are, by part."""
-    lines = FILE.read_text(encoding="utf-8").splitlines() if FILE.exists() else []
-    rows = [json.loads(line) for line in lines]
-    return {part: [row for row in rows if row["part"] == part] for part in PARTS}
-
-
-def write_page(rows: dict[str, Rows]) -> None:
-    present = {part: found for part, found in rows.items() if found}
-    seconds = sum(found[0]["part_seconds"] for found in present.values())
-    commits = sorted({found[0]["commit"] for found in present.values()})
-    sections = [HEAD.format(seconds=f"{seconds / 60:.1f} minutes", commit=", ".join(commits))]
-    for part, found in present.items():
-        sections.append(PARTS[part].markdown(found))
-        if hasattr(PARTS[part], "plot"):
-            PARTS[part].plot(found, IMAGES)
-    PAGE.write_text("\n".join(section.strip() + "\n" for section in sections), encoding="utf-8")
+def show(part: str, rows: list[Row]) -> None:
+    """Prints the tables of a part and draws its picture."""
+    print(
+        f"## {part}: commit {rows[0]['commit']}, {rows[0]['part_seconds']} s\n\n{PARTS[part].tables(rows)}\n",
+        flush=True,
+    )
+    if part in PLOTS:
+        PLOTS[part](rows, IMAGES / f"stability_{part}.png")
 
 
 if __name__ == "__main__":

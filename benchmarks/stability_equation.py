@@ -1,14 +1,12 @@
-"""The dial's equation against mpmath at 50 digits, and the formula as it stands in the paper beside it.
+"""The dial's equation and the paper's formula against mpmath at 50 digits.
 
-Inputs are rounded to their dtype first, and the reference (exact.py) is of exactly these numbers; tau, s, epsilon and
-the temperature are Python's floats. Random points of the reference are compared with mpmath alone: ``reference`` rows.
+Inputs are rounded to their dtype; the reference (exact.py) is of exactly these numbers. tau, s, epsilon and the
+temperature are Python's floats. ``reference`` rows compare random points of the reference with mpmath alone.
 
-Errors are in units of the eps of the result's dtype: float32's for half-precision inputs, as there all is computed in
-float32, but the half's own for their gradients, which are rounded to it. What lies below the smallest normal number may
-be off by that number. The paper's formula is computed in the inputs' dtype, and fails where it is NaN, infinite, 0 in
+Errors are in units of the eps of the result's dtype: float32's for half-precision inputs, which are computed in
+float32, but the half's own for their gradients, which are rounded to it. Results below the smallest normal number may
+be off by that number. The paper's formula is computed in the inputs' dtype. It fails where it is NaN, infinite, 0 in
 place of a normal number, or off by more than 1,000 of that dtype's eps.
-
-Run: python benchmarks/stability_equation.py
 """
 
 from __future__ import annotations
@@ -17,14 +15,14 @@ import itertools
 import math
 import multiprocessing
 import sys
-import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import mpmath
 import numpy as np
 import torch
+from common import table
+from equation_tally import Tallies
 from mpmath import mpf
 from torch import Tensor
 
@@ -35,82 +33,7 @@ from clod_adapter.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.training.target_count import count_slope, soft_count
 from exact import DTYPES, Array, Case, Wide, plain, tensor, wide
 
-NAIVE = 1e3  # units of eps from which on the paper's formula has failed
 FADE = math.log(1.5)  # log(a'' / tau s) above which the soft cut changes nothing
-REASONS = ("nan", "infinite", "zero", "inaccurate")
-
-
-@dataclass
-class Tally:
-    """What was found of one quantity in one dtype."""
-
-    quantity: str
-    dtype: str
-    unit: str  # the dtype whose eps errors are counted in
-    bound: str
-    part: str = "equation"
-    points: int = 0
-    nan: int = 0
-    failed: int = 0  # past the bound, or not finite where it should be
-    worst: float = 0.0
-    worst_of_bound: float = 0.0  # the largest share of the bound that is used
-    worst_at: dict[str, float] = field(default_factory=dict)
-    naive: dict[str, int] = field(default_factory=lambda: dict.fromkeys(REASONS, 0))
-
-    def add(
-        self, got: Array, want: Array, allowed: Array | float, at: dict[str, Any], naive: Array | None = None,
-        sure: Array | bool = True,
-    ) -> None:  # fmt: skip
-        """``want`` is wide; ``at`` says where the arrays' entries are; ``sure`` which of them have a right answer."""
-        info, size = torch.finfo(DTYPES[self.unit]), np.abs(want)
-        with np.errstate(all="ignore"):
-            off = np.abs(got - want)
-            error = np.where(size >= info.tiny, off / (info.eps * size), off > info.tiny)
-            # What overflows may be infinite or, of slopes, 0 by their definition.
-            error = np.where(size > info.max, np.where(np.isinf(got) | (got == 0), 0, np.inf), error)
-            error = np.where(sure, np.where(np.isnan(off), np.where(got == want, 0, np.inf), error), 0)
-            error = np.where((size < info.tiny) & (error > 0), np.inf, error)
-        share, i = error / allowed, int(np.argmax(error))
-        self.points += len(want)
-        self.nan += int(np.isnan(got).sum())
-        self.failed += int((~(share <= 1)).sum())
-        self.worst_of_bound = max(self.worst_of_bound, float(np.max(share)))
-        if error[i] >= self.worst:
-            self.worst = float(error[i])
-            self.worst_at = {key: float(value if np.isscalar(value) else value[i]) for key, value in at.items()}
-        if naive is not None:
-            self._add_naive(naive, np.where(sure, size, 0), want)
-
-    def _add_naive(self, naive: Array, size: Array, want: Array) -> None:
-        info = torch.finfo(DTYPES[self.dtype])
-        normal = (size >= info.tiny) & (size <= info.max) & np.isfinite(naive)
-        with np.errstate(all="ignore"):
-            far = np.abs(naive - want) > NAIVE * info.eps * size
-        found = (
-            np.isnan(naive), np.isinf(naive) & (size <= info.max), normal & (naive == 0), normal & (naive != 0) & far
-        )  # fmt: skip
-        for reason, where in zip(REASONS, found, strict=True):
-            self.naive[reason] += int(where.sum())
-
-    def row(self) -> dict[str, Any]:
-        """JSON-able, with shares of the points for the paper's formula."""
-        shares = {f"naive_{reason}": count / self.points for reason, count in self.naive.items()}
-        rest = {key: value for key, value in asdict(self).items() if key != "naive"}
-        return {**rest, **shares, "naive_failed": sum(shares.values())}
-
-
-class Tallies:
-    """The tallies of one dtype, made on first use."""
-
-    def __init__(self, dtype: str) -> None:
-        self.dtype, self.found = dtype, dict[str, Tally]()
-        self.rounding = dtype if dtype.endswith("16") else exact.computed_in(dtype)  # of gradients
-        self.wide = dtype == "float64"
-        self.info = torch.finfo(DTYPES[exact.computed_in(dtype)])
-
-    def of(self, quantity: str, bound: str, gradient: bool = False) -> Tally:
-        unit = self.rounding if gradient else exact.computed_in(self.dtype)
-        return self.found.setdefault(quantity, Tally(quantity, self.dtype, unit, bound))
 
 
 def gradients(value: Tensor, *leaves: Tensor) -> list[Array]:
@@ -158,7 +81,7 @@ def check_opacities(tallies: Tallies, case: Case) -> None:
 def check_drawn(tallies: Tallies, case: Case, place: str) -> None:
     """What either cut draws, and the soft one's gradient by sigma_d.
 
-    By ``x = log(a'' / tau s)``, a difference of logarithms: nothing is asked of who is kept within their rounding.
+    By ``x = log(a'' / tau s)``, a difference of logarithms. Points within rounding of the threshold are not compared.
     """
     dtype, s, tau = tallies.dtype, case.s, case.tau
     level = wide([exact.log_threshold(tau, s)])[0]
@@ -275,7 +198,7 @@ def check_counts(tallies: Tallies) -> None:
 
 
 def check_reference(tallies: Tallies) -> None:
-    """The way references are put together, beside mpmath alone."""
+    """The combined reference against mpmath alone."""
     random, (logits, sigmas, distances) = np.random.default_rng(4), exact.axes_of("float64")
     axes = logits[:-2], sigmas, distances, exact.SCALES, exact.TAUS, exact.EPSILONS
     for _ in range(1500):
@@ -315,7 +238,7 @@ def check(part: str, dtype: str) -> list[dict[str, Any]]:
 
 
 def measure() -> list[dict[str, Any]]:
-    """A row per quantity and dtype, on two processes; leaves with a message where long double is float64."""
+    """A row per quantity and dtype, on two processes; exits with a message where long double is float64."""
     if np.finfo(Wide).eps > 1e-18:
         sys.exit("numpy's long double is no wider than float64 on this machine: run it on x86")
     jobs = [*itertools.product(("opacities", "rest"), DTYPES), ("reference", "float64")]
@@ -323,50 +246,25 @@ def measure() -> list[dict[str, Any]]:
         return [row for rows in pool.map(check, *zip(*jobs, strict=True)) for row in rows]
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
-    """The bounds, the worst errors, and how often the paper's formula fails."""
+def tables(rows: list[dict[str, Any]]) -> str:
+    """Points; worst errors and shares of the bounds; shares of points at which the paper's formula fails."""
     by_name: dict[str, dict[str, dict[str, Any]]] = {}
     for row in rows:
         by_name.setdefault(row["quantity"], {})[row["dtype"]] = row
-    references = [name for name in by_name if name.startswith("reference")]
-    ours = {name: found for name, found in by_name.items() if name not in references}
-    counted = [row for found in ours.values() for row in found.values()]
-    points, nan, failed = (sum(row[key] for row in counted) for key in ("points", "nan", "failed"))
-    lines = [
-        "## The equation", "",
-        "Against mpmath at 50 digits, at `sigma_d` from 1e-12 to 1e12 and below 0, s from 1 to 1e4, d' from 0 to a",
-        "little above 1, logits from -200 to 200 and infinite, tau from 1e-6 to past 1/s, eps from 0 to 1e-2.", "",
-        f"{points:,} points: {nan} NaN, {failed} past the bound. Worst error in units of eps, and the largest share of",
-        "the bound that is used. The bound is relative; u is `(d s)^2 / 2v`, x is `log(a'' / tau s)`, z is x / T.", "",
-        "| | bound | " + " | ".join(DTYPES) + " |", "|---|---|" + "---:|" * len(DTYPES),
-    ]  # fmt: skip
-    for name, found in ours.items():
+    references = [by_name.pop(name) for name in list(by_name) if name.startswith("reference")]
+    points, nan, failed = (
+        sum(r[key] for f in by_name.values() for r in f.values()) for key in ("points", "nan", "failed")
+    )
+    worst, naive = [], []
+    for name, found in by_name.items():
         wider, bound = found["float64"]["bound"], found["float32"]["bound"]
         if wider != bound:
             bound += f"; float64: {wider.removeprefix(bound).strip()}"
-        cells = (f"{found[d]['worst']:.2g} ({found[d]['worst_of_bound']:.0%})" for d in DTYPES)
-        lines.append(f"| {name} | {bound} | {' | '.join(cells)} |")
-    lines += [
-        "", "The formula as it stands: the share of the same points at which it is NaN, infinite, 0 in place of a",
-        "normal number, or off by more than 1,000 eps; in brackets those that are NaN.", "",
-        "| | " + " | ".join(DTYPES) + " |", "|---|" + "---:|" * len(DTYPES),
-    ]  # fmt: skip
-    for name, found in ours.items():
-        cells = (f"{found[d]['naive_failed']:.1%} ({found[d]['naive_nan']:.1%})" for d in DTYPES)
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    off = max(by_name[name]["float64"]["worst"] for name in references)
-    lines += [
-        "", "Half-precision inputs are computed in float32 and counted in its eps, their gradients in the half's own.",
-        "In float64 the exponential multiplies the rounding of u, in the others u is float64's. The larger numbers are",
-        "those of differences that vanish: x at the threshold, `log(a / tau s*)` at a/tau, z where T is small.",
-        "A gradient of opacity by sigma_d is asked for where the opacity is a normal number. The points are spread",
-        "over all magnitudes: the shares say where the formula fails, not how often it would in a scene.",
+        worst.append([name, bound, *(f"{found[d]['worst']:.2g} ({found[d]['worst_of_bound']:.0%})" for d in DTYPES)])
+        naive.append([name, *(f"{found[d]['naive_failed']:.1%} ({found[d]['naive_nan']:.1%})" for d in DTYPES)])
+    off = max(found["float64"]["worst"] for found in references)
+    return "\n\n".join([
+        f"{points:,} points: {nan} NaN, {failed} past the bound", table(["", "bound", *DTYPES], worst, 2),
+        "The paper's formula: share of the points at which it fails (NaN):", table(["", *DTYPES], naive, 1),
         f"The reference is off by at most {off:.2f} of float64's eps, measured against mpmath alone.",
-    ]  # fmt: skip
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    began = time.perf_counter()
-    print(markdown(measure()), end="")
-    print(f"{time.perf_counter() - began:.0f} s", file=sys.stderr)
+    ])  # fmt: skip

@@ -1,56 +1,45 @@
-"""Popping: the largest change of any pixel per step, for every normaliser and cut, as the steps get shorter.
+"""Popping: the largest change of any pixel per step, for every normaliser and cut, by the length of the steps.
 
-    python benchmarks/stability_popping.py
-
-Made to pop: Gaussians that lie in one place and leave at one dial value, and one far away that enters the frustum while
-the camera turns, among others that leave at dial values of their own. Three sweeps, each in steps of four lengths: the
-dial from 1 to max_sv, a camera that turns where it stands, a camera that moves and turns. What fades changes in
-proportion to the step's length (slope 1), what pops by as much however short the step (slope 0).
+The scene is made to pop: Gaussians in one place with one extinction scale, and one far away that enters the frustum
+while the camera turns, among others with different extinction scales. Three sweeps in steps of four lengths: the dial
+from 1 to max_sv, a camera that turns, a camera that moves and turns. A fade changes in proportion to the step's length
+(slope 1), a pop by the same amount at any length (slope 0).
 
 The default, one D for the scene and the soft cut, has a bound. For the opacities that are drawn (``attenuation``)::
 
     |change of opacity| <= L h    L = 2 x (1.5 - 4 ln x), x = min(1.5 tau max_sv, exp(-5/8)); at most 4.3
 
-``h`` being the change of ``log s``, or of the logarithm of the distance. Rasterizers drop an alpha below 1/255, one
-level of a pixel. So, with ``W`` the largest sum of the Gaussians' footprints over one pixel and colours within 0 and 1,
-no pixel changes by more than ``W (255 L h + 1)`` levels.
+``h`` is the change of ``log s``, or of the logarithm of the distance. Rasterizers drop an alpha below 1/255, one level
+of a pixel. With ``W`` the largest sum of the Gaussians' footprints over one pixel and colours within 0 and 1, no pixel
+changes by more than ``W (255 L h + 1)`` levels.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import clod_adapter  # noqa: F401  # before torch: it sets how OpenMP's threads wait
 
 # isort: split
 import torch
-from common import ROOT
+from common import table
 from torch import Tensor
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import normalized_distances
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CUTS, NORMALIZERS, AdaptConfig, AttenuationConfig
+from clod_adapter.distances import normalized_distances
 from clod_adapter.evaluation.popping import dial_popping, path, path_popping
 from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.render import splat
-from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, QUIET, label_log, new_figure, save, tidy
 
-PICTURE = "stability_popping.png"
 STEPS = (20, 40, 80, 160)
 SWEEPS = {"dial": "the dial from 1 to 5", "turn": "a camera that turns, s = 2", "path": "a camera that moves, s = 2"}
 OTHERS, TOGETHER, SCALE = 120, 4, 2.0
 DISTANCE = 4.0  # of the camera from the middle
-
-
-def main() -> None:
-    rows = measure()
-    plot(rows, ROOT / "docs" / "images")
-    print(markdown(rows))
 
 
 def measure() -> list[dict[str, Any]]:
@@ -143,83 +132,16 @@ def bound(some: Gaussians, cameras: dict[str, list[Camera]], sweep: str, steps: 
     return float(max(cover.sum(0).max() for cover in covers)) * (255 * steepest(some.attenuation) * h + 1)
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
-    longest, shortest = min(STEPS), max(STEPS)
-    bounds = {(row["sweep"], row["steps"]): row["bound"] for row in rows if "bound" in row}
-    heads = " | ".join(f"{name}: 1/{longest} | 1/{shortest}" for name in SWEEPS)
-    lines = [f"| normaliser | cut | {heads} |", "|---|---" + "|---|---" * len(SWEEPS) + "|"]
+def tables(rows: list[dict[str, Any]]) -> str:
+    """Largest change of a pixel in the longest and the shortest steps; the default's bound below its row."""
+    ends, lines = [(name, steps) for name in SWEEPS for steps in (min(STEPS), max(STEPS))], []
     for normalizer, cut in dict.fromkeys((row["normalizer"], row["cut"]) for row in rows):
-        pixels = {
-            (r["sweep"], r["steps"]): r["pixel"] for r in rows if (r["normalizer"], r["cut"]) == (normalizer, cut)
-        }
-        ours = (normalizer, cut) == ("scene", "soft")
-        found = " | ".join(f"{pixels[name, steps]:.1f}" for name in SWEEPS for steps in (longest, shortest))
-        lines.append(f"| {normalizer}{' (default)' if ours else ''} | {cut} | {found} |")
-        if ours:
-            limit = " | ".join(
-                f"{min(bounds[name, steps], 255):.0f}" for name in SWEEPS for steps in (longest, shortest)
-            )
-            lines.append(f"| its bound | | {limit} |")
+        own = {(r["sweep"], r["steps"]): r for r in rows if (r["normalizer"], r["cut"]) == (normalizer, cut)}
+        default = (normalizer, cut) == ("scene", "soft")
+        pixels = [f"{own[end]['pixel']:.1f}" for end in ends]
+        lines.append([f"{normalizer}{' (default)' if default else ''}", cut, *pixels])
+        if default:
+            lines.append(["its bound", "", *(f"{min(own[end]['bound'], 255):.0f}" for end in ends)])
     held = all(row["pixel"] <= row["bound"] + 0.05 for row in rows if "bound" in row)
-    table, sweeps = "\n".join(lines), "; ".join(SWEEPS.values())
-    return f"""## Popping
-
-The largest change of any pixel in one step, levels of 255, in steps of 1/{longest} and 1/{shortest} of a sweep:
-{sweeps}. The scene is made to pop
-(`benchmarks/stability_popping.py`): {TOGETHER} opaque white Gaussians in one place leave at the same dial value, and
-one far away enters as the camera turns.
-
-{table}
-
-![Largest change of a pixel against the step's length](images/{PICTURE})
-
-With the default, once steps are shorter than a fade, half the step changes the picture half as much, and a turn changes
-nothing. What is left at the shortest steps is one level for each of the {TOGETHER} Gaussians, the alpha of 1/255 at
-which every rasterizer drops them. The hard cut leaves a jump that no step is short enough for; with the quantile and
-the maximum a turn changes every opacity at once when a Gaussian enters. The default's bound, `W (255 L h + 1)`,
-{"holds" if held else "IS BROKEN"}."""
-
-
-def plot(rows: list[dict[str, Any]], folder: Path) -> None:
-    """Log-log, a panel a sweep: a colour a normaliser, dashes for the hard cut."""
-    colours = {"scene": BLUE, "quantile": GREEN, "max": ORANGE}
-    with new_figure((10.4, 3.9), layout="constrained") as figure:
-        panels = figure.subplots(1, len(SWEEPS), sharey=True)
-        for axes, (sweep, title) in zip(panels, SWEEPS.items(), strict=True):
-            for normalizer, cut in dict.fromkeys((row["normalizer"], row["cut"]) for row in rows):
-                own = [r for r in rows if (r["normalizer"], r["cut"], r["sweep"]) == (normalizer, cut, sweep)]
-                if sweep == "dial" and normalizer != "scene":  # D is one number as long as the camera stands still
-                    continue
-                default = (normalizer, cut) == ("scene", "soft")
-                axes.plot(
-                    [1 / r["steps"] for r in own], [max(r["pixel"], 0.2) for r in own], marker="o", markersize=3.5,
-                    color=colours[normalizer], linestyle="-" if cut == "soft" else "--", linewidth=1.4 + default,
-                    label=f"{normalizer}, {cut}{' (default)' if default else ''}", zorder=3 if default else 2,
-                )  # fmt: skip
-            limits = [r for r in rows if r["sweep"] == sweep and r.get("bound", 0) > 0]
-            if limits:
-                axes.plot([1 / r["steps"] for r in limits], [r["bound"] for r in limits], color=INK, linewidth=1.2,
-                          linestyle=":", label="bound of the default")  # fmt: skip
-            axes.axhline(TOGETHER, color=QUIET, linewidth=0.8)
-            axes.set_title(title, loc="left", fontsize=9.5)
-            axes.set_xscale("log")
-            axes.set_yscale("log")
-            axes.set_xticks([1 / steps for steps in STEPS], [f"1/{steps}" for steps in STEPS])
-            axes.set_xticks([], minor=True)
-            axes.set_ylim(0.15, 500)
-            label_log(axes.yaxis, "{:g}", subs=(1,))
-            tidy(axes)
-        panels[0].set_ylabel("largest change of a pixel in a step (of 255)")
-        note = {"fontsize": 8, "color": QUIET, "va": "top"}
-        panels[0].text(1 / max(STEPS), TOGETHER * 0.9, f"one level for each of the {TOGETHER}", **note)
-        panels[1].text(1 / max(STEPS), 0.24, "scene, both cuts: no change", fontsize=8, color=BLUE)
-        panels[1].set_xlabel("length of a step, share of the sweep")
-        handles = {h.get_label(): h for axes in panels for h in axes.get_lines() if not h.get_label().startswith("_")}
-        figure.legend(
-            handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize=8.5
-        )
-        save(figure, folder / PICTURE)
-
-
-if __name__ == "__main__":
-    main()
+    found = table(["normaliser", "cut", *(f"{name}: 1/{steps}" for name, steps in ends)], lines)
+    return f"{found}\n\nThe bound {'holds' if held else 'IS BROKEN'}."

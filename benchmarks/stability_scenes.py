@@ -1,247 +1,26 @@
-"""Extreme scenes, each adapted for 200 steps and rendered over its dial: nothing may turn NaN, or fall apart.
+"""Extreme scenes, each adapted for 200 steps and rendered over its dial: all finite, and no loss of quality.
 
-    python benchmarks/stability_scenes.py                    # all, as a table
-    python benchmarks/stability_scenes.py "faint" "floater"  # those whose names hold a word
-
-Each is the capture ``ci_banana`` with one thing about it made extreme, in the checkpoint, the cameras, the photographs
-or the settings. It holds when every picture over the dial is finite and the full-quality end is at most 0.3 dB below
-what the checkpoint itself reaches on the same held-out views.
+The cases are those of ``extreme_scenes.py``. A case holds when every picture over the dial is finite and the
+full-quality end is at most 0.3 dB below the checkpoint itself on the same held-out views.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import math
-import sys
-import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pycolmap
-import torch
-from common import capture
-from PIL import Image
-from plyfile import PlyData, PlyElement
+from common import checkpoint, photographs, table
+from extreme_scenes import CAPTURE, CASES, Case
 
 import clod_adapter as clod
-from clod_adapter.cameras import Camera, Scene, View, in_its_unit
-from clod_adapter.gaussians import SH_C0
-from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.training.pseudo_views import add_pseudo_views
 
-CAPTURE, STEPS, ALLOWED = "ci_banana", 200, 0.3
-RATIO = math.log(1e6)
+STEPS, ALLOWED = 200, 0.3  # dB
 
 
-@dataclass(frozen=True)
-class Case:
-    """What is adapted, and with which settings beside 200 steps."""
-
-    base: clod.Gaussians
-    scene: Scene
-    settings: dict[str, Any] = field(default_factory=dict)
-
-
-Change = Callable[[clod.Gaussians, Scene], Case]
-
-
-def similar(scale: float) -> Change:
-    """The same scene in other units."""
-
-    def change(base: clod.Gaussians, scene: Scene) -> Case:
-        larger = base.replace(means=base.means * scale, log_scales=base.log_scales + math.log(scale))
-        return Case(larger, of_cameras(scene, lambda camera: moved(camera, camera.position * scale)))
-
-    return change
-
-
-def one_view_in(scale: float) -> Change:
-    """A single training image, and the same in other units: one camera says nothing of how large a scene is."""
-
-    def change(base: clod.Gaussians, scene: Scene) -> Case:
-        case = similar(scale)(base, scene)
-        return dataclasses.replace(case, scene=Scene(case.scene.train[:1], case.scene.test))
-
-    return change
-
-
-def floater(base: clod.Gaussians, scene: Scene) -> Case:
-    means, scales = base.means.clone(), base.log_scales.clone()
-    ahead = scene.train[0].camera
-    means[0] = ahead.position + 1e6 * size_of(base) * ahead.viewmat[2, :3]
-    scales[0] = math.log(1e4 * size_of(base))
-    return Case(base.replace(means=means, log_scales=scales), scene)
-
-
-def only_one(base: clod.Gaussians, scene: Scene) -> Case:
-    one = base.select(torch.tensor([0]))
-    mean = torch.stack([view.image.float().mean((0, 1)) for view in scene.train]).mean(0) / 255
-    return Case(
-        one.replace(
-            means=base.means.median(0).values[None], log_scales=torch.full((1, 3), math.log(size_of(base) / 2)),
-            opacity_logits=torch.full((1,), 2.0), sh0=((mean - 0.5) / SH_C0)[None, None], shN=torch.zeros(1, 0, 3),
-        ),
-        scene,
-    )  # fmt: skip
-
-
-def all_in_one_place(base: clod.Gaussians, scene: Scene) -> Case:
-    return Case(base.replace(means=base.means.median(0).values.expand(len(base), 3).clone()), scene)
-
-
-def behind(base: clod.Gaussians, scene: Scene) -> Case:
-    """A third of the training cameras look away from everything; what they photograph is black."""
-
-    def away(view: View) -> View:
-        back = torch.diag(torch.tensor([-1.0, 1, -1]))
-        turned = view.camera.viewmat.clone()
-        turned[:3, :3] = back @ turned[:3, :3]
-        out = view.camera.position - 100 * size_of(base) * view.camera.viewmat[2, :3]
-        turned[:3, 3] = -turned[:3, :3] @ out
-        return View(dataclasses.replace(view.camera, viewmat=turned), torch.zeros_like(view.image))
-
-    train = tuple(away(view) if k % 3 == 0 else view for k, view in enumerate(scene.train))
-    return Case(base, dataclasses.replace(scene, train=train))
-
-
-def inside(base: clod.Gaussians, scene: Scene) -> Case:
-    """A Gaussian around a training camera, one around a held-out one, and one with its centre in the lens."""
-    means, scales, logits = base.means.clone(), base.log_scales.clone(), base.opacity_logits.clone()
-    for row, view in enumerate((scene.train[0], scene.test[0])):
-        means[row], scales[row], logits[row] = view.camera.position, math.log(0.1 * size_of(base)), -1.0
-    return Case(base.replace(means=means, log_scales=scales, opacity_logits=logits), scene)
-
-
-def opacity(value: float) -> Change:
-    def change(base: clod.Gaussians, scene: Scene) -> Case:
-        return Case(
-            base.replace(opacity_logits=torch.full_like(base.opacity_logits, math.log(value / (1 - value)))), scene
-        )
-
-    return change
-
-
-def flat(axes: int) -> Change:
-    """The smallest ``axes`` axes a millionth of the largest: 1 for discs, 2 for needles."""
-
-    def change(base: clod.Gaussians, scene: Scene) -> Case:
-        order = base.log_scales.argsort(1)
-        shrunk = base.log_scales.amax(1, keepdim=True) - RATIO
-        return Case(
-            base.replace(log_scales=base.log_scales.scatter(1, order[:, :axes], shrunk.expand(-1, axes))), scene
-        )
-
-    return change
-
-
-def black(base: clod.Gaussians, scene: Scene) -> Case:
-    def dark(views: tuple[View, ...]) -> tuple[View, ...]:
-        return tuple(View(view.camera, torch.zeros_like(view.image)) for view in views)
-
-    return Case(base, Scene(dark(scene.train), dark(scene.test)))
-
-
-def twice(base: clod.Gaussians, scene: Scene) -> Case:
-    return Case(base, Scene((*scene.train, scene.train[0]), scene.test))
-
-
-def with_(**settings: Any) -> Change:
-    return lambda base, scene: Case(base, scene, settings)
-
-
-def georeferenced(kind: str) -> Change:
-    """Coordinates a million units off, as file of ``kind`` f4 or f8 and COLMAP model; read back by our readers."""
-
-    def change(base: clod.Gaussians, scene: Scene) -> Case:
-        offset = np.array([437_000.0, 4_481_000.0, 1_000_000.0])
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            model = pycolmap.Reconstruction(str(capture(CAPTURE) / "sparse" / "0"))
-            model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), offset))
-            (folder / "sparse" / "0").mkdir(parents=True)
-            model.write_binary(str(folder / "sparse" / "0"))
-            (folder / "images").symlink_to((capture(CAPTURE) / "images").resolve())
-            clod.save(folder / "plain.ply", base)
-            rows = PlyData.read(str(folder / "plain.ply"))["vertex"].data
-            types = [(n, kind if n in ("x", "y", "z") else rows.dtype[n]) for n in rows.dtype.names]
-            shifted = rows.astype(types)
-            for axis, by in zip("xyz", offset, strict=True):
-                shifted[axis] = rows[axis].astype("f8") + by
-            PlyData([PlyElement.describe(shifted, "vertex")]).write(str(folder / "utm.ply"))
-            checkpoint = clod.load(folder / "utm.ply")
-            return Case(checkpoint.gaussians, clod.load_scene(folder, origin=checkpoint.origin))
-
-    return change
-
-
-def with_alpha(base: clod.Gaussians, scene: Scene) -> Case:
-    """Photographs cut out along a soft circle, as PNG with alpha, read back by our reader."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "images").mkdir()
-        for view in (*scene.train, *scene.test):
-            y, x = np.mgrid[-1 : 1 : view.camera.height * 1j, -1 : 1 : view.camera.width * 1j]
-            alpha = np.clip(4 * (1 - np.hypot(x, y)), 0, 1) * 255
-            rgba = np.dstack([view.image.numpy(), alpha.astype(np.uint8)])
-            Image.fromarray(rgba).save(folder / "images" / f"{view.camera.name}.png")
-        views = sorted((*scene.train, *scene.test), key=lambda view: view.camera.name)
-        cameras = [view.camera for view in views]
-        write_model(folder, cameras, [f"{camera.name}.png" for camera in cameras])
-        return Case(base, clod.load_scene(folder))
-
-
-def of_cameras(scene: Scene, change: Callable[[Camera], Camera]) -> Scene:
-    train, test = (tuple(View(change(v.camera), v.image) for v in views) for views in (scene.train, scene.test))
-    return in_its_unit(Scene(train, test))
-
-
-def moved(camera: Camera, position: torch.Tensor) -> Camera:
-    viewmat = camera.viewmat.clone()
-    viewmat[:3, 3] = -viewmat[:3, :3] @ position
-    return dataclasses.replace(camera, viewmat=viewmat)
-
-
-def size_of(base: clod.Gaussians) -> float:
-    """Of the bulk of the scene, in world units."""
-    low, high = (base.means.quantile(q, 0) for q in (0.1, 0.9))
-    return float((high - low).norm())
-
-
-CASES: dict[str, Change] = {
-    "as it is": with_(),
-    "offset by 1e6, stored as double": georeferenced("f8"),
-    "offset by 1e6, stored as float": georeferenced("f4"),
-    "scaled by 1e-4": similar(1e-4),
-    "scaled by 1e4": similar(1e4),
-    "one floater at 1e6 times the size": floater,
-    "one Gaussian in all": only_one,
-    "all Gaussians in one place": all_in_one_place,
-    "all behind a third of the cameras": behind,
-    "cameras inside Gaussians": inside,
-    "opacities all 0.99": opacity(0.99),
-    "opacities all 0.01": opacity(0.01),
-    "discs, axes 1e6 : 1": flat(1),
-    "needles, axes 1e6 : 1": flat(2),
-    "a single training image": one_view_in(1.0),
-    "a single training image, scaled by 1e-4": one_view_in(1e-4),
-    "a single training image, scaled by 1e4": one_view_in(1e4),
-    "black images": black,
-    "images with alpha": with_alpha,
-    "two cameras at one place": twice,
-    "max_sv 1": with_(max_sv=1.0),
-    "max_sv 100, tau 0.004": with_(max_sv=100.0, tau=0.004),
-    "max_sv 100, tau 0.004, 1,500 steps": with_(max_sv=100.0, tau=0.004, iters=1500),
-}
-
-
-def measure(only: list[str] | None = None) -> list[dict[str, Any]]:
-    base, scene = clod.load(capture(CAPTURE) / "pretrained.ply").gaussians, clod.load_scene(capture(CAPTURE))
-    names = [name for name in CASES if not only or any(word in name for word in only)]
-    rows = [run(name, CASES[name](base, scene)) for name in names]
+def measure() -> list[dict[str, Any]]:
+    base, scene = checkpoint(CAPTURE).gaussians, photographs(CAPTURE)
+    rows = [run(name, make(base, scene)) for name, make in CASES.items()]
     return [*rows, {"part": "scenes", "case": "max_sv 100 with the default tau", "error": refusal(max_sv=100.0)}]
 
 
@@ -275,41 +54,12 @@ def run(name: str, case: Case) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
-    refused = [row for row in rows if "error" in row]
-    rows = [row for row in rows if "error" not in row]
-    held = sum(row["holds"] for row in rows)
-    return f"""\
-## Extreme scenes
-
-`{CAPTURE}` (20,000 Gaussians, {rows[0]["base_psnr"]:.2f} dB) with one thing made extreme, adapted for {STEPS} steps;
-PSNR on the held-out views at the share that is kept. A scene holds when every picture and parameter is finite and
-the full-quality end is at most {ALLOWED} dB below the checkpoint itself: {held} of {len(rows)} do.
-
-{table(rows)}
-
-{"".join(f"{row['case']}: `{row['error']}`" for row in refused)}
-
-What it took: coordinates far from 0 are read in float64 and kept relative to an origin of their own (as float the
-checkpoint had lost its digits before it came here; the tuning finds some of them again); the near plane follows the
-cameras' extent where that is below 1; tau is lowered for faint Gaussians; cameras that see nothing are left out; fewer
-than 8 photographs get pictures of the checkpoint's own beside them, from placed cameras; a k-d tree that cannot part
-Gaussians in one place is helped. Where a third of the cameras see nothing eight photographs are left, hardly enough for
-{STEPS} steps (the limit for company is fewer than eight). A dial up to 100 asks for pictures of a thousandth of the
-Gaussians in half of its steps, which {STEPS} steps do not recover from, but 1,500 do.
-"""
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    lines = ["| scene | base | s = 1 | far end | finite | holds | seconds |", "|---|---|---|---|---|---|---|"]
-    for row in rows:
+def tables(rows: list[dict[str, Any]]) -> str:
+    """PSNR @ share kept at both ends of the dial, and which cases hold."""
+    lines, refused = [], [f"{row['case']}: `{row['error']}`" for row in rows if "error" in row]
+    for row in (row for row in rows if "error" not in row):
         ends = [f"{r['psnr']:.2f} @ {r['kept_share']:.0%}" for r in (row["rows"][0], row["rows"][-1])]
         marks = ["yes" if row[key] else "**no**" for key in ("finite", "holds")]
-        lines.append(
-            f"| {row['case']} | {row['base_psnr']:.2f} | {' | '.join(ends)} | {' | '.join(marks)} | {row['seconds']} |"
-        )
-    return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    print(table([row for row in measure(sys.argv[1:]) if "error" not in row]))
+        lines.append([row["case"], f"{row['base_psnr']:.2f}", *ends, *marks, row["seconds"]])
+    found = table(["scene", "base", "s = 1", "far end", "finite", "holds", "seconds"], lines)
+    return "\n\n".join([found, f"{sum(line[5] == 'yes' for line in lines)} of {len(lines)} hold", *refused])

@@ -1,13 +1,11 @@
-"""Stiffness: which optimiser, parameter and step size find sigma_d where its values span eight decades.
+"""Stiffness: optimisers, parameters and step sizes on values of sigma_d that span eight decades.
 
-    python benchmarks/stability_stiffness.py
+The slope of the equation goes as 1/sigma. All measurements use the package's equation, target-count curve, schedule and
+mean of the last steps:
 
-The slope of the equation goes as 1/sigma. Three measurements, all with the package's own equation, count law, schedule
-and mean of the last steps:
-
-- ``equation``: Gaussians at distances over eight decades, whose right sigma_d is known and keeps the count law. The
-  picture is the opacity each is drawn with, its loss the mean square of what the right ones are drawn with less that.
-  Starts are wrong by up to four decades each way. Every optimiser gets the same gradient: the picture's and the law's.
+- ``equation``: Gaussians at distances over eight decades with known sigma_d that meets the target count. The loss is
+  the mean square difference of the drawn opacities from the right ones. Starts are off by up to four decades each way.
+  Every optimiser gets the same gradient, of the loss and of the count term.
 - ``stuck`` and ``training``: the same through the training step itself (``stability_stuck.py``).
 """
 
@@ -18,7 +16,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import clod_adapter  # noqa: F401  # before torch: it sets how OpenMP's threads wait
@@ -26,18 +23,18 @@ import clod_adapter  # noqa: F401  # before torch: it sets how OpenMP's threads 
 # isort: split
 import numpy as np
 import torch
-from common import ROOT
+from common import table
 from stability_stuck import CONFIG, DIALS, STUCK_STEPS, TRAINING_STEPS, scene, stuck_rows, training_rows
 from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
-from clod_adapter.attenuation import Attenuated, attenuate, normalized_distances
-from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, PURPLE, QUIET, label_log, new_figure, save, tidy
+from clod_adapter.attenuation import Attenuated, attenuate
+from clod_adapter.distances import normalized_distances
+from clod_adapter.report.style import BLUE, GREEN, ORANGE, PURPLE, QUIET
 from clod_adapter.training.objective import SIGMA_RANGE
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.target_count import count_gradient
 
-PICTURE = "stability_stiffness.png"
 RATES = tuple(10 ** (k / 2) for k in range(-8, 1))  # 1e-4 to 1 in half decades
 WRONG = 4.0  # decades, each way
 STEPS, LENGTHS = 600, (30, 100, 300, 1000)
@@ -77,12 +74,6 @@ OPTIMIZERS: dict[str, tuple[Callable[[list[Tensor]], Stepper], str]] = {
     "Adagrad": (_torch_optimizer(torch.optim.Adagrad), ORANGE),
     "SGD, momentum 0.9": (_torch_optimizer(torch.optim.SGD, momentum=0.9), QUIET),
 }
-
-
-def main() -> None:
-    rows = measure()
-    plot(rows, ROOT / "docs" / "images")
-    print(markdown(rows))
 
 
 def measure() -> list[dict[str, Any]]:
@@ -165,7 +156,7 @@ def fit(
 
 
 def _gradients(task: Problem, x: Tensor, log: bool, other: int) -> Tensor:
-    """``[runs, N]``: of the picture at dial value 1 and another one, and what the count law adds, by ``x``."""
+    """``[runs, N]``: gradient by ``x`` of the loss at dial value 1 and another one, and of the count term."""
     settings, n, total, pull = CONFIG.attenuation(1.0), len(task.start), torch.zeros(()), torch.zeros_like(x)
     leaf = x.requires_grad_()
     sigma = (leaf.exp() if log else leaf).flatten()
@@ -183,8 +174,8 @@ def _gradients(task: Problem, x: Tensor, log: bool, other: int) -> Tensor:
     return gradient + (pull if log else pull / x.detach())
 
 
-def _curves(rows: list[dict[str, Any]], timed: bool) -> dict[tuple[str, str], list[dict[str, Any]]]:
-    """By optimiser and parameter: errors by step size, or, timed, by seconds at the best of them."""
+def curves(rows: list[dict[str, Any]], timed: bool) -> dict[tuple[str, str], list[dict[str, Any]]]:
+    """Rows by optimiser and parameter: over the step sizes; or, timed, over the steps at the best step size."""
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in rows:
         if row["what"] == "equation" and ("seconds" in row) == timed:
@@ -192,90 +183,28 @@ def _curves(rows: list[dict[str, Any]], timed: bool) -> dict[tuple[str, str], li
     return found
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
+def tables(rows: list[dict[str, Any]]) -> str:
+    """Error and step sizes that converge; Gaussians that cannot come back; the objective before and after."""
     (start,) = (row["error"] for row in rows if row["what"] == "start")
-    enough, timed = CONVERGED * start, _curves(rows, True)
-    lines = ["| optimiser | sigma_d | best error | at | step sizes that converge | seconds to it |"]
-    lines += ["|---|---|---|---|---|---|"]
-    for key, own in _curves(rows, False).items():
+    enough, timed, lines = CONVERGED * start, curves(rows, True), []
+    for key, own in curves(rows, False).items():
         best = min(own, key=lambda row: row["error"])
         good = [row["rate"] for row in own if row["error"] <= enough]
-        span = _span(good)
         first = next((f"{row['seconds']:.2f}" for row in timed[key] if row["error"] <= enough), "")
-        lines.append(f"| {key[0]} | {key[1]} | {best['error']:.3f} | {best['rate']:.2g} | {span} | {first} |")
-    lines += ["", f"| who cannot come back | at the start | after {STUCK_STEPS} steps |", "|---|---|---|"]
-    for row in rows:
-        if row["what"] == "stuck":
-            lines.append(f"| {row['method']} | {row['start']} of {row['of']} | {row['end']} |")
-    ends = {row["from"]: row for row in rows if row["what"] == "training"}
-    low, right = ends["too small"], ends["right"]
-    near = {row["parameter"]: _span(row["rates"]) for row in rows if row["what"] == "near"}
-    table = "\n".join(lines)
-    return f"""## Stiffness
-
-Right values of `sigma_d` over eight decades, starts wrong by up to four each way, {STEPS} steps, the schedule of
-training. The error is the RMS of the opacity that is drawn, {start:.2f} at the start; converged is below a quarter of
-that. Seconds are of the shortest of {", ".join(map(str, LENGTHS))} steps that does, at the best step size
-(`benchmarks/stability_stiffness.py`).
-
-{table}
-
-![Error by step size, and by seconds](images/{PICTURE})
-
-The parameter decides, not the optimiser: a step that suits one linear sigma is eight decades off for another, so none
-converges. With the logarithm the default and Adam's kin do over the same, widest range; smaller steps cannot walk four
-decades in the time. Steps that scale with the gradient (SGD) or only shrink (Adagrad) fall behind. From starts at most
-one decade wrong the default converges at step sizes {near["log"]}, with a linear sigma: {near["linear"]}.
-
-Who has faded out at every dial value gets no gradient from any picture; the count law, which works both ways, calls
-them back. Started ten thousand times too small throughout, {TRAINING_STEPS} steps of the training itself with its
-defaults bring the objective from {low["before"]:.3f} to {low["after"]:.3f}; from the right start it comes to
-{right["after"]:.3f}."""
+        lines.append([*key, f"{best['error']:.3f}", f"{best['rate']:.2g}", _span(good), first])
+    stuck = [[row["method"], f"{row['start']} of {row['of']}", row["end"]] for row in rows if row["what"] == "stuck"]
+    near = [f"{row['parameter']} sigma_d {_span(row['rates'])}" for row in rows if row["what"] == "near"]
+    ends = [
+        f"{row['from']} start: {row['before']:.3f} to {row['after']:.3f}" for row in rows if row["what"] == "training"
+    ]
+    heads = ["optimiser", "sigma_d", "best error", "at", "step sizes that converge", "seconds to it"]
+    return "\n\n".join([
+        table(heads, lines), f"RMS error at the start: {start:.2f}",
+        f"step sizes that converge from starts at most one decade wrong: {'; '.join(near)}",
+        table(["cannot come back", "at the start", f"after {STUCK_STEPS} steps"], stuck),
+        f"objective, {TRAINING_STEPS} steps: {'; '.join(ends)}",
+    ])  # fmt: skip
 
 
 def _span(rates: list[float]) -> str:
     return "none" if not rates else f"{rates[0]:.2g}" if len(rates) == 1 else f"{rates[0]:.2g} to {rates[-1]:.2g}"
-
-
-def plot(rows: list[dict[str, Any]], folder: Path) -> None:
-    """Error by step size on the left, by seconds at the best step size on the right; dashes for linear sigma."""
-    (start,) = (row["error"] for row in rows if row["what"] == "start")
-    with new_figure((10.4, 4.6), layout="constrained") as figure:
-        panels = figure.subplots(1, 2, sharey=True)
-        for axes, timed, along in zip(panels, (False, True), ("rate", "seconds"), strict=True):
-            for (optimizer, parameter), own in _curves(rows, timed).items():
-                ours = (optimizer, parameter) == ("RowAdam", "log")
-                axes.plot(
-                    [row[along] for row in own], [row["error"] for row in own], color=OPTIMIZERS[optimizer][1],
-                    linestyle="-" if parameter == "log" else ":", linewidth=2.6 if ours else 1.3, marker="o",
-                    markersize=3.5 if parameter == "log" else 0, zorder=3 if ours else 2,
-                    label=optimizer + (" (default)" if ours else "") if parameter == "log" else None,
-                )  # fmt: skip
-            for y, text in ((start, "start"), (CONVERGED * start, "converged")):
-                axes.axhline(y, color=QUIET, linewidth=0.8, linestyle="--")
-                if not timed:
-                    axes.text(
-                        0.01, y * 0.97, text, transform=axes.get_yaxis_transform(), fontsize=8, color=QUIET, va="top"
-                    )
-            axes.set_xscale("log")
-            axes.set_yscale("log")
-            tidy(axes)
-        label_log(panels[0].yaxis, "{:g}")
-        label_log(panels[0].xaxis, "{:g}", subs=(1,))
-        label_log(panels[1].xaxis, "{:g}", subs=(1, 3))
-        panels[0].axvline(CONFIG.lr_sigma, color=BLUE, linewidth=0.8)
-        panels[0].text(CONFIG.lr_sigma * 0.9, 0.0125, "default\nstep size", fontsize=8, color=BLUE, ha="right")
-        panels[0].set_ylim(0.012, 0.6)
-        panels[0].set_ylabel("RMS error of the opacity that is drawn")
-        panels[0].set_xlabel(f"step size, {STEPS} steps")
-        panels[1].set_xlabel(f"seconds of training, {LENGTHS[0]} to {LENGTHS[-1]} steps at the best step size")
-        panels[0].plot([], [], color=INK, linestyle="-", marker="o", markersize=3.5, label="log sigma_d")
-        panels[0].plot([], [], color=INK, linestyle=":", label="linear sigma_d")
-        figure.legend(
-            *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False, fontsize=8.5
-        )
-        save(figure, folder / PICTURE)
-
-
-if __name__ == "__main__":
-    main()

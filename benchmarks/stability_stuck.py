@@ -1,13 +1,13 @@
-"""No parameter dies for good: who could not come back from extreme starts, and where training from such a start ends.
+"""Extreme initial values of sigma_d: Gaussians that cannot recover, and the objective after training.
 
 Used by ``stability_stiffness.py``. Gaussians before a camera, whose right sigma_d spans eight decades, go through the
 training step itself, of sigma_d alone.
 
-- ``stuck``: sigma_d starts at 0, ten thousand times too small and too large, and at SIGMA_MAX, a quarter each. Counted
-  is who cannot come back: no gradient from the picture at any dial value, and none in the needed direction from the
-  count term, even if none (all) are kept.
-- ``training``: all start ten thousand times too small: the objective, mean over dial values of
-  ``w_s L (1 + reg_weight (eta / law - 1)^2)``, before and after, beside that from the right start.
+- ``stuck``: sigma_d starts at 0, ten thousand times too small and too large, and at SIGMA_MAX, a quarter each. A
+  Gaussian cannot recover if no picture at any dial value has a gradient for it, and the count term has none in the
+  needed direction, even with none (all) of the Gaussians kept.
+- ``training``: all start ten thousand times too small: the objective, the mean over dial values of
+  ``w_s L (1 + reg_weight (eta / target - 1)^2)``, before and after, and the same from the right start.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances
+from clod_adapter.attenuation import SIGMA_MAX, attenuate
 from clod_adapter.cameras import Camera, View
 from clod_adapter.config import AdaptConfig
+from clod_adapter.distances import normalized_distances
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import sigma_from_importance
 from clod_adapter.losses import photometric_loss
@@ -72,7 +73,7 @@ def training_rows() -> list[dict[str, Any]]:
 def scene(n: int = 192, seed: int = 0) -> tuple[Gaussians, Camera]:
     """A grid of Gaussians in the picture, each in a place of its own, at distances d' from 1e-3 to 1e5, log-uniform.
 
-    Their sigma_d is right for the count law, in a random order of leaving.
+    Their sigma_d is right for the target-count curve, in a random pruning order.
     """
     draw, across, pixels = torch.Generator().manual_seed(seed), 16, 3
     width, height, focal = across * pixels, n // across * pixels, 50.0
@@ -117,7 +118,7 @@ def trained(config: AdaptConfig, start: Tensor, steps: int, *, floor: bool = Tru
 @torch.no_grad()
 def objective(run: _Run) -> float:
     """What training minimises, at dial values evenly spread, for sigma_d as it would be handed out."""
-    (view,), config, found, total = run.views, run.config, run.gaussians(), 0.0
+    (view,), config, found, total = run.draws.views, run.config, run.gaussians(), 0.0
     for s in DIALS:
         shown = render(found, view.camera, s)
         weight = (1 - config.weight_slope * s / config.max_sv) ** 2
@@ -127,11 +128,12 @@ def objective(run: _Run) -> float:
 
 
 def stuck(run: _Run) -> int:
-    """How many cannot come back: no picture reaches them, and the count term does not press them where they need to go.
+    """Gaussians that cannot recover: no gradient from a picture, and none in the needed direction from the count term.
 
-    Who has left at every dial value needs a lift while nobody is kept, who does not fade a press while everybody is.
+    A Gaussian that is culled at every dial value needs a negative gradient while none is kept; one that does not fade
+    needs a positive gradient while all are kept.
     """
-    p, config, camera, reading = run.parameters, run.config, run.views[0].camera, run.objective.attenuation
+    p, config, camera, reading = run.parameters, run.config, run.draws.views[0].camera, run.objective.attenuation
     distances = normalized_distances(p["means"], camera, reading)
     seen = out = lifted = pressed = torch.zeros(len(distances), dtype=torch.bool)
     for s in DIALS:
@@ -140,13 +142,13 @@ def stuck(run: _Run) -> int:
         seen = seen | (torch.autograd.grad(now.drawn.sum(), x, retain_graph=True)[0] != 0)
         if s == 1:
             out = ~now.keep
-        if run.objective.has_law:
+        if run.objective.has_target_count:
             none, all_ = (
                 count_gradient(now._replace(keep=kept), p["opacity_logits"], s, reading.tau, 1.0, config)
                 for kept in (torch.zeros_like(now.keep), torch.ones_like(now.keep))
             )
             lifted, pressed = lifted | (none < 0), pressed | (all_ > 0)
-        else:  # the paper's term knows no lift
+        else:  # the paper's term never lowers it
             count = soft_count(now.log_opacities, s, reading.tau, config.temperature)
             pressed = pressed | (torch.autograd.grad(count, x)[0] != 0)
     return int((~seen & ~torch.where(out, lifted, pressed)).sum())

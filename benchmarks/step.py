@@ -1,16 +1,15 @@
-"""Where a training step's time goes, on real checkpoints.
+"""Time of a training step by section and kernel, on real checkpoints.
 
     python benchmarks/step.py                  # plush_half and bonsai146
     python benchmarks/step.py plush_half --record --label before
 
-Wall time by section and by kernel, means over the steps after the first few, with the default settings at the
-start of training. ``splat_share`` is what the rasterizer takes of a step, forward and backward. A row says
-which commit of the package was imported, so an older one is measured by putting it first on PYTHONPATH.
+Wall times are means over the steps after the first few, with the default settings at the start of training.
+``splat_share`` is the rasterizer's share of a step, forward and backward. A row names the commit of the imported
+package: to measure another one, put it first on PYTHONPATH.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -20,15 +19,16 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 
 # isort: split
 import torch
-from common import append, capture
+from common import append, arguments, checkpoint, photographs
 
 from clod_adapter._kernels import threads
-from clod_adapter.initialization.importance import for_training, start
+from clod_adapter.initialization.importance import for_training, initialize
 from clod_adapter.rasterizers import cpu
-from clod_adapter.training import loop, optimizer
+from clod_adapter.training import loop, objective, optimizer
 
 FILE = "step.jsonl"
 THREADS = 2
+SECTIONS = {"attenuate": "attenuate", "count_gradient": "count", "splat": "splat forward", "photometric_loss": "loss"}
 
 
 class Clock:
@@ -53,19 +53,16 @@ class Clock:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__, record=FILE)
     parser.add_argument("scenes", nargs="*", default=["plush_half", "bonsai146"])
     parser.add_argument("--steps", type=int, default=120)
     parser.add_argument("--label", default="default")
-    parser.add_argument("--record", action="store_true", help=f"add the rows to results/{FILE}")
     args = parser.parse_args()
     torch.set_num_threads(THREADS)
     clock = Clock()
     clock.wrap(threads, "run")
-    clock.wrap(loop, "attenuate", "attenuate")
-    clock.wrap(loop, "count_gradient", "count")
-    clock.wrap(loop, "splat", "splat forward")
-    clock.wrap(loop, "photometric_loss", "loss")
+    for name, section in SECTIONS.items():
+        clock.wrap(objective, name, section)
     clock.wrap(torch.autograd, "grad", "backward")
     clock.wrap(cpu._Splat, "backward", "splat backward")
     clock.wrap(optimizer.RowAdam, "step", "optimiser")
@@ -79,9 +76,9 @@ def main() -> None:
 
 def profile(scene: str, steps: int, clock: Clock, warm: int = 5) -> dict[str, Any]:
     """Milliseconds a step, in all and by section."""
-    base, views = clod.load(capture(scene) / "pretrained.ply").gaussians, clod.load_scene(capture(scene)).train
+    base, views = checkpoint(scene).gaussians, photographs(scene).train
     config = clod.AdaptConfig()
-    begun = for_training(start(base, views, config), views, config)
+    begun = for_training(initialize(base, views, config), views, config)
     run = loop._Run(begun, views, config, None)
     for _ in range(warm):
         run.step(0.0)

@@ -2,23 +2,22 @@
 
     python benchmarks/tradeoff.py plush_half                  # all methods at all budgets, an hour or so
     python benchmarks/tradeoff.py plush_half --methods ours paper --iters 150 300 --seeds 0 1 2
-    python benchmarks/tradeoff.py plush_half --plot           # the rows there are: docs/error_vs_time.html, and its PNG
+    python benchmarks/tradeoff.py plush_half --plot           # docs/error_vs_time.html and its PNG of the stored rows
 
-A budget is a number of steps, each a run of its own with its own schedule. A specialist is made for one count, which
-is what ours keeps at that dial value in its longest run (so run ours first): the base merged to it, then tuned as
-many steps; at s = 1 it is the whole base, tuned. Each run adds a row to ``results/tradeoff.jsonl``.
+A budget is a number of steps; each is a run of its own with its own schedule. A specialist is made for one count, which
+ours keeps at that dial value in its longest run (so run ours first): the base merged to it, then tuned for as many
+steps; at s = 1 the whole base, tuned. Each run adds a row to ``results/tradeoff.jsonl``.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from collections.abc import Callable, Sequence
 from statistics import fmean
 from typing import Any
 
-from common import RESULTS, ROOT, append, capture
+from common import CACHE, RESULTS, ROOT, append, arguments, checkpoint, photographs
+from common import stored as stored_rows
 
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
@@ -48,13 +47,13 @@ LABELS = {"ours": "ours, one file", "paper": "the paper's form, one file", "spec
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("scene", help="a folder of the shared data")
     parser.add_argument("--methods", nargs="+", choices=LABELS, default=list(LABELS))
     parser.add_argument("--iters", nargs="+", type=int, default=list(ITERS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--max-sv", type=float, default=5.0)
-    parser.add_argument("--plot", action="store_true", help="only draw the rows there are")
+    parser.add_argument("--plot", action="store_true", help="only draw the stored rows")
     args = parser.parse_args()
     if args.plot:
         plot(args.scene, args.max_sv)
@@ -67,12 +66,11 @@ def main() -> None:
 
 
 class Contest:
-    """One scene, and what is run on it."""
+    """The runs on one scene."""
 
     def __init__(self, scene: str, max_sv: float) -> None:
         self.scene, self.max_sv, self.console = scene, max_sv, Console()
-        self.base = clod.load(capture(scene) / "pretrained.ply")
-        self.photographs = clod.load_scene(capture(scene))
+        self.base, self.photographs = checkpoint(scene), photographs(scene)
         self.dials = sorted({1.0, min(3.0, max_sv), max_sv})
         self.base_row = clod.evaluate(self.base.gaussians, self.photographs.test, [1.0])[0]
 
@@ -105,7 +103,7 @@ class Contest:
         for s, count in zip(self.dials, self.counts(), strict=True):
             start, merging = self.base.gaussians, 0.0
             if s > 1:
-                start, merging = Merger.find(ROOT / "benchmarks" / "cache").merge(self.base, count)
+                start, merging = Merger.find(CACHE).merge(self.base, count)
             tuned = self.watched(
                 f"specialist for {len(start):,}, {iters} steps",
                 lambda follow, start=start: tune(
@@ -131,9 +129,7 @@ class Contest:
 
 
 def stored(scene: str, max_sv: float) -> list[dict[str, Any]]:
-    path = RESULTS / FILE
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    return [row for row in map(json.loads, lines) if (row["scene"], row["max_sv"]) == (scene, max_sv)]
+    return [row for row in stored_rows(FILE) if (row["scene"], row["max_sv"]) == (scene, max_sv)]
 
 
 def plot(scene: str, max_sv: float) -> None:
@@ -155,7 +151,7 @@ def plot(scene: str, max_sv: float) -> None:
 
 
 def write(scene: str, max_sv: float, rows: list[dict[str, Any]], dials: list[float]) -> None:
-    """The page: what was run on what, a chart a dial value, and every number in a table."""
+    """The page: settings, one chart per dial value, and a table of all numbers."""
     base = rows[-1]["base"]
     given = f"{scene}, {base['kept']:,.0f} Gaussians, {base['psnr']:.2f} dB on held-out photographs"
     body = [page.paragraph(text.format(given=given), kind) for text, kind in READING]

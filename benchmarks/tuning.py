@@ -103,7 +103,7 @@ def _gradients(
     gaussians = start.replace(**leaves)
     loss = photometric_loss(splat(gaussians, gaussians.opacities, view.camera)[0], view.image)
     if prefix is not None:
-        # The rasterizer leaves out what has opacity 0 before anything else.
+        # The rasterizer drops Gaussians of opacity 0 first.
         inside = torch.arange(len(gaussians)) < prefix
         image, _ = splat(gaussians, torch.where(inside, gaussians.opacities, 0), view.camera)
         loss = loss + photometric_loss(image, view.image)

@@ -1,4 +1,4 @@
-"""What a distorted lens costs: loading photographs that are to be undistorted, at first and again from the cache.
+"""Time to load photographs that need undistortion: the first time, and again from the cache.
 
 python benchmarks/undistort.py              # 24 photographs of 4000x3000 in a temporary folder; a minute
 python benchmarks/undistort.py --record     # and a row in results/undistort.jsonl
@@ -6,19 +6,19 @@ python benchmarks/undistort.py --record     # and a row in results/undistort.jso
 
 from __future__ import annotations
 
-import argparse
 import os
 import tempfile
 import time
 from pathlib import Path
 
-import common
 import numpy as np
 import pycolmap
+from common import append, arguments
 from PIL import Image
 
 import clod_adapter as clod
 
+FILE = "undistort.jsonl"
 SIZE = {"width": 4000, "height": 3000}
 LENSES = {
     "PINHOLE": [3000, 3000, 2000, 1500],
@@ -55,9 +55,8 @@ def measured(name: str, scene: Path) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__, record=FILE)
     parser.add_argument("--photographs", type=int, default=24)
-    parser.add_argument("--record", action="store_true")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as work:
         cache = Path(work) / "cache"
@@ -70,7 +69,7 @@ def main() -> None:
         }  # fmt: skip
     print(row)
     if args.record:
-        common.append("undistort.jsonl", row)
+        append(FILE, row)
 
 
 if __name__ == "__main__":

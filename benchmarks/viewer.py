@@ -1,19 +1,17 @@
-"""The page in a headless Chromium against our own renderer: picture, counts, loading times, sizes.
+"""The page in a headless Chromium against clod_adapter.render: pictures, counts, loading times, sizes.
 
-    python benchmarks/viewer.py                      # plush_half, bonsai146 and 500,000 made-up Gaussians
+    python benchmarks/viewer.py                      # plush_half, bonsai146 and 500,000 random Gaussians
     python benchmarks/viewer.py plush_half --pack    # also the one-file page packed by splat-transform; minutes
 
-Each capture's checkpoint is given a dial first, in 100 steps (kept in ``benchmarks/cache``): pictures are compared, not
-their quality. At some held-out cameras and dial values, and with the equation off: dB between the browser's picture and
-that of ``clod_adapter.render``, and the counts. Times are wall times until the first frame is drawn, with WebGL in
-software, and say nothing of a device with a GPU. Rows are added to ``results/viewer.jsonl``.
+Each capture's checkpoint is first adapted for 100 steps (kept in ``benchmarks/cache``), enough to compare pictures. At
+some held-out cameras and dial values, and with the equation off: PSNR between the browser's picture and
+``clod_adapter.render``, and the counts. Times are wall times to the first frame with WebGL in software; they do not
+predict those of a device with a GPU. Rows are added to ``results/viewer.jsonl``.
 """
 
 from __future__ import annotations
 
-import argparse
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -22,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import ROOT, append, capture
+from common import CACHE, COMMAND, ROOT, Process, append, arguments, capture
 
 import clod_adapter as clod
 from clod_adapter.adapter import detach
@@ -39,20 +37,18 @@ CAPTURES = ("plush_half", "bonsai146")
 DIALS = (1.0, 3.0, 5.0)
 CAMERAS = 4
 MANY = 500_000
-CACHE = ROOT / "benchmarks" / "cache"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("captures", nargs="*", default=[*CAPTURES, "many"], help="captures, or many (default: all)")
     parser.add_argument("--pack", action="store_true", help="also the size of the page that splat-transform packs")
     args = parser.parse_args()
     with browser.launch() as chromium:
         for name in args.captures:
             with tempfile.TemporaryDirectory() as folder:
-                row = (
-                    many(chromium, Path(folder)) if name == "many" else measure(chromium, name, Path(folder), args.pack)
-                )
+                made = name == "many"
+                row = many(chromium, Path(folder)) if made else measure(chromium, name, Path(folder), args.pack)
             append(FILE, row)
             print(summary(row))
 
@@ -136,7 +132,7 @@ def adapted(name: str) -> Path:
     if not path.exists():
         CACHE.mkdir(exist_ok=True)
         words = [capture(name) / "pretrained.ply", "--images", capture(name), "--max-sv", 5, "--iters", 100, "-o", path]
-        subprocess.run([sys.executable, "-m", "clod_adapter.cli.main", *map(str, words)], check=True)
+        Process([*COMMAND, *words])
     return path
 
 

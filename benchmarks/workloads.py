@@ -1,7 +1,7 @@
-"""The scenes that the rasterizer is timed on: W1 and W2, made up but shaped like a room, and extreme ones.
+"""The scenes that the rasterizer is timed on: W1 and W2, synthetic rooms, and extreme ones.
 
 W1 and W2 are a room with spheres and boxes in it, its surfaces covered with small flat Gaussians of mixed
-opacity and with one in twenty large and faint. The yardstick makes the same ones: ``differences`` compares.
+opacity, one in twenty large and faint. The yardstick makes the same ones: ``differences`` compares.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def _sizes_and_opacities(draw: np.random.Generator, count: int) -> tuple[Array, 
 
 
 def _colors(draw: np.random.Generator, points: Array) -> Array:
-    """Spherical harmonics of degree 3: waves of colour through the room, higher bands at random."""
+    """Spherical harmonics of degree 3: waves of colour through the room, higher degrees at random."""
     waves = 0.35 * np.sin(points @ draw.normal(size=(3, 3)) * 1.7 + 1.0)
     base = 0.5 + waves + 0.08 * draw.normal(size=points.shape)
     sh = np.empty((len(points), 16, 3))

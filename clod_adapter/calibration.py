@@ -1,8 +1,8 @@
-"""The calibration table: what each dial value of an adapted file keeps, costs and takes. It travels with the file.
+"""The calibration table: count, quality and frame time of an adapted file at each dial value. Stored in the file.
 
-Counts, PSNR and SSIM are of the file; frame times are of the machine and the picture size that the table names.
-Between its rows the table is read by linear interpolation in log s. Beside the rows stand some of the training
-cameras, so that a dial value can be baked later without the photographs (``export.bake``).
+Frame times belong to the machine and the image size that the table names. Values between rows are interpolated linearly
+in log s. The table also has the positions of some training cameras, so that a dial value can be baked without the
+photographs (``bake.bake``).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ AGAINST = ("photographs", "checkpoint")
 
 
 class Measured(Protocol):
-    """What a table takes of a row of ``evaluate``."""
+    """The fields that a table takes from a row of ``evaluate``."""
 
     @property
     def virtual_scale(self) -> float: ...
@@ -39,8 +39,8 @@ class CalibrationRow:
 
     Attributes:
         virtual_scale: the dial s.
-        kept: Gaussians the dial leaves in.
-        psnr: dB; ssim: in [-1, 1]; both against what ``Calibration.against`` says.
+        kept: Gaussians that are not culled.
+        psnr: dB; ssim: in [-1, 1]; both against the images named by ``Calibration.against``.
         frame_ms: median time of a frame, milliseconds.
     """
 
@@ -53,11 +53,11 @@ class CalibrationRow:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """What the dial needs of a camera.
+    """The part of a camera that the equation uses.
 
     Attributes:
         x, y, z: the camera's centre, world units.
-        unit: D, what the normaliser divides distances from there by, world units, > 0.
+        unit: the divisor D of distances from there, world units, > 0.
 
     Raises:
         ClodError: a coordinate is not finite, or the unit is not positive and finite.
@@ -74,28 +74,27 @@ class Viewpoint:
         require(0 < self.unit < math.inf, "the unit of a viewpoint", self.unit, "positive and finite")
 
     def moved(self, by: Sequence[float]) -> Viewpoint:
-        """The same with its centre moved by ``by [3]``, world units."""
+        """A copy with its centre moved by ``by [3]``, world units."""
         x, y, z = (value + step for value, step in zip((self.x, self.y, self.z), by, strict=True))
         return replace(self, x=x, y=y, z=z)
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Rows of ascending dial values, the first at s = 1, and what they were measured on.
+    """Rows of ascending dial values, the first at s = 1, and the conditions of the measurement.
 
     Attributes:
         rows: at least one.
-        total: Gaussians of the file; a file with another number is not the one that was measured.
-        views: held-out views that the rows are means over.
-        width, height: of the pictures, pixels.
-        machine: what the frame times were taken on: one line of printable ASCII.
-        against: what PSNR and SSIM are against: ``photographs``, or, where there were none, the ``checkpoint``'s own
-            pictures.
-        viewpoints: of some of the training cameras, in the file's own coordinates; none in files of earlier versions.
+        total: number of Gaussians in the file; a file with another number does not match the table.
+        views: number of held-out views that the rows average over.
+        width, height: image size in pixels.
+        machine: where the frame times were measured, one line of printable ASCII.
+        against: reference of PSNR and SSIM: the ``photographs``, or without any, renders of the ``checkpoint``.
+        viewpoints: of some training cameras, in the file's coordinates; empty in files of earlier versions.
 
     Raises:
-        ClodError: no rows, dial values that do not ascend from 1, a value that is not finite, an unusable machine, or
-            another ``against``.
+        ClodError: there are no rows, dial values do not ascend from 1, a value is not finite, a count, size or time is
+            not positive, or ``machine`` or ``against`` is invalid.
     """
 
     rows: tuple[CalibrationRow, ...]
@@ -132,10 +131,10 @@ class Calibration:
         against: str = "photographs",
         viewpoints: Sequence[Viewpoint] = (),
     ) -> Calibration:
-        """The table of an evaluation's rows, in any order, for pictures of ``size`` (width, height).
+        """The table of an evaluation's rows, in any order, for images of ``size`` (width, height).
 
         Raises:
-            ClodError: no row at s = 1, or a value that is not finite (the PSNR of equal pictures).
+            ClodError: there is no row at s = 1, or a value is not finite (the PSNR of equal images).
         """
         found = {
             r.virtual_scale: CalibrationRow(*map(float, (r.virtual_scale, r.kept, r.psnr, r.ssim, r.frame_ms)))
@@ -150,25 +149,25 @@ class Calibration:
         """The inverse of ``as_dict``.
 
         Raises:
-            ClodError, KeyError, TypeError or ValueError: it is something else.
+            ClodError, KeyError, TypeError or ValueError: ``values`` is not such a dictionary.
         """
         rows = tuple(CalibrationRow(**{name: float(value) for name, value in row.items()}) for row in values["rows"])
         counts = {name: int(values[name]) for name in ("total", "views", "width", "height")}
-        against = str(values.get("against", AGAINST[0]))  # files that do not say are of before there was another
+        against = str(values.get("against", AGAINST[0]))  # files of earlier versions have no such key
         viewpoints = tuple(Viewpoint(**{k: float(v) for k, v in row.items()}) for row in values.get("viewpoints", ()))
         return cls(rows, machine=str(values["machine"]), against=against, viewpoints=viewpoints, **counts)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain JSON."""
+        """The table as plain JSON values."""
         lists = {name: [dict(vars(row)) for row in getattr(self, name)] for name in ("rows", "viewpoints")}
         return {**vars(self), **lists}
 
 
 def crossing(dials: Sequence[float], values: Sequence[float], target: float) -> float | None:
-    """The smallest dial value from which on ``values`` stay at most ``target``; None where the last one is above it.
+    """The smallest dial value from which ``values`` stay at most ``target``; None if the last one is above it.
 
-    Piecewise linear in log s. A measured curve need not be monotone: where it dips below the target and rises again,
-    the dip does not count.
+    Piecewise linear in log s. A measured curve need not be monotone: a dip below the target does not count
+    if the curve rises above it again.
 
     Args:
         dials: ascending, positive.

@@ -11,9 +11,9 @@ from torch import Tensor
 from clod_adapter.errors import ClodError
 
 NEAR = 0.01
-"""The near plane, world units, as in gsplat."""
-SMALL_EXTENT = 1.0  # of the cameras, world units; below it the near plane comes nearer by as much
-ROUNDING = 1e-6  # times their distance from 0: nearer to each other than that, float32 has cameras in one place
+"""Distance of the near plane, world units, as in gsplat."""
+SMALL_EXTENT = 1.0  # extent of the cameras, world units, below which the near plane is scaled down
+ROUNDING = 1e-6  # of the distance from 0: float32 does not resolve cameras closer together than that
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,12 @@ class View:
 
 
 class StoredView(View):
-    """A view that does not hold its photograph: it is read whenever it is looked at.
+    """A view that reads its photograph on every access instead of holding it.
 
-    Equal only to itself, as comparing would read it; a pickle or a deep copy is a plain View, with the photograph.
+    Compares by identity; a pickle or a deep copy is a plain View that holds the photograph.
 
     Args:
-        image: gives the pixels, as ``View.image`` has them; or the pixels, with which ``dataclasses.replace`` comes.
+        image: returns the pixels of ``View.image``; or the pixels themselves (``dataclasses.replace`` passes these).
     """
 
     def __init__(self, camera: Camera, image: Callable[[], Tensor] | Tensor) -> None:
@@ -107,14 +107,14 @@ def _check_image(camera: Camera, image: Tensor) -> None:
 
 @dataclass(frozen=True)
 class Scene:
-    """Posed photographs, split as the field does: sorted by name, every 8th is held out.
+    """Posed photographs, sorted by name; every 8th is held out, the usual split.
 
     Attributes:
-        train: views to learn from.
+        train: views for training.
         test: held-out views.
-        notes: what was done to the images on the way in, one line each, for the report.
-        left_out: what of the reading this scene does not need, each with the reason: ``("undistortion", "all 97
-            cameras are pinholes")``. Empty for a scene that was not read.
+        notes: changes made to the images when they were read, one line each, for the report.
+        left_out: steps of reading that were skipped, each with the reason: ``("undistortion", "all 97 cameras are
+            pinholes")``. Empty for a scene that was not read from files.
     """
 
     train: tuple[View, ...]
@@ -126,9 +126,8 @@ class Scene:
 def camera_extent(cameras: Sequence[Camera]) -> float:
     """1.1 times the largest distance of a camera from their mean, world units (3DGS's unit for position steps).
 
-    At most 3.3 times the median of these distances, unless that is 0: one camera that stands far off makes no scene
-    larger. 0 for cameras that are all in one place, as a turning one is on its tripod. What only the rounding of
-    float32 may have made counts as 0.
+    At most 3.3 times the median of these distances, unless that is 0, so that one distant camera does not enlarge the
+    extent. 0 for cameras in one place, such as one that turns on a tripod; distances within float32's rounding are 0.
     """
     centres = torch.stack([camera.position for camera in cameras])
     distances = (centres - centres.mean(0)).norm(dim=1)
@@ -138,14 +137,14 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
 
 
 def near_plane(extent: float) -> float:
-    """NEAR; below SMALL_EXTENT nearer in proportion to the extent of the scene, world units, > 0."""
+    """Distance of the near plane, world units, > 0: NEAR, scaled by the extent if that is below SMALL_EXTENT."""
     return NEAR * min(extent / SMALL_EXTENT, 1.0)
 
 
 def in_its_unit(scene: Scene) -> Scene:
-    """The scene with a near plane that fits its unit: where the cameras' extent is below 1, by that much nearer.
+    """The scene with its near planes scaled by the extent of its cameras, if that is below 1.
 
-    A scene in kilometres would else be nearer than the near plane altogether. Larger scenes keep the usual 0.01.
+    A scene in kilometres would otherwise lie in front of the near plane. Larger scenes keep 0.01.
     """
     extent = camera_extent([view.camera for view in (*scene.train, *scene.test)])
     if not 0 < extent < SMALL_EXTENT:

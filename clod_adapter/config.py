@@ -1,4 +1,7 @@
-"""Every choice the paper leaves open, as documented fields of frozen configs."""
+"""Settings of the equation, of the screen-space filter and of training, as frozen dataclasses.
+
+Each field's help is the option's help on the command line.
+"""
 
 from __future__ import annotations
 
@@ -18,39 +21,42 @@ SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degr
 
 
 def option(default: Any, help: str) -> Any:
-    """A config field whose help is also the command line's."""
+    """A field whose help is also that of its command-line option."""
     return field(default=default, metadata={"help": help})
 
 
 def require(ok: bool, name: str, value: object, what: str) -> None:
-    """Raises ClodError naming the field, its value and what it must be."""
+    """Raises ClodError unless ``ok``; the message has the field's name, its value and ``what`` it must be."""
     if not ok:
         raise ClodError(f"{name} is {value}, it must be {what}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class AttenuationConfig:
-    """How a stored ``sigma_d`` is to be read. Travels with the file; the defaults are what adapting writes by default.
+    """Settings of the equation that reads ``sigma_d``. Stored in the file; the defaults are those of adapting.
 
-    The cut keeps a Gaussian iff its attenuated opacity exceeds ``tau * virtual_scale``, and draws it with that
-    opacity (``hard``, the paper's) or with what is above the threshold (``soft``; ``attenuation.attenuate``). The
-    normaliser D turns a distance into the ``d'`` of the equation:
+    A Gaussian is culled unless its attenuated opacity exceeds the culling threshold ``tau * virtual_scale``. A hard
+    threshold, the paper's, keeps that opacity; a soft one fades it to 0 at the threshold (``attenuation.attenuate``).
+    The normalizer D turns a distance into the ``d'`` of the equation:
 
-    - ``scene``: one constant, ``scene_distance``, for every view; 1 for a sigma_d in world units, as files have it;
-    - ``quantile``: the ``quantile`` of the distances of the Gaussians in the view frustum;
-    - ``max``: their maximum, the paper's form.
+    - ``scene``: the constant ``scene_distance`` for every view; 1 in files, where sigma_d is in world units;
+    - ``quantile``: that ``quantile`` of the distances of the Gaussians in the view frustum;
+    - ``max``: the largest of these distances, the paper's form.
+
+    Raises:
+        ClodError: a field is out of range.
     """
 
-    tau: float = option(0.02, "base opacity threshold of the cut; rasterizers drop what is below 1/255 anyway")
-    cut: str = option("soft", "how a Gaussian leaves: hard (at opacity tau s, the paper's) or soft (at 0)")
-    eps: float = option(1e-8, "the paper's epsilon under sigma_d squared; keeps sigma_d = 0 defined")
-    normalizer: str = option("scene", "what distances are divided by: scene, quantile or max")
-    quantile: float = option(0.95, "share of the frustum's Gaussians nearer than D (normalizer quantile)")
-    scene_distance: float = option(1.0, "D in world units (normalizer scene); 1 in files: sigma_d is in world units")
+    tau: float = option(0.02, "culling threshold on opacity at s = 1; rasterizers drop opacities below 1/255 anyway")
+    cut: str = option("soft", "culling threshold: hard (opacity drops to 0 at tau s, the paper's) or soft (fades to 0)")
+    eps: float = option(1e-8, "the paper's epsilon, added to 2 sigma_d^2; defines sigma_d = 0")
+    normalizer: str = option("scene", "divisor D of distances: scene, quantile or max")
+    quantile: float = option(0.95, "quantile of the distances in the frustum that is D (normalizer quantile)")
+    scene_distance: float = option(1.0, "D in world units (normalizer scene); files have 1, sigma_d in world units")
     reference_distance: float = option(
-        0.0, "typical distance in the training views, world units, for what has no camera; 0 where it is not known"
+        0.0, "typical distance in the training views, world units, for uses without a camera; 0 if unknown"
     )
-    max_sv: float = option(5.0, "largest dial value the file was trained for")
+    max_sv: float = option(5.0, "largest dial value of training")
 
     def __post_init__(self) -> None:
         require(0 < self.tau < 1, "tau", self.tau, "between 0 and 1")
@@ -66,27 +72,30 @@ class AttenuationConfig:
             self.tau * self.max_sv < 1,
             "tau",
             self.tau,
-            f"below 1/max_sv = {1 / self.max_sv:.3g}, or nothing survives the cut",
+            f"below 1/max_sv = {1 / self.max_sv:.3g}, or every Gaussian is culled at max_sv",
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScreenFilter:
-    """The screen-space filter that a checkpoint was trained with, and so has to be drawn with. Travels with the file.
+    """The screen-space filter of a checkpoint's training, which rendering has to repeat. Stored in the file.
 
     With C ``[2, 2]`` the covariance of a projected Gaussian, in px^2, a renderer draws C + variance I. With
     ``compensate`` it also multiplies the opacity by
 
         c = sqrt(max(0, det C / det(C + variance I)))
 
-    so that a Gaussian that the filter widens keeps its integral, and drops it where the product is below 1/255.
+    so that a widened Gaussian keeps its integral, and drops a Gaussian whose product is below 1/255.
     The 2D Mip filter of Mip-Splatting (Yu et al., CVPR 2024); ``rasterize_mode="antialiased"`` of gsplat and
-    ``--antialiasing`` of Inria's trainer are the same with a variance of 0.3 in place of 0.1. (Inria's c is at least
-    0.005, Mip-Splatting's at least 0.001; gsplat's has no such floor, and neither has this one.)
+    ``--antialiasing`` of Inria's trainer are the same with a variance of 0.3 instead of 0.1. (Inria's c is at least
+    0.005, Mip-Splatting's at least 0.001; gsplat's and this one have no lower bound.)
+
+    Raises:
+        ClodError: the variance is not between 0.001 and 100, or ``compensate`` is not a bool.
     """
 
     variance: float = option(0.3, "px^2 added to the covariance of every projected Gaussian")
-    compensate: bool = option(False, "whether the opacity is scaled by how much that widens it")
+    compensate: bool = option(False, "whether opacities are scaled by c to compensate for the widening")
 
     def __post_init__(self) -> None:
         require(1e-3 <= self.variance <= 100, "variance", self.variance, "between 0.001 and 100 px^2")
@@ -94,12 +103,12 @@ class ScreenFilter:
 
     @property
     def name(self) -> str | None:
-        """Its name in FILTERS; None for another one."""
+        """Its name in FILTERS; None if it is not in there."""
         return next((name for name, known in FILTERS.items() if known == self), None)
 
     @property
-    def says(self) -> str:
-        """In words."""
+    def description(self) -> str:
+        """Description for messages."""
         return f"{self.variance:g} px^2 of blur, opacities {'' if self.compensate else 'not '}compensated for it"
 
 
@@ -109,54 +118,60 @@ FILTERS = {
     "on": ScreenFilter(compensate=True),
     "mip": ScreenFilter(variance=0.1, compensate=True),
 }
-"""By the names that ``--antialiasing`` has: 3DGS's own, gsplat's and Inria's with antialiasing, Mip-Splatting's."""
+"""Values of ``--antialiasing``: off is 3DGS, on is gsplat's and Inria's antialiasing, mip is Mip-Splatting."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptConfig:
-    """How an adaptation is run. docs/method.md says which defaults were measured, and what the others stand on."""
+    """Settings of training. docs/method.md has the measurement or the source of each default.
+
+    Raises:
+        ClodError: a field is out of range.
+    """
 
     max_sv: float = option(5.0, "largest dial value to train for")
     iters: int = option(1500, "training steps")
-    batch: int = option(1, "views a step; step sizes grow with its root, so fewer steps of more views go as far")
+    batch: int = option(1, "views per step; learning rates scale with its square root")
     time_budget: float | None = option(
-        None, "stop training after this many seconds, schedule included (default: no limit)"
+        None, "stop training after this many seconds; schedules are scaled to it (default: no limit)"
     )
-    seed: int = option(0, "seed of view order, dial values and the importance estimate")
-    tau: float = option(0.02, "base opacity threshold of the cut; lowered for a checkpoint that is too faint for it")
-    cut: str = option("soft", "how a Gaussian leaves: hard (at opacity tau s, the paper's) or soft (at 0)")
-    eps: float = option(1e-8, "the paper's epsilon")
-    normalizer: str = option("scene", "what distances are divided by: scene, quantile or max (the paper's)")
-    quantile: float = option(0.95, "quantile of distances that becomes D (normalizers scene and quantile)")
+    seed: int = option(0, "seed of the view order, the dial values and the importance estimate")
+    tau: float = option(0.02, "culling threshold on opacity at s = 1; lowered automatically for faint checkpoints")
+    cut: str = option("soft", "culling threshold: hard (opacity drops to 0 at tau s, the paper's) or soft (fades to 0)")
+    eps: float = option(1e-8, "the paper's epsilon, added to 2 sigma_d^2")
+    normalizer: str = option("scene", "divisor D of distances: scene, quantile or max (the paper's)")
+    quantile: float = option(0.95, "quantile of the distances that is D (normalizers scene and quantile)")
     start: str = option(
         "importance",
-        "first sigma_d: importance (by rank; who has a neighbour to stand in for it leaves sooner), error (by rank of "
-        "removal error alone), constant (1) or identity (no fading)",
+        "initialization of sigma_d: importance (by rank of importance; replaceable neighbours are culled earlier), "
+        "error (by rank of removal error), constant (1) or identity (no fading)",
     )
-    start_share: float = option(0.62, "share of Gaussians to keep at s = 1")
-    parameter: str = option("log", "what is trained: log (of sigma_d) or linear (sigma_d, the paper's)")
-    sampling: str = option("pair", "dial values of a step: pair (1 and one log-uniform), log, or uniform (the paper's)")
+    start_share: float = option(0.62, "share of Gaussians that the initialization keeps at s = 1")
+    parameter: str = option("log", "trained parameter: log (of sigma_d) or linear (sigma_d itself, the paper's)")
+    sampling: str = option("pair", "dial values per step: pair (1 and a log-uniform one), log or uniform (the paper's)")
     full_weight: float = option(
-        1.0, "weight of the picture at s = 1 beside that at the other dial value (sampling pair)"
+        1.0, "weight of the loss at s = 1 relative to that at the other dial value (sampling pair)"
     )
     full_share: float = option(0.0, "share of steps at s = 1 (samplings log and uniform)")
-    exponent: float = option(1.5, "the count law: the share to keep at s is s^-exponent")
-    count_term: str = option("law", "what moves the count: law (both ways, by sigma_d alone) or paper (its L_reg)")
-    reg_weight: float = option(0.5, "weight of the count term (the paper's lambda_reg)")
-    weight_slope: float = option(
-        0.25, "k of w_s = (1 - k s/max_sv)^2; the paper has 0.5, 0 weighs all dial values alike"
+    exponent: float = option(1.5, "target-count curve: the target share of Gaussians at s is s^-exponent")
+    count_term: str = option(
+        "law", "count loss: law (both directions, through sigma_d alone) or paper (the paper's L_reg)"
     )
-    temperature: float = option(0.15, "width of the straight-through count's sigmoid, in log opacity")
-    ssim_weight: float = option(0.2, "weight of 1 - SSIM against L1")
-    lr_sigma: float = option(0.1, "step size of log sigma_d: its largest relative change a step")
-    lr_means: float = option(5.2e-4, "step size of means, times the cameras' extent")
-    lr_quats: float = option(1.6e-3, "step size of quats")
-    lr_scales: float = option(1.6e-2, "step size of log_scales")
-    lr_opacities: float = option(0.1, "step size of opacity_logits")
-    lr_sh0: float = option(4e-3, "step size of sh0")
-    lr_shN: float = option(0.0, "step size of shN; 0 leaves the higher bands as they are: measured at 0.01 dB")
-    lr_final: float = option(0.1, "step sizes fall exponentially to this share of their start")
-    average: float = option(0.2, "the last share of the steps, over which the mean of the parameters is the outcome")
+    reg_weight: float = option(0.5, "weight of the count loss (the paper's lambda_reg)")
+    weight_slope: float = option(
+        0.25, "k of the loss weight w_s = (1 - k s/max_sv)^2; the paper has 0.5, 0 gives equal weights"
+    )
+    temperature: float = option(0.15, "width of the sigmoid of the straight-through count, in log opacity")
+    ssim_weight: float = option(0.2, "weight w of 1 - SSIM; L1 has 1 - w")
+    lr_sigma: float = option(0.1, "learning rate of log sigma_d: its largest relative change per step")
+    lr_means: float = option(5.2e-4, "learning rate of means, times the extent of the cameras")
+    lr_quats: float = option(1.6e-3, "learning rate of quats")
+    lr_scales: float = option(1.6e-2, "learning rate of log_scales")
+    lr_opacities: float = option(0.1, "learning rate of opacity_logits")
+    lr_sh0: float = option(4e-3, "learning rate of sh0")
+    lr_shN: float = option(0.0, "learning rate of shN; 0 keeps SH degrees above 0 fixed, which costs 0.01 dB")
+    lr_final: float = option(0.1, "final learning rates as a share of the initial ones (exponential decay)")
+    average: float = option(0.2, "share of the steps, at the end, whose parameters are averaged for the result")
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -180,18 +195,18 @@ class AdaptConfig:
         require(0 < self.lr_final <= 1, "lr_final", self.lr_final, "above 0 and at most 1")
         require(0 <= self.average <= 1, "average", self.average, "between 0 and 1")
         for name in ("sigma", "means", "quats", "scales", "opacities", "sh0", "shN"):
-            rate = getattr(self, f"lr_{name}")  # far longer steps would overflow float32 in the end
+            rate = getattr(self, f"lr_{name}")  # larger ones overflow float32 in the end
             require(0 <= rate <= 1e6, f"lr_{name}", rate, "between 0 and 1e6")
         self.attenuation(1.0)  # checks the rest
 
     @classmethod
     def paper(cls, **changes: Any) -> AdaptConfig:
-        """The paper's own form, where it says; the rest, and ``changes``, as in ours.
+        """The settings of the paper where it gives them, the defaults elsewhere; then ``changes``.
 
-        CLoD-GS section 3.3: one s ~ U(1, max_sv) a step, w_s with k = 0.5, its L_reg with lambda 1, distances divided
-        by the frustum's largest, a hard cut, sigma_d itself trained at 1e-2. It does not give tau, the start, the
-        gradient of its count and the other step sizes: 1/255 (what rasterizers drop anyway), constant 1, straight
-        through a sigmoid 0.5 wide, half of ours falling to a twentieth, without a mean at the end.
+        CLoD-GS section 3.3: one s ~ U(1, max_sv) per step, w_s with k = 0.5, its L_reg with lambda 1, distances divided
+        by the largest in the frustum, a hard threshold, sigma_d itself trained at 1e-2. Not in the paper, chosen here:
+        tau 1/255 (the limit of rasterizers), sigma_d initialized to 1, a straight-through count with a sigmoid 0.5
+        wide, half the default learning rates decaying to a twentieth, no average of parameters.
         """
         own: dict[str, Any] = {
             "tau": 1 / 255, "cut": "hard", "normalizer": "max", "start": "constant", "parameter": "linear",
@@ -202,12 +217,12 @@ class AdaptConfig:
         return cls(**{**own, **changes})
 
     def lighter(self, share: float) -> AdaptConfig:
-        """The same with step sizes times ``share`` for everything but sigma_d."""
+        """A copy with the learning rates of all attributes but sigma_d multiplied by ``share``."""
         names = ("lr_means", "lr_quats", "lr_scales", "lr_opacities", "lr_sh0", "lr_shN")
         return replace(self, **{name: share * getattr(self, name) for name in names})
 
     def attenuation(self, scene_distance: float) -> AttenuationConfig:
-        """What training reads sigma_d by; ``units.in_world_units`` of it travels with the file."""
+        """Settings of the equation in training; files have them in world units (``units.in_world_units``)."""
         return AttenuationConfig(
             tau=self.tau, cut=self.cut, eps=self.eps, normalizer=self.normalizer, quantile=self.quantile,
             scene_distance=scene_distance, max_sv=self.max_sv,
@@ -215,5 +230,5 @@ class AdaptConfig:
 
 
 def describe(config: Any) -> dict[str, str]:
-    """The help text of each field of a config."""
+    """Help text by field name."""
     return {f.name: f.metadata["help"] for f in fields(config)}

@@ -1,17 +1,15 @@
-"""When a Gaussian leaves, in closed form: the dial value at which it does, and the sigma_d that has it leave there.
+"""The extinction scale in closed form: the dial value s* at which a Gaussian is culled, and the sigma_d for a given s*.
 
-The words and the equation are those of ``attenuation.py``.
+Equation and symbols are those of ``attenuation.py``.
 """
 
 from __future__ import annotations
-
-import math
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from clod_adapter.attenuation import SIGMA_MAX, conform, twice_variance
+from clod_adapter.attenuation import SIGMA_MAX, conform, culling_threshold, log_threshold, twice_variance
 from clod_adapter.config import AttenuationConfig
 
 _LOG_HUGE = 1e4  # above the logarithms that float64 products here can have
@@ -19,11 +17,11 @@ _LOG_HUGE = 1e4  # above the logarithms that float64 products here can have
 
 @torch.no_grad()
 def extinction_scale(opacity_logits: Tensor, sigma_d: Tensor, d: Tensor, config: AttenuationConfig) -> Tensor:
-    """``[N]`` the dial value s* at which each Gaussian leaves: kept at s iff ``s < s*`` (up to rounding).
+    """``[N]`` the dial value s* at which each Gaussian is culled: kept at s iff ``s < s*`` (up to rounding).
 
     The unique root of ``a exp(-(d s)^2 / (2 v)) = tau s``, which is
     ``s*^2 = (v / d^2) W(a^2 d^2 / (tau^2 v))`` with W the principal Lambert function. In [0, a/tau]; below
-    1 means kept at no dial value. ``a/tau`` where d = 0 (or d^2 / v is negligible); 0 where sigma <= 0,
+    1 the Gaussian is kept at no dial value. ``a/tau`` where d = 0 (or d^2 / v is negligible); 0 where sigma <= 0,
     eps = 0 and d > 0. No gradient.
 
     Accuracy: relative error within ``(6 + |log a|) * finfo.eps`` where ``a`` is a normal number.
@@ -34,9 +32,9 @@ def extinction_scale(opacity_logits: Tensor, sigma_d: Tensor, d: Tensor, config:
     opacity_logits, sigma_d, d = conform(opacity_logits=opacity_logits, sigma_d=sigma_d, d=d)
     radius = twice_variance(sigma_d, config.eps).div_(2).sqrt_()
     ratio = (d.double() / radius).to(d.dtype).masked_fill_(d == 0, 0)
-    upper = opacity_logits.sigmoid().div_(config.tau)
+    upper = opacity_logits.sigmoid().div_(culling_threshold(config.tau, 1.0))
     log_ratio = ratio.log().clamp_(max=_LOG_HUGE)  # ratio is inf where the variance is 0
-    w = _lambert_w_of_exp((F.logsigmoid(opacity_logits) - math.log(config.tau) + log_ratio).mul_(2))
+    w = _lambert_w_of_exp((F.logsigmoid(opacity_logits) - log_threshold(config.tau, 1.0) + log_ratio).mul_(2))
     # The same value twice: e^{-W/2} = sqrt(W / z). The first does not cancel at small W, the second does not
     # amplify W's error at large W.
     return torch.where(w < 1, upper * torch.exp(-0.5 * w), w.sqrt().div_(ratio))
@@ -44,25 +42,25 @@ def extinction_scale(opacity_logits: Tensor, sigma_d: Tensor, d: Tensor, config:
 
 @torch.no_grad()
 def sigma_for_extinction(opacity_logits: Tensor, d: Tensor, extinction: Tensor, config: AttenuationConfig) -> Tensor:
-    """``[N]`` the sigma_d with which a Gaussian at distance d leaves at s*; inverse of ``extinction_scale``.
+    """``[N]`` the sigma_d with which a Gaussian at distance d is culled at s*; inverse of ``extinction_scale``.
 
     ``v = (d s*)^2 / (2 log(a / (tau s*)))``, ``sigma = sqrt(max(v - eps/2, 0))``, in [0, SIGMA_MAX].
-    ``SIGMA_MAX`` where ``s* >= a/tau``, which no finite sigma reaches. 0 where the wish lies below what
-    eps alone allows, and at d = 0, where no sigma matters. No gradient.
+    ``SIGMA_MAX`` where ``s* >= a/tau``, which no finite sigma reaches. 0 where s* is below what eps alone
+    allows, and at d = 0, where sigma has no effect. No gradient.
 
     Computed in float64. Accuracy: sigma^2 is off by at most ``4 finfo.eps``, and ``(|log a| + |log(tau s*)| + 1) /
     log(a / (tau s*))`` of float64's eps, times the larger of v and eps/2: the last step before ``a/tau`` is a steep
     one.
 
     Args:
-        extinction: ``[N]`` wanted s*, >= 0.
+        extinction: ``[N]`` s*, >= 0.
 
     Raises:
         ClodError: the shapes differ.
     """
     given = conform(opacity_logits=opacity_logits, d=d, extinction=extinction)
     opacity_logits, d, extinction = (t.double() for t in given)
-    drop = F.logsigmoid(opacity_logits) - (extinction * config.tau).log_()
+    drop = F.logsigmoid(opacity_logits) - culling_threshold(config.tau, extinction).log_()
     variance = (d * extinction).square_().div_(2 * drop)
     sigma = variance.sub_(config.eps / 2).clamp_(min=0).sqrt_()
     return torch.where(drop > 0, sigma, SIGMA_MAX).clamp_(max=SIGMA_MAX).to(given[0].dtype)

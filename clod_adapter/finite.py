@@ -1,4 +1,4 @@
-"""Which rows hold a value that is not finite, and what is refused for it before work is spent."""
+"""Rows with values that are not finite: finding them, and refusing them before training."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from clod_adapter.gaussians import Gaussians
 
 
 class LossNotFinite(Exception):
-    """A step's loss is not finite, so nothing can be learned from it."""
+    """The loss of a training step is not finite."""
 
 
 def bad_rows(values: Tensor) -> Tensor | None:
-    """``[N]`` bool, the rows of ``values [N, ...]`` that hold a value that is not finite; None where there is none.
+    """``[N]`` bool, the rows of ``values [N, ...]`` with a value that is not finite; None if there is none.
 
-    One pass, without memory of its own, where all are: a sum with a term that is not finite is not finite either.
+    One pass without extra memory if all are finite: a sum with a term that is not finite is not finite.
     """
     if bool(values.sum().isfinite()):
         return None
@@ -28,7 +28,7 @@ def spoilt_rows(gradients: dict[str, Tensor]) -> Tensor:
     """``[N]`` bool, the rows that are bad in any of the gradients ``[N, ...]``."""
     tensors = list(gradients.values())
     spoilt = torch.zeros(len(tensors[0]), dtype=torch.bool, device=tensors[0].device)
-    if bool(torch.stack([tensor.sum() for tensor in tensors]).isfinite().all()):  # a GPU is asked once
+    if bool(torch.stack([tensor.sum() for tensor in tensors]).isfinite().all()):  # one synchronization on a GPU
         return spoilt
     for tensor in tensors:
         if (bad := bad_rows(tensor)) is not None:
@@ -37,7 +37,7 @@ def spoilt_rows(gradients: dict[str, Tensor]) -> Tensor:
 
 
 def bad_gaussians(gaussians: Gaussians) -> dict[str, Tensor]:
-    """By attribute, its ``bad_rows``, of those that have any. An opacity logit may be +-inf: an opacity of 1 or 0."""
+    """``bad_rows`` by attribute, if there are any. An opacity logit may be +-inf: an opacity of 1 or 0."""
     found = {}
     for name, values in gaussians.tensors().items():
         if name == "opacity_logits":
@@ -51,10 +51,11 @@ def require_finite(gaussians: Gaussians, what: str, remedy: str) -> None:
     """Refuses Gaussians with an attribute that is not finite.
 
     Args:
-        what, remedy: the subject of the message, and its end.
+        what: subject of the message, such as the file.
+        remedy: end of the message, what to do.
 
     Raises:
-        ClodError: some row of some attribute is not finite; an opacity logit of +-inf is allowed.
+        ClodError: a value is not finite; an opacity logit of +-inf is allowed.
     """
     for name, bad in bad_gaussians(gaussians).items():
         first = int(bad.nonzero()[0, 0])
@@ -62,7 +63,7 @@ def require_finite(gaussians: Gaussians, what: str, remedy: str) -> None:
 
 
 def largest_colour(gaussians: Gaussians) -> str:
-    """Where colours are largest, for messages: what overflows in a picture is one of these."""
+    """The largest colour coefficient and its row, for the message about an image that overflows."""
     colours = {name: getattr(gaussians, name).abs().flatten(1) for name in ("sh0", "shN")}
     rows = {name: values.amax(1) for name, values in colours.items() if values.numel()}
     name = max(rows, key=lambda each: float(rows[each].max()))

@@ -1,4 +1,4 @@
-"""The container of a splat: a frozen, shape-checked set of Gaussians."""
+"""``Gaussians``: a frozen container of a splat's tensors with checked shapes."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFil
 from clod_adapter.errors import ClodError
 
 SH_C0 = 0.28209479177387814
-"""The degree-0 harmonic, ``1 / (2 sqrt(pi))``: seen without higher bands a colour is ``0.5 + SH_C0 sh0``."""
+"""The harmonic of degree 0, ``1 / (2 sqrt(pi))``: a colour without higher degrees is ``0.5 + SH_C0 sh0``."""
 
 OPAQUE = 20.0
-"""The logit of an opacity that float32 cannot tell from 1; stands for +inf, which not every reader takes."""
+"""A logit whose opacity is 1 in float32; written instead of +inf, which some readers refuse."""
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """N Gaussians in the form checkpoints store them, and, once adapted, their distance decay.
+    """N Gaussians with the parameters that checkpoints store, and, once adapted, their distance decay.
 
     Attributes:
         means: ``[N, 3]`` centres, world units.
-        quats: ``[N, 4]`` rotations, wxyz; not necessarily of unit length.
+        quats: ``[N, 4]`` rotations, wxyz, of any length but 0.
         log_scales: ``[N, 3]`` logarithms of the standard deviations along the axes, world units.
         opacity_logits: ``[N]``; the opacity is their sigmoid. +inf means fully opaque.
         sh0: ``[N, 1, 3]`` degree-0 spherical harmonics.
-        shN: ``[N, K-1, 3]`` higher bands, K in {1, 4, 9, 16, 25}.
+        shN: ``[N, K-1, 3]`` spherical harmonics of degrees 1 and up, K in {1, 4, 9, 16, 25}.
         sigma_d: ``[N]`` distance decay of opacity, or None for a checkpoint without a dial.
-        attenuation: how ``sigma_d`` is to be read; present exactly when ``sigma_d`` is.
-        screen_filter: the filter that they were trained with, and are drawn with.
+        attenuation: settings of the equation that reads ``sigma_d``; None exactly if ``sigma_d`` is None.
+        screen_filter: the filter for rendering, that of training.
 
     Raises:
         ClodError: a tensor has the wrong shape, or one of sigma_d and attenuation is missing.
@@ -81,7 +81,7 @@ class Gaussians:
         return self.opacity_logits.sigmoid()
 
     def tensors(self) -> dict[str, Tensor]:
-        """The tensor fields by name, without an absent sigma_d."""
+        """The tensor fields by name; without sigma_d if that is None."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, Tensor)}
 
@@ -94,14 +94,14 @@ class Gaussians:
         return self.replace(**{name: value[rows] for name, value in self.tensors().items()})
 
     def without_empty_bands(self) -> Gaussians:
-        """The same without the highest SH bands that are 0 throughout: the same pictures, for less work."""
+        """A copy without the highest SH degrees whose coefficients are all 0; renders the same image, faster."""
         degree = self.sh_degree
         while degree > 0 and not self.shN[:, SH_COUNTS[degree - 1] - 1 : SH_COUNTS[degree] - 1].any():
             degree -= 1
         return self.without_bands(degree)
 
     def without_bands(self, degree: int) -> Gaussians:
-        """The same without the SH bands above ``degree``; one that has none above it as it is."""
+        """A copy without the SH degrees above ``degree``; itself if it has none."""
         above = degree < self.sh_degree
         return self.replace(shN=self.shN[:, : SH_COUNTS[degree] - 1].contiguous()) if above else self
 

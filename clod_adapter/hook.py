@@ -1,4 +1,4 @@
-"""The dial as a function that any renderer can call, between its opacities and its rasterizer.
+"""The dial as a function for any renderer: it takes the opacities and returns those to rasterize.
 
 hook = clod_adapter.load("model.ply").hook(virtual_scale=3)
 opacities, keep = hook(means, opacities, viewmat, K, width, height)
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import Attenuated, attenuate_activated, check_dial, normalized_distances
+from clod_adapter.attenuation import Attenuated, attenuate, check_dial
 from clod_adapter.cameras import NEAR, Camera
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
@@ -23,11 +23,11 @@ Array = TypeVar("Array", Tensor, np.ndarray[Any, Any])
 
 @dataclass(frozen=True)
 class Hook:
-    """One dial value for one set of Gaussians; ``dataclasses.replace(hook, virtual_scale=2)`` turns it.
+    """One dial value for one set of Gaussians; ``dataclasses.replace(hook, virtual_scale=2)`` changes it.
 
     Attributes:
-        sigma_d: ``[N]``, row i of the Gaussian in row i of what the hook is called with.
-        attenuation: how ``sigma_d`` is to be read.
+        sigma_d: ``[N]``, in the order of the Gaussians that the hook is called with.
+        attenuation: settings of ``sigma_d``.
         virtual_scale: the dial s >= 1.
 
     Raises:
@@ -45,18 +45,18 @@ class Hook:
         self, means: Array, opacities: Array, viewmat: Any, K: Any = None, width: int = 1, height: int = 1,
         near: float = NEAR,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """The opacities to draw with, 0 for who is left out, and ``[N]`` bool who is kept (CLoD-GS Eq. 2, its mask).
+        """The opacities to draw with, 0 for culled Gaussians, and ``[N]`` bool, kept ones (CLoD-GS Eq. 2, its mask).
 
         numpy in, numpy out; torch in, torch out, on the means' device, differentiable in ``opacities`` and in
         ``sigma_d``. Distances are constants: no gradient reaches ``means`` and ``viewmat``. The camera's arguments may
-        be of either kind, as viewers have them in numpy beside Gaussians on a GPU.
+        be numpy arrays or tensors, as viewers keep cameras in numpy and Gaussians on a GPU.
 
         Args:
             means: ``[N, 3]`` world units.
             opacities: ``[N]`` or ``[N, 1]`` activated, in [0, 1]; the result has its shape and dtype.
             viewmat: ``[4, 4]`` world to camera, a rotation and a translation, OpenCV axes.
-            K: ``[3, 3]`` intrinsics in pixels. With ``width``, ``height`` and ``near`` it says which Gaussians the
-                normalisers ``max`` and ``quantile`` look at; ``scene`` does without.
+            K: ``[3, 3]`` intrinsics in pixels. With ``width``, ``height`` and ``near`` it defines the frustum of the
+                normalisers ``max`` and ``quantile``; ``scene`` needs none of them.
 
         Raises:
             ClodError: the shapes do not fit the hook or each other, or a normaliser that needs K has none.
@@ -72,20 +72,21 @@ class Hook:
         return drawn.detach().numpy(), result.keep.numpy()
 
     def attenuate(self, means: Tensor, opacities: Tensor, camera: Camera) -> Attenuated:
-        """The same of a ``Camera``, with all that ``attenuation.attenuate`` returns."""
+        """The same for a ``Camera``, with everything that ``attenuation.attenuate`` returns."""
         n = len(self.sigma_d)
         if means.shape != (n, 3) or opacities.shape not in ((n,), (n, 1)):
             raise ClodError(
                 f"the dial is for {n} Gaussians, but means is {tuple(means.shape)} and opacities "
-                f"{tuple(opacities.shape)}; give it the rows that it came with"
+                f"{tuple(opacities.shape)}; pass the rows of the file that it was loaded from"
             )
-        distances = normalized_distances(means, camera, self.attenuation)
         sigma_d = self.sigma_d.to(means.device)
-        return attenuate_activated(opacities.reshape(n), sigma_d, distances, self.virtual_scale, self.attenuation)
+        return attenuate(
+            opacities.reshape(n), sigma_d, (means, camera), self.virtual_scale, self.attenuation, activated=True
+        )
 
 
 def _tensor(values: Any) -> Tensor:
-    """A tensor as it is; else a copy, as torch takes neither another byte order nor steps backwards."""
+    """A tensor unchanged; an array as a copy, as torch accepts neither foreign byte order nor negative strides."""
     if isinstance(values, Tensor):
         return values
     array = np.asarray(values)
@@ -93,6 +94,6 @@ def _tensor(values: Any) -> Tensor:
 
 
 def _matrix(values: Any) -> Tensor:
-    """In float32 at least: neither whole numbers nor float16 are enough for a camera."""
+    """In float32 at least: integers and float16 are too coarse for a camera."""
     matrix = _tensor(values)
     return matrix.to(torch.promote_types(matrix.dtype, torch.float32))

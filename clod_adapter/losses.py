@@ -1,7 +1,8 @@
-"""Photometric loss of a render against a photograph."""
+"""The photometric loss of a render against a photograph, and its parts: L1, SSIM and PSNR on any device."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -13,19 +14,22 @@ WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
 
 
-def ssim(image: Tensor, target: Tensor) -> float:
-    """Mean structural similarity of a ``[H, W, 3]`` float image in [0, 1] and a uint8 photograph.
+def psnr(image: Tensor, target: Tensor) -> float:
+    """PSNR in dB of a ``[H, W, 3]`` float render, clamped to [0, 1], against a uint8 photograph.
 
-    11-tap Gaussian window with sigma 1.5, zero padding, data range 1: the form 3DGS and its
-    descendants report (Wang et al. 2004). On the CPU in float32 fused, elsewhere plain torch.
+    ``-10 log10 mean (image - target)^2``; infinite for equal images, NaN if a pixel of the render is NaN. What the plan
+    and the progress display compare; reports have ``metrics.psnr``.
     """
-    if _fusable(image):
-        return float(_Fused(image, target).ssim_sum / image.numel())
-    return float(ssim_plain(image.detach(), unit(target, image)))
+    error = float((image.detach().clamp(0, 1) - unit(target, image)).double().square().mean())
+    return math.inf if error == 0 else -10 * math.log10(error)
 
 
 def ssim_plain(image: Tensor, target: Tensor) -> Tensor:
-    """The plain twin of ``ssim``: two float images, a 0-d tensor, differentiable."""
+    """Mean structural similarity of two ``[H, W, 3]`` float images in [0, 1]: a 0-d tensor, differentiable.
+
+    Gaussian window of 11 taps with sigma 1.5, zero padding, data range 1: the form of 3DGS and its descendants (Wang et
+    al. 2004).
+    """
     taps = torch.exp(-((torch.arange(WINDOW).to(image) - WINDOW // 2) ** 2) / (2 * SIGMA**2))
     taps = taps / taps.sum()
 
@@ -46,30 +50,26 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
         image: ``[H, W, 3]`` float render, not clamped.
         target: ``[H, W, 3]`` uint8 photograph.
 
-    On the CPU in float32 one fused pass computes the loss and its gradient; elsewhere plain torch.
+    On the CPU in float32 one fused pass computes the loss and its gradient; otherwise plain torch.
     """
-    if _fusable(image):
+    if image.device.type == "cpu" and image.dtype == torch.float32:
         return _FusedLoss.apply(image, target, ssim_weight)  # type: ignore[no-any-return, no-untyped-call]
     return photometric_loss_plain(image, target, ssim_weight)
 
 
 def photometric_loss_plain(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """The plain twin of ``photometric_loss``."""
+    """``photometric_loss`` in plain torch."""
     wanted = unit(target, image)
     return (1 - ssim_weight) * (image - wanted).abs().mean() + ssim_weight * (1 - ssim_plain(image, wanted))
 
 
 def unit(photograph: Tensor, like: Tensor) -> Tensor:
-    """A uint8 photograph in [0, 1], of the type and on the device of ``like``; as bytes on its way there."""
+    """A uint8 photograph in [0, 1], of the type and on the device of ``like``; transferred as bytes."""
     return photograph.to(like.device, non_blocking=True).to(like.dtype) / 255
 
 
-def _fusable(image: Tensor) -> bool:
-    return image.device.type == "cpu" and image.dtype == torch.float32
-
-
 class _Fused:
-    """One comparison of a render with a photograph on the CPU; the kernels' scratch planes live as long as it."""
+    """Fused comparison of a render with a photograph on the CPU; owns the kernels' scratch planes."""
 
     def __init__(self, image: Tensor, target: Tensor) -> None:
         from clod_adapter._kernels import ssim as kernels
@@ -85,7 +85,7 @@ class _Fused:
         self.ssim_sum = sums.sum()
 
     def gradient(self, l1: float, dssim: float) -> tuple[Tensor, float]:
-        """Of ``l1 sum |x - y| - dssim sum SSIM`` to the image; and ``sum |x - y|``."""
+        """The gradient of ``l1 sum |x - y| - dssim sum SSIM`` with respect to the image, and ``sum |x - y|``."""
         out, sums = torch.empty(self.height, self.width, 3, dtype=torch.float32, device="cpu"), np.zeros(self.workers)
         self.threads.run(
             self.kernels.loss_gradient, self.workers, self.x, self.y, self.width, *self.slopes, l1, dssim, out.numpy(),

@@ -1,4 +1,4 @@
-"""Scenes far from 0: read relative to an origin of their own, where float32 has digits for them."""
+"""The origin of a scene far from 0: coordinates relative to it fit float32."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ import numpy as np
 Origin = tuple[float, float, float]
 NOWHERE: Origin = (0.0, 0.0, 0.0)
 AXES = ("x", "y", "z")
-# Times the spread of the bulk. Nearer, float32 places the Gaussians to 1e-5 of it and better, and nothing is done.
+# Times the spread of the scene. Closer to 0, float32 resolves 1e-5 of the spread, and the origin stays 0.
 FAR = 100.0
-FINEST = 2.0**-40  # of the distance from 0: what an origin is rounded to at least
+FINEST = 2.0**-40  # of the distance from 0: the finest unit that an origin is rounded to
 
 
 def origin_of(vertex: np.ndarray) -> Origin:
-    """What the coordinates ``x, y, z`` of the rows are to be relative to, world units; 0 unless they are far from it.
+    """The origin for the coordinates ``x, y, z`` of the rows, world units; 0 unless the scene is far from 0.
 
     The median, rounded to multiples of a power of two near the spread (the middle 80 % along the widest axis), so that
-    taking it from float32 coordinates is exact.
+    subtracting it from float32 coordinates is exact.
     """
-    with np.errstate(invalid="ignore"):  # a NaN that signals
+    with np.errstate(invalid="ignore"):  # signalling NaN
         xyz = np.stack([vertex[axis].astype(np.float64) for axis in AXES], 1)
     xyz = xyz[np.isfinite(xyz).all(1)]
     if not len(xyz):
@@ -32,14 +32,14 @@ def origin_of(vertex: np.ndarray) -> Origin:
         spread = float((high - low).max())
     if not 0 < FAR * spread < float(np.abs(middle).max()):
         return NOWHERE
-    # Doubles may spread by less than their largest has digits for.
+    # The spread of doubles may be below the precision of the largest.
     unit = 2.0 ** math.ceil(math.log2(max(spread, FINEST * float(np.abs(middle).max()))))
     x, y, z = (float(value) for value in np.round(middle / unit) * unit + 0.0)  # no -0
     return x, y, z
 
 
 def parse_origin(values: Any) -> Origin:
-    """What a description says is the origin; raises the TypeError or ValueError of what is none."""
+    """The origin from three stored numbers; raises TypeError or ValueError if they are not three finite numbers."""
     x, y, z = map(float, values)
     if not all(map(math.isfinite, (x, y, z))):
         raise ValueError(f"origin is {values!r:.80}, not finite")

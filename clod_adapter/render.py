@@ -1,4 +1,4 @@
-"""The one joint: activate, attenuate, cut, rasterize. Training, evaluation and baking all pass through it."""
+"""Rendering of Gaussians at a dial value: attenuate, cull, rasterize."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import Attenuated, attenuate_seen
+from clod_adapter.attenuation import Attenuated, attenuate
 from clod_adapter.cameras import Camera
-from clod_adapter.config import require
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import Rasterizer, for_device
@@ -17,12 +16,12 @@ from clod_adapter.rasterizers import Rasterizer, for_device
 
 @dataclass(frozen=True)
 class Rendering:
-    """A picture and what it took.
+    """An image, its alpha and the Gaussians it shows.
 
     Attributes:
         image: ``[H, W, 3]`` float, not clamped.
         alpha: ``[H, W]`` accumulated opacity.
-        kept: ``[N]`` bool, the Gaussians the dial leaves in; the rasterizer saw no others.
+        kept: ``[N]`` bool, the Gaussians that the dial keeps; culled ones are neither sorted nor drawn.
     """
 
     image: Tensor
@@ -31,26 +30,23 @@ class Rendering:
 
     @property
     def pixels(self) -> Tensor:
-        """``[H, W, 3]`` uint8, the image as a file has it."""
+        """``[H, W, 3]`` uint8, the image as files store it."""
         return (self.image.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
-def dial(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Attenuated:
-    """Opacities of the Gaussians as ``camera`` sees them at one dial value (CLoD-GS Eq. 2 and its mask).
+def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float) -> Attenuated:
+    """``attenuation.attenuate`` of a container of Gaussians: their opacities at one dial value.
 
-    Without a ``sigma_d`` the dial does nothing: stored opacities, all kept.
+    Without a ``sigma_d`` the dial has no effect: stored opacities, all kept.
+
+    Args:
+        seen_from: the camera, or ``[N]`` distances d where they are known.
 
     Raises:
         ClodError: the dial is below 1 or not finite.
     """
-    if gaussians.sigma_d is None or gaussians.attenuation is None:
-        require(1 <= virtual_scale < float("inf"), "virtual_scale", virtual_scale, "at least 1 and finite")
-        log_opacities = torch.nn.functional.logsigmoid(gaussians.opacity_logits)
-        keep = torch.ones(len(gaussians), dtype=torch.bool, device=log_opacities.device)
-        return Attenuated(gaussians.opacities, log_opacities, keep, gaussians.opacities)
-    return attenuate_seen(
-        gaussians.means, gaussians.opacity_logits, gaussians.sigma_d, camera, virtual_scale, gaussians.attenuation
-    )
+    where = seen_from if isinstance(seen_from, Tensor) else (gaussians.means, seen_from)
+    return attenuate(gaussians.opacity_logits, gaussians.sigma_d, where, virtual_scale, gaussians.attenuation)
 
 
 def splat(
@@ -61,7 +57,7 @@ def splat(
     background: Tensor | None = None,
     rasterizer: Rasterizer | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Image ``[H, W, 3]`` and alpha ``[H, W]`` of the Gaussians with the given ``opacities [N]``, black behind.
+    """Image ``[H, W, 3]`` and alpha ``[H, W]`` of the Gaussians with the given ``opacities [N]``.
 
     Raises:
         ClodError: the opacities or the background have the wrong shape.
@@ -90,8 +86,8 @@ def render(
     """Renders at one dial value, differentiably.
 
     Args:
-        gaussians: adapted or not; without ``sigma_d`` the dial does nothing.
-        camera: where from.
+        gaussians: adapted or not; without ``sigma_d`` the dial has no effect.
+        camera: the view.
         virtual_scale: the dial s >= 1 (the paper's s_v).
         background: ``[3]``, black by default.
         rasterizer: the fastest one for the Gaussians' device by default.

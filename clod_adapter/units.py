@@ -1,8 +1,9 @@
 """The unit of sigma_d: world units in results and files, the typical distance of the scene while it is trained.
 
-The factor of the equation, ``exp(-(d / D s)^2 / (2 sigma^2 + eps))``, stays the same for another D' where
-``D'^2 (2 sigma'^2 + eps) = D^2 (2 sigma^2 + eps)``. In world units D is 1: nothing but sigma_d says how far a Gaussian
-is seen. Training divides by the typical distance, as its step sizes, its range of sigma_d and its start are about 1.
+The attenuation factor, ``exp(-(d / D s)^2 / (2 sigma^2 + eps))``, is the same for another D' where
+``D'^2 (2 sigma'^2 + eps) = D^2 (2 sigma^2 + eps)``. In world units D is 1, and sigma_d alone determines how far a
+Gaussian is seen. Training divides by the typical distance: its learning rates, range of sigma_d and initialization are
+about 1.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from clod_adapter.attenuation import SIGMA_MAX, twice_variance
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 
-# Quantile of the distances from the middle of a scene that stands for the typical one. In three captures it is 0.28,
-# 1.03 and 1.09 of that (few photographs near one another, two scenes all around).
+# Quantile of the distances from the centre of a scene that estimates the typical distance. In three captures it is
+# 0.28, 1.03 and 1.09 of that (few photographs near one another, two scenes seen from all sides).
 REACH = 0.9
 # Down to this ratio eps = 1e-8 of the new unit hides only sigma_d below 0.007 of the old one.
 SMALL = 0.01
@@ -25,13 +26,13 @@ SMALL = 0.01
 
 @torch.no_grad()
 def with_distance(gaussians: Gaussians, distance: float) -> Gaussians:
-    """The same dial with ``scene_distance`` D' = ``distance``, world units, > 0; Gaussians without a dial as they are.
+    """The same dial with ``scene_distance`` D' = ``distance``, world units, > 0; Gaussians without a dial unchanged.
 
-    ``sigma'^2 = ((D / D')^2 (2 sigma^2 + eps) - eps) / 2``, in float64, at least 0. What is 0 or below stays, and so
-    does SIGMA_MAX. Where D / D' is below SMALL, eps would hide sigma': there it becomes ``(D / D')^2 eps``, to six
+    ``sigma'^2 = ((D / D')^2 (2 sigma^2 + eps) - eps) / 2``, in float64, at least 0. Values of 0 or below and SIGMA_MAX
+    stay. Where D / D' is below SMALL, eps would hide sigma': there it becomes ``(D / D')^2 eps``, to six
     digits; where D / D' is above 1 / SMALL, eps grows back so, to four digits, but not beyond the default. The
     normalisers ``max`` and ``quantile`` do not use D, and keep their sigma_d. The result's ``reference_distance`` is
-    ``known_distance`` of what was given.
+    ``known_distance`` of the input.
     """
     config, sigma = gaussians.attenuation, gaussians.sigma_d
     if config is None or sigma is None or config.scene_distance == distance:
@@ -41,7 +42,7 @@ def with_distance(gaussians: Gaussians, distance: float) -> Gaussians:
         ratio = config.scene_distance / distance
         if ratio < SMALL:
             changed = replace(changed, eps=float(f"{config.eps * ratio**2:.6g}"))
-        elif ratio > 1 / SMALL:  # or each change there and back would leave a smaller eps
+        elif ratio > 1 / SMALL:  # else each round trip would end with a smaller eps
             usual = AttenuationConfig().eps
             changed = replace(changed, eps=max(config.eps, float(f"{min(config.eps * ratio**2, usual):.4g}")))
         scaled = twice_variance(sigma, config.eps).mul_(ratio**2).sub_(changed.eps).div_(2).clamp_(min=0).sqrt_()
@@ -56,14 +57,14 @@ def in_world_units(gaussians: Gaussians) -> Gaussians:
 
 
 def known_distance(config: AttenuationConfig) -> float:
-    """World units: ``reference_distance``, else a D other than 1, as earlier versions wrote; 0 where neither tells."""
+    """World units: ``reference_distance``, else a D other than 1, as older versions wrote; 0 where both are unknown."""
     return config.reference_distance or (config.scene_distance if config.scene_distance != 1 else 0.0)
 
 
 def nominal_distance(means: Tensor, config: AttenuationConfig) -> float:
-    """The normalised distance d that stands for a typical place to look from, where there is no camera; > 0.
+    """The normalised distance d of a typical viewpoint, for scenes without cameras; > 0.
 
-    ``known_distance`` over D, or where that is not known ``estimated_distance`` over D; 1 for the normalisers ``max``
+    ``known_distance`` over D, or where that is unknown ``estimated_distance`` over D; 1 for the normalisers ``max``
     and ``quantile``.
 
     Args:
@@ -76,9 +77,9 @@ def nominal_distance(means: Tensor, config: AttenuationConfig) -> float:
 
 @torch.no_grad()
 def estimated_distance(means: Tensor) -> float:
-    """World units, > 0: the REACH quantile of the distances from the middle of the scene, 1 of what has no extent.
+    """World units, > 0: the REACH quantile of the distances from the centre of the scene; 1 for a scene without extent.
 
-    The middle is the median of each coordinate. A guess for a scene whose cameras are not known.
+    The centre is the median of each coordinate. An estimate for a scene whose cameras are unknown.
     """
     if len(means) == 0:
         return 1.0

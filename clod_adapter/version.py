@@ -1,4 +1,4 @@
-"""The package's version, for the headers of the files it writes."""
+"""The package's version, which is written into files."""
 
 from __future__ import annotations
 

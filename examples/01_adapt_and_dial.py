@@ -22,7 +22,7 @@ def main(checkpoint: str, folder: str, out: str = "adapted.ply") -> None:
     config = clod.AdaptConfig(max_sv=5, iters=ITERS)
     result = clod.adapt(base.gaussians, scene, config)
 
-    # What is worth keeping is the difference from the base; the file is made of the two.
+    # The adapter is the difference from the base; the file is made of both.
     about = {"fingerprint": base.fingerprint, "config": asdict(config), "origin": base.origin}
     adapter = clod.extract(base.gaussians, result.gaussians, **about)
     adapted = adapter.apply(base.gaussians)

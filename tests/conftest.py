@@ -24,6 +24,7 @@ import fake_gpu
 from clod_adapter.cameras import Camera
 from clod_adapter.cli.main import main
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.formats.splat_transform import VARIABLE
 from clod_adapter.io.ply.columns import column_map
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import render
@@ -51,6 +52,12 @@ def chromium() -> Iterator[Any]:
     """The one browser of a test process, in which Playwright allows no second; skips where there is none."""
     with browser.launch() as chromium:
         yield chromium
+
+
+@pytest.fixture
+def without_splat_transform(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hides splat-transform, which otherwise packs every exported page and takes seconds."""
+    monkeypatch.setenv(VARIABLE, "there-is-none")
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,8 @@ FENCE = re.compile(r"^( *)(`{3,})(\w*)\n(.*?)^\1\2 *$", re.DOTALL | re.MULTILINE
 SHELL = ("sh", "console")
 LANGUAGES = {*SHELL, "python", "text", "json", "glsl", "wgsl", "html", "css", "js"}
 
+STEPS = 20  # of a training that the pages run
+
 # Commands that are not run, wherever they stand, and why.
 SKIPPED = {
     "pip": "would change the environment that the tests run in",
@@ -81,7 +83,11 @@ def parse(words: list[str]) -> None:
 
 
 def run(words: list[str]) -> None:
-    """Runs a command of a shell block as the shell would, in the current folder; raises where that fails."""
+    """Runs a command of a shell block in the current folder, training for STEPS steps at most.
+
+    Raises:
+        ValueError: the program is unknown, or its exit code is not 0.
+    """
     out: Path | None = None
     if ">" in words:
         words, out = words[: words.index(">")], Path(words[-1])
@@ -96,9 +102,19 @@ def run(words: list[str]) -> None:
 
 
 def _run_clod_adapt(words: list[str]) -> None:
-    code = main(words[1:])
+    code = main(shortened(words[1:]))
     if code:
         raise ValueError(f"{shlex.join(words)}: exit code {code}")
+
+
+def shortened(words: list[str]) -> list[str]:
+    """The words of a training command with ``--iters`` at most STEPS; other commands as they are."""
+    if words[0] in COMMANDS and words[0] != "robustness":
+        return words
+    if "--iters" not in words:
+        return [*words, "--iters", str(STEPS)]
+    at = words.index("--iters") + 1
+    return [*words[:at], str(min(int(words[at]), STEPS)), *words[at + 1 :]]
 
 
 def _run_python(words: list[str]) -> None:

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,15 @@ from clod_adapter.cameras import Camera
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.view import prepare
+from clod_adapter.render import Rendering
 from clod_adapter.viewer.payload import page_config
 from clod_adapter.viewer.server import Server
 
-SIZE = {"width": 640, "height": 480}
+SIZE = {"width": 400, "height": 320}
+TALL = {"width": 640, "height": 600}  # the whole panel is shown
+WITHIN = 45.0  # dB between the page and our renderer
+COUNTS = 1e-3  # of the count
 SECONDS = 10  # until waiting ends
-RESTED = 250  # ms after a movement, while which slow devices draw fewer pixels
 
 
 @dataclass
@@ -68,7 +72,6 @@ class Shown:
 
     def picture(self) -> np.ndarray:
         """``[H, W, 3]`` uint8, of the splats alone, at full resolution, as when nothing moves."""
-        self.page.wait_for_timeout(RESTED)
         data = self.run("clod.capture()").partition(",")[2]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
@@ -76,14 +79,43 @@ class Shown:
         return dict(self.page.evaluate("clod.settled().then(clod.counts)"))
 
 
+def assert_alike(picture: np.ndarray, wanted: np.ndarray, keep: Path) -> None:
+    """Asserts a PSNR of at least WITHIN between two pictures ``[H, W, 3]`` uint8, and writes both to ``keep``."""
+    Image.fromarray(np.concatenate([picture, wanted], axis=1)).save(keep)
+    error = float(((picture.astype(np.float64) - wanted) ** 2).mean())
+    assert 10 * np.log10(255**2 / max(error, 1e-9)) >= WITHIN, keep.name
+
+
+def assert_same(shown: Shown, wanted: Rendering, keep: Path) -> None:
+    """Asserts that the page shows the picture of our renderer and counts the same Gaussians."""
+    counts = shown.counts()
+    assert_alike(shown.picture(), wanted.pixels.numpy(), keep)
+    kept = int(wanted.kept.sum())
+    assert abs(counts["kept"] - kept) <= COUNTS * kept and counts["total"] == len(wanted.kept)
+
+
 def drop(shown: Shown, name: str, data: bytes) -> None:
-    """Lets a file fall on the page, as a user does."""
+    """Drops a file on the page."""
     script = """([name, data]) => {
         const all = new DataTransfer();
-        all.items.add(new File([new Uint8Array(data)], name));
+        all.items.add(new File([Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0))], name));
         document.body.dispatchEvent(new DragEvent("drop", { dataTransfer: all, bubbles: true, cancelable: true }));
     }"""
-    shown.page.evaluate(script, [name, list(data)])
+    shown.page.evaluate(script, [name, base64.b64encode(data).decode()])
+
+
+def fold(shown: Shown, open: bool) -> None:
+    """Shows the whole panel, in a tab that has room for it, or its upper part."""
+    shown.page.set_viewport_size(TALL if open else SIZE)
+    expanded = json.dumps(str(open).lower())
+    script = f"fold => fold.getAttribute('aria-expanded') === {expanded} || fold.click()"
+    shown.page.eval_on_selector("#fold", script)
+
+
+def take(shown: Shown, path: Path) -> None:
+    """Shows another file in the tab, by the page's own function, and waits until it is drawn."""
+    script = "clod.load(Uint8Array.from(atob(given[1]), (letter) => letter.charCodeAt(0)).buffer, given[0])"
+    shown.run(script, [path.name, base64.b64encode(path.read_bytes()).decode()])
 
 
 @contextmanager

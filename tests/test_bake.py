@@ -9,16 +9,16 @@ import pytest
 import torch
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import attenuate, normalized_distances
+from clod_adapter.attenuation import attenuate
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.distances import normalized_distances, viewpoint_of
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for
 from clod_adapter.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
-from clod_adapter.viewpoints import viewpoint_of
 from scenes import camera, gaussians, ring
 
 CONFIG = AttenuationConfig(scene_distance=4.0)
@@ -122,7 +122,7 @@ def test_prefixes_are_what_is_baked(cameras: list[Camera]) -> None:
         assert torch.equal(head.means, ordered.means[:kept])  # those kept are the first, in their order
 
 
-def test_rows_that_leave_together_stay_in_their_order() -> None:
+def test_rows_with_equal_extinction_stay_in_order() -> None:
     some = at_one_place(gaussians(40, 0, 3))
     same = attach(some.replace(opacity_logits=torch.zeros(40)), torch.ones(40), CONFIG)
     assert torch.equal(order_by_extinction(same, [camera()]), torch.arange(40))
@@ -166,5 +166,5 @@ def test_bad_calls_are_named() -> None:
         bake(sphere(), 2.0, camera(), cameras=[camera()])
     with pytest.raises(ClodError, match="no camera is given"):
         order_by_extinction(sphere(), [])
-    with pytest.raises(ClodError, match="no sigma_d, so no order"):
+    with pytest.raises(ClodError, match="no pruning order"):
         order_by_extinction(gaussians(3, 0, 0), [camera()])

@@ -106,4 +106,4 @@ def test_require() -> None:
 def test_filters_by_their_names() -> None:
     assert FILTERS["off"] == CLASSIC == ScreenFilter() and FILTERS["mip"].variance == 0.1
     assert [each.name for each in FILTERS.values()] == list(FILTERS) and ScreenFilter(variance=0.2).name is None
-    assert ScreenFilter().says == "0.3 px^2 of blur, opacities not compensated for it"
+    assert ScreenFilter().description == "0.3 px^2 of blur, opacities not compensated for it"

@@ -21,14 +21,14 @@ from clod_adapter import Gaussians, evaluate, render
 from clod_adapter.alignment.check import check_alignment
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.blocks.divide import divide
-from clod_adapter.blocks.targets import target
+from clod_adapter.blocks.targets import target_image
 from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.cameras import Camera, Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.baselines import matching_dial, mean_kept, rankings
 from clod_adapter.evaluation.budget import dial_for, frame_times
 from clod_adapter.evaluation.popping import dial_popping, path_popping
-from clod_adapter.initialization.importance import seeing, start
+from clod_adapter.initialization.importance import initialize, usable_views
 from clod_adapter.losses import photometric_loss
 from clod_adapter.metrics import psnr_ssim
 from clod_adapter.rasterizers import cpu, cuda
@@ -61,7 +61,7 @@ class Setup:
 def setup(monkeypatch: pytest.MonkeyPatch) -> Iterator[Setup]:
     pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
     base, scene = capture(50, 4, 20, 14)
-    own = start(base, scene.train, CONFIG)
+    own = initialize(base, scene.train, CONFIG)
     module = importlib.import_module("clod_adapter.render")
     if torch.cuda.is_available():
         yield Setup(torch.device("cuda", 0), own, own.to("cuda"), scene)
@@ -100,13 +100,13 @@ def test_render_and_its_gradients(setup: Setup) -> None:
 
 
 def test_the_start_and_what_it_goes_by(setup: Setup) -> None:
-    assert len(seeing(setup.there, setup.scene.train)) == len(setup.scene.train)
+    assert len(usable_views(setup.there, setup.scene.train)) == len(setup.scene.train)
     for kind in ("importance", "error", "constant", "identity"):
         config = replace(CONFIG, start=kind)
 
         def begun(model: Gaussians, config: AdaptConfig = config) -> Tensor:
             plain = model.replace(sigma_d=None, attenuation=None)
-            return start(plain, setup.scene.train, config).sigma_d
+            return initialize(plain, setup.scene.train, config).sigma_d
 
         mine, want = on_both(setup, begun)
         assert mine.device == setup.device
@@ -197,7 +197,7 @@ def test_a_training_is_that_of_the_cpu(setup: Setup) -> None:
 def test_a_block(setup: Setup) -> None:
     views, config = setup.scene.train[:2], replace(CONFIG, iters=2)
     division = divide(setup.there.replace(sigma_d=None, attenuation=None), views, config, 2)
-    aimed = target(division.begun, 25, views[0])
+    aimed = target_image(division.initial, 25, views[0])
     assert aimed.device.type == "cpu" and aimed.dtype == torch.uint8  # photographs of a whole block
     learned = [adapt_block(division, views, config, block)[0] for block in range(2)]
     merged = merge(division, learned)

@@ -73,11 +73,11 @@ def test_sigma_for_extinction_matches_mpmath(dtype: torch.dtype, eps: float, tau
 def test_kept_until_the_extinction_scale(data: list[tuple[float, ...]], eps: float, tau: float, scale: float) -> None:
     inputs = columns(data)
     chosen = config(tau, eps)
-    leaves = extinction_scale(*inputs, chosen)
+    culled_at = extinction_scale(*inputs, chosen)
     kept = attenuate(*inputs, scale, chosen).keep
-    clear = (leaves / scale - 1).abs() > 1e-12
-    assert torch.equal(kept[clear], (scale < leaves)[clear])
-    for row, s in zip(data, leaves.tolist(), strict=True):
+    clear = (culled_at / scale - 1).abs() > 1e-12
+    assert torch.equal(kept[clear], (scale < culled_at)[clear])
+    for row, s in zip(data, culled_at.tolist(), strict=True):
         one = columns([row])
         if s * (1 - 1e-12) >= 1:
             assert attenuate(*one, s * (1 - 1e-12), chosen).keep.all()

@@ -1,4 +1,4 @@
-"""PSNR and SSIM as the field reports them."""
+"""PSNR and SSIM as reported, and the tie to those of training."""
 
 from __future__ import annotations
 
@@ -6,38 +6,79 @@ import math
 
 import pytest
 import torch
-from skimage.metrics import peak_signal_noise_ratio
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from torch import Tensor
 
-from clod_adapter.losses import ssim_plain
+from clod_adapter import losses
+from clod_adapter.demo.textures import photograph
 from clod_adapter.metrics import psnr, psnr_ssim
 
+# The window has 11 taps: images smaller, as large and larger.
+SIZES = [(1, 1), (3, 40), (11, 11), (37, 53), (120, 96)]
 
-@pytest.mark.parametrize("seed", range(3))
-def test_psnr_is_scikit_image_s(seed: int) -> None:
-    g = torch.Generator().manual_seed(seed)
-    target = torch.randint(0, 256, (20, 30, 3), generator=g).to(torch.uint8)
-    image = (target.float() / 255 + 0.1 * torch.randn(20, 30, 3, generator=g)).requires_grad_()
-    psnr, similarity = psnr_ssim(image, target)
-    shown, wanted = image.detach().clamp(0, 1), target.float() / 255
-    want = peak_signal_noise_ratio(wanted.double().numpy(), shown.double().numpy(), data_range=1)
-    assert psnr == pytest.approx(want, abs=1e-4), f"seed {seed}"
-    assert similarity == pytest.approx(ssim_plain(shown, wanted).item(), abs=1e-6)
-    assert isinstance(psnr, float) and isinstance(similarity, float)
+
+def noisy(target: Tensor, sigma: float = 0.1) -> Tensor:
+    """A render of the photograph that also leaves [0, 1]."""
+    generator = torch.Generator().manual_seed(target.numel())
+    return target / 255 + sigma * torch.randn(target.shape, generator=generator)
+
+
+def random_target(height: int, width: int) -> Tensor:
+    generator = torch.Generator().manual_seed(height)
+    return torch.randint(0, 256, (height, width, 3), generator=generator).to(torch.uint8)
+
+
+def real_target() -> Tensor:
+    image = photograph("coffee.png").crop((150, 100, 350, 260))
+    return torch.frombuffer(bytearray(image.tobytes()), dtype=torch.uint8).reshape(160, 200, 3)
+
+
+TARGETS = [pytest.param(random_target(*size), id="x".join(map(str, size))) for size in SIZES]
+TARGETS += [pytest.param(real_target(), id="photograph"), pytest.param(real_target() // 40, id="dark photograph")]
+
+
+@pytest.mark.parametrize("sigma", [0.005, 0.1])
+@pytest.mark.parametrize("target", TARGETS)
+def test_training_and_reports_agree(target: Tensor, sigma: float) -> None:
+    image = noisy(target, sigma)
+    shown, photo = image.clamp(0, 1), target / 255
+    value, similarity = psnr_ssim(image.requires_grad_(), target)
+    assert isinstance(value, float) and isinstance(similarity, float) and value == psnr(image, target)
+    assert value == pytest.approx(losses.psnr(image, target), rel=1e-6)
+    fused = 1 - losses.photometric_loss(shown, target, 1.0).item()
+    plain = losses.ssim_plain(shown.double(), photo.double()).item()
+    assert similarity == pytest.approx(fused, abs=1e-5) and similarity == pytest.approx(plain, abs=1e-5)
+    exact = psnr_ssim(image.double(), target)[1]
+    assert exact == pytest.approx(losses.ssim_plain(shown.double(), target.double() / 255).item(), abs=1e-9)
+
+
+def test_scikit_image_without_the_border() -> None:
+    """PSNR is always scikit-image's; SSIM where the images agree near the border, which its mean leaves out."""
+    target = real_target()
+    image = target / 255
+    inner = (slice(12, -12), slice(12, -12))
+    image[inner] = noisy(target)[inner].clamp(0, 1)
+    x, y = image.double().numpy(), (target.double() / 255).numpy()
+    _, similarity = structural_similarity(
+        x, y, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=2, full=True
+    )
+    found = psnr_ssim(image, target)
+    assert found[0] == pytest.approx(peak_signal_noise_ratio(y, x, data_range=1), rel=1e-6)
+    assert similarity.mean() < 0.9 and found[1] == pytest.approx(similarity.mean(), abs=1e-5)
+
+
+@pytest.mark.parametrize("function", [psnr, losses.psnr])
+def test_psnr_of_known_images(function) -> None:
+    black = torch.zeros(12, 12, 3, dtype=torch.uint8)
+    assert function(torch.full((12, 12, 3), 0.5), black) == pytest.approx(20 * math.log10(2), abs=1e-6)
+    image = torch.zeros(12, 12, 3)
+    assert function(image, black) == math.inf
+    image[3, 4, 1] = math.nan
+    assert math.isnan(function(image, black))
 
 
 def test_renders_are_clamped_first() -> None:
     target = torch.tensor([0, 255], dtype=torch.uint8).repeat(6, 3)[..., None].expand(6, 6, 3).contiguous()
     beyond = torch.where(target > 0, 7.0, -3.0)
     assert psnr_ssim(beyond, target) == (math.inf, pytest.approx(1, abs=1e-6))
-
-
-def test_a_picture_that_is_no_number_is_not_taken_for_the_photograph() -> None:
-    picture, target = torch.zeros(12, 12, 3), torch.zeros(12, 12, 3, dtype=torch.uint8)
-    assert psnr(picture, target) == math.inf
-    picture[3, 4, 1] = math.nan
-    assert math.isnan(psnr(picture, target))
-
-
-def test_known_value() -> None:
-    grey = torch.full((12, 12, 3), 0.5)
-    assert psnr_ssim(grey, torch.zeros(12, 12, 3, dtype=torch.uint8))[0] == pytest.approx(20 * math.log10(2), abs=1e-6)
+    assert losses.psnr(beyond, target) == math.inf

@@ -55,9 +55,9 @@ class BlockFiles:
         """Writes a division, unless another job was quicker."""
         if self.start.exists():
             return
-        assert division.begun.sigma_d is not None
-        tensors = {"sigma_d": division.begun.sigma_d, "block": division.block, "seen": division.seen}
-        about = {"extent": division.extent, "attenuation": division.begun.attenuation}
+        assert division.initial.sigma_d is not None
+        tensors = {"sigma_d": division.initial.sigma_d, "block": division.block, "seen": division.seen}
+        about = {"extent": division.extent, "attenuation": division.initial.attenuation}
         save_block(self.start, tensors | {"kept": division.kept}, about, self.belongs)
 
     def load_start(self, base: Gaussians, views: Sequence[View]) -> Division:
@@ -94,7 +94,7 @@ class BlockFiles:
         """
         path, rows = self.block(block, number), division.rows(block)
         values, about = load_block(path, self._of(block, number))
-        shapes = {name: (t.dtype, (len(rows), *t.shape[1:])) for name, t in division.begun.tensors().items()}
+        shapes = {name: (t.dtype, (len(rows), *t.shape[1:])) for name, t in division.initial.tensors().items()}
         checked(path, values, {n: shape for n, shape in shapes.items() if n in values or n == "sigma_d"})
         with damaged(path):
             steps, seconds = int(about["steps"]), float(about["seconds"])

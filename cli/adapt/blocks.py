@@ -12,14 +12,14 @@ from typing import Any
 
 from clod_adapter.blocks.divide import Division, check_divisible, divide
 from clod_adapter.blocks.memory import MemoryPlan
-from clod_adapter.blocks.targets import config_of
+from clod_adapter.blocks.targets import block_config
 from clod_adapter.blocks.train import Learned, adapt_block, merge
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.robustness import scene_fingerprint
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import seeing
+from clod_adapter.initialization.importance import usable_views
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.image_cache import ImageCache
 from clod_adapter.rasterizers.cpu import release_memory
@@ -81,7 +81,7 @@ class Blocked:
         Raises:
             KeyboardInterrupt: Ctrl-C; what is finished is in files.
         """
-        views = seeing(base, scene.train)
+        views = usable_views(base, scene.train)
         began = time.perf_counter()
         division, after, steps, seconds = self.start(base, views, config), None, 0, 0.0
         start_seconds = time.perf_counter() - began
@@ -95,7 +95,7 @@ class Blocked:
 
     def alone(self, base: Gaussians, scene: Scene, config: AdaptConfig) -> dict[str, Any]:
         """Does what ``--block`` asks for, and no more: the start, or the next pass of one block; returns the report."""
-        views, block = seeing(base, scene.train), self.args.block
+        views, block = usable_views(base, scene.train), self.args.block
         files = self.files
         division, path, learned = self.start(base, views, config), files.start, None
         if block != "start":
@@ -164,7 +164,7 @@ class Blocked:
         if files.block(block, number).exists():
             return files.load_learned(division, block, number)
         name = f"block {block + 1} of {division.count}, pass {number} of {division.passes}"
-        own, state = config_of(division, block, config, first=number == 1), files.state(block, number)
+        own, state = block_config(division, block, config, first=number == 1), files.state(block, number)
         saver = Saver(state, state.exists(), own, self.console, self.stop)
         of = f"{files.belongs['checkpoint']}, {files.belongs['start']}, {name}"
         saver.claim(of, files.belongs["photographs"], f"{self.args.ply} in {files.start}", "before")

@@ -10,7 +10,7 @@ import torch
 from clod_adapter.cameras import View
 from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.metrics import psnr
+from clod_adapter.losses import psnr
 from clod_adapter.render import render
 from clod_adapter.training.loop import Progress
 

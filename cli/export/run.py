@@ -123,7 +123,7 @@ def filter_notes(args: argparse.Namespace, gaussians: Gaussians, dials: list[flo
     if not gaussians.screen_filter.compensate or dialled or suffix in SAY_FILTER:
         return []
     told = 'as PlayCanvas by antiAlias and gsplat by rasterize_mode="antialiased"'
-    return [f"trained antialiased ({gaussians.screen_filter.says}): most readers have to be told, {told}"]
+    return [f"trained antialiased ({gaussians.screen_filter.description}): most readers have to be told, {told}"]
 
 
 def write_files(export: Export, paths: list[Path], dials: list[float] | None) -> tuple[list[dict[str, Any]], list[str]]:

@@ -43,7 +43,7 @@ def require_alignment(
     if not found.on_white and (not found.fits or found.margin < DOUBTFUL):
         with console.status("the checkpoint fits poorly: trying other frames ..."):
             guess = guess_frame(base, views, found, load_points(args.images, checkpoint.origin))
-    numbers = found.as_dict() | {"guess": guess and guess.says}
+    numbers = found.as_dict() | {"guess": guess and guess.description}
     if found.fits and guess is None:
         notes = [FLAT.format(images=args.images)] if not found.views else []
         notes += [OTHER_COLOURS.format(ply=ply, images=args.images)] if found.margin < 0 else []
@@ -73,7 +73,7 @@ def describe(checkpoint: Checkpoint, views: Sequence[View], found: Alignment, gu
             "checkpoint trained on black"
         )
     if guess:
-        return f"{facts}; in another frame it is {guess.psnr:.1f} dB from them: {guess.says}"
+        return f"{facts}; in another frame it is {guess.psnr:.1f} dB from them: {guess.description}"
     return f"{facts}; {places(checkpoint, views)}; give the checkpoint of this scene, in the cameras' frame"
 
 

@@ -29,7 +29,7 @@ def with_filter(
         told = FILTERS[args.antialiasing]
         if told == gaussians.screen_filter or not checkpoint.filter_known:
             return replace(checkpoint, gaussians=gaussians.replace(screen_filter=told))
-        said = gaussians.screen_filter.says
+        said = gaussians.screen_filter.description
         note = f"{checkpoint.path}: drawn {WORDS[args.antialiasing]}, as told; the file says {said}"
         return _noted(checkpoint, told, note, console)
     if checkpoint.filter_known or not views:

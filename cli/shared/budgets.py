@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from clod_adapter.calibration import Calibration, Viewpoint
 from clod_adapter.cameras import Camera, Scene
+from clod_adapter.distances import viewpoint_of
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for, dial_for_times, frame_times
 from clod_adapter.evaluation.evaluate import Row
@@ -14,7 +15,6 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import spread
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.origin import Origin
-from clod_adapter.viewpoints import viewpoint_of
 
 from .console import Console
 from .dials import given_budget

@@ -27,7 +27,7 @@ def read_checkpoint(
     gaussians = checkpoint.gaussians
     dial = ", with sigma_d" if gaussians.sigma_d is not None else ""
     drawn = gaussians.screen_filter
-    filtered = "" if drawn == CLASSIC else f", drawn with {drawn.says}"
+    filtered = "" if drawn == CLASSIC else f", drawn with {drawn.description}"
     console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{dial}{filtered}")
     for note in checkpoint.notes:
         console.note(note)

@@ -1,1 +1,5 @@
-"""Compiled CPU kernels. Everything in here is imported on first use, never by ``import clod_adapter``."""
+"""Compiled CPU kernels, imported on first use, not by ``import clod_adapter``."""
+
+# gsplat's conventions, for all rasterizers: alpha below which nothing is drawn, largest alpha, and the transmittance at
+# which a pixel ends.
+ALPHA_MIN, ALPHA_MAX, T_MIN = 1 / 255, 0.999, 1e-4

@@ -1,24 +1,25 @@
-"""Adam on chosen rows, sixteen of them at a time."""
+"""Adam on selected rows, sixteen at a time."""
 
 from __future__ import annotations
 
 from numba import float32, int64
 
 from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.elementary import vsqrt
 from clod_adapter._kernels.pointers import pointer, scratch
 from clod_adapter._kernels.rows import load_rows, store_rows
-from clod_adapter._kernels.simd import f32x16, load, vsqrt
+from clod_adapter._kernels.simd import f32x16, load
 
 ONE = float32(1)
 
 
 @part
 def find_rows(mask, i, end, rows):  # type: ignore[no-untyped-def]
-    """Lists up to sixteen rows from ``i`` on that are to be stepped; returns how many, and where to go on."""
+    """Lists up to sixteen selected rows from ``i`` on; returns their number and the row to continue from."""
     found = 0
     while i < end and found < 16:
         rows[found] = i
-        found += mask[i]  # not a branch: it would be guessed wrong half the time
+        found += mask[i]  # no branch: half of the predictions would fail
         i += 1
     return found, i
 
@@ -48,8 +49,8 @@ def adam_rows(  # type: ignore[no-untyped-def]
 ):
     """Updates the rows of ``parameter [N, width]`` and of its moments where ``mask [N]`` is set, with ``gradient``.
 
-    ``steps[row]`` counts the row's own updates. ``corrections[0]`` is ``1 / (1 - beta1^n)`` by their number n,
-    ``corrections[1]`` is ``1 / sqrt(1 - beta2^n)``; beyond its last, the last holds.
+    ``steps[row]`` counts the updates of the row. For n updates ``corrections[0, n]`` is ``1 / (1 - beta1^n)`` and
+    ``corrections[1, n]`` is ``1 / sqrt(1 - beta2^n)``; the last entry holds for all larger n.
     """
     width, most, rate = parameter.shape[1], corrections.shape[1] - 1, float32(rate)
     i, end = len(parameter) * worker // workers, len(parameter) * (worker + 1) // workers
@@ -68,7 +69,7 @@ def adam_rows(  # type: ignore[no-untyped-def]
                 rows[lane] = rows[0]
             count = min(steps[rows[lane]], most)
             length[lane], correction[lane] = rate * corrections[0, count], corrections[1, count]
-        # Constant widths, so that what is known of them is left out of the transpositions.
+        # Constant widths, so that the compiler simplifies the transpositions.
         if width == 1:
             step_columns(parameter, first, second, gradient, rows, 1, 0, 1, lanes, length, correction, constants)
         elif width == 3:

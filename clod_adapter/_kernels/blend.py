@@ -1,8 +1,8 @@
 """Front-to-back blending of each tile, and its gradient.
 
-A tile is worked through in blocks of 4x4 pixels, one vector lane a pixel. State of a block lies
-together: 16 transmittances, then 16 reds, greens and blues. A pixel whose transmittance would fall
-to 1e-4 is finished and carries its transmittance negated; a block ends when all its pixels have.
+A tile is processed in blocks of 4x4 pixels, one vector lane per pixel. The state of a block is contiguous: 16
+transmittances, then 16 reds, greens and blues. A pixel whose transmittance would fall to 1e-4 is finished and stores
+its transmittance negated; a block is finished when all its pixels are.
 """
 
 from __future__ import annotations
@@ -43,9 +43,10 @@ from clod_adapter._kernels.conventions import (
     T_MIN,
     TILE,
 )
+from clod_adapter._kernels.elementary import exp2
 from clod_adapter._kernels.pointers import fetch_add, pointer, prefetch, scratch
 from clod_adapter._kernels.rows import store_sums
-from clod_adapter._kernels.simd import anywhere, both, but_not, exp2, fma, ge, gt, load, select, splat, store, vmin
+from clod_adapter._kernels.simd import anywhere, both, but_not, fma, ge, gt, load, select, splat, store, vmin
 
 
 @part
@@ -68,9 +69,9 @@ def blend(  # type: ignore[no-untyped-def]
     worker, workers, records, entries, offsets, across, width, height, background, tiles, cursor, room, masks,
     image, alpha,
 ):  # fmt: skip
-    """Forward: writes ``image [H, W, 3]`` and ``alpha [H, W]``. Tiles are taken from ``tiles`` by an atomic cursor.
+    """Forward pass: writes ``image [H, W, 3]`` and ``alpha [H, W]``. An atomic cursor assigns ``tiles`` to workers.
 
-    ``masks`` receives WORDS words an entry, a bit for each block of the tile that takes part in blending it.
+    ``masks`` receives WORDS words per entry, one bit for each block of the tile that blends it.
     ``room[worker]`` holds FORWARD_STATE floats of scratch (on the stack, LLVM would take minutes to compile it).
     """
     count, tiles, records, entries = len(tiles), pointer(tiles), pointer(records), pointer(entries)
@@ -138,7 +139,7 @@ def write_tile(ox, oy, width, height, state, background, image, alpha):  # type:
 
 @part
 def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):  # type: ignore[no-untyped-def]
-    """Loads per pixel: what remains of v . C behind the current Gaussian, and v for the three channels."""
+    """Loads for each pixel the remainder of v . C behind the current Gaussian, and v of the three channels."""
     for y in range(oy, min(oy + TILE, height)):
         for x in range(ox, min(ox + TILE, width)):
             block = ((y - oy) // BLOCK) * ACROSS + (x - ox) // BLOCK
@@ -156,11 +157,11 @@ def blend_gradient(  # type: ignore[no-untyped-def]
     worker, workers, records, entries, entry_slots, offsets, across, width, height, image, alpha, v_image, v_alpha,
     tiles, cursor, room, masks, shaped, colored, pair_sums,
 ):  # fmt: skip
-    """Backward: per (Gaussian, tile) pair the nine sums over pixels that the projection's gradient needs.
+    """Backward pass: for each pair of Gaussian and tile the nine sums over pixels for the projection's gradient.
 
     With s = alpha dL/dalpha and (dx, dy) from the centre: three of weight * v, then s, s dx, s dy,
-    s dx^2, s dx dy, s dy^2. Walks front to back like the forward pass, keeping the running
-    remainder of v . C, so nothing is stored per pixel and Gaussian, and each pair has its own slot.
+    s dx^2, s dx dy, s dy^2. Runs front to back like the forward pass with a running remainder of
+    v . C, so nothing is stored per pixel and Gaussian. Each pair has its own slot.
     """
     count, tiles, records, entries = len(tiles), pointer(tiles), pointer(records), pointer(entries)
     entry_slots, offsets, pair_sums = pointer(entry_slots), pointer(offsets), pointer(pair_sums)
@@ -175,7 +176,7 @@ def blend_gradient(  # type: ignore[no-untyped-def]
         tile = tiles[turn]
         ox, oy = (tile % across) * TILE, (tile // across) * TILE
         if ox + TILE > width or oy + TILE > height:
-            for k in range(BACKWARD_STATE):  # pixels outside weigh nothing, but nothing times NaN is NaN
+            for k in range(BACKWARD_STATE):  # pixels outside have weight 0, but 0 times NaN is NaN
                 state[k] = float32(0)
         start_tile(ox, oy, width, height, state, 80, live)
         read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state)

@@ -1,4 +1,4 @@
-"""The blocks of 4x4 pixels that a tile is worked through in, and which of them an ellipse touches."""
+"""Blocks of 4x4 pixels in a tile, and which of them an ellipse touches."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from numba import float32, uint64
 from clod_adapter._kernels.bits import set_spans
 from clod_adapter._kernels.compiling import part
 from clod_adapter._kernels.conventions import DET, HALF, MX, MY, QA, QB, QC, REACH, RX, SLACK, TILE, X0, X1, Y0, Y1
-from clod_adapter._kernels.simd import both, eq, ge, load, select, splat, vceil, vfloor, vmax, vmin, vsqrt
+from clod_adapter._kernels.elementary import vceil, vfloor, vsqrt
+from clod_adapter._kernels.simd import both, eq, ge, load, select, splat, vmax, vmin
 
 BLOCK = 4
 ACROSS = TILE // BLOCK
@@ -19,7 +20,7 @@ BLOCK_X = np.tile(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
 BLOCK_Y = np.repeat(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
 LANE_X = np.tile(np.arange(4, dtype=np.float32) + 0.5, 4)
 LANE_Y = np.repeat(np.arange(4, dtype=np.float32) + 0.5, 4)
-# A lane a row of blocks: centre of its first pixel row. Lanes beyond the tile are far below every image.
+# One lane per row of blocks: centre of its first pixel row. Lanes beyond the tile are far below every image.
 ROW_Y = np.where(np.arange(16) < ACROSS, np.arange(16) * BLOCK + 0.5, 1e9).astype(np.float32)
 LAST = float32(ACROSS - 1)
 
@@ -51,7 +52,7 @@ def none_set(words, at):  # type: ignore[no-untyped-def]
 def find_blocks(records, r, ox, oy, masks, at):  # type: ignore[no-untyped-def]
     """Sets in ``masks[at : at + WORDS]`` the tile's blocks that the ellipse of the record at ``r`` touches.
 
-    The ellipse is where alpha reaches 1/255; see ``tiles.extent``, of which this does all rows of blocks at once.
+    The ellipse is where alpha reaches 1/255; see ``tiles.extent``, which this computes for all rows of blocks at once.
     """
     my, rx, b = splat(records[r + MY]), splat(records[r + RX]), splat(records[r + QB])
     row = load(ROW_Y, 0) + splat(float32(oy))
@@ -70,7 +71,7 @@ def find_blocks(records, r, ox, oy, masks, at):  # type: ignore[no-untyped-def]
     low = vmax(vceil(mx + x0 - splat(SLACK)), splat(records[r + X0])) - splat(float32(ox))
     high = vmin(vfloor(mx + x1 + splat(SLACK)), splat(records[r + X1])) - splat(float32(ox))
     quarter = splat(float32(1 / BLOCK))
-    # Bounded on both sides: what is cast to a whole number may be 1e10.
+    # Clamped before the cast to integers: values may be 1e10.
     low = vmin(vmax(vfloor(low * quarter), zero), splat(LAST + float32(1)))
     high = vmax(vmin(vfloor(high * quarter), splat(LAST)), splat(float32(-1)))
     high = select(both(ge(bottom, top), ge(high, low)), high, splat(float32(-1)))

@@ -1,4 +1,4 @@
-"""How kernels are compiled: without the interpreter lock, inlined where asked, cached on disk."""
+"""Compilation of kernels: without the interpreter lock, with inlining, cached on disk."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from clod_adapter.errors import ClodError
 if config.DISABLE_JIT:  # type: ignore[attr-defined]
     raise ClodError("NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it")
 
-# A kernel takes constants and functions from other files, so the stamp is of all kernels' sources.
+# A kernel uses constants and functions of other files, so the stamp covers the sources of all kernels.
 _STAMP = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(Path(__file__).parent.glob("*.py")))).hexdigest()
 
 
@@ -27,17 +27,17 @@ OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"
 def kernel(function: Callable[..., Any]) -> Any:
     """A compiled function that Python calls, usually on several threads."""
     dispatcher: Any = njit(**OPTIONS)(function)
-    with suppress(RuntimeError):  # nowhere to write a cache: neither beside the package nor in the user's cache folder
+    with suppress(RuntimeError):  # no writable cache folder
         dispatcher._cache = _Cache(function)
     return dispatcher
 
 
 class _CacheFile(IndexDataCacheFile):  # type: ignore[misc]
-    """Compiled variants, each in a file named by all that its code depends on, which appears whole or not at all.
+    """Compiled variants, each in a file named by a hash of all that its code depends on and written atomically.
 
-    Numba's own form is an index beside numbered files, which are used again once the sources have changed, and writes
-    the index first. A process that runs between the two writes, or after one that died there, gets the older version's
-    code; two that add a variant at once give both the same number; and a file that was cut stays an error for good.
+    Numba's cache has an index and numbered files, which are reused when the sources change, and writes the index first.
+    Between the two writes other processes load old code; two processes that add a variant choose the same number; a
+    truncated file stays an error.
     """
 
     def _name(self, key: Any) -> str:
@@ -62,5 +62,5 @@ class _Cache(FunctionCache):  # type: ignore[misc]
             super().save_overload(sig, data)
 
 
-# Always inlined: a call would pass seven words on the stack for each array argument.
+# Always inlined: a call would pass seven words on the stack per array.
 part = njit(forceinline=True, **OPTIONS)

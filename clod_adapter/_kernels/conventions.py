@@ -1,14 +1,15 @@
-"""What every kernel agrees on: gsplat's conventions, and the layouts of records, cameras and workspaces."""
+"""Constants of gsplat's conventions, and the layouts of records, cameras and workspaces."""
 
 from __future__ import annotations
 
 from numba import float32
 
-# Alpha below which nothing is drawn, largest alpha, and the transmittance before which a pixel ends.
-ALPHA_MIN, ALPHA_MAX, T_MIN = (float32(v) for v in (1 / 255, 0.999, 1e-4))
+import clod_adapter._kernels as limits
+
+ALPHA_MIN, ALPHA_MAX, T_MIN = (float32(v) for v in (limits.ALPHA_MIN, limits.ALPHA_MAX, limits.T_MIN))
 LOG2E, LOG2_255, TWO_LN2 = float32(1.4426950408889634), float32(7.994353436858858), float32(1.3862943611198906)
 HALF, ZERO, ONE, TWO = float32(0.5), float32(0), float32(1), float32(2)
-HUGE = float32(3e38)  # what is not below it is dropped as not finite
+HUGE = float32(3e38)  # larger values are dropped as not finite
 
 # Columns of a record, the 64 bytes the blending loops read of a visible Gaussian. The exponent of
 # its alpha is in powers of two: log2 alpha = LOG - (QA dx^2 + QB dx dy + QC dy^2).
@@ -16,24 +17,24 @@ MX, MY, QA, QB, QC, LOG, RED, GREEN, BLUE, REACH, RX, DET, X0, Y0, X1, Y1 = rang
 RECORD = 16
 
 # A camera: viewmat row-major (16), fx, fy, cx, cy, width, height, ray clamp low x, high x, low y, high y,
-# centre in world coordinates (3), near plane; then the screen-space filter: its variance (px^2), and 1 where opacities
-# are compensated for it.
+# centre in world coordinates (3), near plane; then the screen-space filter: its variance (px^2), and 1 if opacities are
+# compensated for it.
 FX, FY, CX, CY, WIDTH, HEIGHT, LOW_X, HIGH_X, LOW_Y, HIGH_Y, EYE = range(16, 27)
 NEAR, BLUR, COMPENSATE = range(EYE + 3, EYE + 6)
 CAMERA = COMPENSATE + 1
 
-# The workspace of sixteen Gaussians, a vector each, a lane a Gaussian. As stored: mean (3), quaternion (4), scales (3).
-# Then camera point (3), rotation (9), U = J R_view (6), P = U R S (6), blurred covariance (3), its determinant, unit
-# quaternion (4), 1 / |quaternion|, determinant of P P^T.
+# The workspace of sixteen Gaussians: vectors with one lane per Gaussian. As stored: mean (3), quaternion (4), scales
+# (3). Then camera point (3), rotation (9), U = J R_view (6), P = U R S (6), blurred covariance (3), its determinant,
+# unit quaternion (4), 1 / |quaternion|, determinant of P P^T.
 MEAN, STORED, SCALE, POINT, ROT, UMAT, PMAT = 0, 3, 7, 10, 13, 22, 28
 COV, COVDET, QUAT, QINV, RAWDET = 34, 37, 38, 42, 43
-WORKSPACE = 44 + 16  # load_rows fills sixteen vectors, however few columns it reads
+WORKSPACE = 44 + 16  # load_rows always fills sixteen vectors
 
 # Edge of a tile in pixels: a multiple of the 4 of a block.
 TILE = 64
-# Extents widen by this many pixels, so that rounding never loses a pixel at the 1/255 edge.
+# Extents are widened by this many pixels against rounding at the 1/255 edge.
 SLACK = float32(0.01)
-# Sums over pixels that a (Gaussian, tile) pair hands to the projection's gradient.
+# Sums over pixels per pair of Gaussian and tile, for the projection's gradient.
 PAIR = 9
-# Records are asked for this many entries before they are read.
+# Records are prefetched this many entries ahead.
 AHEAD = 4

@@ -1,4 +1,4 @@
-"""Memory as kernels address it."""
+"""Pointers, stack memory, prefetching and atomics for kernels."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from numba.extending import intrinsic
 
 
 def data_of(context, builder, kind, value):  # type: ignore[no-untyped-def]
-    """The address of an array's elements, or the pointer that was given."""
+    """The address of an array's elements; a pointer is returned unchanged."""
     return value if isinstance(kind, types.CPointer) else context.make_array(kind)(context, builder, value).data
 
 
 @intrinsic
 def pointer(typingctx, array):  # type: ignore[no-untyped-def]
-    """Where a contiguous array's elements lie; ``p[i]`` is the i-th of all of them.
+    """The address of a contiguous array; ``p[i]`` is its i-th element in memory order.
 
-    Kernels turn their arguments into pointers first: passing an array on counts references atomically,
-    and indexing one looks for negative indices. Nothing checks the bounds.
+    Kernels convert their arguments to pointers first: passing an array counts references atomically, and indexing one
+    handles negative indices. Bounds are not checked.
     """
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
@@ -29,7 +29,7 @@ def pointer(typingctx, array):  # type: ignore[no-untyped-def]
 
 @intrinsic(prefer_literal=True)
 def scratch(typingctx, kind, size):  # type: ignore[no-untyped-def]
-    """A pointer to a constant number of ``kind`` on the stack: LLVM keeps a few in registers where it can."""
+    """A pointer to a constant number of ``kind`` on the stack; LLVM keeps small ones in registers."""
     element = kind.instance_type
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
@@ -42,7 +42,7 @@ def scratch(typingctx, kind, size):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def prefetch(typingctx, array, index):  # type: ignore[no-untyped-def]
-    """Asks for the cache line of ``array[index]``, which will be read soon."""
+    """Prefetches the cache line of ``array[index]``."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         data = builder.gep(data_of(context, builder, signature.args[0], args[0]), [args[1]])
@@ -57,7 +57,7 @@ def prefetch(typingctx, array, index):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def fetch_add(typingctx, array, amount):  # type: ignore[no-untyped-def]
-    """Atomically adds to ``array[0]`` (int64) and returns what it was."""
+    """Atomically adds to ``array[0]`` (int64) and returns its old value."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         data = data_of(context, builder, signature.args[0], args[0])

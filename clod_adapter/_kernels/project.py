@@ -1,8 +1,8 @@
 """Projection of Gaussians to the image: the local affine approximation (EWA splatting).
 
-Conventions of gsplat: pixel centres at +0.5, the filter's variance added to the covariance and, where it says so, the
-opacity compensated for that; the Jacobian's ray clamped to 1.3 times the field of view (0.3 beyond the image on either
-side), the camera's near plane, alpha below 1/255 dropped. Sixteen Gaussians at a time, a lane each.
+Conventions of gsplat: pixel centres at +0.5, the filter's variance added to the covariance and, with ``compensate``,
+the opacity compensated for it; the Jacobian's ray clamped to 1.3 times the field of view (0.3 beyond the image on
+either side), the camera's near plane, alpha below 1/255 dropped. Sixteen Gaussians at a time, one per lane.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from numba import float32, float64, int64, uint64
 
 from clod_adapter._kernels.bits import bits_of
+from clod_adapter._kernels.colors import color
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.conventions import (
     ALPHA_MIN,
@@ -21,7 +22,6 @@ from clod_adapter._kernels.conventions import (
     CX,
     CY,
     DET,
-    EYE,
     FX,
     FY,
     GREEN,
@@ -67,25 +67,10 @@ from clod_adapter._kernels.conventions import (
     Y1,
     ZERO,
 )
+from clod_adapter._kernels.elementary import log2, vceil, vfloor, vsqrt
 from clod_adapter._kernels.pointers import pointer, scratch
 from clod_adapter._kernels.rows import load_rows, store_rows
-from clod_adapter._kernels.sh import sh_basis
-from clod_adapter._kernels.simd import (
-    both,
-    f32x16,
-    fma,
-    ge,
-    gt,
-    load,
-    log2,
-    splat,
-    vabs,
-    vceil,
-    vfloor,
-    vmax,
-    vmin,
-    vsqrt,
-)
+from clod_adapter._kernels.simd import both, f32x16, ge, gt, load, splat, vmax, vmin
 
 
 @part
@@ -147,15 +132,6 @@ def finish_covariance(w, cam):  # type: ignore[no-untyped-def]
 
 
 @part
-def view_direction(w, cam, out):  # type: ignore[no-untyped-def]
-    """Unit directions from the camera to the Gaussians into ``out[:3]``; returns 1 / distance."""
-    x, y, z = w[MEAN] - cam[EYE], w[MEAN + 1] - cam[EYE + 1], w[MEAN + 2] - cam[EYE + 2]
-    inverse = ONE / vsqrt(x * x + y * y + z * z)
-    out[0], out[1], out[2] = x * inverse, y * inverse, z * inverse
-    return inverse
-
-
-@part
 def centres(means, rows, cam, out):  # type: ignore[no-untyped-def]
     """Sixteen centres on the image, x then y in pixels, and their depths, into ``out [48]``.
 
@@ -173,13 +149,13 @@ def centres(means, rows, cam, out):  # type: ignore[no-untyped-def]
 
 @part
 def make_records(w, centre, opacity, cam, record):  # type: ignore[no-untyped-def]
-    """The sixteen columns of the records from the workspace, without the colour; which of them reach a pixel centre."""
+    """Fills the sixteen columns of the records except the colours; returns which of them reach a pixel centre."""
     mx, my = load(centre, 0), load(centre, 16)
     idet = ONE / w[COVDET]
     record[MX], record[MY] = mx, my
     record[QA], record[QC] = HALF * LOG2E * w[COV + 2] * idet, HALF * LOG2E * w[COV] * idet
     record[QB], record[DET] = -(LOG2E * w[COV + 1] * idet), LOG2E * LOG2E * idet
-    if cam[COMPENSATE] > ZERO:  # a covariance that is infinite makes NaN of it, which is not drawn
+    if cam[COMPENSATE] > ZERO:  # NaN for an infinite covariance, which is not drawn
         opacity = opacity * vsqrt(w[RAWDET] * idet)
     drawn = ge(opacity, splat(ALPHA_MIN))
     record[LOG] = log2(opacity)
@@ -194,18 +170,11 @@ def make_records(w, centre, opacity, cam, record):  # type: ignore[no-untyped-de
     return both(drawn, both(ge(record[X1], record[X0]), ge(record[Y1], record[Y0])))
 
 
-@part
-def load_sh(shN, rows, bands, w):  # type: ignore[no-untyped-def]
-    """The higher bands' coefficients of sixteen rows, three a band, into ``w``."""
-    for first in range(0, 3 * bands, 16):
-        load_rows(shN, rows, 3 * bands, first, min(3 * bands - first, 16), w, first)
-
-
 @kernel
 def project(worker, workers, means, quats, scales, opacities, sh0, shN, degree, cam, records, depths, ids, counts):  # type: ignore[no-untyped-def]
     """Writes records, depths and row numbers of this worker's visible Gaussians, packed from its first row.
 
-    Behind its N records, ``records`` has a spare one for each worker.
+    After its N records, ``records`` has a spare one for each worker.
     """
     spare = len(opacities) + worker
     first, last = len(opacities) * worker // workers, len(opacities) * (worker + 1) // workers
@@ -226,13 +195,13 @@ def find_visible(first, last, spare, means, quats, scales, opacities, cam, recor
         filled = 0
         while i < last and filled < 16:
             rows[filled], opacity[filled] = i, opacities[i]
-            filled += opacities[i] >= ALPHA_MIN and opacities[i] < HUGE  # else the next one takes its place
+            filled += opacities[i] >= ALPHA_MIN and opacities[i] < HUGE  # else the next row takes its place
             i += 1
         for lane in range(filled, 16):
             rows[lane], opacity[lane] = rows[0], ONE
         valid = covariance(means, quats, scales, rows, cam, w)
         centres(means, rows, cam, centre)
-        valid = both(valid, ge(load(centre, 32), splat(cam[NEAR])))  # as float32 sees it, and as the centre was found
+        valid = both(valid, ge(load(centre, 32), splat(cam[NEAR])))  # in float32 too, not only in float64
         bits = bits_of(both(valid, make_records(w, centre, load(opacity, 0), cam, record)))
         bits &= (uint64(1) << uint64(filled)) - uint64(1)
         if bits == uint64(0):
@@ -243,39 +212,4 @@ def find_visible(first, last, spare, means, quats, scales, opacities, cam, recor
                 depths[packed], ids[packed], targets[lane] = centre[32 + lane], rows[lane], packed
                 packed += 1
         store_rows(records, targets, RECORD, 0, RECORD, record, 0)
-    return packed - first
-
-
-@part
-def color(first, found, means, sh0, shN, degree, cam, records, depths, ids):  # type: ignore[no-untyped-def]
-    """Writes the colours ``max(0, 0.5 + SH)`` of the packed records; returns how many are left: only finite ones."""
-    w, sh, basis = scratch(f32x16, 16), scratch(f32x16, 80), scratch(f32x16, 25)
-    rows, targets = scratch(int64, 16), scratch(int64, 16)
-    bands = (degree + 1) * (degree + 1) - 1
-    packed = first
-    for start in range(first, first + found, 16):
-        for lane in range(16):
-            targets[lane] = min(start + lane, first + found - 1)
-            rows[lane] = ids[targets[lane]]
-        load_rows(means, rows, 3, 0, 3, w, MEAN)
-        view_direction(w, cam, sh)
-        sh_basis(degree, sh[0], sh[1], sh[2], basis)
-        load_rows(sh0, rows, 3, 0, 3, w, 0)
-        load_sh(shN, rows, bands, sh)
-        red, green, blue = HALF + basis[0] * w[0], HALF + basis[0] * w[1], HALF + basis[0] * w[2]
-        for k in range(bands):
-            red, green = fma(basis[k + 1], sh[3 * k], red), fma(basis[k + 1], sh[3 * k + 1], green)
-            blue = fma(basis[k + 1], sh[3 * k + 2], blue)
-        finite = gt(splat(HUGE), vabs(red) + vabs(green) + vabs(blue))
-        w[0], w[1], w[2] = vmax(red, splat(ZERO)), vmax(green, splat(ZERO)), vmax(blue, splat(ZERO))
-        store_rows(records, targets, RECORD, RED, 3, w, 0)
-        bits = bits_of(finite)
-        for lane in range(16):
-            at = start + lane
-            if at < first + found and (bits >> uint64(lane)) & uint64(1):
-                if packed < at:
-                    depths[packed], ids[packed] = depths[at], ids[at]
-                    for k in range(RECORD):
-                        records[packed * RECORD + k] = records[at * RECORD + k]
-                packed += 1
     return packed - first

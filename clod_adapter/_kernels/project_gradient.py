@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from numba import float32, int64
 
+from clod_adapter._kernels.colors import load_sh, view_direction
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.conventions import (
     BLUR,
@@ -33,12 +34,12 @@ from clod_adapter._kernels.conventions import (
     ZERO,
 )
 from clod_adapter._kernels.pointers import pointer, scratch
-from clod_adapter._kernels.project import covariance, load_sh, view_direction
+from clod_adapter._kernels.project import covariance
 from clod_adapter._kernels.rows import load_rows, store_rows
 from clod_adapter._kernels.sh import C0, sh_basis, sh_basis_gradient
 from clod_adapter._kernels.simd import eq, f32x16, gt, load, select, splat, store, vmax, vmin
 
-# Sixteen Gaussians' gradients, a vector each: sums over pixels (9), P (6), rotation matrix (9), then what is stored:
+# Gradients of sixteen Gaussians as vectors: sums over pixels (9), P (6), rotation matrix (9), then what is stored:
 # scales (3), quaternion (4), mean (3), SH degree 0 (3).
 SUMS, V_P, V_ROT, V_SCALE, V_QUAT, V_MEAN, V_SH0 = 0, 9, 15, 24, 27, 31, 34
 GRADIENTS = 37 + 16
@@ -46,16 +47,16 @@ GRADIENTS = 37 + 16
 
 @part
 def covariance_gradient(w, g, cam, compensated):  # type: ignore[no-untyped-def]
-    """From the sums over pixels to the gradients of scales, rotation matrix and mean."""
+    """Gradients of scales, rotation matrix and mean from the sums over pixels."""
     idet = ONE / w[COVDET]
     a, b, c = w[COV + 2] * idet, -(w[COV + 1] * idet), w[COV] * idet
     # dL/dP = K M (K P) with the conic K = [[a, b], [b, c]] and the second moments M of the sums. K P comes from
-    # K = adj(P P^T + blur) / det term by term: for a needle, K times its long column of P would cancel to noise.
+    # K = adj(P P^T + blur) / det term by term: for a needle, K times the long column of P would cancel.
     for k in range(3):
         p0, p1 = w[PMAT + k], w[PMAT + 3 + k]
         t0, t1 = cam[BLUR] * p0, cam[BLUR] * p1
         for j in range(3):
-            if j != k:  # else it is 0, but not where one of the products is fused with the difference
+            if j != k:  # else it is 0, except for the rounding of a fused product
                 cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
                 t0 += w[PMAT + 3 + j] * cross
                 t1 -= w[PMAT + j] * cross
@@ -75,9 +76,9 @@ def covariance_gradient(w, g, cam, compensated):  # type: ignore[no-untyped-def]
 
 @part
 def compensation_gradient(w, g, k, t0, t1):  # type: ignore[no-untyped-def]
-    """Adds to the gradient of column k of P that by the compensation c: of log c it is ``(P P^T)^-1 P - K P``.
+    """Adds the gradient through the compensation c to column k of P: that of log c is ``(P P^T)^-1 P - K P``.
 
-    ``t0, t1`` is the column of K P. The gradient by log c is that by the logarithm of the opacity.
+    ``t0, t1`` is the column of K P. The gradient with respect to log c equals that with respect to log opacity.
     """
     p0, p1, u0, u1, inverse = w[PMAT + k], w[PMAT + 3 + k], splat(ZERO), splat(ZERO), ONE / w[RAWDET]
     for j in range(3):
@@ -90,7 +91,7 @@ def compensation_gradient(w, g, k, t0, t1):  # type: ignore[no-untyped-def]
 
 @part
 def point_gradient(w, g, v_x, v_y, cam):  # type: ignore[no-untyped-def]
-    """Adds to the mean's gradient what comes through the projected centre and through the Jacobian."""
+    """Adds the gradients through the projected centre and through the Jacobian to that of the mean."""
     x, y, iz = w[POINT], w[POINT + 1], ONE / w[POINT + 2]
     rx, ry = x * iz, y * iz
     clamped_x = vmin(vmax(rx, splat(cam[LOW_X])), splat(cam[HIGH_X]))
@@ -130,20 +131,20 @@ def quat_gradient(w, g):  # type: ignore[no-untyped-def]
 
 @part
 def color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN):  # type: ignore[no-untyped-def]
-    """Gradients of the higher bands if ``tuned``, and of the mean through the direction."""
+    """Gradients of the harmonics above degree 0 if ``tuned``, and of the mean through the direction."""
     inverse = view_direction(w, cam, sh)
     x, y, z = sh[0], sh[1], sh[2]
     sh_basis(degree, x, y, z, basis)
     red, green, blue = g[SUMS], g[SUMS + 1], g[SUMS + 2]
-    bands = (degree + 1) * (degree + 1) - 1
-    load_sh(shN, rows, bands, sh)
-    for k in range(bands):
+    terms = (degree + 1) * (degree + 1) - 1
+    load_sh(shN, rows, terms, sh)
+    for k in range(terms):
         b, at = basis[k + 1], 3 * k
         basis[k + 1] = sh[at] * red + sh[at + 1] * green + sh[at + 2] * blue
         sh[at], sh[at + 1], sh[at + 2] = b * red, b * green, b * blue
     if tuned:
-        for first in range(0, 3 * bands, 16):
-            store_rows(v_shN, rows, 3 * bands, first, min(3 * bands - first, 16), sh, first)
+        for first in range(0, 3 * terms, 16):
+            store_rows(v_shN, rows, 3 * terms, first, min(3 * terms - first, 16), sh, first)
     gx, gy, gz = sh_basis_gradient(degree, x, y, z, basis)
     along = gx * x + gy * y + gz * z
     g[V_MEAN], g[V_MEAN + 1] = (gx - along * x) * inverse, (gy - along * y) * inverse
@@ -152,14 +153,14 @@ def color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN):  # ty
 
 @part
 def clear(values, first, last):  # type: ignore[no-untyped-def]
-    """Zeros for the elements from ``first`` up to ``last``."""
+    """Sets the elements from ``first`` up to ``last`` to 0."""
     for k in range(first, last):
         values[k] = ZERO
 
 
 @part
-def no_gradient(first, last, shaped, colored, bands, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN):  # type: ignore[no-untyped-def]
-    """Zeros for the rows from ``first`` up to ``last``, which took no part."""
+def no_gradient(first, last, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN):  # type: ignore[no-untyped-def]
+    """Sets the gradients of the rows from ``first`` up to ``last``, which are not visible, to 0."""
     clear(v_opacities, first, last)
     if shaped:
         clear(v_means, 3 * first, 3 * last)
@@ -167,7 +168,7 @@ def no_gradient(first, last, shaped, colored, bands, v_means, v_quats, v_scales,
         clear(v_scales, 3 * first, 3 * last)
     if colored:
         clear(v_sh0, 3 * first, 3 * last)
-    clear(v_shN, 3 * bands * first, 3 * bands * last)
+    clear(v_shN, 3 * terms * first, 3 * terms * last)
 
 
 @kernel
@@ -175,17 +176,17 @@ def project_gradient(  # type: ignore[no-untyped-def]
     worker, workers, means, quats, scales, opacities, shN, degree, cam, records, packed_ids, counts, slots,
     pair_sums, compensated, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN,
 ):  # fmt: skip
-    """Sums each visible Gaussian's slots and carries them back to its parameters; row order, so memory streams.
+    """Sums the slots of each visible Gaussian and computes the gradients of its parameters, in row order.
 
-    ``compensated`` is True where the camera's filter compensates opacities, else None: a type of its own, so that
-    numba compiles the kernel without what it would add. Empty arrays for means, quats and scales leave their gradients
-    out, an empty ``v_sh0`` or ``v_shN`` its own.
+    ``compensated`` is True if the camera's filter compensates opacities, else None, a separate type for which numba
+    compiles the kernel without compensation. Empty ``v_means``, ``v_quats`` and ``v_scales`` skip these gradients, an
+    empty ``v_sh0`` or ``v_shN`` its own.
     """
     w, g = scratch(f32x16, WORKSPACE), scratch(f32x16, GRADIENTS)
     sh, basis = scratch(f32x16, 80), scratch(f32x16, 25)
     rows, packed, lanes, sums = scratch(int64, 16), scratch(int64, 16), scratch(int64, 16), scratch(float32, 256)
     shaped, colored, tuned = len(v_means) > 0, len(v_sh0) > 0, len(v_shN) > 0
-    bands = (degree + 1) * (degree + 1) - 1 if tuned else 0
+    terms = (degree + 1) * (degree + 1) - 1 if tuned else 0
     first, last = len(opacities) * worker // workers, len(opacities) * (worker + 1) // workers
     end = first + counts[worker]
     means, quats, scales, opacities = pointer(means), pointer(quats), pointer(scales), pointer(opacities)
@@ -199,7 +200,7 @@ def project_gradient(  # type: ignore[no-untyped-def]
             packed[lane], lanes[lane] = min(start + lane, end - 1), lane
             row = rows[lane] = packed_ids[packed[lane]]
             if row > done:
-                no_gradient(done, row, shaped, colored, bands, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN)
+                no_gradient(done, row, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN)
             done = max(done, row + 1)
         add_slots(pair_sums, slots, records, packed, lanes, sums, g)
         for lane in range(16):
@@ -218,12 +219,12 @@ def project_gradient(  # type: ignore[no-untyped-def]
             for k in range(3):
                 g[V_SH0 + k] = C0 * g[SUMS + k]
             store_rows(v_sh0, rows, 3, 0, 3, g, V_SH0)
-    no_gradient(done, last, shaped, colored, bands, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN)
+    no_gradient(done, last, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN)
 
 
 @part
 def add_slots(pair_sums, slots, records, packed, lanes, sums, g):  # type: ignore[no-untyped-def]
-    """Adds up the slots of sixteen packed Gaussians into ``g[SUMS]``, and into a row each of ``sums [16, 16]``."""
+    """Sums the slots of sixteen packed Gaussians into ``g[SUMS]`` and into the rows of ``sums [16, 16]``."""
     for lane in range(16):
         total = splat(ZERO)
         for slot in range(slots[2 * packed[lane]], slots[2 * packed[lane] + 1]):
@@ -232,7 +233,7 @@ def add_slots(pair_sums, slots, records, packed, lanes, sums, g):  # type: ignor
     load_rows(records, packed, RECORD, RED, 3, g, SUMS + PAIR)
     red, green, blue = g[SUMS + PAIR], g[SUMS + PAIR + 1], g[SUMS + PAIR + 2]
     load_rows(sums, lanes, 16, 0, PAIR, g, SUMS)
-    # A colour that was cut at 0 has no gradient.
+    # A colour clamped at 0 has no gradient.
     g[SUMS] = select(gt(red, splat(ZERO)), g[SUMS], splat(ZERO))
     g[SUMS + 1] = select(gt(green, splat(ZERO)), g[SUMS + 1], splat(ZERO))
     g[SUMS + 2] = select(gt(blue, splat(ZERO)), g[SUMS + 2], splat(ZERO))

@@ -1,4 +1,4 @@
-"""Sixteen rows of a table as vectors, a lane a row, and back."""
+"""Loads sixteen rows of a table as vectors, one lane per row, and stores them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from clod_adapter._kernels.simd import INTEGERS, LANES, VECTOR, call_llvm, f32x1
 
 
 def _transposed(builder, rows):  # type: ignore[no-untyped-def]
-    """Sixteen vectors whose i-th lane of the j-th is the j-th lane of the i-th given."""
+    """The 16x16 transpose: lane i of vector j is lane j of vector i of ``rows``."""
     half = LANES // 2
     low = ir.Constant(INTEGERS, [lane for k in range(half) for lane in (k, LANES + k)])
     high = ir.Constant(INTEGERS, [lane for k in range(half, LANES) for lane in (k, LANES + k)])
@@ -22,7 +22,7 @@ def _transposed(builder, rows):  # type: ignore[no-untyped-def]
 
 
 def _row_access(builder, source, rows, width, first, count):  # type: ignore[no-untyped-def]
-    """Addresses of sixteen rows' ``[first : first + count]`` and the mask of so many lanes."""
+    """Addresses of columns ``[first : first + count]`` of sixteen rows, and a mask of ``count`` lanes."""
     i64, i32 = ir.IntType(64), ir.IntType(32)
     addresses = []
     for lane in range(LANES):
@@ -58,7 +58,7 @@ def load_rows(typingctx, source, rows, width, first, count, lanes, at):  # type:
 
 @intrinsic
 def store_rows(typingctx, destination, rows, width, first, count, lanes, at):  # type: ignore[no-untyped-def]
-    """The reverse of ``load_rows``; of rows that are named twice the last counts."""
+    """The inverse of ``load_rows``; of rows that are listed twice the last is stored."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         destination, rows, width, first, count, lanes, at = args

@@ -49,7 +49,7 @@ def sh_basis(degree, x, y, z, out):  # type: ignore[no-untyped-def]
 
 @part
 def sh_basis_gradient(degree, x, y, z, v):  # type: ignore[no-untyped-def]
-    """Gradient of ``sum_k v[k] * basis_k`` to (x, y, z), taken as free variables."""
+    """Gradient of ``sum_k v[k] * basis_k`` with respect to (x, y, z) as free variables."""
     gx = gy = gz = splat(float32(0))
     if degree >= 1:
         gx, gy, gz = -C1 * v[3], -C1 * v[1], C1 * v[2]

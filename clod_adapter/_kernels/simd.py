@@ -1,17 +1,16 @@
 """Sixteen-lane float vectors for Numba, as LLVM vectors.
 
-Numba's loop vectoriser gives up on the splatting loops (aliasing, masks), so the kernels say what
-they mean: ``F32x16`` is LLVM's ``<16 x float>`` and ``Mask16`` its ``<16 x i1>``. LLVM lowers them
-to one AVX-512, two AVX or four SSE/NEON registers, whichever the processor has.
+Numba's loop vectoriser does not vectorise the splatting loops (aliasing, masks), so the kernels use explicit vectors:
+``F32x16`` is LLVM's ``<16 x float>`` and ``Mask16`` its ``<16 x i1>``. LLVM lowers them to one AVX-512, two AVX or four
+SSE/NEON registers, whichever the processor has.
 
 Vectors are made by ``splat`` and ``load`` and combined by ``+ - *``, ``fma``, ``vmin``, comparisons
 ``ge``, ``gt``, ``eq``, and ``select``. Loads and stores take a 1-D contiguous
-float32 array, or a pointer to one, and the index of the first lane; nothing checks the bounds.
+float32 array, or a pointer to one, and the index of the first lane; bounds are not checked.
 """
 
 from __future__ import annotations
 
-import math
 import operator
 from collections.abc import Callable
 
@@ -55,10 +54,6 @@ class _VectorModel(models.PrimitiveModel):
 class _MaskModel(models.PrimitiveModel):
     def __init__(self, dmm, fe_type):  # type: ignore[no-untyped-def]
         super().__init__(dmm, fe_type, _mask)
-
-
-def _constant(value: float) -> ir.Constant:
-    return ir.Constant(VECTOR, [value] * LANES)
 
 
 def call_llvm(builder, name, result, arguments):  # type: ignore[no-untyped-def]
@@ -187,22 +182,8 @@ def _extremum(predicate: str):  # type: ignore[no-untyped-def]
     return operation
 
 
-# Where one is NaN, the second is the result.
+# If one is NaN, the result is the second.
 vmin, vmax = _extremum("<"), _extremum(">")
-
-
-def _unary(intrinsic_name: str):  # type: ignore[no-untyped-def]
-    @intrinsic
-    def operation(typingctx, a):  # type: ignore[no-untyped-def]
-        def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-            return call_llvm(builder, intrinsic_name, VECTOR, args)
-
-        return f32x16(f32x16), codegen
-
-    return operation
-
-
-vsqrt, vfloor, vceil, vabs = (_unary(f"llvm.{name}.v16f32") for name in ("sqrt", "floor", "ceil", "fabs"))
 
 
 @intrinsic
@@ -244,48 +225,3 @@ def select(typingctx, mask, a, b):  # type: ignore[no-untyped-def]
         return builder.select(*args)
 
     return f32x16(mask16, f32x16, f32x16), codegen
-
-
-# Minimax polynomial of 2^f on [-0.5, 0.5] with p(0) = 1: relative error 9e-8, in float32 arithmetic 2e-7.
-_EXP2 = (1.32646524e-3, 9.67151132e-3, 5.55073396e-2, 2.40222421e-1, 6.93146978e-1, 1.0)
-
-
-@intrinsic
-def exp2(typingctx, x):  # type: ignore[no-untyped-def]
-    """``2**x`` for x <= 127, 2**-126 for anything smaller than -126."""
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        low = _constant(-126.0)
-        x = builder.select(builder.fcmp_ordered(">", args[0], low), args[0], low)
-        whole = call_llvm(builder, "llvm.rint.v16f32", VECTOR, [x])
-        f = builder.fsub(x, whole)
-        p = _constant(_EXP2[0])
-        for c in _EXP2[1:]:
-            p = call_llvm(builder, "llvm.fmuladd.v16f32", VECTOR, [p, f, _constant(c)])
-        exponent = builder.shl(builder.fptosi(whole, INTEGERS), ir.Constant(INTEGERS, [23] * LANES))
-        return builder.bitcast(builder.add(builder.bitcast(p, INTEGERS), exponent), VECTOR)
-
-    return f32x16(f32x16), codegen
-
-
-_TINY = 0x3F3504F3  # bits of sqrt(1/2)
-
-
-@intrinsic
-def log2(typingctx, x):  # type: ignore[no-untyped-def]
-    """``log2(x)`` of positive normal numbers, to 1e-7 beside its own rounding; 0 at 1."""
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        def whole(value):  # type: ignore[no-untyped-def]
-            return ir.Constant(INTEGERS, [value] * LANES)
-
-        bits = builder.bitcast(args[0], INTEGERS)
-        exponent = builder.ashr(builder.sub(bits, whole(_TINY)), whole(23))
-        m = builder.bitcast(builder.sub(bits, builder.shl(exponent, whole(23))), VECTOR)  # in [sqrt(1/2), sqrt(2))
-        s = builder.fdiv(builder.fsub(m, _constant(1.0)), builder.fadd(m, _constant(1.0)))
-        square, p = builder.fmul(s, s), _constant(2 / math.log(2) / 9)
-        for k in (7, 5, 3, 1):
-            p = call_llvm(builder, "llvm.fmuladd.v16f32", VECTOR, [p, square, _constant(2 / math.log(2) / k)])
-        return call_llvm(builder, "llvm.fmuladd.v16f32", VECTOR, [p, s, builder.sitofp(exponent, VECTOR)])
-
-    return f32x16(f32x16), codegen

@@ -1,7 +1,7 @@
 """Fused SSIM with its gradient: separable 11-tap Gaussian (sigma 1.5), zero padding, data range 1.
 
-Images become planes ``[3, H, stride]`` with 16 zero lanes left and right of each row, so that the
-blurs need no edge cases along a row. Rows beyond the image are skipped, which is zero padding too.
+Images are copied to planes ``[3, H, stride]`` with 16 zero lanes left and right of each row, so that blurs along a row
+need no edge cases. Rows beyond the image are skipped, which equals zero padding.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def stride(width: int) -> int:
 
 @kernel
 def to_planes(worker, workers, image, target, x, y):  # type: ignore[no-untyped-def]
-    """Splits two ``[H, W, 3]`` images into planes; ``target`` is uint8 and becomes [0, 1]."""
+    """Copies two ``[H, W, 3]`` images into planes; the uint8 ``target`` is scaled to [0, 1]."""
     height, width = image.shape[0], image.shape[1]
     for row in range(height * worker // workers, height * (worker + 1) // workers):
         for column in range(width):
@@ -46,7 +46,7 @@ def blur_row(lines, line, length):  # type: ignore[no-untyped-def]
 
 @kernel
 def ssim_map(worker, workers, x, y, width, similarity, g_mean, g_square, g_product, sums):  # type: ignore[no-untyped-def]
-    """SSIM of each pixel into ``similarity`` and its derivatives to the blurred x, x^2 and x y.
+    """SSIM of each pixel into ``similarity``, and its derivatives by the blurred x, x^2 and x y.
 
     The planes are flat. ``sums[worker]`` receives the sum of SSIM over the image's pixels.
     """
@@ -87,7 +87,7 @@ def ssim_map(worker, workers, x, y, width, similarity, g_mean, g_square, g_produ
             store(g_product, where, two * a * inverse)
         for column in range(width):
             result += similarity[task * step + PAD + column]
-        # Lanes past the image hold SSIM of nothing; they must not flow back.
+        # Lanes beyond the image must not contribute to the gradient.
         for column in range(task * step + PAD + width, (task + 1) * step - PAD):
             g_mean[column] = g_square[column] = g_product[column] = float32(0)
     sums[worker] = result
@@ -95,7 +95,7 @@ def ssim_map(worker, workers, x, y, width, similarity, g_mean, g_square, g_produ
 
 @kernel
 def loss_gradient(worker, workers, x, y, width, g_mean, g_square, g_product, l1, dssim, v_image, sums):  # type: ignore[no-untyped-def]
-    """Gradient of ``l1 sum |x - y| - dssim sum SSIM`` to x, as ``[H, W, 3]``; ``sums[worker]``: sum of |x - y|."""
+    """Gradient of ``l1 sum |x - y| - dssim sum SSIM`` by x, as ``[H, W, 3]``; ``sums[worker]``: sum of |x - y|."""
     channels, height, step = x.shape
     x, y = x.reshape(-1), y.reshape(-1)
     g_mean, g_square, g_product = g_mean.reshape(-1), g_square.reshape(-1), g_product.reshape(-1)

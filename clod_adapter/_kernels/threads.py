@@ -1,7 +1,7 @@
 """Runs compiled kernels on several cores from plain Python threads.
 
-Kernels are compiled with ``nogil=True`` and take ``(worker, workers, *arguments)``. Python's own
-threads avoid a second OpenMP runtime beside torch's, which would spin against it.
+Kernels are compiled with ``nogil=True`` and take ``(worker, workers, *arguments)``. Python threads avoid a second
+OpenMP runtime, which would compete with torch's.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ import torch
 from clod_adapter._support.workers import Job, some
 
 _lock = threading.Lock()
-_alone, _before = 0, 0  # how many want torch on one thread now, and how many threads it had
+_alone, _before = 0, 0  # contexts open now, and torch's threads before the first
 
 
 def worker_count() -> int:
-    """As many workers as torch uses threads (``torch.set_num_threads``, ``OMP_NUM_THREADS``)."""
+    """Number of workers: torch's number of threads (``torch.set_num_threads``, ``OMP_NUM_THREADS``)."""
     return _before if _alone else torch.get_num_threads()
 
 
 @contextmanager
 def torch_on_one_thread() -> Iterator[None]:
-    """Within, torch's own operations stay on one thread, while kernels use as many workers as before.
+    """A context in which torch's operations use one thread, and kernels as many workers as before.
 
-    For work on a hundred thousand numbers at a time, which costs less than waking other threads for it.
+    For operations on about a hundred thousand numbers, which take less time than waking other threads.
     """
     global _alone, _before
     with _lock:
@@ -50,7 +50,7 @@ def run(kernel: Callable[..., Any], workers: int, *arguments: Any) -> None:
     """Calls ``kernel(worker, workers, *arguments)`` for each worker and waits for all of them.
 
     Raises:
-        MemoryError: a thread cannot be started, or has died.
+        MemoryError: a thread cannot be started, or ended early.
     """
     if workers == 1:
         kernel(0, 1, *arguments)
@@ -62,6 +62,6 @@ def run(kernel: Callable[..., Any], workers: int, *arguments: Any) -> None:
         kernel(0, workers, *arguments)
     finally:
         for other in others:
-            other.wait()  # also when interrupted: nobody may still write into arrays that are handed back
+            other.wait()  # also when interrupted: no thread may write into arrays that are returned
     for other in others:
         other.result()

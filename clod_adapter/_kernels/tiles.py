@@ -33,7 +33,7 @@ from clod_adapter._kernels.pointers import pointer, prefetch
 
 @part
 def within(value, otherwise, low, high):  # type: ignore[no-untyped-def]
-    """A whole number between the bounds, before it is cast: an ellipse may reach 1e10 pixels, or none that is known."""
+    """``value`` clamped and cast to int32, ``otherwise`` for NaN: an ellipse may extend over 1e10 pixels."""
     return np.int32(otherwise if value != value else min(max(value, low), high))
 
 

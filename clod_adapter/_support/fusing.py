@@ -1,7 +1,7 @@
-"""Elementwise formulas as one pass over their tensors on a GPU: ``torch.compile`` of the plain one, never a second one.
+"""Elementwise functions fused into one pass on a GPU by ``torch.compile``; there is no second implementation.
 
-Plain torch reads and writes each intermediate. One compiled pass reads the inputs and writes the results, forward and
-backward; only many rows repay the tens of seconds that the first call on a machine takes to compile.
+Plain torch reads and writes each intermediate; a compiled pass reads the inputs and writes the results, forward and
+backward. Compiling takes tens of seconds on the first call, which pays off for many rows only.
 """
 
 from __future__ import annotations
@@ -14,22 +14,21 @@ import torch
 from torch import Tensor
 
 ROWS = 1 << 19
-"""From so many rows on. Below, plain torch's passes are launches of a few microseconds, and compiling takes longer than
-what they cost in a whole training."""
+"""Fewest rows for compiling. Below, all of plain torch's passes in a training take less time than compiling."""
 
 Number = float | Tensor
-"""What is a float where the function runs as it is written, and a 0-d tensor where it runs compiled."""
+"""A float in a plain call, a 0-d tensor in a compiled one."""
 
 
 class Fused:
-    """A function of tensors and floats that on a GPU runs compiled, and anywhere else as it is written.
+    """A function of tensors and floats that runs compiled on a GPU and plain elsewhere.
 
-    Compiled, a float becomes a 0-d float64 tensor (or torch would compile anew for each value); what is named is fixed
-    at compilation. Where torch cannot compile, the plain function runs, and a warning says so once. What is compiled
-    can be gone back through once: for retain_graph=True, TORCH_COMPILE_DISABLE=1 has the plain function run.
+    In compiled calls a float becomes a 0-d float64 tensor, so that torch does not compile for each value; keyword
+    arguments are constants of the compilation. If compiling fails, the plain function runs and one warning is given.
+    Compiled graphs allow one backward pass: for retain_graph=True, set TORCH_COMPILE_DISABLE=1.
 
     Args:
-        function: differentiable by autograd, of elementwise operations; its first argument a tensor with a row each.
+        function: differentiable by autograd, elementwise; its first argument is a tensor with one row per Gaussian.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -41,18 +40,18 @@ class Fused:
         return self.compiled(*values, **fixed) if self.compiles(values[0]) else self.plain(*values, **fixed)
 
     def compiles(self, first: Any) -> bool:
-        """Whether a call with this first argument is to run compiled."""
+        """Whether a call with this first argument runs compiled."""
         return bool(first.is_cuda) and len(first) >= ROWS and not self._failed
 
     def compiled(self, *values: Tensor | float, **fixed: Any) -> Any:
-        """Compiled wherever the tensors are."""
+        """A compiled call on any device."""
         if self._compiled is None:
             self._compiled = torch.compile(self.plain, fullgraph=True, dynamic=True)
         try:
             return self._compiled(*_tensors(values), **fixed)
-        except torch.cuda.OutOfMemoryError:  # torch's own name for it came after 2.4
+        except torch.cuda.OutOfMemoryError:  # torch.OutOfMemoryError came after torch 2.4
             raise
-        except Exception as error:  # of a missing compiler, of triton, of dynamo: they share no class
+        except Exception as error:  # a missing compiler, triton or dynamo: no common class
             self._failed = True
             reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
             warnings.warn(

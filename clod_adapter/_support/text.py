@@ -1,4 +1,4 @@
-"""Names of files as text that every output can hold: a name is bytes to the system, and may be no text at all."""
+"""File names as text for outputs: to the system a name is bytes, which need not be valid text."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import os
 
 
 def as_text(name: str) -> str:
-    """``name`` as text that UTF-8 can encode; a name that is such text already is unchanged.
+    """``name`` as text that UTF-8 can encode; valid text is unchanged.
 
-    Python holds a byte of a file name that the locale's encoding cannot decode as a lone surrogate, U+DC80 to U+DCFF
-    (PEP 383). Bytes that are UTF-8 together become their letter, as under an ASCII locale; others become ``\\xff``, and
-    a surrogate that stands for no byte becomes ``\\ud800``.
+    Python decodes a byte of a file name that the locale cannot decode to a lone surrogate, U+DC80 to U+DCFF (PEP 383).
+    Such bytes become a character if they are valid UTF-8 together, else ``\\xff``; other surrogates become ``\\ud800``.
     """
     try:
         data = name.encode("utf-8", "surrogateescape")

@@ -1,7 +1,7 @@
-"""Threads that are waited for only as long as they live.
+"""Worker threads whose failure to start or to finish raises instead of blocking.
 
-Where memory or the number of threads is limited, a thread may fail to start, or die of it before it has said so.
-Python's own ``Thread.start`` and executors then wait for good, for a word that never comes.
+With little memory or a limit on threads, a thread may fail to start or end early. Python's ``Thread.start`` and
+executors then wait forever.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
-LOOK_SECONDS = 1.0  # between two looks at whether a thread that is waited for still lives
-LOOKS = 30  # for the word of a thread that it runs; not one long wait, which a stopped process would spend stopped
+LOOK_SECONDS = 1.0  # between two checks that a thread is alive
+LOOKS = 30  # checks of a starting thread; a single long wait would also count the time of a stopped process
 
 Result = TypeVar("Result")
 
 
 class Job:
-    """A call that a worker makes; ``result`` waits for it."""
+    """A call on a worker thread; ``result`` waits for it."""
 
     def __init__(self, worker: Worker, call: Callable[[], Any]) -> None:
         self._worker, self._call = worker, call
@@ -33,14 +33,14 @@ class Job:
     def __call__(self) -> None:
         try:
             self._value = self._call()
-        except BaseException as error:  # handed to who waits
+        except BaseException as error:  # raised by ``result``
             self._error = error
         finally:
             del self._call
             self._open.release()
 
     def wait(self) -> None:
-        """Raises MemoryError where the worker has died with the call undone."""
+        """Waits for the call to end; raises MemoryError if the worker ended before."""
         while not self._open.acquire(timeout=LOOK_SECONDS):
             if not self._worker.alive:
                 if not self._open.acquire(blocking=False):
@@ -49,7 +49,7 @@ class Job:
         self._open.release()
 
     def result(self) -> Any:
-        """What the call returns; raises what it raises."""
+        """The return value of the call; raises its exception."""
         self.wait()
         if self._error is not None:
             raise self._error
@@ -57,7 +57,7 @@ class Job:
 
 
 class Worker:
-    """A thread that makes calls, one after the other, until the process ends.
+    """A thread that runs jobs one after the other until the process ends.
 
     Raises:
         MemoryError: it cannot be started.
@@ -87,7 +87,7 @@ class Worker:
         try:
             self._started.set()
             while True:
-                self._jobs.get()()  # no name holds the job, and so its arrays, while the next one is waited for
+                self._jobs.get()()  # unnamed, so that a finished job's arrays are freed
         finally:
             self._life.release()
 
@@ -97,7 +97,7 @@ _workers: list[Worker] = []
 
 
 def some(count: int) -> Sequence[Worker]:
-    """As many workers, the same ones for all.
+    """``count`` workers, shared by all callers.
 
     Raises:
         MemoryError: they cannot be started.
@@ -110,7 +110,7 @@ def some(count: int) -> Sequence[Worker]:
 
 
 def _forget() -> None:
-    """In a forked child, which has none of the threads."""
+    """For a forked child, which has none of the threads."""
     global _lock
     _lock = threading.Lock()
     _workers.clear()
@@ -121,9 +121,9 @@ if hasattr(os, "register_at_fork"):
 
 
 def in_order(calls: Iterable[Callable[[], Result]], count: int) -> Generator[Result, None, None]:
-    """The results of the calls, in their order, made on ``count`` workers; at most twice as many are ahead.
+    """Results of the calls, in order, run on ``count`` workers; at most ``2 count`` calls are in progress or waiting.
 
-    Where one raises, or the iterator is closed, those that were begun are waited for and no more are made.
+    If a call raises or the iterator is closed, started calls are waited for and no more are started.
     """
     workers, pending = some(count), deque[Job]()
     try:

@@ -1,16 +1,15 @@
-"""Do a checkpoint and posed photographs share a frame? What its renders say, before anything is trained on them.
+"""Checks before training that a checkpoint and the posed photographs share a world frame.
 
-A picture's trivial predictor is one colour, the photograph's own mean; the error it leaves is the photograph's
-variance. With ``I_v`` the render at dial 1 over black, clamped to [0, 1], and ``P_v`` the photograph of view v, means
-over pixels and channels,
+The baseline predictor of a photograph is its mean colour, whose error is the photograph's variance. With ``I_v`` the
+render at s = 1 over black, clamped to [0, 1], and ``P_v`` the photograph of view v, means over pixels and channels,
 
     error_v    = mean (I_v - P_v)^2
-    constant_v = mean (P_v - mean P_v)^2        the mean of each channel
+    constant_v = mean (P_v - mean P_v)^2        with the mean of each channel
 
-a checkpoint whose pooled error is the larger one knows less of the pictures than their mean colours do: nearly always
-it stands elsewhere, in other axes or at another scale. What else can look like that is told apart: views that the
-checkpoint does not reach while it explains the others (the count of views it explains), another exposure (the
-correlation, which gain and offset do not change) and another background (the same over white).
+If the pooled error exceeds the pooled constant, the checkpoint nearly always has another position, other axes or
+another scale. Three other causes are told apart: views outside the checkpoint's coverage (by the share of explained
+views), another exposure (by the correlation, which ignores gain and offset) and another background (by a render over
+white).
 """
 
 from __future__ import annotations
@@ -22,39 +21,39 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import in_frustum
 from clod_adapter.cameras import View
 from clod_adapter.config import require
+from clod_adapter.distances import in_frustum
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import spread
 from clod_adapter.losses import unit
 from clod_adapter.render import render
 
 MOST_VIEWS = 8
-# Photographs that vary by less, root mean square, are one colour but for noise and rounding.
+# Root mean square deviation, below which a photograph counts as one colour with noise.
 FLAT = 2 / 255
-# Of a fitting file nine tenths and more are in sight of eight photographs, of a large one given a part of its cameras
-# much less; so this decides only where all photographs are flat.
+# Decides only if all photographs are flat. Eight photographs see nine tenths of a matching file, but much less of a
+# large one of which only some cameras were given.
 FEWEST_IN_VIEW = 0.01
-# Of files that are far from their place at most 0.39, of those that a pixel or two are missing 0.43 and more: a guess
-# tells these. Of fitting ones 0.91 and more, with half of their Gaussians left out 0.67 (benchmarks/alignment.py).
+# Misplaced files measured at most 0.39, those off by a pixel or two at least 0.43 (the search finds these), matching
+# ones at least 0.91, or 0.67 with half of the Gaussians removed (benchmarks/alignment.py).
 CORRELATED = 0.5
-CLEAR = 3.0  # dB by which another explanation must be better than the present one
-DOUBTFUL = 6.0  # dB over the mean colours below which another frame may be the reason; fitting files had 8 to 18
+CLEAR = 3.0  # dB by which another explanation must be better
+DOUBTFUL = 6.0  # dB above the mean colours, below which the frame may be wrong; matching files had 8 to 18
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """What renders and photographs have in common; PSNRs in dB, pooled (of the mean squared error over the views).
+    """Agreement of renders and photographs. PSNRs are in dB and pooled: of the mean squared error over the views.
 
     Attributes:
-        views: compared; those whose photograph is one colour are not.
+        views: number of views compared; photographs of one colour are skipped.
         in_view: share of the Gaussians whose centre projects into any of the views, in [0, 1].
-        psnr: of the renders; NaN, like the next four, where no view was compared.
-        mean_colour_psnr: of each photograph's own mean colour.
+        psnr: of the renders; NaN, like the next four, if no view was compared.
+        mean_colour_psnr: of each photograph's mean colour.
         white_psnr: of the renders over white.
-        correlation: of renders and photographs, each less its own mean colour, in [-1, 1].
-        explained: share of the views that the render explains better than the mean colour, in [0, 1].
+        correlation: of renders and photographs, each minus its mean colour, in [-1, 1].
+        explained: share of the views whose render has a smaller error than the mean colour, in [0, 1].
     """
 
     views: int
@@ -67,10 +66,10 @@ class Alignment:
 
     @property
     def fits(self) -> bool:
-        """Whether something speaks for a common frame, and nothing for a white background.
+        """Whether any measure supports a common frame and none a white background.
 
-        Of flat photographs, whether FEWEST_IN_VIEW are in sight; of others a black picture is never better than the
-        mean colour, so that a file with nothing in sight does not fit.
+        With flat photographs only: whether FEWEST_IN_VIEW of the Gaussians are in view. Otherwise a file with nothing
+        in view does not fit, because a black image is never better than the mean colour.
         """
         if not self.views:
             return self.in_view >= FEWEST_IN_VIEW
@@ -79,22 +78,22 @@ class Alignment:
 
     @property
     def margin(self) -> float:
-        """dB by which the renders are closer to the photographs than their mean colours; NaN for flat ones."""
+        """dB of the renders above the mean colours; NaN if no view was compared."""
         return self.psnr - self.mean_colour_psnr
 
     @property
     def on_white(self) -> bool:
-        """Whether the renders are worse than the mean colours over black, and better over white."""
+        """Whether the renders are worse than the mean colours over black, but better over white."""
         return self.margin < 0 < self.white_psnr - self.mean_colour_psnr and self.white_psnr > self.psnr + CLEAR
 
     def as_dict(self) -> dict[str, float]:
-        """By name."""
+        """The fields by name, for reports."""
         return asdict(self)
 
 
 @torch.no_grad()
 def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
-    """Renders at most MOST_VIEWS of the views, evenly spread, at dial 1, and compares them with the photographs.
+    """Renders at most MOST_VIEWS of the views, evenly spread, at s = 1, and compares them with the photographs.
 
     Raises:
         ClodError: there are no views.
@@ -118,10 +117,10 @@ def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
 
 
 def compare(gaussians: Gaussians, view: View) -> Tensor | None:
-    """``[5]``, means over pixels and channels; None where the photograph is one colour.
+    """``[5]`` means over pixels and channels; None if the photograph is one colour.
 
-    The squared error of the render over black, over white, and of the photograph's mean colour (its variance); the
-    render's variance, and the covariance of the two.
+    Squared error of the render over black, of the render over white, and of the photograph's mean colour (its
+    variance); variance of the render; covariance of render and photograph.
     """
     photograph = unit(view.image, gaussians.means)
     about = photograph - photograph.mean((0, 1))
@@ -136,4 +135,5 @@ def compare(gaussians: Gaussians, view: View) -> Tensor | None:
 
 
 def _decibels(error: float) -> float:
-    return -10 * math.log10(error) if error > 0 else math.inf
+    """PSNR of a mean squared error: infinite for 0, NaN for NaN."""
+    return math.inf if error == 0 else -10 * math.log10(error)

@@ -1,8 +1,8 @@
-"""Frames that checkpoints are found in instead of their cameras': other axes, poses and trainers' normalised worlds.
+"""Frames of checkpoints that differ from that of the cameras: swapped axes, inverted poses, normalized worlds.
 
-A frame is a similarity ``x_cameras = s R x_file + t``. Cameras are brought into the file's frame, not the Gaussians
-into theirs: that is exact for the harmonics too and costs nothing. The picture does not depend on the unit of length,
-so ``[R_c | t_c]`` becomes ``[R_c R | (R_c t + t_c) / s]``.
+A frame is a similarity ``x_cameras = s R x_file + t``. The cameras are transformed into the frame of the file, not the
+Gaussians into that of the cameras, which is exact for spherical harmonics too. An image does not depend on the unit of
+length, so ``[R_c | t_c]`` becomes ``[R_c R | (R_c t + t_c) / s]``.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 GSPLAT = (
-    "it is in the frame that gsplat's trainer normalises the world to: train it with --no-normalize-world-space, or "
-    "apply the inverse of its parser's transform to it"
+    "the checkpoint is in the normalized frame of gsplat's trainer: train with --no-normalize-world-space, or apply "
+    "the inverse of the parser's transform"
 )
 NERFSTUDIO = (
-    "it is in the frame that nerfstudio normalises the world to: put a copy of the dataparser_transforms.json that "
-    "ns-train wrote beside its config.yml into the scene's folder"
+    "the checkpoint is in the normalized frame of nerfstudio: copy dataparser_transforms.json, which ns-train writes "
+    "to the folder of config.yml, into the scene's folder"
 )
-# How nerfstudio's readers turn COLMAP's world before they normalise it: not, today's way, and the older one.
+# Rotations of COLMAP's world in nerfstudio's readers before normalization: none, the current one, the older one.
 NERFSTUDIO_TURNS = (
     ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
@@ -33,29 +33,29 @@ NERFSTUDIO_TURNS = (
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame that the file may be in.
+    """A candidate frame of the file.
 
     Attributes:
-        says: what it is, and what to do.
-        viewmats: ``[V, 4, 4]`` the cameras in it.
+        description: cause and remedy, for messages.
+        viewmats: ``[V, 4, 4]`` the cameras in that frame.
     """
 
-    says: str
+    description: str
     viewmats: Tensor
 
 
 def known_frames(viewmats: Tensor, points: Tensor | None = None) -> list[Frame]:
-    """Those that follow from the cameras, and the scene's points, alone.
+    """The frames that follow from the cameras and the scene's points alone.
 
     Args:
-        viewmats: ``[V, 4, 4]`` float64, of all the cameras, by which trainers normalise.
-        points: ``[M, 3]`` of the COLMAP model, world units; gsplat's trainer normalises by them too.
+        viewmats: ``[V, 4, 4]`` float64, of all cameras: trainers normalize by all of them.
+        points: ``[M, 3]`` of the COLMAP model, world units; gsplat's trainer uses them for its normalization.
     """
     return [*_poses(viewmats), *_axes(viewmats), *_nerfstudio(viewmats), *_gsplat(viewmats, points)]
 
 
 def into_file(viewmats: Tensor, rotation: Tensor, scale: float, offset: Tensor) -> Tensor:
-    """``[V, 4, 4]`` the cameras where ``x_cameras = scale rotation x_file + offset``."""
+    """``[V, 4, 4]`` the cameras in the file's frame, for ``x_cameras = scale rotation x_file + offset``."""
     out = viewmats.clone()
     out[:, :3, :3] = viewmats[:, :3, :3] @ rotation
     out[:, :3, 3] = (viewmats[:, :3, :3] @ offset + viewmats[:, :3, 3]) / scale
@@ -63,12 +63,12 @@ def into_file(viewmats: Tensor, rotation: Tensor, scale: float, offset: Tensor) 
 
 
 def centres_of(viewmats: Tensor) -> Tensor:
-    """``[V, 3]`` the cameras' centres."""
+    """``[V, 3]`` camera centres."""
     return torch.linalg.inv(viewmats)[:, :3, 3]
 
 
 def focus_of(viewmats: Tensor) -> Tensor:
-    """``[3]`` the point closest to the optical axes, least squares; the mean of the centres where they are parallel."""
+    """``[3]`` the least-squares point closest to the optical axes; the mean centre if they are parallel."""
     poses = torch.linalg.inv(viewmats.double())
     centres, forward = poses[:, :3, 3], poses[:, :3, 2]
     across = torch.eye(3, dtype=poses.dtype) - forward[:, :, None] * forward[:, None, :]
@@ -78,12 +78,12 @@ def focus_of(viewmats: Tensor) -> Tensor:
 
 
 def median(rows: Tensor) -> Tensor:
-    """Per column, the mean of the middle two, as numpy has it."""
+    """Median of each column, with numpy's mean of the middle two."""
     return rows.quantile(0.5, dim=0)
 
 
 def _poses(viewmats: Tensor) -> Iterator[Frame]:
-    """The cameras' own mistakes, each camera for itself."""
+    """Wrong conventions of the individual poses."""
     backward = torch.diag(viewmats.new_tensor([1.0, -1, -1, 1]))
     inverse = torch.linalg.inv(viewmats)
     yield Frame(
@@ -100,7 +100,7 @@ def _poses(viewmats: Tensor) -> Iterator[Frame]:
 
 
 def _axes(viewmats: Tensor) -> Iterator[Frame]:
-    """The 47 other ways to name the axes, mirrored ones included."""
+    """The 47 other signed permutations of the axes, including mirrored ones."""
     identity = torch.eye(3, dtype=viewmats.dtype)
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
@@ -109,12 +109,14 @@ def _axes(viewmats: Tensor) -> Iterator[Frame]:
                 continue
             names = ", ".join(("-" if sign < 0 else "") + "xyz"[axis] for sign, axis in zip(signs, order, strict=True))
             mirrored = " (mirrored)" if torch.linalg.det(rotation) < 0 else ""
-            says = f"the cameras' x, y, z are the file's {names}{mirrored}: export it without that turn"
-            yield Frame(says, into_file(viewmats, rotation, 1.0, viewmats.new_zeros(3)))
+            description = (
+                f"the cameras' x, y, z are the file's {names}{mirrored}: export the checkpoint without that rotation"
+            )
+            yield Frame(description, into_file(viewmats, rotation, 1.0, viewmats.new_zeros(3)))
 
 
 def _nerfstudio(viewmats: Tensor) -> Iterator[Frame]:
-    """nerfstudio's default: the mean up to z, the mean centre to the origin, the farthest coordinate to 1."""
+    """nerfstudio's default: mean up direction to z, mean centre to the origin, largest coordinate to 1."""
     poses = torch.linalg.inv(viewmats)
     for rows in NERFSTUDIO_TURNS:
         turn = viewmats.new_tensor(rows)
@@ -126,7 +128,7 @@ def _nerfstudio(viewmats: Tensor) -> Iterator[Frame]:
 
 
 def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
-    """gsplat's ``normalize``: up, focus and median distance from the cameras, then the points' principal axes."""
+    """gsplat's ``normalize``: up, focus and median distance of the cameras, then principal axes of the points."""
     poses = torch.linalg.inv(viewmats)
     rotation = _turning(-poses[:, :3, 1].mean(0), viewmats.new_tensor([0.0, -1, 0]))
     centres, forward = poses[:, :3, 3] @ rotation.T, poses[:, :3, 2] @ rotation.T
@@ -141,18 +143,18 @@ def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
     middle = median(turned)
     axes = torch.linalg.eigh((turned - middle).T.cov()).eigenvectors.flip(1).T
     axes = axes * torch.linalg.det(axes).sign()
-    for signs in ((1.0, 1, 1), (1.0, -1, -1), (-1.0, 1, -1), (-1.0, -1, 1)):  # of eigenvectors anyone's choice
+    for signs in ((1.0, 1, 1), (1.0, -1, -1), (-1.0, 1, -1), (-1.0, -1, 1)):  # eigenvectors have no sign
         turn = torch.diag(viewmats.new_tensor(signs)) @ axes
         yield Frame(GSPLAT, _normalised(viewmats, turn @ rotation, 1 / distance, -turn @ middle))
 
 
 def _normalised(viewmats: Tensor, rotation: Tensor, scale: float, offset: Tensor) -> Tensor:
-    """The cameras where ``x_file = scale (rotation x_cameras + offset)``."""
+    """The cameras in the file's frame, for ``x_file = scale (rotation x_cameras + offset)``."""
     return into_file(viewmats, rotation.T, 1 / scale, -rotation.T @ offset)
 
 
 def _turning(source: Tensor, target: Tensor) -> Tensor:
-    """The smallest rotation from one direction to another (Rodrigues); of opposite ones, half a turn."""
+    """The smallest rotation from one direction to another (Rodrigues); half a turn for opposite directions."""
     a, b = F.normalize(source, dim=0), F.normalize(target, dim=0)
     identity = torch.eye(3, dtype=a.dtype)
     cosine = float(a @ b)

@@ -1,8 +1,8 @@
-"""Which screen-space filter was a checkpoint trained with? What its renders with each say, beside the photographs.
+"""Detects the screen-space filter of a checkpoint's training by comparing renders with the photographs.
 
-A checkpoint holds the opacities and scales that suit one ``ScreenFilter``, and most files do not say which. Drawn with
-another one it is off: Gaussians of a pixel and less are too opaque or too faint. So the views are rendered with each
-filter that is in use, and one that is clearly closer to the photographs than the usual one is taken.
+Opacities and scales of a checkpoint fit one ``ScreenFilter``, which most files do not name. With another filter,
+Gaussians of about a pixel render too opaque or too faint. The views are rendered with each known filter, and a filter
+is chosen if it is clearly closer to the photographs than the expected one.
 """
 
 from __future__ import annotations
@@ -23,20 +23,19 @@ from clod_adapter.losses import unit
 from clod_adapter.render import render
 
 MOST_VIEWS = 8
-# Of files trained with another filter the usual one is 1.7 dB worse and more, of files trained with the usual one the
-# others are 0.48 dB worse and more (benchmarks/antialias.py).
-CLEAR = 0.2  # dB, in the mean over the views
-MOST = 0.75  # share of the views in which the other one has to be better
+# A wrong filter measured at least 0.48 dB worse than that of training (benchmarks/antialias.py).
+CLEAR = 0.2  # dB, mean over the views
+MOST = 0.75  # share of the views in which the chosen filter must be better
 
 
 @dataclass(frozen=True)
 class FilterComparison:
-    """What renders with each filter have in common with the photographs.
+    """Agreement of renders with each filter and the photographs.
 
     Attributes:
-        psnr: dB by the filter's name in FILTERS, mean over the views.
-        expected: the name of the filter that is taken where none is clearly better.
-        chosen: the name of the filter to draw with.
+        psnr: dB by name in FILTERS, mean over the views.
+        expected: name of the filter used unless another is clearly better.
+        chosen: name of the filter for rendering.
     """
 
     psnr: dict[str, float]
@@ -45,21 +44,20 @@ class FilterComparison:
 
     @property
     def screen_filter(self) -> ScreenFilter:
-        """To draw with."""
+        """The chosen filter."""
         return FILTERS[self.chosen]
 
 
 @torch.no_grad()
 def compare_filters(gaussians: Gaussians, views: Sequence[View], expected: str = "off") -> FilterComparison:
-    """Renders at most MOST_VIEWS of the views, evenly spread, at dial 1, with each of FILTERS.
+    """Renders at most MOST_VIEWS of the views, evenly spread, at s = 1, with each of FILTERS.
 
-    Another filter than ``expected`` is chosen where its PSNR is CLEAR dB higher in the mean over the views, it is
-    higher in MOST of them, and its pooled error is ``alignment.DOUBTFUL`` dB below that of the photographs' mean
-    colours: else the checkpoint may not belong to them, and a fainter picture is the nearer one for that. Of two such
-    the one with the higher mean.
+    A filter other than ``expected`` is chosen if its mean PSNR is CLEAR dB higher, its PSNR is higher in MOST of the
+    views, and its pooled error is ``check.DOUBTFUL`` dB below that of the photographs' mean colours (otherwise the
+    frame may be wrong, and a fainter render is closer for that reason). Of several, the one with the highest mean.
 
     Args:
-        expected: name of the filter that is taken where the photographs do not tell.
+        expected: name of the filter used unless another is clearly better.
     """
     views = spread(views, MOST_VIEWS)
     errors = {name: _errors(gaussians.replace(screen_filter=each), views) for name, each in FILTERS.items()}
@@ -85,7 +83,7 @@ def _errors(gaussians: Gaussians, views: Sequence[View]) -> Tensor:
 
 
 def _constant(views: Sequence[View]) -> float:
-    """The mean squared error of each photograph's own mean colour."""
+    """Mean squared error of each photograph's mean colour."""
     pixels = [view.image.float() / 255 for view in views]
     return math.fsum(float((image - image.mean((0, 1))).square().mean()) for image in pixels) / len(pixels)
 

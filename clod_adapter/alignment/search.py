@@ -1,8 +1,8 @@
-"""Where a checkpoint that does not fit its cameras stands, if it can be told.
+"""Searches the frame of a checkpoint that does not fit its cameras.
 
-Known frames (``alignment_frames``) are ranked by the correlation of small pictures of the Gaussians that cover most. If
-the best is none, a scale and an offset are searched by it. Whatever is found is measured as the file was
-(``check_alignment``): only what fits clearly better is named.
+Known frames (``frames.known_frames``) are ranked by the correlation of small renders of the largest Gaussians with the
+photographs. If none fits, a scale and an offset are searched. The result is measured by ``check_alignment`` and
+reported only if it fits clearly better.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import spread
 
 MOST_GAUSSIANS = 20_000
-WIDTH, FINE_WIDTH = 72, 240  # of the small pictures, pixels
-VIEWS = 4  # of them
-SCALES = [10 ** (k / 12) for k in range(-24, 25)]  # a hundredth to a hundred, 21 % apart
-HOPELESS = 0.5  # correlation after the coarse search
-MOST_TRIALS = 80  # of a climb, where a dozen steps do
+WIDTH, FINE_WIDTH = 72, 240  # of the small renders, pixels
+VIEWS = 4  # number of small renders
+SCALES = [10 ** (k / 12) for k in range(-24, 25)]  # a hundredth to a hundred, in steps of 21 %
+LOWEST_CORRELATION = 0.5  # after the coarse search; below it the search ends
+MOST_TRIALS = 80  # of a pattern search, which usually takes a dozen steps
 BETTER_THAN_MEAN = 1.5  # dB
 
 
@@ -35,11 +35,11 @@ class Guess:
     """A frame in which the checkpoint fits.
 
     Attributes:
-        says: what it is, and what to do.
-        psnr: dB, pooled, of the renders in it.
+        description: cause and remedy, for messages.
+        psnr: dB, pooled, of the renders in that frame.
     """
 
-    says: str
+    description: str
     psnr: float
 
 
@@ -47,13 +47,13 @@ class Guess:
 def guess_frame(
     gaussians: Gaussians, views: Sequence[View], found: Alignment, points: Tensor | None = None
 ) -> Guess | None:
-    """A frame that explains the photographs clearly better than the cameras' own; None where none was found.
+    """A frame that explains the photographs clearly better than that of the cameras; None if none was found.
 
-    Clearly: by BETTER_THAN_MEAN dB more than the photographs' mean colours and CLEAR dB more than ``found``.
+    Its PSNR must be BETTER_THAN_MEAN dB above the photographs' mean colours and CLEAR dB above ``found``.
 
     Args:
-        views: all there are: trainers normalise by all the cameras.
-        found: of ``check_alignment``.
+        views: all views, because trainers normalize by all cameras.
+        found: result of ``check_alignment`` for these views.
         points: ``[M, 3]`` the scene's points, world units.
     """
     if len(gaussians) == 0 or found.views == 0:
@@ -64,7 +64,7 @@ def guess_frame(
     def measured(frame: Frame) -> Guess | None:
         psnr = check_alignment(gaussians, _moved(views, frame.viewmats)).psnr
         enough = max(found.mean_colour_psnr + BETTER_THAN_MEAN, found.psnr + CLEAR)
-        return Guess(frame.says, psnr) if psnr >= enough else None
+        return Guess(frame.description, psnr) if psnr >= enough else None
 
     known = measured(max(known_frames(viewmats, points), key=lambda frame: small.score(frame.viewmats)))
     if known:
@@ -74,7 +74,7 @@ def guess_frame(
 
 
 class _Stage:
-    """Small pictures of the Gaussians that cover most, against small photographs."""
+    """Small renders of the Gaussians that cover most, compared with small photographs."""
 
     def __init__(self, gaussians: Gaussians, views: Sequence[View], width: int):
         chosen = spread(range(len(views)), VIEWS)
@@ -87,7 +87,7 @@ class _Stage:
         self.gaussians = gaussians
 
     def score(self, viewmats: Tensor) -> float:
-        """The correlation, in [-1, 1], of pictures from these poses of all the views with the photographs."""
+        """Correlation in [-1, 1] of the photographs with renders from these poses (``[V, 4, 4]``, of all views)."""
         moved = _moved(self.views, viewmats[self.index])
         rows = [row for view in moved if (row := compare(self.gaussians, view)) is not None]
         if not rows:
@@ -97,10 +97,10 @@ class _Stage:
 
 
 def _search(small: _Stage, fine: _Stage, viewmats: Tensor) -> Frame | None:
-    """The best scale and offset; None where nothing comes near the photographs.
+    """The best scale and offset; None if no correlation reaches LOWEST_CORRELATION.
 
-    From the best scale about the origin, and the best one about the point that the cameras look at with the Gaussians'
-    median there, to the nearest maximum of the correlation.
+    Starts from the best scale about the origin, and from the best one about the point that the cameras look at with the
+    median of the Gaussians moved there; climbs from each to the nearest maximum of the correlation.
     """
     focus = focus_of(viewmats)
     unit = float((centres_of(viewmats) - focus).norm(dim=1).quantile(0.5).clamp(min=1e-9))
@@ -110,10 +110,10 @@ def _search(small: _Stage, fine: _Stage, viewmats: Tensor) -> Frame | None:
         place = max(places, key=lambda p: small.score(p.seen_from(viewmats)))
         found.append(_climb(small, viewmats, place, focus, unit, (0.1, 0.02)))
     score, place = max(found, key=lambda pair: pair[0])
-    if score < HOPELESS:
+    if score < LOWEST_CORRELATION:
         return None
     _, place = _climb(fine, viewmats, place, focus, unit, (0.01, 0.001))
-    return Frame(place.says(unit), place.seen_from(viewmats))
+    return Frame(place.description(unit), place.seen_from(viewmats))
 
 
 @dataclass(frozen=True)
@@ -127,26 +127,26 @@ class _Place:
         return into_file(viewmats, torch.eye(3, dtype=viewmats.dtype), self.scale, self.offset)
 
     def neighbours(self, step: float, focus: Tensor, unit: float) -> list[_Place]:
-        """Moved along the axes, and scaled about the point that the cameras look at, so that it stays in sight."""
+        """Moves along the axes, and scales about the point that the cameras look at, which keeps it in view."""
         axes = torch.eye(3, dtype=focus.dtype)
         moves = [_Place(self.scale, self.offset + sign * step * unit * axis) for axis in axes for sign in (1, -1)]
         factors = (1 + step, 1 / (1 + step))
         return moves + [_Place(self.scale * by, focus - by * (focus - self.offset)) for by in factors]
 
-    def says(self, unit: float) -> str:
+    def description(self, unit: float) -> str:
         parts = []
         if abs(math.log(self.scale)) > 0.02:
             larger = self.scale > 1
             parts.append(f"{self.scale if larger else 1 / self.scale:.3g} times {'larger' if larger else 'smaller'}")
         if float(self.offset.norm()) > 0.02 * unit:
             parts.append("moved by (" + ", ".join(f"{value:.3g}" for value in self.offset.tolist()) + ")")
-        return f"the file would have to be {' and '.join(parts) or 'moved a little'}: export it in the cameras' frame"
+        return f"the file should be {' and '.join(parts) or 'moved slightly'}: export it in the cameras' frame"
 
 
 def _climb(
     stage: _Stage, viewmats: Tensor, place: _Place, focus: Tensor, unit: float, steps: tuple[float, float]
 ) -> tuple[float, _Place]:
-    """To the nearest maximum, by a pattern search whose step is halved from one share of ``unit`` to another."""
+    """Pattern search for the nearest maximum; ``steps`` are the first and the last step, shares of ``unit``."""
     step, smallest = steps
     best, trials = stage.score(place.seen_from(viewmats)), 0
     while step >= smallest and trials < MOST_TRIALS:
@@ -162,7 +162,7 @@ def _climb(
 
 
 def _shrunk(view: View, width: int) -> View:
-    """The photograph and camera at a smaller width, by area averages."""
+    """The photograph and its camera at a smaller width, by area averages."""
     camera = view.camera
     if camera.width <= width:
         return view

@@ -1,4 +1,4 @@
-"""A scene in blocks: which Gaussians each has, which views see it, and what all of them begin from."""
+"""Division of a scene into blocks: the Gaussians of each, the views that see it, and the shared initialization."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import attenuate, normalized_distances
 from clod_adapter.cameras import Camera, View, camera_extent
 from clod_adapter.config import AdaptConfig
+from clod_adapter.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
-from clod_adapter.initialization.importance import start
-from clod_adapter.render import splat
+from clod_adapter.initialization.importance import initialize
+from clod_adapter.render import dial, splat
 
-UNSEEN = 0.005  # of what all views show of a block, the share that those it is not trained on may show
-SMALLER = 4  # times, the pictures that tell which views see which blocks
-DIALS = 9  # at which the start's Gaussians are counted
+UNSEEN = 0.005  # of a block's coverage over all views, the share that the views it is not trained on may have
+SMALLER = 4  # downscaling of the images that coverage is measured in
+DIALS = 9  # dial values at which the Gaussians kept by the initialization are counted
 
 
 @dataclass(frozen=True)
 class Division:
-    """A scene in blocks, and what all of them begin from.
+    """A scene divided into blocks, with its initialization.
 
     Attributes:
-        begun: the Gaussians with the sigma_d that training begins from.
-        block: ``[N]`` int16, the block of each.
-        seen: ``[V, B]`` float32, the share of each view's picture that is of each block.
-        kept: ``[V, DIALS]`` float32, how many Gaussians the start keeps in each view, at even steps of log s.
+        initial: the Gaussians with the initial sigma_d.
+        block: ``[N]`` int16, the block of each Gaussian.
+        seen: ``[V, B]`` float32, the share of each view's image that each block covers.
+        kept: ``[V, DIALS]`` float32, Gaussians that the initialization keeps in each view, at even steps of log s.
         extent: of all cameras, world units.
     """
 
-    begun: Gaussians
+    initial: Gaussians
     block: Tensor
     seen: Tensor
     kept: Tensor
@@ -43,20 +43,20 @@ class Division:
 
     @property
     def count(self) -> int:
-        """Of blocks."""
+        """Number of blocks."""
         return self.seen.shape[1]
 
     @property
     def passes(self) -> int:
-        """How often each block is trained; one that is alone has nothing to come into accord with."""
+        """Number of training passes over each block; a single block needs no second one."""
         return 2 if self.count > 1 else 1
 
     def rows(self, block: int) -> Tensor:
-        """``[n]`` int64, ascending: the Gaussians of a block."""
+        """``[n]`` int64, ascending: the rows of a block."""
         return (self.block == block).nonzero()[:, 0]
 
     def views(self, block: int) -> list[int]:
-        """The fewest views that show all but UNSEEN of what is seen of a block, ascending; none of an unseen one."""
+        """The fewest views with all but UNSEEN of a block's coverage, ascending; none for an unseen block."""
         shares, order = self.seen[:, block].double().sort(descending=True, stable=True)
         covered = shares.cumsum(0)
         if not covered[-1] > 0:
@@ -65,15 +65,15 @@ class Division:
         return sorted(order[:fewest].tolist())
 
     def steps(self, block: int, config: AdaptConfig) -> int:
-        """Of a block, both passes: as many as an undivided run takes of the views that see it."""
+        """Training steps of a block in both passes: as many as an undivided run takes of the views that see it."""
         return math.ceil(config.iters * len(self.views(block)) / len(self.seen))
 
 
 def split(means: Tensor, count: int) -> Tensor:
-    """``[N]`` int16: which of ``count`` blocks each centre is in; blocks differ by at most one in size.
+    """``[N]`` int16: the block, of ``count``, of each centre; block sizes differ by at most one.
 
-    A k-d tree: the longest side is halved at the median (at the fitting quantile where the count is odd). Sides are
-    taken between the 5 % and the 95 % quantile, so that a few far Gaussians do not decide where a scene is cut.
+    A k-d tree: the longest side is split at the median (at the corresponding quantile where the count is odd). Sides
+    are measured between the 5 % and the 95 % quantile, so that a few far Gaussians do not determine the split.
 
     Raises:
         ClodError: there are fewer Gaussians than blocks.
@@ -98,7 +98,7 @@ def split(means: Tensor, count: int) -> Tensor:
 
 
 def first_size(total: int, parts: int, fewer: int) -> int:
-    """How many of ``total`` the first ``fewer`` of ``parts`` even parts have."""
+    """Size of the first ``fewer`` of ``parts`` even parts of ``total``."""
     whole, rest = divmod(total, parts)
     return fewer * whole + min(fewer, rest)
 
@@ -110,38 +110,38 @@ def divide(
     count: int,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Division:
-    """Splits a scene into ``count`` blocks and takes the start, of the whole scene, that all of them begin from.
+    """Splits a scene into ``count`` blocks and initializes sigma_d on the whole scene.
 
     Args:
-        views: ``importance.seeing`` of the training views.
-        progress: as ``importance.start`` calls it, and with "blocks" and the number of views looked at, and of all.
+        views: ``importance.usable_views`` of the training views.
+        progress: as ``importance.initialize`` calls it, then with "blocks", the number of views rendered and of all.
 
     Raises:
-        ClodError: the settings are some that blocks cannot be trained with, or there are fewer Gaussians than blocks.
+        ClodError: blocks cannot be trained with these settings, or there are fewer Gaussians than blocks.
     """
     check_divisible(config)
     block = split(base.means, count)
-    begun = start(base.without_empty_bands(), views, config, progress)
-    assert begun.attenuation is not None
-    if begun.attenuation.normalizer != "scene":
+    initial = initialize(base.without_empty_bands(), views, config, progress)
+    assert initial.attenuation is not None
+    if initial.attenuation.normalizer != "scene":
         raise ClodError(
-            f"the checkpoint's dial has the normaliser {begun.attenuation.normalizer}, whose distances depend on all "
+            f"the checkpoint's dial has the normaliser {initial.attenuation.normalizer}, whose distances depend on all "
             "Gaussians in view: it cannot be trained in blocks; adapt it whole"
         )
     seen, kept = torch.empty(len(views), count), torch.empty(len(views), DIALS)
     for k, view in enumerate(views):
-        shown = coverage(begun, begun.opacities, _smaller(view.camera)).double()
+        shown = coverage(initial, initial.opacities, _smaller(view.camera)).double()
         seen[k] = (shown.new_zeros(count).index_add_(0, block.long(), shown) / shown.sum().clamp(min=1e-9)).float()
-        kept[k] = torch.tensor(kept_counts(begun, view, dial_grid(config)))
+        kept[k] = torch.tensor(kept_counts(initial, view, dial_grid(config)))
         if progress:
             progress("blocks", k + 1, len(views))
-    begun = base.replace(sigma_d=begun.sigma_d, attenuation=begun.attenuation)
-    extent = camera_extent([view.camera for view in views]) or begun.attenuation.reference_distance  # type: ignore[union-attr]
-    return Division(begun, block, seen, kept, extent)
+    initial = base.replace(sigma_d=initial.sigma_d, attenuation=initial.attenuation)
+    extent = camera_extent([view.camera for view in views]) or initial.attenuation.reference_distance  # type: ignore[union-attr]
+    return Division(initial, block, seen, kept, extent)
 
 
 def check_divisible(config: AdaptConfig) -> None:
-    """Raises the ClodError of settings that need all of a scene at once."""
+    """Raises ClodError for settings that need the whole scene at once."""
     if config.count_term == "paper" or config.normalizer != "scene":
         raise ClodError(
             "the paper's form cannot be trained in blocks: its count and its distances are of all Gaussians at once; "
@@ -156,17 +156,16 @@ def dial_grid(config: AdaptConfig) -> list[float]:
 
 @torch.no_grad()
 def kept_counts(gaussians: Gaussians, view: View, dials: Sequence[float]) -> list[float]:
-    """How many Gaussians are kept in a view at some dial values."""
-    assert gaussians.sigma_d is not None and gaussians.attenuation is not None
+    """The number of Gaussians kept in a view at some dial values."""
+    assert gaussians.attenuation is not None
     distances = normalized_distances(gaussians.means, view.camera, gaussians.attenuation)
-    given = gaussians.opacity_logits, gaussians.sigma_d, distances
-    return [float(attenuate(*given, s, gaussians.attenuation).keep.sum()) for s in dials]
+    return [float(dial(gaussians, distances, s).keep.sum()) for s in dials]
 
 
 def coverage(gaussians: Gaussians, opacities: Tensor, camera: Camera) -> Tensor:
-    """``[N]`` how many pixels each Gaussian covers: the sum over the picture of its transmittance times its alpha.
+    """``[N]`` pixels that each Gaussian covers: the sum over the image of its transmittance times its alpha.
 
-    The gradient of a picture by the colours that it is mixed from.
+    This is the gradient of the image by the Gaussians' colours.
     """
     grey = gaussians.sh0.new_zeros(gaussians.sh0.shape).requires_grad_()
     plain = gaussians.replace(sh0=grey, shN=gaussians.shN[:, :0], sigma_d=None, attenuation=None)
@@ -176,7 +175,7 @@ def coverage(gaussians: Gaussians, opacities: Tensor, camera: Camera) -> Tensor:
 
 
 def _smaller(camera: Camera) -> Camera:
-    """The same view in fewer pixels."""
+    """The same view with fewer pixels."""
     width, height = (max(size // SMALLER, 1) for size in (camera.width, camera.height))
     shrink = camera.K.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
     return replace(camera, K=camera.K * shrink, width=width, height=height)

@@ -1,6 +1,6 @@
-"""What jobs on one scene hand to each other, as safetensors files: the division they begin from, and what each learned.
+"""Files that jobs on one scene exchange, as safetensors: the division, and the trained rows of each block.
 
-One JSON document under the metadata key ``clod_adapter_block`` says which run a file is of.
+One JSON document under the metadata key ``clod_adapter_block`` identifies the run of a file.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ KEY = "clod_adapter_block"
 
 
 def save_block(path: Path, tensors: dict[str, Tensor], about: dict[str, Any], belongs: dict[str, Any]) -> None:
-    """Writes tensors and what is said of them; loading gives the same bits.
+    """Writes tensors with a description; loading gives the same bits.
 
     Args:
-        about: plain JSON, of this file; an ``AttenuationConfig`` in it is written as its fields.
-        belongs: plain JSON: which run it is of.
+        about: plain JSON, describes this file; an ``AttenuationConfig`` in it is written as its fields.
+        belongs: plain JSON, identifies the run.
 
     Raises:
         ClodError: the file cannot be written.
@@ -43,10 +43,10 @@ def save_block(path: Path, tensors: dict[str, Tensor], about: dict[str, Any], be
 
 
 def load_block(path: Path, belongs: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """The tensors and what is said of them.
+    """The tensors and their description.
 
     Raises:
-        ClodError: the file cannot be read, is damaged, or of another run than ``belongs`` says.
+        ClodError: the file cannot be read, is damaged, or is of another run than ``belongs``.
     """
     refuse_irregular(path, "remove it")
     with damaged(path):
@@ -66,14 +66,14 @@ def load_block(path: Path, belongs: dict[str, Any]) -> tuple[dict[str, Tensor], 
 
 @contextmanager
 def damaged(path: Path) -> Iterator[None]:
-    """Says of what goes wrong within, in reading a file, that it does: as a ClodError."""
+    """Turns errors of reading a file, raised within, into a ClodError that names it."""
     try:
         yield
     except OSError as error:
         raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
     except MemoryError:  # of a file that is whole
         raise
-    except Exception as error:  # SafetensorError, and whatever a crafted file provokes
+    except Exception as error:  # SafetensorError, and anything that a crafted file provokes
         raise ClodError(f"{path}: is no block or damaged ({error!r}); remove it to have it made anew") from error
 
 

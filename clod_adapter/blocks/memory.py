@@ -1,8 +1,7 @@
-"""What an adaptation takes in memory, and in how many blocks it stays below a limit.
+"""The memory that adapting takes, and the number of blocks that keeps it below a limit.
 
-The bytes a Gaussian are measured ones (docs/blocks.md), for the CPU rasterizer and float32 throughout; each is the
-largest that the phase had at once. What is drawn beside a block depends on where the cameras are; a plan takes it to be
-everything.
+Bytes per Gaussian are measured (docs/blocks.md), with the CPU rasterizer in float32; each is the peak of its phase. The
+context of a block depends on the cameras; a plan assumes that it is the whole scene.
 """
 
 from __future__ import annotations
@@ -14,24 +13,24 @@ from dataclasses import dataclass
 from clod_adapter.errors import ClodError
 
 PROCESS = 520e6  # the interpreter, torch, compiled kernels
-PIXEL = 260  # a pixel: picture, photograph, their maps and gradients, lists of tiles
-DRAWN = 640  # a Gaussian that is drawn, beside its attributes: scratch of the rasterizer, gradients
-TRAINED = 640  # one that is trained, on top: its copy, moments, mean, and the saving of all that
-ORDERED = 560  # one whose place in the order of leaving is looked for
-MERGED = 130  # one, while blocks are trained: what the pass before has made of it, and what this one has so far
-WRITTEN = 560  # one that is written: what changed, and the rows of the file
+PIXEL = 260  # per pixel: image, photograph, their maps and gradients, lists of tiles
+DRAWN = 640  # per rendered Gaussian, besides its attributes: rasterizer buffers, gradients
+TRAINED = 640  # more per trained Gaussian: its copy, moments, mean, and their saving
+ORDERED = 560  # per Gaussian, while the pruning order is computed
+MERGED = 130  # per Gaussian, while blocks are trained: result of the previous pass and, so far, of this one
+WRITTEN = 560  # per written Gaussian: changes, and the rows of the file
 IMAGES = 1 / 8  # of the limit, the share that photographs may take
 MOST_BLOCKS = 1024
 
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """What a scene is, as far as memory goes.
+    """The sizes that a scene's memory is estimated from.
 
     Attributes:
         count: Gaussians; attributes: bytes of one in memory; row: its bytes in the file.
         images: bytes of all photographs; pixels: of the largest.
-        pictures: bytes of those that were made, and so cannot be read again: they stay.
+        pictures: bytes of rendered images, which cannot be read again and stay in memory.
     """
 
     count: int
@@ -44,13 +43,13 @@ class MemoryEstimate:
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """How a scene is adapted below a limit; all in bytes.
+    """A plan for adapting below a limit; sizes in bytes.
 
     Attributes:
-        blocks: 1 where the whole fits.
-        cache: what photographs may take, and of a block its own pictures once more.
-        base, start, train, write: the most that is in memory at a time, in all: when the checkpoint is read, while it
-            is ranked, in training, and when it is written.
+        blocks: their number; 1 where the whole scene fits.
+        cache: limit of photographs in memory, and, for blocks, again of target images.
+        base, start, train, write: peak memory while the checkpoint is read, during initialization, in training, and
+            while the result is written.
     """
 
     limit: int
@@ -67,10 +66,10 @@ class MemoryPlan:
 
 
 def plan_for_limit(needs: MemoryEstimate, limit: int) -> MemoryPlan:
-    """The fewest blocks with which nothing takes more than ``limit`` bytes.
+    """The plan with the fewest blocks whose peak is at most ``limit`` bytes.
 
     Raises:
-        ClodError: however many blocks, it takes more; says how much.
+        ClodError: no number of blocks is enough; the message gives the least memory.
     """
     most = min(MOST_BLOCKS, max(needs.count, 1))
     plans = (_plan(needs, limit, blocks) for blocks in range(1, most + 1))
@@ -84,7 +83,7 @@ def plan_for_limit(needs: MemoryEstimate, limit: int) -> MemoryPlan:
 
 
 def least(needs: MemoryEstimate) -> int:
-    """The smallest limit that there is a plan for, bytes, rounded up to a tenth of a gigabyte."""
+    """The smallest possible limit, bytes, rounded up to a tenth of a gigabyte."""
     limit, most = 100_000_000, min(MOST_BLOCKS, max(needs.count, 1))
     while min(_plan(needs, limit, blocks).peak for blocks in (1, most)) > limit:
         limit += 100_000_000
@@ -94,7 +93,7 @@ def least(needs: MemoryEstimate) -> int:
 def _plan(needs: MemoryEstimate, limit: int, blocks: int) -> MemoryPlan:
     count, cache = needs.count, min(needs.images, int(IMAGES * limit))
     always = PROCESS + cache + needs.pictures + PIXEL * needs.pixels
-    if blocks > 1:  # a block's pictures are its own
+    if blocks > 1:  # a block has target images of its own
         cache = min(needs.images + needs.pictures, int(IMAGES * limit))
         always += cache
     if blocks == 1:  # the file's rows stay in memory
@@ -118,10 +117,10 @@ UNITS = {"K": 1, "M": 2, "G": 3, "T": 4}
 
 
 def parse_size(text: str) -> int:
-    """Bytes of a size as people write it: ``8GB``, ``500 MB``, ``7.5GiB``, ``16G``.
+    """Bytes of a size with a unit: ``8GB``, ``500 MB``, ``7.5GiB``, ``16G``.
 
     Raises:
-        ClodError: it is none, or has no unit.
+        ClodError: the text is no size, or has no unit.
     """
     found = re.fullmatch(r"\s*([0-9]+\.?[0-9]*|\.[0-9]+)\s*([KMGT])(i?)B?\s*", text, re.IGNORECASE)
     if found is None:

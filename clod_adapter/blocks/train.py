@@ -1,21 +1,21 @@
-"""Scenes that do not fit: adapting block by block, each with the views that see it, the rest of the scene frozen.
+"""Adapting scenes that do not fit in memory: block by block, each with the views that see it, the rest frozen.
 
-In a first pass each block is trained against the *checkpoint* of the others: they are drawn as if they had no dial, at
-every dial value, which is what their own training aims at, and the block's pictures to be are the photographs as far as
-it can answer for them (``target``). So no block makes up for what another one will. (Against the others' start, at the
-same dial value, each brightens what all have faded: pictures of the merged result were 8 to 11 dB worse,
-docs/blocks.md.) In a second pass each goes on beside the others as the first has left them, at the dial, which brings
-the blocks into accord. Within a pass the jobs are independent, and their order does not matter; what they learn
-is put together by rows.
+In the first pass each block is trained against the *checkpoint* of the others: these are drawn without a dial at every
+dial value, which is what their own training aims at, and the block's target images are the photographs as far as its
+Gaussians cover them (``target_image``). So no block corrects the errors of another. (Trained against the others'
+initialization at the same dial value, each block brightens what all have faded: images of the merged result were 8 to
+11 dB worse, docs/blocks.md.) In the second pass each block continues with the others at the dial, as the first pass
+trained them, which makes the blocks consistent. Within a pass blocks are independent and may be trained in any order;
+their rows are then merged.
 
-What an undivided run has for all of the scene, a block has its share of:
+Each block has its share of an undivided run:
 
-- The start (importance, order of leaving, sigma_d, tau) is of the whole scene.
+- The initialization (importance, pruning order, sigma_d, tau) is that of the whole scene.
 - The unit of position steps is the extent of all cameras.
 - A block takes as many steps as the undivided run takes of the views that see it, so that each Gaussian is stepped as
   often. All blocks together take more, as a view may see several.
-- The count law is of all Gaussians. A block is asked for its own share of the Gaussians that the start keeps in the
-  same view at the same dial value, as far as those add up to the law (``TargetShares``).
+- The target-count curve counts all Gaussians. A block's target is its share of the Gaussians that the initialization
+  keeps in the same view at the same dial value, scaled to the curve (``with_target_shares``).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from torch import Tensor
 
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.blocks.divide import Division
-from clod_adapter.blocks.targets import TargetShares, beside, config_of, target
+from clod_adapter.blocks.targets import block_config, context_rows, target_image, with_target_shares
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
@@ -43,11 +43,11 @@ from clod_adapter.training.state import Adapted, Progress, TrainingState
 
 @dataclass(frozen=True)
 class Learned:
-    """What the training of one block gives.
+    """The trained rows of one block.
 
     Attributes:
-        rows: ``[n]`` int64, which Gaussians of the scene.
-        values: their attributes that were trained, and ``sigma_d``, by name.
+        rows: ``[n]`` int64, rows of the scene.
+        values: their trained attributes and ``sigma_d``, by name.
         steps, seconds: of the training.
     """
 
@@ -68,32 +68,34 @@ def adapt_block(
     resume: TrainingState | None = None,
     cache: ImageCache | None = None,
 ) -> tuple[Learned, Adapted]:
-    """One pass of training one block; the same arguments give the same bits wherever it is done.
+    """One pass of training one block; the same arguments give the same bits on every machine of a kind.
 
     Args:
-        views: all those that ``divide`` was given.
-        config: of the whole scene; ``config_of`` is what the block has of it.
+        views: all views that ``divide`` was given.
+        config: of the whole scene; ``block_config`` derives the block's.
         block: from 0.
-        after: of the second pass: all blocks' first, put together by ``merge``.
-        resume: as ``train.adapt`` takes it, from an earlier call for the same block and pass.
-        cache: keeps pictures that would else all stay in memory.
+        after: in the second pass, the scene after the first, from ``merge``.
+        resume: as in ``training.loop.adapt``, from an earlier call for the same block and pass.
+        cache: of target images, which otherwise all stay in memory.
 
     Returns:
-        What it learned, and the outcome of ``train.adapt``, whose first Gaussians are those of the block. One that
-        no view sees has nothing to learn, and stays.
+        The trained rows, and the result of ``training.loop.adapt``, whose first Gaussians are those of the block. A
+        block that no view sees stays unchanged.
     """
-    scene = after or division.begun
+    scene = after or division.initial
     rows, own = division.rows(block), [views[k] for k in division.views(block)]
     if not own:
         unseen = scene.select(rows)
         return _learned(division, rows, Adapted(unseen, 0, 0.0, 0.0, interrupted=False))
-    gaussians = scene.select(torch.cat([rows, beside(division, block, own, after, _told(progress, "beside", scene))]))
+    context = context_rows(division, block, own, after, _told(progress, "beside", scene))
+    gaussians = scene.select(torch.cat([rows, context]))
     if after is None:
-        own = _aimed(gaussians, len(rows), own, cache, _told(progress, "targets", scene))
-    quotas = TargetShares(division, block, own, config, first=after is None, progress=_told(progress, "quotas", scene))
-    part = TrainableSubset(len(rows), division.extent, quotas, rest_in_full=after is None)
-    settings = config_of(division, block, config, first=after is None)
-    adapted = adapt(gaussians, Scene(tuple(own), ()), settings, progress, resume, part=part)
+        own = _with_target_images(gaussians, len(rows), own, cache, _told(progress, "targets", scene))
+    told = _told(progress, "quotas", scene)
+    targets = with_target_shares(division, block, own, config, first=after is None, progress=told)
+    part = TrainableSubset(len(rows), division.extent, full_context=after is None)
+    settings = block_config(division, block, config, first=after is None)
+    adapted = adapt(gaussians, Scene(tuple(targets), ()), settings, progress, resume, part=part)
     return _learned(division, rows, adapted)
 
 
@@ -101,7 +103,7 @@ def _learned(division: Division, rows: Tensor, adapted: Adapted) -> tuple[Learne
     values = {name: value[: len(rows)] for name, value in adapted.gaussians.tensors().items()}
     changed = {
         name: value.clone() for name, value in values.items()
-        if name == "sigma_d" or not torch.equal(value, getattr(division.begun, name)[rows])
+        if name == "sigma_d" or not torch.equal(value, getattr(division.initial, name)[rows])
     }  # fmt: skip
     return Learned(rows, changed, adapted.steps, adapted.seconds), adapted
 
@@ -114,25 +116,25 @@ def _told(
     return lambda done, total: progress(Progress(phase, done, total, 0.0, done / total, math.nan, lambda: scene))
 
 
-def _aimed(
+def _with_target_images(
     gaussians: Gaussians, own: int, views: Sequence[View], cache: ImageCache | None,
     progress: Callable[[int, int], None] | None,
 ) -> list[View]:  # fmt: skip
-    """The views with their ``target`` in place of the photograph."""
+    """The views with their ``target_image`` in place of the photograph."""
     found = []
     for view in views:
-        aimed = View(view.camera, target(gaussians, own, view))
-        found.append(cache.store(aimed, partial(target, gaussians, own, view)) if cache else aimed)
+        aimed = View(view.camera, target_image(gaussians, own, view))
+        found.append(cache.store(aimed, partial(target_image, gaussians, own, view)) if cache else aimed)
         if progress:
             progress(len(found), len(views))
     return found
 
 
 def merge(division: Division, learned: Sequence[Learned]) -> Gaussians:
-    """The scene with what its blocks have learned.
+    """The scene with the trained rows of its blocks.
 
     Raises:
-        ClodError: a Gaussian is in none of them, or in two.
+        ClodError: a Gaussian is in no block or in two.
     """
     times = torch.zeros_like(division.block, dtype=torch.int32)
     for part in learned:
@@ -142,8 +144,8 @@ def merge(division: Division, learned: Sequence[Learned]) -> Gaussians:
     merged = {}
     for name in (*ATTRIBUTES, "sigma_d"):
         if any(name in part.values for part in learned):
-            merged[name] = getattr(division.begun, name).clone()
+            merged[name] = getattr(division.initial, name).clone()
             for part in learned:
                 if name in part.values:
                     merged[name][part.rows] = part.values[name]
-    return division.begun.replace(**merged)
+    return division.initial.replace(**merged)

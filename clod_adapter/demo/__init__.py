@@ -1,1 +1,1 @@
-"""The demo: a small ray-traced gallery, whose ground truth owes nothing to splatting, and pictures of the results."""
+"""The demo: a small ray-traced gallery as ground truth, independent of splatting, and figures of the results."""

@@ -1,4 +1,4 @@
-"""A base checkpoint for the demo's capture, trained from its point cloud with the project's own rasterizer."""
+"""Trains the base checkpoint of the demo from its point cloud, with this package's rasterizer."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def fit_base(
     iters: int,
     progress: Callable[[Progress], None] | None = None,
 ) -> Gaussians:
-    """Trains one Gaussian per point at full detail: adapting with a dial that does nothing and 3DGS's step sizes.
+    """Trains one Gaussian per point at s = 1: ``adapt`` without fading and with 3DGS's learning rates.
 
     Args:
         points: ``[N, 3]`` world units; colors: ``[N, 3]`` uint8.
@@ -35,12 +35,12 @@ def fit_base(
         lr_opacities=5e-2, lr_sh0=2.5e-3, lr_shN=1.25e-4, lr_final=0.05, average=0.0,
     )  # fmt: skip
     initial = from_points(points, colors)
-    frozen = torch.full((len(initial),), SIGMA_MAX / 10)  # fades nothing, and is no unset dial that would be started
+    frozen = torch.full((len(initial),), SIGMA_MAX / 10)  # no fading; SIGMA_MAX would be initialized
     return detach(adapt(attach(initial, frozen), scene, config, progress).gaussians)
 
 
 def from_points(points: np.ndarray, colors: np.ndarray, *, sh_degree: int = 3) -> Gaussians:
-    """3DGS's start: round Gaussians as wide as the distance to the nearest points, opacity 0.1, flat colour."""
+    """3DGS's initialization: isotropic Gaussians scaled by the distance to neighbours, opacity 0.1, SH degree 0."""
     means = torch.from_numpy(points).float()
     n = len(means)
     rgb = torch.from_numpy(colors).float() / 255
@@ -56,6 +56,6 @@ def from_points(points: np.ndarray, colors: np.ndarray, *, sh_degree: int = 3) -
 
 
 def neighbour_distance(means: Tensor) -> Tensor:
-    """``[N]`` root mean square distance to the three nearest others."""
+    """``[N]`` root mean square distance to the three nearest neighbours."""
     found = [torch.cdist(block, means).topk(4, largest=False).values[:, 1:] for block in means.split(1024)]
     return torch.cat(found).square().mean(1).sqrt()

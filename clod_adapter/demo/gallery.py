@@ -1,4 +1,4 @@
-"""The demo scene: a small gallery of framed photographs and solids, ray-traced, and written as a COLMAP capture.
+"""The demo scene: a ray-traced gallery of framed photographs and solids, written as a COLMAP capture.
 
 World axes: x right, y DOWN, z into the room, in metres; so upright photographs have the usual COLMAP orientation. The
 room is 6 m wide (x from -3 to 3), 8 m long (z from 0 to 8) and 3 m high (floor at y = 0, ceiling at y = -3).
@@ -24,8 +24,8 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.scene.colmap import write_model
 
 LOW, HIGH = np.array([-3.0, -3.0, 0.0]), np.array([3.0, 0.0, 8.0])
-CANDIDATES = 4  # pixels looked at per point, of which those with detail are preferred
-HOLD_OUT = 8  # every 8th view by name is a test view; the point cloud must not see it
+CANDIDATES = 4  # pixels sampled per point; those with detail are preferred
+HOLD_OUT = 8  # every 8th view by name is held out, from the point cloud too
 OAK, BLACK, WHITE, GOLD = (122, 84, 52), (34, 32, 32), (226, 222, 214), (168, 128, 66)
 
 # name, wall, metres along the wall, height of the centre, width and height in metres, frame
@@ -44,7 +44,7 @@ PICTURES = (
 
 @dataclass(frozen=True)
 class Gallery:
-    """The lit scene. Make it with `make_gallery`.
+    """The lit scene, made by `make_gallery`.
 
     Attributes:
         tables: the ray tracer's scene.
@@ -59,22 +59,23 @@ class Gallery:
         return encode_srgb(render_linear(self.tables, camera, self.samples))
 
     def cameras(self, width: int = 320, height: int = 240, count: int = 64) -> list[Camera]:
-        """`count` cameras named ``view_000.png`` on, along smooth paths: some look across the room, some pass by close.
+        """`count` cameras named from ``view_000.png`` on, along smooth paths, both far from and close to the surfaces.
 
-        With the default count the held-out views, every 8th, lie between neighbours on their path.
+        With the default count, held-out views (every 8th) lie between neighbours on their path.
         """
         return path_cameras(width, height, count)
 
     def sample_points(self, n: int, seed: int = 0, views: int = 64) -> tuple[np.ndarray, np.ndarray]:
-        """A point cloud as structure from motion would give it, from rays of the training cameras.
+        """A point cloud like that of structure from motion, from rays of the training cameras.
 
         Args:
-            n: number of points; near surfaces and detail get more, as from feature matches.
-            seed: of the pixels that are chosen and of the noise.
-            views: how many cameras the capture has, at least 2, of which every 8th is left out.
+            n: number of points; denser on near surfaces and on detail, like feature matches.
+            seed: of pixel selection and noise.
+            views: number of cameras in the capture, at least 2; every 8th is held out.
 
         Returns:
-            points ``[n, 3]`` float32 metres, off by about 0.3 % of their distance, and colours ``[n, 3]`` uint8 sRGB.
+            points ``[n, 3]`` float32 metres, with noise of about 0.3 % of their distance, and colours ``[n, 3]`` uint8
+            sRGB.
         """
         require(views >= 2, "views", views, "at least 2")
         random = np.random.default_rng(seed)
@@ -108,12 +109,12 @@ class Gallery:
 
 
 def make_gallery(samples: int = 3) -> Gallery:
-    """Builds the room and bakes its light; several seconds."""
+    """Builds the room and bakes its light, which takes several seconds."""
     return Gallery(bake(unlit_room()), samples)
 
 
 def unlit_room() -> Tables:
-    """The room before any light is computed: every surface has its texture's own colours."""
+    """The room without light: every surface has the colours of its texture."""
     scene = SceneBuilder(materials())
     add_room(scene)
     add_pictures(scene)
@@ -122,7 +123,7 @@ def unlit_room() -> Tables:
 
 
 def materials() -> dict[str, np.ndarray]:
-    """Every texture of the scene by name; pictures carry their file's name."""
+    """All textures of the scene by name; pictures have the names of their files."""
     pictures = {name: tx.framed(name, size, frame) for name, _, _, _, size, frame in PICTURES}
     return pictures | {
         "floor": tx.planks((108, 74, 46), (176, 132, 88)),
@@ -161,7 +162,7 @@ def add_room(scene: SceneBuilder) -> None:
 
 
 def add_pictures(scene: SceneBuilder) -> None:
-    """Every picture as a thin box on its wall."""
+    """All pictures, as thin boxes on their walls."""
     depth = 0.05
     walls = {"left": -np.pi / 2, "right": np.pi / 2, "end": 0.0, "start": np.pi}
     for name, wall, along, middle, (width, height), _ in PICTURES:
@@ -174,7 +175,7 @@ def add_pictures(scene: SceneBuilder) -> None:
 
 
 def add_solids(scene: SceneBuilder) -> None:
-    """What stands on the floor: plinths with balls and a box, a brick column, a bench and a planter."""
+    """Objects on the floor: plinths with balls and a box, a brick column, a bench and a planter."""
     white, oak = Finish("white"), Finish("oak", tile=0.6, light_texel=0.03)
     scene.box((0, 0, 4), (0.56, 0.85, 0.56), white, turn=0.4)
     scene.ball((0, -1.12, 4), 0.27, Finish("enamel", gloss=0.12, light_texel=0.03))
@@ -202,8 +203,8 @@ def write_gallery(
     """Renders the capture into a new `folder`: ``images/*.png`` and a COLMAP model with a point cloud.
 
     Args:
-        folder: does not exist or is empty; it appears when everything in it is complete.
-        count: number of views, at least 2, of which every 8th by name is meant for testing.
+        folder: does not exist or is empty; it is created atomically.
+        count: number of views, at least 2; every 8th by name is held out.
         points: size of the point cloud.
         progress: called with (views done, views in all) after each view.
 

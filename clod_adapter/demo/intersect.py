@@ -1,7 +1,7 @@
-"""Where rays meet flat rectangles, discs, spheres and upright cylinders: the geometry of the ray tracer, compiled.
+"""Compiled intersections of rays with flat rectangles, discs, spheres and upright cylinders.
 
-World axes have y pointing down. Rays are six floats, origin and direction; vectors inside compiled code are spelled out
-component by component, which is what makes it fast.
+World axes have y pointing down. Rays are six floats, origin and direction. Compiled code writes vectors component by
+component, which is fastest.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ import numpy as np
 from numba import njit
 
 QUAD, DISC, SPHERE, CYLINDER = range(4)
-# Not cached on disk: numba would not notice when a function that is inlined from another file has changed.
+# Not cached on disk: numba does not detect changes of functions inlined from other files.
 compiled = njit(nogil=True, error_model="numpy")
 
 
 def record(integers: str, floats: str) -> np.dtype:
-    """A row of a scene table: named int64 and float64 columns."""
+    """Type of a row of a scene table, with named int64 and float64 columns."""
     return np.dtype([(name, np.int64) for name in integers.split()] + [(name, np.float64) for name in floats.split()])
 
 
 # A quad or disc holds x + a u + b v for u, v in 0..1, and n points to its visible side. A sphere has its centre in x
-# and its radius in ax. A cylinder stands on x with radius ax and height bx. `raytrace.Tables` explains the rest.
+# and its radius in ax. A cylinder has its base in x, radius ax and height bx. `raytrace.Tables` has the other fields.
 SURFACE = record(
     "kind level levels light light_height light_width mirror",
     "x y z ax ay az bx by bz nx ny nz repeat_u repeat_v texel glow gloss",
 )
-GROUP = record("first end", "low_x low_y low_z high_x high_y high_z")  # neighbouring surfaces in one box
+GROUP = record("first end", "low_x low_y low_z high_x high_y high_z")  # consecutive surfaces with a common bounding box
 
 
 @compiled
@@ -51,7 +51,7 @@ def surface_point(s: Any, u: float, v: float) -> Any:
 
 @compiled
 def hit_flat(s: Any, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, far: float) -> Any:
-    """Distance to a quad or disc and where on it: t, u, v; t = far for a miss. Both sides count."""
+    """Distance to a quad or disc and position on it: t, u, v; t = far for a miss. Both sides are hit."""
     slope = s.nx * dx + s.ny * dy + s.nz * dz
     if abs(slope) < 1e-12:
         return far, 0.0, 0.0
@@ -97,7 +97,7 @@ def nearest(
     surfaces: np.ndarray, groups: np.ndarray,
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, far: float,
 ) -> Any:  # fmt: skip
-    """The first surface along a ray: index (-1 for none nearer than far), t, u, v."""
+    """The first surface along a ray: index (-1 if none is closer than far), t, u, v."""
     found, best_u, best_v = -1, 0.0, 0.0
     ix, iy, iz = 1 / (dx + 1e-15), 1 / (dy + 1e-15), 1 / (dz + 1e-15)
     for k in range(len(groups)):

@@ -1,6 +1,6 @@
-"""Bakes the light of a scene: soft shadows from its lamps, light passed between surfaces, a glossy ball's mirror.
+"""Bakes the light of a scene: soft shadows of lamps, indirect light, reflections of glossy balls.
 
-All of it is stored on the surfaces: a render costs one ray per sample, and matt surfaces look the same from everywhere.
+Light is stored on the surfaces: a render costs one ray per sample, and matt surfaces do not depend on the view.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from clod_adapter._support.workers import in_order
 from clod_adapter.demo.intersect import compiled, nearest, surface_point
 from clod_adapter.demo.raytrace import MIRROR_HEIGHT, Tables, radiance, trace_rays
 
-LIFT = 1e-4  # world units a ray starts above its surface
-GATHER_SPREAD = 0.2  # width of a light-gathering ray per unit of distance: coarse textures, less noise
-CHUNK = 2048  # light map texels per task
+LIFT = 1e-4  # world units from the surface to the origin of a ray
+GATHER_SPREAD = 0.2  # width of a gathering ray per unit of distance: coarse textures, less noise
+BLOCK = 2048  # light map texels per task
 
 
 @compiled
@@ -53,15 +53,15 @@ def lamp_light(
 
 @compiled
 def bounced_light(tables: Any, where: np.ndarray, uv: np.ndarray, jitter: np.ndarray, n: int, out: np.ndarray) -> None:
-    """Fills out ``[K, 3]`` with the mean radiance that ``n * n`` cosine-weighted rays bring from other surfaces.
+    """Fills out ``[K, 3]`` with the mean radiance of other surfaces along ``n * n`` cosine-weighted rays.
 
-    The lamps must be dark: `lamp_light` has them, with less noise.
+    Lamps must not glow here: `lamp_light` adds their light, with less noise.
     """
     surfaces, groups, levels, texels, light = tables
     for k in range(len(where)):
         px, py, pz, nx, ny, nz = surface_point(surfaces[where[k]], uv[k, 0], uv[k, 1])
         px, py, pz = px + LIFT * nx, py + LIFT * ny, pz + LIFT * nz
-        # any frame around the normal will do
+        # any tangent frame
         ax, ay, az = (nz, 0.0, -nx) if abs(ny) < 0.9 else (0.0, -nz, ny)
         f = 1 / sqrt(ax * ax + ay * ay + az * az)
         ax, ay, az = ax * f, ay * f, az * f
@@ -82,29 +82,29 @@ def bake(tables: Tables, lamp_rays: int = 5, bounce_rays: int = 8, bounces: int 
 
     Args:
         tables: a closed scene (every ray hits something), its light maps at any value.
-        lamp_rays, bounce_rays: strata per axis; rays per texel are their squares (per lamp, per bounce).
-        bounces: how often light is passed on from surface to surface.
+        lamp_rays, bounce_rays: strata per axis; a texel gets their squares in rays (per lamp, per bounce).
+        bounces: number of reflections between surfaces.
     """
     where, uv, jitter = light_texels(tables.surfaces)
     lamps = np.flatnonzero(tables.surfaces["glow"])
-    direct = in_chunks(len(where), lambda k, out: lamp_light(tables, lamps, where[k], uv[k], jitter[k], lamp_rays, out))
+    direct = in_blocks(len(where), lambda k, out: lamp_light(tables, lamps, where[k], uv[k], jitter[k], lamp_rays, out))
     direct = smoothed(direct, tables.surfaces, 1)
     dark = tables.surfaces.copy()
     dark["glow"] = 0
 
-    def passed_on(light: np.ndarray) -> np.ndarray:
+    def bounced(light: np.ndarray) -> np.ndarray:
         scene = tables._replace(surfaces=dark, light=light)
-        found = in_chunks(len(where), lambda k, out: bounced_light(scene, where[k], uv[k], jitter[k], bounce_rays, out))
+        found = in_blocks(len(where), lambda k, out: bounced_light(scene, where[k], uv[k], jitter[k], bounce_rays, out))
         return smoothed(found, tables.surfaces, 2)
 
     light = direct
     for _ in range(bounces):
-        light = direct + passed_on(light)
+        light = direct + bounced(light)
     return with_mirrors(tables._replace(light=light))
 
 
 def light_texels(surfaces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of every light map texel, in the order of ``Tables.light``: its surface ``[K]``, its centre u, v and its jitter.
+    """Surface ``[K]``, centre u, v and jitter of every light map texel, in the order of ``Tables.light``.
 
     The jitter ``[K, 2]`` repeats every four texels, so a blur that wide averages 16 interleaved sets of rays.
     """
@@ -115,16 +115,16 @@ def light_texels(surfaces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return where, uv, (np.stack([(column + row) % 4, row % 4], 1) + 0.5) / 4
 
 
-def in_chunks(count: int, fill: Callable[[slice, np.ndarray], None]) -> np.ndarray:
-    """``[count, 3]`` float32, filled part by part on all cores."""
+def in_blocks(count: int, fill: Callable[[slice, np.ndarray], None]) -> np.ndarray:
+    """``[count, 3]`` float32, filled block by block on all cores."""
     out = np.empty((count, 3), np.float32)
-    parts = [slice(k, k + CHUNK) for k in range(0, count, CHUNK)]
+    parts = [slice(k, k + BLOCK) for k in range(0, count, BLOCK)]
     deque(in_order((partial(fill, part, out[part]) for part in parts), os.cpu_count() or 1), maxlen=0)
     return out
 
 
 def smoothed(light: np.ndarray, surfaces: np.ndarray, passes: int) -> np.ndarray:
-    """Each light map blurred over four texels along each axis (five, the outer two at half weight)."""
+    """Light maps blurred over four texels along each axis (five, the outer two at half weight)."""
     out = light.copy()
     for s in surfaces:
         height, width = s["light_height"], s["light_width"]
@@ -137,7 +137,7 @@ def smoothed(light: np.ndarray, surfaces: np.ndarray, passes: int) -> np.ndarray
 
 
 def with_mirrors(tables: Tables, sharpness: float = 40.0) -> Tables:
-    """Adds the surroundings of every glossy sphere, as seen from its centre through a cosine lobe of that exponent."""
+    """Adds an environment map of every glossy sphere, filtered by a cosine lobe with exponent ``sharpness``."""
     shape = (MIRROR_HEIGHT, 2 * MIRROR_HEIGHT)
     v, u = (np.indices(shape).reshape(2, -1) + 0.5) / np.array([shape]).T
     turn = (u - 0.5) * 2 * pi

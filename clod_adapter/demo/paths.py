@@ -1,4 +1,4 @@
-"""Where the demo's cameras stand: smooth paths through the gallery, near and far."""
+"""Camera paths of the demo: smooth, both far from and close to the surfaces."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FIELD_OF_VIEW = 68.0  # degrees, across the width
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Part of the cameras' way: `pose` gives eye and target for a time in 0..1, `share` is its part of the views."""
+    """One path: `pose` returns eye and target at a time in 0..1, `share` is its relative number of views."""
 
     pose: Callable[[float], tuple[np.ndarray, np.ndarray]]
     share: int
@@ -34,19 +34,19 @@ def walk_in(t: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def past_left_wall(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Past the left wall's pictures, 1.35 m away."""
+    """Past the pictures of the left wall, 1.35 m away."""
     z = 0.9 + 6.2 * t
     return np.array([-1.65, -1.55 + 0.12 * np.sin(4 * np.pi * t), z]), np.array([-3.0, -1.5, z + 0.15])
 
 
 def past_right_wall(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Past the right wall's pictures, back towards the entrance."""
+    """Past the pictures of the right wall, towards the entrance."""
     z = 7.1 - 6.2 * t
     return np.array([1.65, -1.55 + 0.12 * np.sin(4 * np.pi * t), z]), np.array([3.0, -1.5, z - 0.15])
 
 
 def around_plinth(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Around the glossy ball in the middle, an arm's length away."""
+    """Around the glossy ball in the middle, close to it."""
     a = 2 * np.pi * t
     eye = np.array([1.15 * np.sin(a), -1.55 + 0.15 * np.sin(2 * a), 4 - 1.15 * np.cos(a)])
     return eye, np.array([0.0, -1.1, 4.0])
@@ -75,7 +75,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: 
 
 
 def path_cameras(width: int, height: int, count: int) -> list[Camera]:
-    """`count` cameras named ``view_000.png`` on, evenly spaced in time along each of the paths in turn."""
+    """`count` cameras named from ``view_000.png`` on, evenly spaced in time along each path in turn."""
     shares = np.array([path.share for path in PATHS])
     ends = np.rint(count * np.cumsum(shares) / shares.sum()).astype(int)
     poses = []

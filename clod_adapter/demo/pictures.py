@@ -1,4 +1,4 @@
-"""The demo's two pictures: one view at several dial values, and quality against the number of Gaussians kept."""
+"""The demo's figures: one view at several dial values, and quality against the number of Gaussians."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from clod_adapter.report.style import BLUE, INK, ORANGE, QUIET, label_log, new_f
 
 @dataclass(frozen=True)
 class Panel:
-    """One picture of the strip.
+    """One image of the strip.
 
     Attributes:
         image: ``[H, W, 3]`` uint8, or float in 0..1; the same size in every panel.
         virtual_scale: the dial value; None for the ground truth.
-        kept: Gaussians that the dial leaves in.
-        kept_share: that, divided by all.
+        kept: Gaussians that are not culled.
+        kept_share: their share of all, in [0, 1].
         psnr: dB against the ground truth.
         frame_ms: time of a frame, milliseconds.
     """
@@ -65,7 +65,7 @@ def dial_strip(
 
 
 def show(axes: Any, image: np.ndarray, crop: tuple[int, int, int, int] | None, enlarged: bool) -> None:
-    """Puts an image, or with `enlarged` the crop of it, into its axes; the whole image gets the crop's outline."""
+    """Shows an image, or with `enlarged` its crop, in the axes; the whole image gets an outline of the crop."""
     axes.axis("off")
     pixels = image if image.dtype == np.uint8 else np.clip(image, 0, 1)
     if enlarged and crop:
@@ -97,7 +97,7 @@ def quality_curve(
     Args:
         path: the picture to write; its suffix chooses the format.
         rows: with virtual_scale, psnr, ssim, kept and kept_share, in any order.
-        base_row: the checkpoint before the adaptation, with psnr, ssim and kept; drawn as a point by itself.
+        base_row: the checkpoint before adapting, with psnr, ssim and kept; drawn as a separate point.
         title: one line above.
 
     Raises:
@@ -119,7 +119,7 @@ def quality_curve(
 def draw_curve(
     axes: Any, rows: Sequence[Mapping[str, float]], base_row: Mapping[str, float] | None, key: str, colour: str
 ) -> None:
-    """One quality measure against count, the points labelled with their dial values, the base by its name."""
+    """One metric against the count; points are labelled with their dial values."""
     counts, values = [row["kept"] for row in rows], [row[key] for row in rows]
     axes.set_xscale("log")
     axes.margins(x=0.1, y=0.16)

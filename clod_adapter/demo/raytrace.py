@@ -1,8 +1,8 @@
-"""A small ray tracer: textured quads, discs, spheres and upright cylinders under light that is stored per surface.
+"""A small ray tracer: textured quads, discs, spheres and upright cylinders with light maps.
 
 A ray's colour is ``albedo * light`` (or ``albedo * glow`` for a lamp), where ``light`` is looked up in the surface's
-light map, so the shading of a matt surface does not depend on where the camera is. A glossy surface adds a
-prefiltered picture of its surroundings, looked up in the mirror direction. World axes are those of the scene with
+light map, so the shading of a matt surface does not depend on the camera. A glossy surface adds a
+prefiltered environment map, looked up in the mirror direction. World axes are those of the scene with
 y pointing down; distances are in world units; colours are linear RGB until `encode_srgb`.
 """
 
@@ -20,23 +20,23 @@ from clod_adapter._support.workers import in_order
 from clod_adapter.cameras import Camera
 from clod_adapter.demo.intersect import compiled, nearest, record, sphere_uv, surface_point
 
-MIRROR_HEIGHT = 24  # rows of a glossy surface's picture of its surroundings; it is twice as wide
-BAND = 16  # image rows per task: small enough to keep every core busy to the end
+MIRROR_HEIGHT = 24  # rows of a glossy surface's environment map; it is twice as wide
+ROWS = 16  # image rows per task: small enough to balance the cores
 LEVEL = record("first height width", "")  # one level of a texture's mip chain in `Tables.texels`
 
 
 class Tables(NamedTuple):
-    """The scene as arrays; compiled code takes them apart once and passes them on in this order.
+    """The scene as arrays, which compiled code unpacks in this order.
 
-    Besides its geometry, a surface's row has:
+    Besides its geometry, the row of a surface has:
 
-    - `level`, the index of its texture's finest level, `levels`, how many there are, and `texel`, the world size of one
+    - `level`, the index of its texture's finest level, `levels`, their number, and `texel`, the world size of a
       texel of the finest;
-    - `repeat_u`, `repeat_v`, how often the texture is laid along u and v, mirrored every other time;
-    - `light`, where its light map starts in the array of that name, and the light map's height and width;
-    - `glow`, the radiance a lamp emits as a factor of its albedo, 0 for what is not a lamp;
-    - `gloss`, the reflectance at normal incidence, and `mirror`, where the picture of its surroundings starts in
-      `light`, -1 for a matt surface.
+    - `repeat_u`, `repeat_v`, the repetitions of the texture along u and v, every second one mirrored;
+    - `light`, the first row of its light map in the array of that name, and the height and width of the map;
+    - `glow`, the radiance of a lamp as a factor of its albedo, 0 for other surfaces;
+    - `gloss`, the reflectance at normal incidence, and `mirror`, the first row of its environment map in `light`, -1
+      for a matt surface.
     """
 
     surfaces: np.ndarray  # [P] of SURFACE
@@ -48,7 +48,7 @@ class Tables(NamedTuple):
 
 @compiled
 def bilinear(pixels: np.ndarray, first: int, height: int, width: int, u: float, v: float) -> Any:
-    """Interpolated r, g, b of a ``height x width`` picture that starts at row `first` of `pixels`; edges clamp."""
+    """Interpolated r, g, b of a ``height x width`` image that starts at row `first` of `pixels`; edges clamp."""
     x = min(max(u * width - 0.5, 0.0), width - 1.0)
     y = min(max(v * height - 0.5, 0.0), height - 1.0)
     x0, y0 = int(x), int(y)
@@ -65,14 +65,14 @@ def bilinear(pixels: np.ndarray, first: int, height: int, width: int, u: float, 
 
 @compiled
 def mirrored(x: float) -> float:
-    """x folded into 0..1, so that a photograph that does not tile repeats without a seam."""
+    """x folded into 0..1, so that photographs repeat without seams."""
     x = x - 2 * floor(x / 2)
     return 2 - x if x > 1 else x
 
 
 @compiled
 def albedo(s: Any, levels: np.ndarray, texels: np.ndarray, u: float, v: float, footprint: float) -> Any:
-    """Trilinear (mip-mapped) texture of a surface, for a ray as wide as `footprint` world units where it lands."""
+    """Trilinear (mip-mapped) texture of a surface, for a ray of width `footprint` (world units) at the hit."""
     u, v = mirrored(u * s.repeat_u), mirrored(v * s.repeat_v)
     depth = min(log2(max(footprint / s.texel, 1.0)), s.levels - 1.0)
     k = int(depth)
@@ -91,7 +91,7 @@ def radiance(
     surfaces: np.ndarray, groups: np.ndarray, levels: np.ndarray, texels: np.ndarray, light: np.ndarray,
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, spread: float,
 ) -> Any:  # fmt: skip
-    """What a ray sees: r, g, b and the distance (inf where it leaves the scene, black).
+    """Radiance along a ray: r, g, b and the distance (black and inf outside the scene).
 
     `spread` is the ray's width per unit of distance. The back of a flat surface is black.
     """
@@ -103,7 +103,7 @@ def radiance(
     facing = -(nx * dx + ny * dy + nz * dz)
     if facing <= 0:
         return 0.0, 0.0, 0.0, t
-    # one isotropic footprint for a slanted pixel: the geometric mean of its two axes
+    # isotropic footprint of a slanted pixel: the geometric mean of its axes
     r, g, b = albedo(s, levels, texels, u, v, t * spread / sqrt(max(facing, 0.05)))
     if s.glow > 0:
         return r * s.glow, g * s.glow, b * s.glow, t
@@ -134,7 +134,7 @@ def trace_rows(
 ) -> None:
     """Averages ``samples * samples`` rays over the square of each pixel of some image rows.
 
-    `rays` ``[3, 3]`` takes pixel coordinates (x, y, 1) to a world direction; `first` is the row of ``out[0]``. The
+    `rays` ``[3, 3]`` maps pixel coordinates (x, y, 1) to a world direction; `first` is the row of ``out[0]``. The
     samples of a pixel all differ in x and all differ in y, which smooths near-horizontal and near-vertical edges best.
     """
     surfaces, groups, levels, texels, light = tables
@@ -170,8 +170,8 @@ def render_linear(tables: Tables, camera: Camera, samples: int) -> np.ndarray:
     eye, rays = camera_rays(camera)
     spread = 1 / (float(camera.K[0, 0]) * samples)
     out = np.empty((camera.height, camera.width, 3), np.float32)
-    rows = range(0, camera.height, BAND)
-    calls = (partial(trace_rows, tables, eye, rays, spread, samples, row, out[row : row + BAND]) for row in rows)
+    rows = range(0, camera.height, ROWS)
+    calls = (partial(trace_rows, tables, eye, rays, spread, samples, row, out[row : row + ROWS]) for row in rows)
     deque(in_order(calls, os.cpu_count() or 1), maxlen=0)
     return out
 

@@ -1,4 +1,4 @@
-"""Puts a scene together: surfaces, boxes, balls and columns, gathered into the ray tracer's `Tables`."""
+"""Scene builder: panels, boxes, balls and columns, collected into the ray tracer's `Tables`."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Finish:
-    """How a surface looks.
+    """Appearance of a surface.
 
     Attributes:
         texture: name of a texture given to `SceneBuilder`.
-        tile: world size of one repetition; None stretches the texture over the surface once.
-        glow: emitted radiance for a lamp.
-        gloss: share of light that is mirrored at normal incidence.
-        light_texel: wanted world size of a light map's texel.
+        tile: world size of one repetition; None stretches the texture over the surface.
+        glow: emitted radiance of a lamp.
+        gloss: reflectance at normal incidence.
+        light_texel: target world size of a light map texel.
     """
 
     texture: str
@@ -61,18 +61,18 @@ class SceneBuilder:
     def panel(
         self, centre: Vector, forward: Vector, size: tuple[float, float], finish: Finish, down: Vector = (0, 1, 0)
     ) -> None:
-        """A flat rectangle, upright for someone who looks along `forward` with `down` at the bottom of the image."""
+        """A flat rectangle, upright for a camera that looks along `forward` with `down` towards the image's bottom."""
         self.groups.append([panel(np.array(centre), np.array(forward), np.array(down), size, finish)])
 
     def box(
         self, base: Vector, size: Vector, finish: Finish, top: Finish | None = None, front: Finish | None = None,
         turn: float = 0.0, faces: str = "front back left right top",
     ) -> None:  # fmt: skip
-        """A box standing on `base`, its size along x, y, z before it is turned about the vertical.
+        """A box on `base`; its size is along x, y, z before the rotation about the vertical.
 
         Args:
             turn: radians; the front looks to -z at 0, to -x at pi/2.
-            faces: which of front, back, left, right, top and bottom exist.
+            faces: the faces to include, of front, back, left, right, top and bottom.
         """
         width, height, depth = size
         z = np.array([-np.sin(turn), 0, -np.cos(turn)])  # out of the front face
@@ -90,7 +90,7 @@ class SceneBuilder:
         self.groups.append([panel(centre + n * far / 2, -n, down, extent, f) for n, down, far, extent, f in chosen])
 
     def ball(self, centre: Vector, radius: float, finish: Finish) -> None:
-        """A sphere; its texture is a map of longitude and latitude, seamless only if its two ends meet."""
+        """A sphere; its texture maps longitude and latitude."""
         extent = (2 * np.pi * radius, np.pi * radius)
         self.groups.append([round_surface(SPHERE, centre, radius, 0.0, extent, finish)])
 
@@ -102,7 +102,7 @@ class SceneBuilder:
         self.groups.append([round_surface(CYLINDER, base, radius, height, (2 * np.pi * radius, height), finish), lid])
 
     def tables(self) -> Tables:
-        """The scene with every light map at 1, so that colours are the textures' own until light is baked."""
+        """The scene with all light maps at 1: colours are those of the textures until light is baked."""
         placed = [s for group in self.groups for s in group]
         first, levels, texels = mip_chain(list(self.textures.values()))
         span = {name: (first[k], first[k + 1]) for k, name in enumerate(self.textures)}
@@ -147,14 +147,14 @@ def panel(
 def round_surface(
     kind: int, origin: Vector, radius: float, height: float, extent: tuple[float, float], finish: Finish
 ) -> Surface:
-    """A sphere or a cylinder's side, packed as `Tables` says."""
+    """A sphere or the side of a cylinder, in the layout of `Tables`."""
     return Surface(
         kind, np.array(origin), np.array([radius, 0, 0]), np.array([height, 0, 0]), np.zeros(3), extent, finish
     )
 
 
 def group_bounds(group: list[Surface]) -> np.ndarray:
-    """``[6]`` the low and the high corner of the box around some surfaces, a little enlarged against rounding."""
+    """``[6]`` low and high corner of the bounding box of surfaces, slightly enlarged against rounding."""
     corners = []
     for s in group:
         if s.kind <= DISC:
@@ -167,7 +167,7 @@ def group_bounds(group: list[Surface]) -> np.ndarray:
 
 
 def mip_chain(textures: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every texture halved down to one pixel across: where its levels start ``[T + 1]``, all levels, all texels."""
+    """Mip levels of every texture: first level of each ``[T + 1]``, all levels, all texels."""
     first, pages = [0], []
     for texture in textures:
         pages.append(texture.astype(np.float32))

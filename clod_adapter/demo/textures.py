@@ -1,6 +1,6 @@
 """Textures for the demo, linear float32 ``[h, w, 3]`` with sides that are powers of two.
 
-The photographs are those that scikit-image carries in its wheel; nothing is downloaded. The rest is computed.
+The photographs are those in scikit-image's wheel, without a download; other textures are computed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def photograph(name: str) -> Image.Image:
     """One of scikit-image's bundled photographs, as RGB.
 
     Raises:
-        ClodError: scikit-image is missing, or this version of it does not carry the file.
+        ClodError: scikit-image is missing, or the installed version does not include the file.
     """
     try:
         with resources.as_file(resources.files("skimage") / "data" / name) as path:
@@ -31,20 +31,20 @@ def photograph(name: str) -> Image.Image:
 
 
 def linear(image: Image.Image, side: int = SIDE) -> np.ndarray:
-    """An image squeezed into a square texture, area-filtered."""
+    """An image resized to a square texture."""
     return decode_srgb(np.asarray(image.convert("RGB").resize((side, side), Image.Resampling.LANCZOS)))
 
 
 def framed(name: str, size: tuple[float, float], frame: Colour, mat: float = 0.09, rim: float = 0.035) -> np.ndarray:
     """A photograph behind a mat in a bevelled frame, for a panel of `size` metres; `mat` and `rim` are in metres too.
 
-    The photograph is cropped, not squeezed, to what the mat leaves open.
+    The photograph is cropped to the opening of the mat, not distorted.
     """
     scale = 2 * SIDE / max(size)
     width, height = (round(x * scale) for x in size)
     picture = Image.new("RGB", (width, height), frame)
     half = round(rim * scale / 2)
-    # the half of the frame that slopes inward lies in shade
+    # the inner half of the frame is shaded
     picture.paste(shaded(frame, 0.6), (half, half, width - half, height - half))
     picture.paste((240, 236, 226), (2 * half, 2 * half, width - 2 * half, height - 2 * half))
     edge = round((rim + mat) * scale)
@@ -61,12 +61,12 @@ def shaded(colour: Colour, factor: float) -> Colour:
 
 
 def toned(name: str, dark: Colour, light: Colour) -> np.ndarray:
-    """A grey photograph as a material: its 2nd to 98th percentile runs from `dark` to `light`."""
+    """A grey photograph as a material: its 2nd to 98th percentile maps to `dark` to `light`."""
     return tone(photograph(name), dark, light)
 
 
 def brickwork(dark: Colour, light: Colour) -> np.ndarray:
-    """The photograph of a brick wall, turned and straightened: it was taken at an angle, so its rows converge."""
+    """The photograph of a brick wall, rotated and with its perspective corrected."""
     image = photograph("brick.png").rotate(90)
     rows_meet_left = (0, 62, 0, 454, 512, 512, 512, 0)
     return tone(
@@ -75,14 +75,14 @@ def brickwork(dark: Colour, light: Colour) -> np.ndarray:
 
 
 def tone(image: Image.Image, dark: Colour, light: Colour) -> np.ndarray:
-    """Maps the brightness of an image to a run between two colours, see `toned`."""
+    """Maps the brightness of an image to a gradient between two colours, see `toned`."""
     grey = np.asarray(image.convert("L").resize((SIDE, SIDE), Image.Resampling.LANCZOS), np.float32)
     low, high = np.percentile(grey, [2, 98])
     return blend(dark, light, np.clip((grey - low) / (high - low), 0, 1))
 
 
 def blend(dark: Colour, light: Colour, share: np.ndarray) -> np.ndarray:
-    """Linear light between two colours, mixed in sRGB by `share` ``[h, w]``."""
+    """Linear colours between two sRGB colours, mixed in sRGB by `share` ``[h, w]``."""
     mixed = np.array(dark) + share[..., None] * (np.array(light) - np.array(dark))
     return decode_srgb(np.clip(mixed, 0, 255))
 
@@ -93,7 +93,7 @@ def plain(colour: Colour) -> np.ndarray:
 
 
 def plaster(colour: Colour, contrast: float, seed: int, side: int = 256) -> np.ndarray:
-    """A painted wall: cloudy patches in four sizes around `colour`, `contrast` being their share of it."""
+    """A painted wall: noise of four octaves around `colour` with relative `contrast`."""
     random = np.random.default_rng(seed)
     clouds = np.zeros((side, side))
     for octave in range(4):
@@ -104,7 +104,7 @@ def plaster(colour: Colour, contrast: float, seed: int, side: int = 256) -> np.n
 
 
 def planks(dark: Colour, light: Colour, rows: int = 12, seed: int = 3) -> np.ndarray:
-    """Floor boards along v: each of its own tone, with grain along it and thin dark joints."""
+    """Floor boards along v with varying tone, grain and thin dark joints."""
     random = np.random.default_rng(seed)
     grain = Image.fromarray(random.normal(size=(24, 256)).astype(np.float32))
     tone = 0.12 * np.asarray(grain.resize((SIDE, SIDE), Image.Resampling.BICUBIC))

@@ -1,18 +1,18 @@
-"""Budgets: the dial value that keeps so many Gaussians, gives up so many decibels, or draws so many frames a second.
+"""Budgets: the dial value for a number of Gaussians, a PSNR drop, or a frame rate.
 
-- A count needs no measuring. For one camera, Gaussian i is kept iff s is below its extinction scale
+- A count needs no measurement. For one camera, Gaussian i is kept iff s is below its extinction scale
   ``s*_i`` (``extinction.extinction_scale``) and kept sets are nested, so the dial that keeps n lies between the n-th
-  and the (n+1)-th largest ``s*``. For a mean over V cameras the same holds of the ``s*`` of all of them pooled,
-  and of n V. A baked file has one distance for each Gaussian, which stands for one camera. Exact up to ties:
-  Gaussians whose ``s*`` cannot be told apart in float32 are cut together. So is, in all views at once, a Gaussian
-  whose own distance is the unit in each of them (normalizers ``max`` and ``quantile``).
-- PSNR is read off the calibration table that is stored with the file (``calibration.py``).
-- Frames a second are of a machine, a picture size, and what else runs there. Where there are cameras some frames are
-  timed (``frame_times``, a second or two): under load the times of one machine differ by a factor of ten. The
-  table's own times are taken only where they are handed over, or (``clod-adapt export``) where nothing can be timed.
+  and the (n+1)-th largest ``s*``. For the mean over V cameras the same holds for the pooled ``s*`` of all cameras
+  and for n V. A baked file has one distance for each Gaussian and counts as one camera. Exact up to ties:
+  Gaussians whose ``s*`` are equal in float32 are culled together. A Gaussian whose distance is the unit in every view
+  (normalizers ``max`` and ``quantile``) is culled in all views at once.
+- PSNR is read from the calibration table that is stored with the file (``calibration.py``).
+- Frame rates depend on the machine, the image size and the load. With cameras some frames are timed
+  (``frame_times``, a second or two): under load the times of one machine differ by a factor of ten. The table's times
+  are used only where they are passed in, or (``clod-adapt export``) where nothing can be timed.
 
-A budget that already s = 1 keeps within is no error: the dial is 1, and a note says so. s = 1 keeps fewer Gaussians
-than the file has. No budget is met beyond ``max_sv``: the equation goes on, but nothing was trained there.
+A budget that s = 1 already meets is no error: the dial is 1, and a note says so. s = 1 keeps fewer Gaussians than the
+file has. No budget is met beyond ``max_sv``: the equation is defined there, but nothing was trained.
 """
 
 from __future__ import annotations
@@ -26,16 +26,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import attenuate
 from clod_adapter.calibration import Calibration, Viewpoint, crossing
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, require
+from clod_adapter.distances import typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import wait_for
-from clod_adapter.render import render
-from clod_adapter.viewpoints import typical_distance
+from clod_adapter.render import dial, render
 
 TIMED_VIEWS, TIMED_DIALS, TIMED_REPEATS = 4, 6, 2
 
@@ -46,7 +45,7 @@ class DialValue:
 
     Attributes:
         virtual_scale: the dial s, in [1, max_sv].
-        note: one line where the budget does not bind, else empty.
+        note: one line where the budget has no effect, else empty.
     """
 
     virtual_scale: float
@@ -63,22 +62,22 @@ def dial_for(
     calibration: Calibration | None = None,
     baked: bool = False,
 ) -> DialValue:
-    """The smallest dial value that keeps within one budget, so the best picture that it allows.
+    """The smallest dial value that meets one budget: the best quality within it.
 
     Args:
         gaussians: with a dial.
-        keep: Gaussians, at most: in the view of the one camera, the mean over several.
-        psnr_drop: dB below what the calibration has at s = 1. Here alone it is the largest dial value: from the first
-            point on where the interpolated PSNR falls below, the budget counts as spent.
-        fps: frames a second. With a calibration its times are taken as they stand, whatever they were measured on
-            (``calibration.machine``, ``width``, ``height``); without one, some frames of ``cameras`` are timed here.
-        cameras: for ``keep`` and ``fps``, which needs whole cameras to time frames from.
+        keep: largest number of Gaussians: in the view of one camera, or the mean over several.
+        psnr_drop: dB below the calibration's PSNR at s = 1. For this budget the result is the largest dial value before
+            the interpolated PSNR first falls below it.
+        fps: frames per second. The times of a calibration are used as they are, whatever machine and image size they
+            are from (``calibration.machine``, ``width``, ``height``); without one, ``cameras`` are timed.
+        cameras: for ``keep`` and ``fps``; ``fps`` needs whole cameras to render from.
         calibration: for ``psnr_drop`` and ``fps``; ``load(path).calibration``.
-        baked: ``keep`` counts what ``export.bake`` keeps for the cameras.
+        baked: ``keep`` counts the Gaussians that ``bake`` keeps for the cameras.
 
     Raises:
-        ClodError: not exactly one budget, a budget that is not positive, no dial, nothing to judge the budget by, or
-            one that is beyond what the largest trained dial value reaches; the message says what that is.
+        ClodError: not exactly one budget, a budget that is not positive, no dial, no data for the budget, or one that
+            the largest trained dial value does not reach; the message gives its value there.
     """
     budgets = {"keep": keep, "psnr_drop": psnr_drop, "fps": fps}
     given = {name: value for name, value in budgets.items() if value is not None}
@@ -98,13 +97,13 @@ def dial_for(
 
 
 def dial_for_times(times: Sequence[tuple[float, float]], fps: float) -> DialValue:
-    """The smallest dial value from which on frames take at most ``1000 / fps`` ms, linear in log s between the times.
+    """The smallest dial value from which frames take at most ``1000 / fps`` ms, linear in log s between the times.
 
     Args:
-        times: dial values, ascending from 1, each with its milliseconds a frame.
+        times: dial values, ascending from 1, each with its milliseconds per frame.
 
     Raises:
-        ClodError: a frame takes longer than that even at the last dial value.
+        ClodError: a frame takes longer even at the last dial value.
     """
     dials, taken = [s for s, _ in times], [ms for _, ms in times]
     found = crossing(dials, taken, 1e3 / fps)
@@ -125,14 +124,15 @@ def frame_times(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[tuple[float, float]]:
-    """Milliseconds a frame takes here and now, at six dial values from 1 to max_sv, in even steps of log s.
+    """Measures milliseconds per frame at six dial values from 1 to max_sv, in even steps of log s.
 
     Medians over at most four of the cameras, evenly spread.
 
     Args:
         progress: called with (frames timed, frames in all).
 
-    Returns: the dial values, each with its milliseconds.
+    Returns:
+        The dial values, each with its milliseconds.
 
     Raises:
         ClodError: there are no cameras, or the Gaussians have no dial.
@@ -145,9 +145,9 @@ def frame_times(
     max_sv, gaussians = gaussians.attenuation.max_sv, gaussians.without_empty_bands()
     virtual_scales = [max_sv ** (k / (TIMED_DIALS - 1)) for k in range(TIMED_DIALS)] if max_sv > 1 else [1.0]
     times: list[list[float]] = [[] for _ in virtual_scales]
-    render(gaussians, seen[0], max_sv)  # compiled and warm before the clock starts
+    render(gaussians, seen[0], max_sv)  # compiles and warms up before timing
     for done in range(TIMED_REPEATS * len(seen)):
-        for taken, virtual_scale in zip(times, virtual_scales, strict=True):  # in turn: a machine's pace drifts
+        for taken, virtual_scale in zip(times, virtual_scales, strict=True):  # interleaved: clock rates drift
             wait_for(gaussians.means.device)
             began = time.perf_counter()
             render(gaussians, seen[done % len(seen)], virtual_scale)
@@ -162,7 +162,7 @@ def _for_psnr_drop(calibration: Calibration | None, drop: float) -> DialValue:
     if calibration is None:
         raise ClodError("a PSNR drop needs the calibration table that adapting stores with the file")
     best, last = calibration.rows[0].psnr, calibration.rows[-1]
-    # From the far end, where 1/s ascends: the point from which on, down to s = 1, no more is lost than that.
+    # From the largest s, where 1/s ascends: the point from which, down to s = 1, the loss stays within the drop.
     nearness = [1 / row.virtual_scale for row in reversed(calibration.rows)]
     losses = [best - row.psnr for row in reversed(calibration.rows)]
     found = crossing(nearness, losses, drop)
@@ -176,10 +176,10 @@ def _for_psnr_drop(calibration: Calibration | None, drop: float) -> DialValue:
 @torch.no_grad()
 def _for_count(views: _Views, keep: float) -> DialValue:
     largest, wanted = views.config.max_sv, math.floor(keep * len(views))
-    # What a picture really keeps, and not the roots, is what a count is held against: they differ by rounding.
+    # Counts come from renderings, not from the roots: these differ by rounding.
     most, fewest = views.count(1.0), views.count(largest)
     if wanted >= most:
-        note = f"s = 1 keeps {most / len(views):,.0f} of {len(views.logits):,} already" if wanted > most else ""
+        note = f"s = 1 keeps {most / len(views):,.0f} of {len(views.gaussians):,} already" if wanted > most else ""
         return DialValue(1.0, note)
     if wanted < fewest:
         raise ClodError(
@@ -187,14 +187,14 @@ def _for_count(views: _Views, keep: float) -> DialValue:
             f"{fewest / len(views):,.0f} are kept"
         )
     pooled = torch.cat([scales[(scales > 1) & (scales <= largest)] for scales in views.extinction_scales()])
-    staying = min(max(wanted - fewest, 0), len(pooled))  # of those that leave within the dial's range
-    upper = float(pooled.kthvalue(len(pooled) - staying + 1).values) if staying > 0 else largest
-    lower = float(pooled.kthvalue(len(pooled) - staying).values) if staying < len(pooled) else 1.0
+    remaining = min(max(wanted - fewest, 0), len(pooled))  # of those culled within the range of the dial
+    upper = float(pooled.kthvalue(len(pooled) - remaining + 1).values) if remaining > 0 else largest
+    lower = float(pooled.kthvalue(len(pooled) - remaining).values) if remaining < len(pooled) else 1.0
     return DialValue(_polished(math.sqrt(lower * upper), views, wanted))
 
 
 def _polished(guess: float, views: _Views, wanted: int) -> float:
-    """The dial value near ``guess`` that keeps ``wanted``, or where ties allow none the smallest that keeps fewer."""
+    """The dial value near ``guess`` that keeps ``wanted``; where ties prevent it, the smallest that keeps fewer."""
     if views.count(guess) == wanted:
         return guess
     low, high = max(guess * (1 - 1e-4), 1.0), min(guess * (1 + 1e-4), views.config.max_sv)
@@ -209,14 +209,13 @@ def _polished(guess: float, views: _Views, wanted: int) -> float:
 
 
 class _Views:
-    """The Gaussians as some cameras see them, or ``baked``: as one file shows them to all of the cameras."""
+    """The Gaussians at the distances of each camera, or ``baked``: at one distance over all cameras."""
 
     def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera | Viewpoint], baked: bool) -> None:
         assert gaussians.sigma_d is not None and gaussians.attenuation is not None
         self.config: AttenuationConfig = gaussians.attenuation
-        self.means, self.logits, self.sigma_d = gaussians.means, gaussians.opacity_logits, gaussians.sigma_d
-        self.cameras = cameras
-        self.typical = typical_distance(self.means, cameras, self.config) if baked or not cameras else None
+        self.gaussians, self.sigma_d, self.cameras = gaussians, gaussians.sigma_d, cameras
+        self.typical = typical_distance(gaussians.means, cameras, self.config) if baked or not cameras else None
 
     def __len__(self) -> int:
         return len(self.cameras) if self.typical is None else 1
@@ -224,13 +223,13 @@ class _Views:
     def _distances(self) -> Iterator[Tensor]:
         if self.typical is not None:
             return iter([self.typical])
-        return (typical_distance(self.means, [camera], self.config) for camera in self.cameras)
+        return (typical_distance(self.gaussians.means, [camera], self.config) for camera in self.cameras)
 
     def extinction_scales(self) -> Iterator[Tensor]:
-        """``[N]`` for each view, one at a time: all of them at once are views times Gaussians."""
-        return (extinction_scale(self.logits, self.sigma_d, d, self.config) for d in self._distances())
+        """``[N]`` for each view, one at a time: all at once would be views times Gaussians."""
+        logits = self.gaussians.opacity_logits
+        return (extinction_scale(logits, self.sigma_d, d, self.config) for d in self._distances())
 
     def count(self, virtual_scale: float) -> int:
         """Gaussians kept, summed over the views."""
-        kept = (attenuate(self.logits, self.sigma_d, d, virtual_scale, self.config).keep for d in self._distances())
-        return sum(int(keep.sum()) for keep in kept)
+        return sum(int(dial(self.gaussians, d, virtual_scale).keep.sum()) for d in self._distances())

@@ -1,4 +1,4 @@
-"""The training-free start: what each Gaussian contributes to the views, and the sigma_d that follows from its rank."""
+"""Initialization without training: each Gaussian's contribution to the views, and the sigma_d from its rank."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import SIGMA_MAX, normalizing_distance
+from clod_adapter.attenuation import SIGMA_MAX
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.distances import camera_unit, typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.finite import bad_rows, largest_colour
@@ -20,38 +21,37 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.pruning_order import pruning_order
 from clod_adapter.render import splat
 from clod_adapter.units import in_world_units, known_distance, with_distance
-from clod_adapter.viewpoints import typical_distance
 
 T = TypeVar("T")
 
-# A start beyond this many times the normalised distance at the largest dial value would fade by less than a
-# thousandth there, and its gradient with it: such a sigma would never move again.
+# With a sigma_d beyond this many times the distance times the largest dial value, opacity and gradient change by less
+# than a thousandth there: such a sigma would never change in training.
 WIDEST = 22.0
-# Views that are looked at, at most: twice as many changed the trained result by 0.01 to 0.04 dB (docs/performance.md).
+# Most views that are rendered: twice as many changed the trained result by 0.01 to 0.04 dB (docs/performance.md).
 MOST_VIEWS = 64
-# A checkpoint may be so faint that the cut would take its picture. Tau is lowered until those that it fades by their
-# opacity alone are worth at most this share of the picture at s = 1.
+# Culling would ruin a faint checkpoint. Tau is lowered until the Gaussians that it affects by their opacity alone have
+# at most this share of the removal error at s = 1.
 FAINT_SHARE = 0.05
 TAU_MIN = 1e-6
-FADING = 1.5  # times the threshold: fainter ones are drawn less than they are (attenuation's soft cut)
+FADING = 1.5  # times the culling threshold: below, the soft cut reduces the opacity (attenuation)
 
 
-def start(
+def initialize(
     base: Gaussians,
     views: Sequence[View],
     config: AdaptConfig,
     progress: Callable[[str, int, int], None] | None = None,
     error: Tensor | None = None,
 ) -> Gaussians:
-    """The Gaussians with a sigma_d to train from, by what they do in up to MOST_VIEWS of the views, evenly spread.
+    """The Gaussians with an initial sigma_d, from renderings of up to MOST_VIEWS of the views, evenly spread.
 
-    The sigma_d is in world units. A dial that ``base`` already has is kept, with its own settings but the config's
-    ``max_sv``; one that does nothing (``SIGMA_MAX`` throughout, as ``attach`` makes it) counts as none.
+    The sigma_d is in world units. A dial that ``base`` already has is kept, with its own settings except the config's
+    ``max_sv``; one without effect (``SIGMA_MAX`` throughout, as ``attach`` makes it) counts as none.
 
     Args:
-        progress: called with "start" and the number of views done, and of those that are looked at in all; then with
-            "order" and the number of Gaussians whose place is known, and of all of them.
-        error: ``[N]`` from ``removal_error``, of these views and seed, where it is known already.
+        progress: called with "start", the number of views rendered and the number of views to render; then with
+            "order", the number of Gaussians ranked and the number of all Gaussians.
+        error: ``[N]`` from ``removal_error`` of these views and seed, where it is known.
     """
     if base.attenuation is not None and has_dial(base):
         own = dataclasses.replace(base.attenuation, max_sv=config.max_sv)
@@ -63,8 +63,8 @@ def start(
         constant = torch.full_like(base.means[:, 0], value)
         return in_world_units(base.replace(sigma_d=constant, attenuation=attenuation))
     if error is None:
-        looked = partial(progress, "start") if progress else None
-        error = removal_error(base, views, seed=config.seed, progress=looked)
+        rendered = partial(progress, "start") if progress else None
+        error = removal_error(base, views, seed=config.seed, progress=rendered)
     attenuation = dataclasses.replace(attenuation, tau=fitting_tau(base.opacities, error, config))
     importance = error
     if config.start == "importance":
@@ -78,24 +78,24 @@ def start(
     return in_world_units(base.replace(sigma_d=sigma, attenuation=attenuation))
 
 
-def for_training(begun: Gaussians, views: Sequence[View], config: AdaptConfig) -> Gaussians:
-    """``begun`` with sigma_d in units of the scene's typical distance, that of the views where it is not known."""
-    assert begun.attenuation is not None
-    known = known_distance(begun.attenuation) or scene_distance(begun, spread(views, MOST_VIEWS), config.quantile)
-    own = dataclasses.replace(begun.attenuation, reference_distance=known)
-    return with_distance(begun.replace(attenuation=own), known)
+def for_training(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> Gaussians:
+    """``initial`` with sigma_d in units of the scene's typical distance, measured in the views where it is unknown."""
+    assert initial.attenuation is not None
+    known = known_distance(initial.attenuation) or scene_distance(initial, spread(views, MOST_VIEWS), config.quantile)
+    own = dataclasses.replace(initial.attenuation, reference_distance=known)
+    return with_distance(initial.replace(attenuation=own), known)
 
 
 def has_dial(base: Gaussians) -> bool:
-    """Whether there is a sigma_d that does anything."""
+    """Whether there is a sigma_d with any effect."""
     return base.sigma_d is not None and bool((base.sigma_d < SIGMA_MAX).any())
 
 
-def seeing(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
-    """The views that have a Gaussian's centre beyond their near plane: from the others nothing is drawn or learned.
+def usable_views(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
+    """The views with at least one Gaussian's centre beyond their near plane; the others render nothing.
 
     Raises:
-        ClodError: there is none.
+        ClodError: there are none.
     """
     found = []
     for view in views:
@@ -111,10 +111,10 @@ def seeing(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
 
 
 def fitting_tau(opacities: Tensor, error: Tensor, config: AdaptConfig) -> float:
-    """``config.tau``, or less for a checkpoint that is too faint for it; by itself no less than TAU_MIN.
+    """``config.tau``, or less for a faint checkpoint; lowered to no less than TAU_MIN.
 
-    At most 1/FADING of the opacity below which there is FAINT_SHARE of all removal error; and low enough for as many
-    Gaussians as the count law wants at ``max_sv`` to be opaque enough to be there. To six digits: a float32 holds them.
+    At most 1/FADING of the opacity below which lies FAINT_SHARE of all removal error; and so low that as many Gaussians
+    as the target-count curve has at ``max_sv`` exceed the threshold there. Six digits, which a float32 holds.
 
     Args:
         error: ``[N]`` from ``removal_error``.
@@ -137,29 +137,28 @@ def spread(views: Sequence[T], most: int) -> Sequence[T]:
 
 def scene_distance(base: Gaussians, views: Sequence[View], quantile: float) -> float:
     """D of the scene normaliser: mean over views of the ``quantile`` distance in the frustum, world units."""
-    probe = AttenuationConfig(normalizer="quantile", quantile=quantile)
-    total = 0.0
+    config = AttenuationConfig(normalizer="quantile", quantile=quantile)
+    total = 0.0  # not sum(): it rounds differently from Python 3.12 on
     for view in views:
-        distances = (base.means - view.camera.position.to(base.means)).norm(dim=1)
-        total += float(normalizing_distance(distances, base.means, view.camera, probe))
+        total += camera_unit(base.means, view.camera, config)
     return total / len(views)
 
 
 def removal_error(
     gaussians: Gaussians, views: Sequence[View], *, seed: int = 0, progress: Callable[[int, int], None] | None = None
 ) -> Tensor:
-    """``[N]`` estimate of the squared picture error that removing each Gaussian alone would cause.
+    """``[N]`` estimate of the squared image error of removing each Gaussian alone.
 
     To first order removing Gaussian i changes pixel p by ``a_i dC_p/da_i``. Its sum of squares over
-    the pixels, mean over the views, is estimated without a bias by one backward pass a view: with random signs
+    the pixels, mean over the views, is estimated without bias by one backward pass per view: with random signs
     z, ``E[(sum_p z_p dC_p/da_i)^2] = sum_p (dC_p/da_i)^2`` (Hutchinson's estimator on the
     Gauss-Newton matrix). Works with every differentiable rasterizer.
 
     Args:
-        progress: called with the number of views done after each, and of all of them.
+        progress: called with the number of views done and the number of all views.
 
     Raises:
-        ClodError: an error is not finite, as colours overflow in the pictures.
+        ClodError: an error is not finite, as colours overflow in the images.
     """
     generator = torch.Generator().manual_seed(seed)
     total = torch.zeros_like(gaussians.means[:, 0])
@@ -173,7 +172,7 @@ def removal_error(
         if progress:
             progress(done, len(views))
     if (bad := bad_rows(total)) is not None:
-        much = f"what removing {int(bad.sum()):,} of the Gaussians does to the pictures is not finite"
+        much = f"the image error of removing each of {int(bad.sum()):,} Gaussians is not finite"
         raise ClodError(f"{much}; {largest_colour(gaussians)}")
     return total / max(len(views), 1)
 
@@ -187,14 +186,14 @@ def sigma_from_importance(
     share: float,
     exponent: float,
 ) -> Tensor:
-    """``[N]`` sigma_d with which the share kept follows the count law from the start, before any training.
+    """``[N]`` the sigma_d with which the share kept follows the target-count curve before any training.
 
-    Gaussians are ranked by importance. The one at rank fraction r (0 the most important) leaves
-    where ``counting.target_curve`` falls to r. Ranks beyond ``share`` leave before s = 1.
+    Gaussians are ranked by importance. The one at rank fraction r (0 the most important) is culled at the dial value
+    where ``target_count.target_curve`` falls to r. Ranks beyond ``share`` are culled before s = 1.
 
     Args:
-        importance: ``[N]``, larger stays longer.
-        distances: ``[N]`` normalised distance at which the law is to hold.
+        importance: ``[N]``, larger is kept longer.
+        distances: ``[N]`` normalised distance at which the curve holds.
         share: of all Gaussians, kept at s = 1; in (0.5, 1].
     """
     rank, order = torch.empty_like(distances), importance.argsort(descending=True, stable=True)

@@ -1,1 +1,1 @@
-"""The dial in other people's renderers: gsplat, Inria's rasterizer and its forks, shaders."""
+"""The dial in other renderers: gsplat, Inria's rasterizer and its forks, shaders."""

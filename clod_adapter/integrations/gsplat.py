@@ -1,4 +1,4 @@
-"""gsplat's ``rasterization`` with a dial: its arguments and three more, its results.
+"""gsplat's ``rasterization`` with a dial: same arguments plus three, same results.
 
 from clod_adapter.integrations import gsplat as clod_gsplat
 colors, alphas, meta = clod_gsplat.rasterization(
@@ -6,11 +6,11 @@ colors, alphas, meta = clod_gsplat.rasterization(
     sigma_d=model.sigma_d, attenuation=model.attenuation, virtual_scale=3,
 )
 
-gsplat takes one opacity for all cameras, and the dial gives each camera its own. So each camera is one call of gsplat,
-and what the calls return is put together as gsplat has it, ids, order and gradients included. (As scenes of a
-batch they could share a call, but gsplat 1.5.3's packed projection culls all scenes by the opacities of the first.) Who
-is left out has opacity 0: gsplat drops such a row in its projection, before colours, sorting and blending, so nothing
-has to be gathered, and every row and id stays the caller's. Written for gsplat 1.5.3.
+gsplat takes one opacity per Gaussian for all cameras; the dial gives one for each camera. So each camera is one call of
+gsplat, and the results are joined in gsplat's form, including ids, order and gradients. (A batch of scenes could share
+a call, but gsplat 1.5.3's packed projection culls all scenes by the opacities of the first.) Culled Gaussians get
+opacity 0: gsplat drops such rows in its projection, before colours, sorting and blending, so nothing has to be
+gathered, and rows and ids stay those of the caller. Written for gsplat 1.5.3.
 """
 
 from __future__ import annotations
@@ -52,34 +52,34 @@ def rasterization(
     attenuation: AttenuationConfig | None = None,
     **kwargs: Any,
 ) -> Rendered:
-    """``gsplat.rasterization`` of the Gaussians that one dial value keeps, faded as each camera sees them.
+    """``gsplat.rasterization`` with the opacities of one dial value, attenuated for each camera.
 
-    Equals gsplat called with ``attenuation.attenuate``'s opacities, for several cameras ``[..., C, 4, 4]`` camera by
-    camera. Differentiable in ``sigma_d`` and all that gsplat differentiates in; the distances are constants, so the
-    dial adds nothing to the gradients of ``means`` and ``viewmats``. ``meta`` is gsplat's: ``means2d`` takes
-    ``retain_grad()`` and, with ``absgrad``, has its ``absgrad``, as the densification strategies need it. (Of several
-    cameras it is a copy of what was drawn from, which ``torch.autograd.grad`` and hooks of its own do not reach.)
+    Equals gsplat called with the opacities of ``attenuation.attenuate``, camera by camera for ``[..., C, 4, 4]``.
+    Differentiable in ``sigma_d`` and all that gsplat differentiates in; the distances are constants, so the dial adds
+    nothing to the gradients of ``means`` and ``viewmats``. ``meta`` is gsplat's: ``means2d`` takes ``retain_grad()``
+    and, with ``absgrad``, has its ``absgrad``, as densification strategies need it. (With several cameras ``means2d``
+    is a copy, which ``torch.autograd.grad`` and hooks on it do not reach.)
 
-    A file's ``Gaussians.screen_filter`` is gsplat's ``eps2d`` (its variance) and, where it compensates opacities,
-    ``rasterize_mode="antialiased"``: to be given, as without a dial.
+    Pass a file's ``Gaussians.screen_filter`` as without a dial: ``eps2d`` is its variance, and
+    ``rasterize_mode="antialiased"`` its compensation of opacities.
 
-    The distance is that from the centre of ``viewmats``, whatever the camera: an orthographic one that steps back sees
-    the same, fainter; of a rolling shutter it is the start. For the normalisers ``max`` and ``quantile`` those are in
-    sight that a pinhole with these ``Ks`` has in its image; ``scene``, the usual one, does without.
+    Distances are from the centre of ``viewmats`` for every camera model: Gaussians fade as an orthographic camera moves
+    back; for a rolling shutter it is the first pose. The normalizers ``max`` and ``quantile`` take the frustum of a
+    pinhole camera with these ``Ks``; ``scene``, the default, needs none.
 
     Args:
-        args, kwargs: gsplat's own, by position or by name.
-        sigma_d: ``[..., N]`` as ``opacities``; without it this is gsplat's function.
+        args, kwargs: those of gsplat, by position or by name.
+        sigma_d: ``[..., N]`` like ``opacities``; None calls gsplat's function unchanged.
         virtual_scale: the dial s >= 1.
-        attenuation: how ``sigma_d`` is to be read, the file's (``Gaussians.attenuation``); by default
-            ``AttenuationConfig()``, whose distances are in world units.
+        attenuation: settings of the equation, ``Gaussians.attenuation`` of the file; by default
+            ``AttenuationConfig()``, with distances in world units.
 
     Returns:
         ``render_colors [..., C, H, W, X]``, ``render_alphas [..., C, H, W, 1]`` and ``meta``.
 
     Raises:
-        ClodError: the dial is below 1, sigma_d is not as opacities, or ``distributed`` is set, where the cameras of
-            all processes would share one opacity.
+        ClodError: the dial is below 1, the shapes of sigma_d and opacities differ, or ``distributed`` is set, with
+            which the cameras of all processes share one opacity.
     """
     if sigma_d is None:
         return gsplat.rasterization(*args, **kwargs)
@@ -87,10 +87,10 @@ def rasterization(
     bound.apply_defaults()
     given: dict[str, Any] = {**bound.arguments, "sigma_d": sigma_d}
     if given["distributed"]:
-        raise ClodError("distributed=True shares one opacity among all cameras, which a dial cannot; set it to False")
+        raise ClodError("distributed=True shares one opacity among all cameras, a dial needs one each; set it to False")
     if given["opacities"].shape != sigma_d.shape:
         shapes = f"sigma_d is {tuple(sigma_d.shape)} and opacities {tuple(given['opacities'].shape)}"
-        raise ClodError(f"{shapes}; they must be [..., N] alike")
+        raise ClodError(f"{shapes}; both must be [..., N]")
     shape = given["viewmats"].shape[:-2]
     config = attenuation or AttenuationConfig()
     if math.prod(shape) == 1:
@@ -101,7 +101,7 @@ def rasterization(
 
 
 def _signature() -> inspect.Signature:
-    """The installed gsplat's parameters, then ours, for help() and editors."""
+    """Parameters of the installed gsplat followed by ours, for help() and editors."""
     ours = inspect.signature(rasterization).parameters
     added = [parameter for parameter in ours.values() if parameter.kind is parameter.KEYWORD_ONLY]
     theirs = inspect.signature(gsplat.rasterization)
@@ -112,7 +112,7 @@ rasterization.__signature__ = _signature()  # type: ignore[attr-defined]
 
 
 def _one_camera(given: dict[str, Any], virtual_scale: float, config: AttenuationConfig) -> Rendered:
-    """gsplat's result where there is but one camera, whatever the dimensions around it."""
+    """gsplat's result for a single camera with any batch dimensions."""
     camera = Camera(
         given["viewmats"].reshape(4, 4), given["Ks"].reshape(3, 3), given["width"], given["height"],
         near=given["near_plane"],
@@ -125,7 +125,7 @@ def _one_camera(given: dict[str, Any], virtual_scale: float, config: Attenuation
 
 
 def _cameras(given: dict[str, Any], shape: torch.Size) -> Iterator[dict[str, Any]]:
-    """The arguments of each camera on its own, without batch dimensions, in gsplat's order of images."""
+    """Arguments for each camera, without batch dimensions, in gsplat's order of images."""
     values = 1 if given["sh_degree"] is None else 2  # dimensions of one Gaussian's colour
     for index in np.ndindex(*shape):
         batch, camera = index[:-1], slice(index[-1], index[-1] + 1)
@@ -139,7 +139,7 @@ def _cameras(given: dict[str, Any], shape: torch.Size) -> Iterator[dict[str, Any
 
 
 def _joined(metas: Sequence[dict[str, Any]], shape: torch.Size) -> dict[str, Any]:
-    """gsplat's ``meta`` of all images, from that of each: its rows one after the other, its ids counted on."""
+    """gsplat's ``meta`` of all images from that of each: rows concatenated, ids offset."""
     first, images = metas[0], range(len(metas))
     packed = first["gaussian_ids"] is not None
     rows = [0, *accumulate(meta["depths"].numel() for meta in metas)]
@@ -166,15 +166,15 @@ def _joined(metas: Sequence[dict[str, Any]], shape: torch.Size) -> dict[str, Any
 
 
 def _pass_gradients_on(parts: list[Tensor], whole: Tensor, rows: list[int]) -> None:
-    """Has ``whole``, which gsplat did not draw from, carry the ``grad`` and ``absgrad`` of the parts that it did.
+    """Gives ``whole`` the ``grad`` and ``absgrad`` of the parts, which gsplat rendered from.
 
-    As on one of gsplat's: ``grad`` where it is retained, added up over backward passes, ``absgrad`` of the last one.
+    As with gsplat: ``grad`` if it is retained, summed over backward passes; ``absgrad`` of the last one.
     """
     if not whole.requires_grad:
         return
     whole.parts = parts  # type: ignore[attr-defined]
-    weak: Any = weakref.ref(whole)  # whole's graph holds the hooks: with whole in them, neither would ever be freed
-    seen: list[Any] = [0] * len(parts)  # what came by way of whole itself, and is in its grad already
+    weak: Any = weakref.ref(whole)  # the graph of whole holds the hooks; a strong reference would be a cycle
+    seen: list[Any] = [0] * len(parts)  # gradients that came through whole and are in its grad already
 
     def by_whole(gradient: Tensor) -> None:
         seen[:] = gradient.reshape(-1, 2).split([stop - start for start, stop in pairwise(rows)])

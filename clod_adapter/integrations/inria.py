@@ -1,4 +1,4 @@
-"""Inria's rasterizer with a dial, diff-gaussian-rasterization in whichever fork is installed.
+"""Inria's rasterizer with a dial: diff-gaussian-rasterization, in whichever fork is installed.
 
 from clod_adapter.integrations.inria import GaussianRasterizationSettings, GaussianRasterizer
 color, radii, *others = GaussianRasterizer(raster_settings)(
@@ -6,11 +6,10 @@ color, radii, *others = GaussianRasterizer(raster_settings)(
     sigma_d=model.sigma_d, attenuation=model.attenuation, virtual_scale=3,
 )
 
-Forks differ in their settings, in further arguments and in what they return; this class is the installed one's own and
-passes all of it on. Who is left out is handed over with opacity 0 and just behind the camera's centre, where a fork
-culls it first of all, whether by depth (0.2, or nearer where someone has changed that) or, as for panoramas, by
-distance: it costs what a Gaussian out of sight costs, which opacity 0 alone would not save. All rows stay in their
-places: radii are 0 there, and the gradients of every input keep their shapes.
+Forks differ in settings, further arguments and results; this class is derived from the installed one and passes all of
+them on. Culled Gaussians get opacity 0 and a position just behind the camera's centre, where every fork culls them
+first, by depth (0.2 or a changed near plane) or, for panoramas, by distance. They cost as much as a Gaussian out of
+view, which opacity 0 alone would not achieve. All rows keep their places: radii are 0, and gradients keep their shapes.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
 
 class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
-    """The installed ``GaussianRasterizer``, whose call takes the dial as well."""
+    """The installed ``GaussianRasterizer`` with arguments for the dial."""
 
     def forward(
         self,
@@ -51,41 +50,43 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
         attenuation: AttenuationConfig | None = None,
         **kwargs: Any,
     ) -> Any:
-        """What the installed fork returns for the Gaussians that one dial value keeps, faded as the camera sees them.
+        """The installed fork's result with the opacities of one dial value, attenuated for the camera.
 
-        Equals the fork called with ``attenuation.attenuate``'s opacities and only the rows that are kept, with those
-        that are not as rows of radius 0. Differentiable in ``sigma_d``; the distances are constants. A file's
-        ``Gaussians.screen_filter`` is to be given in the settings of forks that have it (``antialiasing``,
+        Equals the fork called with the opacities of ``attenuation.attenuate`` and without culled rows, plus rows of
+        radius 0 for these. Differentiable in ``sigma_d``; the distances are constants. A file's
+        ``Gaussians.screen_filter`` belongs in the settings of forks that support it (``antialiasing``,
         Mip-Splatting's ``kernel_size``).
 
         Args:
-            means3D, means2D, opacities, args, kwargs: the fork's own, by position or by name.
-            sigma_d: ``[N]``; without it this is the fork's function.
+            means3D, means2D, opacities, args, kwargs: those of the fork, by position or by name.
+            sigma_d: ``[N]``; None calls the fork's function unchanged.
             virtual_scale: the dial s >= 1.
-            attenuation: how ``sigma_d`` is to be read, the file's (``Gaussians.attenuation``); by default
-                ``AttenuationConfig()``, whose distances are in world units.
+            attenuation: settings of the equation, ``Gaussians.attenuation`` of the file; by default
+                ``AttenuationConfig()``, with distances in world units.
 
         Raises:
-            ClodError: the dial is below 1, the shapes do not fit, or the settings say ``prefiltered``, with which
-                the rasterizer stops at the first Gaussian out of sight.
+            ClodError: the dial is below 1, the shapes do not match, or the settings have ``prefiltered``, with which
+                the rasterizer aborts at the first Gaussian out of view.
         """
         if sigma_d is None:
             return super().forward(means3D, means2D, opacities, *args, **kwargs)
         settings = self.raster_settings
         if settings.prefiltered:
-            raise ClodError("raster_settings.prefiltered is True, and who the dial leaves out is not; set it to False")
+            raise ClodError(
+                "raster_settings.prefiltered is True, but culled Gaussians are out of view; set it to False"
+            )
         hook = Hook(sigma_d, attenuation or AttenuationConfig(), virtual_scale)
         viewmat = settings.viewmatrix.T  # Inria's matrices multiply from the right
         drawn, keep = hook(
             means3D, opacities, viewmat, _intrinsics(settings), settings.image_width, settings.image_height
         )
-        hidden = settings.campos - NEAR * settings.viewmatrix[:3, 2]  # against the way the camera looks
+        hidden = settings.campos - NEAR * settings.viewmatrix[:3, 2]  # opposite to the viewing direction
         means3D = torch.where(keep[:, None], means3D, hidden.to(means3D))
         return super().forward(means3D, means2D, drawn, *args, **kwargs)
 
 
 def _intrinsics(settings: Any) -> Tensor:
-    """``[3, 3]`` in pixels; the principal point is the image's middle."""
+    """``[3, 3]`` in pixels, with the principal point in the middle of the image."""
     width, height = settings.image_width, settings.image_height
     fx, fy = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
     return torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])

@@ -1,20 +1,20 @@
-"""Rasterizers behind one protocol. They know nothing of ``sigma_d``: opacities go in, pixels come out."""
+"""Rasterizers behind one protocol. They take final opacities; ``sigma_d`` is applied before."""
 
 from __future__ import annotations
 
 import torch
 
 from clod_adapter.errors import ClodError
-from clod_adapter.rasterizers.protocol import Rasterizer, wait_for
+from clod_adapter.rasterizers.protocol import ALPHA_MAX, Rasterizer, wait_for
 
-__all__ = ["Rasterizer", "for_device", "wait_for"]
+__all__ = ["ALPHA_MAX", "Rasterizer", "for_device", "wait_for"]
 
 
 def for_device(device: torch.device) -> Rasterizer:
     """The fastest rasterizer for tensors on ``device``, imported on first use.
 
     Raises:
-        ClodError: there is none for that kind of device, or what it is made of is not installed.
+        ClodError: there is none for that kind of device, or gsplat is not installed or does not work.
     """
     if device.type == "cpu":
         from clod_adapter.rasterizers import cpu

@@ -1,4 +1,4 @@
-"""Tile-based splatting on the CPU, compiled by Numba: forward and all gradients, several threads."""
+"""Tile-based splatting on the CPU, compiled by Numba: forward and backward pass on several threads."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from clod_adapter.rasterizers.protocol import require_float32
 
 
 class _Buffers:
-    """Scratch arrays kept between calls: a fresh large array costs more in page faults than the work in it."""
+    """Scratch arrays kept between calls: page faults of a new large array cost more than the work on it."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, np.ndarray] = {}
@@ -49,14 +49,14 @@ def _give(buffers: _Buffers) -> None:
 
 
 def release_memory() -> None:
-    """Frees the scratch memory of earlier pictures, between one set of Gaussians and the next."""
+    """Frees the scratch memory of earlier renders."""
     _idle.clear()
     release()
 
 
 @dataclass
 class _Frame:
-    """What the forward pass leaves for the backward pass. The arrays are views of pooled buffers."""
+    """State of the forward pass for the backward pass. The arrays are views of pooled buffers."""
 
     buffers: _Buffers
     camera: np.ndarray
@@ -81,7 +81,7 @@ class _Frame:
 
 
 def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.ndarray:
-    """The camera and the screen-space filter as the kernels read them (layout in ``_kernels/conventions.py``)."""
+    """Camera and screen-space filter in the layout of the kernels (``_kernels/conventions.py``)."""
     out = np.empty(conventions.CAMERA, np.float32)
     K = camera.K.detach().cpu().double()
     fx, fy, cx, cy = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
@@ -97,7 +97,7 @@ def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.n
 
 
 def _project(buffers: _Buffers, arrays: list[np.ndarray], degree: int, cam: np.ndarray, workers: int) -> Any:
-    """Packed records of what is visible, their row numbers, how many each worker found, and their depth order."""
+    """Packed records of the visible Gaussians, their row numbers, the count of each worker, and the depth order."""
     n = len(arrays[0])
     records = buffers.get("records", ((n + workers) * conventions.RECORD,), np.float32)
     depths, packed_ids = buffers.get("depths", (n,), np.float32), buffers.get("packed_ids", (n,), np.int32)
@@ -128,7 +128,7 @@ def _prepare(
     total = tiles.tile_offsets(histogram, offsets, totals)
     entries, entry_slots = buffers.get("entries", (total,), np.int32), buffers.get("entry_slots", (total,), np.int32)
     threads.run(tiles.fill_tiles, workers, records, order, across, histogram, totals, slots, entries, entry_slots)
-    # The longest lists first, so that no thread starts a long tile when the others are done.
+    # Longest lists first: no thread starts a long tile when the others are done.
     longest_first = np.argsort(-np.diff(offsets), kind="stable")
     return _Frame(
         buffers, cam, camera.width, camera.height, across, records, packed_ids, counts, slots, entries,
@@ -166,10 +166,10 @@ class _Splat(torch.autograd.Function):
         frame: _Frame = ctx.frame
         v_image, v_alpha = (g.contiguous().numpy() for g in gradients)
         *arrays, _sh0, shN = _arrays(inputs)
-        # What nobody asks for is left out of the sums. Where there are bands, a mean changes the colour too.
+        # Unused sums are skipped. Above SH degree 0, a mean changes the colour too.
         shaped = any(ctx.needs_input_grad[:3])
         colored = any(ctx.needs_input_grad[4:6]) or (shaped and ctx.degree > 0)
-        # Sixteen floats are read at the last pair too.
+        # Reads of the last pair are sixteen floats wide too.
         pair_sums = frame.buffers.get("pair_sums", (len(frame.entries) * conventions.PAIR + 16,), np.float32)
         threads.run(
             blend.blend_gradient, frame.workers, frame.records, frame.entries, frame.entry_slots, frame.offsets,

@@ -1,13 +1,12 @@
-"""Splatting on an NVIDIA GPU by gsplat 1.5.3's kernels, of the rows that are drawn and of no others.
+"""Splatting on an NVIDIA GPU by gsplat 1.5.3's kernels, restricted to the rows that are drawn.
 
-gsplat's projection looks at an opacity last, after all the work on a row, and packed it does that work twice. So rows
-below 1/255, those that a dial has cut among them, are left out beforehand: their 4 bytes of opacity are read, and
-nothing else of them, here or later. Of the rows that stay, the geometry (40 bytes) is gathered once and projected,
-packed; the spherical harmonics (up to 300 bytes) are gathered only of those that the projection finds in the picture,
-by their row in the whole tensor. Unpacked, gsplat would want them of every row that it is given.
+gsplat's projection tests the opacity last, after all other work on a row, and packed mode does that work twice. Rows
+below 1/255, such as culled ones, are therefore removed first: only their opacity (4 bytes) is read. The geometry of the
+other rows (40 bytes) is gathered once and projected in packed mode. Spherical harmonics (up to 300 bytes) are gathered
+only for rows that the projection finds in the image; unpacked, gsplat would need them for every row.
 
-Backward, a row that was gathered is written to one place, so that nothing is added up and the gradients of rows that
-were left out are 0. What gsplat sums over pixels it sums in no fixed order: results repeat but for rounding.
+The backward pass writes each gathered row to one place, without additions; gradients of removed rows are 0. gsplat sums
+over pixels in no fixed order, so results repeat except for rounding.
 """
 
 from __future__ import annotations
@@ -27,20 +26,20 @@ from torch.autograd.function import once_differentiable
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.errors import ClodError
-from clod_adapter.rasterizers.protocol import require_float32
+from clod_adapter.rasterizers.protocol import ALPHA_MIN, require_float32
 
-ALPHA_MIN, TILE = 1 / 255, 16
+TILE = 16
 OLDEST, INSTALL = (1, 5, 3), "pip install gsplat==1.5.3"
 
 
 @lru_cache(maxsize=1)
 def unusable() -> str | None:
-    """Why gsplat cannot draw on a GPU here, with the line that mends it; None where it can.
+    """Why gsplat cannot render on a GPU here, with the command that fixes it; None if it can.
 
-    The first call on a machine may compile gsplat's kernels, which takes minutes; gsplat says so.
+    The first call on a machine may compile gsplat's kernels, which takes minutes; gsplat prints a message.
     """
     try:
-        with contextlib.redirect_stdout(sys.stderr):  # it speaks to stdout, which is our results'
+        with contextlib.redirect_stdout(sys.stderr):  # its messages would mix with results on stdout
             import gsplat
 
             if tuple(int(number) for number in re.findall(r"\d+", gsplat.__version__)[:3]) < OLDEST:
@@ -58,7 +57,7 @@ def unusable() -> str | None:
 
 
 def require_gsplat() -> None:
-    """Raises ClodError where gsplat cannot draw."""
+    """Raises ClodError if gsplat cannot render here."""
     if reason := unusable():
         raise ClodError(f"no rasterizer for the GPU: {reason}; or use the CPU (--device cpu)")
 
@@ -80,7 +79,7 @@ def rasterize(
     rows, geometry = compact(means, quats, scales, opacities)
     drawn = _project(geometry, sh0, shN, rows, camera, screen_filter) if len(rows) else None
     if drawn is None or len(drawn["means2d"]) == 0:
-        # Nothing to draw, but the inputs have gradients: 0.
+        # Nothing to draw; the gradients are 0.
         nothing = sum(_Rows.apply(rows[:0], x).sum() for x in (means, quats, scales, opacities, sh0, shN))
         empty = nothing + means.new_zeros(camera.height, camera.width)
         return background + empty[..., None], empty
@@ -97,7 +96,7 @@ def compact(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> 
 def _project(
     geometry: list[Tensor], sh0: Tensor, shN: Tensor, rows: Tensor, camera: Camera, screen_filter: ScreenFilter
 ) -> dict[str, Tensor]:
-    """What gsplat's tiles and pixels take of the Gaussians that are in the picture: a row each, in the rows' order."""
+    """Inputs of gsplat's tiles and pixels: one row for each Gaussian in the image, in row order."""
     import gsplat
 
     means, quats, scales, opacities = geometry
@@ -111,7 +110,7 @@ def _project(
     degree = math.isqrt(coefficients.shape[1]) - 1
     colors = 0.5 + gsplat.spherical_harmonics(degree, _Rows.apply(ids, means) - eye, coefficients)
     shown = _Rows.apply(ids, opacities) * (1 if compensations is None else compensations)
-    # A row that has a number which is not finite, or projects to one, is not drawn; in the kernels it would be opaque.
+    # Rows with values that are not finite are not drawn; the kernels would draw them opaque.
     sound = (means2d.sum(1) + conics.sum(1) + colors.sum(1) + shown).detach().isfinite()
     rows_of = sound[:, None]
     return {
@@ -121,7 +120,7 @@ def _project(
 
 
 def _blend(drawn: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor]:
-    """Image ``[H, W, 3]`` before nothing, and alpha ``[H, W]``: tiles, their lists by depth, and the pixels."""
+    """Image ``[H, W, 3]`` without a background and alpha ``[H, W]``: tile lists sorted by depth, then pixels."""
     import gsplat
 
     across, down = -(-camera.width // TILE), -(-camera.height // TILE)
@@ -140,16 +139,16 @@ def _blend(drawn: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def _camera(camera: Camera, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """``[1, 4, 4]``, ``[1, 3, 3]`` and the centre ``[3]`` where the Gaussians are, in one transfer."""
+    """View matrix ``[1, 4, 4]``, K ``[1, 3, 3]`` and centre ``[3]`` on the Gaussians' device, in one transfer."""
     parts = (camera.viewmat.flatten(), camera.K.flatten(), camera.position)
     flat = torch.cat([part.detach().to(like.dtype) for part in parts]).to(like.device, non_blocking=True)
     return flat[:16].view(1, 4, 4), flat[16:25].view(1, 3, 3), flat[25:]
 
 
 class _Rows(Function):
-    """The rows of one tensor, or of several side by side along the second dimension; each row at most once.
+    """Selected rows of one tensor, or of several concatenated along the second dimension; each row at most once.
 
-    Backward, what is not finite counts as 0: it comes of rows that are not drawn, as 0 times what they projected to.
+    The backward pass replaces values that are not finite by 0: they are 0 times the projection of rows not drawn.
     """
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""What every rasterizer takes and gives, and what they check alike."""
+"""The interface of every rasterizer, and their common checks."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from clod_adapter._kernels import ALPHA_MAX, ALPHA_MIN, T_MIN
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.errors import ClodError
+
+__all__ = ["ALPHA_MAX", "ALPHA_MIN", "T_MIN", "Rasterizer", "require_float32", "wait_for"]
 
 
 class Rasterizer(Protocol):
@@ -21,10 +24,10 @@ class Rasterizer(Protocol):
         scales: ``[N, 3]`` standard deviations, world units.
         opacities: ``[N]`` in [0, 1]; rows below 1/255 are skipped before any other work.
         sh0: ``[N, 1, 3]``; shN: ``[N, K-1, 3]``.
-        camera: where from; no gradient.
+        camera: the viewpoint; gets no gradient.
         background: ``[3]``.
-        screen_filter: what is added to the projected covariances, and whether opacities are compensated for it, which
-            skips rows that fall below 1/255 by it.
+        screen_filter: variance added to the projected covariances, and whether opacities are compensated for it; rows
+            whose compensated opacity is below 1/255 are skipped.
 
     Returns:
         The image ``[H, W, 3]``, not clamped, and the accumulated alpha ``[H, W]``; both
@@ -38,13 +41,13 @@ class Rasterizer(Protocol):
 
 
 def require_float32(backend: str, **tensors: Tensor) -> None:
-    """Raises the ClodError of a rasterizer that is given a tensor of another type, by the tensor's name."""
+    """Raises ClodError, with the tensor's name, unless all tensors are float32."""
     for name, tensor in tensors.items():
         if tensor.dtype != torch.float32:
             raise ClodError(f"the {backend} rasterizer takes float32 only, and {name} is {tensor.dtype}: use .float()")
 
 
 def wait_for(device: torch.device) -> None:
-    """Returns when the device has done what it was given, so that a clock may be read; the CPU always has."""
+    """Waits until the device has finished, for timing; nothing to wait for on the CPU."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -1,6 +1,6 @@
-"""The oracle: plain torch splatting, every Gaussian at every pixel, gradients by autograd.
+"""The reference for tests: plain torch splatting, every Gaussian at every pixel, gradients by autograd.
 
-Any device, any float type, no speed. Same conventions as the fast backends: pixel centres at +0.5,
+Any device, any float type, slow. Same conventions as the fast backends: pixel centres at +0.5,
 the screen-space filter, the camera's near plane, alpha clamped to 0.999 and dropped below 1/255, a pixel ends
 before its transmittance would fall to 1e-4.
 """
@@ -13,8 +13,7 @@ from torch import Tensor
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.gaussians import SH_C0
-
-ALPHA_MIN, ALPHA_MAX, T_MIN = 1 / 255, 0.999, 1e-4
+from clod_adapter.rasterizers.protocol import ALPHA_MAX, ALPHA_MIN, T_MIN
 
 
 def rasterize(
@@ -76,13 +75,13 @@ def blurred(half: Tensor, opacities: Tensor, screen_filter: ScreenFilter) -> tup
         return covariance, opacities
     unblurred = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(1)
     ratio = unblurred / torch.linalg.det(covariance)
-    shown = ratio > 0  # a root has no slope at 0
+    shown = ratio > 0  # the derivative of the square root at 0 is infinite
     compensated = opacities * ratio.where(shown, 1).sqrt().where(shown, 0)
     return covariance, compensated.where(compensated >= ALPHA_MIN, 0)
 
 
 def blend(alphas: Tensor) -> tuple[Tensor, Tensor]:
-    """Front-to-back weights ``[pixels, n]`` and what is left behind them ``[pixels]``."""
+    """Front-to-back weights ``[pixels, n]`` and the remaining transmittance ``[pixels]``."""
     through = torch.cumprod(1 - alphas, 1)
     before = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], 1)
     alive = (through > T_MIN) | (alphas == 0) & (before > T_MIN)

@@ -1,4 +1,4 @@
-"""What results look like: one drawing style, figures, and the self-contained HTML report.
+"""Presentation of results: figures in one style, and the self-contained HTML report.
 
-Works on plain rows, so that whoever measured them may hand them in.
+Takes plain rows, from any source.
 """

@@ -1,4 +1,4 @@
-"""Error against time, on log axes: of rendering and of adapting; as a PNG, and as an SVG for a page's own colours."""
+"""Charts of error against rendering time and adapting time, on log axes, as PNG or as SVG in the page's colours."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MARKERS = "oDs^vPX"
 
 
 def write_png(path: str | Path, draw: Draw) -> None:
-    """ViewSampler a chart into a file.
+    """Draws a chart into a PNG file.
 
     Raises:
         ClodError: matplotlib is missing, or the file cannot be written.
@@ -30,12 +30,12 @@ def write_png(path: str | Path, draw: Draw) -> None:
 
 
 def chart_file(page: Path, name: str) -> Path:
-    """Where a page's chart of this name goes: beside it."""
+    """Path of a page's chart, in the folder of the page."""
     return page.with_name(f"{page.stem}_{name}.png")
 
 
 def inline_svg(draw: Draw, label: str) -> str:
-    """The chart as an SVG element, its colours those of ``style.css`` (``--ink``, ``--series-1``, ...)."""
+    """The chart as an SVG element with the colours of ``style.css`` (``--ink``, ``--series-1``, ...)."""
     with new_figure(SIZE, layout="constrained") as figure:
         draw(figure)
         text = io.StringIO()
@@ -52,7 +52,7 @@ def inline_svg(draw: Draw, label: str) -> str:
 
 
 def rendering_chart(series: Sequence[Series]) -> Draw:
-    """Error against milliseconds a frame: a line for each dial, points for what has none."""
+    """Error against milliseconds per frame: lines for files with a dial, points for others."""
 
     def draw(figure: Any) -> None:
         axes = figure.subplots()
@@ -64,7 +64,7 @@ def rendering_chart(series: Sequence[Series]) -> Draw:
             for row, point in zip(one.rows if one.dial else (), points, strict=False):
                 _note(axes, f"s = {row['virtual_scale']:g}", point)
         axes.set_xscale("log")
-        axes.set_xlabel("milliseconds a frame (log scale)")
+        axes.set_xlabel("milliseconds per frame (log scale)")
         finish(axes)
 
     return draw
@@ -74,15 +74,15 @@ def training_chart(curves: Sequence[Mapping[str, Any]], base_psnr: float | None)
     """Held-out error against seconds of adapting.
 
     Args:
-        curves: each with ``label`` and ``points``, of which each has ``seconds`` and ``psnr``.
-        base_psnr: of the unadapted base, a line across.
+        curves: each with ``label`` and ``points``; a point has ``seconds`` and ``psnr``.
+        base_psnr: of the unadapted base, drawn as a horizontal line.
     """
 
     return lambda figure: draw_training(figure.subplots(), curves, base_psnr)
 
 
 def draw_training(axes: Any, curves: Sequence[Mapping[str, Any]], base_psnr: float | None) -> None:
-    """What ``training_chart`` shows, into one panel of a figure."""
+    """Draws ``training_chart`` into one panel of a figure."""
     for k, curve in enumerate(curves):
         points = [(point["seconds"], error(point["psnr"])) for point in curve["points"]]
         style = {"color": SERIES[k % len(SERIES)], "marker": MARKERS[k % len(MARKERS)], "label": curve["label"]}
@@ -95,7 +95,7 @@ def draw_training(axes: Any, curves: Sequence[Mapping[str, Any]], base_psnr: flo
 
 
 def error(psnr: float) -> float:
-    """Mean squared error of colours in [0, 1] that has this PSNR in dB."""
+    """Mean squared error of colours in [0, 1] for a PSNR in dB."""
     return 10.0 ** (-psnr / 10)
 
 
@@ -104,7 +104,7 @@ def _note(axes: Any, text: str, at: tuple[float, float]) -> None:
 
 
 def finish(axes: Any) -> None:
-    """Log error on the left, at round PSNR values, which stand on the right."""
+    """Axes of an error chart: log error on the left, with ticks at round PSNR values, which are on the right."""
     axes.set_yscale("log")
     axes.margins(x=0.09, y=0.12)
     low, high = (-10 * math.log10(value) for value in reversed(axes.get_ylim()))

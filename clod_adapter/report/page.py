@@ -1,6 +1,6 @@
-"""A self-contained HTML page: pieces of it as functions that return HTML, and the page that holds them.
+"""A self-contained HTML page, from functions that return HTML.
 
-Nothing is loaded from elsewhere: style, script, charts and pictures are in the file.
+Style, script, charts and images are in the file; nothing is loaded from a network.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ QUALITY = 88  # of WebP
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture with its caption.
+    """An image with its caption.
 
     Attributes:
         image: ``[H, W, 3]`` uint8, or float in 0..1.
-        title: what it is, in a word or two; detail: numbers on it.
+        title: one or two words; detail: its numbers.
     """
 
     image: np.ndarray
@@ -40,14 +40,14 @@ class Picture:
 
 
 def write_page(path: str | Path, title: str, kicker: str, body: Iterable[str], data: Mapping[str, Any]) -> None:
-    """Writes the page, with ``data`` in it as JSON under the id ``data``.
+    """Writes the page, including ``data`` as JSON under the id ``data``.
 
     Raises:
         ClodError: the file cannot be written.
     """
     source = files("clod_adapter.report")
     style, script = ((source / name).read_text(encoding="utf-8") for name in ("style.css", "dial.js"))
-    # In a script element only "</" could end it.
+    # "</" would end the script element.
     rows = json.dumps(data, allow_nan=False, ensure_ascii=False).replace("</", "<\\/")
     page = f"""<!doctype html>
 <html lang="en">
@@ -82,7 +82,7 @@ def paragraph(text: str, kind: str = "") -> str:
 
 
 def tiles(entries: Sequence[tuple[str, str, str]]) -> str:
-    """Key figures: what, value, and a note under it."""
+    """Key figures: label, value and note."""
     cells = (
         f"<div><dt>{escape(what)}</dt><dd>{escape(value)}<small>{escape(note)}</small></dd></div>"
         for what, value, note in entries
@@ -104,7 +104,7 @@ def chart(svg: str, caption: str) -> str:
 
 
 def table(head: Sequence[str], groups: Iterable[tuple[str, Sequence[Sequence[str]]]]) -> str:
-    """Rows of cells under the name of their group."""
+    """A table of groups, each with a heading and rows of cells."""
     lines = ["<tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
     for name, rows in groups:
         lines.append(f'<tr class="group"><td colspan="{len(head)}">{escape(name)}</td></tr>')
@@ -113,7 +113,7 @@ def table(head: Sequence[str], groups: Iterable[tuple[str, Sequence[Sequence[str
 
 
 def strip(pictures: Sequence[Picture]) -> str:
-    """Pictures side by side."""
+    """Images side by side."""
     cells = (
         f'<figure><img src="{data_url(p.image)}" alt="{escape(p.title)}"><figcaption><b>{escape(p.title)}</b> '
         f"{escape(p.detail)}</figcaption></figure>"
@@ -123,7 +123,7 @@ def strip(pictures: Sequence[Picture]) -> str:
 
 
 def dial(frames: Sequence[Picture], others: Mapping[str, Picture]) -> str:
-    """A slider over the frames, ordered by dial value; each of ``others`` shows while its button is held."""
+    """A slider over the frames, in order of dial values; an image of ``others`` is shown while its button is held."""
     height, width = frames[0].image.shape[:2]
     images = [_frame(picture) for picture in frames] + [_frame(picture, name) for name, picture in others.items()]
     buttons = (f'<button type="button" data-shows="{escape(n)}">hold for {escape(n)}</button>' for n in others)
@@ -133,7 +133,7 @@ def dial(frames: Sequence[Picture], others: Mapping[str, Picture]) -> str:
         f'<input type="range" min="0" max="{len(frames) - 1}" value="0" step="1" aria-label="dial value">'
         f'<div class="ends"><span>{escape(frames[0].title)}, full quality</span><span>{escape(frames[-1].title)}</span>'
         f'</div><div class="buttons">{"".join(buttons)}</div></figure>'
-        '<noscript><p class="quiet">The slider needs JavaScript; the pictures below show the same view.</p></noscript>'
+        '<noscript><p class="quiet">The slider needs JavaScript; the images below show the same view.</p></noscript>'
     )
 
 
@@ -145,7 +145,7 @@ def _frame(picture: Picture, name: str = "") -> str:
 
 
 def data_url(image: np.ndarray) -> str:
-    """The picture as WebP in a data: address, at most WIDEST pixels wide."""
+    """The image as WebP in a data: URL, at most WIDEST pixels wide."""
     pixels = image if image.dtype == np.uint8 else (np.clip(image, 0, 1) * 255).round().astype(np.uint8)
     picture = Image.fromarray(pixels)
     if picture.width > WIDEST:

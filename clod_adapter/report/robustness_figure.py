@@ -1,4 +1,4 @@
-"""The figure of the robustness experiment: quality against Gaussians, and what opacity and sigma_d became."""
+"""The figure of the robustness experiment: quality against count, distributions of opacity and sigma_d."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ PANELS = ("PSNR (dB)", "SSIM", "opacity", "decay sigma_d (log scale)")
 
 
 def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], title: str) -> None:
-    """ViewSampler a row of four panels a checkpoint: PSNR and SSIM against Gaussians kept, opacity, sigma_d.
+    """Draws four panels per checkpoint: PSNR and SSIM against Gaussians kept, opacity, sigma_d.
 
     Args:
-        path: the picture to write; its suffix chooses the format.
-        cells: each with ``checkpoint``, ``max_sv`` (None of the baseline), ``rows`` and ``distribution``, as the
-            experiment's JSON has them; any of them may be missing.
+        path: the file to write; its suffix selects the format.
+        cells: with ``checkpoint``, ``max_sv`` (None for the baseline), ``rows`` and ``distribution``, from the
+            experiment's JSON; cells may be missing.
         title: one line above.
 
     Raises:
@@ -67,7 +67,7 @@ def _xy(points: Sequence[tuple[float, float, float]]) -> tuple[list[float], list
 
 
 def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, str]) -> None:
-    """Outlines of the histograms, in percent of the Gaussians a bin."""
+    """Outlines of the histograms, in percent of the Gaussians per bin."""
     for cell in cells:
         histogram = cell["distribution"].get(key)
         if histogram is None:
@@ -76,7 +76,7 @@ def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colou
         base = cell["max_sv"] is None
         style = {"color": ORANGE, "linestyle": "--"} if base else {"color": colours[cell["max_sv"]]}
         axes.stairs(heights, histogram["edges"], linewidth=1.4, **style)
-    axes.set_ylabel("% of Gaussians a bin", color=QUIET, fontsize=8)
+    axes.set_ylabel("% of Gaussians per bin", color=QUIET, fontsize=8)
     if key == "opacity":
         axes.set_yscale("log")  # most are nearly transparent
         label_log(axes.yaxis, "{:g}")
@@ -87,7 +87,7 @@ def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colou
 
 
 def _trim(axes: Any, histograms: Sequence[Mapping[str, Any]]) -> None:
-    """Shows the decades of sigma_d that hold at least a thousandth of the Gaussians a bin."""
+    """Limits the axis to the decades of sigma_d whose bins hold a thousandth of the Gaussians or more."""
     used = [k for h in histograms for k, share in enumerate(h["shares"]) if share > 1e-3]
     if used:
         edges = histograms[0]["edges"]
@@ -100,10 +100,10 @@ def _legend(figure: Any, colours: Mapping[float, str]) -> None:
     from matplotlib.lines import Line2D
 
     lines = [Line2D([], [], color=ORANGE, linestyle="--", marker="D", markersize=3)]
-    names = ["unadapted, most opaque kept"]
+    names = ["unadapted, pruned by opacity"]
     for max_sv, colour in colours.items():
         lines.append(Line2D([], [], color=colour, linewidth=1.8, marker="o", markersize=4.2))
         names.append("adapted at s = 1 only" if max_sv == 1 else f"adapted, s in [1, {max_sv:g}]")
     lines.append(Line2D([], [], color=INK, linestyle=":", marker="o", markersize=3.4, mfc="white"))
-    names.append("beyond the range trained")
+    names.append("beyond the trained range")
     figure.legend(lines, names, loc="outside lower left", ncols=len(names), frameon=False, fontsize=8.5)

@@ -1,4 +1,4 @@
-"""Lines of a chart, taken from the rows that ``clod-adapt --json`` and ``clod-adapt eval --json`` print."""
+"""Series of a chart, from the rows that ``clod-adapt --json`` and ``clod-adapt eval --json`` print."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Series:
-    """Measurements that belong together.
+    """Rows of one file or baseline.
 
     Attributes:
         rows: each with psnr, ssim, kept, frame_ms, and for a dial virtual_scale.
-        dial: they are one file at several dial values.
+        dial: whether the rows are one file at several dial values.
     """
 
     label: str
@@ -24,19 +24,19 @@ class Series:
 
 
 def series_of(report: Mapping[str, Any]) -> list[Series]:
-    """The model over its dial first, then what it is compared with, as far as it was measured.
+    """The series of a report: the model at its dial values first, then the measured comparisons.
 
-    Read are ``rows``; the unadapted base as ``base_row`` or ``base_rows``; the file without its dial as
-    ``detached_row``; the base cut by rank as ``ranked``, ``[{by, row}]``; other files as ``against``,
-    ``[{model, label, theirs}]``. A row without a PSNR (an infinite one, in JSON) is left out.
+    Keys: ``rows``; ``base_row`` or ``base_rows``, the unadapted base; ``detached_row``, the file without its dial;
+    ``ranked``, ``[{by, row}]``, the base pruned by rank; ``against``, ``[{model, label, theirs}]``, other files. Rows
+    without a PSNR (null in JSON if infinite) are skipped.
     """
     base: list[Any] = report.get("base_rows") or [report.get("base_row")]
-    plain_model = report.get("attenuation", {}) is None  # an evaluation's, of a file without a dial
+    plain_model = report.get("attenuation", {}) is None  # evaluation of a file without a dial
     model = Series("the file, no dial" if plain_model else "dial, one file", report.get("rows", []), not plain_model)
     found = [model, Series("base, unadapted", base)]
     ranked = report.get("ranked") or []
     for by in dict.fromkeys(entry["by"] for entry in ranked):
-        found.append(Series(f"base cut by {by}", [entry["row"] for entry in ranked if entry["by"] == by]))
+        found.append(Series(f"base pruned by {by}", [entry["row"] for entry in ranked if entry["by"] == by]))
     against = report.get("against") or []
     for path in dict.fromkeys(entry["model"] for entry in against):
         rows = [entry["theirs"] for entry in against if entry["model"] == path]

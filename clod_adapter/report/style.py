@@ -1,6 +1,6 @@
-"""The one drawing style: colours, fonts, figures, files.
+"""The common style of figures: colours, fonts, axes, files.
 
-matplotlib is an optional dependency and is imported when a picture is drawn.
+matplotlib is an optional dependency, imported when a figure is drawn.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SERIES = (BLUE, ORANGE, GREEN, PURPLE, QUIET)  # in the order that lines are dra
 DPI = 200
 INSTALL = "pip install 'clod-adapter[plots]'"
 STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",  # matplotlib brings it, so captions fit everywhere
+    "font.family": "DejaVu Sans",  # included in matplotlib, so text has the same size everywhere
     "text.color": INK,
     "axes.edgecolor": QUIET,
     "axes.labelcolor": INK,
@@ -29,19 +29,19 @@ STYLE: dict[Any, Any] = {
     "xtick.color": QUIET,
     "ytick.color": QUIET,
     "font.size": 9,
-    "svg.fonttype": "none",  # text stays text in a page
+    "svg.fonttype": "none",  # keeps text as text in a page
 }
 
 
 def check_matplotlib() -> None:
-    """Raises the ClodError that drawing would without matplotlib, before work is spent on what is to be drawn."""
+    """Raises ClodError if matplotlib is missing, for a check before long work."""
     if importlib.util.find_spec("matplotlib") is None:
         raise ClodError(f"pictures need matplotlib: {INSTALL}")
 
 
 @contextmanager
 def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
-    """A matplotlib figure in the house style; without pyplot, so a notebook's own figures are left alone.
+    """A matplotlib figure in the common style; without pyplot, so a notebook's figures are not affected.
 
     Raises:
         ClodError: matplotlib is not installed.
@@ -56,15 +56,15 @@ def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
 
 
 def save(figure: Any, path: str | Path) -> None:
-    """Writes the figure; the file appears whole or not at all."""
-    # Of a PNG the text by which a later run knows it for its own.
+    """Writes the figure atomically."""
+    # Text in a PNG by which a later run recognizes its own output.
     about = {"Software": f"clod-adapter {package_version()}"} if Path(path).suffix.lower() == ".png" else {}
     with atomic_path(path) as part:
         figure.savefig(part, facecolor=PAPER, metadata=about)
 
 
 def shades(count: int) -> list[str]:
-    """``count`` colours of one family from light to dark, for an ordered quantity."""
+    """``count`` shades from light to dark, for an ordered quantity."""
     stops = ((0x9E, 0xC3, 0xE6), (0x1F, 0x5F, 0xA8), (0x10, 0x22, 0x4A))
     colours = []
     for k in range(count):
@@ -76,14 +76,14 @@ def shades(count: int) -> list[str]:
 
 
 def tidy(axes: Any) -> None:
-    """Grid behind, no box."""
+    """Axes with a grid and without a box."""
     axes.grid(color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 
 
 def label_log(axis: Any, text: str = "{:,.0f}", subs: Sequence[float] = (1, 2, 5)) -> None:
-    """Round numbers on a log axis, 1-2-5 in each decade that is shown, written out."""
+    """Labels at round numbers of a log axis, ``subs`` in each decade, written out."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis.set_major_locator(LogLocator(subs=subs))

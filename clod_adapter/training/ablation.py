@@ -11,8 +11,8 @@ from torch import Tensor
 from clod_adapter.cameras import View
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, removal_error, spread
-from clod_adapter.metrics import psnr
-from clod_adapter.rasterizers.reference import ALPHA_MAX
+from clod_adapter.losses import psnr
+from clod_adapter.rasterizers import ALPHA_MAX
 from clod_adapter.render import render
 
 
@@ -49,12 +49,12 @@ def seen(
     Views that have made ``error`` are not looked at again.
 
     Args:
-        error: ``[N]`` the ``removal_error`` of ``spread(views, MOST_VIEWS)``, as ``importance.start`` takes it.
+        error: ``[N]`` the ``removal_error`` of ``spread(views, MOST_VIEWS)``, as ``importance.initialize`` takes it.
         seed: of the signs.
         progress: called with the number of other views done, and of all of them.
     """
-    chosen = {id(view) for view in spread(views, MOST_VIEWS)}
-    others = [view for view in views if id(view) not in chosen]
+    rendered = set(spread(range(len(views)), MOST_VIEWS))
+    others = [view for k, view in enumerate(views) if k not in rendered]
     moves = (error > 0) | (removal_error(base, others, seed=seed, progress=progress) > 0)
     return moves | (base.opacities > ALPHA_MAX)
 

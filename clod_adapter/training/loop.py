@@ -17,7 +17,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.finite import LossNotFinite, largest_colour, require_finite, spoilt_rows
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import for_training, seeing, start
+from clod_adapter.initialization.importance import for_training, initialize, usable_views
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost
 from clod_adapter.training.objective import GradientSum, Objective, TrainableSubset
 from clod_adapter.training.optimizer import RowAdam, add_to_mean
@@ -93,9 +93,9 @@ def adapt(
 
     # Where the higher bands are not tuned, empty ones stay empty.
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
-    views = seeing(base, scene.train)
+    views = usable_views(base, scene.train)
     if resume is None:
-        begun = for_training(start(lean, views, config, report), views, config)
+        begun = for_training(initialize(lean, views, config, report), views, config)
         if peers:  # the same bits in all of them
             own = {"sigma_d": begun.sigma_d, "attenuation": begun.attenuation}
             begun = begun.replace(**peers.broadcast(own)).to(begun.means.device)
@@ -260,7 +260,7 @@ class _Run:
         before = self.draws.state()
         draws = [self.draws.draw() for _ in range(self.config.batch)]
         try:
-            pull = self.objective.pull(self.parameters, self.peers.share(draws) if self.peers else draws)
+            pull = self.objective.gradient_sum(self.parameters, self.peers.share(draws) if self.peers else draws)
             pull = self.peers.sum(pull) if self.peers else pull
             if not math.isfinite(pull.loss):
                 names = ", ".join(view.camera.name or "a view without a name" for view, _ in draws)

@@ -1,9 +1,9 @@
-"""What one view asks of the parameters: the training objective and its gradients."""
+"""The training objective of one view, and its gradients."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -12,45 +12,59 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.attenuation import SIGMA_MAX, attenuate, normalized_distances
-from clod_adapter.cameras import View
+from clod_adapter.attenuation import SIGMA_MAX, Attenuated, attenuate
+from clod_adapter.cameras import Camera, StoredView, View
 from clod_adapter.config import CLASSIC, AdaptConfig, AttenuationConfig, ScreenFilter
+from clod_adapter.distances import normalized_distances
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import splat
 from clod_adapter.training.target_count import TargetShare, count_gradient, paper_count, target_share
 
-# Sigma stays where the equation still tells values apart; below, a Gaussian would be gone for good.
+# Sigma stays where the equation still resolves it; below, a Gaussian would be culled for good.
 SIGMA_RANGE = (1e-4, SIGMA_MAX)
 
 
 @dataclass(frozen=True)
 class TrainableSubset:
-    """What is trained of a scene, where that is not all of it.
+    """The trained Gaussians, where these are not the whole scene.
 
     Attributes:
-        trained: how many of the first rows are; the others are only drawn.
+        trained: number of trained rows, the first ones; the others are the context: drawn, but not trained.
         extent: of the whole scene's cameras, world units: the unit of position steps. By default that of the views.
-        quota: gives, for a view, a dial value and the loss there, what the count term asks of the trained rows; by
-            default the law.
-        rest_in_full: the others are drawn as if they had no dial, and not at the dial too.
-        total: what the law is a share of, where there are more than those trained (``counting.target_share``).
+        full_context: draw the context without a dial, instead of at the dial value of the trained rows.
+        total: number of Gaussians that the target-count curve is a share of, where that is more than ``trained``
+            (``target_count.target_share``).
     """
 
     trained: int
     extent: float | None = None
-    quota: Callable[[View, float, float], TargetShare] | None = None
-    rest_in_full: bool = False
+    full_context: bool = False
     total: int | None = None
+
+
+class TargetView(StoredView):
+    """A view with a target share of its own, in place of the target-count curve's.
+
+    Args:
+        view: camera and photograph.
+        target_share: returns the target share of the trained rows at a dial value.
+    """
+
+    target_share: Callable[[float], TargetShare]
+
+    def __init__(self, view: View, target_share: Callable[[float], TargetShare]) -> None:
+        super().__init__(view.camera, lambda: view.image)
+        object.__setattr__(self, "target_share", target_share)
 
 
 @dataclass
 class GradientSum:
-    """What views ask of the parameters; of several, their sum.
+    """Gradients of the objective, summed over views.
 
     Attributes:
-        gradients: of what is trained, by parameter, of its first ``trained`` rows.
-        kept: ``[trained]`` bool, the rows that a picture had.
+        gradients: by name of the trained parameter, of its first ``trained`` rows.
+        kept: ``[trained]`` bool, the rows that at least one rendering kept.
         loss: photometric loss at the first dial value of each view, summed.
     """
 
@@ -65,12 +79,12 @@ class GradientSum:
 
 @dataclass(frozen=True)
 class Objective:
-    """The objective that ``train.adapt`` states, over parameters as it keeps them.
+    """The objective that ``training.loop.adapt`` documents, as a function of the optimizer's parameters.
 
     Attributes:
-        tuned: the attributes that are trained, beside ``opacity_logits`` and the decay, which always are.
-        part: which rows are, and what is asked of them.
-        screen_filter: that the pictures are drawn with.
+        tuned: the trained attributes, besides ``opacity_logits`` and the decay, which are always trained.
+        part: the trained rows.
+        screen_filter: the filter that images are rendered with.
     """
 
     config: AdaptConfig
@@ -81,84 +95,96 @@ class Objective:
 
     @property
     def trained(self) -> int:
-        """How many of the first rows are trained."""
+        """Number of trained rows, the first ones."""
         return self.part.trained
 
     @property
     def decay(self) -> str:
-        """The name of the parameter that is trained for sigma_d."""
+        """The name of the parameter that sigma_d is trained through."""
         return "sigma" if self.config.parameter == "linear" else "log_sigma"
 
     @property
     def stepped(self) -> tuple[str, ...]:
-        """The names of all parameters that are trained."""
+        """The names of all trained parameters."""
         return (*self.tuned, "opacity_logits", self.decay)
 
     @property
-    def has_law(self) -> bool:
-        """Whether the count law presses; a range of one dial value asks for none."""
+    def has_target_count(self) -> bool:
+        """Whether the target-count curve is part of the objective; with a single dial value it is not."""
         return self.config.count_term == "law" and self.config.max_sv > 1
 
     @property
     def decay_range(self) -> tuple[float, float]:
+        """Lowest and highest value of the decay parameter."""
         low, high = SIGMA_RANGE
         return SIGMA_RANGE if self.config.parameter == "linear" else (math.log(low), math.log(high))
 
     def sigma(self, decay: Tensor) -> Tensor:
-        """``[N]`` sigma_d of its parameter."""
+        """``[N]`` sigma_d from its parameter."""
         return decay if self.config.parameter == "linear" else decay.exp()
 
     def parameter(self, sigma_d: Tensor) -> Tensor:
-        """The inverse of ``sigma``, within the range that is trained."""
+        """The inverse of ``sigma``, clamped to the trained range."""
         sigma = sigma_d.detach().float().clamp(*SIGMA_RANGE)
         return sigma if self.config.parameter == "linear" else sigma.log()
 
-    def pull(self, parameters: dict[str, Tensor], draws: Sequence[tuple[View, list[float]]]) -> GradientSum:
-        """The sum over ``draws``, each a view and the dial values it is rendered at."""
-        return reduce(GradientSum.__add__, (self._pull_of(parameters, view, dials) for view, dials in draws))
+    def gradient_sum(self, parameters: dict[str, Tensor], draws: Sequence[tuple[View, list[float]]]) -> GradientSum:
+        """The gradients summed over ``draws``, each a view and the dial values it is rendered at."""
+        return reduce(GradientSum.__add__, (self._of_view(parameters, view, dials) for view, dials in draws))
 
-    def _pull_of(self, parameters: dict[str, Tensor], view: View, dials: list[float]) -> GradientSum:
-        config, tau, first = self.config, self.attenuation.tau, slice(self.trained)
-        dialled_rows = first if self.part.rest_in_full else slice(None)
+    def _of_view(self, parameters: dict[str, Tensor], view: View, dials: list[float]) -> GradientSum:
+        """Renders one view at its dial values, and differentiates the weighted sum of its losses."""
+        config, first = self.config, slice(self.trained)
         leaves = {name: parameters[name].detach().requires_grad_(name in self.stepped) for name in parameters}
-        logits, decay = leaves["opacity_logits"], leaves[self.decay]
-        sigma = self.sigma(decay[dialled_rows])
-        distances = normalized_distances(parameters["means"], view.camera, self.attenuation)[dialled_rows]
-        drawn_of: Any = {name: leaves[name] for name in ATTRIBUTES}
-        shown = Gaussians(**drawn_of, screen_filter=self.screen_filter)
+        decay = leaves[self.decay]
         photograph = view.image.to(decay.device)
         total, count = decay.new_zeros(()), torch.zeros_like(decay[first])
         kept = torch.zeros_like(count, dtype=torch.bool)
         losses = []
-        for s in dials:
-            dialled = attenuate(logits[dialled_rows], sigma, distances, s, self.attenuation)
-            drawn = dialled.drawn
-            if self.part.rest_in_full:
-                drawn = torch.cat([drawn, parameters["opacity_logits"][self.trained :].sigmoid()])
-            # Dropped rows have opacity 0: the rasterizer leaves them out, and they get no gradient.
-            image, _ = splat(shown, drawn, view.camera)
+        for s, dialled, image in self._rendered(leaves, view.camera, dials):
             loss = photometric_loss(image, photograph, config.ssim_weight)
             losses.append(float(loss.detach()))
             weight = self._weight(s, alone=len(dials) == 1)
             if config.count_term == "paper" and config.reg_weight > 0:
-                loss = loss + paper_count(dialled, s, tau, config, self.part.total)
+                loss = loss + paper_count(dialled, s, self.attenuation.tau, config, self.part.total)
             total = total + weight * loss
-            if self.has_law:
-                own = type(dialled)(*(tensor[first] for tensor in dialled))
-                quota = self._quota(view, s, losses[-1])
-                asked = (s, tau, weight * losses[-1], config, quota)
-                count += count_gradient(own, parameters["opacity_logits"][first], *asked)
+            if self.has_target_count:
+                logits = parameters["opacity_logits"][first]
+                count += self._count_gradient(dialled, logits, view, s, weight * losses[-1])
             kept |= dialled.keep[first]
         found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
         gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}
         count = count if config.parameter == "log" else count / decay.detach()[first]
         return GradientSum(gradients | {self.decay: gradients[self.decay] + count}, kept, losses[0])
 
-    def _quota(self, view: View, s: float, loss: float) -> TargetShare:
-        part = self.part
-        return part.quota(view, s, loss) if part.quota else target_share(s, self.trained, self.config, part.total)
+    def _rendered(
+        self, leaves: dict[str, Tensor], camera: Camera, dials: list[float]
+    ) -> Iterator[tuple[float, Attenuated, Tensor]]:
+        """Each dial value, the opacities of the rows that have a dial, and the image."""
+        rows = slice(self.trained) if self.part.full_context else slice(None)
+        attributes: Any = {name: leaves[name] for name in ATTRIBUTES}
+        shown = Gaussians(**attributes, screen_filter=self.screen_filter)
+        logits, sigma = leaves["opacity_logits"][rows], self.sigma(leaves[self.decay][rows])
+        distances = normalized_distances(leaves["means"], camera, self.attenuation)  # once for all dial values
+        for s in dials:
+            dialled = attenuate(logits, sigma, distances[rows], s, self.attenuation)
+            drawn = dialled.drawn
+            if self.part.full_context:
+                context = leaves["opacity_logits"].detach()[self.trained :]
+                drawn = torch.cat([drawn, attenuate(context, None, distances[self.trained :], s, None).drawn])
+            # Culled rows have opacity 0: the rasterizer skips them, and they get no gradient.
+            yield s, dialled, splat(shown, drawn, camera)[0]
+
+    def _count_gradient(self, dialled: Attenuated, logits: Tensor, view: View, s: float, loss: float) -> Tensor:
+        """``[trained]`` the count term's gradient of log sigma_d at one dial value."""
+        if isinstance(view, TargetView):
+            target = view.target_share(s)
+        else:
+            target = target_share(s, self.trained, self.config, self.part.total)
+        own = Attenuated(*(tensor[: self.trained] for tensor in dialled))
+        return count_gradient(own, logits, s, self.attenuation.tau, loss, self.config, target)
 
     def _weight(self, s: float, *, alone: bool) -> float:
-        """w_s, times ``full_weight`` at the s = 1 that goes with another dial value."""
+        """w_s, times ``full_weight`` at the s = 1 that is drawn together with another dial value."""
         weight = (1 - self.config.weight_slope * s / self.config.max_sv) ** 2
         return weight if alone or s > 1 else weight * self.config.full_weight

@@ -14,7 +14,7 @@ from torch import Tensor
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, removal_error, seeing, spread, start
+from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, initialize, removal_error, spread, usable_views
 from clod_adapter.training.ablation import band_losses, effect, seen
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.plan import FIELDS, RATES, Decision, Override, Plan, freezing
@@ -61,7 +61,7 @@ class _Planner:
         self.base, self.scene, self.config, self.overrule, self.progress = base, scene, config, overrule, progress
         if not scene.train or not len(base):
             adapt(base, scene, config)  # refuses, and says why
-        self.views = seeing(base, scene.train)
+        self.views = usable_views(base, scene.train)
         self.decisions: list[Decision] = []
         self.seconds: dict[str, float] = {}
         self.began = time.perf_counter()
@@ -72,7 +72,7 @@ class _Planner:
         few = self.base.without_bands(degree)
         kept, error = self._unseen(few)
         with self._time("start"):
-            begun = start(few, self.views, self.config, self._report, error=error)
+            begun = initialize(few, self.views, self.config, self._report, error=error)
         plan = Plan((), begun, kept, degree, self.config)
         with self._time("probe"):
             plan = self._attributes(plan, resumed)

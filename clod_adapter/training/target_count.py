@@ -1,4 +1,4 @@
-"""The count law: how many Gaussians to keep at each dial value, and what presses training towards it."""
+"""The target-count curve: the share of Gaussians to keep at each dial value, and the loss term that enforces it."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from torch.autograd.function import once_differentiable
 from clod_adapter.attenuation import Attenuated, conform, log_threshold
 from clod_adapter.config import AdaptConfig
 
-# What the sigmoid's own slope, at most 1/4, does not fall below for who has left while too few are kept. Some widths
-# below the cut it is exactly 0, and so is the picture's: nothing would ever bring such a sigma back.
+# Lower bound of the sigmoid's slope, which is at most 1/4, for culled Gaussians while too few are kept. Some widths
+# below the culling threshold it is exactly 0, and so is the image's gradient: no step would bring such a sigma back.
 LIFT = 1e-3
 
 
 class TargetShare(NamedTuple):
-    """What the count term asks of some Gaussians at one dial value.
+    """The count term's target for some Gaussians at one dial value.
 
     Attributes:
-        share: of them, to be kept, above 0.
-        weight: how much being off it by ``share`` counts; ``1 / share`` where they are all that there are.
+        share: of these Gaussians to keep, above 0.
+        weight: of a relative deviation from ``share``; ``1 / share`` where these are all Gaussians of the scene.
     """
 
     share: float
@@ -33,48 +33,48 @@ class TargetShare(NamedTuple):
 def target_curve(virtual_scale: float, share: float, exponent: float) -> float:
     """The share of all Gaussians to keep at a dial value s: ``1 / (s^p + (1/share - 1) s^-p)``.
 
-    ``share`` at s = 1, and soon the paper's target ``s^-p`` (section 3.3, p = 1.5): with a share of 0.62, 7 % below it
-    at s = 2 and 2 % at s = 3.
+    ``share`` at s = 1, and close to the paper's target ``s^-p`` (section 3.3, p = 1.5) for larger s: with a share of
+    0.62, 7 % below it at s = 2 and 2 % at s = 3.
     """
     power = virtual_scale**exponent
     return 1 / (power + (1 / share - 1) / power)
 
 
 def target_share(virtual_scale: float, count: int, config: AdaptConfig, total: int | None = None) -> TargetShare:
-    """What the count law asks of ``count`` Gaussians: ``target_curve``, and never that the last one goes.
+    """The target of ``count`` Gaussians: ``target_curve``, but at least one Gaussian.
 
     Args:
-        total: what the law is a share of, also Gaussians that are not here because no view sees them: more than the
-            ``count`` there are may be asked for. By default ``count``.
+        total: number of Gaussians that the curve is a share of, including those that were left out because no view
+            sees them: the target may then exceed ``count``. By default ``count``.
     """
     total = total or max(count, 1)
-    law = max(target_curve(virtual_scale, config.start_share, config.exponent), 1 / total) * (total / max(count, 1))
-    return TargetShare(law, 1 / law)
+    share = max(target_curve(virtual_scale, config.start_share, config.exponent), 1 / total) * (total / max(count, 1))
+    return TargetShare(share, 1 / share)
 
 
 def count_gradient(
     dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, loss: float, config: AdaptConfig,
-    quota: TargetShare | None = None,
+    target: TargetShare | None = None,
 ) -> Tensor:  # fmt: skip
-    """``[N]`` what the count term adds to the gradient of log sigma_d at one dial value; opacities are held.
+    """``[N]`` the count term's gradient of log sigma_d at one dial value; opacities are constants.
 
-    That of ``loss reg_weight (eta / law - 1)^2``, eta the share kept, through ``count_slope``. Who is worth
-    less to the picture than the pressure fades, who is worth more stays. It works both ways, and is relative: to the
-    law, as the last percent of the Gaussians matters as much as the first, and to the weighted ``loss``, a constant
-    here, so that the same settings suit scenes and dial values that are fitted well or badly. Nothing presses the last
-    Gaussian out. Where too few are kept, whoever has left is called back, however far below the cut: with a slope of
-    at least ``LIFT / (temperature N)``.
+    The gradient of ``loss reg_weight (eta / target - 1)^2``, eta the share kept, through ``count_slope``. Gaussians
+    whose loss gradient is smaller than this fade, the others stay. The term penalises deviations in both directions. It
+    is relative to the target, as the last percent of the Gaussians matters as much as the first, and to the weighted
+    ``loss``, a constant here, so that one setting suits scenes and dial values that are fitted well or badly. The last
+    Gaussian is never penalised. Where too few are kept, culled Gaussians are brought back, however far below the
+    threshold: with a slope of at least ``LIFT / (temperature N)``.
 
     Args:
-        quota: what is asked of them in place of the law, where they are not all that there are.
+        target: of these Gaussians, where they are not the whole scene; by default ``target_share``.
     """
-    quota = quota or target_share(virtual_scale, len(opacity_logits), config)
+    target = target or target_share(virtual_scale, len(opacity_logits), config)
     eta = float(dialled.keep.sum()) / len(opacity_logits)
-    pressure = 2 * loss * config.reg_weight * (eta / quota.share - 1) * quota.weight
+    penalty = 2 * loss * config.reg_weight * (eta / target.share - 1) * target.weight
     slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, config.temperature)
-    if pressure < 0:
+    if penalty < 0:
         slope = torch.where(dialled.keep, slope, slope.clamp(min=LIFT / (config.temperature * len(slope))))
-    return slope.mul_(pressure)
+    return slope.mul_(penalty)
 
 
 def paper_count(
@@ -83,7 +83,7 @@ def paper_count(
     """0-d, the paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2`` (section 3.3); eta is ``soft_count``.
 
     Args:
-        total: what eta is a share of, as in ``target_share``.
+        total: number of Gaussians that eta is a share of, as in ``target_share``.
     """
     count = soft_count(dialled.log_opacities, virtual_scale, tau, config.temperature)
     count = count * (len(dialled.log_opacities) / (total or len(dialled.log_opacities)))
@@ -95,11 +95,11 @@ def paper_count(
 def count_slope(
     opacity_logits: Tensor, log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float
 ) -> Tensor:
-    """``[N]`` by how much each Gaussian's ``log sigma_d`` moves the share that is kept, softened.
+    """``[N]`` the softened derivative of the share kept by each Gaussian's ``log sigma_d``.
 
     ``q (1 - q) / (temperature N) max(2 u, 1)`` with ``q = sigmoid((log a'' - log(tau s)) / temperature)`` and
-    ``u = log a - log a''``: the slope of ``soft_count`` by ``log sigma_d``, whose own ``2 u`` would be nothing
-    for Gaussians that the dial does not touch yet, and keep them out of its reach for good. 0 at log a'' = -inf.
+    ``u = log a - log a''``: the slope of ``soft_count`` by ``log sigma_d``, except that its factor ``2 u`` is
+    at least 1: Gaussians that are not attenuated yet have u = 0 and would never be. 0 at log a'' = -inf.
 
     Args:
         log_opacities: ``[N]`` log a'' from ``attenuate``.
@@ -109,21 +109,21 @@ def count_slope(
         ClodError: the shapes differ.
     """
     opacity_logits, log_opacities = conform(opacity_logits=opacity_logits, log_opacities=log_opacities)
-    touched = (F.logsigmoid(opacity_logits) - log_opacities).mul_(2).clamp_(min=1)
+    factor = (F.logsigmoid(opacity_logits) - log_opacities).mul_(2).clamp_(min=1)
     slope = _slope_of_sigmoid(log_opacities, log_threshold(tau, virtual_scale), temperature)
-    # Where log a'' is -inf the slope is 0 and touched inf.
-    return slope.mul_(touched).nan_to_num_(0.0, 0.0)
+    # Where log a'' is -inf the slope is 0 and the factor inf.
+    return slope.mul_(factor).nan_to_num_(0.0, 0.0)
 
 
 def soft_count(log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float) -> Tensor:
-    """0-d, the share of Gaussians kept, in [0, 1]: exact on the way forward, soft on the way back.
+    """0-d, the share of Gaussians kept, in [0, 1]: exact in the forward pass, soft in the backward pass.
 
     Forward: mean of ``log a'' > log(tau s)``; 0 for no Gaussians. Backward, straight through: the gradient
     of the mean of ``sigmoid((log a'' - log(tau s)) / temperature)``, which is 0 at log a'' = -inf.
 
     Args:
         log_opacities: ``[N]`` from ``attenuate``, in [-inf, 0].
-        temperature: > 0, in units of log opacity; the larger, the farther from the cut it is felt.
+        temperature: > 0, in units of log opacity; the larger, the farther from the threshold it acts.
     """
     (log_opacities,) = conform(log_opacities=log_opacities)
     return _SoftCount.apply(log_opacities, log_threshold(tau, virtual_scale), temperature)
@@ -147,8 +147,8 @@ class _SoftCount(Function):
 def _slope_of_sigmoid(log_opacities: Tensor, threshold: float, temperature: float) -> Tensor:
     """``[N]`` the slope of the mean of ``sigmoid(z)``, ``z = (log a'' - threshold) / temperature``, by log a''.
 
-    ``sigmoid(z) sigmoid(-z) / (temperature N)``, as 1 - sigmoid(z) would cancel. A temperature that the numbers cannot
-    divide by counts as the nearest that they can: neither 0 / 0 nor inf / inf.
+    ``sigmoid(z) sigmoid(-z) / (temperature N)``, as 1 - sigmoid(z) would cancel. The temperature is clamped
+    to normal numbers of the dtype: neither 0 / 0 nor inf / inf.
     """
     info = torch.finfo(log_opacities.dtype)
     temperature = min(max(temperature, info.tiny), info.max)

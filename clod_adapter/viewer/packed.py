@@ -1,4 +1,4 @@
-"""A splat for a page to send to somebody: SOG, a fifth of the PLY's size, and sigma_d beside it, by splat-transform."""
+"""Packs a splat for a standalone page by splat-transform: SOG, a fifth of the PLY's size, and sigma_d separately."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from clod_adapter.io.checkpoint import load
 from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
 from clod_adapter.viewer.payload import Payload
 
-BITS = 11  # of a sigma_d's fraction that are kept; it is off by at most 2^-12 of itself
+BITS = 11  # stored fraction bits of sigma_d; its relative error is at most 2^-12
 
 
 @dataclass(frozen=True)
 class Packed:
-    """A splat as a page holds it.
+    """A packed splat.
 
     Attributes:
         sog: the .sog file.
-        sigma: gzip of ``[N]`` little-endian float32 sigma_d in the order of its rows; None without a dial.
+        sigma: gzip of ``[N]`` little-endian float32 sigma_d in the row order of ``sog``; None without a dial.
     """
 
     sog: bytes
@@ -36,15 +36,15 @@ def pack(
 ) -> Packed:
     """Packs a splat.
 
-    SOG has no room for sigma_d and puts the rows in Morton order. So they are put in that order first, as a PLY, which
-    keeps all columns; of one that is in it already the order stays.
+    SOG has no field for sigma_d and sorts the rows in Morton order. So a PLY, which keeps all columns, is sorted first;
+    sorting it again does not change the order.
 
     Args:
-        folder: an absolute one that has room for three PLYs of it, in a folder there that is removed.
-        progress: called now and then with the seconds that a part has taken so far.
+        folder: absolute, with space for three PLYs in a temporary folder.
+        progress: called at intervals with the seconds that the current step has taken.
 
     Raises:
-        ClodError: splat-transform fails, takes too long, or loses Gaussians.
+        ClodError: splat-transform fails, takes too long, or removes Gaussians.
     """
     count = len(payload.gaussians)
     timeout = time_limit(count)
@@ -62,7 +62,7 @@ def pack(
 
 
 def _rounded(values: np.ndarray) -> np.ndarray:
-    """float32 with the last bits 0, which gzip takes the room of: to the nearest, as far as there is one."""
+    """float32 rounded to BITS fraction bits, for compression by gzip."""
     step = np.uint32(1 << (23 - BITS))
     up = values.astype("<f4").view("<u4") + (step >> np.uint32(1))
     return (up & ~(step - np.uint32(1))).view("<f4")

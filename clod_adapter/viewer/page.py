@@ -1,7 +1,7 @@
-"""The viewer's page: the built parts put together, for the server or as one file that holds its splats too.
+"""The viewer's page: assembled from its built parts, for the server or as one file that includes the splats.
 
-The page asks for nothing from elsewhere, and may not: its policy names, by their hashes, the one script and the one
-style that a browser is to run of it, and no address that it could reach but that of the server that gave it.
+The page loads nothing from other hosts: its Content-Security-Policy allows one script and one style, by their hashes,
+and connections to its own server only.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from clod_adapter.viewer.packed import Packed, pack
 from clod_adapter.viewer.payload import Payload, page_config
 
 PAGE, STYLE, SCRIPT = "page.html", "viewer.css", "viewer.js"
-LETTERS = 1 << 26  # in an element from which on the next is begun; browsers end a text at some 5e8
+LETTERS = 1 << 26  # characters per script element; browsers limit strings to about 5e8
 PLACES = ("<!--CLOD-STYLE-->", "<!--CLOD-CONFIG-->", "<!--CLOD-DATA-->", "<!--CLOD-SCRIPT-->")  # in this order
 
 
 def served_page(config: Mapping[str, Any]) -> bytes:
-    """The page that fetches its splats from the server it came from."""
+    """The page that fetches its splats from its server."""
     return b"".join(_document(config, (), ""))
 
 
@@ -42,18 +42,18 @@ def write_page(
     tool: SplatTransform | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> None:
-    """Writes the page as one file that holds all it shows, to open from a disk, without a network.
+    """Writes the page as one file that includes the splats, for opening without a server or network.
 
     Args:
         model: with or without a dial.
-        base: to be shown beside it; relative to the same origin.
-        cameras: to jump between, in the world of the Gaussians (relative to the origin).
-        virtual_scale: the dial when the page opens, >= 1.
-        tool: packs the splats to a fifth of their size, with values rounded (``packed.pack``, as ``progress``);
-            without it they are in the page as they are.
+        base: shown for comparison; relative to the same origin.
+        cameras: selectable viewpoints, in the frame of the Gaussians (relative to the origin).
+        virtual_scale: the initial dial value, >= 1.
+        tool: packs the splats to a fifth of their size, with rounded values (``packed.pack``, which calls
+            ``progress``); None stores them unpacked.
 
     Raises:
-        ClodError: the file cannot be written, or they cannot be packed.
+        ClodError: the file cannot be written, or packing fails.
     """
     entries, data = list[dict[str, Any]](), dict[str, Iterable[bytes]]()
     for element, checkpoint in (("clod-model", model), ("clod-base", base)):
@@ -71,7 +71,7 @@ def write_page(
 
 
 def _held(element: str, payload: Payload, packed: Packed | None) -> tuple[dict[str, Any], dict[str, Iterable[bytes]]]:
-    """A splat's entry of the configuration, and the bytes that the page holds of it, by the id of their element."""
+    """A splat's entry in the configuration, and its bytes in the page by the id of their element."""
     if packed is None:
         return payload.describe(element=element), {element: payload.blocks()}
     if packed.sigma is None:
@@ -82,7 +82,7 @@ def _held(element: str, payload: Payload, packed: Packed | None) -> tuple[dict[s
 
 
 def policy(connect: str = "") -> str:
-    """The page's Content-Security-Policy; ``connect`` says where it may fetch from besides what is in it."""
+    """The page's Content-Security-Policy; ``connect`` is a further source that it may fetch from."""
     script, style = (f"'sha256-{_digest(_part(name))}'" for name in (SCRIPT, STYLE))
     return (
         f"default-src 'none'; script-src {script}; style-src {style}; img-src data: blob:; "
@@ -91,7 +91,7 @@ def policy(connect: str = "") -> str:
 
 
 def _document(config: Mapping[str, Any], data: Iterable[bytes], meta: str) -> Iterator[bytes]:
-    """The page in pieces, for data that are large; ``meta`` goes into its head."""
+    """The page in pieces, because data may be large; ``meta`` is added to its head."""
     rest = _part(PAGE)
     filled: dict[str, Iterable[bytes]] = {
         PLACES[0]: (f"{meta}<style>{_part(STYLE)}</style>".encode(),),
@@ -107,12 +107,12 @@ def _document(config: Mapping[str, Any], data: Iterable[bytes], meta: str) -> It
 
 
 def embedded(value: Any) -> str:
-    """JSON that no name in it can end the script element of: with a < it would have to begin."""
+    """JSON without <, so that no text in it can end the script element."""
     return json.dumps(value, allow_nan=False, ensure_ascii=False).replace("<", "\\u003c")
 
 
 def _elements(data: Mapping[str, Iterable[bytes]]) -> Iterator[bytes]:
-    """A script element of that id for each, that holds the bytes as base64; several in turn where they are many."""
+    """Script elements with the bytes as base64, by id; large data are split into several with the same id."""
     for element, blocks in data.items():
         begin, end = f'<script type="application/octet-stream" id="{element}">'.encode(), b"</script>\n"
         yield begin
@@ -130,7 +130,7 @@ def _base64(blocks: Iterable[bytes]) -> Iterator[bytes]:
     left = b""
     for block in blocks:
         left += block
-        whole = len(left) - len(left) % 3  # what is encoded without padding
+        whole = len(left) - len(left) % 3  # encodes without padding
         yield base64.b64encode(left[:whole])
         left = left[whole:]
     yield base64.b64encode(left)

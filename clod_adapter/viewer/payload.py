@@ -1,6 +1,6 @@
-"""What the viewer's page is given of a checkpoint: its Gaussians as one plain kind of PLY, and in JSON what it is.
+"""Data of a checkpoint for the viewer's page: Gaussians as PLY in one layout, and metadata as JSON.
 
-Whatever file the Gaussians came from (ascii, big-endian, doubles, masks, a .pt), the page sees one layout.
+The layout does not depend on the file (ascii, big-endian, doubles, masks, .pt).
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from clod_adapter.io.ply.columns import SIGMA, column_map, inria_dtype
 from clod_adapter.io.ply.header import write_comments
 from clod_adapter.version import package_version
 
-ROWS = 1 << 14  # in a block
+ROWS = 1 << 14  # per block
 
 
 @dataclass(frozen=True)
 class Payload:
-    """A splat as the page reads it.
+    """A splat for the page.
 
     Attributes:
-        name: the file's, without its folder.
-        gaussians: without their empty SH bands, means relative to the checkpoint's origin.
-        calibration: what its dial values keep and cost, if the file says so.
+        name: the file name without its folder.
+        gaussians: without SH degrees that are 0; means are relative to the checkpoint's origin.
+        calibration: the file's calibration table, if any.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Payload:
 
     @cached_property
     def head(self) -> bytes:
-        """The PLY's header, with the dial's settings and calibration as comments."""
+        """The PLY's header, with attenuation settings and calibration as comments."""
         names = [name for name in inria_dtype(self.gaussians.sh_degree).names or () if name not in ("nx", "ny", "nz")]
         names += [SIGMA] if self.gaussians.sigma_d is not None else []
         row = np.zeros((), [(name, "<f4") for name in names])
@@ -62,16 +62,16 @@ class Payload:
         return len(self.head) + len(self.gaussians) * (attributes + 4 * (self.gaussians.sigma_d is not None))
 
     def blocks(self) -> Iterator[bytes]:
-        """The PLY, little-endian float32 in Inria's layout without normals, ``sigma_d`` last; never all of it at once.
+        """The PLY in blocks of rows: little-endian float32, Inria's layout without normals, ``sigma_d`` last.
 
-        A logit above 20 is written as 20: the same opacity in float32.
+        A logit above 20 is written as 20, the same opacity in float32.
         """
         yield self.head
         for start in range(0, len(self.gaussians), ROWS):
             yield _rows(self.gaussians, slice(start, start + ROWS)).astype("<f4", copy=False).tobytes()
 
     def describe(self, **where: Any) -> dict[str, Any]:
-        """The entry of the page's configuration; ``where`` replaces what says how the Gaussians are had."""
+        """The splat's entry in the page's configuration; ``where`` overrides the location of the data."""
         attenuation = self.gaussians.attenuation
         return {
             "name": self.name, "href": None, "element": None, "format": "ply", "sigma": None,
@@ -89,8 +89,8 @@ def page_config(
 
     Args:
         model, base: from ``Payload.describe``.
-        cameras: to jump between, in this order; in the world of the Gaussians.
-        virtual_scale: the dial when the page opens, >= 1.
+        cameras: selectable viewpoints, in this order, in the frame of the Gaussians.
+        virtual_scale: the initial dial value, >= 1.
     """
     return {
         "version": package_version(), "title": model["name"], "model": model, "base": base,
@@ -99,12 +99,12 @@ def page_config(
 
 
 def no_dial(name: str) -> str:
-    """Why the dial of a plain file does nothing, and what to do."""
+    """Message for a file without a dial: the reason and the command that adds one."""
     return f"{name} has no sigma_d, so there is no dial to turn; give it one: clod-adapt {name} --images SCENE"
 
 
 def _rows(gaussians: Gaussians, rows: slice) -> np.ndarray:
-    """``[n, P]`` float32 values of these Gaussians in the order of the header."""
+    """``[n, P]`` float32 values of these rows in the order of the header."""
     g = gaussians
     count = len(g.means[rows])
     parts = [
@@ -122,7 +122,7 @@ def _rows_of(calibration: Calibration | None) -> list[dict[str, float]]:
 
 def _camera(camera: Camera) -> dict[str, Any]:
     def short(matrix: torch.Tensor) -> list[list[float]]:
-        return [[float(f"{value:.9g}") for value in row] for row in matrix.tolist()]  # all that float32 has
+        return [[float(f"{value:.9g}") for value in row] for row in matrix.tolist()]  # full float32 precision
 
     return {
         "name": camera.name, "viewmat": short(camera.viewmat), "K": short(camera.K), "width": camera.width,

@@ -1,8 +1,7 @@
-"""The page over HTTP on this machine alone: a fixed set of answers at the loopback address.
+"""Serves the page over HTTP on the loopback address, from a fixed set of responses.
 
-What is asked for is looked up among the answers, and nothing else is there: no folder is served, no file is opened, no
-request changes anything. A request is answered only where its Host header is a name of this machine, so that a page
-from elsewhere whose name was made to point here (DNS rebinding) reads nothing.
+Requests select one of the responses; no folder is served, no file is opened, nothing is changed. A request is answered
+only if its Host header names this machine, which protects against DNS rebinding by other pages.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ from clod_adapter.errors import ClodError
 
 HOST = "127.0.0.1"
 THIS_MACHINE = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?", re.ASCII)
-SECONDS = 30  # without a word from the other side, then it is given up
+SECONDS = 30  # timeout of an idle connection
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a path is answered with.
+    """The response to a path.
 
     Attributes:
-        kind: its media type.
-        size: bytes.
-        blocks: makes the bytes, for each request anew.
-        policy: the Content-Security-Policy of a page.
+        kind: media type.
+        size: in bytes.
+        blocks: returns the bytes in pieces, called for each request.
+        policy: Content-Security-Policy.
     """
 
     kind: str
@@ -44,22 +43,21 @@ class Answer:
 
 
 class Server(ThreadingHTTPServer):
-    """Serves ``answers``, by path, on loopback, from ``serve_forever`` on; a context manager that closes the port.
+    """Serves ``answers`` on loopback once ``serve_forever`` runs; a context manager that closes the port.
 
     Args:
-        answers: by path, with its leading slash; of an address, what follows ``?`` does not matter.
-        port: 0 takes a free one.
+        answers: by path with its leading slash; a query (``?...``) is ignored.
+        port: 0 selects a free one.
 
     Raises:
-        ClodError: the port is taken or may not be listened on.
+        ClodError: the port is in use or not permitted.
     """
 
-    # Waited for when it is closed: one that still held a tensor while the interpreter ends would abort the process.
+    # Not daemons: a thread that holds a tensor when the interpreter exits would abort the process.
     daemon_threads = False
-    block_on_close = (
-        False  # server_close waits; socketserver's would for threads, too, that a Ctrl-C kept from starting
-    )
-    allow_reuse_address = sys.platform != "win32"  # there it would let two servers share a port
+    # server_close joins instead; socketserver's would also wait for threads that a Ctrl-C kept from starting.
+    block_on_close = False
+    allow_reuse_address = sys.platform != "win32"  # on Windows two servers would share a port
 
     def __init__(self, answers: Mapping[str, Answer], port: int = 0) -> None:
         self.answers = dict(answers)
@@ -82,7 +80,7 @@ class Server(ThreadingHTTPServer):
         return f"http://{HOST}:{self.port}/"
 
     def server_bind(self) -> None:
-        socketserver.TCPServer.server_bind(self)  # HTTPServer's asks the name service for this machine's name
+        socketserver.TCPServer.server_bind(self)  # HTTPServer's looks up the host name
         self.server_name, self.server_port = HOST, self.port
 
     def get_request(self) -> tuple[socket.socket, Any]:
@@ -100,17 +98,17 @@ class Server(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def server_close(self) -> None:
-        """Hangs up on whoever is still being answered, and waits for the threads that did."""
+        """Closes open connections and waits for their threads."""
         for request in list(self._requests):
             with suppress(OSError):
                 request.shutdown(socket.SHUT_RDWR)
         super().server_close()
         for thread in self._answering:
-            if thread.is_alive():  # and not one that has not started
+            if thread.is_alive():  # not one that never started
                 thread.join()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Says nothing of a browser that goes away within an answer, as it does when its tab is closed."""
+        """Ignores connections closed by the browser, for example with its tab."""
         if not isinstance(sys.exception(), ConnectionError | TimeoutError):
             super().handle_error(request, client_address)
 
@@ -144,7 +142,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(block)
 
     def end_headers(self) -> None:
-        """With those that every answer has, errors too."""
+        """Adds the headers of every response, including errors."""
         self.send_header("Cache-Control", "no-store")
         self.send_header("X-Content-Type-Options", "nosniff")
         self.send_header("Cross-Origin-Resource-Policy", "same-origin")
@@ -153,9 +151,9 @@ class _Handler(BaseHTTPRequestHandler):
         super().end_headers()
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Nothing: requests are no news."""
+        """Requests are not logged."""
 
 
 def is_here(hosts: list[str]) -> bool:
-    """Whether a request's Host headers name this machine, at whichever port (that of an ssh tunnel may be another)."""
+    """Whether the Host headers name this machine, with any port (an ssh tunnel may have another)."""
     return len(hosts) == 1 and THIS_MACHINE.fullmatch(hosts[0].lower()) is not None

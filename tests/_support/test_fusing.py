@@ -14,7 +14,7 @@ from torch import Tensor
 from clod_adapter import attenuation
 from clod_adapter._support import fusing
 from clod_adapter._support.fusing import Fused
-from clod_adapter.attenuation import attenuate, attenuate_activated, attenuate_seen
+from clod_adapter.attenuation import attenuate
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.training import optimizer
@@ -29,7 +29,7 @@ DIALS = (1.0, 2.5, 6.0)
 def everything_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
     """Here too, and however few the rows; and each test from the start."""
     monkeypatch.setattr(Fused, "compiles", lambda self, first: not self._failed)
-    for name in ("_attenuated", "_seen", "_activated"):
+    for name in ("_from_logits", "_from_centres", "_from_opacities"):
         monkeypatch.setattr(attenuation, name, Fused(getattr(attenuation, name).plain))
     monkeypatch.setattr(optimizer, "_adam", Fused(optimizer._adam.plain))
 
@@ -56,11 +56,11 @@ def results(given: dict[str, Tensor], view: Camera, config: AttenuationConfig, f
     found: list[Tensor] = []
     for s in DIALS:
         if form == "seen":
-            out = attenuate_seen(given["means"], logits, sigma, view, s, config)
+            out = attenuate(logits, sigma, (given["means"], view), s, config)
         elif form == "logits":
             out = attenuate(logits, sigma, d, s, config)
         else:
-            out = attenuate_activated(logits.sigmoid(), sigma, d, s, config)
+            out = attenuate(logits.sigmoid(), sigma, d, s, config, activated=True)
         loss = (out.drawn * d).sum() + out.log_opacities.clamp(min=-30).sum()
         found += [*(x.detach() for x in out), *torch.autograd.grad(loss, [logits, sigma])]
     return found
@@ -78,7 +78,7 @@ def test_traced_it_is_the_same_from_one_graph(monkeypatch: pytest.MonkeyPatch, r
     torch._dynamo.utils.counters.clear()
     found = results(inputs(), camera(), SOFT, "seen")
     assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == 1  # of three dial values
-    assert not attenuation._seen._failed and attenuation._seen._compiled is not None
+    assert not attenuation._from_centres._failed and attenuation._from_centres._compiled is not None
     assert_same(found, want)
     assert donates() == before
 
@@ -94,7 +94,7 @@ def test_compiled_it_is_the_same_to_rounding(request: pytest.FixtureRequest, for
     want = results(given, camera(), SOFT, form)
     request.getfixturevalue("everything_compiles")
     assert_same(results(given, camera(), SOFT, form), want)
-    used = {"seen": "_seen", "logits": "_attenuated", "opacities": "_activated"}[form]
+    used = {"seen": "_from_centres", "logits": "_from_logits", "opacities": "_from_opacities"}[form]
     assert not getattr(attenuation, used)._failed and getattr(attenuation, used)._compiled is not None
 
 

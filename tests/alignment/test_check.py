@@ -14,6 +14,7 @@ from torch import Tensor
 
 import clod_adapter
 import scenes
+from clod_adapter.alignment import check
 from clod_adapter.alignment.check import FLAT, check_alignment
 from clod_adapter.alignment.frames import NERFSTUDIO_TURNS, focus_of, into_file, known_frames
 from clod_adapter.alignment.search import guess_frame
@@ -127,6 +128,12 @@ def test_few_views_and_one_gaussian(pair: tuple[Gaussians, list[View]], count: i
     assert not lost.fits and guess_frame(stray, seen, lost) is None or count == 2
 
 
+def test_a_render_with_nan_does_not_fit(pair: tuple[Gaussians, list[View]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(check, "compare", lambda *_: torch.full((5,), math.nan))
+    found = check_alignment(*pair)
+    assert math.isnan(found.psnr) and math.isnan(found.margin) and not found.fits
+
+
 def test_nothing_to_show_does_not_fit(pair: tuple[Gaussians, list[View]]) -> None:
     base, views = pair
     none = base.select(torch.zeros(len(base), dtype=torch.bool))
@@ -147,10 +154,7 @@ def test_trained_on_white(pair: tuple[Gaussians, list[View]]) -> None:
 
 CASES = [
     ("file's x, -y, -z: ", 1.0, FLIP, NONE),
-    ("file's x, -z, y: ", 1.0, EYE.new_tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), NONE),
-    ("file's z, x, y: ", 1.0, EYE[[2, 0, 1]], NONE),
     ("(mirrored)", 1.0, torch.diag(EYE.new_tensor([-1.0, 1, 1])), NONE),
-    ("9.7 times larger: ", 9.7, EYE, NONE),
     ("20 times smaller: ", 0.05, EYE, NONE),
     ("moved by (30, -20, 10): ", 1.0, EYE, EYE.new_tensor([30.0, -20, 10])),
     ("4 times larger and moved by (", 4.0, EYE, EYE.new_tensor([3.0, -2, 1])),
@@ -167,7 +171,7 @@ def test_another_frame_is_told(
     assert not found.fits
     guess = guess_frame(base, elsewhere, found)
     assert guess is not None and guess.psnr > found.mean_colour_psnr + 3
-    assert says.rstrip(": ") in _rounded(guess.says)
+    assert says.rstrip(": ") in _rounded(guess.description)
 
 
 def _rounded(text: str) -> str:
@@ -190,7 +194,8 @@ def test_a_turn_is_told_from_all_others(pair: tuple[Gaussians, list[View]]) -> N
     for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)):
         rotation = torch.diag(EYE.new_tensor(signs)) @ EYE[list(order)]
         moved = torch.stack([v.camera.viewmat.double() for v in in_world(views, 1.0, rotation, NONE)])
-        near = [f for f in known_frames(moved) if "cameras' x" in f.says and (f.viewmats - viewmats).abs().max() < 1e-4]
+        turned = [frame.viewmats for frame in known_frames(moved) if "cameras' x" in frame.description]
+        near = [found for found in turned if (found - viewmats).abs().max() < 1e-4]
         assert len(near) == (0 if rotation.equal(EYE) else 1)
 
 
@@ -205,7 +210,7 @@ def test_other_poses_are_told(pair: tuple[Gaussians, list[View]], case: str) -> 
     }[case]
     elsewhere = [posed(view, wrong(view.camera.viewmat)) for view in views]
     guess = guess_frame(base, elsewhere, check_alignment(base, elsewhere))
-    assert guess is not None and guess.says.endswith(case)
+    assert guess is not None and guess.description.endswith(case)
 
 
 def test_another_scene_is_no_frame(pair: tuple[Gaussians, list[View]]) -> None:
@@ -219,7 +224,7 @@ def test_nerfstudios_frame(pair: tuple[Gaussians, list[View]]) -> None:
     """In it the cameras' mean is the origin, their mean up is z, and their farthest coordinate is 1."""
     _, views = pair
     viewmats = torch.stack([v.camera.viewmat.double() for v in in_world(views, 3.0, FLIP, NONE + 2)])
-    frames = [frame for frame in known_frames(viewmats) if "nerfstudio" in frame.says]
+    frames = [frame for frame in known_frames(viewmats) if "nerfstudio" in frame.description]
     assert len(frames) == len(NERFSTUDIO_TURNS)
     for frame in frames:
         poses = torch.linalg.inv(frame.viewmats)
@@ -234,7 +239,7 @@ def test_gsplats_frame(pair: tuple[Gaussians, list[View]]) -> None:
     _, views = pair
     viewmats = torch.stack([v.camera.viewmat.double() for v in in_world(views, 3.0, FLIP, NONE + 2)])
     points = torch.randn(500, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([1.0, 5, 2]) + 3
-    frames = [frame for frame in known_frames(viewmats, points) if "gsplat" in frame.says]
+    frames = [frame for frame in known_frames(viewmats, points) if "gsplat" in frame.description]
     assert len(frames) == 5  # without the points, and with each sign of their axes
     for frame in frames[1:]:
         # The map that takes the cameras there, from where the first one is in both.
@@ -256,7 +261,7 @@ def test_focus() -> None:
     assert torch.isfinite(focus_of(viewmats[:1])).all()
 
 
-@pytest.mark.parametrize("name", ["plush_half", "ci_banana", "bonsai146"])
+@pytest.mark.parametrize("name", ["plush_half", "ci_banana"])
 def test_real_files_fit_and_others_do_not(shared_data: Callable[[str], Path], name: str) -> None:
     base = clod_adapter.load(shared_data(f"{name}/pretrained.ply")).gaussians
     views = everything(clod_adapter.load_scene(shared_data(name)))
@@ -272,4 +277,4 @@ def test_a_real_file_in_another_frame(shared_data: Callable[[str], Path]) -> Non
     elsewhere = in_world(views, 1.0, FLIP, NONE)
     found = check_alignment(base, elsewhere)
     guess = guess_frame(base, elsewhere, found, load_points(shared_data("ci_banana")))
-    assert not found.fits and guess is not None and "x, -y, -z" in guess.says and guess.psnr > 26
+    assert not found.fits and guess is not None and "x, -y, -z" in guess.description and guess.psnr > 26

@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clod_adapter.blocks.divide import Division, coverage, divide, split
-from clod_adapter.blocks.targets import LEFT_OUT, TargetShares, beside, config_of, target
+from clod_adapter.blocks.targets import LEFT_OUT, block_config, context_rows, target_image, with_target_shares
 from clod_adapter.blocks.train import Learned, adapt_block, merge
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import start
+from clod_adapter.initialization.importance import initialize
 from clod_adapter.render import render
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.state import Progress, TrainingState
@@ -108,7 +108,7 @@ def test_a_block_has_the_views_that_see_it(divided: Division, captured: tuple[Ga
     assert division.views(0) == [0, 1, 2] and division.views(1) == [3]
     assert division.steps(0, CONFIG) == 90 and division.steps(1, CONFIG) == 30
     config = replace(CONFIG, time_budget=8.0)
-    passes = [[config_of(division, k, config, first=first) for first in (True, False)] for k in (0, 1)]
+    passes = [[block_config(division, k, config, first=first) for first in (True, False)] for k in (0, 1)]
     assert [[each.iters for each in both] for both in passes] == [[68, 22], [22, 8]]
     assert sum(each.time_budget for both in passes for each in both) == pytest.approx(8.0)
     # In the capture, whose cameras stand around it, all see everything.
@@ -116,8 +116,8 @@ def test_a_block_has_the_views_that_see_it(divided: Division, captured: tuple[Ga
     torch.testing.assert_close(divided.seen.sum(1), torch.ones(len(divided.seen)))
 
 
-def test_what_is_left_out_is_not_missed(captured: tuple[Gaussians, Scene]) -> None:
-    """Of many small ones behind a wall: pictures without what is not beside a block are nearly the same."""
+def test_rows_left_out_of_the_context_are_not_needed(captured: tuple[Gaussians, Scene]) -> None:
+    """Of many small ones behind a wall: images without the rows left out of the context are nearly the same."""
     base, scene = captured
     hidden = gaussians(400, 1, 3, size=0.02)
     hidden = hidden.replace(means=hidden.means * 0.2)  # within the cloud
@@ -125,34 +125,34 @@ def test_what_is_left_out_is_not_missed(captured: tuple[Gaussians, Scene]) -> No
     both = both.replace(opacity_logits=torch.cat([base.opacity_logits + 3, hidden.opacity_logits - 4]))
     division = divide(both, scene.train, CONFIG, BLOCKS)
     for block in range(BLOCKS):
-        rows = torch.cat([division.rows(block), beside(division, block, scene.train)])
+        rows = torch.cat([division.rows(block), context_rows(division, block, scene.train)])
         assert len(rows) < len(both)
         for view in scene.train[:3]:
             whole, part = (render(g, view.camera).image for g in (both, both.select(rows)))
             assert float((whole - part).abs().mean()) <= 2 * LEFT_OUT
 
 
-def test_the_start_is_that_of_the_whole(divided: Division, captured: tuple[Gaussians, Scene]) -> None:
+def test_the_initialization_is_that_of_the_whole_scene(divided: Division, captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
-    whole = start(base, scene.train, CONFIG)
-    assert torch.equal(divided.begun.sigma_d, whole.sigma_d) and divided.begun.attenuation == whole.attenuation
+    whole = initialize(base, scene.train, CONFIG)
+    assert torch.equal(divided.initial.sigma_d, whole.sigma_d) and divided.initial.attenuation == whole.attenuation
     assert divided.extent == camera_extent([view.camera for view in scene.train])
 
 
-def test_quotas_add_up_to_the_law(divided: Division, captured: tuple[Gaussians, Scene]) -> None:
-    """And where each block answers for its part of the loss, they press on each Gaussian as the whole's law does."""
+def test_target_shares_add_up_to_the_curve(divided: Division, captured: tuple[Gaussians, Scene]) -> None:
+    """And where each block has its part of the loss, each Gaussian is penalised as in an undivided run."""
     views, count = captured[1].train, len(captured[0])
     for first in (True, False):
-        quotas = [TargetShares(divided, block, views, CONFIG, first=first) for block in range(BLOCKS)]
-        for k, view in enumerate(views[:2]):
+        shown = [with_target_shares(divided, block, views, CONFIG, first=first) for block in range(BLOCKS)]
+        for k in range(2):
             for s in (1.0, 1.7, 3.0, CONFIG.max_sv):
-                asked = [quota(view, s, 0.1) for quota in quotas]
-                law = target_curve(s, CONFIG.start_share, CONFIG.exponent)
+                asked = [block[k].target_share(s) for block in shown]
+                share = target_curve(s, CONFIG.start_share, CONFIG.exponent)
                 wanted = sum(q.share * len(divided.rows(block)) for block, q in enumerate(asked))
-                assert wanted == pytest.approx(law * count, rel=0.05)
+                assert wanted == pytest.approx(share * count, rel=0.05)
                 for block, q in enumerate(asked):
                     loss = float(divided.seen[k, block]) if first else 1.0
-                    assert loss * q.weight / len(divided.rows(block)) == pytest.approx(1 / (law * count))
+                    assert loss * q.weight / len(divided.rows(block)) == pytest.approx(1 / (share * count))
 
 
 def test_targets_ask_for_the_whole_error_once(captured: tuple[Gaussians, Scene], divided: Division) -> None:
@@ -163,7 +163,7 @@ def test_targets_ask_for_the_whole_error_once(captured: tuple[Gaussians, Scene],
     for block in range(BLOCKS):
         rows = divided.rows(block)
         ordered = base.select(torch.cat([rows, (divided.block != block).nonzero()[:, 0]]))
-        asked = asked + target(ordered, len(rows), view) / 255 - picture.clamp(0, 1)
+        asked = asked + target_image(ordered, len(rows), view) / 255 - picture.clamp(0, 1)
     torch.testing.assert_close(asked, view.image / 255 - picture.clamp(0, 1), rtol=0, atol=BLOCKS / 255)
 
 
@@ -172,8 +172,8 @@ def test_merging_takes_each_row_from_its_block(divided: Division, learned: list[
     for part in learned:
         for name, values in part.values.items():
             assert torch.equal(getattr(whole, name)[part.rows], values), name
-            assert not torch.equal(values, getattr(divided.begun, name)[part.rows]), name
-    assert torch.equal(whole.shN, divided.begun.shN)
+            assert not torch.equal(values, getattr(divided.initial, name)[part.rows]), name
+    assert torch.equal(whole.shN, divided.initial.shN)
     with pytest.raises(ClodError, match="in no block or in two"):
         merge(divided, learned[1:])
     with pytest.raises(ClodError, match="in no block or in two"):
@@ -188,7 +188,7 @@ def test_no_seams(captured: tuple[Gaussians, Scene], divided: Division, whole: G
     base, scene = captured
     undivided = adapt(base, scene, CONFIG).gaussians
     dials = (1.0, 3.0, 5.0)
-    begun = evaluate(divided.begun, scene.test, dials)
+    begun = evaluate(divided.initial, scene.test, dials)
     for before, one, other in zip(begun, *(evaluate(g, scene.test, dials) for g in (undivided, whole)), strict=True):
         gained = (other.psnr - before.psnr) / (one.psnr - before.psnr)
         assert gained > 0.7, f"s {one.virtual_scale}"
@@ -223,7 +223,7 @@ def test_a_block_goes_on_with_the_same_bits(
 
 def test_blocks_have_seeds_of_their_own(divided: Division) -> None:
     whole = replace(CONFIG, seed=2**63 - 1)
-    seeds = {config_of(divided, k, whole, first=first).seed for k in range(BLOCKS) for first in (True, False)}
+    seeds = {block_config(divided, k, whole, first=first).seed for k in range(BLOCKS) for first in (True, False)}
     assert len(seeds) == 2 * BLOCKS and whole.seed not in seeds
 
 
@@ -240,7 +240,7 @@ def test_a_block_that_no_view_sees_stays(captured: tuple[Gaussians, Scene], draw
     assert division.views(behind) == [] and division.steps(behind, CONFIG) == 0
     part, outcome = adapt_block(division, [view], CONFIG, behind)
     assert (part.steps, outcome.steps, list(part.values)) == (0, 0, ["sigma_d"])
-    assert torch.equal(part.values["sigma_d"], division.begun.sigma_d[division.rows(behind)])
+    assert torch.equal(part.values["sigma_d"], division.initial.sigma_d[division.rows(behind)])
 
 
 def test_every_wait_is_told(captured: tuple[Gaussians, Scene], divided: Division) -> None:
@@ -255,7 +255,7 @@ def test_what_needs_all_gaussians_at_once_is_refused(captured: tuple[Gaussians, 
     base, scene = captured
     with pytest.raises(ClodError, match="the paper's form cannot be trained in blocks"):
         divide(base, scene.train, AdaptConfig.paper(), 2)
-    begun = start(base, scene.train, CONFIG)
+    begun = initialize(base, scene.train, CONFIG)
     dialled = begun.replace(attenuation=replace(begun.attenuation, normalizer="max"))
     with pytest.raises(ClodError, match="normaliser max"):
         divide(dialled, scene.train, CONFIG, 2)

@@ -52,6 +52,12 @@ def clod(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest
     return run
 
 
+@pytest.fixture
+def blank_figure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replaces the figure of ``clod-adapt robustness``, which takes a second to draw, by an empty file."""
+    monkeypatch.setattr("clod_adapter.cli.robustness.robustness_figure", lambda path, *_: Path(path).touch())
+
+
 @pytest.fixture(scope="session")
 def spawn() -> Callable[..., subprocess.Popen[str]]:
     """Starts ``clod-adapt`` with these words in a process of its own, with a progress line every ``line_every`` s."""

@@ -13,11 +13,9 @@ import pytest
 import clod_adapter
 
 
+@pytest.mark.usefixtures("without_splat_transform")
 @pytest.mark.parametrize("sv", [None, 2])
-def test_a_page_holds_the_splat_and_its_dial(
-    clod: Any, dialled: Path, tmp_path: Path, sv: int | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("CLOD_SPLAT_TRANSFORM", "there-is-none")
+def test_a_page_holds_the_splat_and_its_dial(clod: Any, dialled: Path, tmp_path: Path, sv: int | None) -> None:
     done = clod("export", dialled, "-o", "page.html", *(["--sv", sv] if sv else []), "--json")
     assert done.code == 0 and "there-is-none" in done.err, done
     assert "exact" not in done.err.replace("as it is", "")
@@ -40,8 +38,8 @@ def test_a_page_has_the_cameras_of_the_scene(clod: Any, dialled: Path, capture: 
     assert names == sorted(path.name for path in (capture.scene / "images").iterdir())
 
 
-def test_what_is_said_of_a_page(clod: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CLOD_SPLAT_TRANSFORM", "there-is-none")
+@pytest.mark.usefixtures("without_splat_transform")
+def test_the_summary_of_a_page(clod: Any, dialled: Path) -> None:
     done = clod("export", dialled, "-o", "page.html", "--sv", 2)
     assert "Gaussians, the dial at s = 2 at first" in done.out and " of " not in done.out
     done = clod("export", dialled, "-o", "page.html", "--sv", 9, "--json")

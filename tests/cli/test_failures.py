@@ -64,13 +64,13 @@ def assert_goes_on(clod: Any, words: list[Any], folder: Path, step: int, whole: 
 
 def pull_changed(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]) -> None:
     """The ``at``-th pull of the run is what ``change`` makes of it; kernels are prepared by another run."""
-    pull, pulls = Objective.pull, count(1)
+    pull, pulls = Objective.gradient_sum, count(1)
 
     def changed(self: Objective, *given: Any) -> Any:
         found = pull(self, *given)
         return change(found) if self.config.iters == ITERS and next(pulls) == at else found
 
-    patch.setattr(Objective, "pull", changed)
+    patch.setattr(Objective, "gradient_sum", changed)
 
 
 def fail(*_: Any, **__: Any) -> Any:

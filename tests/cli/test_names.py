@@ -47,6 +47,7 @@ def test_adapting(clod: Any, odd: Path, tmp_path: Path) -> None:
     assert "gr\\xfcn" in out.with_suffix(".html").read_text("utf-8")
 
 
+@pytest.mark.usefixtures("without_splat_transform")
 @pytest.mark.parametrize(
     "words",
     [
@@ -93,6 +94,7 @@ def test_names_within_a_transforms_file(clod: Any, dialled: Path, tmp_path: Path
         assert done.code == 2 and error.endswith("is no text in UTF-8; rename the photograph, there too"), done
 
 
+@pytest.mark.usefixtures("without_splat_transform")
 @pytest.mark.skipif(sys.platform == "win32", reason="locales are those of POSIX")
 def test_an_ascii_locale(capture: Any, dialled: Path, tmp_path: Path) -> None:
     """Paths and photographs whose names have umlauts, which nothing in that locale can decode."""

@@ -73,6 +73,7 @@ def test_every_checkpoint_at_every_range(run: Any, clod: Any, tmp_path: Path) ->
     assert again.psnr == at(report["cells"][2], 3)["psnr"]
 
 
+@pytest.mark.usefixtures("blank_figure")
 def test_resumes_what_is_unfinished_or_changed(run: Any, tmp_path: Path) -> None:
     first = run()
     assert first.code == 0 and "there already" not in first.err, first
@@ -95,6 +96,7 @@ def test_resumes_what_is_unfinished_or_changed(run: Any, tmp_path: Path) -> None
     }
 
 
+@pytest.mark.usefixtures("blank_figure")
 def test_ctrl_c_leaves_what_there_is(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls, real = [], command.adapt_at_range
 
@@ -127,6 +129,7 @@ def test_ctrl_c_before_the_first_cell(run: Any, tmp_path: Path, monkeypatch: pyt
     assert [p.name for p in (tmp_path / "robustness").rglob("*")] == ["cells"]
 
 
+@pytest.mark.usefixtures("blank_figure")
 def test_progress_is_over_all_cells(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
     done = run()
@@ -137,6 +140,7 @@ def test_progress_is_over_all_cells(run: Any, monkeypatch: pytest.MonkeyPatch) -
     assert run("--quiet", "--out", "other").err == ""
 
 
+@pytest.mark.usefixtures("blank_figure")
 def test_checkpoints_of_one_name(clod: Any, capture: Any, tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()

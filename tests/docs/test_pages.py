@@ -89,16 +89,6 @@ def cell(row: Mapping[str, Any]) -> str:
     return f"{float(row['psnr']):.2f} @ {100 * float(row['kept_share']):.0f} %"
 
 
-def test_the_pruned_checkpoint_is_as_measured() -> None:
-    with (RESULTS / "robustness.csv").open(encoding="utf-8") as stream:
-        rows = [row for row in csv.DictReader(stream) if row["max_sv"] == "5.0"]
-    (page,) = [table for table in tables(DOCS / "from_maskgaussian.md") if table[0] == ["dial", "3DGS", "mask-pruned"]]
-    for name, *written in page[1:]:
-        found = [row for row in rows if f"s = {float(row['virtual_scale']):g}" == name]
-        assert [row["checkpoint"] for row in found] == ["pretrained", "pretrained_mask"]
-        assert written == [f"{float(row['psnr']):.2f} @ {float(row['kept']):,.0f}" for row in found], name
-
-
 def test_the_long_dials_are_those_that_were_measured() -> None:
     rows = [json.loads(line) for line in (RESULTS / "adapt.jsonl").read_text(encoding="utf-8").splitlines()]
     (page,) = [table for table in tables(DOCS / "max_sv.md") if table[0][1:2] == ["plush_half, 5"]]
@@ -115,10 +105,10 @@ def test_the_long_dials_are_those_that_were_measured() -> None:
         assert written == [column.get(name, "") for column in columns], name
 
 
-def test_the_law_is_what_training_presses_towards() -> None:
+def test_the_target_counts_are_those_of_training() -> None:
     config = AdaptConfig()
-    (dials, law) = next(rows for rows in tables(DOCS / "equation.md") if rows[0][0] == "s")
-    for s, share in zip(dials[1:], law[1:], strict=True):
+    (dials, shares) = next(rows for rows in tables(DOCS / "equation.md") if rows[0][0] == "s")
+    for s, share in zip(dials[1:], shares[1:], strict=True):
         assert share == f"{target_curve(float(s), config.start_share, config.exponent):.0%}".replace("%", " %")
 
 

@@ -24,7 +24,7 @@ MAX_SV = 6.0
 
 
 def adapted(n: int, seed: int, normalizer: str = "scene") -> Gaussians:
-    """With decays for which Gaussians leave all over the dial's range, and before and behind it."""
+    """With decays for which Gaussians are culled all over the dial's range, and below and above it."""
     generator = torch.Generator().manual_seed(seed)
     sigma = (torch.randn(n, generator=generator) * 0.8 + 0.4).exp()
     attenuation = AttenuationConfig(max_sv=MAX_SV, normalizer=normalizer, scene_distance=5.0)
@@ -58,7 +58,7 @@ def test_counts_are_exact_up_to_ties(n: int, seed: int, views: int, share: float
     assert wanted - found <= max(1, 0.001 * wanted) + ties, (seed, found, wanted)
 
 
-def test_ties_leave_together() -> None:
+def test_ties_are_culled_together() -> None:
     row = adapted(6, 0)
     same = row.replace(
         means=torch.zeros(6, 3), opacity_logits=torch.tensor([2.0, 2, 2, 2, 3, 5]), sigma_d=torch.ones(6)

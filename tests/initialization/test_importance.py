@@ -1,4 +1,4 @@
-"""The importance estimate against brute force, and the count law of the sigma_d that follows from it."""
+"""The importance estimate against brute force, and the counts kept with the sigma_d that follows from it."""
 
 from __future__ import annotations
 
@@ -8,17 +8,23 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import attenuate, normalized_distances
+from clod_adapter.attenuation import attenuate
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.distances import normalized_distances, typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization import importance
-from clod_adapter.initialization.importance import fitting_tau, removal_error, seeing, sigma_from_importance, start
+from clod_adapter.initialization.importance import (
+    fitting_tau,
+    initialize,
+    removal_error,
+    sigma_from_importance,
+    usable_views,
+)
 from clod_adapter.initialization.pruning_order import pruning_order
 from clod_adapter.render import splat
-from clod_adapter.viewpoints import typical_distance
 from scenes import gaussians, photograph, ring
 
 CONFIG = AttenuationConfig(tau=1 / 255, cut="hard", scene_distance=4.0)
@@ -69,7 +75,7 @@ def test_is_the_mean_over_views_and_reports_them() -> None:
     assert (both >= once / 2).all()  # the same first draw, and a second one
 
 
-def test_start_looks_at_some_of_many_views(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_initialization_renders_some_of_many_views(monkeypatch: pytest.MonkeyPatch) -> None:
     """Evenly spread ones, first to last; all where there are few."""
     some, looked, counts = gaussians(50, 0, 0), [], []
     views = photograph(some, ring(7, 12, 10))
@@ -78,7 +84,7 @@ def test_start_looks_at_some_of_many_views(monkeypatch: pytest.MonkeyPatch) -> N
         looked.clear()
         counts.clear()
         monkeypatch.setattr(importance, "MOST_VIEWS", most)
-        importance.start(some, views, AdaptConfig(), lambda *count: counts.append(count))
+        importance.initialize(some, views, AdaptConfig(), lambda *count: counts.append(count))
         assert looked == [views[k].camera.name for k in expected]
         assert counts[: len(looked)] == [("start", k + 1, len(looked)) for k in range(len(looked))]
         assert {phase for phase, *_ in counts[len(looked) :]} == {"order"} and counts[-1] == ("order", 50, 50)
@@ -94,7 +100,7 @@ def test_what_no_view_shows_counts_nothing() -> None:
 
 @pytest.mark.parametrize("exponent", [1.0, 1.5, 2.5])
 @pytest.mark.parametrize("share", [0.51, 0.6, 0.8, 1.0])
-def test_shares_kept_follow_the_law(share: float, exponent: float, n: int = 1000) -> None:
+def test_shares_kept_follow_the_curve(share: float, exponent: float, n: int = 1000) -> None:
     """At the distances it was made for, ``1 / (s^p + (1/share - 1) s^-p)``, to one Gaussian."""
     g = torch.Generator().manual_seed(0)
     some = gaussians(n, 0, 0).replace(opacity_logits=2 * torch.rand(n, generator=g))  # lasting until s = 127
@@ -110,7 +116,7 @@ def test_shares_kept_follow_the_law(share: float, exponent: float, n: int = 1000
 
 @pytest.mark.parametrize("seed", range(3))
 def test_sigma_grows_with_importance(seed: int, n: int = 200) -> None:
-    """All else equal; and whatever the opacity, those of small importance leave first."""
+    """All else equal; and whatever the opacity, those of small importance are culled first."""
     g = torch.Generator().manual_seed(seed)
     importance = torch.rand(n, generator=g)
     distances, order = torch.full((n,), 0.7), importance.argsort()
@@ -119,14 +125,16 @@ def test_sigma_grows_with_importance(seed: int, n: int = 200) -> None:
     assert (sigma[order].diff() > 0).all() and sigma.isfinite().all(), f"seed {seed}"
     some = gaussians(n, 0, seed)
     sigma = sigma_from_importance(some, importance, distances, CONFIG, share=0.7, exponent=1.5)
-    leaves = extinction_scale(some.opacity_logits, sigma, distances, CONFIG)
-    lasting = (some.opacities * 255 * 0.99 > leaves)[order]  # the others stay until their opacity ends them
+    culled_at = extinction_scale(some.opacity_logits, sigma, distances, CONFIG)
+    lasting = (some.opacities * 255 * 0.99 > culled_at)[
+        order
+    ]  # the others are kept for as long as their opacity allows
     assert lasting.sum() > n / 2
-    assert (leaves[order][lasting].diff() >= -1e-4).all(), f"seed {seed}"
+    assert (culled_at[order][lasting].diff() >= -1e-4).all(), f"seed {seed}"
 
 
 def test_equal_importance_is_ranked_all_the_same() -> None:
-    """Nothing is known (no Gaussian in any view): the law still holds."""
+    """Nothing is known (no Gaussian in any view): the counts still follow the curve."""
     some = gaussians(100, 0, 0).replace(opacity_logits=torch.zeros(100))
     sigma = sigma_from_importance(some, torch.zeros(100), torch.ones(100), CONFIG, share=0.6, exponent=1.5)
     assert abs(attenuate(some.opacity_logits, sigma, torch.ones(100), 1.0, CONFIG).keep.sum().item() - 60) <= 1
@@ -138,12 +146,14 @@ def test_of_no_gaussians() -> None:
     assert sigma.shape == (0,)
 
 
-def test_the_orders_of_the_start() -> None:
-    """By removal error alone the most important leaves last; with neighbours it may leave sooner."""
+def test_the_orders_of_the_initialization() -> None:
+    """By removal error alone the most important is culled last; with neighbours it may be culled earlier."""
     some = gaussians(200, 0, 0)
     views = photograph(some, ring(3, 20, 16))
     error = removal_error(some, views, seed=0)
-    by_error, by_default = (importance.start(some, views, AdaptConfig(start=name)) for name in ("error", "importance"))
+    by_error, by_default = (
+        importance.initialize(some, views, AdaptConfig(start=name)) for name in ("error", "importance")
+    )
 
     def leaving(dialled: Gaussians) -> Tensor:
         d = typical_distance(some.means, [view.camera for view in views], dialled.attenuation)
@@ -174,7 +184,7 @@ def test_tau_is_lowered_for_faint_checkpoints_only() -> None:
 def test_a_checkpoint_of_faint_gaussians_keeps_its_picture() -> None:
     base = gaussians(200, 0, 0, size=0.3).replace(opacity_logits=torch.full((200,), -4.6))
     views = photograph(base, ring(3, 24, 18))
-    dialled = start(base, views, AdaptConfig())
+    dialled = initialize(base, views, AdaptConfig())
     assert dialled.attenuation is not None and dialled.sigma_d is not None and dialled.attenuation.tau < 0.01 / 5
     d = normalized_distances(base.means, views[0].camera, dialled.attenuation)
     assert attenuate(base.opacity_logits, dialled.sigma_d, d, 1.0, dialled.attenuation).keep.float().mean() > 0.5
@@ -186,6 +196,6 @@ def test_views_of_nothing_are_left_out() -> None:
     back = torch.diag(torch.tensor([-1.0, 1, -1, 1]))
     away = dataclasses.replace(views[0].camera, viewmat=back @ views[0].camera.viewmat)
     blind = View(away, views[0].image)
-    assert seeing(some, [views[0], blind, views[1]]) == views[:2]
+    assert usable_views(some, [views[0], blind, views[1]]) == views[:2]
     with pytest.raises(ClodError, match="in front of any of the 1 training cameras"):
-        seeing(some, [blind])
+        usable_views(some, [blind])

@@ -11,7 +11,14 @@ from torch import Tensor
 
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
-from clod_adapter.initialization.pruning_order import APART, COLOUR_FLOOR, LEAVING, NEIGHBOURS, _apart, pruning_order
+from clod_adapter.initialization.pruning_order import (
+    APART,
+    COLOUR_FLOOR,
+    NEIGHBOURS,
+    REMOVED,
+    _without_crowds,
+    pruning_order,
+)
 from scenes import gaussians
 
 
@@ -31,7 +38,7 @@ def plainly(some: Gaussians, worth: Tensor) -> list[int]:
             near = sorted((j for j in left if j != i), key=lambda j: float((centres[i] - centres[j]).square().sum()))
             heirs[i] = min(near[:NEIGHBOURS], key=lambda j: unlike(i, j))
         ranked = sorted(left, key=lambda i: worths[i] * unlike(i, heirs[i]))
-        leaving = [i for i in ranked[: max(int(LEAVING * len(left)), 1)] if ranked.index(heirs[i]) > ranked.index(i)]
+        leaving = [i for i in ranked[: max(int(REMOVED * len(left)), 1)] if ranked.index(heirs[i]) > ranked.index(i)]
         leaving = [i for i in leaving if i not in [heirs[j] for j in leaving]]
         for i in leaving:
             worths[heirs[i]] += worths[i]
@@ -53,7 +60,7 @@ def test_of_none_and_of_one(n: int) -> None:
     assert pruning_order(gaussians(n, 0, 0), torch.ones(n)).tolist() == list(range(n))
 
 
-def test_one_of_two_alike_leaves_before_a_single_one_that_is_worth_less() -> None:
+def test_one_of_two_alike_is_removed_before_a_single_less_important_one() -> None:
     """And by worth alone both would stay: that is what the order is for."""
     three = gaussians(3, 0, 0)
     means = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [5.0, 0, 0]])
@@ -94,10 +101,10 @@ def test_many_in_one_place_are_moved_apart() -> None:
     """A k-d tree cannot part them, and would compare each with all: hours for some hundred thousand."""
     sizes = np.full(200, 0.1)
     sizes[3] = math.inf
-    crowd = _apart(np.full((200, 3), 0.3), sizes)
+    crowd = _without_crowds(np.full((200, 3), 0.3), sizes)
     assert len(np.unique(np.delete(crowd, 3, 0), axis=0)) == 199 and np.abs(crowd - 0.3).max() <= 1e-7
     spread = np.random.default_rng(0).normal(size=(200, 3))
-    assert _apart(spread, sizes) is spread
+    assert _without_crowds(spread, sizes) is spread
     some = gaussians(300, 0, 0)
     order = pruning_order(some.replace(means=torch.full_like(some.means, 0.3)), torch.rand(300))
     assert order.sort().values.equal(torch.arange(300))

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 import inria_forks
-from clod_adapter.attenuation import attenuate, normalized_distances
+from clod_adapter.attenuation import attenuate
 from clod_adapter.config import FILTERS, AttenuationConfig
+from clod_adapter.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render

@@ -17,7 +17,7 @@ from PIL import Image
 import clod_adapter
 import gsplat_in_torch
 from clod_adapter import integrations
-from clod_adapter.attenuation import attenuate_activated
+from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.hook import Hook
 
@@ -32,7 +32,7 @@ def my_opacity(
     """float32's, of the package."""
     config = AttenuationConfig(eps=eps, tau=tau, cut="soft" if soft else "hard", max_sv=1)
     values = (torch.tensor([value], dtype=torch.float32) for value in (opacity, sigma, distance))
-    return float(attenuate_activated(*values, scale, config).drawn)
+    return float(attenuate(*values, scale, config, activated=True).drawn)
 
 
 @pytest.fixture

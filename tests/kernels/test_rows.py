@@ -6,6 +6,7 @@ import ctypes
 import mmap
 import os
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -47,6 +48,7 @@ def to_rows(destination, rows, width, first, count, lanes, at):
     store_rows(pointer(destination), pointer(rows), width, first, count, vectors, at)
 
 
+@cache
 def with_constants(width: int, first: int, count: int) -> tuple[Callable[..., None], Callable[..., None]]:
     """Both, compiled for these numbers as the kernels have them."""
 

@@ -10,29 +10,10 @@ from numba import float32, njit
 
 from clod_adapter._kernels import simd
 from clod_adapter._kernels.bits import bits_of, lowest, set_spans
+from clod_adapter._kernels.elementary import exp2, log2, vabs, vceil, vfloor, vsqrt
 from clod_adapter._kernels.pointers import fetch_add, pointer, prefetch
 from clod_adapter._kernels.rows import store_sums
-from clod_adapter._kernels.simd import (
-    anywhere,
-    both,
-    but_not,
-    eq,
-    exp2,
-    fma,
-    ge,
-    gt,
-    load,
-    log2,
-    select,
-    splat,
-    store,
-    vabs,
-    vceil,
-    vfloor,
-    vmax,
-    vmin,
-    vsqrt,
-)
+from clod_adapter._kernels.simd import anywhere, both, but_not, eq, fma, ge, gt, load, select, splat, store, vmax, vmin
 
 LANES = 16
 NAMES = (

@@ -15,19 +15,18 @@ from oracle import BACKGROUND, IMAGE, assert_agrees
 from scenes import camera, in_front, scene
 
 # Neither multiples of 4 nor of a tile, but one; principal points on either side.
-SIZES = [(61, 45), (33, 70), (97, 31), (64, 64), (5, 7), (130, 50)]
+SIZES = [(61, 45), (33, 70), (97, 31), (64, 64), (5, 7)]
 
 
-@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("degree", range(5))
-def test_random_scenes(rasterize: Rasterizer, degree: int, seed: int) -> None:
-    width, height = SIZES[(degree + 3 * seed) % len(SIZES)]
-    size = (0.05, 0.1, 0.3)[(degree + seed) % 3]
+def test_random_scenes(rasterize: Rasterizer, degree: int) -> None:
+    seed, (width, height) = degree % 2, SIZES[degree]
+    size = (0.05, 0.1, 0.3)[degree % 3]
     view = camera(width, height, off_centre=(0.52, 0.47) if seed else (0.31, 0.72))
     assert_agrees(rasterize, scene(200, degree, 100 * seed + degree, size=size), view)
 
 
-@pytest.mark.parametrize("size", [*SIZES, (1, 1), (3, 200), (200, 3), (33, 1)], ids=lambda s: "x".join(map(str, s)))
+@pytest.mark.parametrize("size", [(130, 50), (1, 1), (3, 200), (200, 3), (33, 1)], ids=lambda s: "x".join(map(str, s)))
 def test_image_sizes(rasterize: Rasterizer, size: tuple[int, int]) -> None:
     assert_agrees(rasterize, scene(100, 1, sum(size), size=0.3), camera(*size), cut=0.05)
 
@@ -59,7 +58,7 @@ def test_near_the_camera_plane(rasterize: Rasterizer, near: float) -> None:
     assert_agrees(rasterize, some, view, rows=depths >= near)
 
 
-@pytest.mark.parametrize("opacity", [0.0, 1 / 255 * 0.999, 0.5, 0.9995, 1.0])
+@pytest.mark.parametrize("opacity", [0.0, 1 / 255 * 0.999, 0.9995, 1.0])
 def test_opacity_of_a_few(rasterize: Rasterizer, opacity: float) -> None:
     some = scene(120, 1, 1, size=0.15)
     some["opacities"][::3] = opacity
@@ -110,9 +109,10 @@ def test_one_that_covers_the_whole_image(rasterize: Rasterizer, opacity: float) 
     assert_agrees(rasterize, one, view)
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
-    "scales", [(1.0, 1e-6, 1e-6), (0.3, 3e-7, 3e-7), (0.3, 0.3, 3e-7)], ids=["needle", "short", "disc"]
+    ("scales", "seed"),
+    [((1.0, 1e-6, 1e-6), 0), ((0.3, 3e-7, 3e-7), 1), ((0.3, 0.3, 3e-7), 2)],
+    ids=["needle", "short", "disc"],
 )
 def test_axis_ratio_of_a_million(rasterize: Rasterizer, scales: tuple[float, float, float], seed: int) -> None:
     """Bounds of a needle are wider: its exponent is a small difference of terms of up to ``61^2 / (2 x 0.3) = 6,200``.
@@ -126,8 +126,7 @@ def test_axis_ratio_of_a_million(rasterize: Rasterizer, scales: tuple[float, flo
     assert_agrees(rasterize, some, camera(), **wider)
 
 
-@pytest.mark.parametrize("length", [1e-8, 0.0, 1e2, 1e3, 1e4])
-@pytest.mark.parametrize("axes", [1, 3])
+@pytest.mark.parametrize(("axes", "length"), [(1, 1e-8), (3, 0.0), (1, 1e2), (3, 1e3), (1, 1e4), (3, 1e4)])
 def test_extreme_scales(rasterize: Rasterizer, axes: int, length: float) -> None:
     if axes == 1 and length >= 100 and getattr(rasterize, "looser", 1.0) > 1:
         pytest.skip("gsplat takes the determinant in float32, where that of such a needle cancels")
@@ -136,7 +135,7 @@ def test_extreme_scales(rasterize: Rasterizer, axes: int, length: float) -> None
     assert_agrees(rasterize, some, camera(), image=IMAGE if axes == 3 or length < 1 else 1e-4)
 
 
-@pytest.mark.parametrize("length", [1e-12, 1e-3, 1e12])
+@pytest.mark.parametrize("length", [1e-12, 1e12])
 def test_quaternions_of_any_length(rasterize: Rasterizer, length: float) -> None:
     some = scene(100, 1, 6)
     some["quats"][::2] *= length
@@ -163,8 +162,11 @@ def test_thousands_in_one_tile(rasterize: Rasterizer) -> None:
     assert_agrees(rasterize, some, camera(5, 4), cut=0.1, nudge=1e-5)
 
 
-@pytest.mark.parametrize("screen_filter", [FILTERS["on"], FILTERS["mip"], ScreenFilter(variance=2.0)], ids=str)
-@pytest.mark.parametrize("size", [0.005, 0.02, 0.2])
+@pytest.mark.parametrize(
+    ("size", "screen_filter"),
+    [(0.005, FILTERS["on"]), (0.02, FILTERS["mip"]), (0.2, FILTERS["on"]), (0.02, ScreenFilter(variance=2.0))],
+    ids=str,
+)
 def test_screen_filters(rasterize: Rasterizer, size: float, screen_filter: ScreenFilter) -> None:
     """Of sizes from a tenth of a pixel to several: opacities compensated to nothing, by half, and hardly."""
     view = camera(70, 50)
@@ -181,7 +183,7 @@ def test_compensation_of_long_and_flat_ones(rasterize: Rasterizer, scales: tuple
     assert_agrees(rasterize, some, view, image=3e-4, screen_filter=FILTERS["on"])
 
 
-@pytest.mark.parametrize("far", [1e4, 1e6, 1e8])
+@pytest.mark.parametrize("far", [1e4, 1e8])
 def test_an_ellipse_that_reaches_beyond_all_whole_numbers(rasterize: Rasterizer, far: float) -> None:
     """Its centre up to 1e12 pixels away, its long axis through the picture: neither a crash nor a wild pixel."""
     view = Camera(torch.eye(4), torch.tensor([[100.0, 0, 64], [0, 100.0, 64], [0, 0, 1]]), 128, 128)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -44,17 +43,15 @@ def test_for_the_gpu_it_is_gsplat_s_or_what_is_missing(monkeypatch: pytest.Monke
         for_device(torch.device("cuda"))
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_same_input_same_bits(rasterize: Backend, torch_threads: int, seed: int) -> None:
-    view, some = camera(130, 97), scene(300 if rasterize.stands_in else 2000, 2, seed)
+def test_same_input_same_bits(rasterize: Backend, torch_threads: int) -> None:
+    view, some = camera(130, 97), scene(300 if rasterize.stands_in else 2000, 2, torch_threads)
     first = differentiate(rasterize, some, view, weights(view))
     for _ in range(1 if rasterize.stands_in else 3):
         assert_same(differentiate(rasterize, some, view, weights(view)), first, **rasterize.rounding)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_thread_count_changes_rounding_at_most(rasterize: Backend, seed: int) -> None:
-    view, some = camera(130, 97), scene(301 if rasterize.stands_in else 2001, 2, seed)
+def test_thread_count_changes_rounding_at_most(rasterize: Backend) -> None:
+    view, some = camera(130, 97), scene(301 if rasterize.stands_in else 2001, 2, 0)
     before = torch.get_num_threads()
     results = []
     for count in (1, 2, 3):
@@ -68,7 +65,7 @@ def test_thread_count_changes_rounding_at_most(rasterize: Backend, seed: int) ->
     assert_same(results[2], results[0], **within)
 
 
-@pytest.mark.parametrize("order", list(itertools.permutations(range(3))), ids=lambda o: "".join(map(str, o)))
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0)], ids=lambda o: "".join(map(str, o)))
 def test_several_forward_passes_alive_at_once(rasterize: Backend, order: tuple[int, ...]) -> None:
     """Then their backward passes, in any order: what a forward pass left behind is its own."""
     cases = [
@@ -253,8 +250,10 @@ def test_zero_quaternions_are_skipped(rasterize: Backend) -> None:
     assert_rows_count_for_nothing(rasterize, some, gone)
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf], ids=str)
-@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [(name, value) for k, name in enumerate(FIELDS) for value in (math.nan, (-1) ** k * math.inf)],
+)
 def test_rows_that_are_not_finite_are_skipped(rasterize: Backend, name: str, value: float) -> None:
     """Whole rows and single elements. A file in the wild has some; they must not spoil the picture."""
     for column in {
@@ -273,8 +272,10 @@ def test_rows_that_are_not_finite_are_skipped(rasterize: Backend, name: str, val
             assert_rows_count_for_nothing(rasterize, some, gone)
 
 
-@pytest.mark.parametrize("name", ["means", "scales"])
-@pytest.mark.parametrize("value", [1e10, 1e20, 1e30, 3e38, -3e38])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("means", 1e10), ("means", 1e30), ("means", -3e38), ("scales", 1e10), ("scales", 1e20), ("scales", 3e38)],
+)
 def test_huge_rows_are_survived(rasterize: Backend, name: str, value: float) -> None:
     """Beyond what float32 can project: whatever is drawn of such rows, it is finite, and so are the gradients."""
     view = camera()
@@ -287,8 +288,13 @@ def test_huge_rows_are_survived(rasterize: Backend, name: str, value: float) -> 
         assert (found.alpha >= 0).all() and (found.alpha <= 1).all()
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, 1e20, 3e38])
-@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities"])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *((name, math.nan) for name in ("means", "quats", "scales", "opacities")),
+        ("means", math.inf), ("quats", 3e38), ("scales", 1e20), ("opacities", math.inf),
+    ],
+)  # fmt: skip
 def test_wild_rows_are_survived_with_compensation(rasterize: Backend, name: str, value: float) -> None:
     """Whatever is drawn of them, it is finite, and so are the gradients; NaN in one row is in no other's."""
     view, some = camera(), scene(150, 1, 5, size=0.03)

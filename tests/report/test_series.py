@@ -31,8 +31,9 @@ def test_an_evaluation_with_comparisons() -> None:
     }
     found = {one.label: (one.dial, [r["psnr"] for r in one.rows]) for one in series_of(report)}
     assert found == {
-        "dial, one file": (True, [20, 20]), "base, unadapted": (False, [22]), "base cut by opacity": (False, [21, 17]),
-        "base cut by removal error": (False, [21, 17]), "x_a": (False, [20]), "y_a": (True, [20, 20]),
+        "dial, one file": (True, [20, 20]), "base, unadapted": (False, [22]),
+        "base pruned by opacity": (False, [21, 17]),
+        "base pruned by removal error": (False, [21, 17]), "x_a": (False, [20]), "y_a": (True, [20, 20]),
     }  # fmt: skip
 
 

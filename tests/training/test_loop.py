@@ -14,14 +14,15 @@ import pytest
 import torch
 
 from clod_adapter.adapter import ATTRIBUTES, attach
-from clod_adapter.attenuation import SIGMA_MAX, attenuate, log_attenuation, normalized_distances
+from clod_adapter.attenuation import SIGMA_MAX, attenuate, log_attenuation
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import FILTERS, AdaptConfig, AttenuationConfig
+from clod_adapter.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization import importance
-from clod_adapter.initialization.importance import scene_distance, start
+from clod_adapter.initialization.importance import initialize, scene_distance
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import render, splat
@@ -61,7 +62,7 @@ def assert_equal(a: Gaussians, b: Gaussians) -> None:
 
 def test_pictures_get_better(captured: tuple[Gaussians, Scene], trained: tuple[Adapted, list[Progress]]) -> None:
     base, scene = captured
-    before = start(base, scene.train, config_of())
+    before = initialize(base, scene.train, config_of())
     for views in (scene.train, scene.test):
         rows = zip(evaluate(before, views, SCALES), evaluate(trained[0].gaussians, views, SCALES), strict=True)
         for old, new in rows:
@@ -75,7 +76,7 @@ def test_the_defaults_do_that_too(captured: tuple[Gaussians, Scene]) -> None:
     config = AdaptConfig(iters=120)
     old, new = (
         evaluate(some, scene.test, SCALES)
-        for some in (start(base, scene.train, config), adapt(base, scene, config).gaussians)
+        for some in (initialize(base, scene.train, config), adapt(base, scene, config).gaussians)
     )
     assert sum(row.psnr for row in new) > sum(row.psnr for row in old) + 0.5 * len(SCALES)
     assert all(more.kept > less.kept for more, less in zip(new, new[1:], strict=False))
@@ -97,7 +98,7 @@ def test_the_dial_works_after_training(
 
 
 def test_sigma_is_learned(captured: tuple[Gaussians, Scene], trained: tuple[Adapted, list[Progress]]) -> None:
-    old, new = start(*captured_views(captured), config_of()).sigma_d, trained[0].gaussians.sigma_d
+    old, new = initialize(*captured_views(captured), config_of()).sigma_d, trained[0].gaussians.sigma_d
     assert ((new / old).log().abs() > 0.02).float().mean() > 0.3
     for name in ATTRIBUTES:
         assert not torch.equal(getattr(trained[0].gaussians, name), getattr(captured[0], name)), name
@@ -132,7 +133,7 @@ def test_a_seed_decides_everything(captured: tuple[Gaussians, Scene], config: di
 
 def test_the_base_is_left_alone(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
-    with_dial = start(base, scene.train, config_of())
+    with_dial = initialize(base, scene.train, config_of())
     for some in (base, with_dial):
         before = {name: value.clone() for name, value in some.tensors().items()}
         adapt(some, scene, config_of(iters=5))
@@ -143,7 +144,7 @@ def test_the_base_is_left_alone(captured: tuple[Gaussians, Scene]) -> None:
 def test_no_steps_give_the_start(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     result = adapt(base, scene, config_of(iters=0))
-    want = start(base, scene.train, config_of())
+    want = initialize(base, scene.train, config_of())
     assert result.steps == 0 and not result.interrupted
     for name in ATTRIBUTES:
         assert torch.equal(getattr(result.gaussians, name), getattr(base, name)), name
@@ -154,7 +155,7 @@ def test_no_steps_give_the_start(captured: tuple[Gaussians, Scene]) -> None:
 def test_the_start_follows_the_count_law(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     base = base.replace(opacity_logits=base.opacity_logits.abs())  # all able to last
-    found = start(base, scene.train, config_of(start_share=0.7, exponent=1.5))
+    found = initialize(base, scene.train, config_of(start_share=0.7, exponent=1.5))
     assert found.attenuation.scene_distance == 1
     assert found.attenuation.reference_distance == pytest.approx(scene_distance(base, scene.train, 0.95))
     for row in evaluate(found, scene.train, SCALES):
@@ -171,7 +172,7 @@ def test_continues_from_a_sigma(captured: tuple[Gaussians, Scene], trained: tupl
     moved = (result.gaussians.sigma_d / first.sigma_d).log().abs()
     assert moved.max() <= 1.01e-2  # a step of log sigma
     assert result.gaussians.attenuation == replace(first.attenuation, max_sv=3.0)
-    assert start(first, captured[1].train, config).sigma_d is first.sigma_d
+    assert initialize(first, captured[1].train, config).sigma_d is first.sigma_d
 
 
 def test_the_outcome_is_in_world_units_and_read_back_as_it_was(
@@ -245,7 +246,7 @@ def test_every_sigma_of_the_start_feels_the_dial(captured: tuple[Gaussians, Scen
     """An opacity too low for its rank asks for an infinite sigma, which could never be learned away."""
     base, scene = captured
     faint = base.replace(opacity_logits=torch.full_like(base.opacity_logits, -3.8))
-    begun = start(faint, scene.train, config_of())
+    begun = initialize(faint, scene.train, config_of())
     distances = normalized_distances(begun.means, scene.train[0].camera, begun.attenuation)
     fades = -log_attenuation(begun.sigma_d, distances, begun.attenuation.max_sv, begun.attenuation.eps)
     assert fades.min() > 1e-5
@@ -278,7 +279,7 @@ def test_only_sigma_where_other_rates_are_zero(captured: tuple[Gaussians, Scene]
     result = adapt(*captured, config_of(iters=10, **still)).gaussians
     for name in ATTRIBUTES:
         assert torch.equal(getattr(result, name), getattr(captured[0], name)), name
-    want = start(*captured_views(captured), config_of()).sigma_d
+    want = initialize(*captured_views(captured), config_of()).sigma_d
     assert ((result.sigma_d / want - 1).abs() > 1e-3).any()
 
 
@@ -311,7 +312,7 @@ def test_one_step_by_hand(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     alone = Scene(scene.train[:2], ())
     config = config_of(iters=1, sampling="log", full_share=1.0, reg_weight=0.0, seed=3)
-    before, seen = start(base, alone.train, config), []
+    before, seen = initialize(base, alone.train, config), []
     after = adapt(before, alone, config, seen.append).gaussians
     losses = [photometric_loss(render(before, view.camera).image, view.image).item() for view in alone.train]
     view = alone.train[min(range(2), key=lambda k: abs(losses[k] - seen[0].loss))]
@@ -338,11 +339,15 @@ def test_one_step_by_hand(captured: tuple[Gaussians, Scene]) -> None:
 def test_a_batch_sums_what_its_views_ask(captured: tuple[Gaussians, Scene]) -> None:
     """And its first step is as long as the root of its size says."""
     base, scene = captured
-    begun, views, config = start(base, scene.train, config_of()), scene.train[:2], config_of(batch=2, sampling="pair")
+    begun, views, config = (
+        initialize(base, scene.train, config_of()),
+        scene.train[:2],
+        config_of(batch=2, sampling="pair"),
+    )
     run = loop._Run(begun, views, config, None)
     draws = [(view, [1.0, 2.0]) for view in views]
-    one, two = (run.objective.pull(run.parameters, [draw]) for draw in draws)
-    both = run.objective.pull(run.parameters, draws)
+    one, two = (run.objective.gradient_sum(run.parameters, [draw]) for draw in draws)
+    both = run.objective.gradient_sum(run.parameters, draws)
     assert both.loss == one.loss + two.loss and torch.equal(both.kept, one.kept | two.kept)
     for name in run.stepped:
         assert torch.equal(both.gradients[name], one.gradients[name] + two.gradients[name]), name
@@ -355,7 +360,7 @@ def test_a_batch_sums_what_its_views_ask(captured: tuple[Gaussians, Scene]) -> N
 def test_only_the_first_rows_are_trained(captured: tuple[Gaussians, Scene]) -> None:
     """The others are in the pictures, and come out as they went in; what is trained goes on from a state, too."""
     base, scene = captured
-    begun, few = start(base, scene.train, config_of()), len(base) // 3
+    begun, few = initialize(base, scene.train, config_of()), len(base) // 3
     states: list[TrainingState] = []
 
     def keep(progress: Progress) -> None:
@@ -560,7 +565,7 @@ def test_max_sv_of_one(captured: tuple[Gaussians, Scene]) -> None:
     """Plain fine-tuning of what s = 1 keeps."""
     base, scene = captured
     result = adapt(base, scene, config_of(iters=40, max_sv=1.0)).gaussians
-    before = evaluate(start(base, scene.train, config_of(max_sv=1.0)), scene.train, [1.0])[0]
+    before = evaluate(initialize(base, scene.train, config_of(max_sv=1.0)), scene.train, [1.0])[0]
     assert evaluate(result, scene.train, [1.0])[0].psnr > before.psnr + 0.5
     assert result.attenuation.max_sv == 1.0
 
@@ -619,13 +624,13 @@ def test_a_base_that_is_not_finite_is_refused(captured: tuple[Gaussians, Scene])
 
 def pulls_changed(monkeypatch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]) -> None:
     """From here on the ``at``-th pull is what ``change`` makes of it."""
-    pull, count = objective.Objective.pull, iter(range(1, 10_000))
+    pull, count = objective.Objective.gradient_sum, iter(range(1, 10_000))
 
     def changed(self: Any, *given: Any) -> Any:
         found = pull(self, *given)
         return change(found) if next(count) == at else found
 
-    monkeypatch.setattr(objective.Objective, "pull", changed)
+    monkeypatch.setattr(objective.Objective, "gradient_sum", changed)
 
 
 def test_a_row_whose_gradient_is_not_finite_is_held(
@@ -645,7 +650,7 @@ def test_a_row_whose_gradient_is_not_finite_is_held(
         base, scene, config, lambda p: seen.append(p.gaussians().select(torch.arange(9))) if p.state else None
     )
     assert result.held == 2 and all(value.isfinite().all() for value in result.gaussians.tensors().values())
-    first = start(base, scene.train, config)
+    first = initialize(base, scene.train, config)
     assert torch.equal(seen[0].sigma_d[3:5], first.sigma_d[3:5]) and not torch.equal(seen[0].sigma_d, first.sigma_d[:9])
     assert (result.gaussians.sigma_d[3:5] != first.sigma_d[3:5]).all()
 

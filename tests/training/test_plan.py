@@ -15,7 +15,7 @@ from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import removal_error, start
+from clod_adapter.initialization.importance import initialize, removal_error
 from clod_adapter.render import render
 from clod_adapter.training import planner
 from clod_adapter.training.loop import Progress, adapt
@@ -93,7 +93,7 @@ def test_unseen_gaussians_come_back_as_they_were(captured: tuple[Gaussians, Scen
     assert plan.kept is not None and not plan.kept[~before].any()
     lean = plan.adapt(scene).gaussians
     assert len(lean) == int(plan.kept.sum())
-    whole, begun = plan.whole(base, lean), start(base, scene.train, CONFIG)
+    whole, begun = plan.whole(base, lean), initialize(base, scene.train, CONFIG)
     for name in ATTRIBUTES:
         assert torch.equal(getattr(whole, name)[~plan.kept], getattr(base, name)[~plan.kept]), name
         assert torch.equal(getattr(whole, name)[plan.kept], getattr(lean, name)), name
@@ -255,14 +255,14 @@ def test_a_probe_that_fails_leaves_the_failure_to_the_training(
     captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Which then ends with what the steps before have learned."""
-    pull, steps = Objective.pull, []
+    pull, steps = Objective.gradient_sum, []
 
     def failing(self: Objective, *given: Any) -> Any:
         steps.append(1)
         found = pull(self, *given)
         return found if len(steps) < 4 else replace(found, loss=float("nan"))
 
-    monkeypatch.setattr(Objective, "pull", failing)
+    monkeypatch.setattr(Objective, "gradient_sum", failing)
     plan = make_plan(*captured, CONFIG)
     found = plan.adapt(captured[1])
     assert found.steps == 3 and "loss of step 4 is not finite" in (found.failed or "") and plan.frozen == ()

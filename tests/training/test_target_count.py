@@ -1,4 +1,4 @@
-"""The count law: its values, the gradient of the square, and that it brings the counts to it."""
+"""The target-count curve: its values, the gradient of its square, and that following this reaches the target."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def some(seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
     return 2 * logits + 1, log_sigma * 0.8, (0.3 * d).exp()
 
 
-def test_the_law() -> None:
+def test_the_target_curve() -> None:
     for share, exponent in ((0.62, 1.5), (0.8, 1.0), (1.0, 2.0)):
         assert target_curve(1.0, share, exponent) == pytest.approx(share)
         values = [target_curve(s, share, exponent) for s in np.linspace(1, 20, 200)]
@@ -56,13 +56,13 @@ def test_the_gradient_is_that_of_the_square() -> None:
     for s in (1.0, 2.5, 6.0):
         dialled = attenuate(logits, log_sigma.exp(), d, s, ATTENUATION)
         slope = count_slope(logits, dialled.log_opacities, s, ATTENUATION.tau, CONFIG.temperature)
-        law = target_curve(s, CONFIG.start_share, CONFIG.exponent)
-        excess = float(dialled.keep.float().mean()) / law - 1
-        want = 0.1 * 2 * CONFIG.reg_weight * excess / law * slope
+        share = target_curve(s, CONFIG.start_share, CONFIG.exponent)
+        excess = float(dialled.keep.float().mean()) / share - 1
+        want = 0.1 * 2 * CONFIG.reg_weight * excess / share * slope
         torch.testing.assert_close(gradient(logits, log_sigma, d, s), want)
 
 
-def test_too_many_are_pressed_down_and_too_few_lifted() -> None:
+def test_too_many_are_penalised_and_too_few_brought_back() -> None:
     logits, log_sigma, d = some()
     many, few = log_sigma + 3, log_sigma - 2
     for s in (1.5, 6.0):
@@ -72,19 +72,19 @@ def test_too_many_are_pressed_down_and_too_few_lifted() -> None:
 
 
 @pytest.mark.parametrize("start", [-1.0, 0.7])
-def test_without_any_picture_the_counts_come_to_the_law(start: float) -> None:
+def test_without_an_image_the_counts_reach_the_curve(start: float) -> None:
     """From too few, and from too many, in the optimiser's steps: Gaussians far from the cut feel little.
 
-    Steps of constant size end where the last few lead, by up to a quarter from the law, so they shrink, as in training.
+    Steps of constant size end up to a quarter from the curve, so they shrink, as in training.
     Ten orders of the dial values then end within 0.07 of it.
     """
     logits, log_sigma, d = some()
-    # Opaque enough that the law can be met: what is fainter than tau s stays nowhere.
+    # Opaque enough to reach the target: a Gaussian fainter than tau s is kept nowhere.
     logits, log_sigma = logits.clamp(min=-1.5) + 1, log_sigma + start
     random = np.random.default_rng(0)
 
     def worst(log_sigma: Tensor) -> float:
-        """Largest departure of the shares kept from the law, as a logarithm."""
+        """Largest deviation of the shares kept from the curve, as a logarithm."""
         found = []
         for s in (1.0, 1.4, 2.0, 3.1, 4.5, 6.0):
             eta = float(attenuate(logits, log_sigma.exp(), d, s, ATTENUATION).keep.float().mean())
@@ -100,8 +100,8 @@ def test_without_any_picture_the_counts_come_to_the_law(start: float) -> None:
     assert worst(log_sigma) < 0.2
 
 
-def test_the_last_gaussian_is_not_pressed_out() -> None:
-    """Of one Gaussian the law would keep a tenth; one that is left stays unpressed."""
+def test_the_last_gaussian_is_not_penalised() -> None:
+    """Of one Gaussian the curve would keep a tenth; the last one is not penalised."""
     config = AdaptConfig()
     logits, sigma, d = torch.tensor([4.0]), torch.tensor([5.0]), torch.tensor([1.0])
     dialled = attenuate(logits, sigma, d, 5.0, config.attenuation(1.0))
@@ -123,7 +123,7 @@ def test_soft_count_is_hard_forward_and_soft_backward() -> None:
 
 
 def test_count_slope_is_that_of_the_soft_count() -> None:
-    """Where 2 u > 1; below that it is as if 2 u were 1, so that who is not touched yet can be."""
+    """Where 2 u > 1; below that it is as if 2 u were 1, so that Gaussians without attenuation yet can get some."""
     tau, s, temperature = 0.02, 2.0, 0.5
     logits = torch.linspace(-5, 5, 200, dtype=torch.float64)
     d, log_sigma = torch.linspace(0.1, 1, 200, dtype=torch.float64), torch.linspace(-1, 2, 200, dtype=torch.float64)
@@ -180,12 +180,12 @@ def test_whoever_has_left_is_called_back_from_any_depth() -> None:
     logits, _, d = some()
     for gone in (-9.2, -100.0):  # the floor that training has, and 0
         assert (gradient(logits, torch.full((N,), gone), d, 2.0) < 0).all()
-    mixed = torch.where(torch.arange(N) % 2 == 0, 5.0, -9.2)  # half stay, where the law at s = 6 asks for 7 %
+    mixed = torch.where(torch.arange(N) % 2 == 0, 5.0, -9.2)  # half stay, where the curve at s = 6 has 7 %
     assert (gradient(logits, mixed, d, 6.0) >= 0).all() and (gradient(logits, mixed, d, 6.0)[1::2] == 0).all()
 
 
-def test_from_nobody_the_counts_come_to_the_law() -> None:
-    """Every sigma at the floor that training has: each of them comes back, and then they leave one by one."""
+def test_from_none_kept_the_counts_reach_the_curve() -> None:
+    """Every sigma at the floor that training has: each of them comes back, and then they are culled one by one."""
     logits, _, d = some()
     logits, log_sigma = logits.clamp(min=-1.5) + 1, torch.full((N,), math.log(1e-4))
     optimizer, rows, random = (
@@ -216,7 +216,7 @@ def test_shares_of_more_than_are_here(form: str, s: float) -> None:
             paper_count(dialled, s, 0.02, config, total).backward()
             found.append(sigma.grad[:40])
         else:
-            quota = target_share(s, count, config, total)
-            found.append(count_gradient(dialled, logits[:count], s, 0.02, 0.3, config, quota)[:40])
+            target = target_share(s, count, config, total)
+            found.append(count_gradient(dialled, logits[:count], s, 0.02, 0.3, config, target)[:40])
     assert found[0].abs().max() > 0 or (form, s) == ("paper", 1.0)
     assert torch.allclose(*found, rtol=1e-5, atol=0)

@@ -1,4 +1,4 @@
-"""The page in a real browser: one Chromium for all tests, a server for each file that is shown."""
+"""The page in a browser: one context for all tests, and a server for each file that is shown."""
 
 from __future__ import annotations
 
@@ -10,30 +10,51 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 import clod_adapter
-from shown import SIZE, Shown, serve
+import scenes
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.gaussians import Gaussians
+from shown import SIZE, Shown, fold, serve, take
 
 
 @pytest.fixture
 def artefacts(tmp_path: Path) -> Path:
-    """Where pictures are kept for a look: CLOD_ARTIFACTS, or the test's own folder."""
+    """The folder for screenshots: CLOD_ARTIFACTS, or the test's own folder."""
     folder = Path(os.environ.get("CLOD_ARTIFACTS", tmp_path))
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
+@pytest.fixture(scope="session")
+def tabs(chromium: Any) -> Iterator[Any]:
+    """The browser context that tests open tabs in: a context for each test doubles the time until the first frame."""
+    with chromium.new_context() as context:
+        context.set_default_timeout(10_000)
+        yield context
+
+
 @pytest.fixture
-def show(chromium: Any) -> Iterator[Callable[..., Shown]]:
-    """Shows the files of a ``clod-adapt view`` command line; an error in the console fails the test."""
+def tab(tabs: Any) -> Iterator[Any]:
+    """A blank tab of the size SIZE, closed after the test."""
+    page = tabs.new_page()
+    page.set_viewport_size(SIZE)
+    yield page
+    page.close()
+
+
+@pytest.fixture
+def show(tabs: Any) -> Iterator[Callable[..., Shown]]:
+    """Opens a tab with the files of a ``clod-adapt view`` command line; an error in its console fails the test."""
     with ExitStack() as stack:
         opened: list[tuple[Shown, str]] = []
 
-        def start(*words: object, address: str = "", **options: Any) -> Shown:
+        def start(*words: object, address: str = "", viewport: Any = SIZE, context: Any = tabs) -> Shown:
             url = stack.enter_context(serve(*words))
-            context = stack.enter_context(chromium.new_context(**({"viewport": SIZE} | options)))
-            context.set_default_timeout(10_000)
             shown = Shown(context.new_page())
+            stack.callback(shown.page.close)
+            shown.page.set_viewport_size(viewport)
             opened.append((shown, url))
             return shown.ready(url + address)
 
@@ -46,7 +67,7 @@ def show(chromium: Any) -> Iterator[Callable[..., Shown]]:
 
 @dataclass(frozen=True)
 class Files:
-    """Ways to write a scene for a test."""
+    """Writes models into the folder of a test."""
 
     folder: Path
 
@@ -58,3 +79,45 @@ class Files:
 @pytest.fixture
 def files(tmp_path: Path) -> Files:
     return Files(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def gaussians() -> Gaussians:
+    """400 Gaussians of SH degree 1 with a dial."""
+    plain = scenes.gaussians(400, 1, 5)
+    sigma_d = torch.linspace(0.05, 6, 400)
+    return plain.replace(sigma_d=sigma_d, attenuation=AttenuationConfig(tau=0.02, cut="soft", scene_distance=3.0))
+
+
+@pytest.fixture(scope="session")
+def plain(gaussians: Gaussians) -> Gaussians:
+    """The same without a dial."""
+    return gaussians.replace(sigma_d=None, attenuation=None)
+
+
+@pytest.fixture(scope="session")
+def model(gaussians: Gaussians, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of ``gaussians``."""
+    path = tmp_path_factory.mktemp("viewer") / "model.ply"
+    clod_adapter.save(path, gaussians)
+    return path
+
+
+@pytest.fixture(scope="session")
+def tab_of_model(tabs: Any, model: Path) -> Iterator[Shown]:
+    """A tab with that file, for ``shown``."""
+    with serve(model) as url:
+        shown = Shown(tabs.new_page())
+        shown.page.set_viewport_size(SIZE)
+        yield shown.ready(url)
+        shown.page.close()
+
+
+@pytest.fixture
+def shown(tab_of_model: Shown, model: Path) -> Iterator[Shown]:
+    """One tab for all tests that need no server of their own: reset to ``model``, as opening one takes a second."""
+    fold(tab_of_model, False)
+    tab_of_model.page.evaluate("document.activeElement.blur(), document.getElementById('target').value = ''")
+    take(tab_of_model, model)
+    yield tab_of_model
+    assert tab_of_model.errors == []

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+import base64
 import gzip
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 
 import scenes
-from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.scene.colmap import write_model
-from shown import Shown, serve
+from shown import Shown, fold, serve, take
 
 DROP = """([name, data, wait, fails]) => {
-    const file = new File([new Uint8Array(data)], name), read = file.arrayBuffer.bind(file);
+    const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
+    const file = new File([bytes], name), read = file.arrayBuffer.bind(file);
     const later = new Promise((resolve) => setTimeout(resolve, wait));
     file.arrayBuffer = () => later.then(() => fails ? Promise.reject(new DOMException("", "NotFoundError")) : read());
     const event = new Event("drop", { bubbles: true, cancelable: true });
@@ -27,20 +25,9 @@ DROP = """([name, data, wait, fails]) => {
 }"""
 
 
-@pytest.fixture(scope="module")
-def gaussians() -> Gaussians:
-    sigma_d = torch.linspace(0.05, 6, 400)
-    attenuation = AttenuationConfig(tau=0.02, cut="soft", scene_distance=3.0)
-    return scenes.gaussians(400, 1, 5).replace(sigma_d=sigma_d, attenuation=attenuation)
-
-
-def plain_of(gaussians: Gaussians) -> Gaussians:
-    return gaussians.replace(sigma_d=None, attenuation=None)
-
-
 def drop(shown: Shown, name: str, data: bytes, *, wait: int = 0, fails: bool = False) -> None:
     """Lets a file fall on the page that can be read after ``wait`` milliseconds, or never."""
-    shown.page.evaluate(DROP, [name, list(data), wait, fails])
+    shown.page.evaluate(DROP, [name, base64.b64encode(data).decode(), wait, fails])
 
 
 def target(shown: Shown, text: str) -> str:
@@ -52,18 +39,16 @@ def target(shown: Shown, text: str) -> str:
     return shown.text("#target-note")
 
 
-def test_of_files_dropped_at_once_the_last_is_shown(show: Any, files: Any, gaussians: Gaussians) -> None:
-    path, one = files.save(gaussians), files.save(scenes.gaussians(9, 0, 1), "nine.ply")
-    shown = show(path)
-    drop(shown, "slow.ply", path.read_bytes(), wait=500)
+def test_of_files_dropped_at_once_the_last_is_shown(shown: Shown, files: Any, model: Path) -> None:
+    one = files.save(scenes.gaussians(9, 0, 1), "nine.ply")
+    drop(shown, "slow.ply", model.read_bytes(), wait=200)
     drop(shown, "nine.ply", one.read_bytes())
     shown.until("document.title === 'nine.ply'")
-    shown.page.wait_for_timeout(800)
+    shown.page.wait_for_timeout(400)
     assert shown.text("#title") == "nine.ply" and shown.counts()["total"] == 9
 
 
-def test_what_no_reader_foresaw_is_said_in_words(show: Any, files: Any, gaussians: Gaussians) -> None:
-    shown = show(files.save(gaussians))
+def test_what_no_reader_foresaw_is_said_in_words(shown: Shown) -> None:
     drop(shown, "folder", b"", fails=True)
     shown.until("!document.getElementById('message').hidden")
     assert "folder" in shown.text("#message") and "cannot read it" in shown.text("#message")
@@ -76,9 +61,8 @@ def test_what_no_reader_foresaw_is_said_in_words(show: Any, files: Any, gaussian
         assert "it is damaged, or too large" in shown.text("#message")
 
 
-def test_a_key_is_let_go_whatever_shift_made_of_it(show: Any, files: Any, gaussians: Gaussians) -> None:
+def test_a_key_is_let_go_whatever_shift_made_of_it(shown: Shown) -> None:
     """On many keyboards + is Shift and =, and Shift may be let go first."""
-    shown = show(files.save(gaussians))
     shown.page.evaluate("""() => {
         const press = (kind, key) => new KeyboardEvent(kind, { key, code: "Equal", bubbles: true });
         const canvas = document.getElementById("canvas");
@@ -89,8 +73,8 @@ def test_a_key_is_let_go_whatever_shift_made_of_it(show: Any, files: Any, gaussi
     assert np.array_equal(shown.picture(), before)
 
 
-def test_letters_move_from_the_dial_too_and_are_text_in_a_text(show: Any, files: Any, gaussians: Gaussians) -> None:
-    shown = show(files.save(gaussians), viewport={"width": 640, "height": 600})
+def test_letters_move_from_the_dial_too_and_are_text_in_a_text(shown: Shown) -> None:
+    fold(shown, True)
     before = shown.picture()
     shown.page.focus("#target")
     shown.page.keyboard.type("wasdech0")
@@ -100,8 +84,8 @@ def test_letters_move_from_the_dial_too_and_are_text_in_a_text(show: Any, files:
     assert not np.array_equal(shown.picture(), before)
 
 
-def test_the_box_takes_counts_alone_and_the_same_again(show: Any, files: Any, gaussians: Gaussians) -> None:
-    shown = show(files.save(gaussians), viewport={"width": 640, "height": 600})
+def test_the_box_takes_counts_alone_and_the_same_again(shown: Shown) -> None:
+    fold(shown, True)
     for text in ("0", "-5", "1.5", "many"):
         assert "A number of Gaussians" in target(shown, text) and shown.text("#dial-value") == "s = 1.00"
     assert "keeps" in target(shown, "1,000,000")
@@ -115,64 +99,30 @@ def test_the_box_takes_counts_alone_and_the_same_again(show: Any, files: Any, ga
     assert shown.counts()["kept"] == 150
 
 
-def test_a_link_asks_for_no_comparison_that_is_not_there(show: Any, files: Any, gaussians: Gaussians) -> None:
-    shown = show(files.save(plain_of(gaussians)), address="#wipe=0.5&other=3&dial=3")
-    assert shown.page.is_hidden("#wipe") and shown.page.input_value("#compare") == "off"
-
-
-def test_cameras_can_be_chosen_by_name(show: Any, files: Any, gaussians: Gaussians, tmp_path: Path) -> None:
-    cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))]
-    write_model(tmp_path, cameras, [camera.name for camera in cameras])
-    shown = show(files.save(gaussians), "--images", tmp_path, viewport={"width": 640, "height": 600})
-    assert shown.page.input_value("#camera") == "0.jpg"
-    shown.page.keyboard.press("n")
-    assert shown.page.input_value("#camera") == "1.jpg"
-    wanted = shown.picture()
-    shown.page.keyboard.press("p")
-    shown.page.select_option("#camera", "1.jpg")
-    assert np.array_equal(shown.picture(), wanted)
-    shown.page.mouse.move(500, 60)
-    shown.page.mouse.wheel(0, 200)
-    shown.until("document.getElementById('camera').selectedIndex === -1")
-
-
-def test_one_gaussian_is_seen_whole(show: Any, files: Any) -> None:
-    lone = scenes.gaussians(1, 0, 5).replace(opacity_logits=torch.tensor([5.0]))
-    picture = show(files.save(lone)).picture().max(2)
+def test_one_gaussian_is_seen_whole(shown: Shown, files: Any) -> None:
+    take(shown, files.save(scenes.gaussians(1, 0, 5).replace(opacity_logits=torch.tensor([5.0])), "one.ply"))
+    picture = shown.picture().max(2)
     assert picture.max() > 20 and (picture[0].max(), picture[-1].max()) == (0, 0)
 
 
-def test_more_gaussians_than_the_device_takes_are_counted(chromium: Any, files: Any, gaussians: Gaussians) -> None:
+def test_a_model_beyond_the_device_limit_is_an_error_with_both_counts(tab: Any, files: Any) -> None:
     small = """const real = WebGL2RenderingContext.prototype.getParameter;
         WebGL2RenderingContext.prototype.getParameter = function (name) {
             return name === this.MAX_TEXTURE_SIZE ? 2 : real.call(this, name);
         };"""
-    with serve(files.save(scenes.gaussians(1100, 3, 5))) as url, chromium.new_context() as context:
-        context.add_init_script(small)
-        shown = Shown(context.new_page())
-        shown.page.goto(url)
+    with serve(files.save(scenes.gaussians(1100, 3, 5))) as url:
+        tab.add_init_script(small)
+        shown = Shown(tab)
+        tab.goto(url)
         shown.until("!document.getElementById('message').hidden")
         assert "1,100 Gaussians" in shown.text("#message") and "takes 682" in shown.text("#message")
 
 
-def test_without_webgl_there_is_a_word_and_no_panel(chromium: Any, files: Any, gaussians: Gaussians) -> None:
-    with serve(files.save(gaussians)) as url, chromium.new_context() as context:
-        context.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
-        shown = Shown(context.new_page())
-        shown.page.goto(url)
+def test_without_webgl_there_is_a_message_and_no_panel(tab: Any, files: Any, plain: Gaussians) -> None:
+    with serve(files.save(plain)) as url:
+        tab.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+        shown = Shown(tab)
+        tab.goto(url)
         shown.until("!document.getElementById('message').hidden")
         assert "WebGL2" in shown.text("#message") and shown.page.is_hidden("#panel")
         assert shown.errors == []
-
-
-def test_keys_on_a_page_without_a_splat_do_nothing(chromium: Any, files: Any, gaussians: Gaussians) -> None:
-    with serve(files.save(gaussians)) as url, chromium.new_context() as context:
-        page = context.new_page()
-        page.route("**/files/model", lambda route: route.fulfill(body=b"ply\nformat"))
-        shown = Shown(page)
-        page.goto(url)
-        page.wait_for_selector("#message:not([hidden])")
-        for key in "0lvncpe[w+":
-            page.keyboard.press(key)
-        page.wait_for_timeout(100)
-        assert shown.errors == [] and shown.text("#target-note") == ""

@@ -74,7 +74,7 @@ def test_a_plain_file_has_no_sigma(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1])
-def test_a_packed_page_shows_what_is_in_it(chromium: Any, tmp_path: Path, degree: int) -> None:
+def test_a_packed_page_shows_its_contents(chromium: Any, tmp_path: Path, degree: int) -> None:
     """Against our render of what splat-transform itself reads from the page's .sog."""
     try:
         tool = SplatTransform.find()

@@ -36,10 +36,12 @@ def read_back(payload: Payload, folder: Path) -> Any:
 
 def assert_same(one: Gaussians, other: Gaussians) -> None:
     assert one.attenuation == other.attenuation and one.screen_filter == other.screen_filter
-    assert {k: v.tolist() for k, v in one.tensors().items()} == {k: v.tolist() for k, v in other.tensors().items()}
+    assert one.tensors().keys() == other.tensors().keys()
+    for name, value in one.tensors().items():
+        assert torch.equal(value, other.tensors()[name]), name
 
 
-@pytest.mark.parametrize("degree", range(5))
+@pytest.mark.parametrize("degree", [0, 1, 4])
 def test_bytes_are_a_plain_ply(degree: int, tmp_path: Path) -> None:
     gaussians = dialled(ROWS + 3, degree)  # more than one block
     calibration = Calibration((CalibrationRow(1.0, 30.5, 29.25, 0.9, 4.0),), len(gaussians), 2, 8, 6, "a machine")

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+import clod_adapter
 import scenes
 from shown import Shown, serve
 
@@ -35,16 +36,22 @@ LATE = """
 """
 
 
-@pytest.fixture
-def late(chromium: Any, files: Any) -> Iterator[Shown]:
-    with serve(files.save(scenes.gaussians(200, 0, 5))) as url, chromium.new_context(viewport=SMALL) as context:
-        context.add_init_script(LATE)
-        shown = Shown(context.new_page()).ready(url)
-        for _ in range(12):  # fast so far
-            shown.page.mouse.wheel(0, 10)
-            shown.page.wait_for_timeout(40)
-        shown.page.wait_for_timeout(300)
+@pytest.fixture(scope="module")
+def late(tabs: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
+    """A page that drew its first frames fast."""
+    path = tmp_path_factory.mktemp("late") / "model.ply"
+    clod_adapter.save(path, scenes.gaussians(200, 0, 5))
+    with serve(path) as url:
+        page = tabs.new_page()
+        page.set_viewport_size(SMALL)
+        page.add_init_script(LATE)
+        shown = Shown(page).ready(url)
+        for _ in range(12):
+            page.mouse.wheel(0, 10)
+            page.wait_for_timeout(40)
+        page.wait_for_timeout(300)
         yield shown
+        page.close()
         assert shown.errors == []
 
 

@@ -1,4 +1,4 @@
 """The equation for renderers in other languages: ``attenuation.glsl``, ``attenuation.wgsl``, ``golden.json``.
 
-``golden.json`` holds cases that any such function is to be tested with, made by ``golden.py`` from ``attenuation.py``.
+``golden.json`` has test cases for such functions, made by ``golden.py`` from ``attenuation.py``.
 """

@@ -1,9 +1,9 @@
-"""Makes ``golden.json``: what the equation's float64 form says, for the tests of it in other languages.
+"""Makes ``golden.json``: values of the equation in float64, for tests of implementations in other languages.
 
     python -m clod_adapter.integrations.shaders.golden
 
-A row is opacity, sigma, distance, scale, eps, tau, soft, then what these give: ``faded``, the attenuated opacity
-``a''``, and ``drawn``, what a rasterizer is given of it. The inputs are float32's numbers, written in full. A float32
+A row has the inputs opacity, sigma, distance, scale, eps, tau, soft, and the results ``faded``, the attenuated opacity
+``a''``, and ``drawn``, the opacity for the rasterizer. Inputs are float32 numbers, written in full. A float32
 implementation passes if for every row ``|result - drawn| <= tolerance faded``, and 0 where drawn is 0.
 """
 
@@ -17,29 +17,29 @@ from typing import Any
 import numpy as np
 import torch
 
-from clod_adapter.attenuation import attenuate_activated
+from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.extinction import extinction_scale
 
 COLUMNS = ("opacity", "sigma", "distance", "scale", "eps", "tau", "soft", "faded", "drawn")
-TOLERANCE = 3e-5  # float32's rounding times the cut's steepest slope and the exponent's largest size, with room
+TOLERANCE = 3e-5  # float32 rounding times the steepest slope and the largest exponent, with a margin
 TAU, EPS = 0.02, 1e-8
 
 
 def rows() -> list[list[Any]]:
-    """The inputs: the ordinary and the extreme, then each cut from both of its sides."""
+    """The inputs: ordinary and extreme values, then both sides of each culling threshold."""
     ordinary = itertools.product((0.03, 0.4, 1.0), (0.2, 1.5), (0.05, 1.2), (1.0, 2.5, 7.0), (EPS,), (TAU,))
     extreme = itertools.chain(
         itertools.product((0.0, 1.0), (-1.0, 0.0, 1e30), (0.0,), (1.0, 100.0), (0.0, EPS), (TAU,)),
         itertools.product((0.9,), (-1.0, 0.0, 1e-25, 1e-6, 1e30), (1e-25, 1e-6, 1e4), (40.0,), (0.0, EPS), (1 / 255,)),
         itertools.product((0.5,), (0.01, 5.0), (1e-3, 1.0), (30.0, 100.0), (0.0, 1e-2), (1e-6,)),
-        [(0.5, 1.0, 0.0, 2.0, EPS, 0.25), (1.0, 1.0, 0.0, 1.0, EPS, 0.5)],  # a'' = tau s, and is not kept; and 2 tau s
+        [(0.5, 1.0, 0.0, 2.0, EPS, 0.25), (1.0, 1.0, 0.0, 1.0, EPS, 0.5)],  # a'' = tau s, which is culled; and 2 tau s
     )
     found = [list(map(_float32, row)) for row in itertools.chain(ordinary, extreme)]
     for opacity, sigma, distance in itertools.product((0.3, 0.999), (0.1, 0.8, 4.0), (0.0, 1.2)):
-        leaves = _leaves_at(opacity, sigma, distance)
-        shares = (0.5, 0.9, 0.999, 1.001)  # of the dial value at which it goes; between the first two it begins to fade
-        dials = [scale for scale in (leaves * share for share in shares) if 1 <= scale <= 100]
+        culled = _culled_at(opacity, sigma, distance)
+        shares = (0.5, 0.9, 0.999, 1.001)  # of the dial value that culls it; fading begins between the first two
+        dials = [scale for scale in (culled * share for share in shares) if 1 <= scale <= 100]
         found += [list(map(_float32, (opacity, sigma, distance, scale, EPS, TAU))) for scale in dials]
     return [[*row, soft] for row in found for soft in (False, True)]
 
@@ -54,11 +54,11 @@ def _results(row: list[Any]) -> tuple[float, float]:
     *values, scale, eps, tau, soft = row
     config = AttenuationConfig(tau=tau, eps=eps, cut="soft" if soft else "hard", max_sv=1)
     opacity, sigma, distance = (torch.tensor([value], dtype=torch.float64) for value in values)
-    result = attenuate_activated(opacity, sigma, distance, scale, config)
+    result = attenuate(opacity, sigma, distance, scale, config, activated=True)
     return float(result.opacities), float(result.drawn)
 
 
-def _leaves_at(opacity: float, sigma: float, distance: float) -> float:
+def _culled_at(opacity: float, sigma: float, distance: float) -> float:
     config = AttenuationConfig(tau=_float32(TAU), eps=_float32(EPS), max_sv=1)
     values = [torch.tensor([_float32(value)], dtype=torch.float64) for value in (opacity, sigma, distance)]
     return float(extinction_scale(values[0].logit(), values[1], values[2], config))
@@ -69,7 +69,7 @@ def _float32(value: float) -> float:
 
 
 def text() -> str:
-    """The file, a row a line."""
+    """The file's text, one row per line."""
     content = golden()
     lines = ",\n".join(f"  {json.dumps(row)}" for row in content.pop("rows"))
     return f'{json.dumps(content)[:-1]}, "rows": [\n{lines}\n]}}\n'

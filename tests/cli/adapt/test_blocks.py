@@ -250,13 +250,13 @@ def test_a_block_whose_loss_is_not_finite_ends_early(
     adapt: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The others do not, and all that was learned is written."""
-    pull, pulls = Objective.pull, count(1)
+    pull, pulls = Objective.gradient_sum, count(1)
 
     def spoilt(self: Objective, *given: Any) -> Any:
         found = pull(self, *given)  # not of the run that prepares the kernels
         return replace(found, loss=float("nan")) if self.config.max_sv == 3 and next(pulls) == 3 else found
 
-    monkeypatch.setattr(Objective, "pull", spoilt)
+    monkeypatch.setattr(Objective, "gradient_sum", spoilt)
     done = adapt("a.ply", "--json")
     report = json.loads(done.out)
     note = "block 1 of 3, pass 1 of 2: the loss of step 3 is not finite"
@@ -268,14 +268,14 @@ def test_a_block_whose_loss_is_not_finite_ends_early(
 def test_an_error_in_a_block_leaves_its_state(
     adapt: Callable[..., Any], whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pull, pulls = Objective.pull, count(1)
+    pull, pulls = Objective.gradient_sum, count(1)
 
     def failing(self: Objective, *given: Any) -> Any:
         if self.config.max_sv == 3 and next(pulls) == 6:
             raise ZeroDivisionError
         return pull(self, *given)
 
-    monkeypatch.setattr(Objective, "pull", failing)
+    monkeypatch.setattr(Objective, "gradient_sum", failing)
     done = adapt("a.ply", "--quiet")
     state = "a.block1.pass1.resume.safetensors"
     assert done.code == 1 and f"the same command goes on from step 5, which is in {state}\n" in done.err, done

@@ -187,11 +187,11 @@ def test_a_loss_that_is_not_finite_ends_both(server: Server, words: list[Any], t
     """After the same step, whichever has it; what was learned before is written and measured."""
     spoil = (
         "from dataclasses import replace; from clod_adapter.training.objective import Objective\n"
-        "pull, steps = Objective.pull, []\n"
+        "pull, steps = Objective.gradient_sum, []\n"
         "def spoilt(self, *given):\n"
         "    steps.append(1)\n"
         "    return replace(pull(self, *given), loss=float('nan') if len(steps) == 4 else 0.1)\n"
-        "Objective.pull = spoilt"
+        "Objective.gradient_sum = spoilt"
     )
     run = server.start(tmp_path / "run", *words, *TINY, before={1: spoil})
     assert run.wait() == [1, 0], run.log(0) + run.log(1)
@@ -253,12 +253,12 @@ def test_the_launcher_is_gone_too(server: Server, words: list[Any], tmp_path: Pa
 def test_a_loss_within_a_step_loses_none(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
     """The second fails in its fifth step, and says why by way of the first; going on ends as if it had not."""
     fail = (
-        "from clod_adapter.training.objective import Objective; real, calls = Objective.pull, []\n"
+        "from clod_adapter.training.objective import Objective; real, calls = Objective.gradient_sum, []\n"
         "def pull(*arguments):\n"
         "    calls.append(1)\n"
         "    if len(calls) == 5: raise MemoryError('no room for this view')\n"
         "    return real(*arguments)\n"
-        "Objective.pull = pull"
+        "Objective.gradient_sum = pull"
     )
     run = server.start(tmp_path / "run", *words, *TINY, before={1: fail})
     assert run.wait() == [0, 2], run.log(0)

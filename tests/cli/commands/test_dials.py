@@ -14,8 +14,8 @@ import pytest
 from PIL import Image
 
 import clod_adapter
-from clod_adapter.attenuation import normalized_distances
 from clod_adapter.cli.shared import budgets
+from clod_adapter.distances import normalized_distances
 from clod_adapter.extinction import extinction_scale
 from clod_adapter.io.checkpoint import load, save
 

@@ -101,6 +101,7 @@ def test_black_photographs_are_noted(clod: Any, capture: Any, tmp_path: Path) ->
     assert "show one colour each" in json.loads(done.out)["notes"][0]
 
 
+@pytest.mark.usefixtures("blank_figure")
 def test_robustness_stops_too(clod: Any, capture: Any, turned: Path, tmp_path: Path) -> None:
     done = clod("robustness", capture.ply, turned, "--images", capture.scene, "--max-sv", 2, "--iters", 1)
     assert done.code == 2 and f"{turned}: does not fit" in done.err and "--misaligned-ok" in done.err, done

@@ -101,6 +101,7 @@ def test_what_a_run_is_resumed_by_depends_on_the_filter(trained: tuple[Path, Pat
     assert len({_fingerprint(some.replace(screen_filter=each)) for each in FILTERS.values()}) == len(FILTERS)
 
 
+@pytest.mark.usefixtures("blank_figure")
 def test_robustness_finds_out_for_each(clod: Any, capture: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
     ply, scene = trained
     words = ("robustness", ply, "--images", scene, "--max-sv", 1, "--iters", 2, "-o", tmp_path / "rob", "--json")
@@ -115,6 +116,7 @@ def test_robustness_finds_out_for_each(clod: Any, capture: Any, trained: tuple[P
     assert max(row["psnr"] for row in json.loads(other.out)["cells"][0]["rows"]) < 35
 
 
+@pytest.mark.usefixtures("without_splat_transform")
 @pytest.mark.parametrize("out", ["a.ply", "a.spz", "a.html", "a.splat"])
 def test_exports_carry_it_or_say_that_they_do_not(clod: Any, trained: tuple[Path, Path], out: str) -> None:
     done = clod("export", trained[0], "-o", out, "--antialiasing", "on", "--json")

@@ -59,8 +59,8 @@ def test_without_photographs_nothing_is_said_of_any(
     report, text = json.loads(done.out), (tmp_path / "dial.html").read_text(encoding="utf-8")
     shown = re.sub(r"<script.*?</script>|<style.*?</style>|data:[^\"]*", "", text, flags=re.S)
     assert report["scene"] is None and report["outputs"]["page"] == "dial.html"
-    assert "on its own pictures from placed cameras" in shown and "hold for base" in shown
-    before_the_notes = shown[: shown.index("What it was run with")]
+    assert "steps on synthetic views" in shown and "hold for base" in shown
+    before_the_notes = shown[: shown.index("Settings and machine")]
     assert re.findall(r"\S+ photograph", before_the_notes) == ["without photograph"]
     assert text.count('data-name="photograph"') == 0 and text.count('data-name="base"') == 1
     # The base, whose only error is the rounding, is a row and not a line or a point of the charts: the name stands

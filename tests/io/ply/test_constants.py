@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import attenuate_seen
+from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
@@ -51,7 +51,7 @@ def same_dial(found: Gaussians, g: Gaussians) -> None:
     assert found.sigma_d is not None and g.sigma_d is not None and found.attenuation and g.attenuation
     for s in (1.0, 1.7, 3.1):
         want, got = (
-            attenuate_seen(x.means, x.opacity_logits, x.sigma_d, camera(), s, x.attenuation)  # type: ignore[arg-type]
+            attenuate(x.opacity_logits, x.sigma_d, (x.means, camera()), s, x.attenuation)  # type: ignore[arg-type]
             for x in (g, found)
         )
         assert torch.equal(want.keep, got.keep) and torch.equal(want.drawn, got.drawn)

@@ -1,0 +1,122 @@
+"""The normalised distance d of the dial's equation: of one camera, and one for each Gaussian over several cameras.
+
+For a camera with centre c, a Gaussian with centre mu and the normaliser's D (all in world units)::
+
+    d = |mu - c| / D
+
+A plain file and an order of rows have one distance for each Gaussian instead of one for each view. That is the
+geometric mean over the known cameras v, ``d_i = exp(mean over v of log d_iv)``. Cameras that do not see a Gaussian
+count like the others: measured against a mean over the cameras that see it, and against one weighted by the Gaussian's
+contribution there, this was as good, and it needs no frustum.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from clod_adapter.calibration import Viewpoint
+from clod_adapter.cameras import Camera
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+
+NEAREST = 1e-6  # lower bound of d in the geometric mean: a camera in a Gaussian's centre must not decide alone
+
+
+@torch.no_grad()
+def normalized_distances(means: Tensor, camera: Camera, config: AttenuationConfig) -> Tensor:
+    """``[N]`` the equation's d, without unit, >= 0, in float32 or, from float64, in float64.
+
+    A constant for autograd: the dial adds nothing to the gradient of ``means``. ``torch.autocast`` has no effect here.
+
+    Args:
+        means: ``[N, 3]`` world units.
+    """
+    means = means.to(torch.promote_types(means.dtype, torch.float32))  # float16's square overflows from 256 on
+    with torch.autocast(means.device.type, enabled=False):  # it would round the camera's position to 3 digits
+        distances = euclidean(means, camera.position.to(means))
+        return distances.div_(normalizing_distance(distances, means, camera, config))
+
+
+def euclidean(means: Tensor, position: Tensor) -> Tensor:
+    """``[N]`` distances of ``means [N, 3]`` from ``position [3]``."""
+    x, y, z = (means - position).unbind(1)  # three times as fast as a norm over rows of 3
+    return x.square().addcmul_(y, y).addcmul_(z, z).sqrt_()
+
+
+@torch.no_grad()
+def normalizing_distance(distances: Tensor, means: Tensor, camera: Camera, config: AttenuationConfig) -> Tensor:
+    """0-d, the D of ``config.normalizer``, world units, > 0.
+
+    ``scene`` is ``config.scene_distance``. ``max`` (the paper's) and ``quantile`` are taken over the Gaussians whose
+    centre projects into the image from beyond the near plane, or over all Gaussians where there is none. The quantile
+    is an element, the ``ceil(q n)``-th smallest, not an interpolation. D is at least the smallest normal number, so
+    that 0 / D is 0, and 1 where there are no Gaussians.
+
+    Args:
+        distances: ``[N]`` from the camera's centre, world units.
+        means: ``[N, 3]`` world units.
+    """
+    if config.normalizer == "scene" or len(distances) == 0:
+        value = config.scene_distance if config.normalizer == "scene" else 1.0
+        return torch.full((), value, dtype=distances.dtype, device=distances.device)
+    visible = distances[in_frustum(means, camera)]
+    if len(visible) == 0:
+        visible = distances
+    if config.normalizer == "max":
+        found = visible.max()
+    else:
+        # Not torch.quantile: it sorts, and refuses more than 16M elements.
+        found = visible.kthvalue(min(max(math.ceil(config.quantile * len(visible)), 1), len(visible))).values
+    return found.clamp(min=torch.finfo(found.dtype).tiny)
+
+
+def in_frustum(means: Tensor, camera: Camera) -> Tensor:
+    """``[N]`` bool: the centre projects into the image, from beyond the near plane."""
+    projection = (camera.K @ camera.viewmat[:3].to(camera.K)).to(means)
+    x, y, z = projection[:, :3] @ means.T + projection[:, 3:]
+    return (z > camera.near) & (x >= 0) & (x < camera.width * z) & (y >= 0) & (y < camera.height * z)
+
+
+@torch.no_grad()
+def camera_unit(means: Tensor, camera: Camera, config: AttenuationConfig) -> float:
+    """``normalizing_distance`` of one camera and centres ``means [N, 3]``, world units, as a number to store."""
+    distances = (means - camera.position.to(means)).norm(dim=1)
+    return float(normalizing_distance(distances, means, camera, config))
+
+
+def viewpoint_of(camera: Camera, means: Tensor, config: AttenuationConfig) -> Viewpoint:
+    """The viewpoint of a camera that looks at Gaussians with centres ``means [N, 3]``, world units."""
+    x, y, z = camera.position.to(means).double().tolist()
+    return Viewpoint(x, y, z, camera_unit(means, camera, config))
+
+
+@torch.no_grad()
+def typical_distance(means: Tensor, places: Sequence[Camera | Viewpoint], config: AttenuationConfig) -> Tensor:
+    """``[N]`` d_i, without unit, >= 0: the distances from one place, or the geometric mean over several.
+
+    Args:
+        means: ``[N, 3]`` world units.
+        places: at least one.
+
+    Raises:
+        ClodError: there is no place.
+    """
+    if not places:
+        raise ClodError("no camera is given, so there is no distance for the dial to fade by; give at least one")
+    if len(places) == 1:
+        return _from(places[0], means, config)
+    logs = torch.zeros_like(means[:, 0])
+    for place in places:
+        logs += _from(place, means, config).clamp(min=NEAREST).log()
+    return (logs / len(places)).exp()
+
+
+def _from(place: Camera | Viewpoint, means: Tensor, config: AttenuationConfig) -> Tensor:
+    if isinstance(place, Camera):
+        return normalized_distances(means, place, config)
+    centre = torch.tensor([place.x, place.y, place.z], dtype=means.dtype, device=means.device)
+    return (means - centre).norm(dim=1) / place.unit

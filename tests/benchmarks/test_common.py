@@ -1,0 +1,27 @@
+"""Tables, and processes that are timed from outside."""
+
+from __future__ import annotations
+
+import sys
+
+import common
+import pytest
+
+
+def test_a_table_is_markdown() -> None:
+    lines = common.table(["scene", "dB"], [["plush", 29.0], ["banana", 25.8]], 1).splitlines()
+    assert lines == ["| scene | dB |", "|---|---:|", "| plush | 29.0 |", "| banana | 25.8 |"]
+
+
+def test_a_process_is_timed_by_its_messages() -> None:
+    code = "import sys, time; print('half', file=sys.stderr, flush=True); time.sleep(0.3); print('done')"
+    run = common.Process([sys.executable, "-c", code], {"half": "^half"})
+    assert (run.out, run.lines) == ("done\n", ["half"])
+    assert 0 < run.moments["half"] <= run.seconds - 0.3
+    assert run.peak_bytes >= max(size for _, size, _ in run.memory) > 0
+
+
+def test_another_exit_code_ends_the_benchmark() -> None:
+    with pytest.raises(SystemExit, match="exit code 3"):
+        common.Process([sys.executable, "-c", "raise SystemExit(3)"])
+    assert common.Process([sys.executable, "-c", "raise SystemExit(3)"], code=3).out == ""

@@ -1,0 +1,227 @@
+"""One function decides what is drawn: raise its culling threshold, and everything that uses a dial follows."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from clod_adapter import attenuation
+from clod_adapter.bake import bake, order_by_extinction
+from clod_adapter.blocks.divide import divide
+from clod_adapter.blocks.targets import context_rows, with_target_shares
+from clod_adapter.cameras import View
+from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.evaluation.budget import dial_for
+from clod_adapter.evaluation.evaluate import evaluate
+from clod_adapter.extinction import extinction_scale, sigma_for_extinction
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.hook import Hook
+from clod_adapter.initialization.importance import sigma_from_importance
+from clod_adapter.render import render
+from clod_adapter.training.objective import Objective, TrainableSubset
+from clod_adapter.viewer.payload import Payload
+from scenes import gaussians, photograph, ring
+
+N, DIAL = 120, 2.0
+TAU, RAISED = 0.02, 0.2
+CAMERAS = ring(3, 24, 18)
+
+
+def model_of(tau: float) -> Gaussians:
+    sigma_d = 0.3 + 2 * torch.rand(N, generator=torch.Generator().manual_seed(1))
+    settings = AttenuationConfig(tau=tau, scene_distance=4.0, reference_distance=4.0, max_sv=4.0)
+    return gaussians(N, 1, 0, size=0.15).replace(sigma_d=sigma_d, attenuation=settings)
+
+
+def views_of(model: Gaussians) -> tuple[View, ...]:
+    return photograph(model.replace(sigma_d=None, attenuation=None), CAMERAS)
+
+
+def rendering(model: Gaussians) -> list[Tensor]:
+    found = render(model, CAMERAS[0], DIAL)
+    return [found.image, found.alpha, found.kept]
+
+
+def evaluation(model: Gaussians) -> list[Any]:
+    return [(row.psnr, row.ssim, row.kept, row.in_view) for row in evaluate(model, views_of(model), [1.0, DIAL])]
+
+
+def objective(config: AdaptConfig, trained: int = N, **part: Any) -> Callable[[Gaussians], list[Any]]:
+    def gradients(model: Gaussians) -> list[Any]:
+        assert model.attenuation is not None and model.sigma_d is not None
+        asked = Objective(config, model.attenuation, ("means", "sh0"), TrainableSubset(trained, **part))
+        parameters = {name: value for name, value in model.tensors().items() if name != "sigma_d"}
+        parameters[asked.decay] = asked.parameter(model.sigma_d)
+        found = asked.gradient_sum(parameters, [(views_of(model)[0], [1.0, DIAL])])
+        return [found.loss, found.kept, *found.gradients.values()]
+
+    return gradients
+
+
+def budget(**given: Any) -> Callable[[Gaussians], list[float]]:
+    def solved(model: Gaussians) -> list[float]:
+        return [dial_for(model, keep=float(share), **given).virtual_scale for share in (20, 25)]
+
+    return solved
+
+
+def baked(**given: Any) -> Callable[[Gaussians], list[Tensor]]:
+    return lambda model: list(bake(model, DIAL, **given).tensors().values())
+
+
+def hook(model: Gaussians) -> list[Tensor]:
+    assert model.attenuation is not None and model.sigma_d is not None
+    view = CAMERAS[0]
+    return list(Hook(model.sigma_d, model.attenuation, DIAL)(model.means, model.opacities, view.viewmat))
+
+
+def copy_with(name: str, installed: ModuleType, needs: str) -> Any:
+    """A copy of one of our integrations, made while ``installed`` is the renderer's module."""
+    spec = importlib.util.find_spec(f"clod_adapter.integrations.{name}")
+    assert spec is not None and spec.loader is not None
+    copy = importlib.util.module_from_spec(spec)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, needs, installed)
+        spec.loader.exec_module(copy)
+    return copy
+
+
+def gsplat(model: Gaussians) -> list[Tensor]:
+    """The opacities that gsplat is called with."""
+
+    def rasterization(
+        means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
+        width: int, height: int, near_plane: float = 0.01, sh_degree: int | None = None, distributed: bool = False,
+    ) -> Any:  # fmt: skip
+        return opacities
+
+    installed = ModuleType("gsplat")
+    installed.rasterization = rasterization  # type: ignore[attr-defined]
+    view = CAMERAS[0]
+    return [
+        copy_with("gsplat", installed, "gsplat").rasterization(
+            model.means, model.quats, model.scales, model.opacities, model.sh0[:, 0], view.viewmat[None], view.K[None],
+            view.width, view.height, sigma_d=model.sigma_d, attenuation=model.attenuation, virtual_scale=DIAL,
+        )
+    ]  # fmt: skip
+
+
+def inria(model: Gaussians) -> list[Tensor]:
+    """The centres and opacities that diff-gaussian-rasterization is called with."""
+
+    class Rasterizer(nn.Module):
+        def __init__(self, raster_settings: Any) -> None:
+            super().__init__()
+            self.raster_settings = raster_settings
+
+        def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor) -> list[Tensor]:
+            return [means3D, opacities]
+
+    installed, view = ModuleType("diff_gaussian_rasterization"), CAMERAS[0]
+    installed.GaussianRasterizer, installed.GaussianRasterizationSettings = Rasterizer, object  # type: ignore[attr-defined]
+    settings = SimpleNamespace(
+        prefiltered=False, viewmatrix=view.viewmat.T, image_width=view.width, image_height=view.height, tanfovx=0.5,
+        tanfovy=0.4, campos=view.position,
+    )  # fmt: skip
+    rasterizer = copy_with("inria", installed, "diff_gaussian_rasterization").GaussianRasterizer(settings)
+    dial = {"sigma_d": model.sigma_d, "attenuation": model.attenuation, "virtual_scale": DIAL}
+    return rasterizer(model.means, torch.zeros(N, 3), model.opacities, **dial)
+
+
+def blocks(model: Gaussians) -> list[Any]:
+    """A block's context, and its target shares."""
+    views, config = views_of(model), AdaptConfig(max_sv=4.0)
+    division = divide(model, views, config, 2)
+    shares = with_target_shares(division, 0, [views[k] for k in division.views(0)], config, first=False)
+    return [division.kept, context_rows(division, 0, views), *(share.target_share(DIAL) for share in shares)]
+
+
+def order(model: Gaussians) -> list[Tensor]:
+    return [order_by_extinction(model, CAMERAS)]
+
+
+def extinction(model: Gaussians) -> list[Tensor]:
+    assert model.attenuation is not None and model.sigma_d is not None
+    given = model.opacity_logits, torch.full((N,), 0.8), model.attenuation
+    scale = extinction_scale(given[0], model.sigma_d, *given[1:])
+    return [scale, sigma_for_extinction(given[0], given[1], torch.full((N,), DIAL), given[2])]
+
+
+def initialization(model: Gaussians) -> list[Tensor]:
+    assert model.attenuation is not None
+    distances = torch.full((N,), 0.8)
+    return [sigma_from_importance(model, model.opacities, distances, model.attenuation, share=0.7, exponent=1.5)]
+
+
+CONSUMERS: dict[str, Callable[[Gaussians], list[Any]]] = {
+    "render": rendering,
+    "evaluate": evaluation,
+    "objective": objective(AdaptConfig(max_sv=4.0)),
+    "objective of a block": objective(AdaptConfig(max_sv=4.0), trained=N // 2, full_context=True),
+    "the paper's objective": objective(AdaptConfig.paper(max_sv=4.0)),
+    "dial_for one camera": budget(cameras=CAMERAS[:1]),
+    "dial_for several cameras": budget(cameras=CAMERAS),
+    "dial_for a baked file": budget(cameras=CAMERAS, baked=True),
+    "bake for one camera": baked(camera=CAMERAS[0]),
+    "bake for several cameras": baked(cameras=CAMERAS),
+    "Hook": hook,
+    "gsplat": gsplat,
+    "diff-gaussian-rasterization": inria,
+    "blocks": blocks,
+    "order_by_extinction": order,
+    "extinction": extinction,
+    "initialization": initialization,
+}
+
+
+CLOSED_FORMS = ("order_by_extinction", "extinction", "initialization")  # these share the threshold with the cut alone
+
+
+def same(these: list[Any], those: list[Any]) -> bool:
+    pairs = list(zip(these, those, strict=True))
+    return all(torch.equal(a, b) if isinstance(a, Tensor) else a == b for a, b in pairs)
+
+
+@pytest.mark.parametrize("name", CONSUMERS)
+def test_everything_follows_the_culling_threshold(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A threshold of 10 tau s gives, to the bit, what a tenfold tau gives."""
+    consumer = CONSUMERS[name]
+    before, wanted = consumer(model_of(TAU)), consumer(model_of(RAISED))
+    assert not same(before, wanted)
+    # The function's own code, as an edit of its source would change it for whoever has imported it.
+    changed = (lambda tau, virtual_scale: (10 * tau) * virtual_scale).__code__
+    monkeypatch.setattr(attenuation.culling_threshold, "__code__", changed)
+    assert 10 * TAU == RAISED and same(consumer(model_of(TAU)), wanted)
+
+
+@pytest.mark.parametrize("name", [name for name in CONSUMERS if name not in CLOSED_FORMS])
+def test_everything_passes_through_the_cut(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cut that keeps only what is nearly opaque changes whatever renders, counts or bakes."""
+    consumer = CONSUMERS[name]
+    before, cut = consumer(model_of(TAU)), attenuation._cut
+
+    def strict(opacities: Tensor, log_opacities: Tensor, threshold: Any, kind: str) -> Any:
+        faint = opacities < 0.15
+        shown = opacities.masked_fill(faint, 0)
+        return cut(shown, log_opacities.masked_fill(faint, -torch.inf), threshold, kind)
+
+    monkeypatch.setattr(attenuation, "_cut", strict)
+    assert not same(consumer(model_of(TAU)), before)
+
+
+def test_the_viewer_takes_the_settings_of_the_file() -> None:
+    """Its shaders have an equation of their own, checked against golden values; the settings are the file's."""
+    model = model_of(TAU)
+    payload = Payload("model.ply", model)
+    assert payload.describe()["attenuation"] == asdict(model.attenuation)  # type: ignore[arg-type]
+    raised = Payload("model.ply", model.replace(attenuation=replace(model.attenuation, tau=RAISED)))  # type: ignore[type-var]
+    assert json.dumps(raised.describe()["attenuation"]["tau"]).encode() in raised.head and raised.head != payload.head

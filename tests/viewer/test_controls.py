@@ -1,0 +1,99 @@
+"""Keys, pointer, touch, typed counts, links and the list of cameras, in a browser."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import clod_adapter
+import scenes
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.scene.colmap import write_model
+from shown import TALL, Shown, fold
+
+
+def test_keys_move_the_dial(shown: Shown) -> None:
+    assert shown.text("#dial-value") == "s = 1.00"
+    full = shown.counts()["kept"]
+    for _ in range(10):
+        shown.page.keyboard.press("]")
+    fewer = shown.counts()["kept"]
+    assert fewer < full and shown.text("#dial-value") != "s = 1.00"
+    shown.page.keyboard.press("[")
+    assert fewer < shown.counts()["kept"] < full
+    shown.page.focus("#dial")
+    shown.page.keyboard.press("End")
+    assert shown.text("#dial-value") == "s = 5.00" and shown.counts()["kept"] < fewer
+    shown.page.keyboard.press("Home")
+    assert shown.counts()["kept"] == full
+    shown.page.keyboard.press("e")
+    assert shown.counts()["kept"] == 400 and not shown.page.is_checked("#equation")
+
+
+def test_a_count_is_kept_to(shown: Shown, gaussians: Gaussians) -> None:
+    camera = scenes.camera(320, 240)
+    fold(shown, True)
+    shown.camera(camera)
+    wanted = clod_adapter.dial_for(gaussians, keep=150, cameras=[camera]).virtual_scale
+    shown.page.fill("#target", "150")
+    shown.page.keyboard.press("Enter")
+    shown.until("document.getElementById('dial-value').textContent !== 's = 1.00'")
+    assert shown.counts()["kept"] == 150
+    assert shown.text("#dial-value") == f"s = {wanted:.2f}"
+
+
+def test_pointer_and_wheel_move_the_camera(shown: Shown) -> None:
+    pictures = [shown.picture()]
+    mouse = shown.page.mouse
+    mouse.move(100, 60)
+    mouse.down()
+    mouse.move(150, 80, steps=3)
+    mouse.up()
+    pictures.append(shown.picture())
+    mouse.wheel(0, 300)
+    pictures.append(shown.picture())
+    shown.page.keyboard.press("0")
+    pictures.append(shown.picture())
+    for one, other in zip(pictures, pictures[1:], strict=False):
+        assert np.abs(one.astype(int) - other).mean() > 1
+    assert np.array_equal(pictures[0], pictures[-1])
+
+
+def test_touch_moves_the_camera(chromium: Any, show: Any, model: Path) -> None:
+    shown = show(model, context=chromium.new_context(has_touch=True))
+    protocol = shown.page.context.new_cdp_session(shown.page)
+
+    def touch(kind: str, *points: tuple[int, int]) -> None:
+        where = [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(points)]
+        protocol.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": where})
+
+    pictures = [shown.picture()]
+    for moves in ([((200, 80),), ((260, 100),)], [((200, 80), (300, 80)), ((150, 80), (350, 80))]):  # a turn, a pinch
+        touch("touchStart", *moves[0])
+        touch("touchMove", *moves[1])
+        touch("touchEnd")
+        pictures.append(shown.picture())
+        assert np.abs(pictures[-1].astype(int) - pictures[-2]).mean() > 1
+
+
+def test_cameras_of_the_scene(show: Any, model: Path, tmp_path: Path) -> None:
+    """By keys, and by name in the list, which shows none once the camera is moved."""
+    cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))]
+    write_model(tmp_path, cameras, [camera.name for camera in cameras])
+    shown = show(model, "--images", tmp_path, viewport=TALL)
+    views = []
+    for key, name in (("", 0), ("n", 1), ("n", 2), ("n", 0), ("p", 2)):
+        if key:
+            shown.page.keyboard.press(key)
+        assert shown.page.input_value("#camera") == f"{name}.jpg"
+        views.append(shown.picture())
+    same = [[bool(np.abs(a.astype(int) - b).mean() < 0.5) for b in views] for a in views]
+    assert same[0] == [True, False, False, True, False] and same[2] == [False, False, True, False, True]
+    shown.page.select_option("#camera", "1.jpg")
+    assert np.array_equal(shown.picture(), views[1])
+    shown.page.mouse.move(500, 60)
+    shown.page.mouse.wheel(0, 200)
+    shown.until("document.getElementById('camera').selectedIndex === -1")

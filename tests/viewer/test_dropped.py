@@ -1,0 +1,108 @@
+"""Files dropped on the page: their layouts, settings and screen filters, and files that cannot be read."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+
+import clod_adapter
+import scenes
+from clod_adapter.config import FILTERS, AttenuationConfig
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.file_formats import write
+from clod_adapter.render import render
+from shown import Shown, assert_same, drop
+
+CAMERA = scenes.camera(320, 240)
+
+
+def fall(shown: Shown, path: Path, dial: float) -> None:
+    """Drops a file and waits until it is drawn."""
+    drop(shown, path.name, path.read_bytes())
+    shown.until(f"document.title === '{path.name}'")
+    shown.camera(CAMERA)
+    shown.run("clod.setDial(given)", dial)
+
+
+def test_every_ply_layout_gives_the_same_picture(
+    shown: Shown, files: Any, gaussians: Gaussians, artefacts: Path
+) -> None:
+    path = files.save(gaussians, "usual.ply")
+    fall(shown, path, 2.0)
+    wanted = shown.picture()
+    assert_same(shown, render(gaussians, CAMERA, 2.0), artefacts / "dropped.png")
+    vertex = PlyData.read(str(path), mmap=False)["vertex"]
+    doubles = vertex.data.astype([(name, "f8") for name in vertex.data.dtype.names])
+    layouts: dict[str, dict[str, Any]] = {
+        "ascii.ply": {"text": True},
+        "big.ply": {"byte_order": ">"},
+        "doubles.ply": {},
+    }
+    for name, options in layouts.items():
+        rows = doubles if name == "doubles.ply" else vertex.data
+        element = PlyElement.describe(rows, "vertex", comments=vertex.comments)
+        PlyData([element], **options).write(str(files.folder / name))
+        fall(shown, files.folder / name, 2.0)
+        assert shown.page.is_enabled("#dial") and np.array_equal(shown.picture(), wanted), name
+
+
+def test_settings_are_read_without_comments(shown: Shown, files: Any, gaussians: Gaussians, artefacts: Path) -> None:
+    """Other tools remove comments: columns hold the settings too. A file of an earlier version has its defaults."""
+    cases: dict[str, tuple[dict[str, Any], list[str]]] = {
+        "default.ply": ({}, []),
+        "paper.ply": ({"tau": 1 / 255, "cut": "hard", "normalizer": "max"}, []),
+        "tau.ply": ({"tau": 0.013}, []),
+        "old.ply": ({}, ["clod_adapter max_sv 4.0"]),
+    }
+    for name, (settings, comments) in cases.items():
+        model = gaussians.replace(attenuation=AttenuationConfig(**settings))
+        rows = PlyData.read(str(files.save(model)), mmap=False)["vertex"].data
+        path = files.folder / name
+        PlyData([PlyElement.describe(rows, "vertex", comments=comments)], byte_order="<").write(str(path))
+        fall(shown, path, 1.5)
+        wanted = render(clod_adapter.load(path).gaussians if comments else model, CAMERA, 1.5)
+        assert 0 < int(wanted.kept.sum()) < 400
+        assert_same(shown, wanted, artefacts / f"bare_{name}.png")
+
+
+def test_the_screen_filter_of_the_file_is_used(
+    shown: Shown, files: Any, gaussians: Gaussians, plain: Gaussians, artefacts: Path
+) -> None:
+    """From our comments, from columns without them, from an SPZ, and from another program's comment."""
+    small = gaussians.log_scales - 2.0  # where filters differ most
+    for form, suffix in (("comments", "ply"), ("columns", "ply"), ("spz", "spz"), ("tag", "ply")):
+        name = "on" if form == "tag" else "mip"
+        base = plain if form == "tag" else gaussians
+        path = files.folder / f"{form}.{suffix}"
+        write(path, base.replace(log_scales=small, screen_filter=FILTERS[name]))
+        if form in ("columns", "tag"):
+            gone = rb"(?m)^comment .*\n" if form == "columns" else rb"(?m)^comment clod_adapter .*\n"
+            path.write_bytes(re.sub(gone, b"", path.read_bytes()))
+        found = clod_adapter.load(path).gaussians
+        assert found.screen_filter == FILTERS[name]
+        fall(shown, path, 1.0)
+        assert_same(shown, render(found, CAMERA), artefacts / f"filter_{form}.png")
+
+
+def test_a_broken_file_is_an_error_and_leaves_the_picture(shown: Shown, model: Path) -> None:
+    data = model.read_bytes()
+    broken = (
+        ("cut.ply", data[:-100], "truncated"),
+        ("head.ply", data[:300], "truncated"),
+        ("words.ply", b"good morning", "no splat"),
+        ("empty.ply", b"", "empty"),
+        ("mesh.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "mesh"),
+    )
+    before = shown.picture()
+    for name, bad, said in broken:
+        drop(shown, name, bad)
+        shown.page.wait_for_selector("#message:not([hidden])")
+        assert name in shown.text("#message") and said in shown.text("#message")
+        assert shown.text("#title") == "model.ply"
+        shown.page.click("#dismiss")
+        assert shown.page.is_hidden("#message")
+    assert np.array_equal(shown.picture(), before)
