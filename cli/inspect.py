@@ -38,7 +38,7 @@ def lines_of(found: Inspection) -> list[str]:
         lines += splat_lines(found.splat)
     if found.about is not None:
         lines += tensor_lines(found.about)
-    lines += _block("anomaly", [oddity.says for oddity in found.oddities])
+    lines += _block("anomaly", [anomaly.says for anomaly in found.anomalies])
     lines += _block("excluded", found.left_out)
     warnings = [note.removeprefix(WARNING) for note in found.notes if note.startswith(WARNING)]
     lines += _block("note", [note for note in found.notes if not note.startswith(WARNING)])

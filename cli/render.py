@@ -18,7 +18,7 @@ from clod_adapter.cameras import View
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.claims import output_lock
+from clod_adapter.io.lock import output_lock
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
 from clod_adapter.version import package_version

@@ -13,8 +13,7 @@ from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.trimming import trimmed
+from clod_adapter.io.checkpoint import Checkpoint, trimmed
 from clod_adapter.training.loop import Adapted
 from clod_adapter.training.plan import Plan
 from clod_adapter.version import package_version

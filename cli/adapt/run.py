@@ -13,7 +13,7 @@ from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import check_config
 from clod_adapter.io.atomic import remove_leftovers
-from clod_adapter.io.claims import output_lock
+from clod_adapter.io.lock import output_lock
 from clod_adapter.rasterizers.cpu import release_memory
 from clod_adapter.training.loop import Adapted, Progress
 from clod_adapter.training.plan import Plan

@@ -9,8 +9,8 @@ from collections.abc import Collection
 from pathlib import Path
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.ply.header import PREFIX, ROW, all_comments, read_header
-from clod_adapter.io.readers import PLY, check_readable, file_has_dial, reader_of
+from clod_adapter.io.file_formats import PLY, check_readable, file_has_dial, format_of
+from clod_adapter.io.ply.header import PREFIX, ROW, all_comments, read_head
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.report.charts import chart_file
 from clod_adapter.report.style import check_matplotlib
@@ -45,7 +45,7 @@ def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fp
     if not has_dial(model):
         raise ClodError(f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ...")
     needed = name != "keep" and name not in measured
-    if needed and reader_of(Path(model)) is PLY and not _has_calibration(model):  # others fail when read
+    if needed and format_of(Path(model)) is PLY and not _has_calibration(model):  # others fail when read
         raise ClodError(
             f"{model}: has no calibration in its header, which {option} needs; adapt it again without interrupting, "
             "or give --sv or --keep"
@@ -53,7 +53,7 @@ def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fp
 
 
 def _has_calibration(model: str) -> bool:
-    return any(comment.startswith(f"{PREFIX}{ROW} ") for comment in all_comments(read_header(Path(model))))
+    return any(comment.startswith(f"{PREFIX}{ROW} ") for comment in all_comments(read_head(Path(model)).ply))
 
 
 def has_dial(model: str) -> bool:

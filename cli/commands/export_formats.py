@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.writers import WRITERS
+from clod_adapter.io.file_formats import WRITABLE
 
 LOD_META = "lod-meta.json"
 PAGE = ".html"
@@ -50,7 +50,7 @@ FORMATS = {
 
 def suffixes() -> list[str]:
     """The suffixes that can be written."""
-    return [suffix for suffix in FORMATS if suffix in WRITERS or suffix in PACKED or suffix == PAGE]
+    return [suffix for suffix in FORMATS if suffix in WRITABLE or suffix in PACKED or suffix == PAGE]
 
 
 def format_table() -> str:

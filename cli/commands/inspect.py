@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from clod_adapter.io.readers import check_readable
+from clod_adapter.io.file_formats import check_readable
 
 from .command import Command
 

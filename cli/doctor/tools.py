@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from clod_adapter._support.text import first_line
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.caches import user_caches
+from clod_adapter.io.scene.folder import user_caches
 
 from ..shared.browsers import find_browser
 from .checks import CheckFailed, Probe
@@ -44,7 +44,7 @@ def plots() -> str:
 def glb() -> str:
     """Writes a file and reads it."""
     from clod_adapter.io.checkpoint import load
-    from clod_adapter.io.writers import write
+    from clod_adapter.io.file_formats import write
 
     gaussians = _gaussians()
     try:
@@ -60,8 +60,8 @@ def glb() -> str:
 
 def splat_transform() -> str:
     """splat-transform packs a file."""
+    from clod_adapter.io.file_formats import write
     from clod_adapter.io.formats.splat_transform import HELP, SplatTransform
-    from clod_adapter.io.writers import write
 
     try:
         tool = SplatTransform.find()

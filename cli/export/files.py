@@ -14,9 +14,9 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint, load
+from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
 from clod_adapter.io.ply.header import PREFIX
-from clod_adapter.io.writers import write
 from clod_adapter.origin import NOWHERE
 from clod_adapter.viewer.page import write_page
 

@@ -168,7 +168,7 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("export PLY -o x.ply --order extinction", "base.ply: has no sigma_d to order its Gaussians by"),
         ("export text.ply -o x.glb", "text.ply: is not a PLY"),
         ("apply PLY missing.safetensors -o x.ply", "missing.safetensors: .*No such file"),
-        ("apply PLY text.ply -o x.ply", "text.ply: is no safetensors file"),
+        ("apply PLY text.ply -o x.ply", "text.ply: is not a safetensors file"),
         ("apply mine.ply text.ply -o mine.ply", "mine.ply: is an input file"),
         ("apply PLY text.ply -o text.ply", "text.ply: is an input file"),
         ("apply PLY text.ply -o x.splat", "x.splat: .*must end in .ply"),
@@ -185,7 +185,7 @@ def test_bad_input(clod: Any, bad: dict[str, Path], tmp_path: Path, line: str, s
         ("eval PLY --images SCENE --keep 0", "--keep has 0"),
         ("render PLY --images SCENE", "required: -o/--out"),
         ("export DIALLED -o dialled.ply --sv 2", "dialled.ply: is an input file"),
-        ("apply PLY text.ply -o x.ply", "text.ply: is no safetensors file"),
+        ("apply PLY text.ply -o x.ply", "text.ply: is not a safetensors file"),
     ],
 )
 def test_bad_input_with_json(clod: Any, bad: dict[str, Path], tmp_path: Path, line: str, said: str) -> None:

@@ -23,10 +23,10 @@ from clod_adapter.cli.commands.export_formats import FORMATS, PACKED, level_path
 from clod_adapter.cli.shared import budgets
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.formats.safetensors import read_model_safetensors
+from clod_adapter.io.file_formats import FORMATS as FILE_FORMATS
+from clod_adapter.io.file_formats import WRITABLE, read_model
 from clod_adapter.io.formats.splat_transform import INSTALL
 from clod_adapter.io.ply.header import write_comments
-from clod_adapter.io.writers import WRITERS
 
 TOOL = """
 import json, pathlib, sys
@@ -193,12 +193,12 @@ def test_level_names() -> None:
 
 
 def test_every_format_is_in_the_help() -> None:
-    assert set(WRITERS) <= set(FORMATS) and not set(WRITERS) & set(PACKED)
-    for suffix, writer in WRITERS.items():
+    assert set(WRITABLE) <= set(FORMATS) and not set(WRITABLE) & set(PACKED)
+    for suffix, writer in ((suffix, FILE_FORMATS[suffix]) for suffix in WRITABLE):
         assert FORMATS[suffix].sigma == writer.carries_sigma, suffix
 
 
-@pytest.mark.parametrize("suffix", WRITERS)
+@pytest.mark.parametrize("suffix", WRITABLE)
 def test_every_format_is_written_with_its_dial_where_it_has_room(clod: Any, dialled: Path, suffix: str) -> None:
     words = () if FORMATS[suffix].sigma else ("--sv", 1)
     done = clod("export", dialled, "-o", f"x{suffix}", *words, "--json")
@@ -220,7 +220,7 @@ def test_the_dial_stays_as_it_is(clod: Any, dialled: Path, tmp_path: Path) -> No
     again = load("same.ply")
     assert same(again.gaussians, model.gaussians) and again.gaussians.attenuation == model.gaussians.attenuation
     assert again.calibration == model.calibration and again.notes == ()
-    assert same(read_model_safetensors("same.safetensors"), model.gaussians)
+    assert same(read_model("same.safetensors").gaussians, model.gaussians)
 
 
 def test_a_plain_file_is_converted(clod: Any, capture: Any) -> None:

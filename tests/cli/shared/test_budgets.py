@@ -96,7 +96,7 @@ def test_an_unusable_calibration_is_the_reason_given(clod: Any, dialled: Path, t
     extra = b"element face 0\nproperty list uchar int vertex_indices\nend_header"  # a note of its own, after it
     (tmp_path / "other.ply").write_bytes(data.replace(b"end_header", extra, 1))
     done = clod("export", "other.ply", "--psnr-drop", 1, "-o", "x.ply")
-    said = "other.ply: --psnr-drop: the calibration in the header is of 299 Gaussians and ignored, these are 300; adapt"
+    said = "other.ply: --psnr-drop: the calibration is of 299 Gaussians and ignored, these are 300; adapt"
     assert done.code == 2 and said in done.err and "not carried over" in done.err
 
 
