@@ -13,7 +13,7 @@ from clod_adapter.demo.pictures import Panel, dial_strip, quality_curve
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.claims import output_lock
+from clod_adapter.io.lock import output_lock
 from clod_adapter.io.scene.load import load_scene
 from clod_adapter.render import render
 

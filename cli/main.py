@@ -153,7 +153,7 @@ def build_parser(name: str) -> Parser:
     if not name:
         others = "\n".join(f"  {PROG} {word:<10} {other.summary}" for word, other in COMMANDS.items())
         parser.epilog = f"other commands, each with its own --help:\n{others}\n\n{command.epilog}"
-        parser.add_argument("--version", action="version", version=f"{PROG} {package_version()}")
+        parser.general.add_argument("--version", action="version", version=f"{PROG} {package_version()}")
     return parser
 
 

@@ -15,7 +15,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.robustness import CellResult, adapt_at_range, baseline, scene_fingerprint
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.claims import output_lock
+from clod_adapter.io.lock import output_lock
 from clod_adapter.progress import Listener, Phase, Progress, Stopped
 from clod_adapter.report.robustness_figure import robustness_figure
 from clod_adapter.version import package_version

@@ -42,6 +42,7 @@ class Adapter:
         kept: of a result with fewer rows than its base, ``[base_count]`` bool: the rows that it has. None for all.
         sh_degree: of a result with fewer SH bands than its base. None for the base's.
         screen_filter: that it was trained with, and the result is drawn with.
+        notes: of reading its file: settings that were ignored or filled in.
 
     Raises:
         ClodError: a tensor has the wrong type or shape, sigma_d is not finite, or version is no plain text.
@@ -58,6 +59,7 @@ class Adapter:
     kept: Tensor | None = None
     sh_degree: int | None = None
     screen_filter: ScreenFilter = CLASSIC
+    notes: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         if self.sigma_d.dim() != 1 or self.sigma_d.dtype != torch.float32:

@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from clod_adapter.adapter import Adapter, detach, extract, trim
 from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.trimming import trimmed
+from clod_adapter.io.checkpoint import Checkpoint, trimmed
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 

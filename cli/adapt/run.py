@@ -10,7 +10,7 @@ from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
-from clod_adapter.io.claims import output_lock
+from clod_adapter.io.lock import output_lock
 from clod_adapter.progress import Progress
 from clod_adapter.rasterizers.cpu import release_memory
 from clod_adapter.training.plan import Plan

