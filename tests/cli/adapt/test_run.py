@@ -347,7 +347,7 @@ def test_without_photographs(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
     assert report["calibration"]["against"] == "checkpoint"
     (note, *_) = json.loads(clod("export", "dial.ply", "--psnr-drop", 1, "-o", "plain.ply", "--json").out)["notes"]
-    assert "against the checkpoint's own pictures" in note
+    assert "against renders of the checkpoint" in note
     photographs = json.loads(clod("eval", "dial.ply", "--images", capture.scene, "--sv", 1, 4, "--json").out)["rows"]
     assert photographs[0]["psnr"] > 20 and photographs[0]["psnr"] > photographs[1]["psnr"]
 
