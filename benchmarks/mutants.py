@@ -24,6 +24,7 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 import clod_adapter as clod
+from clod_adapter._support.version import package_version
 from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.file_formats import FORMATS as FILE_FORMATS
 from clod_adapter.io.file_formats import WRITABLE
@@ -32,7 +33,6 @@ from clod_adapter.io.ply.columns import inria_dtype
 from clod_adapter.io.ply.header import read_head
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.state_file import save_state
-from clod_adapter.version import package_version
 
 sys.path.insert(0, str(ROOT / "tests"))
 from packing import write_packed  # noqa: E402

@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.adapter_file import load_adapter
 from clod_adapter.io.checkpoint import save, trimmed
-from clod_adapter.version import package_version
 
 from .shared.console import Console
 from .shared.files import size

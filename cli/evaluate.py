@@ -6,13 +6,13 @@ import argparse
 from dataclasses import asdict
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.cameras import Scene
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.perceptual import available_metrics
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.progress import Stopped
-from clod_adapter.version import package_version
 
 from .comparisons import Comparisons, compare
 from .shared.antialiasing import with_filter

@@ -7,11 +7,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.calibration import Calibration
 from clod_adapter.inspection.report import Inspection, Splat, inspect
 from clod_adapter.inspection.statistics import Spread
 from clod_adapter.io.settings import WARNING
-from clod_adapter.version import package_version
 
 from .shared.console import duration
 from .shared.files import size

@@ -13,9 +13,9 @@ from contextlib import nullcontext, redirect_stdout
 from importlib import import_module
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Stopped
-from clod_adapter.version import package_version
 
 from .commands.adapt import ADAPT
 from .commands.apply import APPLY

@@ -14,6 +14,7 @@ from PIL import Image, PngImagePlugin
 from torch import Tensor
 
 from clod_adapter._support.text import file_name
+from clod_adapter._support.version import package_version
 from clod_adapter.cameras import View
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
@@ -21,7 +22,6 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.lock import output_lock
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
-from clod_adapter.version import package_version
 
 from .shared.antialiasing import with_filter
 from .shared.budgets import solve_dials

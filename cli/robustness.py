@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from clod_adapter._support.text import as_text
+from clod_adapter._support.version import package_version
 from clod_adapter.cameras import Scene
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.robustness import CellResult, adapt_at_range, baseline, scene_fingerprint
@@ -18,7 +19,6 @@ from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.lock import output_lock
 from clod_adapter.progress import Listener, Phase, Progress, Stopped
 from clod_adapter.report.robustness_figure import robustness_figure
-from clod_adapter.version import package_version
 
 from .commands.settings import make_configs
 from .robustness_cells import Cell, cells_of

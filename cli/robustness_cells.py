@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from clod_adapter._support.text import as_text
+from clod_adapter._support.version import package_version
 from clod_adapter.config import CLASSIC, AdaptConfig
 from clod_adapter.evaluation.robustness import BASELINE_SHARES, CellResult
 from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.version import package_version
 
 from .shared.report import machine, write_report
 

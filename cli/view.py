@@ -7,9 +7,9 @@ import json
 import sys
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.cameras import Camera
 from clod_adapter.io.scene.poses import load_cameras
-from clod_adapter.version import package_version
 from clod_adapter.viewer.page import policy, served_page
 from clod_adapter.viewer.payload import Payload, page_config
 from clod_adapter.viewer.server import Answer, Server

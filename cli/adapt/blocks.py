@@ -8,6 +8,7 @@ from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.blocks.divide import Division, check_divisible, divide
 from clod_adapter.blocks.memory import MemoryPlan
 from clod_adapter.blocks.targets import block_config
@@ -21,7 +22,6 @@ from clod_adapter.io.scene.image_cache import ImageCache
 from clod_adapter.progress import Phase, Stopped
 from clod_adapter.rasterizers.cpu import release_memory
 from clod_adapter.training.state import Adapted, StateRefused
-from clod_adapter.version import package_version
 
 from ..shared.console import duration
 from ..shared.files import size

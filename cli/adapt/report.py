@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
-from clod_adapter.version import package_version
 
 from ..shared.budgets import calibrate
 from ..shared.console import duration

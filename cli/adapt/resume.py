@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
@@ -22,7 +23,6 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Listener, Progress, Stopped
 from clod_adapter.training.state import StateRefused, TrainingState
 from clod_adapter.training.state_file import load_state, save_state
-from clod_adapter.version import package_version
 
 from ..commands.settings import OPTIONS
 from ..shared.console import Console

@@ -6,7 +6,7 @@ import argparse
 import time
 from typing import Any
 
-from clod_adapter.version import package_version
+from clod_adapter._support.version import package_version
 
 from ..shared.console import Console
 from .backends import BACKENDS

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.bake import order_by_extinction
 from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import Gaussians
@@ -16,7 +17,6 @@ from clod_adapter.io.lock import output_lock
 from clod_adapter.io.ply.columns import MASKS, SIGMA, inria_dtype
 from clod_adapter.io.ply.constants import PREFIX
 from clod_adapter.io.scene.poses import load_cameras
-from clod_adapter.version import package_version
 
 from ..commands.export_formats import LOD_META, PAGE, level_paths, suffix_of
 from ..shared.antialiasing import with_filter

@@ -20,11 +20,11 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.origin import NOWHERE, Origin, parse_origin
-from clod_adapter.version import package_version
 
 WARNING = "warning: "  # prefix of a note that must not be missed
 FILTER = "screen_filter"

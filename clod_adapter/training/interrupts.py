@@ -39,5 +39,5 @@ class DeferredInterrupt:
 
     def _record(self, number: int, frame: FrameType | None) -> None:
         if self.received:
-            raise KeyboardInterrupt
+            signal.default_int_handler(number, frame)
         self.received = True

@@ -25,6 +25,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 import clod_adapter
+from clod_adapter._support.version import package_version
 from clod_adapter.cli.adapt import inputs as adapt_inputs
 from clod_adapter.cli.adapt import resume
 from clod_adapter.cli.adapt import run as adapt_command
@@ -34,7 +35,6 @@ from clod_adapter.cli.shared.interrupts import GracefulStop
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Phase, Progress
 from clod_adapter.training.state_file import load_state
-from clod_adapter.version import package_version
 from scenes import stripped
 
 OUTPUTS = ["dial.json", "dial.ply", "dial.safetensors"]

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from clod_adapter.version import package_version
+from clod_adapter._support.version import package_version
 
 
 def test_an_error_of_the_system_is_one_line(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:

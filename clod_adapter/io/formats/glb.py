@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
@@ -20,7 +21,6 @@ from clod_adapter.io.file_formats import History
 from clod_adapter.io.formats.arrays import arrays_of, colours_of, normalized, scales_of, sigmoid
 from clod_adapter.io.formats.metadata import KEY, write_metadata
 from clod_adapter.origin import Origin
-from clod_adapter.version import package_version
 
 EXTENSION = "KHR_gaussian_splatting"
 SIGMA = "_SIGMA_D"

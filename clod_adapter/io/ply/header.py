@@ -11,13 +11,13 @@ from typing import Any
 
 from plyfile import PlyData
 
+from clod_adapter._support.version import package_version
 from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
 from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.io.screen_filter import tagged
 from clod_adapter.io.settings import FILTER
 from clod_adapter.io.sniff import read_start, refuse
-from clod_adapter.version import package_version
 
 PREFIX = "clod_adapter "
 # Comments of the calibration: machine; total, views, width, height, reference; one for each row and each viewpoint.

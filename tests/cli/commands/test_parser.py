@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from clod_adapter._support.version import package_version
 from clod_adapter.cli.main import COMMANDS, build_parser
-from clod_adapter.version import package_version
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])
