@@ -137,10 +137,8 @@ def _train(number: int, launch: Launch, stop: GracefulStop) -> None:
         job: Any = group.broadcast(None)
         if job.device == "cuda":
             _take_gpu(launch)
-        base, scene, begun = job.base.to(job.device), Scene(job.views, ()), [job.state]
-        config, subset = job.config, job.subset
-        del job  # frees the state as soon as it is restored
-        adapt(base, scene, config, stop.heeding(), begun.pop(), subset=subset, group=group)
+        base, scene = job.base.to(job.device), Scene(job.views, ())
+        adapt(base, scene, job.config, stop.heeding(), job.state, subset=job.subset, group=group)
 
 
 def _take_gpu(launch: Launch) -> None:

@@ -7,14 +7,13 @@ import math
 import pytest
 import torch
 
-from clod_adapter.adapter import attach
 from clod_adapter.cameras import Scene
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization import importance
 from clod_adapter.initialization.importance import removal_error
 from clod_adapter.render import render
 from clod_adapter.training import ablation
-from clod_adapter.training.ablation import effect, largest_change, seen, sh_degree_losses
+from clod_adapter.training.ablation import largest_change, seen, sh_degree_losses
 from scenes import capture, gaussians, photograph, ring
 
 LIMIT = 0.02
@@ -128,18 +127,3 @@ def test_the_largest_change(captured: tuple[Gaussians, Scene]) -> None:
     with torch.no_grad():
         images = [render(g, scene.train[0].camera).image.clamp(0, 1) for g in (base, less)]
     assert change == float((images[0] - images[1]).abs().max()) > 0.1 and lost > 1
-
-
-def test_the_effect_of_a_move(captured: tuple[Gaussians, Scene]) -> None:
-    base, scene = captured
-    before = attach(base)
-    same = effect("sh0", before, before, scene.train, [5.0, 1.0], LIMIT)
-    assert same == (0.0, 5.0)
-    for by in (0.2, -0.2):  # harm and use alike
-        moved, s = effect("sh0", before, before.replace(sh0=base.sh0 + by), scene.train, [5.0, 1.0], LIMIT)
-        assert moved > LIMIT and s == 5.0
-    little, _ = effect("sh0", before, before.replace(sh0=base.sh0 + 1e-7), scene.train, [5.0, 1.0], LIMIT)
-    assert 0 <= little < LIMIT
-    # The others' moves are no part of it.
-    other = before.replace(means=base.means + 0.1)
-    assert effect("sh0", before, other, scene.train, [1.0], LIMIT) == (0.0, 1.0)
