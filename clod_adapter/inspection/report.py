@@ -240,7 +240,7 @@ def _anomalies(splat: Splat, questions: dict[str, tuple[float, float]]) -> list[
             Anomaly(
                 "antialiased",
                 0,
-                f"trained with antialiasing, which rendering uses too: {splat.screen_filter.description}",
+                f"trained with antialiasing: {splat.screen_filter.description}",
             )
         )
     return found

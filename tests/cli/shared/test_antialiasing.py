@@ -135,7 +135,7 @@ def test_inspect_says_it(clod: Any, trained: tuple[Path, Path]) -> None:
     assert clod("export", trained[0], "-o", "a.ply", "--antialiasing", "mip").code == 0
     done = clod("inspect", "a.ply")
     assert (
-        "trained with antialiasing, which rendering uses too: 0.1 px^2 of blur, opacities compensated"
+        "trained with antialiasing: 0.1 px^2 of blur, opacities compensated"
         in done.out + done.err
     )
     assert json.loads(clod("inspect", "a.ply", "--json").out)["splat"]["screen_filter"]["variance"] == 0.1
