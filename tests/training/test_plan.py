@@ -60,7 +60,9 @@ def test_resuming(captured: tuple[Gaussians, Scene]) -> None:
     plans = [make_plan(base, scene, CONFIG, Override(leave_out=frozenset({"means", "scales"}))) for _ in range(2)]
     plans[0].adapt(scene, stop)
     assert "parameter.quats" in states[0].tensors and "parameter.means" not in states[0].tensors
-    found = plans[1].whole(base, plans[1].adapt(scene, resume=states[0]).gaussians)
+    steps: list[int] = []
+    found = plans[1].whole(base, plans[1].adapt(scene, lambda now: steps.append(now.done), states[0]).gaussians)
+    assert steps == list(range(26, 41))
     assert_equal(found, plans[0].whole(base, plans[0].adapt(scene).gaussians))
     assert torch.equal(found.means, base.means) and torch.equal(found.log_scales, base.log_scales)
     assert not torch.equal(found.quats, base.quats)
