@@ -22,11 +22,14 @@ from clod_adapter.viewer.page import write_page
 from shown import COUNTS, SIZE, Shown, serve
 
 
-def test_a_file_without_sigma_d_says_why_there_is_no_dial(show: Any, files: Any, plain: Gaussians) -> None:
-    shown = show(files.save(plain, "plain.ply"))
+def test_a_file_without_sigma_d_has_no_dial(show: Any, files: Any, plain: Gaussians) -> None:
+    """The page says why; it shows the file's name as text."""
+    name = "<img src=x onerror=clod=1><script>clod=1<!script>&amp;'\".ply"
+    shown = show(files.save(plain, name))
+    assert shown.text("#title") == name and shown.page.title() == name and shown.page.query_selector("img") is None
     assert shown.page.is_disabled("#dial") and shown.page.is_disabled("#target") and shown.page.is_disabled("#equation")
     said = shown.text("#no-dial")
-    assert "plain.ply has no sigma_d" in said and "clod-adapt plain.ply" in said
+    assert f"{name} has no sigma_d" in said and f"clod-adapt {name}" in said
     assert shown.counts() == {"total": 400, "kept": 400, "drawn": shown.counts()["drawn"]}
     assert shown.picture().max() > 50
     shown.page.keyboard.press("]")
@@ -37,7 +40,7 @@ def test_a_file_without_sigma_d_says_why_there_is_no_dial(show: Any, files: Any,
 
 
 def test_a_model_that_cannot_be_fetched_is_an_error(tab: Any, files: Any, gaussians: Gaussians) -> None:
-    """And keys do nothing without one."""
+    """Keys then do nothing."""
     with serve(files.save(gaussians)) as url:
         tab.route("**/files/model", lambda route: route.fulfill(body=b"ply\nformat"))
         shown = Shown(tab)
@@ -49,13 +52,6 @@ def test_a_model_that_cannot_be_fetched_is_an_error(tab: Any, files: Any, gaussi
             tab.keyboard.press(key)
         tab.wait_for_timeout(100)
         assert shown.errors == [] and shown.text("#target-note") == ""
-
-
-def test_a_name_is_text_on_the_page(show: Any, files: Any, plain: Gaussians) -> None:
-    name = "<img src=x onerror=clod=1><script>clod=1<!script>&amp;'\".ply"
-    shown = show(files.save(plain, name))
-    assert shown.text("#title") == name and shown.page.title() == name and name in shown.text("#no-dial")
-    assert shown.page.query_selector("img") is None
 
 
 def test_more_gaussians_than_16_bits_count(show: Any, files: Any) -> None:
@@ -70,16 +66,16 @@ def test_more_gaussians_than_16_bits_count(show: Any, files: Any) -> None:
     assert shown.picture().max() > 50
 
 
-def test_a_dial_beyond_the_trained_is_said(files: Any, gaussians: Gaussians) -> None:
+def test_a_dial_beyond_the_trained_range_is_noted(files: Any, gaussians: Gaussians) -> None:
     path = str(files.save(gaussians))
     for sv, said in (("5", []), ("9", ["the page's dial ends at s = 5, as far as was trained for, and opens there"])):
         assert prepare(build_parser("view").parse_args([path, "--sv", sv]), Console(quiet=True))[1]["notes"] == said
 
 
-def test_one_file_holds_more_than_one_text_node_may(
+def test_one_file_larger_than_a_text_node(
     tab: Any, files: Any, gaussians: Gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The data goes on in further elements."""
+    """The data continues in further elements."""
     monkeypatch.setattr(page, "LETTERS", 20_000)
     monkeypatch.setattr(payload, "ROWS", 100)
     write_page(tmp_path / "page.html", clod_adapter.load(files.save(gaussians)))
