@@ -19,9 +19,10 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize
+from clod_adapter.progress import Phase, Progress
 from clod_adapter.render import render
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.state import Progress, TrainingState
+from clod_adapter.training.state import TrainingState
 from clod_adapter.training.target_count import target_curve
 from scenes import capture, gaussians
 
@@ -247,7 +248,7 @@ def test_every_wait_is_told(captured: tuple[Gaussians, Scene], divided: Division
     told: list[tuple[str, int, int]] = []
     views = captured[1].train
     adapt_block(divided, views, replace(CONFIG, iters=1), 0, progress=lambda p: told.append((p.phase, p.done, p.total)))
-    for phase in ("beside", "targets", "quotas"):
+    for phase in (Phase.CONTEXT, Phase.TARGET_IMAGES, Phase.TARGET_COUNTS):
         assert [one[1:] for one in told if one[0] == phase] == [(k + 1, len(views)) for k in range(len(views))]
 
 

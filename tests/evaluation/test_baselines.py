@@ -33,7 +33,7 @@ def test_without_a_dial_there_is_nothing_to_turn() -> None:
 def test_rankings() -> None:
     base, scene = capture(n=60, views=4, width=24, height=18)
     seen = []
-    orders = rankings(base, scene.train, lambda *a: seen.append(a))
+    orders = rankings(base, scene.train, lambda now: seen.append((now.done, now.total)))
     assert seen[-1] == (len(scene.train), len(scene.train))
     values = {"opacity": base.opacity_logits, "removal error": removal_error(base, scene.train)}
     assert list(orders) == list(values)

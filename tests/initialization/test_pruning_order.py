@@ -86,14 +86,14 @@ def test_all_in_one_place_and_of_no_worth() -> None:
 
 def test_reports_its_progress() -> None:
     seen: list[tuple[int, int]] = []
-    pruning_order(gaussians(100, 0, 0), torch.ones(100), lambda *count: seen.append(count))
+    pruning_order(gaussians(100, 0, 0), torch.ones(100), lambda now: seen.append((now.done, now.total)))
     assert seen == sorted(seen) and 0 < seen[0][0] < 50 and seen[-1] == (100, 100)
 
 
 def test_many_in_one_place_take_few_rounds() -> None:
     some, seen = gaussians(2000, 0, 0), []
     some = some.replace(means=torch.zeros(2000, 3), sh0=torch.zeros(2000, 1, 3))
-    order = pruning_order(some, torch.zeros(2000), lambda *count: seen.append(count))
+    order = pruning_order(some, torch.zeros(2000), lambda now: seen.append((now.done, now.total)))
     assert sorted(order.tolist()) == list(range(2000)) and len(seen) < 300
 
 

@@ -112,10 +112,10 @@ def test_what_is_not_finite_or_not_visible_plays_no_part(blob: clod.Gaussians) -
 
 def test_progress_reaches_the_end(blob: clod.Gaussians) -> None:
     seen: list[tuple[int, int]] = []
-    cameras = place_cameras(blob, views=3, progress=lambda *at: seen.append(at))
+    cameras = place_cameras(blob, views=3, progress=lambda now: seen.append((now.done, now.total)))
     assert seen[-1][0] == seen[-1][1] == len(seen)
     seen.clear()
-    render_pseudo_views(blob, cameras, progress=lambda *at: seen.append(at))
+    render_pseudo_views(blob, cameras, progress=lambda now: seen.append((now.done, now.total)))
     assert seen == [(1, 3), (2, 3), (3, 3)]
 
 
@@ -125,7 +125,7 @@ def test_the_pictures_are_the_checkpoints_own(blob: clod.Gaussians) -> None:
     assert [view.camera for view in scene.test] == [cameras[0], cameras[8]] and len(scene.train) == 7
     image = (clod.render(blob, cameras[1]).image.clamp(0, 1) * 255).round().to(torch.uint8)
     assert torch.equal(scene.train[0].image, image)
-    assert "7 placed cameras to train on, 2 held out, 40x30" in scene.notes[0]
+    assert "7 pseudo views to train on, 2 held out, 40x30" in scene.notes[0]
     assert render_pseudo_views(blob, cameras[:1]).test == ()
 
 
@@ -166,7 +166,7 @@ def test_few_photographs_of_a_checkpoint_that_no_camera_can_be_placed_for(blob: 
     faint = blob.replace(opacity_logits=torch.full((len(blob),), -4.6))  # fainter than what is looked for
     views, config = scenes.photograph(faint, scenes.ring(2, 24, 18)), clod.AdaptConfig(iters=1)
     scene, lighter = add_pseudo_views(faint, clod.Scene(views, ()), config)
-    assert scene.train == views and "none of the checkpoint's own pictures can be added" in scene.notes[-1]
+    assert scene.train == views and "no pseudo views can be added" in scene.notes[-1]
     assert clod.adapt(faint, scene, lighter).steps == 1
 
 

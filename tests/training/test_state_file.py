@@ -92,7 +92,7 @@ def test_a_damaged_description(tmp_path: Path, state: TrainingState, changes: di
 
 
 def assert_refused(path: Path) -> None:
-    with pytest.raises(ClodError, match="is no training state or damaged") as caught:
+    with pytest.raises(ClodError, match="is not a training state or is damaged") as caught:
         load_state(path)
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
 
