@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
 
@@ -55,6 +57,14 @@ def gaussians(n: int, degree: int, seed: int, *, size: float = 0.08) -> Gaussian
     s = scene(n, degree, seed, size=size)
     logs, logits = s["scales"].log(), s["opacities"].logit()
     return Gaussians(s["means"], s["quats"], logs, logits, s["sh0"], s["shN"])
+
+
+def dialled(n: int, degree: int, seed: int, **settings: Any) -> Gaussians:
+    """With a sigma_d that is log-normal around e, 0 in every 50th row, and attenuation settings (soft culling)."""
+    sigma_d = (torch.randn(n, generator=torch.Generator().manual_seed(seed + 1)) + 1).exp()
+    sigma_d[::50] = 0.0
+    attenuation = AttenuationConfig(**{"tau": 0.02, "cut": "soft", "scene_distance": 3.0} | settings)
+    return gaussians(n, degree, seed).replace(sigma_d=sigma_d, attenuation=attenuation)
 
 
 def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Camera]:

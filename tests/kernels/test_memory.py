@@ -7,9 +7,8 @@ import random
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -102,21 +101,10 @@ def test_memory_is_used_again(fresh: list[int], rounds: list[list[tuple[int, ...
     assert len(fresh) == allocated
 
 
-class _Doubled(torch.autograd.Function):
-    """Twice its input; gradient, and what it saves, in recycled memory."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        out = recycled(x.shape)
-        out.copy_(2 * x)
-        ctx.save_for_backward(out)
-        return out
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        out = recycled(gradients[0].shape)
-        out.copy_(2 * gradients[0])
-        return out
+def grad_of(tensor: Tensor) -> Tensor:
+    leaf = torch.zeros(SHAPE, requires_grad=True)
+    leaf.grad = tensor
+    return leaf
 
 
 HOLDERS: dict[str, Callable[[Tensor], Any]] = {
@@ -137,15 +125,10 @@ HOLDERS: dict[str, Callable[[Tensor], Any]] = {
     "dlpack": lambda t: torch.from_dlpack(t),
     "numpy by dlpack": lambda t: np.from_dlpack(t),
     "graph": lambda t: t.clone().requires_grad_() * t,
+    "gradient": grad_of,
+    "alias of a gradient": lambda t: grad_of(t).grad[3:],
     "cycle": lambda t: [t],
 }
-
-
-def filled(extents: tuple[int, int]) -> list[Tensor]:
-    """Five new tensors, each filled with its number, none of them in this memory."""
-    others = [recycled(SHAPE).fill_(k) for k in range(5)]
-    assert not any(overlap(extent(other), extents) for other in others)
-    return others
 
 
 @pytest.mark.parametrize("holder", HOLDERS)
@@ -156,8 +139,9 @@ def test_held_memory_is_not_used_again(holder: str) -> None:
     if holder == "cycle":
         held.append(held)
     del tensor
-    others = filled(where)
-    if isinstance(held, Tensor | np.ndarray) and holder != "graph":
+    others = [recycled(SHAPE).fill_(k) for k in range(5)]
+    assert not any(overlap(extent(other), where) for other in others)
+    if isinstance(held, Tensor | np.ndarray) and holder not in ("graph", "gradient"):
         assert (held == 7).all()
     del held
     if holder == "cycle":
@@ -166,34 +150,9 @@ def test_held_memory_is_not_used_again(holder: str) -> None:
     assert all((other == k).all() for k, other in enumerate(others))
 
 
-def test_gradients_are_held_by_their_leaves() -> None:
-    leaf = torch.ones(SHAPE, requires_grad=True)
-    _Doubled.apply(leaf).sum().backward()
-    assert leaf.grad is not None
-    others = filled(extent(leaf.grad))
-    assert (leaf.grad == 2).all()
-    _Doubled.apply(leaf).sum().backward()  # accumulated in place
-    assert (leaf.grad == 4).all() and all((other == k).all() for k, other in enumerate(others))
-    alias = leaf.grad[3:]
-    leaf.grad = None
-    recycled(SHAPE).fill_(-1)
-    assert (alias == 4).all()
-
-
-def test_saved_tensors_are_held_by_the_graph() -> None:
-    leaf = torch.ones(SHAPE, requires_grad=True)
-    out = _Doubled.apply(leaf)
-    where, node = extent(out), out.grad_fn
-    total = (out * out).sum()
-    del out
-    filled(where)
-    total.backward()
-    assert (leaf.grad == 8).all() and node is not None
-
-
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)], ids=str)
 def test_images_and_gradients_of_several_passes(order: tuple[int, ...]) -> None:
-    """Large ones, in recycled memory: live tensors keep their values while others are drawn and released."""
+    """Large ones, in recycled memory: gradients and saved tensors keep their values while others are drawn."""
     cases = [(scene(6000, 1, seed, size=0.03), camera(150, 121 + 5 * seed)) for seed in range(3)]
     alone = [differentiate(cpu.rasterize, some, view, weights(view)) for some, view in cases]
     alone = [r._replace(gradients={name: g.clone() for name, g in r.gradients.items()}) for r in alone]
@@ -228,66 +187,33 @@ def test_few_stay_idle_and_the_oldest_are_freed(fresh: list[int]) -> None:
     assert len(fresh) == 1
 
 
-@pytest.fixture
-def restless() -> Iterator[None]:
-    """Threads take turns as often as they can."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    yield
-    sys.setswitchinterval(before)
-
-
-def run_threads(*work: Callable[[], None]) -> None:
-    """Runs these at the same time and raises what one of them raised."""
-    with ThreadPoolExecutor(len(work)) as pool:
-        for future in [pool.submit(each) for each in work]:
-            future.result()
-
-
-@pytest.mark.usefixtures("restless")
 def test_threads_never_get_the_same_memory(workers: int = 4, rounds: int = 500) -> None:
-    """Each fills its tensors with a number of its own, which must be there until the tensor is released."""
-    together = threading.Barrier(workers)
+    """Each fills its tensors with a number, which must be there until another thread releases them.
+
+    The threads take turns as often as they can.
+    """
+    together, passed = threading.Barrier(workers), [deque[tuple[Tensor, float]]() for _ in range(workers)]
 
     def work(k: int) -> None:
-        choose, held = random.Random(k), deque()
+        choose = random.Random(k)
         together.wait()
         for turn in range(rounds):
             tensor, number = recycled((choose.choice([20_000, 20_001, 40_000]),)), float(k * rounds + turn)
-            held.append((tensor.fill_(number), number))
-            if len(held) > choose.randrange(6):
-                tensor, number = held.popleft()
+            passed[choose.randrange(workers)].append((tensor.fill_(number), number))
+            while len(passed[k]) > choose.randrange(6):
+                tensor, number = passed[k].popleft()
                 assert (tensor == number).all()
-                held.rotate(choose.randrange(3))
-        assert all((tensor == number).all() for tensor, number in held)
 
-    run_threads(*(partial(work, k) for k in range(workers)))
-    assert idle() <= IDLE
-
-
-@pytest.mark.usefixtures("restless")
-def test_tensors_released_by_another_thread(rounds: int = 500) -> None:
-    """Two threads allocate, two others release."""
-    passed: list[deque[tuple[Tensor, float] | None]] = [deque(maxlen=5) for _ in range(2)]
-
-    def allocate(k: int) -> None:
-        for turn in range(rounds):
-            number = float(2 * turn + k)
-            passed[k].append((recycled((20_000,)).fill_(number), number))
-        passed[k].append(None)
-
-    def release(k: int) -> None:
-        while True:
-            try:
-                given = passed[k].popleft()
-            except IndexError:
-                continue
-            if given is None:
-                return
-            assert (given[0] == given[1]).all()
-
-    run_threads(*(partial(work, k) for k in range(2) for work in (allocate, release)))
-    assert idle() <= IDLE
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(work, range(workers)))
+    finally:
+        sys.setswitchinterval(before)
+    assert all((tensor == number).all() for held in passed for tensor, number in held)
+    passed.clear()
+    assert 0 < idle() <= IDLE
 
 
 def test_idle_memory_can_be_freed() -> None:

@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 import clod_adapter
 import scenes
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.view import prepare
-from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import dial
 from clod_adapter.viewer import page, payload
@@ -56,9 +54,8 @@ def test_a_model_that_cannot_be_fetched_is_an_error(tab: Any, files: Any, gaussi
 
 def test_more_gaussians_than_16_bits_count(show: Any, files: Any) -> None:
     count = 100_000
-    many = scenes.gaussians(count, 0, 6, size=0.003)
-    sigma_d = torch.randn(count, generator=torch.Generator().manual_seed(0)).exp()
-    many = many.replace(sigma_d=sigma_d, attenuation=AttenuationConfig(tau=0.02, cut="soft", scene_distance=3.0))
+    many = scenes.dialled(count, 0, 6)
+    many = many.replace(log_scales=many.log_scales - 3.3)
     shown, camera = show(files.save(many), "--sv", 3), scenes.camera(320, 240)
     shown.camera(camera)
     kept = int(dial(many, camera, 3.0).keep.sum())

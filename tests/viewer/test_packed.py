@@ -14,7 +14,6 @@ import torch
 
 import clod_adapter
 import scenes
-from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.splat_transform import SplatTransform
@@ -26,14 +25,12 @@ from shown import SIZE, Shown, assert_same
 
 
 def dialled(degree: int) -> Gaussians:
-    """Some of them too faint for the 8 bits that SOG has for an opacity."""
-    plain = scenes.gaussians(1000, degree, 4)
-    logits = plain.opacity_logits.clone()
+    """Some Gaussians are too transparent for the 8 bits that SOG has for an opacity."""
+    model = scenes.dialled(1000, degree, 4, scene_distance=1.0, reference_distance=3.0)
+    logits, sigma_d = model.opacity_logits.clone(), model.sigma_d.clone()
     logits[::20] = -12.0
-    sigma_d = torch.randn(1000, generator=torch.Generator().manual_seed(1)).exp()
     sigma_d[:3] = torch.tensor([0.0, 1e9, -0.5])
-    attenuation = AttenuationConfig(tau=0.02, cut="soft", reference_distance=3.0)
-    return plain.replace(opacity_logits=logits, sigma_d=sigma_d, attenuation=attenuation)
+    return model.replace(opacity_logits=logits, sigma_d=sigma_d)
 
 
 class Reversing:

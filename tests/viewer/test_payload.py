@@ -20,9 +20,7 @@ from clod_adapter.viewer.payload import ROWS, Payload, page_config
 
 
 def dialled(n: int = 40, degree: int = 1) -> Gaussians:
-    plain = scenes.gaussians(n, degree, 3)
-    attenuation = AttenuationConfig(tau=0.02, cut="soft")
-    return plain.replace(sigma_d=torch.linspace(-0.1, 3, n), attenuation=attenuation, screen_filter=FILTERS["mip"])
+    return scenes.dialled(n, degree, 3, scene_distance=1.0).replace(screen_filter=FILTERS["mip"])
 
 
 def read_back(payload: Payload, folder: Path) -> Any:
