@@ -67,6 +67,14 @@ def dialled(n: int, degree: int, seed: int, **settings: Any) -> Gaussians:
     return gaussians(n, degree, seed).replace(sigma_d=sigma_d, attenuation=attenuation)
 
 
+def looking(forward: Tensor) -> Tensor:
+    """``[3, 3]`` rotation of the world, y down, for a camera that looks along this vector."""
+    forward = forward / forward.norm()
+    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
+    right = right / right.norm()
+    return torch.stack([right, torch.linalg.cross(forward, right), forward])
+
+
 def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Camera]:
     """Cameras on a circle around the origin, looking at it, at slightly different heights and distances."""
     cameras = []
@@ -77,11 +85,8 @@ def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Ca
             * (1 + 0.1 * math.cos(3 * turn))
             * torch.tensor([math.cos(turn), 0.2 * math.sin(2 * turn), math.sin(turn)])
         )
-        forward = -eye / eye.norm()
-        right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
-        right = right / right.norm()
         viewmat = torch.eye(4)
-        viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        viewmat[:3, :3] = looking(-eye)
         viewmat[:3, 3] = -viewmat[:3, :3] @ eye
         K = torch.tensor([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1.0]])
         cameras.append(Camera(viewmat, K, width, height, f"view_{k}.png"))

@@ -1,4 +1,4 @@
-"""The projection packs sixteen Gaussians at a time: every way in which sixteen can be incomplete."""
+"""The projection packs sixteen Gaussians at a time: counts and visibility patterns around sixteen."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.rasterizers import cpu, reference
-from oracle import BACKGROUND, Parameters, assert_agrees, assert_same, differentiate, weights
+from oracle import Parameters, assert_agrees, assert_same, differentiate, weights
 from scenes import camera, in_front, scene
 
 VIEW = camera(45, 37)
@@ -25,7 +25,7 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
 
 
 def all_visible(n: int, degree: int = 3) -> Parameters:
-    """Translucent, before the camera, in the image."""
+    """Translucent Gaussians in front of the camera, in the image."""
     some = scene(n, degree, n, size=0.15)
     g = torch.Generator().manual_seed(n)
     z = 2 + 2 * torch.rand(n, 1, generator=g)
@@ -36,7 +36,7 @@ def all_visible(n: int, degree: int = 3) -> Parameters:
 
 
 def hide(some: Parameters, gone: Tensor, how: str) -> None:
-    """Rows that go through the projection and are not found, or that do not even reach it."""
+    """Makes rows invisible: culled by the projection, or before it."""
     if how == "behind":
         some["means"][gone] = in_front(VIEW, torch.tensor([[0.1, 0.2, -3.0]])).expand(int(gone.sum()), 3)
     elif how == "beside":
@@ -49,18 +49,8 @@ def hide(some: Parameters, gone: Tensor, how: str) -> None:
 def test_all_visible(threads: int, n: int, degree: int) -> None:
     some = all_visible(n, degree)
     seen = differentiate(reference.rasterize, {k: v.double() for k, v in some.items()}, VIEW, weights(VIEW))
-    assert (seen.gradients["opacities"] != 0).all()  # the scene is what it says
+    assert (seen.gradients["opacities"] != 0).all()  # all are visible
     assert_agrees(cpu.rasterize, some, VIEW)
-
-
-@pytest.mark.parametrize(("n", "how"), [(1, "behind"), (15, "beside"), (16, "faint"), (17, "behind"), (33, "beside")])
-def test_all_invisible(threads: int, n: int, how: str) -> None:
-    some = all_visible(n)
-    hide(some, torch.ones(n, dtype=torch.bool), how)
-    found = differentiate(cpu.rasterize, some, VIEW, weights(VIEW))
-    assert torch.equal(found.image, BACKGROUND.expand(VIEW.height, VIEW.width, 3)) and (found.alpha == 0).all()
-    for name in some:
-        assert (found.gradients[name] == 0).all(), name
 
 
 ROWS = torch.arange(49)
@@ -76,18 +66,21 @@ PATTERNS = {
     "all but the first": ROWS > 0,
     "all but the last": ROWS < 48,
     "all but one in the middle": ROWS != 24,
+    "all": ROWS >= 0,
     "random": torch.rand(49, generator=torch.Generator().manual_seed(0)) < 0.5,
 }
 
 
-@pytest.mark.parametrize(("pattern", "how"), [*zip(PATTERNS, ["behind", "faint"] * 6, strict=True)])
+@pytest.mark.parametrize(("pattern", "how"), [*zip(PATTERNS, ["behind", "faint", "beside"] * 5, strict=False)])
 def test_some_invisible(threads: int, pattern: str, how: str) -> None:
     some, gone = all_visible(49), PATTERNS[pattern]
     hide(some, gone, how)
     assert_agrees(cpu.rasterize, some, VIEW, rows=~gone)
 
 
-@pytest.mark.parametrize(("pattern", "name"), [*zip(PATTERNS, ["sh0", "first of shN", "last of shN"] * 4, strict=True)])
+@pytest.mark.parametrize(
+    ("pattern", "name"), [*zip(PATTERNS, ["sh0", "first of shN", "last of shN"] * 5, strict=False)]
+)
 def test_colors_that_are_not_finite(threads: int, pattern: str, name: str) -> None:
     """Such rows are projected, packed, and removed again, beside others that are invisible."""
     some, gone = all_visible(49), PATTERNS[pattern]

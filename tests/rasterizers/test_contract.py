@@ -201,8 +201,7 @@ def test_invisible_rows_are_skipped(rasterize: Backend, torch_threads: int, case
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [(name, value) for k, name in enumerate(FIELDS) for value in (math.nan, (-1) ** k * math.inf)],
+    ("name", "value"), [(name, value) for k, name in enumerate(FIELDS) for value in (math.nan, (-1) ** k * math.inf)]
 )
 def test_rows_that_are_not_finite_are_skipped(rasterize: Backend, name: str, value: float) -> None:
     """Whole rows and single elements, which files have; they must not change the image."""

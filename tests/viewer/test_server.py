@@ -126,9 +126,5 @@ def test_an_interrupt_while_a_thread_starts(monkeypatch: pytest.MonkeyPatch) -> 
         raise KeyboardInterrupt
 
     monkeypatch.setattr(threading.Thread, "start", interrupted)
-    with (
-        pytest.raises(KeyboardInterrupt),
-        Server({}) as server,
-        socket.create_connection(("127.0.0.1", server.port)),
-    ):
+    with pytest.raises(KeyboardInterrupt), Server({}) as server, socket.create_connection(("127.0.0.1", server.port)):
         server.handle_request()
