@@ -10,9 +10,6 @@ import pytest
 
 import clod_adapter
 import scenes
-from clod_adapter.cli.main import build_parser
-from clod_adapter.cli.shared.console import Console
-from clod_adapter.cli.view import prepare
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import dial
 from clod_adapter.viewer import page, payload
@@ -61,15 +58,6 @@ def test_more_gaussians_than_16_bits_count(show: Any, files: Any) -> None:
     kept = int(dial(many, camera, 3.0).keep.sum())
     assert shown.counts()["total"] == count and abs(shown.counts()["kept"] - kept) <= COUNTS * kept
     assert shown.picture().max() > 50
-
-
-def test_a_dial_beyond_the_trained_range_is_noted(files: Any, gaussians: Gaussians) -> None:
-    path = str(files.save(gaussians))
-    for sv, said in (
-        ("5", []),
-        ("9", ["the page's dial ends at s = 5, the largest value trained for, and opens there"]),
-    ):
-        assert prepare(build_parser("view").parse_args([path, "--sv", sv]), Console(quiet=True))[1]["notes"] == said
 
 
 def test_one_file_larger_than_a_text_node(
