@@ -87,9 +87,9 @@ def test_description() -> None:
     assert plain["attenuation"] is None and plain["max_sv"] == 1.0 and plain["calibration"] == []
     assert plain["screen_filter"] == {"variance": 0.3, "compensate": False}
     assert plain["no_dial"].startswith("p.ply has no sigma_d") and "clod-adapt p.ply" in plain["no_dial"]
-    (camera,) = scenes.ring(1, 20, 10)
+    camera = scenes.ring(3, 20, 10)[1]
     config = json.loads(json.dumps(page_config(entry, None, [camera], 2.5)))
     shown = config["cameras"][0]
-    assert (shown["name"], shown["width"], shown["height"], config["virtual_scale"]) == ("view_0.png", 20, 10, 2.5)
+    assert (shown["name"], shown["width"], shown["height"], config["virtual_scale"]) == ("view_1.png", 20, 10, 2.5)
     assert torch.equal(torch.tensor(shown["viewmat"]), camera.viewmat)
     assert torch.equal(torch.tensor(shown["K"]), camera.K)
