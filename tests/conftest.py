@@ -25,7 +25,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.cli.main import main
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.splat_transform import VARIABLE
-from clod_adapter.io.ply.columns import column_map
+from clod_adapter.io.ply.columns import column_map, inria_dtype
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import render
 from scenes import looking
@@ -50,7 +50,7 @@ def shared_data() -> Callable[[str], Path]:
 
 @pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
-    """The one browser of a test process, in which Playwright allows no second; skips where there is none."""
+    """The one browser of a test process (Playwright allows no second); skips where there is none."""
     with browser.launch() as chromium:
         yield chromium
 
@@ -63,7 +63,7 @@ def without_splat_transform(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @dataclass(frozen=True)
 class Capture:
-    """A scene folder with ten 64x48 photographs, the checkpoint they are pictures of, and how to write such a one."""
+    """A scene folder with ten 64x48 photographs, the checkpoint they show, and a writer of such checkpoints."""
 
     scene: Path
     ply: Path
@@ -89,7 +89,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 @pytest.fixture(scope="session")
 def dialled(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The capture's checkpoint with a dial up to 4 and its calibration, as the main job leaves it."""
+    """The capture's checkpoint with a dial up to 4 and its calibration, as clod-adapt writes it."""
     path = tmp_path_factory.mktemp("dialled") / "dial.ply"
     words = [capture.ply, "--images", capture.scene, "--iters", 12, "--max-sv", 4, "--out", path, "--quiet", "--json"]
     assert main([str(word) for word in words]) == 0
@@ -98,21 +98,12 @@ def dialled(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _write_inria(path: Path, gaussians: Gaussians) -> Path:
     """A plain file as Inria's trainer writes it, normals included."""
-    columns = column_map(gaussians.sh_degree)
-    order = ["means", "", "sh0", "shN", "opacity_logits", "log_scales", "quats"]
-    names = [name for key in order for name in sorted(columns.get(key, ("nx", "ny", "nz")), key=_by_number)]
-    vertex = np.zeros(len(gaussians), [(name, "<f4") for name in names])
-    for key, group in columns.items():
-        values = getattr(gaussians, key).reshape(len(gaussians), -1).numpy()
-        for column, name in enumerate(group):
-            vertex[name] = values[:, column]
+    vertex = np.zeros(len(gaussians), inria_dtype(gaussians.sh_degree))
+    for key, group in column_map(gaussians.sh_degree).items():
+        for name, values in zip(group, getattr(gaussians, key).reshape(len(gaussians), -1).T.numpy(), strict=True):
+            vertex[name] = values
     PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
     return path
-
-
-def _by_number(name: str) -> tuple[int, str]:
-    number = name.rpartition("_")[2]
-    return (int(number) if number.isdigit() else 0, name)
 
 
 def _blob(count: int) -> Gaussians:

@@ -44,11 +44,9 @@ def fresh(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return sizes
 
 
-def extent(x: Tensor | np.ndarray) -> tuple[int, int]:
+def extent(x: Tensor) -> tuple[int, int]:
     """First address and the one behind the last."""
-    if isinstance(x, Tensor):
-        return x.data_ptr(), x.data_ptr() + x.numel() * x.element_size()
-    return x.ctypes.data, x.ctypes.data + x.nbytes
+    return x.data_ptr(), x.data_ptr() + x.numel() * x.element_size()
 
 
 def overlap(a: tuple[int, int], b: tuple[int, int]) -> bool:
