@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
+import clod_adapter
 import scenes
+from clod_adapter.gaussians import Gaussians
 from shown import Shown, drop, fold, serve, take
 
 
@@ -50,14 +52,19 @@ def test_keys(shown: Shown) -> None:
     assert not np.array_equal(shown.picture(), before)
 
 
-def test_the_count_box_takes_counts_only(shown: Shown) -> None:
+def test_the_count_box_takes_counts_only(shown: Shown, gaussians: Gaussians) -> None:
+    """And sets the dial that ``dial_for`` finds for the count."""
+    camera = scenes.camera(320, 240)
+    wanted = clod_adapter.dial_for(gaussians, keep=150, cameras=[camera]).virtual_scale
     fold(shown, True)
+    shown.camera(camera)
     for text in ("0", "-5", "1.5", "many"):
         assert "A number of Gaussians" in target(shown, text) and shown.text("#dial-value") == "s = 1.00"
     assert "keeps" in target(shown, "1,000,000")
     shown.run("clod.setEquation(false)")
     assert "keeps 150 in this view" in target(shown, "150")
     assert shown.counts()["kept"] == 150 and shown.page.is_checked("#equation")
+    assert shown.text("#dial-value") == f"s = {wanted:.2f}"
     shown.run("clod.setDial(1)")
     assert target(shown) and shown.counts()["kept"] == 150
 
