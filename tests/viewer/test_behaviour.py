@@ -60,24 +60,16 @@ def test_more_gaussians_than_16_bits_count(show: Any, files: Any) -> None:
     assert shown.picture().max() > 50
 
 
-def test_one_file_larger_than_a_text_node(
-    tab: Any, files: Any, gaussians: Gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_one_file_needs_no_network(
+    chromium: Any, show: Any, files: Any, gaussians: Gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The data continues in further elements."""
+    """Its data, which may be larger than a text node, continues in further elements."""
     monkeypatch.setattr(page, "LETTERS", 20_000)
     monkeypatch.setattr(payload, "ROWS", 100)
-    write_page(tmp_path / "page.html", clod_adapter.load(files.save(gaussians)))
-    text = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert text.count('id="clod-model"') > 2
-    shown = Shown(tab).ready((tmp_path / "page.html").as_uri())
-    assert shown.counts()["total"] == 400 and shown.errors == []
-
-
-def test_one_file_needs_no_network(chromium: Any, show: Any, files: Any, gaussians: Gaussians, tmp_path: Path) -> None:
     path = files.save(gaussians)
-    served = show(path, "--sv", 2)
-    model = clod_adapter.load(path)
+    served, model = show(path, "--sv", 2), clod_adapter.load(path)
     write_page(tmp_path / "page.html", model, base=model, cameras=scenes.ring(2, 320, 240), virtual_scale=2.0)
+    assert (tmp_path / "page.html").read_text(encoding="utf-8").count('id="clod-model"') > 2
     with chromium.new_context(viewport=SIZE, offline=True) as context:
         alone = Shown(context.new_page()).ready((tmp_path / "page.html").as_uri())
         for shown in (served, alone):

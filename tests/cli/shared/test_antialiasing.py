@@ -134,10 +134,7 @@ def test_exports_carry_it_or_say_that_they_do_not(clod: Any, trained: tuple[Path
 def test_inspect_says_it(clod: Any, trained: tuple[Path, Path]) -> None:
     assert clod("export", trained[0], "-o", "a.ply", "--antialiasing", "mip").code == 0
     done = clod("inspect", "a.ply")
-    assert (
-        "trained with antialiasing: 0.1 px^2 of blur, opacities compensated"
-        in done.out + done.err
-    )
+    assert "trained with antialiasing: 0.1 px^2 of blur, opacities compensated" in done.out + done.err
     assert json.loads(clod("inspect", "a.ply", "--json").out)["splat"]["screen_filter"]["variance"] == 0.1
 
 
