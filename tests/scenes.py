@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
 
@@ -57,6 +59,22 @@ def gaussians(n: int, degree: int, seed: int, *, size: float = 0.08) -> Gaussian
     return Gaussians(s["means"], s["quats"], logs, logits, s["sh0"], s["shN"])
 
 
+def dialled(n: int, degree: int, seed: int, **settings: Any) -> Gaussians:
+    """With a sigma_d that is log-normal around e, 0 in every 50th row, and attenuation settings (soft culling)."""
+    sigma_d = (torch.randn(n, generator=torch.Generator().manual_seed(seed + 1)) + 1).exp()
+    sigma_d[::50] = 0.0
+    attenuation = AttenuationConfig(**{"tau": 0.02, "cut": "soft", "scene_distance": 3.0} | settings)
+    return gaussians(n, degree, seed).replace(sigma_d=sigma_d, attenuation=attenuation)
+
+
+def looking(forward: Tensor) -> Tensor:
+    """``[3, 3]`` rotation of the world, y down, for a camera that looks along this vector."""
+    forward = forward / forward.norm()
+    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
+    right = right / right.norm()
+    return torch.stack([right, torch.linalg.cross(forward, right), forward])
+
+
 def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Camera]:
     """Cameras on a circle around the origin, looking at it, at slightly different heights and distances."""
     cameras = []
@@ -67,11 +85,8 @@ def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Ca
             * (1 + 0.1 * math.cos(3 * turn))
             * torch.tensor([math.cos(turn), 0.2 * math.sin(2 * turn), math.sin(turn)])
         )
-        forward = -eye / eye.norm()
-        right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
-        right = right / right.norm()
         viewmat = torch.eye(4)
-        viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        viewmat[:3, :3] = looking(-eye)
         viewmat[:3, 3] = -viewmat[:3, :3] @ eye
         K = torch.tensor([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1.0]])
         cameras.append(Camera(viewmat, K, width, height, f"view_{k}.png"))

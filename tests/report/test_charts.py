@@ -69,9 +69,6 @@ def test_svg_has_the_pages_colours_and_fonts() -> None:
     assert {"var(--ink)", "var(--quiet)", "var(--series-1)", "var(--series-2)"} <= set(re.findall(r"var\([^)]*\)", svg))
     assert not re.findall(r"#(?!000000|ffffff)[0-9a-f]{6}", svg) and "DejaVu" not in svg
     assert "base &amp; co" in svg
-
-
-def test_shades_go_from_light_to_dark() -> None:
-    for count in (1, 2, 5):
+    for count in (1, 2, 5):  # from light to dark
         sums = [sum(bytes.fromhex(colour[1:])) for colour in shades(count)]
         assert len(sums) == count and sums == sorted(sums, reverse=True) and len(set(sums)) == count
