@@ -100,9 +100,7 @@ def test_what_is_not_finite_or_not_visible_plays_no_part(blob: clod.Gaussians) -
         shN=torch.cat([bad.shN[:10], torch.full_like(bad.shN[:10], math.nan), bad.shN[20:]]),
         opacity_logits=torch.cat([bad.opacity_logits[:20], torch.full((10,), -30.0)]),
     )
-    both = clod.Gaussians(
-        **{name: torch.cat([value, getattr(bad, name)]) for name, value in blob.tensors().items()},
-    )
+    both = clod.Gaussians(**{name: torch.cat([value, getattr(bad, name)]) for name, value in blob.tensors().items()})
     assert [c.viewmat.tolist() for c in place_cameras(both, views=4)] == [
         c.viewmat.tolist() for c in place_cameras(blob, views=4)
     ]
