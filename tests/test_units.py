@@ -43,7 +43,7 @@ def test_another_distance_is_the_same_dial(distance: float, eps: float, s: float
     torch.testing.assert_close(found[1][possible], found[0][possible], rtol=1e-6, atol=1e-9)
 
 
-def test_what_is_no_number_of_the_equation_stays() -> None:
+def test_special_values_and_other_normalisers_keep_their_sigma() -> None:
     sigma = torch.tensor([0.0, -1.0, SIGMA_MAX, 2.0])
     some = attach(gaussians(4, 0, 0), sigma, AttenuationConfig(scene_distance=8.0))
     there = in_world_units(some)
@@ -51,9 +51,6 @@ def test_what_is_no_number_of_the_equation_stays() -> None:
     assert there.sigma_d[3].item() == pytest.approx(16.0)
     assert in_world_units(there) is there and in_world_units(gaussians(4, 0, 0)).attenuation is None
     assert there.attenuation == AttenuationConfig(reference_distance=8.0)
-
-
-def test_other_normalisers_keep_their_sigma() -> None:
     for normalizer in ("max", "quantile"):
         some = dialled(normalizer=normalizer)
         there = in_world_units(some)
