@@ -7,7 +7,6 @@ torch in place of its kernels.
 from __future__ import annotations
 
 import importlib
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -99,21 +98,16 @@ def test_render_and_its_gradients(setup: Setup) -> None:
         assert float((mine - slopes[1][name]).norm()) <= 2e-2 * float(slopes[1][name].norm()) + 1e-7, name
 
 
-def test_the_start_and_what_it_goes_by(setup: Setup) -> None:
+@pytest.mark.parametrize("kind", ["importance", "error", "constant", "identity"])
+def test_the_initialization(setup: Setup, kind: str) -> None:
     assert len(usable_views(setup.there, setup.scene.train)) == len(setup.scene.train)
-    for kind in ("importance", "error", "constant", "identity"):
-        config = replace(CONFIG, start=kind)
-
-        def begun(model: Gaussians, config: AdaptConfig = config) -> Tensor:
-            plain = model.replace(sigma_d=None, attenuation=None)
-            return initialize(plain, setup.scene.train, config).sigma_d
-
-        mine, want = on_both(setup, begun)
-        assert mine.device == setup.device
-        torch.testing.assert_close(mine.cpu().log(), want.log(), rtol=0.02, atol=0.02)
+    plain, config = {"sigma_d": None, "attenuation": None}, replace(CONFIG, start=kind)
+    mine, want = on_both(setup, lambda model: initialize(model.replace(**plain), setup.scene.train, config).sigma_d)
+    assert mine.device == setup.device
+    torch.testing.assert_close(mine.cpu().log(), want.log(), rtol=0.02, atol=0.02)
 
 
-def test_numbers(setup: Setup) -> None:
+def test_numbers(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rows, counts, dial values, popping, alignment, orders: the CPU's, within what two rasterizers differ by."""
     cameras, test = setup.cameras, setup.scene.test
     rows, want = on_both(setup, lambda model: evaluate(model, test, [1.0, 3.0]))
@@ -135,11 +129,8 @@ def test_numbers(setup: Setup) -> None:
     ):
         mine, own = on_both(setup, run)
         assert float(mine) == pytest.approx(float(own), rel=5e-3)
-
-
-def test_frame_times(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.import_module("clod_adapter.evaluation.budget"), "TIMED_REPEATS", 1)
-    assert all(taken > 0 for _, taken in frame_times(setup.there, setup.cameras[:1]))
+    assert all(taken > 0 for _, taken in frame_times(setup.there, cameras[:1]))
 
 
 def test_placed_cameras_are_those_of_the_cpu(setup: Setup) -> None:
