@@ -25,8 +25,7 @@ from common import append, arguments, checkpoint, photographs, stored, table
 
 import clod_adapter as clod
 from clod_adapter.initialization.importance import initialize, usable_views
-from clod_adapter.io.formats.models import load_model
-from clod_adapter.io.writers import WRITERS, write
+from clod_adapter.io.file_formats import FORMATS, WRITABLE, read_model, write
 
 FILE = "formats.jsonl"
 DIALS = (1.0, 5.0)
@@ -45,8 +44,8 @@ def run(scene: str, config: clod.AdaptConfig) -> None:
     model = initialize(base, usable_views(base, views.train), config, lambda *_: None)
     cameras = [view.camera for view in views.test]
     baked = {s: clod.bake(model, s, cameras=[view.camera for view in views.train]) for s in DIALS}
-    for suffix, writer in WRITERS.items():
-        sources = {s: model if writer.carries_sigma else baked[s] for s in DIALS}
+    for suffix in WRITABLE:
+        sources = {s: model if FORMATS[suffix].carries_sigma else baked[s] for s in DIALS}
         row: dict[str, Any] = {}
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"model{suffix}"
@@ -55,12 +54,12 @@ def run(scene: str, config: clod.AdaptConfig) -> None:
                 row[f"s{s:g}"] = pictures(sources[s], read(path), cameras, s)
         append(FILE, {
             "benchmark": "formats", "scene": scene, "config": asdict(config), "suffix": suffix, "views": len(cameras),
-            "dial": writer.carries_sigma, "threads": torch.get_num_threads(), **row,
+            "dial": FORMATS[suffix].carries_sigma, "threads": torch.get_num_threads(), **row,
         })  # fmt: skip
 
 
 def read(path: Path) -> clod.Gaussians:
-    return clod.load(path).gaussians if path.suffix == ".ply" else load_model(path).gaussians
+    return clod.load(path).gaussians if path.suffix == ".ply" else read_model(path).gaussians
 
 
 def round_trip(path: Path, gaussians: clod.Gaussians, before: dict[str, Any]) -> dict[str, Any]:

@@ -35,9 +35,8 @@ from common import append, arguments
 from damage import mutate
 from mutants import FORMATS, Input, make, write, write_images
 
-from clod_adapter.cli.adapt.resume import Saver
+from clod_adapter.cli.adapt.resume import find_state
 from clod_adapter.cli.shared.console import Console
-from clod_adapter.cli.shared.interrupts import GracefulStop
 from clod_adapter.errors import ClodError
 from clod_adapter.io.adapter_file import load_adapter
 
@@ -88,8 +87,8 @@ def read(kind: str, folder: Path, case: Input, number: int) -> None:
     elif kind == "safetensors":
         load_adapter(folder / next(iter(case)))
     elif kind == "states":
-        saver = Saver(folder / next(iter(case)), True, clod.AdaptConfig(), Console(quiet=True), GracefulStop())
-        if saver.state is None or saver.frozen is None:
+        resumed = find_state(folder / next(iter(case)), True, clod.AdaptConfig(), Console(quiet=True))
+        if resumed is None or resumed.frozen is None:
             raise AssertionError("the state was not read")
     else:
         clod.load(folder / next(iter(case)), activated=None if number % 2 else "both")

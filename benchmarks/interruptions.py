@@ -9,6 +9,7 @@ states are flushed to the disk of ``--folder``. ``load_seconds`` is the time to 
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -19,7 +20,7 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 import torch
 from common import append, arguments, checkpoint, photographs
 
-from clod_adapter.cli.adapt.resume import Saver
+from clod_adapter.cli.adapt.resume import Saver, identify
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.interrupts import GracefulStop
 from clod_adapter.training.state_file import load_state
@@ -42,11 +43,13 @@ def main() -> None:
 
 def measure(scene: str, config: clod.AdaptConfig, path: Path) -> None:
     base, views = checkpoint(scene), photographs(scene)
-    saver = Saver(path, False, config, Console(), GracefulStop())
     began = time.perf_counter()
-    saver.belong(base.gaussians, views, scene, scene)
+    names = argparse.Namespace(ply=scene, images=scene)
+    saver = Saver(
+        path, identify(None, base.gaussians, views, config, names, Console()), None, Console(), GracefulStop()
+    )
     digest_seconds = time.perf_counter() - began
-    adapted = clod.adapt(base.gaussians, views, config, saver.watching(lambda progress: None))
+    adapted = clod.adapt(base.gaussians, views, config, saver.saving(lambda progress: None))
     saver.keep()
     began = time.perf_counter()
     load_state(path)

@@ -24,14 +24,15 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 import clod_adapter as clod
+from clod_adapter._support.version import package_version
 from clod_adapter.io.adapter_file import save_adapter
+from clod_adapter.io.file_formats import FORMATS as FILE_FORMATS
+from clod_adapter.io.file_formats import WRITABLE
+from clod_adapter.io.file_formats import write as write_model
 from clod_adapter.io.ply.columns import inria_dtype
 from clod_adapter.io.ply.header import read_head
-from clod_adapter.io.writers import WRITERS
-from clod_adapter.io.writers import write as write_model
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.state_file import save_state
-from clod_adapter.version import package_version
 
 sys.path.insert(0, str(ROOT / "tests"))
 from packing import write_packed  # noqa: E402
@@ -204,8 +205,8 @@ def _whole_models(folder: Path) -> list[Input]:
     base = _base(folder).gaussians
     dial = clod.attach(base, torch.rand(len(base)) + 0.1, clod.AttenuationConfig())
     inputs = []
-    for suffix in (suffix for suffix in WRITERS if suffix != ".ply"):
-        for gaussians in (base, dial)[: 1 + WRITERS[suffix].carries_sigma]:
+    for suffix in (suffix for suffix in WRITABLE if suffix != ".ply"):
+        for gaussians in (base, dial)[: 1 + FILE_FORMATS[suffix].carries_sigma]:
             write_model(folder / f"whole{suffix}", gaussians, ("a comment",))
             inputs.append({f"whole{suffix}": (folder / f"whole{suffix}").read_bytes()})
     packed = write_packed(folder / "whole.compressed.ply", base)

@@ -108,7 +108,7 @@ def take_part(scene: str, config: clod.AdaptConfig, file: Path) -> None:
 
         with joined(*next(iter(rendezvous("env://")))) as peers:
             peers.agree(0.0, True)  # both have read and compiled before a clock runs
-            adapted = clod.adapt(base, views, config, peers=peers)
+            adapted = clod.adapt(base, views, config, group=peers)
         if peers.rank > 0:
             return
     else:

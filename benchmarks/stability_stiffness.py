@@ -133,7 +133,7 @@ def problem(wrong: float = WRONG) -> Problem:
 def fit(
     task: Problem, optimizer: str, parameter: str, rates: tuple[float, ...], steps: int
 ) -> tuple[list[Tensor], float]:
-    """sigma_d after training as ``train._Run`` does it, at dial value 1 and another one a step; and seconds.
+    """sigma_d after training as ``trainer.Trainer`` does it, at dial value 1 and another one a step; and seconds.
 
     One run a step size, all of them at once; they know nothing of each other.
     """

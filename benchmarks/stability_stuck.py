@@ -30,8 +30,8 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import sigma_from_importance
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import render
-from clod_adapter.training.loop import _Run
 from clod_adapter.training.target_count import count_gradient, soft_count, target_curve
+from clod_adapter.training.trainer import Trainer
 
 FROZEN = {f"lr_{name}": 0.0 for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
 CONFIG = AdaptConfig(**FROZEN)
@@ -100,15 +100,15 @@ def scene(n: int = 192, seed: int = 0) -> tuple[Gaussians, Camera]:
     return attach(some, right, settings), camera
 
 
-def trained(config: AdaptConfig, start: Tensor, steps: int, *, floor: bool = True) -> _Run:
+def trained(config: AdaptConfig, start: Tensor, steps: int, *, floor: bool = True) -> Trainer:
     """``scene`` after so many steps of the training itself; without its floor under sigma_d, a relu may come to 0."""
     some, camera = scene()
     picture = (render(some.replace(sigma_d=None, attenuation=None), camera).image.clamp(0, 1) * 255).round()
     settings = config.attenuation(some.attenuation.scene_distance)
     views = (View(camera, picture.to(torch.uint8)),)
-    run = _Run(some.replace(sigma_d=start, attenuation=settings), views, config, None)
+    run = Trainer(some.replace(sigma_d=start, attenuation=settings), views, config)
     if not floor:
-        run.range = (TINY, SIGMA_MAX)
+        run.decay_range = (TINY, SIGMA_MAX)
         run.parameters[run.decay].copy_(start.clamp(min=TINY))
     for k in range(steps):
         run.step(k / steps)
@@ -116,7 +116,7 @@ def trained(config: AdaptConfig, start: Tensor, steps: int, *, floor: bool = Tru
 
 
 @torch.no_grad()
-def objective(run: _Run) -> float:
+def objective(run: Trainer) -> float:
     """What training minimises, at dial values evenly spread, for sigma_d as it would be handed out."""
     (view,), config, found, total = run.draws.views, run.config, run.gaussians(), 0.0
     for s in DIALS:
@@ -127,7 +127,7 @@ def objective(run: _Run) -> float:
     return total / len(DIALS)
 
 
-def stuck(run: _Run) -> int:
+def stuck(run: Trainer) -> int:
     """Gaussians that cannot recover: no gradient from a picture, and none in the needed direction from the count term.
 
     A Gaussian that is culled at every dial value needs a negative gradient while none is kept; one that does not fade

@@ -24,7 +24,8 @@ from common import append, arguments, checkpoint, photographs
 from clod_adapter._kernels import threads
 from clod_adapter.initialization.importance import for_training, initialize
 from clod_adapter.rasterizers import cpu
-from clod_adapter.training import loop, objective, optimizer
+from clod_adapter.training import objective, optimizer
+from clod_adapter.training.trainer import Trainer
 
 FILE = "step.jsonl"
 THREADS = 2
@@ -79,7 +80,7 @@ def profile(scene: str, steps: int, clock: Clock, warm: int = 5) -> dict[str, An
     base, views = checkpoint(scene).gaussians, photographs(scene).train
     config = clod.AdaptConfig()
     begun = for_training(initialize(base, views, config), views, config)
-    run = loop._Run(begun, views, config, None)
+    run = Trainer(begun, views, config)
     for _ in range(warm):
         run.step(0.0)
     clock.seconds.clear()

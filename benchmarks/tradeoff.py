@@ -89,7 +89,7 @@ class Contest:
         make = clod.AdaptConfig if method == "ours" else clod.AdaptConfig.paper
         config = make(max_sv=self.max_sv, iters=iters, seed=seed)
         done = self.watched(f"{method}, {iters} steps", lambda follow: clod.adapt(
-            self.base.gaussians, self.photographs, config, lambda p: follow(p.share if p.phase == "train" else 0.0)
+            self.base.gaussians, self.photographs, config, lambda p: follow(p.share if p.phase == "training" else 0.0)
         ))  # fmt: skip
         rows = clod.evaluate(done.gaussians, self.photographs.test, self.dials)
         return [done.start_seconds + done.seconds] * len(rows), [row.as_dict() for row in rows]

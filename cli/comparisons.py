@@ -1,9 +1,9 @@
-"""What ``clod-adapt eval`` measures on request: comparison rows and popping. The computing is in the library."""
+"""What ``clod-adapt eval`` compares on request: the base and other files at equal counts, and popping."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -15,58 +15,39 @@ from clod_adapter.evaluation.evaluate import Row, evaluate
 from clod_adapter.evaluation.perceptual import Metric
 from clod_adapter.evaluation.popping import Popping, dial_popping, path_popping
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Stopped
 
 from .shared.console import Console
 from .shared.files import labels
+from .shared.interrupts import GracefulStop
 from .shared.report import popping_table, rows_table
 
-CLOSE = 0.01  # relative distance of two counts that count as the same
-POPPING_VIEWS = 2  # held-out views before which the dial is turned
-PATH_CAMERAS = 5  # neighbours by name, which a capture takes one after the other
+CLOSE = 0.01  # relative difference up to which two counts are equal
+POPPING_VIEWS = 2  # held-out views in which the dial is turned
+PATH_CAMERAS = 5  # neighbours by name, which are usually photographed one after the other
 
 Job = tuple[str, Gaussians, Tensor | None, float]
-"""A label, Gaussians, which of them (None for all), and the dial value."""
+"""A label, Gaussians, the rows of them that are measured (None for all), and the dial value."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Comparisons:
-    """Runs what was asked for; what is finished when Ctrl-C ends it is kept.
+    """The comparisons that were finished.
 
     Attributes:
-        base_row: the base as it is.
-        ranked: (our dial value, ranked by, the base at as many Gaussians as that keeps).
-        against: (file, that file, ours at the dial value that keeps as many).
-        popping: (what moved, how the picture changed).
+        base_row: the unadapted base with all its Gaussians.
+        ranked: (row of the model, ranking, the base pruned by that ranking to the same count).
+        against: (file, its row, row of the model at the dial value with the same count).
+        popping: (what moves, how the image changes).
+        interrupted: Ctrl-C ended them early.
     """
 
-    model: Gaussians
-    scene: Scene
-    metrics: Mapping[str, Metric]
-    console: Console
     base_row: Row | None = None
-    ranked: list[tuple[Row, str, Row]] = field(default_factory=list)
-    against: list[tuple[str, Row, Row]] = field(default_factory=list)
-    popping: list[tuple[str, Popping]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-    def run(
-        self, rows: Sequence[Row], base: Gaussians | None, others: Mapping[str, Gaussians], with_popping: bool
-    ) -> bool:
-        """Returns whether Ctrl-C cut it short.
-
-        Args:
-            rows: of the model, at whose counts the base is ranked; a file with a dial is measured at their values.
-        """
-        try:
-            if base is not None:
-                self._rank(rows, base)
-            if others:
-                self._match(rows, others)
-            if with_popping:
-                self._pop(max(row.virtual_scale for row in rows))
-        except KeyboardInterrupt:
-            return True
-        return False
+    ranked: tuple[tuple[Row, str, Row], ...] = ()
+    against: tuple[tuple[str, Row, Row], ...] = ()
+    popping: tuple[tuple[str, Popping], ...] = ()
+    notes: tuple[str, ...] = ()
+    interrupted: bool = False
 
     def report(self) -> dict[str, Any]:
         """For --json."""
@@ -85,7 +66,7 @@ class Comparisons:
         }
 
     def text(self) -> str:
-        """For the console; nothing where nothing was asked for."""
+        """For the console; empty without comparisons."""
         parts = []
         if self.base_row:
             marked = [("base", self.base_row)]
@@ -93,78 +74,117 @@ class Comparisons:
                 label = f"s={ours.virtual_scale:g}"
                 marked += [(label, ours)] if (label, ours) not in marked else []
                 marked.append((by, row))
-            title = "beside the base, neither adapted nor faded, cut to the same counts by rank:"
+            title = "the unadapted base, pruned to the same counts by two rankings:"
             parts.append(f"{title}\n{rows_table(marked)}")
         if self.against:
             marked = []
             for path, theirs, ours in self.against:
                 marked += [(path, theirs), (f"s={ours.virtual_scale:.4g}", ours)]
-            parts.append(f"other files, and below each the dial value that keeps as many:\n{rows_table(marked)}")
+            parts.append(f"other files, each followed by the dial value with the same count:\n{rows_table(marked)}")
         if self.popping:
             parts.append(popping_table(self.popping))
         return "".join(f"\n{part}\n" for part in parts)
 
-    def _rank(self, rows: Sequence[Row], base: Gaussians) -> None:
+
+def compare(
+    model: Gaussians, rows: Sequence[Row], base: Gaussians | None, others: Mapping[str, Gaussians], scene: Scene,
+    metrics: Mapping[str, Metric], console: Console, with_popping: bool,
+) -> Comparisons:  # fmt: skip
+    """Measures what was requested; after Ctrl-C, what is finished.
+
+    Args:
+        rows: of the model: the base is pruned to their counts, and other files with a dial are measured at their
+            dial values.
+    """
+    stop, found = GracefulStop(), Comparisons()
+    run = _Comparing(model, scene, metrics, console, stop)
+    with stop.listening():
+        try:
+            for base_row, ranked in run.ranked(rows, base) if base is not None else ():
+                found = replace(found, base_row=base_row, ranked=(*found.ranked, *ranked))
+            for notes, against in run.against(rows, others) if others else ():
+                found = replace(found, notes=(*found.notes, *notes), against=(*found.against, *against))
+            for notes, popping in run.popping(max(row.virtual_scale for row in rows)) if with_popping else ():
+                found = replace(found, notes=(*found.notes, *notes), popping=(*found.popping, *popping))
+        except Stopped:
+            return replace(found, interrupted=True)
+    return found
+
+
+@dataclass(frozen=True)
+class _Comparing:
+    """The measurements; each yields what is new once it is finished."""
+
+    model: Gaussians
+    scene: Scene
+    metrics: Mapping[str, Metric]
+    console: Console
+    stop: GracefulStop
+
+    def ranked(self, rows: Sequence[Row], base: Gaussians) -> Iterator[tuple[Row, list[tuple[Row, str, Row]]]]:
         with self.console.meter("removal error") as meter:
-            orders = rankings(base, self.scene.train, lambda done, total: meter.update(done / total, f"{done}/{total}"))
+            orders = rankings(base, self.scene.train, self.stop.heeding(meter))
         wanted = [(row, by, order) for row in rows for by, order in orders.items()]
         jobs: list[Job] = [("base", base, None, 1.0)]
         jobs += [(by, base, order[: round(row.kept)], 1.0) for row, by, order in wanted]
         found = self._measured(jobs)
-        self.base_row = next(found)
+        base_row = next(found)
+        yield base_row, []
         for (ours, by, _), row in zip(wanted, found, strict=True):
-            self.ranked.append((ours, by, replace(row, kept_share=row.kept / len(base))))  # not of what was selected
+            yield base_row, [(ours, by, replace(row, kept_share=row.kept / len(base)))]  # of the whole base
 
-    def _match(self, rows: Sequence[Row], others: Mapping[str, Gaussians]) -> None:
+    def against(
+        self, rows: Sequence[Row], others: Mapping[str, Gaussians]
+    ) -> Iterator[tuple[list[str], list[tuple[str, Row, Row]]]]:
         cameras = [view.camera for view in self.scene.test]
-        jobs: list[Job] = []
-        with self.console.status("looking for the dial values that keep as many ..."):
+        jobs, notes = list[Job](), list[str]()
+        with self.console.status("finding the dial values with the same counts ..."):
             for path, other in others.items():
                 for theirs in [row.virtual_scale for row in rows] if other.sigma_d is not None else [1.0]:
                     count = mean_kept(other, cameras, theirs)
                     ours = matching_dial(self.model, cameras, count)
                     jobs += [(path, other, None, theirs), (path, self.model, None, ours)]
-                    self._note_count(path, count, mean_kept(self.model, cameras, ours))
+                    notes += self._count_note(path, count, mean_kept(self.model, cameras, ours))
+        yield notes, []
         found = self._measured(jobs)
         for (path, *_), their_row, our_row in zip(jobs[::2], found, found, strict=True):
-            self.against.append((path, their_row, our_row))
+            yield [], [(path, their_row, our_row)]
 
-    def _note_count(self, path: str, count: float, kept: float) -> None:
-        if abs(kept - count) > CLOSE * count:
-            more = "at most" if kept < count else "at least"
-            self.notes.append(f"{path} keeps {count:,.0f} Gaussians; beside it is the model with {more} {kept:,.0f}")
-            self.console.say(self.notes[-1])
-
-    def _measured(self, jobs: Sequence[Job]) -> Iterator[Row]:
-        """The jobs' rows, one by one, under one progress bar."""
-        with self.console.meter("compare") as meter:
-            for i, (label, gaussians, chosen, virtual_scale) in enumerate(jobs):
-                shown = gaussians if chosen is None else gaussians.select(chosen)
-
-                def update(done: int, total: int, before: int = i, label: str = label) -> None:
-                    meter.update((before + done / total) / len(jobs), label)
-
-                yield evaluate(shown, self.scene.test, [virtual_scale], metrics=self.metrics, progress=update)[0]
-
-    def _pop(self, max_sv: float) -> None:
+    def popping(self, max_sv: float) -> Iterator[tuple[list[str], list[tuple[str, Popping]]]]:
         if self.model.sigma_d is None or max_sv <= 1:
-            self.notes.append("no popping is measured: there is no dial to turn, or only s = 1 was asked for")
-            self.console.say(self.notes[-1])
+            yield [self._noted("popping is not measured: there is no dial, or only s = 1 was requested")], []
             return
-        test = self.scene.test
+        test, walk = self.scene.test, _neighbours([*self.scene.train, *self.scene.test])
         views = [test[(2 * k + 1) * len(test) // (2 * POPPING_VIEWS)] for k in range(min(POPPING_VIEWS, len(test)))]
-        walk = _neighbours([*self.scene.train, *test])
-        jobs = [(f"dial, {v.camera.name}", partial(dial_popping, self.model, v.camera, max_sv)) for v in views]
+        jobs: list[tuple[str, Callable[..., Popping]]] = [
+            (f"dial, {v.camera.name}", partial(dial_popping, self.model, v.camera, max_sv)) for v in views
+        ]
         if len(walk) > 1:
             path = partial(path_popping, self.model, [view.camera for view in walk], max_sv)
             jobs.append((f"camera, {walk[0].camera.name} to {walk[-1].camera.name}, s = {max_sv:g}", path))
         with self.console.meter("popping") as meter:
-            for i, (moved, measure) in enumerate(jobs):
+            for i, (moved, sweep) in enumerate(jobs):
+                yield [], [(moved, sweep(progress=self.stop.heeding(meter.part(i, len(jobs), moved))))]
 
-                def update(done: int, total: int, before: int = i, moved: str = moved) -> None:
-                    meter.update((before + done / total) / len(jobs), moved)
+    def _measured(self, jobs: Sequence[Job]) -> Iterator[Row]:
+        with self.console.meter("compare") as meter:
+            for i, (label, gaussians, chosen, virtual_scale) in enumerate(jobs):
+                shown = gaussians if chosen is None else gaussians.select(chosen)
+                listener = self.stop.heeding(meter.part(i, len(jobs), label))
+                rows = evaluate(shown, self.scene.test, [virtual_scale], metrics=self.metrics, progress=listener)
+                if not rows:
+                    raise Stopped(f"stopped at {label}")
+                yield rows[0]
 
-                self.popping.append((moved, measure(progress=update)))
+    def _count_note(self, path: str, count: float, kept: float) -> list[str]:
+        if abs(kept - count) <= CLOSE * count:
+            return []
+        more = "at most" if kept < count else "at least"
+        return [self._noted(f"{path} keeps {count:,.0f} Gaussians; the model is compared with {more} {kept:,.0f}")]
+
+    def _noted(self, text: str) -> str:
+        self.console.say(text)
+        return text
 
 
 def _neighbours(views: Sequence[View]) -> list[View]:

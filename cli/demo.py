@@ -1,4 +1,4 @@
-"""``clod-adapt demo``: the main job on a scene that comes with the package, and pictures of the result."""
+"""``clod-adapt demo``: adapts a scene that comes with the package, and draws figures of the result."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from clod_adapter.demo.pictures import Panel, dial_strip, quality_curve
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.claims import output_lock
+from clod_adapter.io.lock import output_lock
 from clod_adapter.io.scene.load import load_scene
 from clod_adapter.render import render
-from clod_adapter.training.loop import Progress
 
 from .adapt import run as adapt
 from .commands.adapt import ADAPT
@@ -43,18 +42,18 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def show(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """What ``run`` does while no other run writes to the folder."""
+    """Runs the demo; the caller holds the lock of the folder."""
     console, watch = Console(args.quiet), Stopwatch()
     capture, base, model = folder / "capture", folder / "base.ply", folder / "gallery.ply"
     pictures = {"dial": folder / "dial.png", "curve": folder / "curve.png"}
     check_outputs((), (), beside=[*vars(Outputs.of(str(base), str(model))).values(), *pictures.values()])
     if base.exists() and not capture.exists():
-        raise ClodError(f"{base}: is there without {capture}, so it is not the demo's; choose another --out")
+        raise ClodError(f"{base}: exists without {capture}, so the demo did not make it; choose another --out")
     prepare_kernels(console)
     with announced_compiling(console):
         prepare(capture, base, console)
     report = adapt.run(adapt_arguments(args, base, capture, model))
-    for path in pictures.values():  # those of an earlier run are of other files
+    for path in pictures.values():  # of an earlier run
         path.unlink(missing_ok=True)
     if report["rows"]:
         draw(capture, model, report, pictures)
@@ -65,14 +64,14 @@ def show(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
 
 def check_extra() -> None:
-    """Refuses, before minutes are spent, to start without the packages that only the demo needs."""
+    """Raises the ClodError of a missing package before minutes are spent."""
     for module, package in EXTRA.items():
         if importlib.util.find_spec(module) is None:
             raise ClodError(f"the demo needs {package}: pip install 'clod-adapter[demo]'")
 
 
 def adapt_arguments(args: argparse.Namespace, base: Path, capture: Path, model: Path) -> argparse.Namespace:
-    """What the main job's own parser makes of the command line for the demo's files."""
+    """The arguments of the main command for the demo's files."""
     words = [f"--images={capture}", f"--max-sv={MAX_SV:g}", f"--iters={ADAPT_STEPS}", f"--out={model}"]
     words += [f"--{name}" for name in ("quiet", "json") if getattr(args, name)]
     words += ["--resume"] if Outputs.of(str(base), str(model)).state.exists() else []
@@ -82,14 +81,14 @@ def adapt_arguments(args: argparse.Namespace, base: Path, capture: Path, model: 
 def print_next(folder: Path, pictures: dict[str, Path], watch: Stopwatch) -> None:
     print(f"\n{duration(watch.total())} for the demo; everything is in {folder.resolve()}")
     if pictures:
-        print("look at dial.png, a view over the dial, and curve.png, quality against the number of Gaussians")
+        print("see dial.png, a view at several dial values, and curve.png, quality against the number of Gaussians")
     else:
-        print("no pictures: the measurements that they show were interrupted")
+        print("no figures: the measurements were interrupted")
     print("next, a splat of your own:\n  clod-adapt YOURS.ply --images YOUR_SCENE")
 
 
 def prepare(capture: Path, base: Path, console: Console) -> None:
-    """Makes the capture and the base checkpoint, or says that those there are used."""
+    """Makes the capture and the base checkpoint, unless they exist."""
     # Here and not above: the ray tracer brings scikit-image, whose absence check_extra is to report first.
     from clod_adapter.demo.fit import fit_base
     from clod_adapter.demo.gallery import make_gallery, write_gallery
@@ -102,23 +101,17 @@ def prepare(capture: Path, base: Path, console: Console) -> None:
         gallery = make_gallery()
     else:
         with console.meter("ray tracing") as meter:
-            gallery = write_gallery(
-                capture, progress=lambda done, total: meter.update(done / total, f"view {done}/{total}")
-            )
+            gallery = write_gallery(capture, progress=meter)
     points, colors = gallery.sample_points(POINTS)
     with console.meter("base") as meter:
-
-        def follow(progress: Progress) -> None:
-            meter.update(progress.share, f"{progress.done}/{progress.total}")
-
-        fitted = fit_base(points, colors, load_scene(capture), iters=FIT_STEPS, progress=follow)
+        fitted = fit_base(points, colors, load_scene(capture), iters=FIT_STEPS, progress=meter)
     save(base, fitted)
     console.say(f"trained a plain checkpoint of {len(fitted):,} Gaussians: {base}")
 
 
 @torch.no_grad()
 def draw(capture: Path, model: Path, report: dict[str, Any], pictures: dict[str, Path]) -> None:
-    """One held-out view over the dial, and the curve over all held-out views."""
+    """Draws a held-out view at several dial values, and the quality curve of all held-out views."""
     view, gaussians = load_scene(capture).test[VIEW], load(model).gaussians
     panels = [Panel(view.image.numpy())]
     for row in evaluate(gaussians, [view], DIALS, repeats=5):

@@ -1,4 +1,4 @@
-"""``clod-adapt inspect``: what a file is, on one screen."""
+"""``clod-adapt inspect``: the kind and contents of a file, on one screen."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.calibration import Calibration
 from clod_adapter.inspection.report import Inspection, Splat, inspect
 from clod_adapter.inspection.statistics import Spread
 from clod_adapter.io.settings import WARNING
-from clod_adapter.version import package_version
 
 from .shared.console import duration
 from .shared.files import size
 
-WIDTH = 13  # of the names at the left
-MOST_ROWS = 8  # of a calibration: the first and last are always shown
-MOST_LINES = 6  # of oddities, of what is left out, and of what the file says
-LONGEST = 100  # letters of a comment, of which a file may have any number
+WIDTH = 13  # of the labels
+MOST_ROWS = 8  # of a calibration, including the first and last
+MOST_LINES = 6  # under one label
+LONGEST = 100  # characters of a comment
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def lines_of(found: Inspection) -> list[str]:
-    """What is printed, line by line."""
+    """The lines to print."""
     lines = [f"{found.path} ({size(Path(found.path))})", _line("what", found.what)]
     if found.writer:
         by_us = found.writer.startswith("clod-adapter")
@@ -38,8 +38,8 @@ def lines_of(found: Inspection) -> list[str]:
         lines += splat_lines(found.splat)
     if found.about is not None:
         lines += tensor_lines(found.about)
-    lines += _block("odd", [oddity.says for oddity in found.oddities])
-    lines += _block("left out", found.left_out)
+    lines += _block("anomaly", [anomaly.says for anomaly in found.anomalies])
+    lines += _block("excluded", found.left_out)
     warnings = [note.removeprefix(WARNING) for note in found.notes if note.startswith(WARNING)]
     lines += _block("note", [note for note in found.notes if not note.startswith(WARNING)])
     return lines + _block("warning", warnings)
@@ -52,7 +52,7 @@ def splat_lines(splat: Splat) -> list[str]:
     lines = [_line("Gaussians", count), _line("harmonics", _harmonics(splat))]
     if splat.encoding:
         names = ", ".join(splat.extra[:6]) + (", ..." if len(splat.extra) > 6 else "")
-        more = f", of them unknown here: {names}" if splat.extra else ""
+        more = f", not read: {names}" if splat.extra else ""
         lines.append(_line("layout", f"{splat.encoding}, {len(splat.columns)} properties{more}"))
     lines += _block("says", (comment[:LONGEST] for comment in splat.comments))
     rows = [*zip("xyz", v.position, strict=True), ("scale", v.scale), ("opacity", v.opacity)]
@@ -65,12 +65,12 @@ def splat_lines(splat: Splat) -> list[str]:
     if splat.dial is None:
         return [*lines, _line("dial", "none: no sigma_d")]
     a = splat.dial.attenuation
-    lines.append(_line("dial", f"s = 1 to {a.max_sv:g}, {a.cut} cut at tau, distances {_unit(a)}"))
+    lines.append(_line("dial", f"s = 1 to {a.max_sv:g}, {a.cut} culling at tau, distances {_unit(a)}"))
     return lines + calibration_lines(splat.dial.calibration)
 
 
 def spread_table(rows: Sequence[tuple[str, Spread]]) -> list[str]:
-    """A line for each range, under a line of names."""
+    """One line per range, below the column names."""
     names = ("least", "1 %", "median", "99 %", "greatest")
     lines = [" " * WIDTH + "".join(f"{name:>11}" for name in names)]
     for name, spread in rows:
@@ -80,9 +80,9 @@ def spread_table(rows: Sequence[tuple[str, Spread]]) -> list[str]:
 
 
 def calibration_lines(calibration: Calibration | None) -> list[str]:
-    """The table that the file carries, thinned out where it is long."""
+    """The calibration of the file, with at most MOST_ROWS rows."""
     if calibration is None:
-        return [_line("calibration", "none: --fps and --psnr-drop have nothing to go by")]
+        return [_line("calibration", "none, so --fps and --psnr-drop cannot be solved from it")]
     c, rows = calibration, list(calibration.rows)
     if len(rows) > MOST_ROWS:
         rows = [rows[round(k * (len(rows) - 1) / (MOST_ROWS - 1))] for k in range(MOST_ROWS)]
@@ -95,25 +95,23 @@ def calibration_lines(calibration: Calibration | None) -> list[str]:
 
 
 def tensor_lines(about: dict[str, Any]) -> list[str]:
-    """Of an adapter or a training state."""
+    """The lines of an adapter or a training state."""
     lines = [_line("Gaussians", f"{about['count']:,}")]
     if about["kind"] == "state":
         after = f"{about['steps']} steps in {duration(about['seconds'])}, loss {about['loss']:.4g}"
         return [*lines, _line("after", after), _line("of", ", ".join(f"{k} {v}" for k, v in about["belongs"].items()))]
     lines.append(_line("for the file", f"with SHA-256 {about['base']}"))
-    lines.append(
-        _line("changes", ", ".join(f"{k} ({v})" for k, v in about["updates"].items()) or "nothing but sigma_d")
-    )
+    lines.append(_line("changes", ", ".join(f"{k} ({v})" for k, v in about["updates"].items()) or "only sigma_d"))
     settings = ", ".join(f"{key} {value}" for key, value in about["config"].items() if key in SETTINGS)
-    lines.append(_line("trained with", settings or "settings that are not known"))
+    lines.append(_line("trained with", settings or "unknown settings"))
     lines += ["", *spread_table([("sigma_d", Spread(**about["sigma"]))]), ""]
     a = about["attenuation"]
-    lines.append(_line("dial", f"s = 1 to {a['max_sv']:g}, {a['cut']} cut at tau = {a['tau']:.3g}"))
+    lines.append(_line("dial", f"s = 1 to {a['max_sv']:g}, {a['cut']} culling at tau = {a['tau']:.3g}"))
     calibration = about["calibration"]
     return lines + calibration_lines(calibration and Calibration.from_dict(calibration))
 
 
-SETTINGS = ("max_sv", "iters", "seed", "tau", "cut")  # of those trained with, the ones worth a line
+SETTINGS = ("max_sv", "iters", "seed", "tau", "cut")  # of the training settings, those shown
 
 
 def _harmonics(splat: Splat) -> str:

@@ -1,4 +1,4 @@
-"""The ``clod-adapt`` command: picks the command, runs it, and turns what went wrong into one line."""
+"""The ``clod-adapt`` command: selects the command, runs it, and turns errors into one line."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from contextlib import nullcontext, redirect_stdout
 from importlib import import_module
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
-from clod_adapter.version import package_version
+from clod_adapter.progress import Stopped
 
 from .commands.adapt import ADAPT
 from .commands.apply import APPLY
@@ -28,14 +29,14 @@ from .commands.parser import Parser, make_parser
 from .commands.render import RENDER
 from .commands.robustness import ROBUSTNESS
 from .commands.view import VIEW
-from .shared.interrupts import sigterm_as_interrupt
+from .shared.interrupts import interrupt_as_stopped, sigterm_as_interrupt
 from .shared.launch import launched, silence_but_first
 from .shared.shortages import check_addresses, shortage
 
 PROG = "clod-adapt"
-REPORT = "please report it, with the lines above, as an issue of the repository that this program is from"
+REPORT = "please report it, with the lines above, as an issue of this program's repository"
 
-# Adapting is the main job and needs no word.
+# Adapting is the main command and has no name.
 COMMANDS: dict[str, Command] = {
     "view": VIEW, "inspect": INSPECT, "eval": EVALUATE, "render": RENDER, "export": EXPORT, "apply": APPLY,
     "robustness": ROBUSTNESS, "demo": DEMO, "doctor": DOCTOR,
@@ -43,10 +44,9 @@ COMMANDS: dict[str, Command] = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs a command line; returns its exit code: 0, 2 for bad input, 130 when interrupted with nothing written.
+    """Runs a command line; returns its exit code: 0, 2 for bad input, 130 if interrupted with nothing written.
 
-    A report that has an exit_code of its own ends with that. An error that nobody foresaw is shown as the traceback
-    that it is, and ends with 1.
+    A report may have its own exit_code. An unexpected error prints its traceback and returns 1.
     """
     print_any_name()
     try:
@@ -55,14 +55,14 @@ def main(argv: list[str] | None = None) -> int:
     except Exception:
         traceback.print_exc()
         print(
-            f"{PROG}: error: this is a fault of {PROG} {package_version()}, not of what was given: {REPORT}",
+            f"{PROG}: error: this is a bug in {PROG} {package_version()}, not in the input: {REPORT}",
             file=sys.stderr,
         )
         return 1
 
 
 def print_any_name() -> None:
-    """Makes stdout and stderr escape what their encoding has no letter for: a file's name may hold it."""
+    """Makes stdout and stderr escape characters that their encoding lacks, as in names of files."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -72,20 +72,18 @@ def _main(argv: list[str] | None) -> int:
     words = sys.argv[1:] if argv is None else argv
     name = words[0] if words and words[0] in COMMANDS else ""
     try:
-        args = build_parser(name).parse_args(words[1:] if name else words)
-        code = run_here(COMMANDS.get(name, ADAPT), args)
-        sys.stdout.flush()
+        with interrupt_as_stopped():
+            args = build_parser(name).parse_args(words[1:] if name else words)
+            code = run_here(COMMANDS.get(name, ADAPT), args)
+            sys.stdout.flush()
     except ClodError as error:
         print(f"{PROG}: error: {' '.join(str(error).splitlines())}", file=sys.stderr)
         return 2
-    except (KeyboardInterrupt, SystemError) as error:
-        # A Ctrl-C within the dispatching of a compiled function comes as a SystemError.
-        if isinstance(error, SystemError) and not isinstance(error.__cause__, KeyboardInterrupt):
-            raise
+    except Stopped:
         print(f"{PROG}: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        # The reader of a pipe is gone; without this Python complains once more when it flushes at exit.
+        # The reader of a pipe has ended; without this Python reports it again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (MemoryError, RuntimeError, ImportError, OSError) as error:
@@ -101,7 +99,7 @@ def _main(argv: list[str] | None) -> int:
 
 
 def run_here(command: Command, args: argparse.Namespace) -> int:
-    """Runs a command, and returns its exit code; of several processes the first does, and the others help it adapt."""
+    """Runs a command and returns its exit code. Of several processes the first runs it; the others only train."""
     launch = launched()
     if launch.size == 1:
         return run(command, args)
@@ -118,11 +116,7 @@ def run_here(command: Command, args: argparse.Namespace) -> int:
 
 
 def run(command: Command, args: argparse.Namespace) -> int:
-    """Runs a command and prints its report where --json asks for it; a command without one has printed its own.
-
-    Returns:
-        The exit code that the report has, or 0.
-    """
+    """Runs a command, prints its report with --json, and returns the report's exit code, or 0."""
     from .shared.report import jsonable
 
     command.check(args)
@@ -136,7 +130,7 @@ def run(command: Command, args: argparse.Namespace) -> int:
 
 
 def import_command(command: Command, args: argparse.Namespace) -> Any:
-    """The command's module, with torch and all, which takes a second or two."""
+    """The command's module; importing it, with torch, takes a second or two."""
     from .shared.console import Console
 
     check_addresses()
@@ -148,18 +142,18 @@ def import_command(command: Command, args: argparse.Namespace) -> Any:
         with Console(args.quiet).status("starting ..."):
             return import_module(name)
     finally:
-        gc.freeze()  # what was imported stays: later collections, one of them at exit, need not go through it
+        gc.freeze()  # later collections, one of them at exit, skip what was imported
         gc.enable()
 
 
 def build_parser(name: str) -> Parser:
-    """The parser of a command; of the main job for an empty name."""
+    """The parser of a command; of the main command for an empty name."""
     command = COMMANDS.get(name, ADAPT)
     parser = make_parser(command, f"{PROG} {name}".strip())
     if not name:
         others = "\n".join(f"  {PROG} {word:<10} {other.summary}" for word, other in COMMANDS.items())
         parser.epilog = f"other commands, each with its own --help:\n{others}\n\n{command.epilog}"
-        parser.add_argument("--version", action="version", version=f"{PROG} {package_version()}")
+        parser.general.add_argument("--version", action="version", version=f"{PROG} {package_version()}")
     return parser
 
 

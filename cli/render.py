@@ -1,4 +1,4 @@
-"""``clod-adapt render``: the scene's cameras at some dial values, as PNG files."""
+"""``clod-adapt render``: renders the scene's cameras at some dial values to PNG files."""
 
 from __future__ import annotations
 
@@ -14,31 +14,30 @@ from PIL import Image, PngImagePlugin
 from torch import Tensor
 
 from clod_adapter._support.text import file_name
+from clod_adapter._support.version import package_version
 from clod_adapter.cameras import View
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.claims import output_lock
+from clod_adapter.io.lock import output_lock
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
-from clod_adapter.version import package_version
 
 from .shared.antialiasing import with_filter
 from .shared.budgets import solve_dials
 from .shared.console import Console
-from .shared.devices import on_device, pick_device
 from .shared.files import make_folder
-from .shared.inputs import read_checkpoint, read_scene
 from .shared.kernels import prepare_kernels
 from .shared.measure import choose_dials
+from .shared.models import read_model_and_scene
 from .shared.outputs import check_no_input, check_ours
 from .shared.report import Stopwatch
 from .shared.views import pick_views
 
 
 @dataclass(frozen=True)
-class Picture:
-    """What was written for a view: per dial value the Gaussians kept, and dB against the photograph."""
+class Written:
+    """An image file of a view; per dial value the Gaussians kept, and PSNR (dB) against the photograph."""
 
     view: str
     file: str
@@ -48,32 +47,19 @@ class Picture:
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
-    device = pick_device(args.device, console)
-    model = on_device(read_checkpoint(args.model, console, args.activated), device)
-    scene = read_scene(args.images, console, model.origin)
+    model, _, scene, device = read_model_and_scene(args, console)
     prepare_kernels(console, device, training=False)
     model = with_filter(model, args, console, [*scene.test, *scene.train])
     views = pick_views(scene, args.views)
-    written = [out / name for name in files(views)]
-    check_no_input(written, [args.model], args.images)
-    for path in written:
-        check_ours(path)
+    check_images([out / name for name in image_names(views)], args)
     solved, notes = solve_dials(args, model, [view.camera for view in views], console)
     dials, beyond = choose_dials(solved or [1.0], model.gaussians.attenuation)
     notes += beyond
     for note in notes:
         console.say(note)
-    gaussians, pictures, interrupted = model.gaussians.without_empty_bands(), [], False
+    gaussians = model.gaussians.without_empty_bands()
     make_folder(out)
-    try:
-        with output_lock(out / "pictures", of=out), console.meter("render") as meter:
-            for picture in draw(gaussians, views, dials, out, args.beside):
-                pictures.append(picture)
-                meter.update(len(pictures) / len(views), f"{len(pictures)}/{len(views)}")
-    except KeyboardInterrupt:
-        if not pictures:
-            raise
-        interrupted = True
+    pictures, interrupted = write_all(write_images(gaussians, views, dials, out, args.beside), len(views), out, console)
     print(summary(pictures, dials, len(gaussians), out))
     return {
         "command": "render", "version": package_version(), "model": args.model, "scene": args.images,
@@ -83,42 +69,64 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def files(views: Sequence[View]) -> list[Path]:
-    """For each view the PNG's name: that of its photograph, whose suffix stays where names would else collide."""
+def check_images(paths: Sequence[Path], args: argparse.Namespace) -> None:
+    check_no_input(paths, [args.model], args.images)
+    for path in paths:
+        check_ours(path)
+
+
+def image_names(views: Sequence[View]) -> list[Path]:
+    """The PNG's name for each view: that of its photograph, with its suffix only where names would collide."""
     paths = [Path(file_name(str(Path(*PureWindowsPath(view.camera.name).parts)))) for view in views]
     short = [path.with_suffix(".png") for path in paths]
     return short if len(set(short)) == len(short) else [path.with_name(f"{path.name}.png") for path in paths]
 
 
+def write_all(images: Iterator[Written], total: int, out: Path, console: Console) -> tuple[list[Written], bool]:
+    """Writes the images with a progress bar; those written, and whether Ctrl-C ended it after the first."""
+    written = list[Written]()
+    try:
+        with output_lock(out / "pictures", of=out), console.meter("render") as meter:
+            for image in images:
+                written.append(image)
+                meter.update(len(written) / total, f"{len(written)}/{total}")
+    except KeyboardInterrupt:
+        if not written:
+            raise
+        return written, True
+    return written, False
+
+
 @torch.no_grad()
-def draw(
+def write_images(
     gaussians: Gaussians, views: Sequence[View], dials: Sequence[float], out: Path, beside: bool
-) -> Iterator[Picture]:
-    """Writes a picture for each view: the dial values from left to right, behind the photograph with ``beside``."""
-    for view, name in zip(views, files(views), strict=True):
+) -> Iterator[Written]:
+    """Writes an image per view: the dial values from left to right, after the photograph with ``beside``."""
+    for view, name in zip(views, image_names(views), strict=True):
         shown = [render(gaussians, view.camera, dial) for dial in dials]
-        panels = [picture.pixels.cpu() for picture in shown]
+        panels = [rendering.pixels.cpu() for rendering in shown]
         write_png(out / name, torch.cat([view.image, *panels] if beside else panels, dim=1))
-        kept = [int(picture.kept.sum()) for picture in shown]
-        yield Picture(view.camera.name, str(out / name), kept, [psnr(p.image, view.image) for p in shown])
+        kept = [int(rendering.kept.sum()) for rendering in shown]
+        errors = [psnr(rendering.image, view.image) for rendering in shown]
+        yield Written(view.camera.name, str(out / name), kept, errors)
 
 
 def write_png(path: Path, pixels: Tensor) -> None:
-    """Writes ``[H, W, 3]`` uint8, in a folder that is made where it is missing."""
+    """Writes ``[H, W, 3]`` uint8 pixels; makes the folder if it is missing."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ClodError(f"{path.parent}: cannot be made ({error.strerror or error}); choose another --out") from error
     with atomic_path(path) as temporary:
         about = PngImagePlugin.PngInfo()
-        about.add_text("Software", f"clod-adapter {package_version()}")  # by which a later run knows it for its own
+        about.add_text("Software", f"clod-adapter {package_version()}")  # check_ours looks for it
         Image.fromarray(pixels.cpu().numpy()).save(temporary, pnginfo=about)
 
 
-def summary(pictures: Sequence[Picture], dials: Sequence[float], total: int, out: Path) -> str:
-    lines = [f"wrote {len(pictures)} picture{'s' * (len(pictures) != 1)} to {out}"]
+def summary(pictures: Sequence[Written], dials: Sequence[float], total: int, out: Path) -> str:
+    lines = [f"wrote {len(pictures)} image{'s' * (len(pictures) != 1)} to {out}"]
     for k, dial in enumerate(dials):
         kept = fmean(picture.kept[k] for picture in pictures)
         error = fmean(picture.psnr[k] for picture in pictures)
-        lines.append(f"  s = {dial:.5g}: {kept:,.0f} of {total:,} Gaussians, {error:.2f} dB, means over the pictures")
+        lines.append(f"  s = {dial:.5g}: {kept:,.0f} of {total:,} Gaussians, {error:.2f} dB, means over the images")
     return "\n".join(lines)

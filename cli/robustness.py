@@ -1,4 +1,4 @@
-"""``clod-adapt robustness``: checkpoints adapted at several ranges of the dial; one figure, one CSV, one JSON."""
+"""``clod-adapt robustness``: adapts checkpoints at several ranges of the dial; writes a figure, a CSV and a JSON."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from clod_adapter._support.text import as_text
+from clod_adapter._support.version import package_version
 from clod_adapter.cameras import Scene
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.robustness import Outcome, adapt_at_range, baseline, scene_fingerprint
+from clod_adapter.evaluation.robustness import CellResult, adapt_at_range, baseline, scene_fingerprint
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.claims import output_lock
+from clod_adapter.io.lock import output_lock
+from clod_adapter.progress import Listener, Phase, Progress, Stopped
 from clod_adapter.report.robustness_figure import robustness_figure
-from clod_adapter.training.loop import Progress
-from clod_adapter.version import package_version
 
 from .commands.settings import make_configs
 from .robustness_cells import Cell, cells_of
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     found = {cell.name: read for cell in cells if (read := cell.read())}
     missing, notes = [cell for cell in cells if cell.name not in found], list[str]()
     if found:
-        console.say(f"{len(found)} of {len(cells)} cells are there already: {', '.join(found)}")
+        console.say(f"{len(found)} of {len(cells)} cells are done already: {', '.join(found)}")
     if missing:
         with watch.time("kernels"):
             for screen_filter in dict.fromkeys(each.gaussians.screen_filter for each in checkpoints):
@@ -65,14 +65,16 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             for checkpoint in checkpoints:
                 if any(cell.checkpoint is checkpoint for cell in missing):
                     notes += require_alignment(checkpoint, scene, args, console)[1]
-    make_folder(folder)  # only now: what cannot be read, or does not fit, leaves none behind
+    make_folder(folder)  # only now: input that cannot be read leaves no folder
     make_folder(folder / "cells")
     check_outputs(outputs.values(), args.ply, args.images)
     with output_lock(outputs["json"], of=folder), stop.listening():
         with watch.time("cells"):
-            interrupted = run_cells(missing, scene, found, console, stop)
+            done = run_cells(missing, scene, console, stop)
+        found |= done
+        interrupted = len(done) < len(missing)
         if not found:
-            raise KeyboardInterrupt
+            raise Stopped("stopped before the first cell was finished")
         report = describe(args, cells, found, interrupted, [*scene.notes, *notes]) | {
             "views": len(scene.test), "machine": machine(), "seconds": watch.report(),
             "outputs": {k: str(v) for k, v in outputs.items()},
@@ -83,18 +85,18 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def read_checkpoints(args: argparse.Namespace, console: Console) -> list[Checkpoint]:
-    """All of them, relative to one origin."""
+    """Reads all checkpoints, relative to one origin."""
     found, device = list[Checkpoint](), pick_device(args.device, console)
     for path in args.ply:
         origin = found[0].origin if found else None
         found.append(on_device(read_checkpoint(path, console, args.activated, origin), device))
         if found[-1].gaussians.sigma_d is not None:
-            console.say(f"  note: the dial of {path} plays no part: it is taken as a checkpoint without one")
+            console.say(f"  note: the dial of {path} is ignored")
     return found
 
 
 def plan(args: argparse.Namespace, checkpoints: Sequence[Checkpoint], scene: Scene) -> list[Cell]:
-    """All cells; every range is measured at the dial values of the widest, and at the end of its own."""
+    """All cells. Every range is measured at the dial values of the widest one and at its own end."""
     configs = make_configs(args)
     dials = sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)})
     seen, cells = scene_fingerprint(scene), list[Cell]()
@@ -103,54 +105,54 @@ def plan(args: argparse.Namespace, checkpoints: Sequence[Checkpoint], scene: Sce
     return cells
 
 
-def run_cells(
-    cells: Sequence[Cell], scene: Scene, found: dict[str, dict[str, Any]], console: Console, stop: GracefulStop
-) -> bool:
-    """Runs the cells and adds them to ``found``; says whether Ctrl-C cut that short."""
+def run_cells(cells: Sequence[Cell], scene: Scene, console: Console, stop: GracefulStop) -> dict[str, dict[str, Any]]:
+    """Runs the cells; returns those that were finished, by name."""
+    found: dict[str, dict[str, Any]] = {}
     costs = [cell.cost(len(scene.train), len(scene.test)) for cell in cells]
     with closing(Meter(console, "robustness", slow=True)) as meter:
         for k, cell in enumerate(cells):
-            run_of = CellRun(meter, stop, sum(costs[:k]) / sum(costs), costs[k] / sum(costs), f"{k + 1}/{len(cells)}")
+            before, weight = sum(costs[:k]) / sum(costs), costs[k] / sum(costs)
+
+            def show(
+                now: Progress, before: float = before, weight: float = weight, cell: Cell = cell, k: int = k
+            ) -> None:
+                share, text = position(cell, scene, now)
+                meter.update(before + weight * share, f"{cell.name} ({k + 1}/{len(cells)}) {text}".rstrip())
+
             try:
-                outcome = run_of(cell, scene)
-            except KeyboardInterrupt:
-                if stop.requests > 1:
-                    raise
-                console.say(f"stopping: {cell.name} was not finished and is dropped; the same command goes on with it")
-                return True
+                outcome = run_cell(cell, scene, stop.heeding(show))
+            except Stopped:
+                console.say(f"stopping: {cell.name} was not finished; the same command continues with it")
+                break
             found[cell.name] = cell.write(outcome)
-    return False
+    return found
 
 
-class CellRun:
-    """Runs one cell as the part ``[before, before + weight]`` of all that is to be done."""
+def run_cell(cell: Cell, scene: Scene, progress: Listener) -> CellResult:
+    """Measures one cell.
 
-    def __init__(self, meter: Meter, stop: GracefulStop, before: float, weight: float, count: str):
-        self.meter, self.stop, self.before, self.weight, self.count = meter, stop, before, weight, count
+    Raises:
+        Stopped: ``progress`` returned False.
+    """
+    base = cell.checkpoint.gaussians
+    if cell.config is None:
+        return baseline(base, scene.test, cell.points, progress=progress)
+    return adapt_at_range(
+        base, scene, cell.config, cell.points, fingerprint=cell.checkpoint.fingerprint,
+        origin=cell.checkpoint.origin, progress=progress,
+    )  # fmt: skip
 
-    def __call__(self, cell: Cell, scene: Scene) -> Outcome:
-        base, self.name = cell.checkpoint.gaussians, cell.name
-        self.show(0.0, "")
-        if cell.config is None:
-            return baseline(base, scene.test, cell.points, measured=lambda d, n: self.show(d / n, "baseline"))
-        # The shares that cell.cost has them at.
-        measuring = len(cell.points) * len(scene.test) / cell.cost(len(scene.train), len(scene.test))
 
-        def follow(progress: Progress) -> None:
-            begin, end = {"start": (0.0, 0.04), "order": (0.04, 0.05), "train": (0.05, 1.0)}[progress.phase]
-            of_it = begin + (end - begin) * progress.share
-            self.show((1 - measuring) * of_it, f"step {progress.done}" if progress.phase == "train" else "importance")
-
-        return adapt_at_range(
-            base, scene, cell.config, cell.points, fingerprint=cell.checkpoint.fingerprint,
-            origin=cell.checkpoint.origin, follow=follow,
-            measured=lambda done, total: self.show(1 - measuring * (1 - done / total), "measuring"),
-        )  # fmt: skip
-
-    def show(self, share: float, text: str) -> None:
-        self.meter.update(self.before + self.weight * share, f"{self.name} ({self.count}) {text}".rstrip())
-        if self.stop.requests:
-            raise KeyboardInterrupt
+def position(cell: Cell, scene: Scene, now: Progress) -> tuple[float, str]:
+    """The share of the cell that is done, by the costs of ``cell.cost``, and a text."""
+    if cell.config is None:
+        return now.share, "baseline"
+    measuring = len(cell.points) * len(scene.test) / cell.cost(len(scene.train), len(scene.test))
+    if now.phase == Phase.EVALUATION:
+        return 1 - measuring * (1 - now.share), "measuring"
+    begin, end = {Phase.IMPORTANCE: (0.0, 0.04), Phase.PRUNING_ORDER: (0.04, 0.05)}.get(now.phase, (0.05, 1.0))
+    text = f"step {now.done}" if now.phase == Phase.TRAINING else "importance"
+    return (1 - measuring) * (begin + (end - begin) * now.share), text
 
 
 def describe(
@@ -188,7 +190,7 @@ def write_outputs(report: dict[str, Any], outputs: dict[str, Path], scene: str) 
 
 
 def print_summary(report: dict[str, Any], outputs: dict[str, Path], watch: Stopwatch) -> None:
-    """A line a cell: at s = 1 and at the end of the widest range; of a baseline its counts' ends."""
+    """One line per cell: its first and last row."""
     width = max(len(cell["checkpoint"]) for cell in report["cells"])
     print(f"\n{'checkpoint':<{max(width, 10)}}  range     at the first              at the last")
     for cell in report["cells"]:
@@ -196,7 +198,7 @@ def print_summary(report: dict[str, Any], outputs: dict[str, Path], watch: Stopw
         name = "base" if cell["max_sv"] is None else f"[1, {cell['max_sv']:g}]"
         print(f"{cell['checkpoint']:<{max(width, 10)}}  {name:<8}  {ends[0]}    {ends[1]}")
     if report["missing"]:
-        print(f"\nmissing: {', '.join(report['missing'])}; the same command goes on from here")
+        print(f"\nmissing: {', '.join(report['missing'])}; the same command continues")
     print()
     for path in outputs.values():
         print(path)

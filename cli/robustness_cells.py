@@ -1,4 +1,4 @@
-"""The cells of the robustness experiment on disk: what each is, whether it is there already, and writing it."""
+"""The cells of the robustness experiment on disk."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from clod_adapter._support.text import as_text
+from clod_adapter._support.version import package_version
 from clod_adapter.config import CLASSIC, AdaptConfig
-from clod_adapter.evaluation.robustness import BASELINE_SHARES, Outcome
+from clod_adapter.evaluation.robustness import BASELINE_SHARES, CellResult
 from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.version import package_version
 
 from .shared.report import machine, write_report
 
@@ -23,10 +23,10 @@ class Cell:
 
     Attributes:
         label: names the checkpoint.
-        config: of the adaptation; None of the baseline.
-        points: where it is measured: dial values, or shares of the baseline.
+        config: of the adaptation; None for the baseline.
+        points: dial values, or shares of the baseline, that are measured.
         inputs: fingerprints of checkpoint and scene.
-        folder: of the cells.
+        folder: of all cells.
     """
 
     label: str
@@ -49,12 +49,12 @@ class Cell:
         return self.folder / f"{self.name}.safetensors"
 
     def key(self) -> dict[str, Any]:
-        """What the result depends on, as JSON gives it back."""
+        """Everything that the result depends on, as JSON."""
         config = asdict(self.config) if self.config else None
         return {"version": package_version(), "config": config, "points": list(self.points), **self.inputs}
 
     def read(self) -> dict[str, Any] | None:
-        """The finished cell, or None where there is none of this key."""
+        """The finished cell, or None if there is none with this key."""
         try:
             found = json.loads(self.rows_file.read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -62,21 +62,21 @@ class Cell:
         same = isinstance(found, dict) and found.get("key") == self.key()
         return found if same and (self.config is None or self.adapter_file.is_file()) else None
 
-    def write(self, outcome: Outcome) -> dict[str, Any]:
-        """Writes the adapter and then the rows, whose presence says that the cell is finished."""
+    def write(self, result: CellResult) -> dict[str, Any]:
+        """Writes the adapter and then the rows, which mark the cell as finished."""
         self.rows_file.unlink(missing_ok=True)
-        if outcome.adapter:
-            save_adapter(self.adapter_file, outcome.adapter)
+        if result.adapter:
+            save_adapter(self.adapter_file, result.adapter)
         cell = {
             "checkpoint": as_text(self.label), "max_sv": self.config.max_sv if self.config else None,
-            "adapter": str(self.adapter_file) if outcome.adapter else None, "seconds": round(outcome.seconds, 3),
-            "rows": outcome.rows, "distribution": outcome.distribution, "machine": machine(), "key": self.key(),
+            "adapter": str(self.adapter_file) if result.adapter else None, "seconds": round(result.seconds, 3),
+            "rows": result.rows, "distribution": result.distribution, "machine": machine(), "key": self.key(),
         }  # fmt: skip
         write_report(self.rows_file, cell)
         return cell
 
     def cost(self, train_views: int, test_views: int) -> float:
-        """About how long it takes, in rendered frames; a training step is taken for three."""
+        """Approximate cost in rendered frames; a training step counts as three."""
         measuring = float(len(self.points) * test_views)
         if self.config is None:
             return measuring
@@ -86,7 +86,7 @@ class Cell:
 def cells_of(
     label: str, checkpoint: Checkpoint, configs: list[AdaptConfig], dials: list[float], scene: str, folder: Path
 ) -> list[Cell]:
-    """The baseline of a checkpoint, which is quick, and its ranges."""
+    """The baseline of a checkpoint and its ranges."""
     inputs = {"checkpoint_sha256": checkpoint.fingerprint, "scene_sha256": scene}
     if checkpoint.gaussians.screen_filter != CLASSIC:
         inputs["screen_filter"] = repr(checkpoint.gaussians.screen_filter)

@@ -1,4 +1,4 @@
-"""``clod-adapt view``: the page that shows a file and turns its dial, on loopback until Ctrl-C."""
+"""``clod-adapt view``: serves the page that shows a file, on the loopback address until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import json
 import sys
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.cameras import Camera
 from clod_adapter.io.scene.poses import load_cameras
-from clod_adapter.version import package_version
 from clod_adapter.viewer.page import policy, served_page
 from clod_adapter.viewer.payload import Payload, page_config
 from clod_adapter.viewer.server import Answer, Server
 
-from .shared.antialiasing import alike, with_filter
+from .shared.antialiasing import with_filter, with_filter_of
 from .shared.browsers import open_browser
 from .shared.console import Console
-from .shared.dials import opens_at
+from .shared.dials import initial_dial
 from .shared.inputs import read_checkpoint
 from .shared.report import jsonable
 
@@ -25,32 +25,31 @@ MODEL, BASE = "/files/model", "/files/base"
 
 
 def run(args: argparse.Namespace) -> None:
-    """Serves until it is interrupted; prints the address, or with --json the object, before that."""
+    """Prints the address, or with --json the report, and serves the page until it is interrupted."""
     console = Console(args.quiet)
     answers, report = prepare(args, console)
     with Server(answers, args.port) as server:
         report |= {"url": server.url, "port": server.port}
-        # Not after the command, as main prints other reports: a script needs the address while it is served.
+        # Here, and not by main after the command: a script needs the address while the page is served.
         shown = json.dumps(jsonable(report)) if args.json else f"{server.url}  (Ctrl-C ends)"
-        try:  # from the address on: who has read it may interrupt before the first request is waited for
+        try:  # around print: a reader of the address may interrupt before the server waits
             print(shown, file=sys.__stdout__ if args.json else None, flush=True)
             if not args.no_browser and not open_browser(server.url):
-                console.say(f"no browser to open here; open {server.url} in one, through ssh -L from another machine")
+                console.say(f"no browser found; open {server.url}, from another machine through ssh -L")
             server.serve_forever()
         except KeyboardInterrupt:
             console.say("ended")
 
 
 def prepare(args: argparse.Namespace, console: Console) -> tuple[dict[str, Answer], dict[str, Any]]:
-    """What is served, by path, and what is reported of it."""
-    model = with_filter(read_checkpoint(args.model, console, args.activated), args, console)
-    base = None
+    """The answers of the server by path, and the report."""
+    model, base = with_filter(read_checkpoint(args.model, console, args.activated), args, console), None
     if args.base:
         base = with_filter(read_checkpoint(args.base, console, args.activated, model.origin), args, console)
-        base = alike(base, model, args)
+        base = with_filter_of(base, model, args)
     cameras, notes = load_cameras(args.images, model.origin) if args.images else (list[Camera](), list[str]())
     attenuation = model.gaussians.attenuation
-    opening, more = opens_at(args.sv, attenuation.max_sv if attenuation else None)
+    opening, more = initial_dial(args.sv, attenuation.max_sv if attenuation else None)
     notes += more
     for note in notes:
         console.note(note)

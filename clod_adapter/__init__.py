@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from clod_adapter.io.adapter_file import load_adapter, save_adapter
     from clod_adapter.io.checkpoint import Checkpoint, load, save
     from clod_adapter.io.scene.load import load_scene
+    from clod_adapter.progress import Phase, Progress, Stopped
     from clod_adapter.render import Rendering, render
     from clod_adapter.training.loop import Adapted, adapt
     from clod_adapter.training.objective import TrainableSubset
@@ -61,14 +62,15 @@ on_first_use(__name__, {
     "training.pseudo_views": ("render_pseudo_views", "place_cameras"),
     "training.plan": ("Decision", "Override", "Plan"),
     "training.planner": ("make_plan",),
+    "progress": ("Phase", "Progress", "Stopped"),
     "render": ("Rendering", "render"),
     "training.loop": ("Adapted", "adapt"),
 })  # fmt: skip
 
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
-    "Decision", "DialValue", "Gaussians", "Hook", "Override", "Plan", "Rendering", "Scene", "ScreenFilter",
-    "TrainableSubset", "View", "adapt", "attach", "bake", "detach", "dial_for", "evaluate", "extract", "load",
-    "load_adapter", "load_scene", "make_plan", "order_by_extinction", "place_cameras", "render",
+    "Decision", "DialValue", "Gaussians", "Hook", "Override", "Phase", "Plan", "Progress", "Rendering", "Scene",
+    "ScreenFilter", "Stopped", "TrainableSubset", "View", "adapt", "attach", "bake", "detach", "dial_for", "evaluate",
+    "extract", "load", "load_adapter", "load_scene", "make_plan", "order_by_extinction", "place_cameras", "render",
     "render_pseudo_views", "save", "save_adapter",
 ]  # fmt: skip

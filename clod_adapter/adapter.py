@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from clod_adapter._support.version import package_version
 from clod_adapter.attenuation import SIGMA_MAX
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter
@@ -19,7 +20,6 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.origin import NOWHERE, Origin
 from clod_adapter.units import in_world_units
-from clod_adapter.version import package_version
 
 HALF_ERROR = 2e-3  # the rounding that a difference may suffer, as a share of the largest
 ATTRIBUTES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
@@ -42,6 +42,7 @@ class Adapter:
         kept: of a result with fewer rows than its base, ``[base_count]`` bool: the rows that it has. None for all.
         sh_degree: of a result with fewer SH bands than its base. None for the base's.
         screen_filter: that it was trained with, and the result is drawn with.
+        notes: of reading its file: settings that were ignored or filled in.
 
     Raises:
         ClodError: a tensor has the wrong type or shape, sigma_d is not finite, or version is no plain text.
@@ -58,6 +59,7 @@ class Adapter:
     kept: Tensor | None = None
     sh_degree: int | None = None
     screen_filter: ScreenFilter = CLASSIC
+    notes: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         if self.sigma_d.dim() != 1 or self.sigma_d.dtype != torch.float32:

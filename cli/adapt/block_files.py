@@ -1,10 +1,10 @@
-"""The files of a run in blocks, where it goes on from in whichever process: their names, and what is in them."""
+"""The files of a run in blocks, which any process can continue: their names and contents."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,52 +21,52 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import remove_leftovers
 
 
-@dataclass
+@dataclass(frozen=True)
 class BlockFiles:
-    """Beside ``ply``, the output.
+    """The files beside ``ply``, the output.
 
     Attributes:
-        belongs: what the files of this run say that they are of; with the start read or written, of that start too,
-            as jobs that made one each, on unlike machines, may have cut the scene unlike.
-        count: of blocks; 0 before there is a start.
+        run_of: identifies the run in its files, and, once the initialization is read, that initialization: two jobs
+            on different machines may divide the scene differently.
+        count: of blocks; 0 before the initialization is read.
     """
 
     ply: Path
-    belongs: dict[str, Any]
-    count: int = field(default=0, init=False)
+    run_of: dict[str, Any]
+    count: int = 0
 
     @property
     def start(self) -> Path:
         return self.ply.with_suffix(".start.safetensors")
 
     def block(self, block: int, number: int) -> Path:
-        """What a block learns in a pass, 1 or 2."""
+        """The result of a block after pass 1 or 2."""
         return self.ply.with_suffix(f".block{block + 1}.pass{number}.safetensors")
 
     def state(self, block: int, number: int) -> Path:
-        """What a block's training can be resumed from."""
+        """The training state of a block."""
         return self.block(block, number).with_suffix(".resume.safetensors")
 
     def missing(self, number: int) -> list[int]:
-        """The blocks, from 1, whose pass is not done."""
+        """The numbers, from 1, of the blocks whose pass is not done."""
         return [block + 1 for block in range(self.count) if not self.block(block, number).exists()]
 
     def save_start(self, division: Division) -> None:
-        """Writes a division, unless another job was quicker."""
+        """Writes a division, unless another job has written one."""
         if self.start.exists():
             return
         assert division.initial.sigma_d is not None
         tensors = {"sigma_d": division.initial.sigma_d, "block": division.block, "seen": division.seen}
         about = {"extent": division.extent, "attenuation": division.initial.attenuation}
-        save_block(self.start, tensors | {"kept": division.kept}, about, self.belongs)
+        save_block(self.start, tensors | {"kept": division.kept}, about, self.run_of)
 
-    def load_start(self, base: Gaussians, views: Sequence[View]) -> Division:
-        """The division of the file.
+    def load_start(self, base: Gaussians, views: Sequence[View]) -> tuple[Division, BlockFiles]:
+        """The division of the file, and the files of the blocks that it makes.
 
         Raises:
             ClodError: it cannot be read, is damaged, or of another run.
         """
-        tensors, about = load_block(self.start, self.belongs)
+        tensors, about = load_block(self.start, self.run_of)
         device = base.means.device
         count = tensors["seen"].shape[-1] if "seen" in tensors and tensors["seen"].dim() else 0
         shapes = {
@@ -75,22 +75,22 @@ class BlockFiles:
         }  # fmt: skip
         checked(self.start, tensors, shapes)
         if tensors["block"].unique().tolist() != list(range(count)):
-            raise ClodError(f"{self.start}: a block has no Gaussians; remove it to have it made anew")
+            raise ClodError(f"{self.start}: a block has no Gaussians; delete it to make it again")
         with damaged(self.start):
             settings, extent = AttenuationConfig(**about["attenuation"]), float(about["extent"])
-        self.belongs, self.count = self.belongs | {"start": _digest(tensors)}, count
         begun = base.replace(sigma_d=tensors["sigma_d"].to(device), attenuation=settings)
-        return Division(begun, tensors["block"].to(device), tensors["seen"], tensors["kept"], extent)
+        division = Division(begun, tensors["block"].to(device), tensors["seen"], tensors["kept"], extent)
+        return division, replace(self, run_of=self.run_of | {"start": _digest(tensors)}, count=count)
 
     def save_learned(self, learned: Learned, block: int, number: int) -> None:
         about = {"steps": learned.steps, "seconds": learned.seconds}
         save_block(self.block(block, number), learned.values, about, self._of(block, number))
 
     def load_learned(self, division: Division, block: int, number: int) -> Learned:
-        """What a block has learned in a pass.
+        """The result of a block after a pass.
 
         Raises:
-            ClodError: the file cannot be read, is damaged, or of another run, start, block or pass.
+            ClodError: the file cannot be read, is damaged, or of another run, initialization, block or pass.
         """
         path, rows = self.block(block, number), division.rows(block)
         values, about = load_block(path, self._of(block, number))
@@ -101,10 +101,10 @@ class BlockFiles:
         return Learned(rows, {name: value.to(rows.device) for name, value in values.items()}, steps, seconds)
 
     def _of(self, block: int, number: int) -> dict[str, Any]:
-        return self.belongs | {"block": f"{block + 1} of {self.count}, pass {number}"}
+        return self.run_of | {"block": f"{block + 1} of {self.count}, pass {number}"}
 
     def remove(self) -> None:
-        """Removes the files of this run, and what killed jobs have left of them."""
+        """Removes the files of this run, and temporary files of killed jobs."""
         each = [(block, number) for block in range(self.count) for number in (1, 2)]
         for path in (self.start, *(name(*one) for one in each for name in (self.block, self.state))):
             path.unlink(missing_ok=True)

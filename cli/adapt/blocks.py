@@ -1,213 +1,236 @@
-"""``--memory`` where the whole does not fit: training in blocks, in one process or as jobs, from file to file."""
+"""``--memory`` for scenes that do not fit: training in blocks, in one process or as separate jobs."""
 
 from __future__ import annotations
 
-import argparse
-import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.blocks.divide import Division, check_divisible, divide
 from clod_adapter.blocks.memory import MemoryPlan
 from clod_adapter.blocks.targets import block_config
 from clod_adapter.blocks.train import Learned, adapt_block, merge
-from clod_adapter.cameras import Scene, View
-from clod_adapter.config import AdaptConfig
+from clod_adapter.cameras import View
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.robustness import scene_fingerprint
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import usable_views
-from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.image_cache import ImageCache
+from clod_adapter.progress import Phase, Stopped
 from clod_adapter.rasterizers.cpu import release_memory
-from clod_adapter.training.loop import Adapted
-from clod_adapter.training.state import Progress, StateRefused
-from clod_adapter.version import package_version
+from clod_adapter.training.state import Adapted, StateRefused
 
-from ..shared.console import Console, duration
-from ..shared.files import Outputs, size
-from ..shared.interrupts import GracefulStop
+from ..shared.console import duration
+from ..shared.files import size
 from ..shared.report import machine
 from .block_files import BlockFiles
-from .progress import LABELS, ProgressDisplay
-from .resume import Saver
+from .inputs import Inputs
+from .progress import ProgressDisplay
+from .resume import Saver, check_resumed, find_state, settings_key
+from .setup import Setup
 
 
-@dataclass
-class Blocked:
-    """One run in blocks. Its files are where it goes on from, in whichever process.
+@dataclass(frozen=True)
+class Pass:
+    """One block in one pass, and the result of the pass before."""
 
-    Attributes:
-        failed: of the blocks that this process has trained, where training ended early for a loss that was not finite.
-    """
+    block: int
+    number: int
+    before: Gaussians | None = None
 
-    args: argparse.Namespace
-    plan: MemoryPlan
-    console: Console
-    stop: GracefulStop
+    def name(self, division: Division) -> str:
+        return f"block {self.block + 1} of {division.count}, pass {self.number} of {division.passes}"
+
+
+@dataclass(frozen=True)
+class BlockResult:
+    """The result of one block in one pass; ``failed``: why training ended early in this process."""
+
+    learned: Learned
+    failed: str | None = None
+
+
+@dataclass(frozen=True)
+class Divided:
+    """The scene in blocks, its views, and the files of the blocks."""
+
+    division: Division
+    views: Sequence[View]
     files: BlockFiles
-    failed: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """A run in blocks. Its files hold its progress, so any process can continue it."""
+
+    setup: Setup
+    plan: MemoryPlan
+    files: BlockFiles
 
     @classmethod
-    def of(
-        cls, args: argparse.Namespace, outputs: Outputs, plan: MemoryPlan | None, base: Checkpoint, scene: Scene,
-        config: AdaptConfig, console: Console, stop: GracefulStop,
-    ) -> Blocked | None:  # fmt: skip
-        """None where the whole is trained at once; not where that was begun as a block of its own."""
-        files = BlockFiles(outputs.ply, {})
+    def of(cls, setup: Setup, inputs: Inputs) -> Blocks | None:
+        """None if the whole scene is trained at once; not for one block of a run that was started in blocks."""
+        args, plan, files = setup.args, inputs.memory, BlockFiles(setup.outputs.ply, {})
         if plan is None or (plan.blocks == 1 and not args.block and not files.start.exists()):
             return None
-        check_divisible(config)
+        check_divisible(inputs.config)
         if args.trim or args.keep_in or args.leave_out:
             raise ClodError(
-                "--trim, --with and --without are of a plan that looks at all Gaussians at once, which does not fit; "
-                "leave them out, or give more --memory"
+                "--trim, --with and --without are of a plan, which needs all Gaussians at once; leave them out, or "
+                "give more --memory"
             )
-        console.say("plan: none is made of blocks; all bands and Gaussians stay, and every attribute is trained")
-        with console.meter("looking through the photographs") as meter:
-            photographs = scene_fingerprint(scene, lambda done, of: meter.update(done / of, f"{done}/{of}"))
-        files.belongs = {
-            "version": package_version(), "settings": asdict(config), "checkpoint": base.fingerprint,
-            "photographs": photographs, "screen_filter": asdict(base.gaussians.screen_filter),
+        setup.console.say("plan: none in blocks; all SH degrees and Gaussians are kept, and every attribute is trained")
+        with setup.console.meter(Phase.FINGERPRINT) as meter:
+            photographs = scene_fingerprint(inputs.scene, meter)
+        run_of = {
+            "version": package_version(), "settings": asdict(inputs.config), "checkpoint": inputs.base.fingerprint,
+            "photographs": photographs, "screen_filter": asdict(inputs.base.gaussians.screen_filter),
         }  # fmt: skip
-        return cls(args, plan, console, stop, files)
+        return cls(setup, plan, BlockFiles(setup.outputs.ply, run_of))
 
-    def all(self, base: Gaussians, scene: Scene, config: AdaptConfig) -> Adapted:
-        """Does what is not in files yet, and puts all together.
+    def adapt(self, inputs: Inputs) -> Adapted:
+        """Trains the blocks that are not done yet, and merges all.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C; what is finished is in files.
+            Stopped: Ctrl-C; finished blocks are in their files.
         """
-        views = usable_views(base, scene.train)
         began = time.perf_counter()
-        division, after, steps, seconds = self.start(base, views, config), None, 0, 0.0
-        start_seconds = time.perf_counter() - began
+        divided, failed, merged, steps, seconds = self.divided(inputs), list[str](), None, 0, 0.0
+        start_seconds, division = time.perf_counter() - began, divided.division
         for number in range(1, division.passes + 1):
-            learned = [self.learn(division, views, config, block, number, after) for block in range(division.count)]
-            after = merge(division, learned)
-            steps, seconds = steps + sum(p.steps for p in learned), seconds + sum(p.seconds for p in learned)
-        assert after is not None
-        failed = "; ".join(self.failed) or None
-        return Adapted(after, steps, seconds, start_seconds, interrupted=False, failed=failed)
+            results = [self.train(inputs, divided, Pass(block, number, merged)) for block in range(division.count)]
+            merged = merge(division, [result.learned for result in results])
+            steps, seconds = (
+                steps + sum(result.learned.steps for result in results),
+                seconds + sum(result.learned.seconds for result in results),
+            )
+            failed += [result.failed for result in results if result.failed]
+        assert merged is not None
+        return Adapted(merged, steps, seconds, start_seconds, interrupted=False, failed="; ".join(failed) or None)
 
-    def alone(self, base: Gaussians, scene: Scene, config: AdaptConfig) -> dict[str, Any]:
-        """Does what ``--block`` asks for, and no more: the start, or the next pass of one block; returns the report."""
-        views, block = usable_views(base, scene.train), self.args.block
-        files = self.files
-        division, path, learned = self.start(base, views, config), files.start, None
+    def run_job(self, inputs: Inputs) -> dict[str, Any]:
+        """Does the job of ``--block``, the initialization or the next pass of one block; returns the report."""
+        args, result, number = self.setup.args, None, 1
+        divided = self.divided(inputs)
+        division, files, block = divided.division, divided.files, args.block
+        path = files.start
         if block != "start":
             if int(block) > division.count:
                 raise ClodError(f"--block is {block}, and there are {division.count} blocks; give 1 to that")
             block = int(block) - 1
             number = 1 if not files.block(block, 1).exists() else division.passes
-            after = self._first_pass(division, views, config) if number == 2 else None
-            learned = self.learn(division, views, config, block, number, after)
+            before = self.first_pass(inputs, divided) if number == 2 else None
+            result = self.train(inputs, divided, Pass(block, number, before))
             path = files.block(block, number)
         number = next((n for n in range(1, division.passes + 1) if files.missing(n)), 0)
         missing = files.missing(number) if number else []
         print(f"{size(path):>9}  {path}")
-        print(f"of pass {number}, blocks {missing} are to come" if number else "all are there: leave out --block")
+        print(f"pass {number}: blocks {missing} are missing" if number else "all blocks are done: leave out --block")
         return {
-            "command": "adapt", "version": package_version(), "model": self.args.ply, "scene": self.args.images,
+            "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
             "block": block, "blocks": division.count, "passes": division.passes, "pass": number, "missing": missing,
-            "steps": learned.steps if learned else 0, "memory": asdict(self.plan), "machine": machine(),
-            "outputs": {"block": str(path)}, "exit_code": 1 if self.failed else 0,
+            "steps": result.learned.steps if result else 0, "memory": asdict(self.plan), "machine": machine(),
+            "outputs": {"block": str(path)}, "exit_code": 1 if result and result.failed else 0,
         }  # fmt: skip
 
-    def _first_pass(self, division: Division, views: Sequence[View], config: AdaptConfig) -> Gaussians:
-        if missing := self.files.missing(1):
+    def first_pass(self, inputs: Inputs, divided: Divided) -> Gaussians:
+        """The merged result of the first pass."""
+        if missing := divided.files.missing(1):
             raise ClodError(
-                f"block {self.args.block} has its first pass, and the second needs the first of all: run --block "
+                f"block {self.setup.args.block} has its first pass, and the second needs the first of all: run --block "
                 f"{missing[0]} first ({len(missing)} are missing)"
             )
-        learned = [self.learn(division, views, config, block, 1, None) for block in range(division.count)]
-        return merge(division, learned)
+        results = [self.train(inputs, divided, Pass(block, 1)) for block in range(divided.division.count)]
+        return merge(divided.division, [result.learned for result in results])
 
-    def start(self, base: Gaussians, views: Sequence[View], config: AdaptConfig) -> Division:
-        """The division, of the file, which is made where there is none.
+    def divided(self, inputs: Inputs) -> Divided:
+        """The division in the file, which is made if it does not exist.
 
         Raises:
             ClodError: the file is of another run, or of one with another number of blocks.
+            Stopped: Ctrl-C.
         """
-        path, there = self.files.start, self.files.start.exists()
-        if not there:
-            with self._following("start") as follow:
-                division = divide(base, views, config, self.plan.blocks, _told(follow, base))
-            self.files.save_start(division)
-            del division
+        console, base, path = self.setup.console, inputs.base.gaussians, self.files.start
+        views, exists = usable_views(base, inputs.scene.train), path.exists()
+        if not exists:
+            with self._display(Phase.TRAINING) as display:
+                made = divide(base, views, inputs.config, self.plan.blocks, display)
+            self.files.save_start(made)
+            del made
             release_memory()
-        division = self.files.load_start(base, views)
+        division, files = self.files.load_start(base, views)
         if division.count != self.plan.blocks:
             raise ClodError(
-                f"{path}: is of a run in {division.count} blocks, and --memory {self.args.memory} makes "
-                f"{self.plan.blocks}; give the --memory that it was begun with, or remove it to start afresh"
+                f"{path}: is of a run in {division.count} blocks, and --memory {self.setup.args.memory} makes "
+                f"{self.plan.blocks}; use the original --memory, or delete it to start over"
             )
-        if there:
-            self.console.say(f"{path}: the start of {division.count} blocks is there")
-            return division
-        steps = [division.steps(block, config) for block in range(division.count)]
-        self.console.say(
+        steps = [division.steps(block, inputs.config) for block in range(division.count)]
+        console.say(
+            f"{path}: the initialization of {division.count} blocks exists" if exists else
             f"wrote {path}: {division.count} blocks of {min(steps)} to {max(steps)} steps, {sum(steps)} in "
-            f"all (each takes {config.iters} times its share of the views)"
-        )
-        return division
+            f"all (each takes {inputs.config.iters} times its share of the views)"
+        )  # fmt: skip
+        return Divided(division, views, files)
 
-    def learn(
-        self, division: Division, views: Sequence[View], config: AdaptConfig, block: int, number: int,
-        after: Gaussians | None,
-    ) -> Learned:  # fmt: skip
-        """What one block learns in a pass, of the file where there is one."""
-        files = self.files
-        if files.block(block, number).exists():
-            return files.load_learned(division, block, number)
-        name = f"block {block + 1} of {division.count}, pass {number} of {division.passes}"
-        own, state = block_config(division, block, config, first=number == 1), files.state(block, number)
-        saver = Saver(state, state.exists(), own, self.console, self.stop)
-        of = f"{files.belongs['checkpoint']}, {files.belongs['start']}, {name}"
-        saver.claim(of, files.belongs["photographs"], f"{self.args.ply} in {files.start}", "before")
-        try:
-            with self._following(name) as follow:
-                learned, adapted = adapt_block(
-                    division, views, config, block, after=after, progress=saver.watching(follow), resume=saver.state,
-                    cache=ImageCache(self.plan.cache),
-                )  # fmt: skip
+    def train(self, inputs: Inputs, divided: Divided, job: Pass) -> BlockResult:
+        """Trains one block in one pass, unless its file exists.
+
+        Raises:
+            Stopped: Ctrl-C; the same command resumes.
+        """
+        division, files, console = divided.division, divided.files, self.setup.console
+        if files.block(job.block, job.number).exists():
+            return BlockResult(files.load_learned(division, job.block, job.number))
+        name = job.name(division)
+        own = block_config(division, job.block, inputs.config, first=job.number == 1)
+        path = files.state(job.block, job.number)
+        resumed = find_state(path, path.exists(), own, console)
+        of = f"{files.run_of['checkpoint']}, {files.run_of['start']}, {name}"
+        run_of = settings_key(own) | {"base_sha256": of, "views_sha256": files.run_of["photographs"]}
+        check_resumed(resumed, run_of, f"{self.setup.args.ply} in {files.start}", "before", console)
+        saver = Saver(path, run_of, resumed, console, self.setup.stop)
+        with saver.rescuing("the same command"):
+            try:
+                with self._display(name) as display:
+                    learned, adapted = adapt_block(
+                        division, divided.views, inputs.config, job.block, after=job.before,
+                        progress=saver.saving(display), resume=resumed.state if resumed else None,
+                        cache=ImageCache(self.plan.cache),
+                    )  # fmt: skip
+            except StateRefused as error:
+                raise saver.naming(error) from error
             saver.keep()
             release_memory()
             if adapted.failed or not adapted.interrupted:
-                files.save_learned(learned, block, number)
-        except StateRefused as error:
-            raise saver.naming(error) from error
-        except Exception:
-            saver.rescue("the same command")
-            raise
+                files.save_learned(learned, job.block, job.number)
+        return self._finished(name, saver, learned, adapted)
+
+    def _finished(self, name: str, saver: Saver, learned: Learned, adapted: Adapted) -> BlockResult:
+        """Says how the training of a block has ended.
+
+        Raises:
+            Stopped: it was interrupted.
+        """
+        say = self.setup.console.say
         if adapted.failed:
-            self.failed.append(f"{name}: {adapted.failed}")
-            self.console.say(f"{name}: ended after step {adapted.steps}: {adapted.failed}")
+            say(f"{name}: ended after step {adapted.steps}: {adapted.failed}")
         elif adapted.interrupted:
-            more = "" if saver.saved is None else "; the same command goes on with it"
-            self.console.say(f"{name}: stopped after step {adapted.steps}{more}")
-            raise KeyboardInterrupt
+            more = "" if saver.saved is None else "; the same command resumes it"
+            say(f"{name}: stopped after step {adapted.steps}{more}")
+            raise Stopped(f"stopped in {name}")
         saver.close(finished=True)
-        self.console.say(f"{name}: {len(learned.rows):,} Gaussians, {learned.steps} steps, {duration(learned.seconds)}")
-        return learned
+        say(f"{name}: {len(learned.rows):,} Gaussians, {learned.steps} steps, {duration(learned.seconds)}")
+        return BlockResult(learned, f"{name}: {adapted.failed}" if adapted.failed else None)
 
     def remove(self) -> None:
-        """Removes the files of this run, once its outputs are there."""
-        self.files.remove()
+        """Removes the files of this run, once its outputs are written."""
+        replace(self.files, count=self.plan.blocks).remove()
 
     @contextmanager
-    def _following(self, name: str) -> Iterator[Callable[[Progress], None]]:
-        follower = ProgressDisplay(self.console, self.stop, None, (), 1.0, None)
-        follower.labels = LABELS | {"train": name}
-        with self.stop.listening(), closing(follower):
-            yield follower
-
-
-def _told(follow: Callable[[Progress], None], base: Gaussians) -> Callable[[str, int, int], None]:
-    """The progress of ``divide`` as that of an adaptation."""
-    return lambda phase, done, total: follow(
-        Progress(phase, done, total, 0.0, done / max(total, 1), math.nan, lambda: base)
-    )
+    def _display(self, training: str) -> Iterator[ProgressDisplay]:
+        display = ProgressDisplay(self.setup.console, self.setup.stop, None, (), 1.0, None, training)
+        with self.setup.stop.listening(), closing(display):
+            yield display

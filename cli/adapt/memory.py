@@ -1,4 +1,4 @@
-"""``--memory``: how its bytes are planned, printed before any work; and what is not kept meanwhile."""
+"""``--memory``: the memory plan, which is printed before any work."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from ..shared.console import Console
 
 
 def image_cache(args: argparse.Namespace) -> ImageCache | None:
-    """What photographs may take of ``--memory``."""
+    """The cache that holds the photographs within their share of ``--memory``."""
     return ImageCache(int(IMAGES * parse_size(args.memory))) if args.memory else None
 
 
 def plan_memory(args: argparse.Namespace, base: Checkpoint, scene: Scene, console: Console) -> MemoryPlan | None:
-    """The plan for ``--memory``, which is printed; None without it.
+    """The plan for ``--memory``, which is printed; None without the option.
 
     Raises:
-        ClodError: it is too little; says the least that would do.
+        ClodError: it is too small; gives the minimum.
     """
     if not args.memory:
         return None
@@ -37,26 +37,26 @@ def plan_memory(args: argparse.Namespace, base: Checkpoint, scene: Scene, consol
         images=3 * sum(pixels) - made, pixels=max(pixels), pictures=made,
     )  # fmt: skip
     plan = plan_for_limit(needs, parse_size(args.memory))
-    how = "the whole at once" if plan.blocks == 1 else f"in {plan.blocks} blocks"
-    console.say(f"memory: {in_words(plan.peak)} of {in_words(plan.limit)}, {how}; at most, with the program's own:")
+    how = "the whole scene at once" if plan.blocks == 1 else f"in {plan.blocks} blocks"
+    console.say(f"memory: {in_words(plan.peak)} of {in_words(plan.limit)}, {how}; peaks, including the program itself:")
     for name, what in (
-        ("base", "reading the checkpoint"), ("start", "the start, of the whole scene"), ("train", "training"),
-        ("write", "writing"), ("cache", "of it photographs"),
+        ("base", "reading the checkpoint"), ("start", "initialization of the whole scene"), ("train", "training"),
+        ("write", "writing"), ("cache", "of it for photographs"),
     ):  # fmt: skip
         console.say(f"  {in_words(getattr(plan, name)):>8}  {what}")
     return plan
 
 
 def without_rows(base: Checkpoint) -> Checkpoint:
-    """The checkpoint without the rows of its file, which only writing needs."""
+    """The checkpoint without the rows of its file, which are needed for writing only."""
     return replace(base, vertex=base.vertex[:0].copy())
 
 
 def with_rows(base: Checkpoint, args: argparse.Namespace) -> Checkpoint:
-    """The inverse of ``without_rows``: reads them again.
+    """The inverse of ``without_rows``: reads the file again.
 
     Raises:
-        ClodError: the file is another one by now.
+        ClodError: the file has changed.
     """
     again = load(args.ply, activated=args.activated, origin=base.origin)
     if again.fingerprint != base.fingerprint:

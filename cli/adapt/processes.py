@@ -1,7 +1,7 @@
-"""Adapting in several processes: the first one does what one does alone, and the others train along when it trains.
+"""Adapting in several processes: the first one runs the command, the others only train.
 
-They meet at the launcher's store. What the others need they are sent, so only the first one reads files, says anything
-and writes; they wait for work until it says that there is no more.
+They communicate through the launcher's store. Only the first one reads files, prints and writes; it sends the others
+what they need. They wait for work until it says that there is no more.
 """
 
 from __future__ import annotations
@@ -21,109 +21,110 @@ from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Stopped
 from clod_adapter.training.distributed import PATIENCE, ProcessGroup, ProcessLost, joined
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.objective import TrainableSubset
 from clod_adapter.training.plan import Plan
-from clod_adapter.training.state import Adapted, Progress, TrainingState
+from clod_adapter.training.state import Adapted, TrainingState
 
 from ..shared.interrupts import GracefulStop
 from ..shared.launch import Launch, launched
 from .progress import ProgressDisplay
 
-BACKENDS = {"cpu": "gloo", "cuda": "nccl"}  # what processes talk by, by where they train
+BACKENDS = {"cpu": "gloo", "cuda": "nccl"}  # of torch.distributed, by device
 if TYPE_CHECKING:
     from torch.distributed.distributed_c10d import Store
 
-JOBS, OVER = "clod/jobs", "clod/over"  # in the store: how many times all were called to train, and that it was the last
-LOOK_EVERY = 0.05  # seconds between looks for work
+JOBS, OVER = "clod/jobs", "clod/over"  # keys in the store: the number of jobs so far, and that there are no more
+POLL_EVERY = 0.05  # seconds between checks for work
 
 
 @dataclass(frozen=True)
 class Job:
-    """What the others are sent: the arguments of ``adapt``, and the kind of device that the first one trains on."""
+    """What the others are sent: the arguments of ``adapt``, and the type of device that the first one trains on."""
 
     base: Gaussians
     views: tuple[View, ...]
     config: AdaptConfig
     state: TrainingState | None
-    part: TrainableSubset
+    subset: TrainableSubset
     device: str
 
     @classmethod
     def of(cls, plan: Plan, scene: Scene, state: TrainingState | None) -> Job:
-        """What ``plan.adapt`` does, from ``state`` or where the plan has begun."""
-        state = next(iter(plan.begun), None) if state is None else state
+        """The job of ``plan.adapt``, from ``state``."""
         lean = plan.lean
-        return cls(lean, scene.train, plan.config, state, plan.part, lean.means.device.type)
+        return cls(lean, scene.train, plan.config, state, plan.subset, lean.means.device.type)
 
 
 @contextmanager
 def leading() -> Iterator[None]:
-    """Within, this first process may call for the others; after it they end."""
+    """Within the block the first process may give jobs to the others; after it they end."""
     store = _store()
     try:
         with _threads(Launch()):
             yield
     finally:
-        with suppress(RuntimeError):  # the launcher is gone, and the others know of it by that
+        with suppress(RuntimeError):  # the launcher has ended, which the others notice
             store.set(OVER, "1")
 
 
 @contextmanager
-def together(make_job: Callable[[], Job], follower: ProgressDisplay) -> Iterator[ProcessGroup | None]:
-    """The processes to train with, which then do so too; None where this one is alone, and no job is made.
+def together(make_job: Callable[[], Job], display: ProgressDisplay) -> Iterator[ProcessGroup | None]:
+    """The group to train with, after giving the job to the others; None for a single process.
 
     Raises:
-        ClodError: within, what ended one of them, where the loss of a process is what ended this.
+        ClodError: a process was lost before the first step; says why it ended.
+        Stopped: Ctrl-C, which the others have received too.
     """
     launch = launched()
     if launch.size == 1:
         yield None
         return
     job = make_job()
-    follower.console.say(_describe(launch, job.config, job.device))
+    display.console.say(_describe(launch, job.config, job.device))
     number = _store().add(JOBS, 1)
     try:
-        with _threads(launch), joined(_of_job(number), launch.rank, launch.size) as peers:
-            peers.broadcast(job)
+        with _threads(launch), joined(_of_job(number), launch.rank, launch.size) as group:
+            group.broadcast(job)
             del job
-            yield peers
+            yield group
     except ProcessLost as error:
-        if follower.stop.requests:  # which the others have heard of too
-            raise KeyboardInterrupt from error
-        raise ClodError(f"{explain(str(error))}; nothing was learned by then, so start again") from error
+        if display.stop.requests:
+            raise Stopped("stopped before the first step") from error
+        raise ClodError(f"{explain(str(error))}; this was before the first step, so start again") from error
 
 
 def take_part() -> None:
-    """What a process that is not the first does: trains along, silently, until there is no more to do."""
+    """What a process that is not the first does: trains silently until there are no more jobs."""
     launch, store, stop = launched(), _store(), GracefulStop(aborts=False)
     with stop.listening(), _threads(launch):
         for number in count(1):
             if not _is_called(store, number, stop):
                 return
             try:
-                _train_along(number, launch, stop)
+                _train(number, launch, stop)
             except ProcessLost:
-                continue  # the first one says so; where it is the one that is gone, the launcher does
+                continue  # reported by the first process, or by the launcher
 
 
 def explain(lost: str) -> str:
-    """Why a process was lost, with what it said itself, if it could."""
+    """Why a process was lost, with the error that it reported, if any."""
     said = []
-    with suppress(RuntimeError):  # without the launcher's store nobody could say anything
+    with suppress(RuntimeError):  # the launcher's store has ended too
         for key in map(_reason, range(1, launched().size)):
             said += [_store().get(key).decode()] if _store().check([key]) else []
     return "; ".join([lost, *said])
 
 
 def hurried(adapted: Adapted) -> bool:
-    """Whether the launcher is ending this: after its signal, or where a process is gone, it waits for 30 seconds."""
+    """Whether the launcher ends the processes: after its signal, or a lost process, it waits for 30 seconds."""
     return adapted.interrupted and not adapted.failed and launched().size > 1
 
 
 def describe_processes(adapted: Adapted, batch: int) -> dict[str, Any]:
-    """For the report; of the seconds those of this process, which for one by itself are 0."""
+    """For the report; the seconds are those of this process, 0 for a single one."""
     count, device = launched().size, adapted.gaussians.means.device.type
     return {
         "count": count, "backend": BACKENDS[device] if count > 1 else None, "batch": batch,
@@ -131,23 +132,19 @@ def describe_processes(adapted: Adapted, batch: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _train_along(number: int, launch: Launch, stop: GracefulStop) -> None:
-    def follow(progress: Progress) -> None:
-        if stop.requests:
-            raise KeyboardInterrupt
-
-    with joined(_of_job(number), launch.rank, launch.size) as peers, _giving_reasons(launch.rank):
-        job: Any = peers.broadcast(None)
+def _train(number: int, launch: Launch, stop: GracefulStop) -> None:
+    with joined(_of_job(number), launch.rank, launch.size) as group, _giving_reasons(launch.rank):
+        job: Any = group.broadcast(None)
         if job.device == "cuda":
             _take_gpu(launch)
         base, scene, begun = job.base.to(job.device), Scene(job.views, ()), [job.state]
-        config, part = job.config, job.part
-        del job  # so that the state, as large as all that is trained, goes as soon as it is restored
-        adapt(base, scene, config, follow, begun.pop(), part=part, peers=peers)
+        config, subset = job.config, job.subset
+        del job  # frees the state as soon as it is restored
+        adapt(base, scene, config, stop.heeding(), begun.pop(), subset=subset, group=group)
 
 
 def _take_gpu(launch: Launch) -> None:
-    """A GPU for each process on this machine."""
+    """Selects a GPU for each process on this machine."""
     if (gpus := torch.cuda.device_count()) < launch.local_size:
         raise ClodError(f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as there are")
     torch.cuda.set_device(launch.local_rank)
@@ -155,7 +152,7 @@ def _take_gpu(launch: Launch) -> None:
 
 @contextmanager
 def _giving_reasons(rank: int) -> Iterator[None]:
-    """Leaves word of what ends this process; to be left before the others notice that it does."""
+    """Stores the error that ends this process, before the others notice that it has ended."""
     try:
         yield
     except ProcessLost:
@@ -167,22 +164,24 @@ def _giving_reasons(rank: int) -> Iterator[None]:
 
 
 def _is_called(store: Store, number: int, stop: GracefulStop) -> bool:
-    """Waits for work. Not by a wait of the store's own, within which no signal would be heard."""
+    """Waits for work. Polls, because a wait of the store's own would delay signals."""
     try:
         while store.add(JOBS, 0) < number:
             if store.check([OVER]) or stop.requests:
                 return False
-            time.sleep(LOOK_EVERY)
-    except RuntimeError:  # the store is gone, and with it whoever could call
+            time.sleep(POLL_EVERY)
+    except RuntimeError:  # the store has ended, and the first process with it
         return False
     return True
 
 
 @lru_cache(maxsize=1)
 def _store() -> Store:
-    """What the launcher has for its processes to meet at."""
+    """The launcher's key-value store."""
     if not torch.distributed.is_available():
-        raise ClodError("this build of torch has no torch.distributed, so it takes one process: do without torchrun")
+        raise ClodError(
+            "this build of torch has no torch.distributed, so only one process can train: leave out torchrun"
+        )
     from torch.distributed.rendezvous import rendezvous
 
     try:
@@ -204,9 +203,9 @@ def _reason(rank: int) -> str:
 
 @contextmanager
 def _threads(launch: Launch) -> Iterator[None]:
-    """Within, this process uses its part of the machine's cores, or what OMP_NUM_THREADS gives it.
+    """Within the block this process uses its share of the machine's cores, or OMP_NUM_THREADS.
 
-    torchrun sets that to 1, which is no one's wish.
+    torchrun sets that to 1 by default, which is ignored.
     """
     before = torch.get_num_threads()
     if os.environ.get("OMP_NUM_THREADS", "1") == "1":

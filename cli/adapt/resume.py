@@ -1,156 +1,189 @@
-"""``--resume``: the state of a training, saved beside its output now and then, and gone on from."""
+"""``--resume``: the training state that is saved beside the output now and then, and resumed from."""
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import math
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import asdict
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.robustness import scene_fingerprint
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.atomic import remove_leftovers
-from clod_adapter.training.state import Progress, StateRefused, TrainingState
+from clod_adapter.progress import Listener, Progress, Stopped
+from clod_adapter.training.state import StateRefused, TrainingState
 from clod_adapter.training.state_file import load_state, save_state
-from clod_adapter.version import package_version
 
 from ..commands.settings import OPTIONS
 from ..shared.console import Console
 from ..shared.interrupts import GracefulStop
 
-# Not "leave out --resume", which the demo gives by itself.
-BEGUN = "give what it was begun with, or remove it to start afresh"
+# Not "leave out --resume": the demo gives that option itself.
+ORIGINAL = "use the original arguments, or delete the file to start over"
 SAVE_EVERY = 5.0  # seconds between saves, at least
-SAVE_COST = 0.015  # share of the training that all of them may take; only the first is not asked
+SAVE_COST = 0.015  # largest share of the training time that saving may take, except the first save
+
+RunKey = dict[str, Any]
+"""Identifies a run, in its state file: version, config, hashes of base and views, overrides, frozen attributes."""
 
 
-class Saver:
-    """The state file of one run.
+@dataclass(frozen=True)
+class Resumed:
+    """The state file of an interrupted run of these settings.
 
     Attributes:
-        state: what to go on from, where ``--resume`` found it.
-        saved: the step that the file of this run is of; None where it has written none yet.
-        latest: where the training of this run stands that is not saved yet; it holds on to all that is trained.
-        seconds, saves: spent in saving, and how often.
-
-    Raises:
-        ClodError: the file to resume from is damaged, or of other settings.
+        run_of: the key of the run that saved it.
     """
 
-    def __init__(self, path: Path, resume: bool, config: AdaptConfig, console: Console, stop: GracefulStop) -> None:
-        self.path, self.console, self.stop = path, console, stop
-        self.belongs: dict[str, Any] = {"version": package_version(), "config": asdict(config)}
-        self.found: dict[str, Any] = {}
-        self.state: TrainingState | None = None
-        self.saved: int | None = None
-        self.latest: Progress | None = None
-        self.seconds, self.saves, self.warned = 0.0, 0, False
-        self.began, self.due = math.inf, 0.0
-        remove_leftovers(path)
-        if path.exists():
-            self._look(resume)
-        elif resume:
-            console.say(f"there is no {path} to resume from: starting from the beginning")
+    path: Path
+    state: TrainingState
+    run_of: RunKey
 
-    def _look(self, resume: bool) -> None:
-        """Reads the file that is there; also where it is only to be replaced, so that no other file ever is."""
-        state, found = load_state(self.path)
-        if (wrong := _wrong_entry(found)) is not None:
-            raise ClodError(
-                f"{self.path}: is no training state or damaged (its record has {wrong} {found[wrong]!r:.60}); "
-                "remove it to start afresh"
-            )
-        if resume:
-            self.state, self.found, self.saved = state, found, state.steps
-            self._refuse_other_settings()
-        else:
-            self.console.say(
-                f"{self.path} has step {state.steps} of a run that was interrupted, with which --resume would go on; "
-                "this run begins anew, and replaces it once its own training has begun"
-            )
+    @property
+    def frozen(self) -> list[str]:
+        """The attributes that the plan of the run froze."""
+        return list(self.run_of.get("frozen", []))
 
-    def belong(self, base: Gaussians, scene: Scene, checkpoint: str, source: str) -> None:
-        """Says what the states to come belong to, and refuses the one found where it belongs to something else.
-
-        Args:
-            checkpoint, source: where ``base`` and the views are from, for the messages.
-        """
-        self.claim(_fingerprint(base), scene_fingerprint(scene), checkpoint, source)
-
-    def claim(self, base: str, views: str, checkpoint: str, source: str) -> None:
-        """``belong`` by the fingerprints of base and views."""
-        self.belongs |= {"base_sha256": base, "views_sha256": views}
-        if self.state is None:
-            return
+    def check_inputs(self, run_of: RunKey, checkpoint: str, source: str) -> None:
+        """Raises ClodError if base or views are others; ``checkpoint`` and ``source`` name them in the message."""
         for key, what in (
             ("base_sha256", f"another checkpoint than {checkpoint}"),
             ("views_sha256", f"other photographs than {source}"),
         ):
-            if self.found.get(key) != self.belongs[key]:
-                raise ClodError(f"{self.path}: is of {what}; {BEGUN}")
-        self.console.say(f"resuming {self.path} from step {self.state.steps}")
+            if self.run_of.get(key) != run_of[key]:
+                raise ClodError(f"{self.path}: is of {what}; {ORIGINAL}")
 
-    def naming(self, error: StateRefused) -> ClodError:
-        """What the state found was refused for, with the name of its file."""
-        return ClodError(f"{self.path}: {str(error).partition(';')[0]}; remove it to start afresh")
+    def check_override(self, requested: dict[str, list[str]]) -> None:
+        """Raises ClodError if the run had other ``--with`` or ``--without``, which changes its tensors."""
+        then = self.run_of.get("overruled", {})
+        if then != requested:
+            words = " ".join(" ".join((option, *names)) for option, names in then.items() if names)
+            raise ClodError(f"{self.path}: is of a run with {words or 'no --with or --without'}; {ORIGINAL}")
 
-    def _refuse_other_settings(self) -> None:
-        if (then := self.found.get("version")) != (now := self.belongs["version"]):
-            raise ClodError(f"{self.path}: is of version {then} of this package, not {now}; remove it to start afresh")
-        now, then = self.belongs["config"], self.found.get("config")
+    def check_settings(self, run_of: RunKey) -> None:
+        """Raises ClodError if version or settings are others."""
+        if (then := self.run_of.get("version")) != (now := run_of["version"]):
+            raise ClodError(f"{self.path}: is of version {then} of this package, not {now}; delete it to start over")
+        now, then = run_of["config"], self.run_of.get("config")
         if not isinstance(then, dict) or then.keys() != now.keys():
-            raise ClodError(f"{self.path}: is of other settings; {BEGUN}")
+            raise ClodError(f"{self.path}: is of other settings; {ORIGINAL}")
         different = [name for name in now if now[name] != then[name]]
         options = [_as_option(name, then[name]) for name in different if name in OPTIONS]
-        if options or different:
+        if different:
             what = ", ".join(options) or f"another --form ({different[0]} {then[different[0]]})"
-            raise ClodError(f"{self.path}: is of a run with {what}; {BEGUN}")
+            raise ClodError(f"{self.path}: is of a run with {what}; {ORIGINAL}")
 
-    @property
-    def frozen(self) -> list[str] | None:
-        """The attributes that the run to go on with froze; None where there is none."""
-        return list(self.found.get("frozen", [])) if self.state is not None else None
 
-    def watching(self, follow: Callable[[Progress], None]) -> Callable[[Progress], None]:
-        """The progress callback that also saves: after the first step, now and then, and when training is stopped.
+def find_state(path: Path, resume: bool, config: AdaptConfig, console: Console) -> Resumed | None:
+    """The state to resume from; None without ``resume`` or without a file.
 
-        An error of ``follow`` stops it too.
-        """
+    Raises:
+        ClodError: the file is not a training state (then it is not replaced either), is damaged, or of other settings.
+    """
+    if not path.exists():
+        if resume:
+            console.say(f"there is no {path} to resume from: starting from the beginning")
+        return None
+    state, run_of = load_state(path)
+    if (wrong := _wrong_entry(run_of)) is not None:
+        raise ClodError(
+            f"{path}: is not a training state or is damaged (its record has {wrong} {run_of[wrong]!r:.60}); "
+            "delete it to start over"
+        )
+    found = Resumed(path, state, run_of)
+    if resume:
+        found.check_settings(settings_key(config))
+        return found
+    console.say(
+        f"{path} has step {state.steps} of an interrupted run, which --resume would continue; this run starts over, "
+        "and replaces the file once its training has begun"
+    )
+    return None
 
-        def call(progress: Progress) -> None:
-            self.latest = progress if progress.state else None
+
+def settings_key(config: AdaptConfig) -> RunKey:
+    return {"version": package_version(), "config": asdict(config)}
+
+
+def identify(
+    resumed: Resumed | None, base: Gaussians, scene: Scene, config: AdaptConfig, args: argparse.Namespace,
+    console: Console,
+) -> RunKey:  # fmt: skip
+    """The key of a run on these Gaussians and views, without its plan.
+
+    Raises:
+        ClodError: ``resumed`` is of others.
+    """
+    hashes = {"base_sha256": _fingerprint(base), "views_sha256": scene_fingerprint(scene)}
+    run_of = settings_key(config) | hashes
+    check_resumed(resumed, run_of, args.ply, args.images or "the pseudo views", console)
+    return run_of
+
+
+def check_resumed(resumed: Resumed | None, run_of: RunKey, checkpoint: str, source: str, console: Console) -> None:
+    """``Resumed.check_inputs``, and a message that the run is resumed."""
+    if resumed:
+        resumed.check_inputs(run_of, checkpoint, source)
+        console.say(f"resuming {resumed.path} from step {resumed.state.steps}")
+
+
+class Saver:
+    """Saves the training state of one run.
+
+    Attributes:
+        saved: the step that is in the file; None if the file is not of this run.
+        latest: the last progress that is not saved; it references everything that is trained.
+        seconds, saves: time spent saving, and how often.
+    """
+
+    def __init__(
+        self, path: Path, run_of: RunKey, resumed: Resumed | None, console: Console, stop: GracefulStop
+    ) -> None:
+        self.path, self.run_of, self.console, self.stop = path, run_of, console, stop
+        self.saved = resumed.state.steps if resumed else None
+        self.latest: Progress | None = None
+        self.seconds, self.saves, self.warned = 0.0, 0, False
+        self.began, self.due = math.inf, 0.0
+
+    def saving(self, listener: Listener) -> Listener:
+        """The listener that also saves: after the first step, now and then, and when training stops or fails."""
+
+        def listen(now: Progress) -> bool:
+            self.latest = now if now.state else None
             try:
-                follow(progress)
-            except (KeyboardInterrupt, Exception):
-                if not self.stop.aborted:
-                    self._save(progress)
+                going = listener(now) is not False
+            except Exception:
+                self._save(now)
                 raise
-            if time.perf_counter() >= self.due and progress.share < 1:
-                self._save(progress)
+            stopping = (not going or now.error) and not self.stop.aborted
+            if stopping or (time.perf_counter() >= self.due and now.share < 1):
+                self._save(now)
+            return going
 
-        return call
+        return listen
 
     def _save(self, progress: Progress) -> None:
-        """Saves, if there is something to be saved. Where that fails training goes on, which matters more."""
+        """Saves the state, if there is one. If that fails, training continues."""
         if progress.state is None:
             return
         began = time.perf_counter()
         self.began = min(self.began, began)
         try:
-            save_state(self.path, progress.state(), self.belongs)
+            save_state(self.path, progress.state(), self.run_of)
             self.saved, self.latest = progress.done, None
         except (ClodError, MemoryError) as error:
             if not self.warned:
-                self.console.say(f"warning: the run goes on, but --resume will not know of it: {error}")
+                self.console.say(f"warning: the run continues, but --resume will not find it: {error}")
             self.warned = True
         now = time.perf_counter()
         cost = now - began
@@ -158,37 +191,52 @@ class Saver:
         self.due = max(now + SAVE_EVERY, self.began + (self.seconds + cost) / SAVE_COST)
 
     def keep(self) -> None:
-        """Saves where training has ended, so that what comes after it can fail. Where it cannot, see ``rescue``."""
+        """Saves the end of the training, so that later steps may fail; if that fails, ``rescue`` saves it elsewhere."""
         if self.latest is not None:
             self._save(self.latest)
 
-    def rescue(self, how: str = "--resume") -> None:
-        """After a failure: says what goes on from where, on stderr also with ``--quiet``.
+    @contextmanager
+    def rescuing(self, how: str = "--resume") -> Iterator[None]:
+        """Calls ``rescue`` on an error within the block."""
+        try:
+            yield
+        except Stopped:
+            raise
+        except Exception:
+            self.rescue(how)
+            raise
 
-        What could not be saved beside the output is saved in a new folder for temporary files.
+    def rescue(self, how: str = "--resume") -> None:
+        """After an error: says on stderr, also with ``--quiet``, from which step ``how`` resumes.
+
+        A state that cannot be saved beside the output is saved in a new folder for temporary files.
         """
         self.keep()
         if self.latest is not None and (path := self._save_elsewhere(self.latest)):
-            _tell(f"step {self.latest.done} is in {path}: move it to {self.path}, and {how} goes on from there")
+            _tell(f"step {self.latest.done} is in {path}: move it to {self.path}, and {how} resumes from there")
         elif self.saves and self.saved is not None:
-            _tell(f"{how} goes on from step {self.saved}, which is in {self.path}")
+            _tell(f"{how} resumes from step {self.saved}, which is in {self.path}")
 
     def _save_elsewhere(self, progress: Progress) -> Path | None:
-        """Where, if it could."""
+        """The file, if it could be saved."""
         assert progress.state is not None
         try:
             folder = Path(tempfile.mkdtemp(prefix="clod-adapt-"))
         except OSError:
             return None
         try:
-            save_state(folder / self.path.name, progress.state(), self.belongs)
+            save_state(folder / self.path.name, progress.state(), self.run_of)
         except (ClodError, MemoryError):
             folder.rmdir()
             return None
         return folder / self.path.name
 
+    def naming(self, error: StateRefused) -> ClodError:
+        """The error with the name of the state file."""
+        return ClodError(f"{self.path}: {str(error).partition(';')[0]}; delete it to start over")
+
     def close(self, finished: bool) -> None:
-        """Removes this run's file, or says what it is for; one of another run that it has not replaced stays."""
+        """Removes the run's file if the run is finished, else says how to resume."""
         self.latest = None
         if self.saved is None:
             return
@@ -196,7 +244,7 @@ class Saver:
             self.path.unlink(missing_ok=True)
             self.saved = None
         else:
-            self.console.say(f"--resume goes on from step {self.saved}, which is in {self.path}")
+            self.console.say(f"--resume resumes from step {self.saved}, which is in {self.path}")
 
 
 def _tell(text: str) -> None:
@@ -204,12 +252,12 @@ def _tell(text: str) -> None:
         print(text, file=sys.stderr)
 
 
-def _wrong_entry(found: dict[str, Any]) -> str | None:
-    """Which entry of a state's record is of the wrong type, of those that are more than compared."""
-    frozen, overruled = found.get("frozen", []), found.get("overruled", {})
+def _wrong_entry(run_of: RunKey) -> str | None:
+    """The entry of a wrong type, of those whose contents are used."""
+    frozen, override = run_of.get("frozen", []), run_of.get("overruled", {})
     if not _is_words(frozen):
         return "frozen"
-    if not isinstance(overruled, dict) or not all(map(_is_words, overruled.values())):
+    if not isinstance(override, dict) or not all(map(_is_words, override.values())):
         return "overruled"
     return None
 
@@ -224,7 +272,7 @@ def _as_option(name: str, value: object) -> str:
 
 
 def _fingerprint(gaussians: Gaussians) -> str:
-    """SHA-256, hex, of the Gaussians as they were read, which the options of reading have a part in."""
+    """SHA-256, hex, of the Gaussians as read, which depends on the options for reading."""
     digest = hashlib.sha256(repr((gaussians.attenuation, gaussians.screen_filter)).encode())
     for name, tensor in gaussians.tensors().items():
         digest.update(f"{name} {tuple(tensor.shape)};".encode())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from clod_adapter.blocks.memory import parse_size
 from clod_adapter.errors import ClodError
@@ -12,68 +13,56 @@ from ..shared.files import Outputs
 from ..shared.launch import launched
 from .checks import check_checkpoint, check_scene, page_files
 from .command import Command
-from .options import add_activated, add_antialiasing, add_device
+from .options import add_activated, add_antialiasing, add_device, add_misaligned_ok
 from .settings import add_settings, make_config
 
-# As in clod_adapter.training.plan, which would import torch; a test compares the two.
+if TYPE_CHECKING:
+    from argparse import _ActionsContainer
+
+# As in clod_adapter.training.plan, which imports torch; a test compares the two.
 NAMES = ("bands", "unseen", "means", "quats", "scales", "opacities", "sh0")
-
-PLAN = """\
-Before training a plan is printed: what the scene does not need, by which
-number, and the option that overrules it. Higher SH bands are left out where the
-training views change by less than 0.02 dB without them, Gaussians where they
-move no pixel of any, and an attribute is frozen where tuning it can do less
-than 0.02 dB. What was left out is in OUT.ply as it was; with --trim it is not,
-and OUT.ply is smaller. --with and --without settle it beforehand, for bands,
-unseen (Gaussians), means, quats, scales, opacities and sh0. A training of fewer
-than 300 steps freezes no attribute by itself.
-"""
-
-
-def add_plan_options(parser: ArgumentParser) -> None:
-    for option, dest, what in (
-        ("--with", "keep_in", "train with these, whatever the plan would find: "),
-        ("--without", "leave_out", "leave these out or frozen, likewise"),
-    ):
-        names = ", ".join(NAMES) if dest == "keep_in" else ""
-        parser.add_argument(
-            option, dest=dest, metavar="NAME", nargs="+", action="extend", choices=NAMES, default=[], help=what + names
-        )
-    parser.add_argument("--trim", action="store_true", help="do not write the bands and Gaussians that were left out")
 
 
 def adapt_options(parser: ArgumentParser) -> None:
-    parser.add_argument(
-        "ply",
-        metavar="PLY",
-        help="the checkpoint: a PLY in Inria's 3DGS layout, or another file that inspect reads; never modified",
-    )
-    parser.add_argument(
+    given = parser.add_argument_group("input")
+    given.add_argument(
+        "ply", metavar="PLY",
+        help="checkpoint: a PLY in Inria's 3DGS layout, or another file that inspect reads; never modified",
+    )  # fmt: skip
+    given.add_argument(
         "--images", metavar="DIR",
-        help="the scene: photographs in DIR/images and their COLMAP model in DIR/sparse/0, or nerfstudio's or "
-        "instant-ngp's DIR/transforms.json (default: none, see below)",
+        help="scene folder: images/ with a COLMAP model in sparse/0, or a transforms.json of nerfstudio or instant-ngp "
+        "(default: none, see below)",
     )  # fmt: skip
-    add_settings(parser)
-    add_plan_options(parser)
-    parser.add_argument(
-        "-o", "--out", metavar="OUT.ply", help="output (default: PLY's name with _clod, in this folder)"
+    add_activated(given)
+    add_antialiasing(given)
+    output = parser.add_argument_group("output")
+    output.add_argument(
+        "-o", "--out", metavar="OUT.ply", help="output file (default: name of PLY with _clod, in the current folder)"
     )
-    parser.add_argument(
-        "--memory", metavar="SIZE", help="stay below this, as in 8GB: where the whole does not fit, train it in blocks"
-    )
-    parser.add_argument(
-        "--block", metavar="N", help="do only the start, or only block N, of a run with --memory; without it the same "
-        "command does what is missing, and puts all together",
+    output.add_argument("--report", action="store_true", help="also write a page, OUT.html, and its charts")
+    training = parser.add_argument_group("training")
+    add_settings(training)
+    training.add_argument("--resume", action="store_true", help="continue the same command where it was interrupted")
+    add_misaligned_ok(training)
+    add_device(training, "train and measure")
+    add_advanced(parser.add_argument_group("advanced"))
+
+
+def add_advanced(options: _ActionsContainer) -> None:
+    options.add_argument(
+        "--with", dest="keep_in", metavar="NAME", nargs="+", action="extend", choices=NAMES, default=[],
+        help=f"train these whatever the plan measures: {', '.join(NAMES)}",
     )  # fmt: skip
-    parser.add_argument("--resume", action="store_true", help="go on with the same command where it was interrupted")
-    add_device(parser, "train and measure")
-    parser.add_argument(
-        "--misaligned-ok", action="store_true", help="train even where a checkpoint does not fit the photographs"
+    options.add_argument(
+        "--without", dest="leave_out", metavar="NAME", nargs="+", action="extend", choices=NAMES, default=[],
+        help="exclude or freeze these whatever the plan measures",
+    )  # fmt: skip
+    options.add_argument("--trim", action="store_true", help="do not write the SH degrees and Gaussians excluded")
+    options.add_argument("--memory", metavar="SIZE", help="memory limit, as in 8GB; larger scenes are split in blocks")
+    options.add_argument(
+        "--block", metavar="N", help="with --memory: run only the initialization (start), or only block N"
     )
-    parser.add_argument("--report", action="store_true", help="also a page to look at, OUT.html, and its charts")
-    add_activated(parser)
-    add_antialiasing(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
 
 
 def check_adapt(args: Namespace) -> None:
@@ -98,13 +87,11 @@ def check_memory(args: Namespace) -> None:
     if args.memory is not None:
         parse_size(args.memory)
         if launched().size > 1:
-            raise ClodError(
-                "--memory is for one process: leave out torchrun, and give jobs of their own each a --block"
-            )
+            raise ClodError("--memory needs a single process: run without torchrun, or start one job per --block")
     if args.block is None:
         return
     if args.memory is None:
-        raise ClodError("--block is of a run in blocks, which --memory makes; give it too")
+        raise ClodError("--block needs --memory, which splits the scene in blocks; give both")
     if args.block != "start" and not (args.block.isascii() and args.block.isdigit() and int(args.block) >= 1):
         raise ClodError(f"--block is {args.block!r}; give start, or the number of a block, from 1")
 
@@ -115,72 +102,59 @@ ADAPT = Command(
     description="""\
 Give a trained 3D Gaussian splat a quality dial: one file for every budget.
 
-Learns one number per Gaussian, sigma_d, with which a renderer fades detail out
-smoothly with distance, and tunes the rest lightly. The dial s is set when
-rendering: 1 is full quality, at s roughly s^-1.5 of the Gaussians are drawn.
+Learns one number per Gaussian, sigma_d, by which a renderer fades detail out
+with distance, and fine-tunes the other attributes. The dial s is set when
+rendering: s = 1 is full quality; at s about s^-1.5 of the Gaussians are drawn.
 """,
     usage="PLY [--images DIR] [--max-sv S] [--out OUT.ply] [options]",
-    epilog=f"""\
-outputs, side by side; a file of that name is replaced:
-  OUT.ply          the splat with one more property, sigma_d
-  OUT.safetensors  the adapter: only what changed; "clod-adapt apply" makes
-                   OUT.ply again from it and the checkpoint
-  OUT.json         the report: settings, machine, times, and per dial value the
-                   quality on held-out photographs (every 8th by name)
-with --report, which needs pip install 'clod-adapter[plots]':
-  OUT.html         one self-contained page: a view under a slider, error against
-                   the time of a frame and against seconds of training, all rows
-  OUT_rendering.png, OUT_adapting.png  its charts
-The PLY's header and the adapter hold the report's rows too: dial value, count,
-PSNR, SSIM and frame time, from which --psnr-drop and --fps find a dial value
-elsewhere. The same seed gives the same Gaussians, bit for bit; the frame times
-in the calibration are those of the run.
+    epilog="""\
+outputs (existing files are replaced):
+  OUT.ply          the splat with sigma_d, and a calibration in its header: dial
+                   value, count, PSNR, SSIM and frame time
+  OUT.safetensors  the adapter: "clod-adapt apply" rebuilds OUT.ply from it
+  OUT.json         the report: settings, machine, times, and quality on held-out
+                   photographs (every 8th by name) per dial value
+  OUT.html, OUT_rendering.png, OUT_adapting.png
+                   with --report: a self-contained page and its charts; needs
+                   pip install 'clod-adapter[plots]'
+The same seed gives the same Gaussians, bit for bit.
 
-without --images cameras are placed where the checkpoint looks photographed, and
-the pictures are its own, at full detail: it is its own teacher. The numbers are
-then against the checkpoint, on placed views held out. With the photographs the
-result is better; give them where there are any.
+without --images:
+  Cameras are placed, and the checkpoint itself renders the target images: all
+  quality numbers are relative to it. Photographs give a better result.
 
-{PLAN}
-Before training eight of the photographs are compared with what the checkpoint
-shows there. Where that is worse than their own mean colours, or another frame
-fits clearly better, it stops, with what was found: other axes, scale or offset,
-gsplat's or nerfstudio's normalised frame, a white background.
---misaligned-ok goes on with a warning.
+plan:
+  Printed before training: action, measured effect, option that overrides it.
+  Higher SH degrees (bands) are excluded if training views change by less than
+  0.02 dB without them, Gaussians (unseen) if they change no pixel of a training
+  view. An attribute is frozen if tuning it gains less than 0.02 dB (from 300
+  steps). Excluded values are in OUT.ply unchanged, or with --trim not at all.
 
-While training its state is saved in OUT.resume.safetensors, after the first
-step and then now and then, for at most 2 % of the time. After a crash, a kill,
-a full disk or Ctrl-C the same command with --resume goes on from there, and
-ends with the very Gaussians, bit for bit, that it would have ended with
-undisturbed (on as many threads). Without such a file it starts from the
-beginning, and says so; the finished run removes it. No file has its final name
-before it is whole.
+alignment:
+  Renders of eight views are compared with the photographs. If the photographs'
+  mean colours, another frame (axes, scale, offset, normalised) or a white
+  background fit better, the command stops and says which.
 
---memory 8GB plans what every phase takes, prints it, and adapts in blocks what
-does not fit: blocks of the scene, each with the views that see it, in two
-passes. Blocks can be jobs: with --block start, and then --block 1 and so on
-(once for each pass), in any order; the same command without --block does what
-is missing and writes the outputs, the same ones. Killed, it is repeated.
+interruption:
+  Ctrl-C or SIGTERM while training finishes the step and writes the result so
+  far (exit code 0, "interrupted": true); a second one aborts. While measuring
+  it skips the rest; while writing it has no effect.
+  Training saves its state in OUT.resume.safetensors (at most 2 % of the time),
+  or in the temporary folder if that fails. After Ctrl-C, a crash or a full disk
+  the same command with --resume continues and gives the same Gaussians, bit for
+  bit (on as many threads).
 
-torchrun starts several processes, on one machine or many, which train together:
-each takes its part of a step's views, one by default. The outcome is that of
-one process with the same --batch, but for rounding. docs/many_processes.md.
+large scenes, several processes:
+  --memory 8GB plans the memory of every phase and trains a scene that does not
+  fit in blocks, in two passes. Blocks can be separate jobs: --block start, then
+  --block N for each block, once per pass, in any order. The same command
+  without --block does the rest and writes the outputs.
+  Processes of torchrun train together, each on a part of a step's views; the
+  result is that of one process with the same --batch, up to rounding.
 
-Ctrl-C, or SIGTERM, while training stops after the step under way and writes the
-state for --resume and what was learned so far (exit code 0, "interrupted": true
-in the report); once more aborts, and the state last saved stays. While the
-result is written it is finished first; while it is measured the rest is
-skipped. Before training nothing is written. A background job of a
-script ignores Ctrl-C; SIGTERM stops it.
-
-The state is also saved where training ends, so that no error after it loses
-what was learned; where that cannot be beside the output, it is in the folder
-for temporary files, and stderr says what to do with it.
-
-exit codes: 0 written; 1 a loss that is not finite ended training early (what
-was learned before is written), or a fault of this program (a traceback, and
-where to report it); 2 bad input or a full disk, one line on stderr and no
-output written; 130 interrupted with nothing to write, or aborted
+exit codes: 0 written; 1 loss not finite (the result until then is written), or
+a fault of this program; 2 bad input or a full disk; 130 interrupted without a
+result
 
 examples:
   clod-adapt garden.ply --images garden --max-sv 5

@@ -15,11 +15,12 @@ from .options import add_activated
 
 
 def apply_options(parser: ArgumentParser) -> None:
-    parser.add_argument("base", metavar="BASE.ply", help="the checkpoint that was adapted")
-    parser.add_argument("adapter", metavar="ADAPTER.safetensors", help="what clod-adapt wrote beside its PLY")
-    parser.add_argument("-o", "--out", metavar="OUT.ply", required=True, help="what to write; replaced if it exists")
-    add_activated(parser)
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
+    given = parser.add_argument_group("input")
+    given.add_argument("base", metavar="BASE.ply", help="the checkpoint that was adapted")
+    given.add_argument("adapter", metavar="ADAPTER.safetensors", help="the adapter that clod-adapt wrote")
+    add_activated(given)
+    output = parser.add_argument_group("output")
+    output.add_argument("-o", "--out", metavar="OUT.ply", required=True, help="output file; replaced if it exists")
 
 
 def check_apply(args: Namespace) -> None:
@@ -33,12 +34,12 @@ def check_apply(args: Namespace) -> None:
 
 APPLY = Command(
     module="apply",
-    summary="Make the adapted PLY from checkpoint and adapter.",
-    description="Make the adapted PLY again from the checkpoint and the small adapter file.",
+    summary="Rebuild the adapted PLY from checkpoint and adapter.",
+    description="Rebuild the adapted PLY from the checkpoint and the small adapter file.",
     usage="BASE.ply ADAPTER.safetensors -o OUT.ply [--json]",
     epilog="""\
-OUT.ply is bit for bit what clod-adapt wrote. BASE.ply must be the very file
-that was adapted: its SHA-256 is compared with the one in the adapter.
+OUT.ply equals the file that clod-adapt wrote, bit for bit. BASE.ply must be the
+checkpoint that was adapted: the adapter stores its SHA-256.
 
 example:
   clod-adapt apply garden.ply garden_clod.safetensors -o again.ply

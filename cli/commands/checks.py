@@ -1,4 +1,4 @@
-"""What can be seen to be wrong without torch, which takes a second or two to import; refused before that."""
+"""Checks of arguments and files that need no torch, whose import takes a second or two."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from collections.abc import Collection
 from pathlib import Path
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.ply.header import PREFIX, ROW, all_comments, read_header
-from clod_adapter.io.readers import PLY, check_readable, file_has_dial, reader_of
+from clod_adapter.io.file_formats import PLY, check_readable, file_has_dial, format_of
+from clod_adapter.io.ply.header import PREFIX, ROW, all_comments, read_head
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.report.charts import chart_file
 from clod_adapter.report.style import check_matplotlib
@@ -19,7 +19,7 @@ from ..shared.dials import given_budget
 
 
 def page_files(path: Path, charts: list[str]) -> list[Path]:
-    """A page and its charts; refuses a page that could not be drawn."""
+    """The files of a page and its charts; refuses a page that cannot be written."""
     check_matplotlib()
     if path.suffix.lower() != ".html":
         raise ClodError(f"{path}: --report names the page to write, so it must end in .html")
@@ -27,10 +27,10 @@ def page_files(path: Path, charts: list[str]) -> list[Path]:
 
 
 def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fps",)) -> None:
-    """Refuses values that are none, and budgets that the file's header says nothing can be solved for.
+    """Refuses dial values out of range, and budgets that need something the file does not have.
 
     Args:
-        measured: the budgets that the command measures for itself, without a calibration.
+        measured: budgets that the command solves by measuring, without a calibration.
     """
     for virtual_scale in args.sv or ():
         if not 1 <= virtual_scale < math.inf:
@@ -43,17 +43,17 @@ def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fp
         if not 0 < value < math.inf:
             raise ClodError(f"{option} has {value:g}, it must be positive and finite")
     if not has_dial(model):
-        raise ClodError(f"{model}: has no sigma_d, so no dial for {option}; give it one first: clod-adapt {model} ...")
+        raise ClodError(f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ...")
     needed = name != "keep" and name not in measured
-    if needed and reader_of(Path(model)) is PLY and not _has_calibration(model):  # others say so when they are read
+    if needed and format_of(Path(model)) is PLY and not _has_calibration(model):  # others fail when read
         raise ClodError(
-            f"{model}: has no calibration in its header, which {option} needs; adapt it again, and let it measure to "
-            "the end, or give --sv or --keep"
+            f"{model}: has no calibration in its header, which {option} needs; adapt it again without interrupting, "
+            "or give --sv or --keep"
         )
 
 
 def _has_calibration(model: str) -> bool:
-    return any(comment.startswith(f"{PREFIX}{ROW} ") for comment in all_comments(read_header(Path(model))))
+    return any(comment.startswith(f"{PREFIX}{ROW} ") for comment in all_comments(read_head(Path(model)).ply))
 
 
 def has_dial(model: str) -> bool:
@@ -62,19 +62,19 @@ def has_dial(model: str) -> bool:
 
 
 def check_checkpoint(path: str) -> None:
-    """Refuses what by its first bytes is no checkpoint."""
+    """Refuses a file that is no checkpoint, by its first bytes."""
     check_readable(Path(path))
 
 
 def check_scene(folder: str) -> None:
-    """Refuses what is no folder with a COLMAP model or a transforms.json."""
+    """Refuses anything but a folder with a COLMAP model or a transforms.json."""
     if not Path(folder).is_dir():
         raise ClodError(f"{folder}: is not a folder; give the one that holds images/ and sparse/0")
     find_cameras(Path(folder))
 
 
 def check_makeable(out: Path) -> None:
-    """Refuses a folder that is no folder, or cannot be made or written to."""
+    """Refuses an output folder that is a file, or cannot be made or written to."""
     parent = next(folder for folder in (out, *out.parents) if folder.exists())
     if not parent.is_dir():
         raise ClodError(f"{out}: {parent} is a file; choose another --out")

@@ -1,4 +1,4 @@
-"""A command: what ``--help`` says of it, its options, its checks, and the module that runs it."""
+"""A command: its ``--help`` text, options, early checks, and the module that runs it."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Command:
-    """What ``--help`` says of a command, and its options.
+    """The texts of ``--help``, and what parses, checks and runs a command.
 
     Attributes:
-        module: of ``clod_adapter.cli``; its ``run(args)`` returns the object that --json prints. It may import torch.
-        add_arguments: adds the options to a parser.
-        check: refuses, before torch is imported, arguments and files that cannot work.
+        module: name below ``clod_adapter.cli``; its ``run(args)`` returns the object that --json prints. It may import
+            torch.
+        add_arguments: adds the options, in groups, to a parser.
+        check: raises ClodError, before torch is imported, for arguments and files that cannot work.
     """
 
     module: str

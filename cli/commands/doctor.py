@@ -1,49 +1,42 @@
-"""``clod-adapt doctor``: its text, options."""
+"""``clod-adapt doctor``: its text."""
 
 from __future__ import annotations
 
-from argparse import ArgumentParser
-
 from .command import Command
-
-
-def doctor_options(parser: ArgumentParser) -> None:
-    parser.add_argument("--quiet", action="store_true", help="no progress")
-
 
 DOCTOR = Command(
     module="doctor.run",
-    summary="Say what works here, and what mends the rest.",
+    summary="Check backends and tools, and say how to fix them.",
     description="""\
-Say which backends and tools work here, why the others do not, and the line that
-mends each.
+Check which backends and tools work on this machine. For each that does not,
+print the reason and a command that fixes it.
 """,
     usage="[--json] [--quiet]",
     epilog="""\
-Each line has a name, ok or off, what was found, and behind -> what to type.
-ok means that it was done: a rasterizer has drawn what the reference draws, a
-metric has measured, a file was packed. Only the browser is found, not opened.
+Each line has a name, ok or off, the result, and after -> the fix. ok means that
+the check ran the thing itself: a rasterizer rendered the reference's image, a
+metric measured, a file was packed. Only the browser is not opened.
 
-  cpu, gpu       what the commands draw and train with
+  cpu, gpu       backends of all commands
   driver, cuda, gsplat
-                 what gpu needs, in this order: mend the first that is off
-  gsplat, inria  what the integrations of these names draw with
+                 what gpu needs, in this order: fix the first that is off
+  gsplat, inria  backends of the integrations of these names
   processes      torch.distributed, for several processes
   plots, glb, splat-transform, demo, lpips, flip
                  optional: figures and reports, .glb files, packed files, the
                  demo, two columns of clod-adapt eval
   cores, memory, cache
-                 what this process may use, and where things are kept
+                 limits of this process, and folders for cached files
 
-Nothing is installed or fetched, and gsplat is not compiled. All that stays is
-the compiled kernels of the CPU, on the first run.
+Nothing is installed or downloaded, and gsplat is not compiled; the first run
+leaves the compiled CPU kernels.
 
-exit codes: 0 something draws; 1 nothing does, neither cpu nor gpu
+exit codes: 0 cpu or gpu works; 1 neither does
 
 examples:
   clod-adapt doctor
   clod-adapt doctor --json > doctor.json
 """,
-    add_arguments=doctor_options,
+    add_arguments=lambda parser: None,
     check=lambda args: None,
 )

@@ -16,25 +16,28 @@ from .options import add_activated, add_antialiasing, add_device, add_images
 
 
 def evaluate_options(parser: ArgumentParser) -> None:
-    parser.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one as the baseline")
-    add_images(parser)
-    default = "dial values, 1 (full quality) and up (default: 1 2 3 5 as far as trained, and the last one trained)"
-    add_dial_options(parser, default, "(mean over the held-out views)", several=True, required=False)
-    parser.add_argument(
-        "--base", metavar="BASE.ply", help="also the unadapted checkpoint, cut by rank to as many Gaussians as each row"
+    given = parser.add_argument_group("input")
+    given.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one as a baseline")
+    add_images(given)
+    add_activated(given)
+    add_antialiasing(given)
+    dial = parser.add_argument_group("dial values, one of")
+    default = "dial values from 1 (full quality) (default: 1 2 3 5 below the largest trained, and that)"
+    add_dial_options(dial, default, "(mean over the held-out views)", several=True)
+    measuring = parser.add_argument_group("measuring")
+    measuring.add_argument(
+        "--base", metavar="BASE.ply", help="also measure the checkpoint, pruned to the count of each row"
     )
-    parser.add_argument(
+    measuring.add_argument(
         "--against", metavar="FILE.ply", nargs="+", default=[],
-        help="also other files, and beside each MODEL.ply at the dial value that keeps as many Gaussians",
+        help="also measure other files, each beside MODEL.ply at the same number of Gaussians",
     )  # fmt: skip
-    parser.add_argument(
-        "--popping", action="store_true", help="also how evenly the picture changes with the dial and with the camera"
+    measuring.add_argument(
+        "--popping", action="store_true", help="also measure how evenly the image changes with the dial and the camera"
     )
-    parser.add_argument("--report", metavar="OUT.html", help="also a page to look at, and beside it its charts")
-    add_device(parser, "render")
-    add_activated(parser)
-    add_antialiasing(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
+    add_device(measuring, "render")
+    output = parser.add_argument_group("output")
+    output.add_argument("--report", metavar="OUT.html", help="also write a self-contained page, and its charts")
 
 
 def check_evaluate(args: Namespace) -> None:
@@ -46,8 +49,7 @@ def check_evaluate(args: Namespace) -> None:
         check_checkpoint(args.base)
         if has_dial(args.base):
             raise ClodError(
-                f"{args.base}: has a dial (sigma_d); give --base the checkpoint that was adapted, or give it to "
-                "--against"
+                f"{args.base}: has a dial (sigma_d); give --base the checkpoint that was adapted, or use --against"
             )
     check_scene(args.images)
     if args.report:
@@ -63,43 +65,34 @@ EVALUATE = Command(
     usage="MODEL.ply --images DIR [--sv S [S ...]] [options]",
     epilog=f"""\
 {BUDGETS}
-All numbers are over the held-out photographs (every 8th by name):
+columns, over the held-out photographs (every 8th by name):
   PSNR, SSIM  means against the photographs
-  kept        Gaussians that the dial leaves in, and their share of all
-  in view     those of them that have their centre in the picture
-  frame ms    median time to render a picture
-  LPIPS, FLIP the picture's distance as seen: LPIPS with AlexNet, the mean of
-              FLIP; where pip install 'clod-adapter[eval]' put their packages,
-              and LPIPS its network's weights, which are not downloaded here
-A checkpoint without a dial shows the same at every value: the baseline.
+  kept        Gaussians kept, and their share of all
+  in view     of these, the ones with their centre in the image
+  frame ms    median time to render an image
+  LPIPS, FLIP LPIPS (AlexNet) and mean FLIP, with the packages of
+              pip install 'clod-adapter[eval]' and LPIPS's network weights
 
-With --base each row is followed by the base, untouched, at the same count: the
-Gaussians of highest opacity, and those of highest removal error, the error that
-leaving one out alone makes in the photographs trained on. With --against a file
-that has a dial itself is measured at every dial value; the model keeps as many
-as a mean over the held-out views, at most what it keeps at s = 1.
+--base adds two rows per dial value: the base without tuning, reduced to as many
+Gaussians by opacity, and by removal error (the error in the training views when
+one Gaussian is removed). --against measures a file with a dial at every dial
+value, and MODEL.ply at as many Gaussians, or at s = 1.
 
---popping turns the dial from 1 to the largest S in 200 equal ratios before two
-held-out cameras, and moves through five neighbouring cameras in 200 steps at
-that S; of a moving camera only what the dial does is counted, not the motion.
-Per step: the change of the picture (root mean square, levels of 255), the
-largest against the mean (1 is even, 200 a single switch), and how much of the
-largest is left when the step is halved: 0.5 of a fade, 1.0 of a jump.
+--popping turns the dial from 1 to the largest S in 200 equal ratios at two
+held-out cameras, and moves through five cameras in 200 steps at that S, where
+only the dial's changes count. Printed are the RMS change per step (of 255), the
+ratio of largest to mean (1 even, 200 a single jump), and the share of the
+largest left when the step is halved (0.5 a fade, 1.0 a jump).
 
---report writes one self-contained page: a held-out view under a slider, error
-against milliseconds a frame, all rows, the settings; and OUT_rendering.png.
-
-Ctrl-C skips the dial values that are not finished (exit code 0, "interrupted":
-true); before the first one is, there is nothing to print (exit code 130).
+Ctrl-C skips unfinished dial values (exit code 0, "interrupted": true; 130 if
+none is finished).
 
 examples:
   clod-adapt eval garden_clod.ply --images garden
-  clod-adapt eval garden.ply --images garden --sv 1
   clod-adapt eval garden_clod.ply --images garden --sv 1 4 --json > eval.json
   clod-adapt eval garden_clod.ply --images garden --base garden.ply --popping
   clod-adapt eval garden_clod.ply --images garden --against merged.ply cut.ply
   clod-adapt eval garden_clod.ply --images garden --keep 500000 200000
-  clod-adapt eval garden_clod.ply --images garden --report garden.html
 """,
     add_arguments=evaluate_options,
     check=check_evaluate,

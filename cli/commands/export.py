@@ -18,48 +18,45 @@ from .command import Command
 from .export_formats import FORMATS, LOD_META, PACKED, PAGE, format_table, level_paths, suffix_of, suffixes
 from .options import add_activated, add_antialiasing, add_device
 
-DIGITS = 6  # significant ones of a level, all of which its file's name has
+DIGITS = 6  # significant digits of a level, all of them in its file's name
 
 
 def levels_of(text: str) -> list[float]:
-    """The dial values of ``1,2,4,7``."""
+    """Parses ``1,2,4,7``."""
     try:
         levels = [float(f"{float(word):.{DIGITS}g}") for word in text.split(",")]
     except ValueError:
         levels = []
     if not levels or levels[0] < 1 or not all(a < b for a, b in pairwise([*levels, inf])):
-        raise ArgumentTypeError(f"{text!r} must be rising dial values of at least 1, as in 1,2,4,7")
+        raise ArgumentTypeError(f"{text!r} must be ascending dial values of at least 1, as in 1,2,4,7")
     return levels
 
 
 def export_options(parser: ArgumentParser) -> None:
-    parser.add_argument("model", metavar="MODEL", help="an adapted file, or a plain one to convert")
-    parser.add_argument(
-        "-o", "--out", metavar="OUT", required=True, help="what to write, by its suffix; replaced if it exists"
+    given = parser.add_argument_group("input")
+    given.add_argument("model", metavar="MODEL", help="an adapted file, or a plain one to convert")
+    given.add_argument("--images", metavar="DIR", help="scene folder: cameras to bake for, and for the views of a page")
+    given.add_argument(
+        "--camera", metavar="PHOTO", help="bake for the camera of this photograph alone; its suffix can be left out"
     )
-    add_dial_options(parser, "the dial value to bake", "(in the file written)", several=False, required=False)
-    parser.add_argument(
-        "--levels", metavar="S,S,...", type=levels_of,
-        help="several dial values, each baked into a file of its own, OUT_s1.ply, OUT_s2.ply, ...; all or none appear",
-    )  # fmt: skip
-    parser.add_argument(
+    add_activated(given)
+    add_antialiasing(given, photographs=False)
+    dial = parser.add_argument_group("dial values, one of")
+    add_dial_options(dial, "the dial value to bake", "(in the file written)", several=False)
+    dial.add_argument(
+        "--levels", metavar="S,S,...", type=levels_of, help="several dial values, each baked into its own file"
+    )
+    output = parser.add_argument_group("output")
+    output.add_argument("-o", "--out", metavar="OUT", required=True, help="output file; its suffix is the format")
+    output.add_argument(
         "--lod-meta", action="store_true",
-        help="the levels as one streaming set in the new folder OUT, for PlayCanvas's viewers (by splat-transform)",
+        help="write the levels as one streaming set for PlayCanvas's viewers, in the new folder OUT",
     )  # fmt: skip
-    parser.add_argument(
-        "--camera", metavar="PHOTO", help="bake for this photograph's camera alone; its name, with or without suffix"
-    )
-    parser.add_argument(
-        "--images", metavar="DIR", help="the scene: its cameras to bake for, to order by, or for a page's views"
-    )
-    parser.add_argument(
+    output.add_argument(
         "--order", choices=["extinction"],
-        help="put the rows in the order in which the dial keeps them longest, for renderers that draw a prefix",
+        help="sort the Gaussians by the dial value at which they are culled, latest first, for prefix rendering",
     )  # fmt: skip
-    add_device(parser, "measure, for --fps and --psnr-drop with --images")
-    add_activated(parser)
-    add_antialiasing(parser, photographs=False)
-    parser.add_argument("--quiet", action="store_true", help="nothing on stderr but errors")
+    add_device(output, "measure for --fps and --psnr-drop with --images")
 
 
 def check_export(args: Namespace) -> None:
@@ -68,21 +65,21 @@ def check_export(args: Namespace) -> None:
     if args.images is not None:
         check_scene(args.images)
     check_export_outputs(args)
-    check_dials(args, args.model, measured=measured(args))
+    check_dials(args, args.model, measured=measured_budgets(args))
     check_checkpoint(args.model)
     dial = has_dial(args.model)
     if bakes and not dial:
-        raise ClodError(f"{args.model}: has no sigma_d, so there is no dial value to bake; it is plain already")
+        raise ClodError(f"{args.model}: has no sigma_d, so no dial value can be baked; export it without one")
     if args.order and not dial:
-        raise ClodError(f"{args.model}: has no sigma_d, so there is no order to put its rows in; adapt it first")
+        raise ClodError(f"{args.model}: has no sigma_d to order its Gaussians by; adapt it first")
     if not args.lod_meta:
         check_format(args, bakes, dial)
     if args.lod_meta or suffix_of(Path(args.out)) in PACKED:
         SplatTransform.find()
 
 
-def measured(args: Namespace) -> tuple[str, ...]:
-    """The budgets that are measured: frame times from a scene's cameras, the PSNR of a file on its photographs."""
+def measured_budgets(args: Namespace) -> tuple[str, ...]:
+    """The budgets solved by measuring: frame times at a scene's cameras, PSNR of the file on its photographs."""
     if args.images is None:
         return ()
     page = Path(args.out).suffix.lower() == PAGE
@@ -92,20 +89,20 @@ def measured(args: Namespace) -> tuple[str, ...]:
 def check_together(args: Namespace, bakes: bool) -> None:
     """Refuses options that do not go together."""
     if args.levels and (args.sv is not None or given_budget(args) is not None):
-        raise ClodError("--levels has the dial values; give no other with it")
+        raise ClodError("--levels gives the dial values; give no other option for them")
     if args.lod_meta and not args.levels:
-        raise ClodError("--lod-meta is a set of levels; give them, as in --levels 1,2,4,7")
+        raise ClodError("--lod-meta needs several levels; give them, as in --levels 1,2,4,7")
     if args.lod_meta and args.order:
-        raise ClodError("a streaming set has an order of its own; leave out --order")
+        raise ClodError("--lod-meta sorts the Gaussians itself; remove --order")
     if args.camera is not None and args.images is None:
-        raise ClodError("--camera names a photograph of a scene; give that too, with --images")
+        raise ClodError("--camera needs the scene of the photograph; give --images too")
     page = Path(args.out).suffix.lower() == PAGE
     if page and (args.levels or args.camera is not None or args.order):
-        raise ClodError(f"a {PAGE} shows the whole dial; leave out --levels, --camera and --order")
+        raise ClodError(f"a {PAGE} page contains the whole dial; remove --levels, --camera and --order")
     if args.camera is not None and not bakes:
-        raise ClodError("--camera is where a dial value is baked for; give one, as in --sv 2")
+        raise ClodError("--camera needs a dial value to bake; give one, as in --sv 2")
     if args.images is not None and not (bakes or args.order or page):
-        raise ClodError(f"--images is for baking, --order and a {PAGE}; give one of them with it, as in --sv 2")
+        raise ClodError(f"--images is used for baking, --order and {PAGE} only; add one of them, as in --sv 2")
 
 
 def check_export_outputs(args: Namespace) -> None:
@@ -116,93 +113,80 @@ def check_export_outputs(args: Namespace) -> None:
             check_outputs([path], [args.model], args.images)
         return
     if out.suffix.lower() in (".json", *suffixes()):
-        raise ClodError(f"{out}: with --lod-meta, --out names the folder that {LOD_META} is to be in, not a file")
+        raise ClodError(f"{out}: with --lod-meta, --out names the folder for {LOD_META}, not a file")
     if out.exists() and not out.is_dir():
-        raise ClodError(f"{out}: is a file; with --lod-meta give --out the name of a new folder")
-    if not out.name:  # ".", the folder one is in, which cannot be put in the place of itself
-        raise ClodError(f"{out}: is the folder you are in; give --out the name of a new one")
+        raise ClodError(f"{out}: is a file; with --lod-meta, --out must name a new folder")
+    if not out.name:  # ".", the current folder, which cannot be replaced
+        raise ClodError(f"{out}: is the current folder; --out must name a new one")
     check_target(out)
 
 
 def check_format(args: Namespace, bakes: bool, dial: bool) -> None:
-    """Refuses what the format of --out has no room for."""
+    """Refuses what the format of --out cannot store."""
     suffix = suffix_of(Path(args.out))
     if dial and not bakes and not FORMATS[suffix].sigma:
         others = ", ".join(other for other in suffixes() if FORMATS[other].sigma)
         raise ClodError(
-            f"{args.out}: {suffix} has no room for sigma_d; choose a dial value to bake, as in --sv 1, or another "
-            f"format ({others})"
+            f"{args.out}: {suffix} cannot store sigma_d; choose a dial value to bake, as in --sv 1, or another format "
+            f"({others})"
         )
     if args.order and not FORMATS[suffix].ordered:
-        raise ClodError(f"{args.out}: {suffix} has an order of its own; leave out --order")
+        raise ClodError(f"{args.out}: {suffix} sorts the Gaussians itself; remove --order")
 
 
 EXPORT = Command(
     module="export.run",
     summary="Write a file for other tools: another format, or plain.",
     description="""\
-Write a model for other tools: in another format, with its dial where the format
-has room for it, or with one dial value baked in, for viewers without a dial.
+Write a model for other tools: in another format, with its dial if the format
+can store it, or with one dial value baked in.
 """,
     usage="MODEL -o OUT [--sv S | --keep N | ... | --levels S,...]",
     epilog=f"""\
-by the suffix of OUT:
+formats, by the suffix of OUT:
   suffix           dial  values
 {format_table()}
-Where the dial is kept and no dial value is given, nothing is baked. A plain
-MODEL is converted. Columns that Inria's layout does not have are left out.
+Without a dial value nothing is baked. Columns that Inria's layout does not have
+are dropped.
 
-Baking keeps the Gaussians of one dial value, with opacities for good: lossy.
-The dial fades a Gaussian by its distance from the camera, and a plain file has
-no camera: each Gaussian has its mean distance from the training cameras, those
-of --images, else up to 16 that adapting stores in MODEL, else 16 that are
-placed where MODEL looks photographed, which lost 0.5 dB at worst. At equal
-counts files for training cameras measured 0.05 dB below to 0.6 dB above the
-dial with --max-sv 5 (benchmarks/bake.py). With --camera it is how the dial
-looks from there, exact from that place and near it. Keep the adapted file: this
-cannot be undone.
+baking:
+  A baked file has the Gaussians of one dial value, with fixed opacities. This
+  is lossy; keep MODEL. The dial depends on the distance to the camera; baking
+  takes each Gaussian's mean distance to the training cameras of --images, else
+  to those stored in MODEL, else to 16 placed ones (at worst 0.5 dB lower).
+  With --camera the file is exact at that camera.
 
---keep is exact: OUT has N Gaussians. With --images --psnr-drop writes the
-smallest file that, as read back, is at most DB below MODEL at s = 1 on the
-held-out photographs, and --json has its PSNR; what splat-transform rounds is
-measured after. --fps then times frames of MODEL first. Without --images both
-are found in the calibration stored in MODEL, which is of the dial and, for
-frame times, of the machine that a note names.
+budgets:
+  --keep is exact: OUT has N Gaussians. With --images, --psnr-drop finds the
+  smallest file that measures at most DB below MODEL at s = 1 on the held-out
+  photographs (splat-transform's rounding is measured afterwards), and --fps
+  times frames of MODEL. Without --images both use the calibration in MODEL.
 
---levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on. With --lod-meta OUT is
-a folder that must not be there yet (or be empty): lod-meta.json, level 0 the
-finest, and the chunks that a streaming viewer loads.
+levels and order:
+  --levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on, all or none. With
+  --lod-meta OUT is a new folder with lod-meta.json, level 0 the finest, and the
+  chunks that a streaming viewer loads.
+  --order extinction is for renderers that draw the first n rows: for any n
+  these are the rows of --keep n, with the opacities of the file. They pop
+  where the dial fades.
 
---order extinction is for renderers that draw the first n rows, whatever n: the
-first n are those that --keep n writes. They are drawn with the opacities that
-stand in the file: on two captures 0.1 to 0.6 dB below the dial at many rows, up
-to 0.8 above it at few (benchmarks/prefix.py), and they pop where it fades.
-
-SIBR reads a baked .ply; the SH degree it takes from sh_degree in the cfg_args
-beside the model, up to 3, and its released versions do not show degree 0.
-
-A .html is what "clod-adapt view" shows, in one file to send to somebody; it
-needs no network. --sv, or a budget, is where its dial stands at first, and
---images gives it the photographs' cameras to jump between.
-
-.sog, .compressed.ply and --lod-meta need splat-transform 3.7 with Node 22, on
-the PATH or as the command in CLOD_SPLAT_TRANSFORM. In a folder of its own:
-  npm install node@22 @playcanvas/splat-transform@3.7
-  PATH=$PWD/node_modules/node/bin:$PWD/node_modules/.bin:$PATH
-Without a GPU, SOG's spherical harmonics take minutes for 100,000 Gaussians.
+other tools:
+  SIBR reads a baked .ply of SH degree 1 to 3, and takes the degree from
+  sh_degree in cfg_args next to the file.
+  .html is the page of "clod-adapt view" in one file; --sv or a budget sets its
+  initial dial value.
+  .sog, .compressed.ply and --lod-meta need splat-transform 3.7 with Node 22, on
+  the PATH or in CLOD_SPLAT_TRANSFORM; "clod-adapt doctor" prints how to install
+  it. Without a GPU, 100,000 Gaussians take minutes for .sog.
 
 examples:
   clod-adapt export garden_clod.ply --sv 2 -o garden_s2.ply
   clod-adapt export garden_clod.ply --keep 200000 -o garden_200k.ply
   clod-adapt export garden_clod.ply --psnr-drop 0.2 --images garden -o small.ply
-  clod-adapt export garden_clod.ply --sv 3 --camera a.jpg --images garden \\
-      -o from_a.ply
   clod-adapt export garden_clod.ply -o garden.glb
   clod-adapt export garden_clod.ply --images garden -o garden.html
-  clod-adapt export garden_clod.ply --levels 1,2,4,7 -o garden.ply
   clod-adapt export garden_clod.ply --levels 1,2,4,7 --lod-meta -o garden_lod
-  clod-adapt export garden_clod.ply --order extinction --images garden \\
-      -o sorted.ply
+  clod-adapt export garden_clod.ply --order extinction -o sorted.ply
 """,
     add_arguments=export_options,
     check=check_export,

@@ -1,4 +1,4 @@
-"""What ``clod-adapt export`` writes, by the suffix of its output; without torch."""
+"""The output formats of ``clod-adapt export``, by suffix; without torch."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.writers import WRITERS
+from clod_adapter.io.file_formats import WRITABLE
 
 LOD_META = "lod-meta.json"
 PAGE = ".html"
@@ -15,12 +15,12 @@ PAGE = ".html"
 
 @dataclass(frozen=True)
 class Format:
-    """A format as --help has it.
+    """A format and its lines in --help.
 
     Attributes:
-        about: what becomes of the values, lines of at most 54 letters.
-        ordered: whether the rows stay in their order.
-        sigma: whether it carries sigma_d; if not, a dial value has to be baked.
+        about: precision of the values, lines of at most 54 letters.
+        ordered: whether the rows keep their order.
+        sigma: whether it stores sigma_d; if not, a dial value has to be baked.
     """
 
     about: tuple[str, ...]
@@ -28,33 +28,33 @@ class Format:
     sigma: bool = True
 
 
-# Those that splat-transform packs. Their rows follow a space-filling curve.
+# Written by splat-transform, which sorts rows along a space-filling curve.
 PACKED = {
     ".sog": Format(("8 to 16 bits, SH from a palette; by splat-transform",), ordered=False, sigma=False),
     ".compressed.ply": Format(("8 to 11 bits; by splat-transform",), ordered=False, sigma=False),
 }
 FORMATS = {
-    ".ply": Format(("exact; baked, in Inria's layout, which SIBR reads",)),
-    ".glb": Format(("float32's rounding, SH degree 3 at most", "(KHR_gaussian_splatting, _SIGMA_D)")),
-    ".spz": Format(("6 to 24 bits, SH degree 3 at most, sigma_d half floats",)),
+    ".ply": Format(("exact; baked, in Inria's layout",)),
+    ".glb": Format(("float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D)")),
+    ".spz": Format(("6 to 24 bits, SH degree up to 3, sigma_d 16-bit floats",)),
     ".safetensors": Format(("exact; for Python",)),
-    ".pt": Format(("exact; as gsplat's trainer saves its own",)),
-    ".splat": Format(("8 bits, no view-dependent colour",), ordered=False, sigma=False),
+    ".pt": Format(("exact; layout of gsplat's trainer",)),
+    ".splat": Format(("8 bits, SH degree 0",), ordered=False, sigma=False),
     **PACKED,
     PAGE: Format(
-        ("the viewer with the splat in it, one file to send;", "exact, or by splat-transform 8 to 16 bits"),
+        ("the viewer with the splat, in one file;", "exact, or 8 to 16 bits by splat-transform"),
         ordered=False,
     ),
 }
 
 
 def suffixes() -> list[str]:
-    """Those that can be written."""
-    return [suffix for suffix in FORMATS if suffix in WRITERS or suffix in PACKED or suffix == PAGE]
+    """The suffixes that can be written."""
+    return [suffix for suffix in FORMATS if suffix in WRITABLE or suffix in PACKED or suffix == PAGE]
 
 
 def format_table() -> str:
-    """The formats for --help."""
+    """The table of formats for --help."""
     lines = []
     for suffix in suffixes():
         first, *more = FORMATS[suffix].about
@@ -64,14 +64,14 @@ def format_table() -> str:
 
 
 def suffix_of(out: Path) -> str:
-    """The suffix that says what is written to ``out``.
+    """The known suffix of ``out``, in lower case.
 
     Raises:
-        ClodError: none of them does.
+        ClodError: it has none.
     """
     found = [suffix for suffix in suffixes() if out.name.lower().endswith(suffix) and len(out.name) > len(suffix)]
     if not found:
-        raise ClodError(f"{out}: --out must end in one of {', '.join(suffixes())}, which says what to write")
+        raise ClodError(f"{out}: --out must end in one of {', '.join(suffixes())}, which is the format")
     return max(found, key=len)  # .compressed.ply ends in .ply
 
 

@@ -5,45 +5,45 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from clod_adapter.io.readers import check_readable
+from clod_adapter.io.file_formats import check_readable
 
 from .command import Command
 
 
 def inspect_options(parser: ArgumentParser) -> None:
-    parser.add_argument("file", metavar="FILE", help="a splat, an adapter, or the state of an interrupted run")
+    given = parser.add_argument_group("input")
+    given.add_argument("file", metavar="FILE", help="a splat, an adapter, or the state of an interrupted run")
     parser.set_defaults(quiet=True)
 
 
 def check_inspect(args: Namespace) -> None:
     path = Path(args.file)
-    if path.suffix.lower() != ".safetensors":  # which may be an adapter or a state, and no splat
+    if path.suffix.lower() != ".safetensors":  # an adapter or a state is no splat
         check_readable(path)
 
 
 INSPECT = Command(
     module="inspect",
-    summary="Say what a file is and what is in it.",
+    summary="Print what a file is and what it contains.",
     description="""\
-Say what a file is, who wrote it as far as it tells, what is in it, and what
-adapting it would leave out. Nothing is changed, nothing is written.
+Print what a file is, which program wrote it, what it contains, and what
+adapting it would exclude. Reads only.
 """,
     usage="FILE [--json]",
     epilog="""\
-Reads what clod-adapt reads: PLY (compressed, too), gsplat's .pt, adapters and
-the states of interrupted runs (.safetensors), .sog and .ksplat through
-splat-transform where that is installed, and the formats of clod-adapt export.
-A file that is none of these is refused with what it is, where that shows.
+FILE can be a PLY (also compressed), gsplat's .pt, an adapter or the state of an
+interrupted run (.safetensors), any format of clod-adapt export, and, with
+splat-transform installed, .sog or .ksplat.
 
-  looks like   a guess from comments and the order of properties, never a proof
-  says         comments in the file, by which to know a baked one
+  looks like   a guess from comments and the order of properties
+  says         comments in the file, for example of a baked one
   needle       a Gaussian more than 10 times as long as its second axis
-  tau          opacity below which the dial leaves out at s = 1: the file's own,
-               or the one that adapting would start from
+  tau          culling threshold of the opacity at s = 1: the file's own, or the
+               one that adapting would use
 
---json has all of it, the properties and numbers of the file included.
+--json also has all properties and numbers.
 
-exit codes: 0 it was read; 2 it is broken or something else, one line on stderr
+exit codes: 0 read; 2 damaged or of another kind, one line on stderr
 
 examples:
   clod-adapt inspect garden.ply

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from clod_adapter.errors import ClodError
 
@@ -11,18 +11,28 @@ from .command import Command
 
 
 class Parser(argparse.ArgumentParser):
-    """Reports misuse like any other bad input: in one line, by ``main``."""
+    """Reports misuse as a ClodError, which ``main`` prints in one line.
+
+    Attributes:
+        general: the last group of ``--help``: options that all commands have.
+    """
+
+    general: Any
 
     def error(self, message: str) -> NoReturn:
-        raise ClodError(f"{message} ({self.prog} --help explains)")
+        raise ClodError(f"{message} (see {self.prog} --help)")
 
 
 def make_parser(command: Command, prog: str) -> Parser:
     """The parser of a command, with the options that all commands have."""
     parser = Parser(
         prog=prog, usage=f"{prog} {command.usage}", description=command.description, epilog=command.epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=argparse.RawDescriptionHelpFormatter, add_help=False,
     )  # fmt: skip
     command.add_arguments(parser)
-    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, all else on stderr")
+    parser.general = parser.add_argument_group("general")
+    parser.general.add_argument("-h", "--help", action="help", help="show this text")
+    if parser.get_default("quiet") is None:
+        parser.general.add_argument("--quiet", action="store_true", help="no progress, no notes")
+    parser.general.add_argument("--json", action="store_true", help="one JSON object on stdout")
     return parser

@@ -1,26 +1,29 @@
-"""The settings of the main job: options that are fields of its config, and their values in the user's words."""
+"""Training settings: the options that are fields of ``AdaptConfig``, and the config that they make."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from clod_adapter.config import AdaptConfig, describe
 from clod_adapter.errors import ClodError
 
 from ..shared.launch import launched
 
+if TYPE_CHECKING:
+    from argparse import _ActionsContainer
+
 OPTIONS: dict[str, Any] = {
     "max_sv": ("S", float), "iters": ("N", int), "batch": ("N", int), "time_budget": ("SEC", float),
     "seed": ("N", int),
 }  # fmt: skip
-# Those whose default another one has a say in: as many views are seen whatever the batch.
-DEFAULTS = {"iters": "1500, divided by the batch", "batch": "1; of several processes, one each"}
+# Defaults that depend on another option: the number of views seen stays the same for every batch.
+DEFAULTS = {"iters": "1500 divided by the batch", "batch": "1 per process"}
 
 
-def add_settings(parser: argparse.ArgumentParser, without: Sequence[str] = ()) -> None:
-    """Adds the options but those of the fields in ``without``, which a command has in another form."""
+def add_settings(options: _ActionsContainer, without: Sequence[str] = ()) -> None:
+    """Adds the options except the fields in ``without``, which a command has in another form."""
     helps, defaults = describe(AdaptConfig), AdaptConfig()
     for name, (metavar, kind) in OPTIONS.items():
         if name in without:
@@ -28,30 +31,31 @@ def add_settings(parser: argparse.ArgumentParser, without: Sequence[str] = ()) -
         default = None if name in DEFAULTS else getattr(defaults, name)
         shown = f" (default: {DEFAULTS[name]})" if name in DEFAULTS else ""
         shown = shown if default is None else f" (default: {default:g})"
-        parser.add_argument(
+        options.add_argument(
             f"--{name.replace('_', '-')}", metavar=metavar, type=kind, default=default, help=helps[name] + shown
         )
-
-    parser.add_argument(
-        "--form",
-        choices=["ours", "paper"],
-        default="ours",
-        help="of the training: ours, or the paper's own (default: ours)",
-    )
+    options.add_argument(
+        "--form", choices=["ours", "paper"], default="ours",
+        help="training as measured here (ours) or as published (paper) (default: ours)",
+    )  # fmt: skip
 
 
 def make_config(args: argparse.Namespace) -> AdaptConfig:
-    """The settings; what is wrong with one is said in the words of the command line."""
+    """The settings.
+
+    Raises:
+        ClodError: a value is out of range; the message names the option.
+    """
     make = AdaptConfig.paper if args.form == "paper" else AdaptConfig
     limit = 1 / make().tau
     if args.max_sv >= limit:
-        raise ClodError(f"--max-sv is {args.max_sv:g}, it must be below {limit:g}, where nothing survives the cut")
+        raise ClodError(f"--max-sv is {args.max_sv:g}, it must be below {limit:g}, where every Gaussian is culled")
     given = {name: getattr(args, name) for name in OPTIONS}
     size = launched().size
     given["batch"] = size if given["batch"] is None else given["batch"]
     if given["iters"] is None:
         given["iters"] = max(round(make().iters / max(given["batch"], 1)), 1)
-    for name, value in given.items():  # one at a time, which tells the option to name
+    for name, value in given.items():  # one at a time, so that the error can name the option
         try:
             make(**{name: value})
         except ClodError as error:
@@ -62,7 +66,7 @@ def make_config(args: argparse.Namespace) -> AdaptConfig:
 
 
 def make_configs(args: argparse.Namespace) -> list[AdaptConfig]:
-    """One a range, ascending, where ``--max-sv`` takes several."""
+    """One config per value of ``--max-sv``, ascending."""
     return [make_config(argparse.Namespace(**vars(args) | {"max_sv": value})) for value in sorted(set(args.max_sv))]
 
 

@@ -1,4 +1,4 @@
-"""``clod-adapt doctor``: what works here, why the rest does not, and the line that mends it."""
+"""``clod-adapt doctor``: checks every backend and tool, and prints for each a result and a fix."""
 
 from __future__ import annotations
 
@@ -6,31 +6,32 @@ import argparse
 import time
 from typing import Any
 
-from clod_adapter.version import package_version
+from clod_adapter._support.version import package_version
 
 from ..shared.console import Console
-from ..shared.findings import Finding, Look
 from .backends import BACKENDS
+from .checks import Check, Probe
 from .tools import TOOLS
 
-DRAWS = ("cpu", "gpu")  # those that the commands draw and train with
-LOOKS: dict[str, Look] = BACKENDS | TOOLS
+RENDERERS = ("cpu", "gpu")  # backends of the other commands
+PROBES: dict[str, Probe] = BACKENDS | TOOLS
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    """Looks at everything; the report's exit code is 1 where nothing draws."""
-    console, findings, seconds = Console(args.quiet), list[Finding](), dict[str, float]()
-    with console.status("looking ...") as show:
-        for name, look in LOOKS.items():
-            show(f"looking at {name} ({len(findings) + 1} of {len(LOOKS)}) ...")
+    """Runs all checks; the report's exit code is 1 where neither the CPU nor the GPU backend works."""
+    console, checks, seconds = Console(args.quiet), list[Check](), dict[str, float]()
+    with console.status("checking ...") as show:
+        for name, probe in PROBES.items():
+            show(f"checking {name} ({len(checks) + 1} of {len(PROBES)}) ...")
             began = time.perf_counter()
-            findings.append(Finding.of(name, look))
+            checks.append(Check.run(name, probe))
             seconds[name] = round(time.perf_counter() - began, 3)
-    width = max(map(len, LOOKS)) + 2
-    draws = [finding.name for finding in findings if finding.ok and finding.name in DRAWS]
-    print("\n".join(finding.line(width) for finding in findings))
-    print(f"draws and trains on: {', '.join(draws)}" if draws else "nothing draws here: mend torch, then cpu")
+    width = max(map(len, PROBES)) + 2
+    draws = [check.name for check in checks if check.ok and check.name in RENDERERS]
+    print("\n".join(check.line(width) for check in checks))
+    failed = "no rendering backend works: fix torch first, then the CPU backend"
+    print(f"rendering and training backends: {', '.join(draws)}" if draws else failed)
     return {
         "command": "doctor", "version": package_version(), "draws": draws, "exit_code": 0 if draws else 1,
-        "findings": [finding.as_dict() for finding in findings], "seconds": seconds,
+        "findings": [check.as_dict() for check in checks], "seconds": seconds,
     }  # fmt: skip

@@ -1,4 +1,4 @@
-"""What ``clod-adapt export`` bakes for: the cameras there are; and a PSNR budget that holds for the file written."""
+"""The cameras that ``clod-adapt export`` bakes for, and the search for a file within a PSNR budget."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.poses import load_cameras
+from clod_adapter.progress import Stopped
 from clod_adapter.training.pseudo_views import place_cameras
 
 from ..shared.console import Console
@@ -21,8 +22,8 @@ from ..shared.kernels import prepare_kernels
 from ..shared.measure import measure
 from ..shared.views import named
 
-PLACED = 16  # cameras, where none are known
-CLOSE = 1.01  # ratio of dial values at which the search for a PSNR ends
+PLACED = 16  # cameras placed where none are known
+DIAL_RATIO = 1.01  # of two dial values, at which the search for a PSNR ends
 
 
 @dataclass(frozen=True)
@@ -30,9 +31,9 @@ class Target:
     """The cameras that a dial value is baked for.
 
     Attributes:
-        camera: the one of ``--camera``, from where the result is exact; else None.
-        cameras: that one, or all that it is baked for; none for a model without a dial.
-        about: which these are, in a few words of printable ASCII.
+        camera: the one of ``--camera``, for which the result is exact; else None.
+        cameras: that one, or all that the file is baked for; empty for a model without a dial.
+        about: a description in printable ASCII.
     """
 
     camera: Camera | None
@@ -41,13 +42,13 @@ class Target:
 
 
 def find_target(args: argparse.Namespace, model: Checkpoint, console: Console) -> tuple[Target, list[str]]:
-    """The cameras of --camera, of --images, or stored with the model, else some that are placed; and notes on them."""
+    """The cameras of --camera, --images or the model's file, else placed ones; and notes on them."""
     if args.camera is not None:
         cameras, notes = load_cameras(args.images, model.origin)
         found = named(cameras, args.camera, "--camera")
         if len(found) > 1:
             both = f"{found[0].name} and {found[1].name}"
-            raise ClodError(f"--camera has {args.camera!r}, which {both} are; give the whole name")
+            raise ClodError(f"--camera: {args.camera!r} matches {both}; give the full name")
         return Target(found[0], found, "one camera"), notes
     if args.images is not None:
         cameras, notes = load_cameras(args.images, model.origin, training=True)
@@ -60,56 +61,54 @@ def find_target(args: argparse.Namespace, model: Checkpoint, console: Console) -
 def _placed(model: Checkpoint, console: Console) -> tuple[Target, list[str]]:
     try:
         with console.meter("placing cameras") as meter:
-            cameras = place_cameras(
-                model.gaussians, views=PLACED, progress=lambda n, of: meter.update(n / of, f"{n}/{of}")
-            )  # fmt: skip
+            cameras = place_cameras(model.gaussians, views=PLACED, progress=meter)
     except ClodError as error:
-        raise ClodError(f"{model.path}: it stores no cameras to bake for, and {error}; give --images") from error
-    note = f"{model.path} stores no cameras, so {len(cameras)} are placed; give --images, which is better"
+        raise ClodError(f"{model.path}: no cameras stored to bake for, and {error}; give --images") from error
+    note = f"{model.path} stores no cameras: baked for {len(cameras)} placed ones; --images gives a better result"
     return Target(None, cameras, f"{len(cameras)} placed cameras"), [note]
 
 
 @dataclass(frozen=True)
 class Photographs:
-    """What files are measured on, for a PSNR budget.
+    """The photographs that files are measured on, for a PSNR budget.
 
     Attributes:
-        views: the held-out ones.
-        reference: dB of the model at s = 1.
+        views: held-out views.
+        reference: PSNR of the model at s = 1, dB.
     """
 
     views: Sequence[View]
     reference: float
 
-    def lost(self, gaussians: Gaussians, console: Console, label: str) -> float:
-        """dB by which Gaussians without a dial are below the model at s = 1."""
+    def drop_of(self, gaussians: Gaussians, console: Console, label: str) -> float:
+        """PSNR of the model at s = 1 minus that of Gaussians without a dial, dB."""
         return self.reference - _psnr(gaussians, self.views, console, label)
 
 
 def measure_drop(
     args: argparse.Namespace, model: Checkpoint, candidate: Callable[[float], Gaussians], console: Console
 ) -> tuple[float, Photographs]:
-    """The largest dial value, to 1 %, whose file is at most ``--psnr-drop`` below the model at s = 1.
+    """The largest dial value, to 1 %, whose file has at most ``--psnr-drop`` dB less than the model at s = 1.
 
     Args:
-        candidate: what a reader finds in the file of a dial value.
+        candidate: the Gaussians in the file of a dial value, as read back.
 
     Raises:
-        ClodError: no photographs are held out, or the file of s = 1 is below that already.
+        ClodError: no photographs are held out, or already the file of s = 1 loses more.
     """
     scene, drop = read_scene(args.images, console, model.origin), args.psnr_drop[0]
     if not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to measure on; give at least two")
     assert model.gaussians.attenuation is not None
     prepare_kernels(console, model.gaussians.means.device, training=False)
-    photographs = Photographs(scene.test, _psnr(model.gaussians, scene.test, console, "the dial, s=1"))
+    photographs = Photographs(scene.test, _psnr(model.gaussians, scene.test, console, "dial, s=1"))
 
     def lost(s: float) -> float:
-        return photographs.lost(candidate(s), console, f"a file, s={s:.4g}")
+        return photographs.drop_of(candidate(s), console, f"file, s={s:.4g}")
 
     if (least := lost(1.0)) > drop:
         raise ClodError(
-            f"--psnr-drop {drop:g} is out of reach: the file of s = 1 is {least:.2f} dB below the model at s = 1"
+            f"--psnr-drop {drop:g} is out of reach: the file baked at s = 1 is {least:.2f} dB below the model at s = 1"
         )
     return largest_within(lost, drop, model.gaussians.attenuation.max_sv), photographs
 
@@ -117,16 +116,16 @@ def measure_drop(
 def _psnr(gaussians: Gaussians, views: Sequence[View], console: Console, label: str) -> float:
     rows, interrupted = measure(gaussians, views, [1.0], console, label)
     if interrupted:
-        raise KeyboardInterrupt
+        raise Stopped("stopped during measurement")
     return rows[0].psnr
 
 
 def largest_within(lost: Callable[[float], float], drop: float, largest: float) -> float:
-    """The largest dial value in [1, largest], to 1 %, that loses at most ``drop``, given that 1 does."""
+    """The largest dial value in [1, largest], to 1 %, that loses at most ``drop`` dB, if 1 does."""
     if largest == 1 or lost(largest) <= drop:
         return largest
     low, high = 1.0, largest
-    while high / low > CLOSE:
+    while high / low > DIAL_RATIO:
         middle = math.sqrt(low * high)
         low, high = (middle, high) if lost(middle) <= drop else (low, middle)
     return low

@@ -1,4 +1,4 @@
-"""The files of an export: one of them as it is written, and as a reader finds it."""
+"""Writes the files of an export, and reads them back."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint, load
+from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
 from clod_adapter.io.ply.header import PREFIX
-from clod_adapter.io.writers import write
 from clod_adapter.origin import NOWHERE
 from clod_adapter.viewer.page import write_page
 
@@ -27,14 +27,14 @@ from .baking import Target
 
 @dataclass(frozen=True)
 class Export:
-    """What is written from where.
+    """A model and how to write it.
 
     Attributes:
         model: as read.
-        gaussians: the model's, in the order asked for.
-        target: the cameras that are baked for.
-        cameras: of the scene, for a page to jump between.
-        ordered: whether the rows have been put in order.
+        gaussians: the model's, sorted if ``ordered``.
+        target: the cameras to bake for.
+        cameras: of the scene, for the views of a page.
+        ordered: whether the rows are sorted by extinction.
         console: for splat-transform's progress.
     """
 
@@ -45,8 +45,8 @@ class Export:
     ordered: bool
     console: Console
 
-    def piece(self, virtual_scale: float | None) -> tuple[Gaussians, tuple[str, ...]]:
-        """The Gaussians of one file, baked if there is a dial value; lines on how they came about, its own too."""
+    def content(self, virtual_scale: float | None) -> tuple[Gaussians, tuple[str, ...]]:
+        """The Gaussians of one file, baked if there is a dial value; and its comments, those of the model first."""
         about = [comment for comment in self.model.comments if not comment.startswith(PREFIX)]
         gaussians = self.gaussians
         if virtual_scale is not None:
@@ -61,40 +61,40 @@ class Export:
         return gaussians, tuple(dict.fromkeys(about))
 
     def write(self, path: Path, suffix: str, virtual_scale: float | None) -> tuple[int, tuple[str, ...]]:
-        """Writes a file; how many Gaussians are in it, and notes on what has no room there."""
+        """Writes a file; its number of Gaussians, and notes on what the format cannot store."""
         if suffix == PAGE:
             return len(self.gaussians), self._write_page(path, virtual_scale or 1.0)
-        gaussians, about = self.piece(virtual_scale)
+        gaussians, about = self.content(virtual_scale)
         if suffix in PACKED:
             return len(gaussians), self._pack(path, suffix, gaussians, about)
         calibration = self.model.calibration if virtual_scale is None else None
         notes = write(path, gaussians, about, origin=self.model.origin, calibration=calibration)
         if suffix == ".ply" and any(self.model.origin):
-            notes += ("x, y and z are doubles, which SIBR and some other readers take for something else",)
+            notes += ("x, y and z are doubles, which SIBR and some other readers misread",)
         return len(gaussians), notes
 
     def candidate(self, out: Path, virtual_scale: float) -> Gaussians:
-        """What a reader finds in the file of a dial value; what splat-transform rounds is not rounded yet."""
+        """The Gaussians in the file of a dial value, as read back; without the rounding of splat-transform."""
         suffix = suffix_of(out)
         if suffix in PACKED:
-            return self.piece(virtual_scale)[0]
+            return self.content(virtual_scale)[0]
         with TemporaryDirectory(dir=out.parent, prefix=".tmp-") as folder:
             path = Path(folder) / f"candidate{suffix}"
             self.write(path, suffix, virtual_scale)
             return self.read_back(path, suffix)
 
     def read_back(self, path: Path, suffix: str) -> Gaussians:
-        """What is in a file that was written, where the model is."""
+        """The Gaussians of a written file, on the model's device and relative to its origin."""
         origin = NOWHERE if suffix in (".splat", *PACKED) else self.model.origin
         return load(path, origin=origin).gaussians.to(self.gaussians.means.device)
 
     def write_levels(self, folder: Path, levels: list[float]) -> tuple[list[int], tuple[str, ...]]:
-        """Makes ``folder`` a streaming set; how many Gaussians each level has, and notes."""
+        """Writes a streaming set to ``folder``; the number of Gaussians per level, and notes."""
         folder.mkdir()
         with TemporaryDirectory(dir=folder) as temporary:
             words, counts = list[str | Path](), list[int]()
             for k, level in enumerate(levels):
-                gaussians, about = self.piece(level)
+                gaussians, about = self.content(level)
                 source = Path(temporary) / f"{k}.ply"
                 write(source, gaussians, about)
                 words += [source, "-l", str(k)]
@@ -103,21 +103,24 @@ class Export:
         return counts, notes
 
     def _write_page(self, path: Path, virtual_scale: float) -> tuple[str, ...]:
-        """Writes the page, packed where there is something to pack it with."""
+        """Writes the page; packs the splat where splat-transform is installed."""
         try:
             tool = SplatTransform.find()
         except ClodError as error:
             write_page(path, self.model, cameras=self.cameras, virtual_scale=virtual_scale)
-            return (f"the splat is in the page as it is; packed, the page would be a fifth of this: {error}",)
+            return (f"the splat in the page is not packed, which would make the page five times smaller: {error}",)
         with ticking(self.console, f"splat-transform {tool.version}, {len(self.gaussians):,} Gaussians") as tick:
             write_page(
                 path, self.model, cameras=self.cameras, virtual_scale=virtual_scale, tool=tool, progress=tick
             )  # fmt: skip
-        return ("the splat is packed: values are rounded",)
+        return ("the splat in the page is packed: values are rounded",)
 
     def _pack(self, path: Path, suffix: str, gaussians: Gaussians, about: tuple[str, ...]) -> tuple[str, ...]:
         with TemporaryDirectory(dir=path.parent, prefix=".tmp-") as folder:
-            source, packed = Path(folder) / "plain.ply", Path(folder) / f"packed{suffix}"  # named as the tool wants it
+            source, packed = (
+                Path(folder) / "plain.ply",
+                Path(folder) / f"packed{suffix}",
+            )  # the tool tells formats by their suffix
             write(source, gaussians, about)
             notes = self._transform([source], packed, len(gaussians))
             with atomic_path(path) as temporary:
@@ -129,11 +132,11 @@ class Export:
         with ticking(self.console, f"splat-transform {tool.version}, {count:,} Gaussians") as tick:
             seconds = tool.run(*words, out, timeout=time_limit(count), progress=tick)
         self.console.say(f"splat-transform took {duration(seconds)}")
-        notes = ["values are rounded, and the rows are in an order of splat-transform's"]
+        notes = ["splat-transform rounds values and sorts the Gaussians"]
         if any(self.model.origin):
-            notes.append("the origin is dropped: coordinates are relative to it")
+            notes.append("coordinates are relative to the model's origin, which is dropped")
         if not tool.gpu and self.gaussians.sh_degree > 0 and out.suffix != ".ply":
-            notes.append("splat-transform has no GPU here: the palette of spherical harmonics is a rougher one")
+            notes.append("splat-transform runs without a GPU: its palette of spherical harmonics is coarser")
         return tuple(notes)
 
     def _position(self, camera: Camera) -> str:
@@ -143,6 +146,6 @@ class Export:
 
 @contextmanager
 def ticking(console: Console, text: str) -> Iterator[Callable[[float], None]]:
-    """Shows the seconds that a part takes whose length is not known."""
+    """Shows the elapsed seconds of a part of unknown length."""
     with console.status(f"{text} ...") as show:
         yield lambda seconds: show(f"{text}, {duration(seconds)} so far")

@@ -1,4 +1,4 @@
-"""``clod-adapt export``: a model in another format, with its dial or with one dial value baked in."""
+"""``clod-adapt export``: writes a model in another format, with its dial or with one dial value baked in."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.bake import order_by_extinction
 from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.claims import output_lock
+from clod_adapter.io.lock import output_lock
 from clod_adapter.io.ply.columns import MASKS, SIGMA, inria_dtype
 from clod_adapter.io.ply.constants import PREFIX
 from clod_adapter.io.scene.poses import load_cameras
-from clod_adapter.version import package_version
 
 from ..commands.export_formats import LOD_META, PAGE, level_paths, suffix_of
 from ..shared.antialiasing import with_filter
 from ..shared.budgets import solve_dials
 from ..shared.console import Console
 from ..shared.devices import on_device, pick_device
-from ..shared.dials import given_budget, opens_at
+from ..shared.dials import given_budget, initial_dial
 from ..shared.files import size
 from ..shared.inputs import read_checkpoint
 from ..shared.measure import choose_dials
@@ -31,45 +31,44 @@ from ..shared.report import Stopwatch
 from .baking import Photographs, Target, find_target, measure_drop
 from .files import Export
 
-OF_THE_DIAL = (
-    "--psnr-drop goes by the calibration, which is of the dial: at equal counts, files of three captures were at most "
-    "0.05 dB below it; with --images the file itself is measured"
+CALIBRATED_DIAL = (
+    "--psnr-drop uses the calibration, which measured the dial and not the file: at equal counts, files of three "
+    "captures were at most 0.05 dB below it; with --images the file itself is measured"
 )
-SAY_FILTER = (".spz", ".safetensors", PAGE)  # formats that say it to every reader
+STORE_FILTER = (".spz", ".safetensors", PAGE)  # formats in which every reader finds the screen-space filter
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
-    page = out.suffix.lower() == PAGE
+    console, watch, page = Console(args.quiet), Stopwatch(), Path(args.out).suffix.lower() == PAGE
     model = with_filter(read_checkpoint(args.model, console, args.activated), args, console)
     if args.images is not None and (args.fps or args.psnr_drop):  # frames are timed, or files measured
         model = on_device(model, pick_device(args.device, console))
-    export, notes = prepare(args, model, page, console)
+    export, notes = prepare_export(args, model, page, console)
     dials, photographs, more = dial_values(args, export, page, console)
-    notes += [*more, *left_out(model), *filter_notes(args, export.gaussians, dials)]
+    notes += [*more, *dropped_columns(model), *filter_notes(args, export.gaussians, dials)]
     for note in notes:
         console.say(note)
-    with output_lock(out):
-        if args.lod_meta:
-            outputs, lost = write_set(export, out, dials)
-        else:
-            outputs, lost = write_files(export, level_paths(out, args.levels) if args.levels else [out], dials)
+    outputs, losses = write_export(args, export, dials)
     if photographs:
-        lost += add_psnr(outputs[0], export, photographs, args.psnr_drop[0])
-    for note in dict.fromkeys(lost):
+        losses += add_psnr(outputs[0], export, photographs, args.psnr_drop[0])
+    losses = list(dict.fromkeys(losses))
+    for note in losses:
         console.note(note)
-    lines = [*(describe(output, len(export.gaussians)) for output in outputs)]
-    print("\n".join([*lines, *exactness(export.target, None if page else dials)]))
+    print("\n".join(output_line(output, len(export.gaussians)) for output in outputs))
+    if dials is not None and not page:
+        print(baking_line(export.target))
     camera = export.target.camera
     return {
         "command": "export", "version": package_version(), "model": args.model, "base_count": len(export.gaussians),
         "camera": camera.name if camera else None, "cameras": len(export.target.cameras), "order": args.order,
-        "outputs": outputs, "notes": [*model.notes, *notes, *dict.fromkeys(lost)], "seconds": watch.report(),
+        "outputs": outputs, "notes": [*model.notes, *notes, *losses], "seconds": watch.report(),
     }  # fmt: skip
 
 
-def prepare(args: argparse.Namespace, model: Checkpoint, page: bool, console: Console) -> tuple[Export, list[str]]:
-    """What is to be written, once a dial value is known; and notes on the cameras."""
+def prepare_export(
+    args: argparse.Namespace, model: Checkpoint, page: bool, console: Console
+) -> tuple[Export, list[str]]:
+    """The model sorted as asked for, with the cameras to bake for; and notes on these."""
     target, cameras, notes = Target(None, (), ""), list[Camera](), list[str]()
     baked = args.levels or args.sv or given_budget(args)
     if args.order or (baked and not (page and (args.sv or args.psnr_drop))):
@@ -85,9 +84,9 @@ def prepare(args: argparse.Namespace, model: Checkpoint, page: bool, console: Co
 def dial_values(
     args: argparse.Namespace, export: Export, page: bool, console: Console
 ) -> tuple[list[float] | None, Photographs | None, list[str]]:
-    """The dial values to bake, for a page where it opens, None where the dial is to stay; and notes on them.
+    """The dial values to bake, the initial one for a page, or None to keep the dial; and notes on them.
 
-    Between them the photographs that the file is to be measured on, if it is.
+    The second value has the photographs to measure the file on, where --psnr-drop asks for it.
     """
     model, target = export.model, export.target
     attenuation = model.gaussians.attenuation
@@ -100,34 +99,47 @@ def dial_values(
     if solved is None:
         return None, None, notes
     if page and attenuation is not None:
-        opening, more = opens_at(solved[0], attenuation.max_sv)
+        opening, more = initial_dial(solved[0], attenuation.max_sv)
         return [opening], None, notes + more
     if args.psnr_drop and target.camera is None:
-        notes.append(OF_THE_DIAL)
+        notes.append(CALIBRATED_DIAL)
     dials, beyond = choose_dials(solved, attenuation)
     return dials, None, notes + beyond
 
 
-def left_out(model: Checkpoint) -> list[str]:
-    """A note on the columns that outputs do not have."""
+def dropped_columns(model: Checkpoint) -> list[str]:
+    """A note on columns of the model that outputs do not have."""
     known = {*(inria_dtype(model.gaussians.sh_degree).names or ()), SIGMA, *MASKS}
     names = model.vertex.dtype.names or ()
-    others = [name for name in names if name not in known and not name.startswith(PREFIX)]  # those are settings
-    return [f"columns left out: {', '.join(others)}"] if others else []
+    others = [name for name in names if name not in known and not name.startswith(PREFIX)]  # the prefix marks settings
+    return [f"columns dropped: {', '.join(others)}"] if others else []
 
 
 def filter_notes(args: argparse.Namespace, gaussians: Gaussians, dials: list[float] | None) -> list[str]:
-    """A note on the filter of a file without a dial that the readers it is for have to be told of."""
+    """A note on an antialiasing filter that readers of the output do not find in the file."""
     suffix = LOD_META if args.lod_meta else suffix_of(Path(args.out))
     dialled = gaussians.sigma_d is not None and dials is None
-    if not gaussians.screen_filter.compensate or dialled or suffix in SAY_FILTER:
+    if not gaussians.screen_filter.compensate or dialled or suffix in STORE_FILTER:
         return []
-    told = 'as PlayCanvas by antiAlias and gsplat by rasterize_mode="antialiased"'
-    return [f"trained antialiased ({gaussians.screen_filter.description}): most readers have to be told, {told}"]
+    options = 'antiAlias in PlayCanvas, rasterize_mode="antialiased" in gsplat'
+    return [
+        f"trained antialiased ({gaussians.screen_filter.description}): most readers need an option for it: {options}"
+    ]
+
+
+def write_export(
+    args: argparse.Namespace, export: Export, dials: list[float] | None
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Writes all files of the command; a description of each, and notes."""
+    out = Path(args.out)
+    with output_lock(out):
+        if args.lod_meta:
+            return write_set(export, out, dials)
+        return write_files(export, level_paths(out, args.levels) if args.levels else [out], dials)
 
 
 def write_files(export: Export, paths: list[Path], dials: list[float] | None) -> tuple[list[dict[str, Any]], list[str]]:
-    """Writes a file, or one for each of several dial values, together; what they are, and notes."""
+    """Writes one file, or one per dial value, all or none; a description of each, and notes."""
     outputs, notes = list[dict[str, Any]](), list[str]()
     chosen: list[float | None] = [None] if dials is None else [*dials]
     with atomic_paths(*paths) as temporaries:
@@ -140,8 +152,8 @@ def write_files(export: Export, paths: list[Path], dials: list[float] | None) ->
 
 
 def write_set(export: Export, out: Path, dials: list[float] | None) -> tuple[list[dict[str, Any]], list[str]]:
-    """Writes a streaming set; what is in it, and notes."""
-    assert dials is not None  # check_export has seen to it
+    """Writes a streaming set; a description of it, and notes."""
+    assert dials is not None  # checked by check_export
     with atomic_path(out) as folder:
         counts, notes = export.write_levels(folder, dials)
         total = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
@@ -150,16 +162,18 @@ def write_set(export: Export, out: Path, dials: list[float] | None) -> tuple[lis
 
 
 def add_psnr(output: dict[str, Any], export: Export, photographs: Photographs, drop: float) -> list[str]:
-    """Measures the file that was written, adds that to what is said of it; a note where it lost more than ``drop``."""
+    """Measures the written file and adds the PSNR to its description; a note where it lost more than ``drop`` dB."""
     path = Path(output["file"])
-    lost = photographs.lost(export.read_back(path, suffix_of(path)), export.console, path.name)
+    lost = photographs.drop_of(export.read_back(path, suffix_of(path)), export.console, path.name)
     reference = photographs.reference
     output |= {"psnr": reference - lost, "reference_psnr": reference, "views": len(photographs.views)}
-    return [f"{path} is {lost:.2f} dB below, not {drop:g}: values are rounded"] if lost > drop else []
+    return (
+        [f"{path} is {lost:.2f} dB below the model, not {drop:g}: splat-transform rounds values"] if lost > drop else []
+    )
 
 
-def describe(output: dict[str, Any], total: int) -> str:
-    """A line on an output of a model of ``total`` Gaussians."""
+def output_line(output: dict[str, Any], total: int) -> str:
+    """One line on an output of a model of ``total`` Gaussians."""
     line = f"wrote {output['file']} ({size(output['bytes'])}): {output['count']:,}"
     if levels := output.get("levels"):
         shown = ", ".join(f"{level['count']:,} at s = {level['virtual_scale']:.5g}" for level in levels)
@@ -167,7 +181,7 @@ def describe(output: dict[str, Any], total: int) -> str:
     if output["virtual_scale"] is None:
         return f"{line} Gaussians"
     if output["file"].lower().endswith(PAGE):
-        return f"{line} Gaussians, the dial at s = {output['virtual_scale']:.5g} at first"
+        return f"{line} Gaussians, initial dial value s = {output['virtual_scale']:.5g}"
     line = f"{line} of {total:,} Gaussians, s = {output['virtual_scale']:.5g}"
     if "psnr" not in output:
         return line
@@ -176,9 +190,7 @@ def describe(output: dict[str, Any], total: int) -> str:
     return f"{line}; {output['psnr']:.2f} dB on {output['views']} held-out photographs, {below} the model at s = 1"
 
 
-def exactness(target: Target, dials: list[float] | None) -> list[str]:
-    """Which cameras a baked file is for, in words."""
-    if dials is None or not target.cameras:
-        return []
-    place = f"exact from the camera of {target.camera.name} only" if target.camera else f"baked for {target.about}"
-    return [f"{place}, and lossy: the dial and the Gaussians that it leaves out are gone"]
+def baking_line(target: Target) -> str:
+    """The cameras that a baked file is for."""
+    cameras = f"exact at the camera of {target.camera.name} only" if target.camera else f"baked for {target.about}"
+    return f"{cameras}; lossy: without the dial and the Gaussians culled at this dial value"

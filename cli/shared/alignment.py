@@ -1,4 +1,4 @@
-"""Before training: does the checkpoint stand where the cameras look? Stops with what was found where it does not."""
+"""The alignment of checkpoint and photographs, checked before training."""
 
 from __future__ import annotations
 
@@ -20,28 +20,29 @@ from clod_adapter.origin import Origin
 from .console import Console
 
 OTHER_COLOURS = (
-    "warning: {ply} shows the photographs in {images}, but some are farther from it than from their own mean colours: "
-    "another exposure, views that it does not cover, or a poor checkpoint?"
+    "warning: {ply} matches the photographs in {images}, but some differ more from it than from their own mean "
+    "colours; check for another exposure, views that it does not cover, or a poor checkpoint"
 )
-FLAT = "warning: the photographs in {images} show one colour each, which is what the checkpoint will be trained on"
+FLAT = "warning: the photographs in {images} have a single colour each, on which the checkpoint is trained"
 
 
 def require_alignment(
     checkpoint: Checkpoint, scene: Scene, args: argparse.Namespace, console: Console
 ) -> tuple[dict[str, Any], list[str]]:
-    """The numbers of ``check_alignment`` and the ``guess``, for the report, and a note where the file does not fit.
+    """Compares renders with the photographs; for a poor match also in other frames, which takes some seconds.
 
-    Where the file fits poorly, or not at all, other frames are tried on it, which takes some seconds.
+    Returns:
+        The numbers of ``check_alignment`` and the ``guess``, for the report; and notes.
 
     Raises:
-        ClodError: it does not fit, or clearly better in another frame; not with --misaligned-ok.
+        ClodError: the checkpoint does not match, or matches clearly better in another frame; not with --misaligned-ok.
     """
     base, ply, views = checkpoint.gaussians, checkpoint.path, [*scene.test, *scene.train]
     with console.status("comparing the checkpoint with the photographs ..."):
         found = check_alignment(base, views)
     guess = None
     if not found.on_white and (not found.fits or found.margin < DOUBTFUL):
-        with console.status("the checkpoint fits poorly: trying other frames ..."):
+        with console.status("poor match: trying other frames ..."):
             guess = guess_frame(base, views, found, load_points(args.images, checkpoint.origin))
     numbers = found.as_dict() | {"guess": guess and guess.description}
     if found.fits and guess is None:
@@ -50,35 +51,34 @@ def require_alignment(
         for note in notes:
             console.say(note)
         return numbers, notes
-    message = f"{ply}: does not fit {args.images}: {describe(checkpoint, views, found, guess)}"
+    message = f"{ply}: does not match {args.images}: {mismatch(checkpoint, views, found, guess)}"
     if not args.misaligned_ok:
-        raise ClodError(f"{message}; --misaligned-ok trains regardless")
+        raise ClodError(f"{message}; use --misaligned-ok to train anyway")
     console.say(f"warning: {message}")
     return numbers, [f"warning: {message}"]
 
 
-def describe(checkpoint: Checkpoint, views: Sequence[View], found: Alignment, guess: Guess | None) -> str:
-    """What was found, and what to do."""
+def mismatch(checkpoint: Checkpoint, views: Sequence[View], found: Alignment, guess: Guess | None) -> str:
+    """The measurements, and what to do."""
     share = f"{found.in_view:.2g}" if 0 < found.in_view < 0.01 else f"{found.in_view:.0%}"
     facts = f"{share} of its Gaussians are in view"
     if found.views:
         facts = (
-            f"its renders of {found.views} views are {found.psnr:.1f} dB from the photographs, whose own mean colours "
-            f"are {found.mean_colour_psnr:.1f} dB from them, and {facts}"
+            f"renders of {found.views} views have a PSNR of {found.psnr:.1f} dB against the photographs, the mean "
+            f"colours of these {found.mean_colour_psnr:.1f} dB; {facts}"
         )
     if found.on_white:
         return (
-            f"{facts}; over white the renders are {found.white_psnr:.1f} dB from them, but clod-adapt renders over "
-            "black: give photographs with the background cut out (transparent PNGs are laid over black) or a "
-            "checkpoint trained on black"
+            f"{facts}; over white the renders have {found.white_psnr:.1f} dB, but clod-adapt renders over black: give "
+            "photographs with a transparent background (PNG; composited over black), or a checkpoint trained on black"
         )
     if guess:
-        return f"{facts}; in another frame it is {guess.psnr:.1f} dB from them: {guess.description}"
-    return f"{facts}; {places(checkpoint, views)}; give the checkpoint of this scene, in the cameras' frame"
+        return f"{facts}; in another frame renders have {guess.psnr:.1f} dB: {guess.description}"
+    return f"{facts}; {positions(checkpoint, views)}; give the checkpoint of this scene, in the cameras' frame"
 
 
-def places(checkpoint: Checkpoint, views: Sequence[View]) -> str:
-    """Where the Gaussians are, and where the cameras, in the coordinates of their files."""
+def positions(checkpoint: Checkpoint, views: Sequence[View]) -> str:
+    """The positions of Gaussians and cameras, in the coordinates of their files."""
     base, origin = checkpoint.gaussians, checkpoint.origin
     if not len(base):
         return "it is empty"
@@ -88,8 +88,8 @@ def places(checkpoint: Checkpoint, views: Sequence[View]) -> str:
     focus = focus_of(torch.stack([view.camera.viewmat for view in views])).to(centres)
     away = float((centres - focus).norm(dim=1).median())
     return (
-        f"half of it lies within {radius:.3g} of {_point(middle, origin)}, the cameras look at about "
-        f"{_point(focus, origin)} from {away:.3g} away"
+        f"half of the Gaussians lie within {radius:.3g} of {_point(middle, origin)}, the cameras look at about "
+        f"{_point(focus, origin)} from a distance of {away:.3g}"
     )
 
 

@@ -1,4 +1,4 @@
-"""``--antialiasing``: the screen-space filter that a checkpoint is drawn with, as told, stored or found out."""
+"""``--antialiasing``: the screen-space filter of a checkpoint, as given, stored or measured."""
 
 from __future__ import annotations
 
@@ -19,40 +19,40 @@ WORDS = {"off": "without antialiasing", "on": "with antialiasing", "mip": "with 
 def with_filter(
     checkpoint: Checkpoint, args: argparse.Namespace, console: Console, views: Sequence[View] = ()
 ) -> Checkpoint:
-    """The checkpoint with the filter that it is to be drawn with, and a note, which is said too, where that is news.
+    """The checkpoint with the filter to render it with, and a note, also printed, where the file has another or none.
 
-    That of ``--antialiasing``; with ``auto`` what the file says; where it does not say, the one whose renders of
-    ``views`` are clearly closest to the photographs, or without views the usual one.
+    The filter is that of ``--antialiasing``. With ``auto`` it is the file's; if the file has none, the one whose
+    renders of ``views`` are clearly closest to the photographs, or without views the default.
     """
     gaussians = checkpoint.gaussians
     if args.antialiasing != "auto":
-        told = FILTERS[args.antialiasing]
-        if told == gaussians.screen_filter or not checkpoint.filter_known:
-            return replace(checkpoint, gaussians=gaussians.replace(screen_filter=told))
-        said = gaussians.screen_filter.description
-        note = f"{checkpoint.path}: drawn {WORDS[args.antialiasing]}, as told; the file says {said}"
-        return _noted(checkpoint, told, note, console)
+        given = FILTERS[args.antialiasing]
+        if given == gaussians.screen_filter or not checkpoint.filter_known:
+            return replace(checkpoint, gaussians=gaussians.replace(screen_filter=given))
+        stored = gaussians.screen_filter.description
+        note = f"{checkpoint.path}: rendered {WORDS[args.antialiasing]} (--antialiasing); the file has {stored}"
+        return _noted(checkpoint, given, note, console)
     if checkpoint.filter_known or not views:
         return checkpoint
     with console.status("comparing screen-space filters with the photographs ..."):
         found = compare_filters(gaussians, views, gaussians.screen_filter.name or "off")
     if found.chosen == found.expected:
         return checkpoint
-    return _noted(checkpoint, found.screen_filter, _news(checkpoint, found), console)
+    return _noted(checkpoint, found.screen_filter, _measured_note(checkpoint, found), console)
 
 
-def alike(base: Checkpoint, model: Checkpoint, args: argparse.Namespace) -> Checkpoint:
-    """The base that a model was made of, with the filter of the model where its own file does not say."""
+def with_filter_of(base: Checkpoint, model: Checkpoint, args: argparse.Namespace) -> Checkpoint:
+    """The base of a model, with the model's filter if its own file has none."""
     if args.antialiasing != "auto" or base.filter_known or not model.filter_known:
         return base
     return replace(base, gaussians=base.gaussians.replace(screen_filter=model.gaussians.screen_filter))
 
 
-def _news(checkpoint: Checkpoint, found: FilterComparison) -> str:
+def _measured_note(checkpoint: Checkpoint, found: FilterComparison) -> str:
     chosen, expected = (f"{found.psnr[name]:.2f} dB {WORDS[name]}" for name in (found.chosen, found.expected))
     return (
-        f"{checkpoint.path}: the photographs say that it was trained {WORDS[found.chosen]}: {chosen}, {expected}; "
-        f"drawn so (--antialiasing {found.expected} overrides)"
+        f"{checkpoint.path}: by the photographs it was trained {WORDS[found.chosen]}: {chosen}, {expected}; "
+        f"rendered so (--antialiasing {found.expected} overrides it)"
     )
 
 

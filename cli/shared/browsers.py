@@ -1,4 +1,4 @@
-"""A browser in a window of its own, to look at a page in."""
+"""A browser that opens a window."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import os
 import subprocess
 import webbrowser
 
-IN_TERMINAL = ("lynx", "w3m", "links", "links2", "elinks", "www-browser")  # those would take it over
+IN_TERMINAL = ("lynx", "w3m", "links", "links2", "elinks", "www-browser")  # they would take over the terminal
 
 
 def find_browser() -> webbrowser.BaseBrowser | None:
-    """The browser that would be opened; None where there is none, or only one that runs in the terminal."""
+    """The default browser; None if there is none, or only one that runs in the terminal."""
     try:
         browser = webbrowser.get()
     except webbrowser.Error:
@@ -21,13 +21,13 @@ def find_browser() -> webbrowser.BaseBrowser | None:
 
 
 def open_browser(url: str) -> bool:
-    """Whether a browser was opened in a window of its own; one that runs in the terminal is none."""
+    """Opens ``url`` in a browser window; False if there is no such browser."""
     browser = find_browser()
     if browser is None:
         return False
     if type(browser) is not webbrowser.GenericBrowser:
         return browser.open(url)
-    # A program of the user's, or of an editor that shows the page where its window is. Its open() would wait for it.
+    # A program of the user's, or of an editor that shows the page in its own window. Its open() would wait for it.
     command = [browser.name, *(word.replace("%s", url) for word in browser.args)]
     nowhere = subprocess.DEVNULL
     try:

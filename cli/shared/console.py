@@ -1,4 +1,4 @@
-"""What the user sees while something runs: lines and progress, all of it on stderr."""
+"""Messages and progress, all on stderr."""
 
 from __future__ import annotations
 
@@ -13,33 +13,34 @@ from typing import Any
 from tqdm import tqdm
 
 from clod_adapter.io.settings import WARNING
+from clod_adapter.progress import Listener, Progress
 
-tqdm.monitor_interval = 0  # its thread would watch bars that are drawn at every step anyway, and may never start
-LINE_EVERY = 10.0  # seconds between progress lines where stderr is no terminal
+tqdm.monitor_interval = 0  # bars are updated at every step anyway, and its thread may fail to start
+LINE_EVERY = 10.0  # seconds between progress lines if stderr is not a terminal
 BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 
 
 @dataclass(frozen=True)
 class Console:
-    """Writes lines to stderr, or with ``quiet`` nothing."""
+    """Writes lines to stderr; nothing with ``quiet``."""
 
     quiet: bool = False
 
     def say(self, text: str) -> None:
         if not self.quiet:
             with _unbreakable():
-                tqdm.write(text, file=sys.stderr)  # not print: a bar may be on this line
+                tqdm.write(text, file=sys.stderr)  # print would overwrite a bar on this line
                 sys.stderr.flush()
 
     def note(self, text: str) -> None:
-        """A note on what was read or written; one that begins with "warning: " as that."""
+        """Writes a note on what was read or written, or a warning if it begins so."""
         self.say(f"  {text}" if text.startswith(WARNING) else f"  note: {text}")
 
     @contextmanager
     def status(self, text: str) -> Iterator[Callable[[str], None]]:
-        """Shows on a terminal what is being done, while it is, where there is no telling how far it is.
+        """Shows on a terminal what is being done, if its progress is unknown.
 
-        Gives a function to show something else with; off a terminal that is a line now and then.
+        Yields a function that changes the text; without a terminal it writes a line now and then.
         """
         shown, printed = None, time.perf_counter()
         if not self.quiet and sys.stderr.isatty():
@@ -64,7 +65,7 @@ class Console:
 
     @contextmanager
     def meter(self, label: str) -> Iterator[Meter]:
-        """The progress of one phase, which ends with the block."""
+        """The progress of a phase, until the end of the block."""
         meter = Meter(self, label)
         try:
             yield meter
@@ -74,10 +75,10 @@ class Console:
 
 @dataclass
 class Meter:
-    """Progress with the time left: a bar on a terminal, elsewhere a line now and then.
+    """Progress with the time left: a bar on a terminal, otherwise a line now and then. Is a ``progress.Listener``.
 
     Args:
-        slow: of few and uneven steps: shown from the start, and judged by all of its time so far.
+        slow: for few and uneven steps: shown from the start, with the time left from the mean pace.
         initial: the share that was done before.
     """
 
@@ -98,7 +99,7 @@ class Meter:
             )  # fmt: skip
 
     def update(self, share: float, text: str = "") -> None:
-        """Shows the ``share`` that is done, in [0, 1], and ``text`` behind it."""
+        """Shows the ``share`` that is done, in [0, 1], followed by ``text``."""
         now = time.perf_counter()
         if self.bar is not None:
             with _unbreakable():
@@ -108,6 +109,13 @@ class Meter:
             self.printed = now
             left = (now - self.began) * (1 - share) / max(share - self.initial, 1e-9)
             self.console.say(f"{self.label} {share:4.0%}, {duration(left)} left, {text}".removesuffix(", "))
+
+    def __call__(self, now: Progress) -> None:
+        self.update(now.share, f"{now.done}/{now.total}")
+
+    def part(self, index: int, count: int, text: str) -> Listener:
+        """The listener of the ``index``-th of ``count`` equal parts."""
+        return lambda now: self.update((index + now.share) / count, text)
 
     def close(self) -> None:
         if self.bar is not None:
@@ -127,7 +135,7 @@ def duration(seconds: float) -> str:
 
 @contextmanager
 def _unbreakable() -> Iterator[None]:
-    """When the reader of stderr is gone the work goes on unseen; a training run is not lost over it."""
+    """If the reader of stderr has ended, the work continues without output."""
     try:
         yield
     except BrokenPipeError:

@@ -1,4 +1,4 @@
-"""Which device a command works on: the GPU where it can draw there, else the CPU, with the reason in a line."""
+"""The device of a command: the GPU where a backend works on it, else the CPU, with the reason in a line."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from dataclasses import replace
 
 import torch
 
+from clod_adapter._support.text import first_line
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.rasterizers.cuda import unusable
 
 from .console import Console
-from .findings import first_line
 
 
 def pick_device(name: str, console: Console) -> torch.device:
-    """The device of ``--device``; says in a line why a GPU that is there is not used.
+    """The device of ``--device``; prints why a GPU is not used.
 
     Raises:
-        ClodError: cuda was asked for and cannot be had; says what to install.
+        ClodError: cuda was asked for and does not work; the message says what to install.
     """
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return torch.device("cpu")
@@ -34,23 +34,23 @@ def pick_device(name: str, console: Console) -> torch.device:
 
 
 def no_gpu() -> str | None:
-    """Why nothing can be drawn on a GPU here, None where it can. The first time gsplat may compile for minutes."""
+    """Why no GPU backend works, None if one does. The first call may compile gsplat for minutes."""
     if torch.cuda.is_available():
         return _fails() or unusable()
     if torch.version.cuda is None:
         return f"torch {torch.__version__} is built without CUDA: install torch from https://pytorch.org for your CUDA"
-    return "torch sees no NVIDIA GPU: nvidia-smi says whether there is one, and whether its driver is as new as CUDA's"
+    return "torch finds no NVIDIA GPU; check with nvidia-smi that there is one and that its driver is new enough"
 
 
 def _fails() -> str | None:
-    """Why torch cannot compute on the GPU that it sees: one too old or too new for this torch, or taken."""
+    """Why torch cannot compute on the GPU that it finds: not supported by this torch, or in use."""
     try:
         torch.ones(1, device="cuda").add_(1).item()
     except (RuntimeError, AssertionError) as error:
-        return f"torch cannot compute on it ({first_line(error)}); clod-adapt doctor says what mends that"
+        return f"torch cannot compute on it ({first_line(error)}); clod-adapt doctor prints a fix"
     return None
 
 
 def on_device(checkpoint: Checkpoint, device: torch.device) -> Checkpoint:
-    """The checkpoint with its Gaussians there. Photographs stay where they were read, and go over one at a time."""
+    """The checkpoint with its Gaussians on the device. Photographs stay in main memory and are copied one at a time."""
     return replace(checkpoint, gaussians=checkpoint.gaussians.to(device))

@@ -1,36 +1,34 @@
-"""The ways to give a dial value: ``--sv``, or a budget that it is solved from."""
+"""The options for dial values: ``--sv``, or a budget from which the dial value is solved."""
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
-from typing import Any
+from argparse import Namespace
+from typing import TYPE_CHECKING, Any
 
-# Option, metavar, type, help. All but the first are budgets, under the names that budget.dial_for has for them.
+if TYPE_CHECKING:
+    from argparse import _ActionsContainer
+
+# Budgets: name (as of budget.dial_for), metavar, type, help.
 OPTIONS: tuple[tuple[str, str, type, str], ...] = (
     ("keep", "N", int, "the dial value that keeps N Gaussians {where}"),
-    ("fps", "F", float, "the dial value that draws F frames a second, by the frame times {times}"),
-    ("psnr_drop", "DB", float, "the dial value that gives up DB decibels against s = 1, {decibels}"),
+    ("fps", "F", float, "the dial value that renders F frames per second, by frame times {times}"),
+    ("psnr_drop", "DB", float, "the dial value that loses DB decibels against s = 1, {decibels}"),
 )  # fmt: skip
 BUDGETS = """\
-budgets, each solved to the dial value that just keeps within it:
-  --keep       exact, from the dial values at which Gaussians leave; s = 1 keeps
-               fewer than the file has
-  --psnr-drop  read off the calibration in the file's header, measured by
-               clod-adapt on its held-out photographs; where it had none,
-               against the checkpoint's own pictures, as a note then says
-  --fps        some frames are timed first, here and now: times depend on the
-               machine, the size of the pictures, and what else is running
-A count or frame rate that s = 1 meets gives s = 1 and a note, and a drop larger
-than there is the largest trained dial value; a count or frame rate that this
-does not reach is an error that says what is reachable.
+budgets, each solved for a dial value:
+  --keep       exact; s = 1 keeps fewer Gaussians than the file has
+  --psnr-drop  from the calibration in the file's header
+  --fps        times some frames first; depends on machine, image size and load
+If s = 1 meets the budget, or the largest trained dial value loses less than DB,
+that is the result. A count or frame rate that is out of reach is an error.
 """
 
 
-def add_dial_options(parser: ArgumentParser, sv_help: str, where: str, *, several: bool, required: bool) -> None:
+def add_dial_options(options: _ActionsContainer, sv_help: str, where: str, *, several: bool) -> None:
     """Adds --sv and the budgets, of which one may be given; ``several`` allows more than one value of it."""
-    times = "measured here first" if several else "stored in the file, or with --images measured first"
-    decibels = "by the stored calibration" if several else "by the stored calibration, or with --images as measured"
-    group: Any = parser.add_mutually_exclusive_group(required=required)
+    times = "measured first" if several else "in the file, or with --images measured first"
+    decibels = "by the calibration" if several else "by the calibration, or with --images measured"
+    group: Any = options.add_mutually_exclusive_group()
     count = "+" if several else 1
     group.add_argument("--sv", metavar="S", type=float, nargs=count, help=sv_help)
     for name, metavar, kind, text in OPTIONS:
@@ -39,21 +37,21 @@ def add_dial_options(parser: ArgumentParser, sv_help: str, where: str, *, severa
         group.add_argument(option, metavar=metavar, type=kind, nargs=count, help=shown)
 
 
-def opens_at(virtual_scale: float, max_sv: float | None) -> tuple[float, list[str]]:
-    """Where the dial of a page stands at first, and a note where that is not what was asked for.
+def initial_dial(virtual_scale: float, max_sv: float | None) -> tuple[float, list[str]]:
+    """The initial dial value of a page, and a note where it differs from the one asked for.
 
     Args:
-        max_sv: where it ends; None for a file without a dial.
+        max_sv: largest value of the page's dial; None for a file without a dial.
     """
     if max_sv is None:
-        return 1.0, [f"no sigma_d, so no dial to be at s = {virtual_scale:g}"] if virtual_scale > 1 else []
+        return 1.0, [f"no sigma_d, so s = {virtual_scale:g} has no effect"] if virtual_scale > 1 else []
     if virtual_scale > max_sv:
-        return max_sv, [f"the page's dial ends at s = {max_sv:g}, as far as was trained for, and opens there"]
+        return max_sv, [f"the page's dial ends at s = {max_sv:g}, the largest value trained for, and opens there"]
     return virtual_scale, []
 
 
 def given_budget(args: Namespace) -> tuple[str, str, list[float]] | None:
-    """The budget's name, its option and its values, if one is given."""
+    """Name, option and values of the budget, or None without one."""
     for name, *_ in OPTIONS:
         if getattr(args, name) is not None:
             return name, f"--{name.replace('_', '-')}", getattr(args, name)

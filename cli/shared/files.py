@@ -1,4 +1,4 @@
-"""The files of the commands: their names, checked before work is spent."""
+"""Names of output files and folders, checked before any work is done."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .outputs import check_no_input, check_outputs
 
 @dataclass(frozen=True)
 class Outputs:
-    """The three files of a run."""
+    """The three output files of a run."""
 
     ply: Path
     adapter: Path
@@ -22,20 +22,20 @@ class Outputs:
 
     @classmethod
     def of(cls, checkpoint: str, out: str | None) -> Outputs:
-        """Beside ``out``, by default the checkpoint's name with _clod in the current folder."""
+        """From ``out``; by default the checkpoint's name with _clod, in the current folder."""
         ply = Path(out or f"{Path(checkpoint).stem}_clod.ply")
         return cls(ply, ply.with_suffix(".safetensors"), ply.with_suffix(".json"))
 
     @property
     def state(self) -> Path:
-        """What ``--resume`` goes on from; there only while a run is not finished."""
+        """The state for ``--resume``; exists only until the run is finished."""
         return self.ply.with_suffix(".resume.safetensors")
 
     def check(self, inputs: Sequence[str], scene: str | None, more: Sequence[Path]) -> None:
-        """``check_outputs`` for them, the states and blocks of a run, and ``more``."""
+        """``check_outputs`` for these, for the state and blocks of a run, and for ``more``."""
         check_ply_name(self.ply, "--out")
         check_outputs([self.ply], inputs, scene, beside=[self.adapter, self.report, *more])
-        blocks = self.ply.parent.glob(f"{escape(self.ply.stem)}.*.safetensors")  # which are looked into when found
+        blocks = self.ply.parent.glob(f"{escape(self.ply.stem)}.*.safetensors")  # read if they exist
         check_no_input([self.state, *blocks], inputs, scene)
 
     def names(self) -> dict[str, str]:
@@ -48,9 +48,9 @@ def check_ply_name(path: Path, option: str) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Makes ``--out`` a folder, where it is none yet."""
+    """Makes the folder of ``--out`` if it does not exist."""
     if folder.exists() and not folder.is_dir():
-        raise ClodError(f"{folder}: is a file; give --out the name of a folder")
+        raise ClodError(f"{folder}: is a file; --out must name a folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -58,10 +58,10 @@ def make_folder(folder: Path) -> None:
 
 
 def labels(paths: Sequence[str]) -> list[str]:
-    """Names of files that tell them apart: the stem, with its folder where two stems are the same.
+    """A distinct label per file: its stem, with the folder's name where two stems are equal.
 
     Raises:
-        ClodError: a file is given twice, or two have the same name all the same.
+        ClodError: a file is given twice, or two labels are equal.
     """
     resolved = [Path(path).resolve() for path in paths]
     if len(set(resolved)) < len(resolved):
@@ -75,6 +75,6 @@ def labels(paths: Sequence[str]) -> list[str]:
 
 
 def size(of: Path | int) -> str:
-    """Of a file, or of so many bytes: ``4 kB``, ``12.3 MB``."""
+    """The size of a file, or a number of bytes, as text: ``4 kB``, ``12.3 MB``."""
     count = of if isinstance(of, int) else of.stat().st_size
     return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{max(count / 1e3, 1):.0f} kB"

@@ -1,4 +1,4 @@
-"""Checkpoints and scenes as the commands read them: with a word to the user on what is in them."""
+"""Reading checkpoints and scenes, with messages on their contents."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from clod_adapter.io.ply.values import Activated
 from clod_adapter.io.scene.image_cache import ImageCache
 from clod_adapter.io.scene.load import load_scene
 from clod_adapter.origin import Origin
+from clod_adapter.progress import Phase
 from clod_adapter.training.pseudo_views import add_pseudo_views, place_cameras, render_pseudo_views
 
 from .console import Console
@@ -21,7 +22,7 @@ from .files import size
 def read_checkpoint(
     path: str, console: Console, activated: Activated | None = None, origin: Origin | None = None
 ) -> Checkpoint:
-    """Reads a checkpoint and says what is in it; the options as ``load`` takes them."""
+    """Reads a checkpoint and prints its contents; options as for ``load``."""
     with console.status(f"reading {path} ({size(Path(path))}) ..."):
         checkpoint = load(path, activated=activated, origin=origin)
     gaussians = checkpoint.gaussians
@@ -35,12 +36,9 @@ def read_checkpoint(
 
 
 def read_scene(folder: str, console: Console, origin: Origin, cache: ImageCache | None = None) -> Scene:
-    """Reads the photographs and says how they are used."""
-    with console.meter("photographs") as meter:
-        scene = load_scene(
-            folder, origin=origin, progress=lambda done, total: meter.update(done / total, f"{done}/{total}"),
-            cache=cache,
-        )  # fmt: skip
+    """Reads the photographs and prints how they are used."""
+    with console.meter(Phase.PHOTOGRAPHS) as meter:
+        scene = load_scene(folder, origin=origin, progress=meter, cache=cache)
     camera = scene.train[0].camera
     size = f"{camera.width}x{camera.height}"
     console.say(f"{folder}: {len(scene.train)} photographs to train on, {len(scene.test)} held out, {size}")
@@ -52,8 +50,8 @@ def read_scene(folder: str, console: Console, origin: Origin, cache: ImageCache 
 def with_pseudo_views(
     gaussians: Gaussians, scene: Scene, config: AdaptConfig, console: Console
 ) -> tuple[Scene, AdaptConfig]:
-    """What ``placement.add_pseudo_views`` makes of few photographs, and says so."""
-    with console.status("looking for places of cameras ..."):
+    """``pseudo_views.add_pseudo_views``, with its notes."""
+    with console.status("placing cameras ..."):
         more, lighter = add_pseudo_views(gaussians, scene, config)
     for note in more.notes[len(scene.notes) :]:
         console.note(note)
@@ -61,15 +59,11 @@ def with_pseudo_views(
 
 
 def place_scene(gaussians: Gaussians, seed: int, console: Console) -> Scene:
-    """Without photographs: places cameras, takes the checkpoint's own pictures, and says so."""
-    with console.meter("placing cameras") as meter:
-        cameras = place_cameras(
-            gaussians, seed=seed, progress=lambda done, total: meter.update(done / total, f"{done}/{total}")
-        )
-    with console.meter("pictures") as meter:
-        scene = render_pseudo_views(
-            gaussians, cameras, progress=lambda done, total: meter.update(done / total, f"{done}/{total}")
-        )
+    """A scene of pseudo views, with its notes."""
+    with console.meter(Phase.CAMERAS) as meter:
+        cameras = place_cameras(gaussians, seed=seed, progress=meter)
+    with console.meter(Phase.PSEUDO_VIEWS) as meter:
+        scene = render_pseudo_views(gaussians, cameras, progress=meter)
     for note in scene.notes:
         console.say(note)
     return scene

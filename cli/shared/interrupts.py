@@ -1,7 +1,7 @@
-"""Ctrl-C, and SIGTERM, with which schedulers announce the end, as another Ctrl-C.
+"""Ctrl-C and SIGTERM, which schedulers send before they end a job; both are handled alike.
 
-A SIGINT that is ignored when the command starts stays ignored: shells start a background job of a script so, and the
-Ctrl-C that ends the script is not meant for the job. SIGTERM ends the job in any case.
+A SIGINT that is ignored when the command starts stays ignored: shells start background jobs of a script so, and the
+Ctrl-C that ends the script is not meant for them. SIGTERM ends such a job.
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
+from clod_adapter.progress import Listener, Progress, Stopped
+
 
 class GracefulStop:
-    """Counts Ctrl-C. The first is a request, which the step under way outlives; a second one interrupts at once.
+    """Counts signals. The first one requests a stop after the step under way; the second raises KeyboardInterrupt.
 
     Args:
-        aborts: whether it does. Launchers and schedulers repeat their signals: what they start does not abort.
+        aborts: whether the second one does. Launchers and schedulers repeat signals, so their processes do not abort.
     """
 
     def __init__(self, aborts: bool = True) -> None:
@@ -26,8 +28,16 @@ class GracefulStop:
 
     @property
     def aborted(self) -> bool:
-        """Whether nothing is to be written any more."""
+        """Whether the user does not want anything to be written."""
         return self.aborts and self.requests > 1
+
+    def heeding(self, display: Listener | None = None) -> Listener:
+        """The listener that calls ``display`` and stops once a signal has arrived."""
+
+        def listen(now: Progress) -> bool:
+            return (display is None or display(now) is not False) and self.requests == 0
+
+        return listen
 
     @contextmanager
     def listening(self) -> Iterator[None]:
@@ -41,14 +51,27 @@ class GracefulStop:
 
 
 @contextmanager
+def interrupt_as_stopped() -> Iterator[None]:
+    """Within the block Ctrl-C raises Stopped. From the dispatcher of a compiled function it comes as a SystemError."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        raise Stopped("interrupted") from error
+    except SystemError as error:
+        if not isinstance(error.__cause__, KeyboardInterrupt):
+            raise
+        raise Stopped("interrupted") from error
+
+
+@contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
-    """Within, SIGTERM raises KeyboardInterrupt. To be entered after pycolmap's import, which installs a handler."""
+    """Within the block SIGTERM raises KeyboardInterrupt. Enter it after importing pycolmap, which sets a handler."""
     with _handled_by(signal.default_int_handler, signal.SIGTERM):
         yield
 
 
 def listen_no_more() -> None:
-    """From here to the end of the process, past the blocks above, neither Ctrl-C nor SIGTERM is heard."""
+    """Ignores Ctrl-C and SIGTERM until the process ends, also after the blocks above."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
 
@@ -64,5 +87,5 @@ def _handled_by(handler: Callable[[int, FrameType | None], Any], *numbers: signa
         yield
     finally:
         for number, earlier in before.items():
-            if signal.getsignal(number) is handler:  # and not listen_no_more
+            if signal.getsignal(number) is handler:  # not after listen_no_more
                 signal.signal(number, earlier)

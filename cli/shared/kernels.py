@@ -1,4 +1,4 @@
-"""Compiled kernels, made ready before anything is measured or timed: loaded, or on the first run compiled."""
+"""The compiled kernels, loaded or on the first run compiled before anything is measured or timed."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ from clod_adapter.cameras import Camera, Scene, View
 from clod_adapter.config import CLASSIC, AdaptConfig, ScreenFilter
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Stopped
 from clod_adapter.training.loop import adapt
 
 from .console import Console, Meter
 
 CPU = torch.device("cpu")
 OTHER = ""
-# What a kernel takes of the time that all of them take to compile; only the time left that is shown depends on it.
+# Share of each kernel in the time to compile all of them; used only for the progress shown.
 SHARES = {"project": 0.2, "project_gradient": 0.42, OTHER: 0.035}
 
 
 def prepare_kernels(
     console: Console, device: torch.device = CPU, *, training: bool = True, screen_filter: ScreenFilter = CLASSIC
 ) -> None:
-    """Adapts and evaluates a miniature on the device, so that all kernels that this takes are there.
+    """Evaluates, and with ``training`` adapts, a scene of one Gaussian, so that all kernels are compiled.
 
-    Training with a filter that compensates opacities takes a kernel of its own.
+    Training with a filter that compensates opacities needs another kernel.
     """
     one = Gaussians(
         torch.zeros(1, 3), torch.ones(1, 4), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3),
@@ -41,13 +42,13 @@ def prepare_kernels(
         evaluate(one, [view], [1.0])
         if training:
             adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0))
-            if adapted.interrupted:  # it keeps what it has, and that is nothing here
-                raise KeyboardInterrupt
+            if adapted.interrupted:
+                raise Stopped("stopped while the kernels were compiled")
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Of several, each would compile on its own once a Ctrl-C has ended that of the first."""
+    """Limits torch to one thread; after a Ctrl-C in one, each of several threads would compile on its own."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -58,11 +59,10 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def announced_compiling(console: Console, shares: Mapping[str, float] | None = None) -> Iterator[None]:
-    """Says so when something has to be compiled within the block; it takes a while.
+    """Prints a line when something is compiled within the block.
 
     Args:
-        shares: of the time, by kernel and for ``OTHER`` ones: with them, how far it is is shown too, and that it will
-            happen again where what is compiled cannot be kept.
+        shares: of the compile time, by kernel and for ``OTHER`` ones: shows progress, and whether there is a cache.
     """
     listener = _Compiling(console, shares)
     try:
@@ -73,7 +73,7 @@ def announced_compiling(console: Console, shares: Mapping[str, float] | None = N
 
 
 class _Compiling(Listener):  # type: ignore[misc]
-    """Follows compilations; those of what a kernel is made of happen within its own."""
+    """Follows compilations; functions that a kernel calls are compiled within its own."""
 
     def __init__(self, console: Console, shares: Mapping[str, float] | None) -> None:
         self.console, self.shares = console, shares
@@ -84,9 +84,9 @@ class _Compiling(Listener):  # type: ignore[misc]
         self.depth += 1
         if not self.said:
             self.said = True
-            # What the demo's ray tracer compiles is never kept: its pictures are.
+            # The demo's ray tracer is never cached: its images are.
             cached = not self.shares or not isinstance(event.data["dispatcher"]._cache, NullCache)
-            nowhere = "on every run, as no folder to keep them in can be written: set NUMBA_CACHE_DIR"
+            nowhere = "on every run, as no cache folder is writable: set NUMBA_CACHE_DIR"
             self.console.say(f"compiling kernels ({'first run only, well under a minute' if cached else nowhere}) ...")
             self.meter = Meter(self.console, "compiling", slow=True) if self.shares else None
 

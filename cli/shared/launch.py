@@ -1,4 +1,4 @@
-"""Where this process stands among those that a launcher started, torchrun or another that sets the same variables."""
+"""The rank of this process among those that torchrun, or a launcher with the same variables, started."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ NEEDED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 
 @dataclass(frozen=True)
 class Launch:
-    """Attributes:
-    rank, size: which process this is, from 0, and how many there are; local_rank, local_size: of those on this machine.
+    """The place of this process in its group.
+
+    Attributes:
+        rank, size: index of this process, from 0, and number of processes.
+        local_rank, local_size: the same among the processes on this machine.
     """
 
     rank: int = 0
@@ -25,31 +28,28 @@ class Launch:
 
 
 def launched() -> Launch:
-    """By the environment; one process by itself where it does not say otherwise.
+    """Reads the environment variables; a single process without them.
 
     Raises:
-        ClodError: the variables do not make sense.
+        ClodError: their values are inconsistent.
     """
     if not all(name in os.environ for name in NEEDED):
         return Launch()
     names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
-    said = {name: os.environ[name] for name in names if name in os.environ}
+    found = {name: os.environ[name] for name in names if name in os.environ}
     try:
-        launch = Launch(*(int(said.get(name, default)) for name, default in zip(names, (0, 1, 0, 1), strict=True)))
+        launch = Launch(*(int(found.get(name, default)) for name, default in zip(names, (0, 1, 0, 1), strict=True)))
     except ValueError:
         launch = Launch(-1)
     if not 0 <= launch.rank < launch.size or not 0 <= launch.local_rank < launch.local_size:
-        shown = ", ".join(f"{name}={value}" for name, value in said.items())
-        raise ClodError(f"the environment says {shown}, which cannot be; start the processes with torchrun")
+        shown = ", ".join(f"{name}={value}" for name, value in found.items())
+        raise ClodError(f"inconsistent environment variables: {shown}; start the processes with torchrun")
     return launch
 
 
 @contextmanager
 def silence_but_first() -> Iterator[None]:
-    """Within, of several processes the first alone prints; what the others would is the same, or it says it for them.
-
-    An exception that leaves the block is none of that.
-    """
+    """Within the block, only the first of several processes prints; an exception that leaves it is not silenced."""
     if os.environ.get("RANK", "0") == "0" or not all(name in os.environ for name in NEEDED):
         yield
         return

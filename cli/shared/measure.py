@@ -1,4 +1,4 @@
-"""Rows of dial values as commands measure them: with progress, ended by Ctrl-C between frames."""
+"""Measuring dial values with progress; Ctrl-C ends it between frames."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from clod_adapter.config import AttenuationConfig
 from clod_adapter.evaluation.evaluate import Row, evaluate
 from clod_adapter.evaluation.perceptual import Metric
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Progress
 
 from .console import Console
 from .interrupts import GracefulStop
@@ -17,13 +18,13 @@ DIALS = (1.0, 2.0, 3.0, 5.0)
 
 
 def choose_dials(given: list[float] | None, attenuation: AttenuationConfig | None) -> tuple[list[float], list[str]]:
-    """The dial values to measure, and a note where they are beyond what the file was trained for."""
+    """The dial values to measure, and a note if they are outside the trained range."""
     trained = attenuation.max_sv if attenuation else None
     if given is None:
         return [s for s in DIALS if trained is None or s < trained] + ([trained] if trained else []), []
     if trained is None or max(given) <= trained:
         return given, []
-    return given, [f"trained up to s = {trained:g}; beyond that nothing was learned"]
+    return given, [f"trained up to s = {trained:g}; larger dial values were not trained"]
 
 
 def measure(
@@ -34,18 +35,14 @@ def measure(
     label: str = "measure",
     metrics: Mapping[str, Metric] | None = None,
 ) -> tuple[list[Row], bool]:
-    """The rows of the dial values, none where there are no views, and whether Ctrl-C cut them short."""
-    rows, stop = list[Row](), GracefulStop()  # raised between frames: within a kernel it would be a SystemError
+    """The rows of the dial values, none without views, and whether Ctrl-C ended the measurement early."""
+    stop = GracefulStop()
+    if not views:
+        return [], False
     with console.meter(label) as meter, stop.listening():
-        try:
-            for i, virtual_scale in enumerate(virtual_scales if views else ()):
 
-                def report(done: int, total: int, before: int = i, s: float = virtual_scale) -> None:
-                    meter.update((before + done / total) / len(virtual_scales), f"s={s:g}")
-                    if stop.requests:
-                        raise KeyboardInterrupt
+        def show(now: Progress) -> None:
+            meter.update(now.share, f"s={virtual_scales[(now.done - 1) // len(views)]:g}")
 
-                rows += evaluate(gaussians, views, [virtual_scale], metrics=metrics, progress=report)
-        except KeyboardInterrupt:
-            return rows, True
+        rows = evaluate(gaussians, views, virtual_scales, metrics=metrics, progress=stop.heeding(show))
     return rows, stop.requests > 0

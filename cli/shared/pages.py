@@ -1,9 +1,9 @@
-"""``--report``: a run's page. Its pictures are rendered here; its rows are those of the report."""
+"""``--report``: renders the images of a run's page; its rows are those of the report."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +14,21 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.claims import output_lock
+from clod_adapter.io.lock import output_lock
 from clod_adapter.metrics import psnr
+from clod_adapter.progress import Phase, Progress, Stopped
 from clod_adapter.render import render
 from clod_adapter.report.page import Picture
 from clod_adapter.report.tradeoff_page import own_teacher, write_tradeoff_report
-from clod_adapter.training.loop import Progress
 
 from .console import Console
+from .interrupts import interrupt_as_stopped
 from .report import jsonable
 
 FRAMES = 13  # positions of the page's slider
-SNAPSHOTS = tuple(2.0**-k for k in range(6, 0, -1))  # shares of the training at which its state is copied
+SNAPSHOTS = tuple(2.0**-k for k in range(6, 0, -1))  # shares of the training at which the result so far is copied
 INTERRUPTED = "the page was interrupted and not written"
-SNAPSHOT_VIEWS = 12  # held-out views that these are measured on, at most
+SNAPSHOT_VIEWS = 12  # held-out views that snapshots are measured on, at most
 
 
 def write_eval_page(
@@ -38,14 +39,14 @@ def write_eval_page(
     scene: Scene,
     console: Console,
 ) -> dict[str, Any]:
-    """The page where ``--report`` asks for it, with a picture of the base where there is one; adds to the report."""
+    """Writes the page if ``--report`` requests it; returns the entries of the report that it changes."""
     if not args.report:
         return {}
-    return {"outputs": _write(Path(args.report), report, model, base, scene, console)}
+    return _write(Path(args.report), report, model, base, scene, console)
 
 
 class AdaptPage:
-    """Follows a training for its page: copies the state now and then, and measures the copies after the end."""
+    """Copies the result so far during training, and measures the copies after its end, for the page."""
 
     def __init__(self, base: Gaussians, scene: Scene, config: AdaptConfig, console: Console) -> None:
         self.base, self.scene, self.config, self.console = base, scene, config, console
@@ -53,29 +54,25 @@ class AdaptPage:
         self.snapshots: list[tuple[float, Gaussians]] = []  # seconds of the training, and the state then
         self.trained = 0.0
 
-    def watching(self, follow: Callable[[Progress], None]) -> Callable[[Progress], None]:
-        """The progress callback that also takes the copies."""
-
-        def call(progress: Progress) -> None:
-            if progress.phase == "train":
-                self.trained = progress.seconds
-                if self.due and progress.share >= self.due[0]:
-                    self.due = [share for share in self.due if share > progress.share]
-                    self.snapshots.append((progress.seconds, self._copy(progress.gaussians())))
-            follow(progress)
-
-        return call
+    def __call__(self, now: Progress) -> None:
+        """A listener."""
+        if now.phase == Phase.TRAINING and now.gaussians is not None:
+            self.trained = now.seconds
+            if self.due and now.share >= self.due[0]:
+                self.due = [share for share in self.due if share > now.share]
+                self.snapshots.append((now.seconds, self._copy(now.gaussians())))
 
     def _copy(self, state: Gaussians) -> Gaussians:
-        fixed = {"shN": self.base.shN} if self.config.lr_shN == 0 else {}  # the largest part, where it is not trained
+        fixed = {"shN": self.base.shN} if self.config.lr_shN == 0 else {}  # the largest tensor, if it is not trained
         changing = {name: value.clone() for name, value in state.tensors().items() if name not in fixed}
         return state.replace(**changing, **fixed)
 
-    def write(self, path: Path, report: dict[str, Any], result: Gaussians, start_seconds: float) -> dict[str, str]:
-        """Writes the page; returns its files, none, and a note in the report, where Ctrl-C or the disk stopped it."""
+    def write(self, path: Path, report: dict[str, Any], result: Gaussians, start_seconds: float) -> dict[str, Any]:
+        """Writes the page, unless Ctrl-C or the disk stops it; returns the entries of the report that it changes."""
         try:
-            training = self._training(result, start_seconds) if self.scene.test and self.snapshots else None
-        except KeyboardInterrupt:
+            with interrupt_as_stopped():
+                training = self._training(result, start_seconds) if self.scene.test and self.snapshots else None
+        except Stopped:
             return _without(report, self.console, INTERRUPTED)
         return _write(path, report, result, self.base, self.scene, self.console, training)
 
@@ -83,7 +80,7 @@ class AdaptPage:
         """Held-out PSNR of the copies and of the result, at s = 1, 3 and the largest."""
         views = self.scene.test[:: -(-len(self.scene.test) // SNAPSHOT_VIEWS)]
         dials = sorted({1.0, min(3.0, self.config.max_sv), self.config.max_sv})
-        if self.snapshots[-1][0] == self.trained:  # the state at the end, which is the result
+        if self.snapshots[-1][0] == self.trained:  # the result itself
             self.snapshots.pop()
         states = [*self.snapshots, (self.trained, result)]
         curves: list[dict[str, Any]] = [{"label": f"s = {s:g}", "virtual_scale": s, "points": []} for s in dials]
@@ -104,40 +101,39 @@ def _write(
     scene: Scene,
     console: Console,
     training: dict[str, Any] | None = None,
-) -> dict[str, str]:
+) -> dict[str, Any]:
     try:
-        with output_lock(path), console.status(f"writing {path} ..."):
+        with interrupt_as_stopped(), output_lock(path), console.status(f"writing {path} ..."):
             frames, others = pictures(model, base, scene.test, own_teacher(report))
             written = write_tradeoff_report(path, jsonable(report), frames, others, jsonable(training))
-    except KeyboardInterrupt:
+    except Stopped:
         return _without(report, console, INTERRUPTED)
     except ClodError as error:
-        return _without(report, console, f"there is no page: {error}")
+        return _without(report, console, f"the page was not written: {error}")
     console.say(f"wrote {path}: open it in a browser")
-    return {name: str(file) for name, file in written.items()}
+    return {"outputs": {**report.get("outputs", {}), **{name: str(file) for name, file in written.items()}}}
 
 
-def _without(report: dict[str, Any], console: Console, why: str) -> dict[str, str]:
-    """No files, and a note: what was measured is worth reporting without its page."""
-    report["notes"].append(why)
+def _without(report: dict[str, Any], console: Console, why: str) -> dict[str, Any]:
+    """A note: the report is kept without its page."""
     console.say(why)
-    return {}
+    return {"outputs": report.get("outputs", {}), "notes": [*report["notes"], why]}
 
 
 @torch.no_grad()
 def pictures(
     model: Gaussians, base: Gaussians | None, views: Sequence[View], own: bool = False
 ) -> tuple[list[Picture], dict[str, Picture]]:
-    """The held-out view in the middle over the dial; and the photograph, and the base.
+    """The middle held-out view at the slider's dial values, and the photograph and the base to compare with.
 
     Args:
-        own: the views are not photographs but the base's own pictures.
+        own: the views are pseudo views.
     """
     if not views:
         return [], {}
     view = views[len(views) // 2]
     if own:
-        others = {"base": Picture(view.image.numpy(), "base, unadapted", "its own picture, which errors are against")}
+        others = {"base": Picture(view.image.numpy(), "base, unadapted", "its own rendering, the reference")}
     else:
         others = {"photograph": Picture(view.image.numpy(), "photograph", "held out from training")}
         others |= {"base": _rendered(base, view, 1.0, "base, unadapted")} if base is not None else {}

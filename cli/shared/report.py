@@ -1,4 +1,4 @@
-"""What a run reports: a JSON row for scripts, a table for people."""
+"""Reports: JSON for scripts, tables for the console."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from clod_adapter.evaluation.evaluate import Row
     from clod_adapter.evaluation.popping import Popping
 
-# Round values, each about 1.4 times the last, closer below 3 where most Gaussians leave. No dial reaches 1/tau, 50.
+# Round values, each about 1.4 times the last, closer below 3 where most Gaussians are culled; max_sv < 1/tau = 50.
 DIALS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
 
 
@@ -32,7 +32,7 @@ class Stopwatch:
 
     @contextmanager
     def time(self, name: str) -> Iterator[None]:
-        """Adds the block's time to what ``name`` already has."""
+        """Adds the time of the block to ``name``."""
         began = time.perf_counter()
         try:
             yield
@@ -47,7 +47,7 @@ class Stopwatch:
 
 
 def machine() -> dict[str, Any]:
-    """What the times were taken on."""
+    """The hardware and software that times were measured on."""
     import numba
     import torch
 
@@ -64,7 +64,7 @@ def machine() -> dict[str, Any]:
 
 
 def machine_name(device: str = "cpu") -> str:
-    """The machine in a line: what frame times on that kind of device depend on most."""
+    """The machine in one line: what frame times on that type of device depend on most."""
     about = machine()
     if device == "cuda":
         return about["gpu"]
@@ -82,7 +82,7 @@ def _cpu_name() -> str:
 
 
 def jsonable(value: Any) -> Any:
-    """``value`` with what JSON has no word for (an infinite PSNR) as null, and names of files as text."""
+    """``value`` with numbers that JSON cannot represent (an infinite PSNR) as null, and file names as text."""
     if isinstance(value, dict):
         return {jsonable(key): jsonable(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -100,18 +100,18 @@ def write_report(path: Path, report: dict[str, Any]) -> None:
 
 
 def report_dials(max_sv: float) -> list[float]:
-    """Dial values worth a row, in even steps of their logarithm, dense enough to read between; last ``max_sv``."""
+    """The dial values of a report, in about even steps of their logarithm; the last one is ``max_sv``."""
     return [s for s in DIALS if s < max_sv] + [max_sv]
 
 
 def table(rows: Sequence[Row], base_rows: Sequence[Row] = (), plain_rows: Sequence[Row] = ()) -> str:
-    """The rows under each other, those of the base first and those without the dial last, both marked."""
+    """A table: the base first, then the dial values, then the rows without the dial."""
     marked = [("base", row) for row in base_rows] + [(f"{row.virtual_scale:.5g}", row) for row in rows]
     return rows_table(marked + [("plain", row) for row in plain_rows])
 
 
 def rows_table(marked: Sequence[tuple[str, Row]]) -> str:
-    """The rows under each other, each behind its label; LPIPS and FLIP where they were measured."""
+    """A table of labelled rows; LPIPS and FLIP if they were measured."""
     width = max(6, *(len(label) for label, _ in marked))
     more = [name for name in ("lpips", "flip") if any(getattr(row, name) is not None for _, row in marked)]
     heads = "".join(f"  {name.upper():>6}" for name in more)
@@ -124,11 +124,11 @@ def rows_table(marked: Sequence[tuple[str, Row]]) -> str:
 
 
 def popping_table(results: Sequence[tuple[str, Popping]]) -> str:
-    """How the picture changes over each sweep, and how to read it."""
+    """A table of popping measurements, with an explanation."""
     width = max(len(moved) for moved, _ in results)
     lines = [
-        "popping: how much a step changes the picture, in levels of 255 (RMS over the picture, largest pixel). Halving",
-        "the step leaves 0.5 of a fade's largest change, and 1.0 of a jump's:",
+        "popping: change of the image per step, in levels of 255 (RMS over the image, largest change of a pixel).",
+        "Halving the step halves the largest change of a fade (0.5), but not that of a jump (1.0):",
         f"{'what moves':>{width}}  steps     mean  largest     at  / mean  halved   pixel  halved",
     ]
     for moved, p in results:

@@ -1,4 +1,4 @@
-"""What says that memory or threads ran out, in whichever words: each library has its own error for it."""
+"""Recognizes the errors of the libraries for exhausted memory or threads."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ import sys
 from clod_adapter.blocks.memory import in_words
 from clod_adapter.errors import ClodError
 
-ADDRESSES = 1_800_000_000  # bytes that the libraries and the smallest run take of a process's address space
-# Of RuntimeErrors (torch's allocators, Python's threads) and of ImportErrors (the loader's).
-SAYINGS = (
+ADDRESSES = 1_800_000_000  # bytes of address space that the libraries and the smallest run need
+# In RuntimeErrors (torch's allocators, Python's threads) and ImportErrors (the loader's).
+MESSAGES = (
     "can't allocate memory", "not enough memory", "out of memory", "std::bad_alloc", "can't start new thread",
     "failed to map segment", "cannot allocate memory",
 )  # fmt: skip
-LLVM = "libllvmlite"  # its package says of a library that could not be mapped that it could not be found
+LLVM = "libllvmlite"  # reported as not found where it could not be mapped
 
 
 def check_addresses() -> None:
-    """Refuses a limit of the address space (``ulimit -v``) in which the libraries alone would not fit.
+    """Refuses a limit of the address space (``ulimit -v``) that is too small for the libraries.
 
-    Some of them abort the process where they cannot map what they need, without a word.
+    Some of them abort the process without a message where they cannot map their memory.
     """
     limit = address_limit()
     if limit is not None and limit < ADDRESSES:
         raise ClodError(
-            f"the address space is limited to {in_words(limit)} (ulimit -v), and torch and LLVM alone take "
+            f"the address space is limited to {in_words(limit)} (ulimit -v), but torch and LLVM need "
             f"{in_words(ADDRESSES)}; raise the limit"
         )
 
 
 def address_limit() -> int | None:
-    """Bytes; None where there is no limit."""
+    """The limit in bytes; None without one."""
     if sys.platform == "win32":
         return None
     import resource
@@ -41,16 +41,16 @@ def address_limit() -> int | None:
 
 
 def shortage(error: BaseException) -> str | None:
-    """A line on what ran out, and what to do, where that is what the error says; None where it is another."""
+    """One line on the shortage and what to do; None if the error is another."""
     text = (str(error) or "allocating").splitlines()[0]
     if isinstance(error, OSError):
         short = error.errno == errno.ENOMEM or (LLVM in text and address_limit() is not None)
     else:
-        short = isinstance(error, MemoryError) or any(saying in str(error).lower() for saying in SAYINGS)
+        short = isinstance(error, MemoryError) or any(message in str(error).lower() for message in MESSAGES)
     if not short:
         return None
     limit = address_limit()
-    more = "free some"
+    more = "free some memory"
     if limit is not None:
         more = f"raise the limit of {in_words(limit)} on the address space (ulimit -v)"
-    return f"there is not enough memory ({text[:200]}); {more}"
+    return f"not enough memory ({text[:200]}); {more}"

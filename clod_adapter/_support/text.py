@@ -21,3 +21,8 @@ def as_text(name: str) -> str:
 def file_name(text: str) -> str:
     """The file name whose bytes are ``text`` in UTF-8, as a COLMAP model or a JSON file has it, in any locale."""
     return os.fsdecode(text.encode("utf-8"))
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of an error's message that is not blank."""
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), "no message")

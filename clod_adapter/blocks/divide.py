@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from clod_adapter.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.importance import initialize
+from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import dial, splat
 
 UNSEEN = 0.005  # of a block's coverage over all views, the share that the views it is not trained on may have
@@ -108,13 +109,13 @@ def divide(
     views: Sequence[View],
     config: AdaptConfig,
     count: int,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Listener | None = None,
 ) -> Division:
     """Splits a scene into ``count`` blocks and initializes sigma_d on the whole scene.
 
     Args:
         views: ``importance.usable_views`` of the training views.
-        progress: as ``importance.initialize`` calls it, then with "blocks", the number of views rendered and of all.
+        progress: called in the phases of ``importance.initialize``, then in ``Phase.COVERAGE`` after each view.
 
     Raises:
         ClodError: blocks cannot be trained with these settings, or there are fewer Gaussians than blocks.
@@ -133,8 +134,7 @@ def divide(
         shown = coverage(initial, initial.opacities, _smaller(view.camera)).double()
         seen[k] = (shown.new_zeros(count).index_add_(0, block.long(), shown) / shown.sum().clamp(min=1e-9)).float()
         kept[k] = torch.tensor(kept_counts(initial, view, dial_grid(config)))
-        if progress:
-            progress("blocks", k + 1, len(views))
+        tell(progress, Phase.COVERAGE, k + 1, len(views))
     initial = base.replace(sigma_d=initial.sigma_d, attenuation=initial.attenuation)
     extent = camera_extent([view.camera for view in views]) or initial.attenuation.reference_distance  # type: ignore[union-attr]
     return Division(initial, block, seen, kept, extent)

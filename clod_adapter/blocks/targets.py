@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -18,6 +18,7 @@ from clod_adapter.distances import normalized_distances
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.importance import spread
 from clod_adapter.losses import unit
+from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import dial, splat
 from clod_adapter.training.objective import TargetView
 from clod_adapter.training.target_count import TargetShare, target_curve
@@ -34,7 +35,7 @@ def context_rows(
     block: int,
     views: Sequence[View],
     after: Gaussians | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Listener | None = None,
 ) -> Tensor:
     """``[m]`` int64, ascending: the Gaussians of other blocks that any of the views needs.
 
@@ -55,8 +56,7 @@ def context_rows(
             opacities = dialled if after else torch.where(own, dialled, scene.opacities)
             covered = coverage(scene, opacities, view.camera)
             drawn |= covered > _least_covered(covered)
-        if progress:
-            progress(k + 1, len(views))
+        tell(progress, Phase.CONTEXT, k + 1, len(views))
     return (drawn & ~own).nonzero()[:, 0]
 
 
@@ -74,7 +74,7 @@ def with_target_shares(
     config: AdaptConfig,
     *,
     first: bool,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Listener | None = None,
 ) -> list[TargetView]:
     """A block's views, each with the block's target share in it.
 
@@ -95,8 +95,7 @@ def with_target_shares(
         stands_for = each / max(float(division.seen[k, block]), LEAST_SEEN) if first else each
         share = partial(_target_share, config, parts, stands_for, len(own), len(division.initial))
         found.append(TargetView(view, share))
-        if progress:
-            progress(len(found), len(numbers))
+        tell(progress, Phase.TARGET_COUNTS, len(found), len(numbers))
     return found
 
 

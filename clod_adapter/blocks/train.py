@@ -20,8 +20,7 @@ Each block has its share of an undivided run:
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -36,9 +35,10 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.scene.image_cache import ImageCache
+from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.objective import TrainableSubset
-from clod_adapter.training.state import Adapted, Progress, TrainingState
+from clod_adapter.training.state import Adapted, TrainingState
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def adapt_block(
     block: int,
     *,
     after: Gaussians | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Listener | None = None,
     resume: TrainingState | None = None,
     cache: ImageCache | None = None,
 ) -> tuple[Learned, Adapted]:
@@ -87,15 +87,14 @@ def adapt_block(
     if not own:
         unseen = scene.select(rows)
         return _learned(division, rows, Adapted(unseen, 0, 0.0, 0.0, interrupted=False))
-    context = context_rows(division, block, own, after, _told(progress, "beside", scene))
+    context = context_rows(division, block, own, after, progress)
     gaussians = scene.select(torch.cat([rows, context]))
     if after is None:
-        own = _with_target_images(gaussians, len(rows), own, cache, _told(progress, "targets", scene))
-    told = _told(progress, "quotas", scene)
-    targets = with_target_shares(division, block, own, config, first=after is None, progress=told)
+        own = _with_target_images(gaussians, len(rows), own, cache, progress)
+    targets = with_target_shares(division, block, own, config, first=after is None, progress=progress)
     part = TrainableSubset(len(rows), division.extent, full_context=after is None)
     settings = block_config(division, block, config, first=after is None)
-    adapted = adapt(gaussians, Scene(tuple(targets), ()), settings, progress, resume, part=part)
+    adapted = adapt(gaussians, Scene(tuple(targets), ()), settings, progress, resume, subset=part)
     return _learned(division, rows, adapted)
 
 
@@ -108,25 +107,16 @@ def _learned(division: Division, rows: Tensor, adapted: Adapted) -> tuple[Learne
     return Learned(rows, changed, adapted.steps, adapted.seconds), adapted
 
 
-def _told(
-    progress: Callable[[Progress], None] | None, phase: str, scene: Gaussians
-) -> Callable[[int, int], None] | None:
-    if progress is None:
-        return None
-    return lambda done, total: progress(Progress(phase, done, total, 0.0, done / total, math.nan, lambda: scene))
-
-
 def _with_target_images(
     gaussians: Gaussians, own: int, views: Sequence[View], cache: ImageCache | None,
-    progress: Callable[[int, int], None] | None,
+    progress: Listener | None,
 ) -> list[View]:  # fmt: skip
     """The views with their ``target_image`` in place of the photograph."""
     found = []
     for view in views:
         aimed = View(view.camera, target_image(gaussians, own, view))
         found.append(cache.store(aimed, partial(target_image, gaussians, own, view)) if cache else aimed)
-        if progress:
-            progress(len(found), len(views))
+        tell(progress, Phase.TARGET_IMAGES, len(found), len(views))
     return found
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,7 +11,8 @@ from clod_adapter.attenuation import SIGMA_MAX
 from clod_adapter.cameras import Scene
 from clod_adapter.config import SH_COUNTS, AdaptConfig
 from clod_adapter.gaussians import SH_C0, Gaussians
-from clod_adapter.training.loop import Progress, adapt
+from clod_adapter.progress import Listener, Stopped
+from clod_adapter.training.loop import adapt
 
 
 def fit_base(
@@ -22,13 +21,16 @@ def fit_base(
     scene: Scene,
     *,
     iters: int,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Listener | None = None,
 ) -> Gaussians:
     """Trains one Gaussian per point at s = 1: ``adapt`` without fading and with 3DGS's learning rates.
 
     Args:
         points: ``[N, 3]`` world units; colors: ``[N, 3]`` uint8.
         iters: training steps.
+
+    Raises:
+        Stopped: ``progress`` returned False, or Ctrl-C ended training.
     """
     config = AdaptConfig(
         max_sv=1, iters=iters, lr_sigma=0, lr_means=1.6e-4, lr_quats=1e-3, lr_scales=5e-3,
@@ -36,7 +38,10 @@ def fit_base(
     )  # fmt: skip
     initial = from_points(points, colors)
     frozen = torch.full((len(initial),), SIGMA_MAX / 10)  # no fading; SIGMA_MAX would be initialized
-    return detach(adapt(attach(initial, frozen), scene, config, progress).gaussians)
+    adapted = adapt(attach(initial, frozen), scene, config, progress)
+    if adapted.interrupted:
+        raise Stopped(f"stopped at step {adapted.steps}")
+    return detach(adapted.gaussians)
 
 
 def from_points(points: np.ndarray, colors: np.ndarray, *, sh_degree: int = 3) -> Gaussians:

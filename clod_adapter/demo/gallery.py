@@ -6,7 +6,6 @@ room is 6 m wide (x from -3 to 3), 8 m long (z from 0 to 8) and 3 m high (floor 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from clod_adapter.demo.raytrace import Tables, camera_rays, encode_srgb, render_
 from clod_adapter.demo.shapes import Finish, SceneBuilder
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.scene.colmap import write_model
+from clod_adapter.progress import Listener, Phase, tell
 
 LOW, HIGH = np.array([-3.0, -3.0, 0.0]), np.array([3.0, 0.0, 8.0])
 CANDIDATES = 4  # pixels sampled per point; those with detail are preferred
@@ -198,7 +198,7 @@ def write_gallery(
     height: int = 240,
     count: int = 64,
     points: int = 20000,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Listener | None = None,
 ) -> Gallery:
     """Renders the capture into a new `folder`: ``images/*.png`` and a COLMAP model with a point cloud.
 
@@ -206,7 +206,7 @@ def write_gallery(
         folder: does not exist or is empty; it is created atomically.
         count: number of views, at least 2; every 8th by name is held out.
         points: size of the point cloud.
-        progress: called with (views done, views in all) after each view.
+        progress: called in ``Phase.PHOTOGRAPHS`` after each view.
 
     Raises:
         ClodError: the folder cannot be written, count is too small, or a bundled photograph is missing.
@@ -219,8 +219,7 @@ def write_gallery(
         images.mkdir(parents=True)
         for done, camera in enumerate(cameras, 1):
             Image.fromarray(gallery.render(camera)).save(images / camera.name)
-            if progress:
-                progress(done, count)
+            tell(progress, Phase.PHOTOGRAPHS, done, count)
         xyz, rgb = gallery.sample_points(points, views=count)
         write_model(part, cameras, [camera.name for camera in cameras], xyz, rgb)
     return gallery

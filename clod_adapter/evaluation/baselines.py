@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from statistics import fmean
 
 import torch
@@ -13,17 +13,18 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, removal_error, spread
+from clod_adapter.progress import Listener
 from clod_adapter.render import dial
 
 
 @torch.no_grad()
 def mean_kept(gaussians: Gaussians, cameras: Sequence[Camera], virtual_scale: float) -> float:
-    """Gaussians that the dial leaves in, mean over the cameras; nothing is rendered."""
+    """Gaussians kept at a dial value, mean over the cameras; without rendering."""
     return fmean(int(dial(gaussians, camera, virtual_scale).keep.sum()) for camera in cameras)
 
 
 def matching_dial(gaussians: Gaussians, cameras: Sequence[Camera], count: float) -> float:
-    """The dial value that keeps ``count`` on average: 1 without a dial or where that keeps no more, max_sv at most."""
+    """The dial value that keeps ``count`` on average, clamped to [1, max_sv]; 1 without a dial."""
     if gaussians.attenuation is None:
         return 1.0
     try:
@@ -32,21 +33,19 @@ def matching_dial(gaussians: Gaussians, cameras: Sequence[Camera], count: float)
         return gaussians.attenuation.max_sv
 
 
-def rankings(
-    base: Gaussians, views: Sequence[View], progress: Callable[[int, int], None] | None = None
-) -> dict[str, Tensor]:
-    """``[N]`` indices of the Gaussians of an unadapted base, the ones to keep longest first, by two rules.
+def rankings(base: Gaussians, views: Sequence[View], progress: Listener | None = None) -> dict[str, Tensor]:
+    """``[N]`` indices of the Gaussians of an unadapted base, most important first, by two rankings.
 
-    ``opacity``: the stored one. ``removal error``: the error that removing it alone would cause in up to 64 of the
-    training views, evenly spread (``importance.removal_error``). ``base.select(order[:n])`` is the base at n Gaussians.
+    ``opacity``: as stored. ``removal error``: the image error of removing the Gaussian alone, in up to 64 evenly
+    spread training views (``importance.removal_error``). ``base.select(order[:n])`` is the base pruned to n Gaussians.
 
     Args:
-        progress: called with (views done, views in all).
+        progress: called in ``Phase.IMPORTANCE`` after each view.
     """
     removal = removal_error(base, spread(views, MOST_VIEWS), progress=progress)
     return {"opacity": by_opacity(base), "removal error": removal.argsort(descending=True, stable=True)}
 
 
 def by_opacity(gaussians: Gaussians) -> Tensor:
-    """``[N]`` indices, the most opaque first; equals in their order."""
+    """``[N]`` indices, the most opaque first; stable."""
     return gaussians.opacity_logits.argsort(descending=True, stable=True)

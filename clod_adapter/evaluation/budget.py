@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -33,6 +33,7 @@ from clod_adapter.distances import typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.rasterizers import wait_for
 from clod_adapter.render import dial, render
 
@@ -122,14 +123,14 @@ def frame_times(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Listener | None = None,
 ) -> list[tuple[float, float]]:
     """Measures milliseconds per frame at six dial values from 1 to max_sv, in even steps of log s.
 
     Medians over at most four of the cameras, evenly spread.
 
     Args:
-        progress: called with (frames timed, frames in all).
+        progress: called in ``Phase.FRAME_TIMES`` with the frames timed so far.
 
     Returns:
         The dial values, each with its milliseconds.
@@ -153,8 +154,7 @@ def frame_times(
             render(gaussians, seen[done % len(seen)], virtual_scale)
             wait_for(gaussians.means.device)
             taken.append((time.perf_counter() - began) * 1e3)
-        if progress:
-            progress((done + 1) * len(times), TIMED_REPEATS * len(seen) * len(times))
+        tell(progress, Phase.FRAME_TIMES, (done + 1) * len(times), TIMED_REPEATS * len(seen) * len(times))
     return [(s, statistics.median(taken)) for s, taken in zip(virtual_scales, times, strict=True)]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import torch
@@ -17,6 +17,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.perceptual import Metric
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.metrics import psnr_ssim
+from clod_adapter.progress import Listener, Phase, Progress
 from clod_adapter.rasterizers import wait_for
 from clod_adapter.render import Rendering, render
 
@@ -57,7 +58,7 @@ def evaluate(
     *,
     repeats: int = 1,
     metrics: Mapping[str, Metric] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Listener | None = None,
 ) -> list[Row]:
     """Renders ``views`` at each dial value and compares with the photographs.
 
@@ -65,7 +66,8 @@ def evaluate(
         gaussians: adapted or not; without ``sigma_d`` every dial value shows the base.
         repeats: frames timed per view and dial value; all renders of one view are the same.
         metrics: more to measure, from ``perceptual.available_metrics``: any of ``lpips`` and ``flip``.
-        progress: called with (frames done, frames in all).
+        progress: called in ``Phase.EVALUATION`` after each view of each dial value. If it returns False, the rows of
+            the dial values that are complete are returned.
 
     Raises:
         ClodError: no views, no dial values, a dial value below 1 or not finite, or repeats below 1.
@@ -79,7 +81,7 @@ def evaluate(
     require(repeats >= 1, "repeats", repeats, "at least 1")
     gaussians, device = gaussians.without_empty_bands(), gaussians.means.device
     render(gaussians, views[0].camera, max(virtual_scales))  # compiled and warm before the clock starts
-    rows = []
+    rows = list[Row]()
     for i, virtual_scale in enumerate(virtual_scales):
         results, times = [], []
         more: dict[str, list[float]] = {name: [] for name in metrics or {}}
@@ -93,13 +95,17 @@ def evaluate(
             results.append((*psnr_ssim(rendering.image, view.image), *_counts(gaussians, view, rendering)))
             for name, metric in (metrics or {}).items():
                 more[name].append(metric(rendering.image, view.image))
-            if progress:
-                progress(i * len(views) + j + 1, len(virtual_scales) * len(views))
+            done = Progress(Phase.EVALUATION, i * len(views) + j + 1, len(virtual_scales) * len(views))
+            stopped = progress is not None and progress(done) is False
+            if stopped and j + 1 < len(views):
+                return rows
         psnr, ssim, kept, in_view = (statistics.fmean(column) for column in zip(*results, strict=True))
         share = kept / max(len(gaussians), 1)
         frame_ms = statistics.median(times)
         perceived = {name: statistics.fmean(values) for name, values in more.items()}
         rows.append(Row(float(virtual_scale), psnr, ssim, kept, share, in_view, frame_ms, **perceived))
+        if stopped:
+            break
     return rows
 
 

@@ -1,23 +1,22 @@
-"""Popping: does the picture change evenly as the dial turns or the camera moves, or does it jump?
+"""Popping: whether the image changes evenly or in jumps as the dial turns or the camera moves.
 
-Neighbouring steps k, k+1 of a sweep are compared *from one camera*, so that only what the level of detail does is
-counted and not the camera's own motion: with ``I_c(k)`` the picture, clamped to [0, 1], that camera c sees of the
-Gaussians as they are opaque at step k, step k changes it by
+Neighbouring steps k, k+1 of a sweep are compared *from one camera*, so that only the level of detail counts and not
+the motion of the camera. With ``I_c(k)`` the image, clamped to [0, 1], from camera c with the opacities of step k,
+step k changes it by
 
     delta_k = I_c(k+1) - I_c(k)      c the camera of step k+1
     change_k = 255 rms(delta_k)      root mean square over pixels and channels, in levels of 255
 
-A fade changes the picture in proportion to the step's length, a jump by the same amount however short the step. Two
-numbers tell them apart:
+A fade changes the image in proportion to the length of the step, a jump by a constant amount. Two numbers distinguish
+them:
 
-    ratio       = max change / mean change              1 where all is even; a single switch within n steps gives n,
-                                                        without bound as the steps get finer
-    persistence = max change / max change over 2 steps  1/2 for a fade, 1 for a jump or a flicker, about 0.7 where many
+    ratio       = max change / mean change              1 if all steps are equal; a single switch within n steps
+                                                        gives n
+    persistence = max change / max change over 2 steps  1/2 for a fade, 1 for a jump or a flicker, about 0.7 if many
                   (I_c(k+1) - I_c(k-1))                 small jumps at different places add up in every step
 
-so ``max change (2 - 1 / persistence)`` is about what would be left of the largest change at the shortest of steps. What
-a Gaussian leaves behind when it is cut hardly shows in the root mean square; it does in the largest change of a pixel,
-which is therefore given as well.
+so ``max change (2 - 1 / persistence)`` approximates the largest change in the limit of short steps. The jump of a
+single culled Gaussian hardly changes the root mean square, so the largest change of a pixel is measured too.
 """
 
 from __future__ import annotations
@@ -36,23 +35,22 @@ from clod_adapter.cameras import Camera
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import dial, render, splat
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
 class Popping:
-    """How a picture changes over a sweep; changes are in levels of 255.
+    """How the image changes over a sweep; changes are in levels of 255.
 
     Attributes:
-        steps: how many, of equal length.
-        mean: change of the picture in a step, mean over the steps.
-        largest: the largest of them; at: where it ends, as a dial value or a share of the camera path.
-        ratio: largest / mean, in [1, steps]; NaN where nothing changes at all.
+        steps: number of steps of equal length.
+        mean: mean change of a step.
+        largest: largest change of a step; at: its end, as a dial value or a share of the camera path.
+        ratio: largest / mean, in [1, steps]; NaN if nothing changes.
         persistence: largest / the largest over two steps at once: 0.5 a fade, 1 a jump, at most 1; NaN as above.
-        pixel: the largest change of one channel of one pixel in one step; pixel_at: where.
-        pixel_persistence: the same as persistence, of the largest changes of one pixel.
+        pixel: largest change of one channel of one pixel in one step; pixel_at: its end.
+        pixel_persistence: persistence of the largest changes of one pixel.
         changes: of every step.
     """
 
@@ -72,13 +70,17 @@ class Popping:
 
 
 @torch.no_grad()
-def sweep(show: Callable[[int, int], Tensor], positions: Sequence[float], progress: Progress | None = None) -> Popping:
-    """The measure itself, of anything that can be shown.
+def sweep(show: Callable[[int, int], Tensor], positions: Sequence[float], progress: Listener | None = None) -> Popping:
+    """Measures any sequence of images.
 
     Args:
-        show: ``show(k, j)`` is the picture ``[H, W, 3]`` from the camera of step k of the Gaussians as at step j.
-        positions: where the steps are, at least three.
-        progress: called with (steps done, steps in all).
+        show: ``show(k, j)`` is the image ``[H, W, 3]`` from the camera of step k with the Gaussians of step j.
+        positions: of the steps, at least three.
+        progress: called in ``Phase.POPPING`` after each step.
+
+    Raises:
+        ClodError: fewer than three positions.
+        Stopped: ``progress`` returned False.
     """
     require(len(positions) >= 3, "number of positions", len(positions), "at least 3")
     once, twice = [], []
@@ -87,8 +89,7 @@ def sweep(show: Callable[[int, int], Tensor], positions: Sequence[float], progre
         once.append(_change(new - show(k, k - 1).clamp(0, 1)))
         if k >= 2:
             twice.append(_change(new - show(k, k - 2).clamp(0, 1)))
-        if progress:
-            progress(k, len(positions) - 1)
+        tell(progress, Phase.POPPING, k, len(positions) - 1)
     changes, pixels = zip(*once, strict=True)
     wide_changes, wide_pixels = zip(*twice, strict=True)
     largest, pixel, mean = max(changes), max(pixels), math.fsum(changes) / len(changes)
@@ -101,9 +102,9 @@ def sweep(show: Callable[[int, int], Tensor], positions: Sequence[float], progre
 
 
 def dial_popping(
-    gaussians: Gaussians, camera: Camera, max_sv: float, *, steps: int = 200, progress: Progress | None = None
+    gaussians: Gaussians, camera: Camera, max_sv: float, *, steps: int = 200, progress: Listener | None = None
 ) -> Popping:
-    """Turns the dial from 1 to ``max_sv`` before a camera that stands still, in steps of equal ratio.
+    """Turns the dial from 1 to ``max_sv`` in steps of equal ratio, for one camera.
 
     Raises:
         ClodError: ``max_sv`` is not above 1 or not finite, or there are fewer than two steps.
@@ -111,7 +112,7 @@ def dial_popping(
     require(1 < max_sv < math.inf, "max_sv", max_sv, "above 1 and finite")
     positions = [max_sv ** (k / steps) for k in range(steps + 1)]
     gaussians = gaussians.without_empty_bands()
-    # Each picture is wanted three times: as the newest, one and two steps later.
+    # Each image is used three times.
     picture = lru_cache(maxsize=3)(lambda j: render(gaussians, camera, positions[j]).image)
     return sweep(lambda _, j: picture(j), positions, progress)
 
@@ -122,9 +123,9 @@ def path_popping(
     virtual_scale: float,
     *,
     steps: int = 200,
-    progress: Progress | None = None,
+    progress: Listener | None = None,
 ) -> Popping:
-    """Moves through the ``cameras`` at a fixed dial value, in steps of equal length (``path``).
+    """Moves through the ``cameras`` in steps of equal length (``path``), at one dial value.
 
     Raises:
         ClodError: fewer than two cameras or two steps, or the dial is below 1 or not finite.
@@ -141,10 +142,10 @@ def path_popping(
 
 
 def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
-    """``steps + 1`` cameras from the first to the last through all of them, equally far apart along the way.
+    """``steps + 1`` cameras from the first to the last through all of them, at equal distances along the path.
 
-    Between neighbours the centre moves straight and the rotation turns evenly about one axis; where no centre moves,
-    each turn takes as many steps as the next. Size and intrinsics are the first camera's.
+    Centres are interpolated linearly and rotations by slerp. If no centre moves, each rotation takes the same number
+    of steps. Size and intrinsics are the first camera's.
 
     Raises:
         ClodError: fewer than two cameras or two steps.
@@ -174,7 +175,7 @@ def _turned(start: Tensor, end: Tensor, share: float) -> Tensor:
     turn = end.double() @ start.double().T
     angle = math.acos(min(max((float(turn.trace()) - 1) / 2, -1.0), 1.0))
     axis = torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    if float(axis.norm()) < 1e-9:  # no turn, or half a turn, which no neighbours of a capture are apart
+    if float(axis.norm()) < 1e-9:  # no rotation, or half a turn, which does not occur between neighbours of a capture
         return start.double()
     cross = torch.linalg.cross(torch.eye(3, dtype=torch.float64), F.normalize(axis, dim=0).expand(3, 3))
     return torch.linalg.matrix_exp(share * angle * cross) @ start.double()

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import TypeVar
 
 import torch
@@ -19,6 +18,7 @@ from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.finite import bad_rows, largest_colour
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.pruning_order import pruning_order
+from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
 from clod_adapter.units import in_world_units, known_distance, with_distance
 
@@ -40,7 +40,7 @@ def initialize(
     base: Gaussians,
     views: Sequence[View],
     config: AdaptConfig,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Listener | None = None,
     error: Tensor | None = None,
 ) -> Gaussians:
     """The Gaussians with an initial sigma_d, from renderings of up to MOST_VIEWS of the views, evenly spread.
@@ -49,8 +49,7 @@ def initialize(
     ``max_sv``; one without effect (``SIGMA_MAX`` throughout, as ``attach`` makes it) counts as none.
 
     Args:
-        progress: called with "start", the number of views rendered and the number of views to render; then with
-            "order", the number of Gaussians ranked and the number of all Gaussians.
+        progress: called in ``Phase.IMPORTANCE`` after each view, and then in ``Phase.PRUNING_ORDER``.
         error: ``[N]`` from ``removal_error`` of these views and seed, where it is known.
     """
     if base.attenuation is not None and has_dial(base):
@@ -63,13 +62,11 @@ def initialize(
         constant = torch.full_like(base.means[:, 0], value)
         return in_world_units(base.replace(sigma_d=constant, attenuation=attenuation))
     if error is None:
-        rendered = partial(progress, "start") if progress else None
-        error = removal_error(base, views, seed=config.seed, progress=rendered)
+        error = removal_error(base, views, seed=config.seed, progress=progress)
     attenuation = dataclasses.replace(attenuation, tau=fitting_tau(base.opacities, error, config))
     importance = error
     if config.start == "importance":
-        order = partial(progress, "order") if progress else None
-        importance = pruning_order(base, error.sqrt() * base.opacities, order)
+        importance = pruning_order(base, error.sqrt() * base.opacities, progress)
     distances = typical_distance(base.means, [view.camera for view in views], attenuation)
     sigma = sigma_from_importance(
         base, importance, distances, attenuation, share=config.start_share, exponent=config.exponent
@@ -145,7 +142,7 @@ def scene_distance(base: Gaussians, views: Sequence[View], quantile: float) -> f
 
 
 def removal_error(
-    gaussians: Gaussians, views: Sequence[View], *, seed: int = 0, progress: Callable[[int, int], None] | None = None
+    gaussians: Gaussians, views: Sequence[View], *, seed: int = 0, progress: Listener | None = None
 ) -> Tensor:
     """``[N]`` estimate of the squared image error of removing each Gaussian alone.
 
@@ -155,7 +152,7 @@ def removal_error(
     Gauss-Newton matrix). Works with every differentiable rasterizer.
 
     Args:
-        progress: called with the number of views done and the number of all views.
+        progress: called in ``Phase.IMPORTANCE`` after each view.
 
     Raises:
         ClodError: an error is not finite, as colours overflow in the images.
@@ -169,8 +166,7 @@ def removal_error(
         signs = drawn.to(image.device).to(image) * 2 - 1
         (gradient,) = torch.autograd.grad((image * signs).sum(), opacities)  # as grad_outputs they would import sympy
         total += (gradient * opacities.detach()).square()
-        if progress:
-            progress(done, len(views))
+        tell(progress, Phase.IMPORTANCE, done, len(views))
     if (bad := bad_rows(total)) is not None:
         much = f"the image error of removing each of {int(bad.sum()):,} Gaussians is not finite"
         raise ClodError(f"{much}; {largest_colour(gaussians)}")

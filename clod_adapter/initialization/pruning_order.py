@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -11,6 +9,7 @@ from torch import Tensor
 from clod_adapter._kernels import threads
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.progress import Listener, Phase, tell
 
 NEIGHBOURS = 8
 REMOVED = 0.25  # of the remaining Gaussians, per round
@@ -24,9 +23,7 @@ CROWD = 64  # Gaussians with equal centres, from which on these are displaced,
 JITTER = 1e-6  # by this share of their size: a k-d tree cannot split equal points, and compares each with all others
 
 
-def pruning_order(
-    gaussians: Gaussians, importance: Tensor, progress: Callable[[int, int], None] | None = None
-) -> Tensor:
+def pruning_order(gaussians: Gaussians, importance: Tensor, progress: Listener | None = None) -> Tensor:
     """``[N]`` int64, how many Gaussians are removed before each: half-edge collapse, as for the levels of a mesh.
 
     In rounds. Removing Gaussian i costs the minimum over its NEIGHBOURS nearest centres j of
@@ -41,7 +38,7 @@ def pruning_order(
 
     Args:
         importance: ``[N]`` >= 0, of each Gaussian alone.
-        progress: called with the number of Gaussians ranked and the number of all Gaussians.
+        progress: called in ``Phase.PRUNING_ORDER`` after each round, with the number of Gaussians ranked so far.
 
     Raises:
         ClodError: a centre is not finite.
@@ -62,11 +59,9 @@ def pruning_order(
         order[left[removed]] = gone + np.arange(len(removed))
         gone += len(removed)
         left = np.delete(left, removed)
-        if progress:
-            progress(gone, count)
+        tell(progress, Phase.PRUNING_ORDER, gone, count)
     order[left] = gone
-    if progress:
-        progress(count, count)
+    tell(progress, Phase.PRUNING_ORDER, count, count)
     return torch.from_numpy(order).to(importance.device)
 
 

@@ -1,4 +1,4 @@
-"""The numbers of an inspection: ranges, shares and counts of what a file's rows hold. Plain numpy, n log n at most."""
+"""Statistics of an inspection: ranges, shares and counts of a file's rows, in numpy, O(n log n)."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from clod_adapter.config import SH_COUNTS
-from clod_adapter.io.ply.columns import MASKS, SIGMA, column_map, read_table
-from clod_adapter.io.ply.usable import row_rules
-from clod_adapter.origin import Origin, relative
+from clod_adapter.io.ply.columns import SIGMA, column_map
+from clod_adapter.io.ply.rows import usable_blocks
+from clod_adapter.origin import Origin
 
 BULK = (0.01, 0.99)  # quantiles that bound the middle 98 %
 NEEDLE = 10.0  # a Gaussian this many times as long as its second axis
 FAR = 10.0  # times the distance from the median position within which nine tenths lie
 FAINT = 1 / 255  # opacity that rasterizers leave out
-_BLOCK = 1 << 14  # rows that stay in cache while their columns are picked out
 _MAIN = ("means", "quats", "log_scales", "opacity_logits", "sh0")
 
 
@@ -40,7 +39,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Values:
-    """What the usable rows hold.
+    """Statistics of the usable rows.
 
     Attributes:
         total: rows of the file.
@@ -118,30 +117,17 @@ def _gather(
 ) -> tuple[dict[str, np.ndarray], np.ndarray, dict[str, int], int]:
     """The usable rows' attributes ``[P, N]`` float32, which rows they are, why others are not, the SH degree used.
 
-    The higher harmonics, three quarters of a file, are looked at and not kept.
+    The higher harmonics, three quarters of a file, are examined and not kept.
     """
     groups = column_map(sh_degree)
-    names = [name for group in groups.values() for name in group]
-    extras = [name for name in (SIGMA, *MASKS) if name in (vertex.dtype.names or ())]
-    wanted = {key: groups[key] for key in _MAIN} | ({SIGMA: (SIGMA,)} if SIGMA in extras else {})
+    wanted = {key: groups[key] for key in _MAIN} | ({SIGMA: (SIGMA,)} if SIGMA in (vertex.dtype.names or ()) else {})
     columns = {key: np.empty((len(group), len(vertex)), np.float32) for key, group in wanted.items()}
-    keep, dropped = np.zeros(len(vertex), bool), Counter[str]()
-    places = {name: k for k, name in enumerate(names + extras)}
-    bands = [places[name] for name in groups["shN"]]
-    used = np.zeros(len(bands), bool)
-    for start in range(0, len(vertex), _BLOCK):
-        rows = slice(start, start + _BLOCK)
-        table = read_table(vertex[rows], names + extras)
-        if any(origin):
-            table[:, :3] = relative(vertex[rows], origin)
-        usable = np.ones(len(table), bool)
-        for rule, reason in row_rules(table, names + extras):
-            dropped[reason] += int((usable & ~rule).sum())
-            usable &= rule
+    keep, dropped, used = np.zeros(len(vertex), bool), Counter[str](), np.zeros(len(groups["shN"]), bool)
+    for rows, values, usable in usable_blocks(vertex, sh_degree, origin, dropped):
         keep[rows] = usable
-        used |= (table[usable][:, bands] != 0).any(0)
-        for key, group in wanted.items():
-            columns[key][:, rows] = table[:, [places[name] for name in group]].T
+        used |= (values["shN"][usable] != 0).any(0)
+        for key in wanted:
+            columns[key][:, rows] = values[key].T
     if not keep.all():
         columns = {key: values[:, keep] for key, values in columns.items()}
     highest = int(used.nonzero()[0].max()) // 3 + 1 if used.any() else 0  # the last coefficient that is used

@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from clod_adapter.adapter import Adapter
 from clod_adapter.inspection.statistics import Spread
 from clod_adapter.io.adapter_file import FORMAT, KEY, load_adapter
 from clod_adapter.io.tensor_file import read_metadata
@@ -13,22 +14,22 @@ from clod_adapter.training.state_file import KEY as STATE_KEY
 from clod_adapter.training.state_file import load_state
 
 
-def inspect_tensors(path: Path) -> tuple[str, dict[str, Any]] | None:
-    """What such a file is, and plain JSON about it; None where it is neither.
+def inspect_tensors(path: Path) -> tuple[str, dict[str, Any], tuple[str, ...]] | None:
+    """The kind of such a file, plain JSON about it, and notes; None where it is neither.
 
     Raises:
         ClodError: it cannot be read, or is damaged.
     """
     metadata = read_metadata(path)
     if STATE_KEY in metadata:
-        return "the state of an interrupted run, for --resume", _state(path)
+        return "the state of an interrupted run, for --resume", _state(path), ()
     if KEY in metadata and f'"{FORMAT}"' in metadata[KEY]:
-        return "an adapter: what clod-adapt learned, without its checkpoint", _adapter(path)
+        adapter = load_adapter(path)
+        return "an adapter: what clod-adapt learned, without its checkpoint", _adapter(adapter), adapter.notes
     return None
 
 
-def _adapter(path: Path) -> dict[str, Any]:
-    adapter = load_adapter(path)
+def _adapter(adapter: Adapter) -> dict[str, Any]:
     kinds = {name: f"{str(t.dtype).removeprefix('torch.')} {list(t.shape)}" for name, t in adapter.updates.items()}
     return {
         "kind": "adapter", "writer": f"clod-adapter {adapter.version}", "count": len(adapter.sigma_d),

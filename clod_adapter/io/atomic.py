@@ -15,7 +15,7 @@ from clod_adapter.errors import ClodError
 
 @contextmanager
 def atomic_path(final: str | Path) -> Iterator[Path]:
-    """Gives a temporary name beside ``final``; on success what was written there takes its place.
+    """Gives a temporary name beside ``final``; on success the file written there replaces it.
 
     The body writes a file, or makes a folder, at the yielded path, which does not exist yet. It is
     flushed to disk before it is renamed, so a crash leaves either the old ``final`` or the new one.
@@ -31,9 +31,9 @@ def atomic_path(final: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_paths(*finals: str | Path) -> Iterator[tuple[Path, ...]]:
-    """``atomic_path`` for files that appear together: all are complete and flushed before the first is renamed.
+    """``atomic_path`` for several files: all are complete and flushed before the first is renamed.
 
-    What the body says in a ClodError of a temporary name is said of the final one.
+    A ClodError of the body names the final paths in place of the temporary ones.
     """
     targets = [Path(final) for final in finals]
     for target in targets:
@@ -63,7 +63,7 @@ def atomic_paths(*finals: str | Path) -> Iterator[tuple[Path, ...]]:
 
 
 def remove_leftovers(final: Path) -> None:
-    """Removes what killed processes left beside ``final`` of their attempts to write it; where it can, that is."""
+    """Removes temporaries of ``final`` that killed processes left, where permissions allow."""
     for path in final.parent.glob(f"{_mark(final)}*"):
         if path != lock_file(final):
             with suppress(OSError):
@@ -71,12 +71,12 @@ def remove_leftovers(final: Path) -> None:
 
 
 def lock_file(final: Path) -> Path:
-    """Beside ``final``, what a process holds a lock of while it writes it (``claims``)."""
+    """The file beside ``final`` that ``lock.output_lock`` locks."""
     return final.parent / f"{_mark(final)}lock"
 
 
 def check_target(final: Path) -> None:
-    """Raises the ClodError that ``atomic_path`` would, as far as can be told before anything is written."""
+    """Raises the ClodError of ``atomic_path`` that can be predicted before anything is written."""
     folder = final.parent
     if not folder.is_dir():
         raise ClodError(f"{final}: folder {folder} does not exist; create it first")
@@ -85,17 +85,17 @@ def check_target(final: Path) -> None:
     if final.is_dir() and any(final.iterdir()):
         raise ClodError(f"{final}: is a folder that is not empty; choose another name")
     if final.is_file() and not (final.stat().st_mode & 0o222 and os.access(final, os.W_OK)):
-        # A rename would replace it all the same, and root has access to everything.
+        # A rename would replace it, and root has access to everything.
         raise ClodError(f"{final}: is write-protected; choose another output, or chmod u+w if it is to be replaced")
 
 
 def _mark(final: Path) -> str:
-    """How its temporaries' names begin: short, however long its own is."""
+    """The prefix of its temporaries' names: short, whatever the length of its own."""
     return f".tmp-{zlib.crc32(os.fsencode(final.name)):08x}-"
 
 
 def _temporary(final: Path) -> Path:
-    # That of a temporary is one of its final. The suffix is kept because some writers choose their format by it.
+    # A temporary of a temporary has the mark of the final file. Some writers choose their format by the suffix.
     mark = final.name[:14] if final.name.startswith(".tmp-") else _mark(final)
     return final.parent / f"{mark}{uuid.uuid4().hex[:16]}{final.suffix}"
 

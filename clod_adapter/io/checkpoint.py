@@ -1,57 +1,56 @@
-"""Checkpoints: a tolerant reader, and a strict writer of the extended PLY."""
+"""Checkpoints: a reader of every format, and the writer of the extended PLY."""
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from clod_adapter.adapter import trim
 from clod_adapter.calibration import Calibration, Viewpoint
-from clod_adapter.config import CLASSIC
+from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.ply.columns import MASKS, SIGMA, column_map, inria_dtype, read_table
-from clod_adapter.io.ply.constants import dial_constants, filter_constants, read_constants
-from clod_adapter.io.ply.header import (
-    has_settings,
-    read_attenuation,
-    read_calibration,
-    read_screen_filter,
-    write_comments,
-)
-from clod_adapter.io.ply.plausible import judge
-from clod_adapter.io.ply.usable import row_rules
+from clod_adapter.io.file_formats import PLY, Model, format_of, read_model
+from clod_adapter.io.ply.columns import SIGMA, column_map, in_shape, read_table, rows_of
+from clod_adapter.io.ply.constants import dial_constants, filter_constants
+from clod_adapter.io.ply.header import PREFIX, write_comments
+from clod_adapter.io.ply.plausible import check_plausible
+from clod_adapter.io.ply.rows import PlyRows, read_ply, usable_blocks, usable_rows
 from clod_adapter.io.ply.values import Activated, as_stored_by_inria
-from clod_adapter.io.ply.write import ROWS, write_rows
-from clod_adapter.io.readers import read_rows
-from clod_adapter.io.screen_filter import likely
-from clod_adapter.origin import AXES, NOWHERE, Origin, origin_of, relative
+from clod_adapter.io.ply.write import write_rows
+from clod_adapter.io.screen_filter import implied_filter, tagged
+from clod_adapter.io.settings import matching_calibration
+from clod_adapter.io.sniff import file_sha256
+from clod_adapter.origin import NOWHERE, Origin, origin_of, relative
 from clod_adapter.units import in_world_units
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A file as read: its Gaussians, and what the writer needs to give the rest back untouched.
+    """A file as read: its Gaussians, and what the writer keeps of it.
 
     Attributes:
         gaussians: the usable Gaussians, float32; with sigma_d and attenuation if the file is extended.
-        vertex: ``[N]`` structured array, the same rows with every column of the file, in file order
-            and type, native byte order; what was activated or filtered is not any more.
-        comments: the header's comments.
-        notes: what was dropped or noticed, one line each, for the report.
-        fingerprint: SHA-256 of the file's bytes, hex; before it and a colon, what was taken as activated.
-        path: where it was read from.
-        calibration: what its dial values keep, cost and take, if the file says so.
+        vertex: ``[N]`` structured array, the same rows with every column of the file, in file order and type, native
+            byte order; activated values and filters are undone.
+        comments: the header's, or the lines of history of another format.
+        notes: what was dropped or noticed, one line each.
+        fingerprint: SHA-256 of the file's bytes, hex; preceded by "opacity:", "scales:" or "both:" where values were
+            taken as activated.
+        path: of the file.
+        calibration: what its dial values keep, cost and take, if it stores that.
         origin: ``[3]`` what the means are relative to, world units: not 0 only for a scene far from 0, whose
-            photographs are to be read relative to it too (``load_scene``). Outputs are in the file's own coordinates.
-        filter_known: whether the file says which screen-space filter it was trained with, or a dial was tuned with it;
-            else that of the Gaussians is only the likely one.
+            photographs are to be read relative to it too (``load_scene``). Outputs have the file's own coordinates.
+        filter_known: whether the file states its screen-space filter, or a dial was tuned with it; else that of the
+            Gaussians is only implied.
     """
 
     gaussians: Gaussians
@@ -66,12 +65,12 @@ class Checkpoint:
 
     @property
     def viewpoints(self) -> tuple[Viewpoint, ...]:
-        """Those of the calibration, relative to the origin as the Gaussians are; empty where the file has none."""
+        """Those of the calibration, relative to the origin as the Gaussians are; empty without a calibration."""
         stored = self.calibration.viewpoints if self.calibration else ()
         return tuple(viewpoint.moved([-value for value in self.origin]) for viewpoint in stored)
 
     def hook(self, virtual_scale: float = 1.0) -> Hook:
-        """The dial for a renderer that has these Gaussians: it turns their opacities into what is drawn of them.
+        """The dial for a renderer that has these Gaussians: it maps their opacities to attenuated ones.
 
         Raises:
             ClodError: the file has no sigma_d, or the dial is below 1 or not finite.
@@ -82,55 +81,135 @@ class Checkpoint:
 
 
 def load(path: str | Path, *, activated: Activated | None = None, origin: Origin | None = None) -> Checkpoint:
-    """Reads a checkpoint of plain Gaussians, in Inria's, MaskGaussian's, Mip-Splatting's or our extended layout.
+    """Reads a checkpoint of plain Gaussians; the suffix decides the format (``file_formats.FORMATS``).
 
-    The name's suffix says which format it is (``readers.READERS``); the rest of this is of PLY. Any property order,
-    byte order or ascii, with or without normals, SH degree 0 to 4. Rows with a value that is not finite in a used
-    column, or with a zero rotation, are dropped and counted in the notes; opacity = +inf stays and means fully opaque.
-    In MaskGaussian's old layout (``masks_0, masks_1``) rows with existence probability sigmoid(masks_0 - masks_1) < 0.5
-    go too. Mip-Splatting's ``filter_3D`` is fused into scale and opacity.
+    A PLY may have Inria's, MaskGaussian's, Mip-Splatting's or our extended layout: any property order, byte order or
+    ascii, with or without normals, SH degree 0 to 4. It is read once; the fingerprint is of the bytes that were parsed.
+
+    Rows with a value that is not finite in a used column, or with a zero rotation, are dropped and counted in the
+    notes; opacity = +inf stays and means fully opaque. Of MaskGaussian's old layout (``masks_0, masks_1``) rows with
+    existence probability sigmoid(masks_0 - masks_1) < 0.5 are dropped too. Mip-Splatting's ``filter_3D`` is fused into
+    scale and opacity.
 
     Args:
-        activated: which values to take as activated already, where no opacity is below -0.1 and half are at
-            most 1, or no scale is below 0, as in no usual file of logits and logarithms: "none", "opacity",
-            "scales" or "both". Files that this package wrote, and formats that settle it, are not in question.
-        origin: what the means are to be relative to, as another checkpoint's are; by default what suits them.
+        activated: which values are activated already, for a file where no opacity is below -0.1 and half are at most
+            1, or no scale is below 0, as in no usual file of logits and logarithms: "none", "opacity", "scales" or
+            "both". Not needed for files of this package, and for formats that define it.
+        origin: what the means are to be relative to, world units; by default chosen by ``origin_of``.
 
     Raises:
-        ClodError: not a checkpoint, damaged, of another kind, nothing usable in it, or values in question and
-            ``activated`` is None.
+        ClodError: not a checkpoint, damaged, of another kind, nothing usable in it, or the range of the values leaves
+            open whether they are activated and ``activated`` is None.
     """
     path = Path(path)
-    rows = read_rows(path)
-    names = rows.vertex.dtype.names or ()
-    constants = read_constants(path, rows.vertex) if SIGMA in names else {}
-    said, expected = read_screen_filter(path, rows.comments, constants), likely(rows.comments, names)
-    vertex, was, changes = as_stored_by_inria(path, rows.vertex, "none" if rows.settled else activated)
-    if origin is None:
-        origin = origin_of(vertex) if rows.origin is None else rows.origin
-    values, keep, notes = _gather(path, vertex, rows.sh_degree, origin)
-    if any(origin):
-        where = ", ".join(f"{value:.10g}" for value in origin)
-        notes.append(f"far from 0: read relative to ({where}); outputs have x, y, z as double")
-    if not keep.all():
-        vertex = vertex[keep]
-    gaussians, calibration = _gaussians(values), None
-    if SIGMA in values:
-        attenuation, remarks = read_attenuation(path, rows.comments, constants)
-        sigma_d = torch.from_numpy(values[SIGMA][:, 0])
-        gaussians = gaussians.replace(sigma_d=sigma_d, attenuation=attenuation)
-        if not has_settings(rows.comments):
-            remarks += judge(gaussians.means, gaussians.opacity_logits, sigma_d, attenuation)
-        calibration, doubts = read_calibration(rows.comments, len(gaussians))
-        notes += remarks + doubts
-        expected = CLASSIC  # what a dial was tuned with, where nothing says
-    gaussians = gaussians.replace(screen_filter=said or expected)
-    notes = [*changes, *notes, *rows.notes]
-    fingerprint = _sha256(path) if was == "none" else f"{was}:{_sha256(path)}"
+    source: PlyRows | Model
+    if format_of(path) is PLY:
+        source = read_ply(path)
+        content = _ply_content(path, source, activated, origin)
+    else:
+        source = read_model(path)
+        content = _model_content(path, source, activated, origin)
+    metadata = source.metadata
+    tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in content.arrays.items()}
+    dial = SIGMA in tensors
+    screen_filter = metadata.screen_filter or (CLASSIC if dial else content.implied_filter)
+    attenuation = metadata.attenuation if dial else None
+    gaussians = Gaussians(**tensors, attenuation=attenuation, screen_filter=screen_filter)
+    notes = [*content.changes, *_row_notes(gaussians, content), *metadata.notes]
+    if attenuation is not None and not metadata.described:
+        notes += check_plausible(gaussians.means, gaussians.opacity_logits, tensors[SIGMA], attenuation)
+    calibration, mismatch = matching_calibration(metadata, len(gaussians)) if dial else (None, [])
     return Checkpoint(
-        gaussians, vertex, (*rows.comments, *changes), tuple(notes), fingerprint, path, calibration, origin,
-        filter_known=said is not None or SIGMA in values,
+        gaussians, content.vertex, (*content.comments, *content.changes), (*notes, *mismatch, *source.notes),
+        content.fingerprint, path, calibration, content.origin,
+        filter_known=dial or metadata.screen_filter is not None,
     )  # fmt: skip
+
+
+class _Content(NamedTuple):
+    """The usable Gaussians of a file, before the settings are applied.
+
+    Attributes:
+        arrays: of ``Gaussians.tensors``, float32, means relative to ``origin``.
+        vertex, comments, fingerprint, origin: of the ``Checkpoint``.
+        changes: to values that were not stored as logits and logarithms, one line each.
+        dropped: rows by reason.
+        implied_filter: by other programs' comments and columns.
+    """
+
+    arrays: dict[str, np.ndarray]
+    vertex: np.ndarray
+    comments: tuple[str, ...]
+    fingerprint: str
+    origin: Origin
+    changes: list[str]
+    dropped: Counter[str]
+    implied_filter: ScreenFilter
+
+
+def _ply_content(path: Path, rows: PlyRows, activated: Activated | None, origin: Origin | None) -> _Content:
+    implied = implied_filter(rows.comments, rows.vertex.dtype.names or ())
+    vertex, was, changes = as_stored_by_inria(path, rows.vertex, activated if rows.activation_unknown else "none")
+    origin, dropped = origin_of(vertex) if origin is None else origin, Counter[str]()
+    groups = column_map(rows.sh_degree) | ({SIGMA: (SIGMA,)} if SIGMA in (vertex.dtype.names or ()) else {})
+    values = {key: np.empty((len(vertex), len(group)), np.float32) for key, group in groups.items()}
+    keep = np.empty(len(vertex), bool)
+    for block, found, usable in usable_blocks(vertex, rows.sh_degree, origin, dropped):
+        keep[block] = usable
+        for key in groups:
+            values[key][block] = found[key]
+    arrays, vertex = _usable(path, in_shape(values), vertex, keep, dropped)
+    return _Content(arrays, vertex, rows.comments, _fingerprint(was, rows.sha256), origin, changes, dropped, implied)
+
+
+def _model_content(path: Path, model: Model, activated: Activated | None, origin: Origin | None) -> _Content:
+    metadata, arrays = model.metadata, {name: tensor.numpy() for name, tensor in model.gaussians.tensors().items()}
+    vertex, dropped = rows_of(arrays, metadata.origin), Counter[str]()
+    vertex, was, changes = as_stored_by_inria(path, vertex, activated if model.activation_unknown else "none")
+    if changes:
+        arrays["opacity_logits"], scales = vertex["opacity"].copy(), column_map(0)["log_scales"]
+        arrays["log_scales"] = read_table(vertex, scales)
+    if origin is None:
+        origin = metadata.origin if any(metadata.origin) else origin_of(vertex)
+    if origin != metadata.origin:
+        arrays["means"] = relative(vertex, origin)
+    arrays, vertex = _usable(path, arrays, vertex, usable_rows(arrays, dropped), dropped)
+    about = ["".join(c if c.isascii() and c.isprintable() else "?" for c in line) for line in metadata.about]
+    comments = tagged([line for line in about if not line.startswith(PREFIX)], model.gaussians.screen_filter)
+    fingerprint = _fingerprint(was, model.sha256 or file_sha256(path))
+    return _Content(
+        arrays, vertex, tuple(comments), fingerprint, origin, changes, dropped, model.gaussians.screen_filter
+    )  # fmt: skip
+
+
+def _usable(
+    path: Path, arrays: dict[str, np.ndarray], vertex: np.ndarray, keep: np.ndarray, dropped: Counter[str]
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The arrays and rows to keep; refuses a file with none."""
+    if not keep.any():
+        reasons = "; ".join(_dropped_notes(dropped, len(keep))) or "it has 0 rows"
+        raise ClodError(f"{path}: no usable Gaussian in it ({reasons}); export it again")
+    if keep.all():
+        return arrays, vertex
+    return {name: array[keep] for name, array in arrays.items()}, vertex[keep]
+
+
+def _row_notes(gaussians: Gaussians, content: _Content) -> list[str]:
+    notes = _dropped_notes(content.dropped, len(gaussians) + content.dropped.total())
+    if opaque := int((gaussians.opacity_logits == torch.inf).sum()):
+        notes.append(f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque")
+    if any(content.origin):
+        where = ", ".join(f"{value:.10g}" for value in content.origin)
+        notes.append(f"far from 0: read relative to ({where}); outputs have x, y, z as double")
+    return notes
+
+
+def _dropped_notes(dropped: Counter[str], total: int) -> list[str]:
+    return [f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in dropped.items() if lost]
+
+
+def _fingerprint(activated: Activated, sha256: str) -> str:
+    return sha256 if activated == "none" else f"{activated}:{sha256}"
 
 
 def save(
@@ -149,7 +228,7 @@ def save(
     overwritten only where it differs from the base's float32 reading, so what was not tuned stays
     byte-equal. Where the base has an origin, x, y and z are written as double. sigma_d is written in world units
     (``units.in_world_units``). The settings follow the element line as comments, and those that are not the defaults
-    stand in columns too (``ply_constants``). Without a sigma_d a plain file results.
+    are stored in columns too (``ply.constants``). Without a sigma_d a plain file results.
 
     Args:
         version: of the package that made the values, for the header (``Adapter.version``); by default the running one.
@@ -181,63 +260,32 @@ def save(
 
 def blank(count: int, sh_degree: int, origin: Origin = NOWHERE) -> Checkpoint:
     """A base of zeros in Inria's layout (normals included), for Gaussians that come from no file, or not as rows."""
-    kinds = [(name, "f8" if any(origin) and name in AXES else "f4") for name in inria_dtype(sh_degree).names or ()]
-    vertex = np.zeros(count, kinds)
     groups = column_map(sh_degree)
-    gaussians = _gaussians({name: np.zeros((count, len(group)), np.float32) for name, group in groups.items()})
-    for axis, value in zip(AXES, origin, strict=True):
-        vertex[axis] = value
-    return Checkpoint(gaussians, vertex, (), (), "", Path(), origin=origin)
+    arrays = in_shape({name: np.zeros((count, len(group)), np.float32) for name, group in groups.items()})
+    tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    return Checkpoint(Gaussians(**tensors), rows_of(arrays, origin), (), (), "", Path(), origin=origin)
 
 
-def _gather(
-    path: Path, vertex: np.ndarray, sh_degree: int, origin: Origin
-) -> tuple[dict[str, np.ndarray], np.ndarray, list[str]]:
-    """The usable rows' attributes ``[M, P]`` float32, and sigma_d; ``[N]`` which they are; why others are not."""
-    there = [name for name in (SIGMA, *MASKS) if name in (vertex.dtype.names or ())]
-    groups = column_map(sh_degree) | ({SIGMA: (SIGMA,)} if SIGMA in there else {})
-    names = [name for group in column_map(sh_degree).values() for name in group] + there
-    values = {key: np.empty((len(vertex), len(group)), np.float32) for key, group in groups.items()}
-    keep, gone, opaque = np.ones(len(vertex), bool), dict[str, int](), 0
-    for start in range(0, len(vertex), ROWS):
-        rows = slice(start, start + ROWS)
-        table, usable, at = read_table(vertex[rows], names), keep[rows], 0
-        if any(origin):
-            table[:, :3] = relative(vertex[rows], origin)
-        for rule, reason in row_rules(table, names):
-            gone[reason] = gone.get(reason, 0) + int((usable & ~rule).sum())
-            usable &= rule
-        opaque += int((table[usable, names.index("opacity")] == np.inf).sum())
-        for key, group in groups.items():
-            values[key][rows] = table[:, at : at + len(group)]
-            at += len(group)
-    notes = [f"{lost} of {len(vertex)} Gaussians dropped: {reason}" for reason, lost in gone.items() if lost]
-    if not keep.any():
-        raise ClodError(f"{path}: no usable Gaussian in it ({'; '.join(notes) or 'it has 0 rows'}); export it again")
-    if not keep.all():
-        values = {key: array[keep] for key, array in values.items()}
-    return (
-        values,
-        keep,
-        notes + ([f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque"] * (opaque > 0)),
-    )
+def trimmed(checkpoint: Checkpoint, kept: Tensor | None, sh_degree: int | None) -> Checkpoint:
+    """The checkpoint with fewer rows and SH degrees; every other column is unchanged.
 
+    ``f_rest_*`` are numbered channel by channel, so with a lower degree a number means another coefficient: values
+    move between columns, and the remaining columns keep their order.
 
-def _gaussians(values: dict[str, np.ndarray]) -> Gaussians:
-    """Of the attributes' columns ``[N, P]``, whose memory they use."""
-    tensors: dict[str, Any] = {name: torch.from_numpy(values[name]) for name in column_map(0)}
-    tensors["opacity_logits"] = tensors["opacity_logits"][:, 0]
-    for name in ("sh0", "shN"):
-        tensors[name] = tensors[name].unflatten(1, (values[name].shape[1] // 3, 3))
-    return Gaussians(**tensors)
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    try:
-        with open(path, "rb") as file:
-            for block in iter(lambda: file.read(1 << 20), b""):
-                digest.update(block)
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    return digest.hexdigest()
+    Args:
+        kept: ``[N]`` bool; None for all rows.
+        sh_degree: None for the checkpoint's.
+    """
+    if kept is None and sh_degree is None:
+        return checkpoint
+    gaussians, vertex = trim(checkpoint.gaussians, kept, sh_degree), checkpoint.vertex
+    vertex = vertex if kept is None else vertex[kept.cpu().numpy()]
+    before, after = (column_map(g.sh_degree)["shN"] for g in (checkpoint.gaussians, gaussians))
+    if before != after:
+        gone = set(before) - set(after)
+        fewer = np.empty(len(vertex), [(n, vertex.dtype[n]) for n in vertex.dtype.names or () if n not in gone])
+        source = dict(zip(after, before, strict=False))  # both list coefficient by coefficient
+        for name in fewer.dtype.names or ():
+            fewer[name] = vertex[source.get(name, name)]
+        vertex = fewer
+    return replace(checkpoint, gaussians=gaussians, vertex=vertex)

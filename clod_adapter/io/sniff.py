@@ -1,7 +1,11 @@
-"""Files that are not what they are called: what they are, by first bytes and name, and what to do about them."""
+"""First looks at a file: whether it can be read, and, where its name is wrong, what it is and what to do."""
 
 from __future__ import annotations
 
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
@@ -11,14 +15,14 @@ _CONVERT = "convert it: splat-transform IN{suffix} OUT.ply; better still, adapt 
 
 _PAGE = "which clod-adapt export wrote to be opened in a browser, or a download went wrong"
 
-# What a file begins with (white space aside), what it then is whatever its name, and what to do.
+# First bytes (after white space) that determine what a file is whatever its name, what it is, and what to do.
 CONTENTS = (
     (b"version https://git-lfs", "a Git LFS pointer, not the file it stands for", "fetch that: git lfs pull"),
     (b"<!doctype html", f"a web page, {_PAGE}", "download the file itself"),
     (b"<html", f"a web page, {_PAGE}", "download the file itself"),
     (b"<?xml", "an XML document, perhaps an error that a server sent", "download the file itself"),
 )
-# The same by suffix, for formats that no first bytes tell apart.
+# The same by suffix, for formats without characteristic first bytes.
 SUFFIXES = {
     ".lcc": ("an LCC file, compressed for delivery", _CONVERT),
     ".hier": (
@@ -35,7 +39,7 @@ SUFFIXES = {
     ),
     ".json": ("a JSON document; of an unbundled SOG it is the table of contents", _CONVERT),
 }
-# The same by first bytes, where neither of the two above knows better.
+# The same by first bytes, where neither table above matches.
 ARCHIVES = (
     (b"\x1f\x8b", "compressed with gzip", "unpack it first: gunzip"),
     (b"PK\x03\x04", "a zip archive", "unpack it first; a gsplat checkpoint must be called .pt to be read as one"),
@@ -50,8 +54,63 @@ ARCHIVES = (
 )
 
 
+def refuse_irregular(path: Path, remedy: str = "give the name of a file") -> None:
+    """Refuses what exists and is not a regular file: reading a pipe would wait.
+
+    Raises:
+        ClodError: the path is not a regular file.
+    """
+    if path.exists() and not path.is_file():
+        raise ClodError(f"{path}: cannot be read (it is not a regular file); {remedy}")
+
+
+def read_start(path: Path, size: int = 64) -> bytes:
+    """The first bytes of a file, at most ``size``.
+
+    Raises:
+        ClodError: the file cannot be read, or is not a regular file.
+    """
+    try:
+        refuse_irregular(path)
+        with open(path, "rb") as file:
+            return file.read(size)
+    except (OSError, ValueError) as error:  # ValueError: a name that holds a NUL
+        raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of the file's bytes, hex.
+
+    Raises:
+        ClodError: the file cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+
+
+@contextmanager
+def utf8_name(path: Path) -> Iterator[str]:
+    """A name for libraries that encode names as UTF-8: the file's own, or that of a handle where it is not UTF-8."""
+    try:
+        same = str(path).encode() == os.fsencode(path)
+    except UnicodeEncodeError:
+        same = False
+    if same:
+        yield str(path)
+    else:
+        with open(path, "rb") as held:
+            yield f"/dev/fd/{held.fileno()}"
+
+
 def refuse_known(path: Path, start: bytes) -> None:
-    """Raises the ClodError of a file that, whatever its name, is no splat, by what it begins with."""
+    """Refuses a file whose first bytes are never those of a splat.
+
+    Raises:
+        ClodError: it is empty, or is one of ``CONTENTS``.
+    """
     if not start:
         raise ClodError(f"{path}: is empty; copy or export it again")
     text = start.lstrip()[:64].lower()
@@ -63,7 +122,14 @@ def refuse_known(path: Path, start: bytes) -> None:
 def refuse(
     path: Path, start: bytes, otherwise: str = "is not a PLY file; convert it to a .ply in Inria's 3DGS layout first"
 ) -> NoReturn:
-    """Raises the ClodError of a file that begins with ``start`` and so is not what its name says: by default a PLY."""
+    """Refuses a file by its first bytes, naming what it is.
+
+    Args:
+        otherwise: the message for a file that none of the tables knows.
+
+    Raises:
+        ClodError: always.
+    """
     refuse_known(path, start)
     suffix = path.suffix.lower()
     if suffix in SUFFIXES:

@@ -1,4 +1,4 @@
-"""Safetensors files, whole, and what they say of themselves."""
+"""Safetensors files: tensors and metadata."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 from safetensors import safe_open
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.regular import read_start, utf8_name
-from clod_adapter.io.sniff import refuse_known
+from clod_adapter.io.sniff import read_start, refuse_known, utf8_name
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -25,12 +24,12 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors and the metadata of a file that somebody gave.
+    """The tensors and the metadata of an input file.
 
     Raises:
         ClodError: it cannot be read, is something else, or damaged.
     """
-    with _said_in_one_line(path):
+    with _one_line_errors(path):
         return read_tensors(path)
 
 
@@ -40,7 +39,7 @@ def read_metadata(path: Path) -> dict[str, str]:
     Raises:
         ClodError: as ``load_tensors``.
     """
-    with _said_in_one_line(path), _opened(path, "np") as file:
+    with _one_line_errors(path), _opened(path, "np") as file:
         return file.metadata() or {}
 
 
@@ -51,7 +50,7 @@ def _opened(path: Path, framework: str) -> Iterator[Any]:
 
 
 @contextmanager
-def _said_in_one_line(path: Path) -> Iterator[None]:
+def _one_line_errors(path: Path) -> Iterator[None]:
     refuse_known(path, read_start(path))
     try:
         yield
@@ -60,4 +59,4 @@ def _said_in_one_line(path: Path) -> Iterator[None]:
     except MemoryError:  # of a file that is whole
         raise
     except Exception as error:  # SafetensorError, and whatever a crafted header provokes
-        raise ClodError(f"{path}: is no safetensors file or damaged ({error}); copy or export it again") from error
+        raise ClodError(f"{path}: is not a safetensors file, or damaged ({error}); copy or export it again") from error

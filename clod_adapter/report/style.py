@@ -11,9 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.version import package_version
 
 INK, QUIET, GRID, PAPER = "#1c1c1e", "#6b6b70", "#e4e4e7", "#ffffff"
 BLUE, ORANGE, GREEN, PURPLE = "#1f5fa8", "#c2571a", "#2d7d5a", "#7a4fa3"

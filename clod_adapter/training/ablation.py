@@ -1,8 +1,8 @@
-"""What a scene needs of a checkpoint, measured on its training views: bands, rows, and attributes that are tuned."""
+"""Effect on the training views of removing SH degrees or Gaussians, and of training an attribute."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from statistics import fmean
 
 import torch
@@ -12,17 +12,17 @@ from clod_adapter.cameras import View
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, removal_error, spread
 from clod_adapter.losses import psnr
+from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.rasterizers import ALPHA_MAX
 from clod_adapter.render import render
 
 
 @torch.no_grad()
-def band_losses(base: Gaussians, views: Sequence[View], limit: float) -> Iterator[tuple[int, float]]:
-    """What the highest SH bands are worth: from the highest one down, (degree, dB without it and those above).
+def sh_degree_losses(base: Gaussians, views: Sequence[View], limit: float) -> Iterator[tuple[int, float]]:
+    """Effect of removing the highest SH degrees: (degree, dB without it and those above), from the highest down.
 
-    By how much PSNR against the photographs at full detail changes in either direction, mean over ``views``: one's
-    gain makes up for no other's loss. Ends after the first that is not below ``limit``. Bands that are 0 throughout
-    are not rendered for.
+    The mean over ``views`` of the absolute change of PSNR against the photographs at full detail. Ends after the first
+    degree that is not below ``limit``. Degrees whose coefficients are all 0 have effect 0 without rendering.
     """
     used = base.without_empty_bands().sh_degree
     yield from ((degree, 0.0) for degree in range(base.sh_degree, used, -1))
@@ -37,21 +37,18 @@ def band_losses(base: Gaussians, views: Sequence[View], limit: float) -> Iterato
             return
 
 
-def seen(
-    base: Gaussians, views: Sequence[View], error: Tensor, seed: int, progress: Callable[[int, int], None] | None = None
-) -> Tensor:
-    """``[N]`` bool, which Gaussians move any pixel of any of the views.
+def seen(base: Gaussians, views: Sequence[View], error: Tensor, seed: int, progress: Listener | None = None) -> Tensor:
+    """``[N]`` bool, which Gaussians change any pixel of any of the views.
 
-    A picture is linear in each opacity, so a Gaussian by whose opacity no pixel's derivative differs from 0 changes
-    nothing when it goes. The backward pass of ``removal_error`` has the derivatives with random signs: that those of a
-    Gaussian cancel to exactly 0 in all pixels and views of it has no weight in practice, and ``largest_change`` bounds
-    what it would do. Rasterizers clamp alpha, above which it has no derivative: Gaussians that opaque count as seen.
-    Views that have made ``error`` are not looked at again.
+    An image is linear in each opacity, so removing a Gaussian changes nothing if no pixel has a derivative by its
+    opacity. The backward pass of ``removal_error`` sums the derivatives with random signs; that all of them cancel to
+    exactly 0 is not relevant in practice, and ``largest_change`` bounds the effect. Rasterizers clamp alpha, where it
+    has no derivative: Gaussians that opaque count as seen. Views that ``error`` was computed from are not used again.
 
     Args:
         error: ``[N]`` the ``removal_error`` of ``spread(views, MOST_VIEWS)``, as ``importance.initialize`` takes it.
         seed: of the signs.
-        progress: called with the number of other views done, and of all of them.
+        progress: called in ``Phase.IMPORTANCE`` after each of the other views.
     """
     rendered = set(spread(range(len(views)), MOST_VIEWS))
     others = [view for k, view in enumerate(views) if k not in rendered]
@@ -61,16 +58,15 @@ def seen(
 
 @torch.no_grad()
 def largest_change(
-    base: Gaussians, less: Gaussians, views: Sequence[View], progress: Callable[[int, int], None] | None = None
+    base: Gaussians, less: Gaussians, views: Sequence[View], progress: Listener | None = None
 ) -> tuple[float, float]:
-    """The largest difference of a channel between pictures of the two, in [0, 1]; and dB lost, mean over views."""
+    """The largest difference of a channel between renderings of the two, in [0, 1], and the mean loss of PSNR in dB."""
     largest, lost = 0.0, []
     for done, view in enumerate(views, 1):
         with_all, without = (render(each, view.camera).image.clamp(0, 1) for each in (base, less))
         largest = max(largest, float((with_all - without).abs().max()))
         lost.append(_difference(psnr(with_all, view.image), psnr(without, view.image)))
-        if progress:
-            progress(done, len(views))
+        tell(progress, Phase.TRIMMING, done, len(views))
     return largest, fmean(lost) if lost else 0.0
 
 
@@ -78,11 +74,11 @@ def largest_change(
 def effect(
     name: str, before: Gaussians, after: Gaussians, views: Sequence[View], dials: Sequence[float], limit: float
 ) -> tuple[float, float]:
-    """What the move of one attribute from ``before`` to ``after`` does: (dB, the dial value that it was found at).
+    """Effect of the change of one attribute from ``before`` to ``after``: (dB, the dial value where it was measured).
 
-    By how much PSNR against the photographs, mean over ``views``, changes where the attribute is put back and the
-    others are as in ``after``, in either direction view by view: early in a training steps are long, and even what
-    will be useful may do harm. At each of ``dials`` in turn, until one is at least ``limit``; else the largest.
+    The mean over ``views`` of the absolute change of PSNR against the photographs when the attribute alone is reset.
+    Absolute, because early steps are long and may lower PSNR even where training the attribute helps in the end.
+    Measured at each of ``dials`` until one is at least ``limit``; otherwise the largest.
     """
     old, new = getattr(before, name), getattr(after, name)
     most = (0.0, dials[0])

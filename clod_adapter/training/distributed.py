@@ -1,8 +1,8 @@
 """Several processes that train one set of Gaussians, on ``torch.distributed``.
 
-Each holds all parameters, draws the same views from the same seed, and takes every step itself. What is shared out is
-the work on the views: of a batch each process pulls its part, and the pulls are summed before anyone steps. So all of
-them hold the same numbers throughout, and the first one's are the outcome.
+Each process holds all parameters, samples the same views from the same seed, and makes every step. Only the views of a
+batch are divided: each process computes the gradients of its share, and the gradients are summed before the step. All
+processes therefore hold the same parameters; the result is that of the first one.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# A process that says nothing for so long counts as lost. The first one may be drawing or saving in the meantime.
+# A process that does not answer for so long counts as lost. The first one may be evaluating or saving meanwhile.
 PATIENCE = timedelta(minutes=10)
 
 
 class ProcessLost(ClodError):
-    """A process that trained along is gone, or says nothing any more."""
+    """Another process of the group has ended, or does not answer."""
 
 
 class ProcessGroup:
-    """This process among those that train together: the default group of ``torch.distributed``.
+    """The processes that train together: the default group of ``torch.distributed``.
 
-    All processes call the methods in the same order. They raise ProcessLost where one of them is gone; nothing more
-    can be exchanged then.
+    All processes call the methods in the same order. They raise ProcessLost if a process has ended; no further
+    exchange is possible then.
 
     Attributes:
-        rank, size: which one this is, from 0, and how many there are.
-        waiting, exchanging: seconds spent in waiting for the slowest, and in moving and summing numbers.
+        rank, size: of this process, from 0, and of the group.
+        waiting, exchanging: seconds spent waiting for the slowest process, and sending and summing.
     """
 
     def __init__(self) -> None:
@@ -54,34 +54,34 @@ class ProcessGroup:
         self.waiting, self.exchanging = 0.0, 0.0
 
     def share(self, work: Sequence[T]) -> Sequence[T]:
-        """This process's part of the work: every ``size``-th, from its rank on."""
+        """This process's share of the work: every ``size``-th item, from its rank on."""
         return work[self.rank :: self.size]
 
     def agree(self, share_done: float, going: bool) -> tuple[float, bool]:
-        """The first process's ``share_done``, and whether all of them are ``going`` on."""
+        """The first process's ``share_done``, and whether all processes continue."""
         said = torch.tensor([share_done if self.rank == 0 else -math.inf, 0.0 if going else 1.0], dtype=torch.float64)
         self._meet(said, "MAX")
         return float(said[0]), not said[1]
 
-    def sum(self, pull: GradientSum) -> GradientSum:
-        """The sum of all processes' pulls; takes the place of this one's, tensor by tensor."""
-        loss = torch.tensor([pull.loss], dtype=torch.float64)
+    def sum(self, own: GradientSum) -> GradientSum:
+        """The sum over all processes; overwrites the gradients given."""
+        loss = torch.tensor([own.loss], dtype=torch.float64)
         self._meet(loss)
-        gradients = {name: gradient.contiguous() for name, gradient in pull.gradients.items()}
-        kept = pull.kept.to(torch.uint8)
-        # All at once and in place. Only the rows kept, or one long message, would take longer to put together than it
-        # saves: measured on loopback, where a million Gaussians take 80 ms, packed 150 ms, the rows kept 300 ms.
+        gradients = {name: gradient.contiguous() for name, gradient in own.gradients.items()}
+        kept = own.kept.to(torch.uint8)
+        # All at once and in place. Sending only the rows kept, or one packed message, takes longer: on loopback a
+        # million Gaussians take 80 ms, packed 150 ms, only the rows kept 300 ms.
         with self._exchange():
             under_way = [dist.all_reduce(kept, dist.ReduceOp.MAX, async_op=True)]
             under_way += [dist.all_reduce(gradient, async_op=True) for gradient in gradients.values()]
             for work in under_way:
                 work.wait()
             if kept.is_cuda:
-                torch.cuda.synchronize()  # NCCL's own wait returns at once, and its time would be another's
+                torch.cuda.synchronize()  # NCCL's own wait returns at once
         return GradientSum(gradients, kept.bool(), float(loss))
 
     def broadcast(self, value: T) -> T:
-        """The first process's value, with its tensors on the CPU; what the others give is not looked at."""
+        """The first process's value, with its tensors on the CPU; the argument of the others is ignored."""
         tensors: list[Tensor] = []
         self._meet()
         with self._exchange():
@@ -92,11 +92,11 @@ class ProcessGroup:
             if self.rank > 0:
                 tensors = [torch.empty(shape, dtype=dtype) for shape, dtype in about[1]]
             for tensor in filter(Tensor.numel, tensors):
-                dist.broadcast(tensor.view(-1).view(torch.uint8), 0)  # which any backend has
+                dist.broadcast(tensor.view(-1).view(torch.uint8), 0)  # a type that every backend has
         return value if self.rank == 0 else _with_tensors(about[0], tensors)
 
     def _meet(self, said: Tensor | None = None, how: str = "SUM") -> None:
-        """Waits for all of them, and reduces few numbers, on the CPU: of a loss gloo tells at once, NCCL might not."""
+        """Waits for all processes and reduces a few numbers, on the CPU: gloo reports a lost process at once."""
         began = time.perf_counter()
         with _losses():
             dist.all_reduce(torch.zeros(1) if said is None else said, getattr(dist.ReduceOp, how))
@@ -112,7 +112,7 @@ class ProcessGroup:
 
 @contextmanager
 def joined(store: Store, rank: int, size: int) -> Iterator[ProcessGroup]:
-    """Within, this process trains with the others that enter with the same ``store``: gloo on CPUs, NCCL on GPUs."""
+    """The group of the processes that enter with the same ``store``: gloo on CPUs, NCCL on GPUs."""
     nccl = torch.cuda.is_available() and dist.is_nccl_available()
     with _losses(), _silent_stdout():
         dist.init_process_group(
@@ -126,7 +126,7 @@ def joined(store: Store, rank: int, size: int) -> Iterator[ProcessGroup]:
 
 @contextmanager
 def _silent_stdout() -> Iterator[None]:
-    """Nothing is written to the file descriptor of stdout: gloo prints there whom it connected, as in torch 2.9.1."""
+    """Discards output to the file descriptor of stdout, where gloo prints its connections (torch 2.9.1)."""
     try:
         stdout = os.dup(1)
     except OSError:  # it is closed
@@ -143,18 +143,18 @@ def _silent_stdout() -> Iterator[None]:
 
 @contextmanager
 def _losses() -> Iterator[None]:
-    """The backends' errors, which are RuntimeErrors, as ProcessLost."""
+    """Turns the backends' RuntimeErrors into ProcessLost."""
     try:
         yield
     except (torch.cuda.OutOfMemoryError, ProcessLost):
         raise
     except RuntimeError as error:
         what = re.sub(r"^\[[^]]*\] *", "", str(error).partition("\n")[0]).partition(". ")[0]
-        raise ProcessLost(f"a process that trained along is gone ({what})") from error
+        raise ProcessLost(f"a process of the group has ended ({what})") from error
 
 
 def _without_tensors(value: Any, tensors: list[Tensor]) -> bytes:
-    """A pickle of ``value`` that has numbers for its tensors, which are appended to ``tensors``."""
+    """A pickle of ``value`` with numbers in place of its tensors, which are appended to ``tensors``."""
 
     class Pickler(pickle.Pickler):
         def persistent_id(self, found: Any) -> int | None:

@@ -1,8 +1,8 @@
-"""The plan: what of a checkpoint is trained, what a scene does not need of it, and by which numbers."""
+"""The training plan: what is trained, what is left out because the scene does not need it, and the measurements."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -14,11 +14,12 @@ from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Listener, within
 from clod_adapter.training.ablation import largest_change
 from clod_adapter.training.distributed import ProcessGroup
 from clod_adapter.training.loop import Adapted, adapt
 from clod_adapter.training.objective import TrainableSubset
-from clod_adapter.training.state import Progress, TrainingState
+from clod_adapter.training.state import TrainingState
 
 RATES = {
     "means": "lr_means", "quats": "lr_quats", "scales": "lr_scales", "opacities": "lr_opacities", "sh0": "lr_sh0",
@@ -29,13 +30,14 @@ NAMES = ("bands", "unseen", *RATES)
 
 @dataclass(frozen=True)
 class Decision:
-    """What is done with one thing, and why.
+    """One line of the plan.
 
     Attributes:
+        what: the part of the checkpoint.
         verdict: "kept" or "left out", of an attribute "trained" or "frozen".
-        number: what was measured, in ``unit``; None where nothing was.
-        why: what the number is, or the reason without one.
-        name: which of NAMES ``Override`` has it by; empty where there is nothing to choose.
+        number: the measured effect, in ``unit``; None if nothing was measured.
+        why: what the number is, or the reason if there is none.
+        name: the name in NAMES by which ``Override`` changes it; empty if there is nothing to change.
     """
 
     what: str
@@ -47,7 +49,7 @@ class Decision:
 
     @property
     def measured(self) -> str:
-        """The number as it is shown."""
+        """The number as text."""
         if self.number is None:
             return "-"
         return f"{self.number:.3f} {self.unit}" if self.unit else f"{self.number:,.0f}"
@@ -55,10 +57,10 @@ class Decision:
 
 @dataclass(frozen=True)
 class Override:
-    """What is decided beforehand, whatever its numbers: any of NAMES.
+    """Decisions that are fixed in advance, without a measurement; both sets are subsets of NAMES.
 
     Raises:
-        ClodError: there is no such thing, or it is in both.
+        ClodError: a name is unknown, or in both sets.
     """
 
     keep: frozenset[str] = frozenset()
@@ -66,24 +68,25 @@ class Override:
 
     def __post_init__(self) -> None:
         for name in sorted((self.keep | self.leave_out) - set(NAMES)):
-            raise ClodError(f"{name!r} is nothing that a plan decides; it decides {', '.join(NAMES)}")
+            raise ClodError(f"{name!r} is not part of a plan; the names are {', '.join(NAMES)}")
         for name in sorted(self.keep & self.leave_out):
-            raise ClodError(f"{name!r} is to be both kept and left out; choose one")
+            raise ClodError(f"{name!r} is both kept and left out; choose one")
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is trained, of which Gaussians.
+    """What is trained, and how.
 
     Attributes:
-        decisions: one for each thing that was looked at.
-        start: the whole base's rows with the sigma_d that training starts from, without the bands left out.
-        kept: ``[N]`` bool, the rows that are trained; None for all of them.
-        sh_degree: of what is trained.
-        config: with step size 0 for what stays frozen.
-        begun: what training goes on from where its first steps are done already; the first ``adapt`` takes it away.
-        seconds: wall time of "bands", "unseen" (what the start would not look at) and "probe" (without the steps of the
-            training), and of the "start".
+        decisions: one for each part of the checkpoint.
+        start: all rows of the base with the initial sigma_d, without the SH degrees that are left out.
+        kept: ``[N]`` bool, the rows that are trained; None for all.
+        sh_degree: the SH degree that is trained.
+        config: with learning rate 0 for frozen attributes.
+        begun: the state after the first steps, if they were done to make the plan; else None. ``adapt`` starts from a
+            copy of it.
+        seconds: wall time of "bands", "unseen" (beyond the initialization) and "probe" (beyond the training steps), and
+            of the initialization, "start".
     """
 
     decisions: tuple[Decision, ...]
@@ -91,41 +94,41 @@ class Plan:
     kept: Tensor | None
     sh_degree: int
     config: AdaptConfig
-    begun: list[TrainingState] = field(default_factory=list)
+    begun: TrainingState | None = None
     seconds: dict[str, float] = field(default_factory=dict)
 
     @property
     def frozen(self) -> tuple[str, ...]:
-        """The attributes that are not tuned, as NAMES has them."""
+        """The names of the attributes that are not trained."""
         return tuple(name for name, rate in RATES.items() if not getattr(self.config, rate))
 
     @cached_property
     def lean(self) -> Gaussians:
-        """What is to be trained."""
+        """The Gaussians that are trained."""
         return trim(self.start, self.kept, None)
 
     @property
-    def part(self) -> TrainableSubset:
-        """For ``train.adapt`` of ``lean``: the count law remains a share of all Gaussians."""
+    def subset(self) -> TrainableSubset:
+        """For ``loop.adapt`` of ``lean``: the target counts remain shares of all Gaussians."""
         return TrainableSubset(len(self.start) if self.kept is None else int(self.kept.sum()), total=len(self.start))
 
     def adapt(
         self,
         scene: Scene,
-        progress: Callable[[Progress], None] | None = None,
+        progress: Listener | None = None,
         resume: TrainingState | None = None,
-        peers: ProcessGroup | None = None,
+        group: ProcessGroup | None = None,
     ) -> Adapted:
-        """``train.adapt`` of what is to be trained; the count law remains a share of all Gaussians."""
-        if resume is None and self.begun:  # and let go of it, which is as large as all that is trained
-            return adapt(self.lean, scene, self.config, progress, self.begun.pop(), part=self.part, peers=peers)
-        return adapt(self.lean, scene, self.config, progress, resume, part=self.part, peers=peers)
+        """``loop.adapt`` of ``lean``, from ``resume`` or ``begun``."""
+        states = [self.begun if resume is None else resume]
+        del resume  # so that the state, if it is the caller's last reference, is freed once training has copied it
+        return adapt(self.lean, scene, self.config, progress, states.pop(), subset=self.subset, group=group)
 
     def whole(self, base: Gaussians, lean: Gaussians) -> Gaussians:
-        """``lean``, trained, with what was left out put back: rows with the base's values and their start's sigma_d.
+        """``lean`` after training, together with what was left out: the base's values and the initial sigma_d.
 
         Args:
-            base: what the plan was made for.
+            base: the checkpoint that the plan was made for.
         """
         if not self.trims(base):
             return lean
@@ -140,19 +143,15 @@ class Plan:
         return lean.replace(**values)
 
     def trims(self, base: Gaussians) -> bool:
-        """Whether anything is left out that need not be written."""
+        """Whether Gaussians or SH degrees are left out."""
         return self.kept is not None or self.sh_degree < base.sh_degree
 
-    def bound(self, base: Gaussians, scene: Scene, progress: Callable[[int, int], None] | None = None) -> Decision:
-        """What not writing it does to the base's pictures, of all views, at full detail."""
+    def trimming_effect(self, base: Gaussians, scene: Scene, progress: Listener | None = None) -> Decision:
+        """How much the base's renderings of all views at full detail change without what is left out."""
         less, views = trim(base, self.kept, self.sh_degree), len(scene.train) + len(scene.test)
-
-        def report(before: int) -> Callable[[int, int], None]:
-            return lambda done, _: progress(before + done, views) if progress else None
-
-        seen_at, lost = largest_change(base, less, scene.train, report(0))
-        new_at, more = largest_change(base, less, scene.test, report(len(scene.train)))
-        why = f"lost on all training views, a pixel at most {seen_at:.2g}"
+        seen_at, lost = largest_change(base, less, scene.train, within(progress, 0, views))
+        new_at, more = largest_change(base, less, scene.test, within(progress, len(scene.train), views))
+        why = f"loss on all training views, largest change of a pixel {seen_at:.2g}"
         if scene.test:
             why += f"; held out {more:.3f} dB, {new_at:.2g}"
         return Decision("what is left out", "trimmed", lost, "dB", why)
@@ -165,6 +164,6 @@ class Plan:
 
 
 def freezing(config: AdaptConfig, names: Collection[str]) -> AdaptConfig:
-    """The settings with these attributes frozen."""
+    """The settings with learning rate 0 for these attributes."""
     rates: dict[str, Any] = {RATES[name]: 0.0 for name in names}
     return replace(config, **rates)

@@ -1,24 +1,22 @@
-"""Views where there are no photographs: cameras placed from the Gaussians alone, their pictures the checkpoint's own.
+"""Pseudo views: cameras placed from the Gaussians alone, with the checkpoint's own renderings as photographs.
 
-A checkpoint is right only where its photographs looked, and shows in two ways where that was:
+A checkpoint is accurate only where its photographs looked. Two properties of the Gaussians tell where that was:
 
-- Gaussians end up a pixel or two large as their nearest cameras saw them. So the smallest ones tell how far
-  away those stood (``typical_reach``), and a picture that is full of Gaussians many pixels wide is of a place that
-  none of them looked at.
-- The higher SH bands begin at 0 and are moved only by photographs, so their part of the colour is strong in the
-  directions a Gaussian was seen from and fades in others.
+- Gaussians are a pixel or two large in their nearest cameras. The smallest ones therefore give the distance of the
+  cameras (``typical_reach``), and a rendering full of Gaussians many pixels wide shows a place without photographs.
+- The higher SH degrees start at 0 and are changed only by photographs, so their contribution to the colour is strong
+  in the directions from which a Gaussian was photographed and weak in others.
 
-Candidates look at random Gaussians, small opaque ones first, from random sides; each is judged by two small pictures
-(``_score``), and as many again are tried beside the best. Of those that are good, the ones far from each other are
-taken. Nothing here knows which way is up, whether the scene is an object or a room, or its unit: a side or a place
-that nobody photographed fails the judgement.
+Candidate cameras look at random Gaussians, preferably small opaque ones, from random directions. Each is scored by two
+small renderings (``_score``), and as many again are tried near the best. Of the good ones, cameras far from each other
+are chosen. The method needs no up direction, scene type or unit.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -28,25 +26,26 @@ from clod_adapter.cameras import Camera, Scene, View, near_plane
 from clod_adapter.config import AdaptConfig, require
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import render, splat
 
 VIEWS = 96
-FEW, OWN = 8, 16  # photographs to train on, and what is added where there are fewer
+FEW, OWN = 8, 16  # with fewer than FEW training photographs, OWN pseudo views are added
 WIDTH, HEIGHT = 496, 368
 FIELD = 55.0  # horizontal, degrees: between a phone's 65 and the 35 of a portrait lens
-TRIES = 3  # candidates for each view, first anywhere, then as many beside the best of those
-BEST = 0.2  # share of the first ones that see what was photographed; later ones must be as good
-STEP = 0.2  # how far beside, in units of the distance, and of the direction's length
-LOOK = (80, 60)  # size of the picture that a candidate is judged by
+TRIES = 3  # candidates for each view, first anywhere, then as many near the best of those
+BEST = 0.2  # share of the first candidates that are good; later ones must score as high
+STEP = 0.2  # standard deviation of the offset from a good camera, of the reach, and of its unit direction
+LOOK = (80, 60)  # size of the renderings that a candidate is scored by
 TEST_EVERY = 8  # as with photographs
-SMALL, SMALL_PIXELS = 0.1, 2.0  # a tenth of the Gaussians is this small or smaller, as their nearest cameras saw them
+SMALL, SMALL_PIXELS = 0.1, 2.0  # a tenth of the Gaussians is at most this many pixels large in the nearest cameras
 FAR = 4.0  # cameras stand at most this many times as far away as the scene is large
-VISIBLE = 0.05  # less opaque ones say nothing about where cameras stood
+VISIBLE = 0.05  # Gaussians of lower opacity are ignored
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A camera, and how much what it sees looks photographed (larger is better, no unit)."""
+    """A camera and its score (larger is better, no unit)."""
 
     camera: Camera
     score: float
@@ -58,78 +57,72 @@ def place_cameras(
     views: int = VIEWS,
     seed: int = 0,
     field: float = FIELD,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Listener | None = None,
 ) -> list[Camera]:
-    """Cameras that see the scene from about where it was photographed.
+    """Places cameras about where the scene was photographed from.
 
     Args:
-        gaussians: a checkpoint without a dial; one it has is ignored.
-        views: how many cameras, at least 1.
-        seed: of the candidates; the same seed gives the same cameras.
-        field: of view, horizontal, degrees; best that of the cameras it was photographed with.
-        progress: called with the number of candidates judged, and of all of them.
+        gaussians: a checkpoint; a dial it has is ignored.
+        views: number of cameras, at least 1.
+        seed: of the candidate cameras.
+        field: horizontal field of view, degrees; ideally that of the original cameras.
+        progress: called in ``Phase.CAMERAS`` after each candidate.
 
     Returns:
-        ``views`` cameras (fewer only where fewer see anything) of 496x368 pixels, in an order in which every
-        beginning is spread out.
+        ``views`` cameras (fewer if fewer see anything) of 496x368 pixels, ordered so that every prefix is spread out.
 
     Raises:
         ClodError: no Gaussian is visible and finite, or no camera sees anything.
+        Stopped: ``progress`` returned False.
     """
     require(views >= 1, "views", views, "at least 1")
-    seen, generator = _judgeable(gaussians), torch.Generator().manual_seed(seed)
+    seen, generator = _usable(gaussians), torch.Generator().manual_seed(seed)
     reach, tries, zoom = typical_reach(seen, field), TRIES * views, _zoom(field)
     judged: list[Candidate] = []
 
     def judge(cameras: Iterable[Camera]) -> None:
         for camera in cameras:
             judged.append(Candidate(camera, _score(seen, camera)))
-            if progress:
-                progress(len(judged), 2 * tries)
+            tell(progress, Phase.CAMERAS, len(judged), 2 * tries)
 
     judge(_anywhere(seen, tries, reach, zoom, generator))
     good = _best(judged, math.inf, max(round(BEST * tries), 1))
     if not good:
-        raise ClodError("no camera can be placed: from everywhere that was tried the checkpoint shows nothing")
+        raise ClodError("no camera can be placed: the checkpoint is empty from every candidate camera")
     judge(_beside(good, tries, reach, zoom, generator))
     good = _best(judged, good[-1].score, views)
     return [_resized(c.camera, WIDTH, HEIGHT, k) for k, c in enumerate(_spread(good, views, reach))]
 
 
 @torch.no_grad()
-def render_pseudo_views(
-    gaussians: Gaussians, cameras: list[Camera], *, progress: Callable[[int, int], None] | None = None
-) -> Scene:
-    """The scene of ``cameras`` with the checkpoint's own pictures as photographs; every 8th is held out.
+def render_pseudo_views(gaussians: Gaussians, cameras: list[Camera], *, progress: Listener | None = None) -> Scene:
+    """A scene of ``cameras`` with the checkpoint's own renderings as photographs; every 8th is held out.
 
     Args:
-        gaussians: the teacher, rendered at s = 1: a checkpoint without a dial in full.
-        progress: called with the number of pictures made, and of all of them.
+        gaussians: the teacher, rendered at s = 1.
+        progress: called in ``Phase.PSEUDO_VIEWS`` after each view.
     """
     teacher = gaussians.without_empty_bands()
     views = []
     for camera in cameras:
         views.append(View(camera, render(teacher, camera).pixels.cpu()))
-        if progress:
-            progress(len(views), len(cameras))
+        tell(progress, Phase.PSEUDO_VIEWS, len(views), len(cameras))
     held_out = range(0, len(views), TEST_EVERY) if len(views) > 1 else range(0)
     train = tuple(view for k, view in enumerate(views) if k not in held_out)
     test = tuple(views[k] for k in held_out)
     note = (
-        f"no photographs: {len(train)} placed cameras to train on, {len(test)} held out, {_describe(cameras)}, and the "
-        "checkpoint is its own teacher; the numbers are against the checkpoint, not photographs"
+        f"no photographs: {len(train)} pseudo views to train on, {len(test)} held out, {_describe(cameras)}; the "
+        "checkpoint is the teacher, and all numbers compare with its renderings, not with photographs"
     )
     return Scene(train, test, (note,))
 
 
 def add_pseudo_views(gaussians: Gaussians, scene: Scene, config: AdaptConfig) -> tuple[Scene, AdaptConfig]:
-    """What to adapt with where there are fewer than FEW photographs to train on; otherwise what was given.
+    """Adds OWN pseudo views, and halves all learning rates but that of sigma_d, with fewer than FEW photographs.
 
-    So few do not show all that the checkpoint knows, and what they do not show would be lost. They get OWN pictures of
-    the checkpoint's own beside them, from placed cameras with the field of view of the first, and everything but
-    sigma_d steps half as far. Of more photographs the checkpoint's pictures take more than they add, as they have its
-    errors and other distances (docs/method.md). Where no camera can be
-    placed, the photographs have to do, and a note says so.
+    So few photographs do not show the whole scene, and training would damage the rest. Pseudo views have the field of
+    view of the first photograph. With more photographs they harm more than they help, as they contain the errors of
+    the checkpoint and have other distances (docs/method.md). If no camera can be placed, a note says so.
     """
     if not 0 < len(scene.train) < FEW:
         return scene, config
@@ -138,27 +131,26 @@ def add_pseudo_views(gaussians: Gaussians, scene: Scene, config: AdaptConfig) ->
             gaussians, place_cameras(gaussians, views=OWN, seed=config.seed, field=_field(scene.train[0].camera))
         )
         own = (*placed.train, *placed.test)
-        added = f"{len(own)} of the checkpoint's own pictures from placed cameras are added"
+        added = f"{len(own)} pseudo views, the checkpoint's own renderings from placed cameras, are added"
     except ClodError as error:
-        own, added = (), f"none of the checkpoint's own pictures can be added ({error})"
-    note = f"only {len(scene.train)} photographs to train on: {added}, and everything but sigma_d steps half as far"
+        own, added = (), f"no pseudo views can be added ({error})"
+    note = f"only {len(scene.train)} photographs to train on: {added}, and all learning rates but sigma_d's are halved"
     return dataclasses.replace(scene, train=(*scene.train, *own), notes=(*scene.notes, note)), config.lighter(0.5)
 
 
 def typical_reach(gaussians: Gaussians, field: float = FIELD) -> float:
-    """World units between the cameras and what they look at.
+    """Estimated distance between cameras and scene, world units.
 
-    From there the smallest tenth of the visible Gaussians is at most SMALL_PIXELS pixels large; but never more than
-    FAR times the median distance of the Gaussians from their centre, for a splat of few large ones. ``field`` is the
-    cameras' horizontal field of view, degrees.
+    The distance at which the smallest tenth of the visible Gaussians is at most SMALL_PIXELS pixels large; at most FAR
+    times the median distance of the Gaussians from their centre. ``field`` is the horizontal field of view, degrees.
     """
     footprint = _quantile(_size(gaussians), SMALL) * WIDTH * _zoom(field) / SMALL_PIXELS
     from_centre = (gaussians.means - gaussians.means.median(0).values).norm(dim=1)
     return min(footprint, FAR * _quantile(from_centre, 0.5)) or footprint
 
 
-def _judgeable(gaussians: Gaussians) -> Gaussians:
-    """What is visible and finite, without a dial. An infinite opacity logit is a fully opaque Gaussian."""
+def _usable(gaussians: Gaussians) -> Gaussians:
+    """The visible and finite Gaussians, without a dial. An infinite opacity logit is a fully opaque Gaussian."""
     plain = gaussians.replace(sigma_d=None, attenuation=None)
     rows = plain.opacities > VISIBLE
     for values in plain.tensors().values():
@@ -170,9 +162,9 @@ def _judgeable(gaussians: Gaussians) -> Gaussians:
 
 
 def _anywhere(gaussians: Gaussians, count: int, reach: float, zoom: float, generator: torch.Generator) -> list[Camera]:
-    """Looking at Gaussians drawn by opacity over size, from uniform directions, at half to twice the reach."""
+    """Cameras towards Gaussians sampled by opacity over size, from uniform directions, at half to twice the reach."""
     interest = gaussians.opacities / _size(gaussians).clamp(min=1e-12)
-    # Drawn by hand, as torch.multinomial has a limit of 2^24 weights.
+    # torch.multinomial has a limit of 2^24 weights.
     ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
     drawn = torch.searchsorted(ends, torch.rand(count, generator=generator, dtype=torch.float64) * ends[-1])
     targets = gaussians.means[drawn.clamp(max=len(gaussians) - 1).to(gaussians.means.device)].cpu()
@@ -184,7 +176,7 @@ def _anywhere(gaussians: Gaussians, count: int, reach: float, zoom: float, gener
 def _beside(
     candidates: list[Candidate], count: int, reach: float, zoom: float, generator: torch.Generator
 ) -> list[Camera]:
-    """A step away from the candidates, each in turn, and looking a little elsewhere."""
+    """Cameras with random offsets of position and direction from the candidates, each in turn."""
     steps = STEP * torch.randn(count, 2, 3, generator=generator)
     cameras = []
     for k in range(count):
@@ -196,18 +188,18 @@ def _beside(
 
 
 def _best(judged: list[Candidate], least: float, count: int) -> list[Candidate]:
-    """By score: those that have ``least``, or the first ``count`` if that is more, but none that shows nothing."""
+    """By score: those of at least ``least``, or the first ``count`` if that is more, but no empty ones."""
     ranked = sorted((c for c in judged if c.score > -math.inf), key=lambda c: -c.score)
     return ranked[: max(count, sum(c.score >= least for c in ranked))]
 
 
 def _score(gaussians: Gaussians, camera: Camera) -> float:
-    """How much the picture looks photographed; -inf where it shows nothing.
+    """How likely a photograph was taken from here; -inf if the rendering is empty.
 
-    ``log h - 0.5 p - 2 e`` with h the mean size of the higher bands' part of the colour, p the mean log
-    size in pixels (both means weighted by what covers the picture), e the share of pixels that are not covered.
+    ``log h - 0.5 p - 2 e`` with h the mean magnitude of the higher SH degrees' colour, p the mean log size in pixels
+    (both weighted by alpha), e the share of pixels that are not covered.
     """
-    higher = torch.zeros_like(gaussians.sh0)  # so that the colour is 0.5 + the higher bands' part
+    higher = torch.zeros_like(gaussians.sh0)  # the colour is then 0.5 + that of the higher degrees
     bands, alpha = splat(gaussians.replace(sh0=higher), gaussians.opacities, camera)
     covered = float(alpha.sum())
     if covered < 0.1 * alpha.numel():
@@ -226,7 +218,7 @@ def _score(gaussians: Gaussians, camera: Camera) -> float:
 
 
 def _spread(candidates: list[Candidate], count: int, reach: float) -> list[Candidate]:
-    """``count`` of them, first the best, then each time the one farthest from those taken, in place and direction."""
+    """``count`` candidates by farthest-point sampling of position and direction, from the best one."""
     places = torch.stack([torch.cat([c.camera.position / reach, c.camera.viewmat[2, :3]]) for c in candidates])
     taken = [0]
     gap = (places - places[0]).norm(dim=1)
@@ -237,7 +229,7 @@ def _spread(candidates: list[Candidate], count: int, reach: float) -> list[Candi
 
 
 def _looking(eye: Tensor, target: Tensor, zoom: float) -> Camera:
-    """A camera for a look; which way is up is unknown, and COLMAP's y axis points down more often than not."""
+    """A camera for scoring. The up direction is unknown; COLMAP's y axis usually points down."""
     forward = torch.nn.functional.normalize(target - eye, dim=0)
     down = torch.tensor([0.0, 1.0, 0.0]) if abs(float(forward[1])) < 0.99 else torch.tensor([0.0, 0.0, 1.0])
     right = torch.nn.functional.normalize(torch.linalg.cross(down, forward), dim=0)
@@ -257,12 +249,12 @@ def _resized(camera: Camera, width: int, height: int, number: int) -> Camera:
 
 def _describe(cameras: list[Camera]) -> str:
     if not cameras:
-        return "no pictures"
+        return "no images"
     return f"{cameras[0].width}x{cameras[0].height}, {_field(cameras[0]):.0f} degrees wide"
 
 
 def _zoom(field: float) -> float:
-    """The focal length in widths of the picture, of a horizontal field of view in degrees."""
+    """The focal length in image widths, of a horizontal field of view in degrees."""
     return 0.5 / math.tan(math.radians(field) / 2)
 
 

@@ -1,9 +1,8 @@
-"""Where a training stands: as it is told while it runs, as it can be gone on from, and as it ended."""
+"""The state that training can be resumed from, and the result of training."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,31 +12,30 @@ from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 
-OTHER_RUN = "the training state is of other Gaussians, views or settings; give those it was saved with"
+OTHER_RUN = "the training state is of other Gaussians, views or settings; use those it was saved with"
 
 
 class StateRefused(ClodError):
-    """A training state cannot be gone on from: it is of another run, or damaged."""
+    """A training state does not fit the run, or is damaged."""
 
 
 @dataclass(frozen=True)
 class TrainingState:
-    """All that the steps to come depend on, besides the base, the views and the config.
+    """Everything that later steps depend on, except the base, the views and the config.
 
-    ``adapt`` goes on from it and ends with the bits that it would have ended with undisturbed, on as many threads and
-    processes.
+    ``adapt`` resumes from it to the same bits as an uninterrupted run, with as many threads and processes.
 
     Attributes:
-        tensors: by kind and name, as in ``parameter.means``: of each attribute that changes (what does not is the
-            base's) its ``parameter``, Adam's ``first`` and ``second`` moment and a row's number of ``steps``, and,
-            where there is one by now, the ``mean`` that will be the outcome. float32 and, the steps, int32.
-        attenuation: how sigma_d is to be read.
-        random: the state of NumPy's generator; order: the views to come in this round, the next one last.
-        loss: its running mean; averaged: how many steps are in the mean.
-        steps, seconds: done and spent in training; start_seconds: spent before it.
+        tensors: by kind and name, as in ``parameter.means``: of each trained attribute its ``parameter``, Adam's
+            ``first`` and ``second`` moment, the number of ``steps`` of each row, and the ``mean`` if there is one.
+            float32, the steps int32.
+        attenuation: the settings that sigma_d is defined by.
+        random: the state of NumPy's generator; order: the remaining views of this round, the next one last.
+        loss: its running mean; averaged: the number of steps in the mean.
+        steps, seconds: of training; start_seconds: before it.
 
     Raises:
-        StateRefused: it counts steps or seconds that cannot be.
+        StateRefused: steps or seconds are impossible.
     """
 
     tensors: dict[str, Tensor]
@@ -54,10 +52,13 @@ class TrainingState:
         times = (self.seconds, self.start_seconds)
         possible = 0 <= self.averaged <= self.steps < 2**31 and all(0 <= seconds < math.inf for seconds in times)
         if not possible:
-            raise StateRefused("the training state counts steps or seconds that cannot be; start afresh")
+            raise StateRefused("the training state has impossible counts of steps or seconds; start over")
 
     def check(self, own: dict[str, Tensor]) -> None:
-        """Refuses a state whose tensors are not like a run's ``own``, or that cannot be.
+        """Compares the tensors with those of a run, and their values with what training can produce.
+
+        Args:
+            own: the tensors of the run, which are not changed.
 
         Raises:
             StateRefused: it is of another run, or damaged.
@@ -67,59 +68,32 @@ class TrainingState:
             raise StateRefused(OTHER_RUN)
         for name, values in self.tensors.items():
             kind, _, attribute = name.partition(".")
-            if kind == "steps":  # an index in compiled code, which checks none
+            if kind == "steps":  # an index in compiled code, which does not check it
                 sound = (values >= 0) & (values <= self.steps)
             elif kind == "second":
                 sound = values >= 0  # and not NaN
             elif kind == "first":  # Adam's is at most 7.3 times the root of the second
                 sound = values.abs() <= 10 * self.tensors[f"second.{attribute}"].sqrt() + 1e-15
-            else:  # an infinite opacity stays what it is in the base
+            else:  # an infinite opacity does not change
                 sound = values.isfinite() | (values == own[f"parameter.{attribute}"])
             if not bool(sound.all()):
-                raise StateRefused(f"the training state has {name} that cannot be; start afresh")
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Where an adaptation stands; handed to the progress callback.
-
-    Attributes:
-        phase: "start" (a view a step), "order" (a Gaussian a step: who leaves before whom) or "train"; of a block
-            also "beside", "targets" and "quotas" (a view a step).
-        done, total: steps of the phase.
-        seconds: since training began; before it, since the adaptation did.
-        share: of the phase that is done, by steps or by time budget, whichever is further.
-        loss: running mean of the photometric loss, NaN before the first step.
-        gaussians: gives the state now (before training, the base; within the last ``average`` of it, the mean so
-            far); it shares memory with what is being trained, so use it within the callback.
-        state: gives what training can be resumed from, likewise; None before training.
-        lost: why training ends here, where a process that trained along is gone or an error ends it.
-    """
-
-    phase: str
-    done: int
-    total: int
-    seconds: float
-    share: float
-    loss: float
-    gaussians: Callable[[], Gaussians]
-    state: Callable[[], TrainingState] | None = None
-    lost: str | None = None
+                raise StateRefused(f"the training state has impossible values of {name}; start over")
 
 
 @dataclass(frozen=True)
 class Adapted:
-    """The outcome of ``adapt``.
+    """The result of ``adapt``.
 
     Attributes:
         gaussians: with ``sigma_d`` and ``attenuation``.
         steps: training steps done.
-        seconds: wall time of the training loop; start_seconds: of what comes before it. Of a resumed training both
-            count from its first beginning.
-        interrupted: a KeyboardInterrupt, the loss of a process, or a loss that is not finite ended it early.
+        seconds: wall time of the training loop; start_seconds: before it. Both include the run that was resumed.
+        interrupted: training ended early: the listener returned False, Ctrl-C, a process was lost, or the loss of a
+            step was not finite.
         lost: which process was lost; failed: which step's loss was not finite.
-        waiting, exchanging: of these seconds, in this call, those spent on other processes (``ProcessGroup``).
-        held: Gaussians that some step of this call did not move, as their gradients were not finite.
+        waiting, exchanging: seconds of this call spent waiting for and exchanging with other processes.
+        held: the number of Gaussians that some step of this call did not move because their gradient was not finite.
+        signalled: a Ctrl-C, or another signal with Python's own handler, arrived.
     """
 
     gaussians: Gaussians
@@ -132,3 +106,4 @@ class Adapted:
     exchanging: float = 0.0
     failed: str | None = None
     held: int = 0
+    signalled: bool = False

@@ -1,7 +1,4 @@
-"""Training states as safetensors files: the tensors, and one JSON document with the rest, what it belongs to included.
-
-The JSON stands under the metadata key ``clod_adapter_state``.
-"""
+"""Training states as safetensors files: the tensors, and a JSON document in the metadata with everything else."""
 
 from __future__ import annotations
 
@@ -15,18 +12,18 @@ from safetensors.torch import save
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.regular import refuse_irregular
+from clod_adapter.io.sniff import refuse_irregular
 from clod_adapter.io.tensor_file import read_tensors
 from clod_adapter.training.state import TrainingState
 
-KEY = "clod_adapter_state"
+KEY = "clod_adapter_state"  # of the JSON document in the metadata
 
 
 def save_state(path: str | Path, state: TrainingState, belongs: dict[str, Any]) -> None:
     """Writes a state; loading it gives the same bits.
 
     Args:
-        belongs: plain JSON: which run it is of.
+        belongs: identifies the run; plain JSON.
 
     Raises:
         ClodError: the file cannot be written.
@@ -41,13 +38,13 @@ def save_state(path: str | Path, state: TrainingState, belongs: dict[str, Any]) 
 
 
 def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
-    """Reads a state, and what it belongs to.
+    """Reads a state, and ``belongs`` of the run that saved it.
 
     Raises:
-        ClodError: the file cannot be read, is damaged, or no training state.
+        ClodError: the file cannot be read, is damaged, or is not a training state.
     """
     path = Path(path)
-    refuse_irregular(path, "remove it to start afresh")
+    refuse_irregular(path, "delete it to start over")
     try:
         tensors, metadata = read_tensors(path)
         about = _typed(json.loads(metadata[KEY]), dict)
@@ -63,11 +60,11 @@ def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
     except MemoryError:  # of a file that is whole
         raise
     except Exception as error:  # SafetensorError, and whatever a crafted file provokes
-        raise ClodError(f"{path}: is no training state or damaged ({error}); remove it to start afresh") from error
+        raise ClodError(f"{path}: is not a training state or is damaged ({error}); delete it to start over") from error
 
 
 def _typed(value: Any, *kinds: type) -> Any:
-    """The value, where it is of one of these types of JSON's; raises TypeError. A bool is no number there."""
+    """The value, if it is of one of these JSON types (a bool is not a number); raises TypeError otherwise."""
     if type(value) not in kinds:
         raise TypeError(f"{value!r:.40} is not of the type {kinds[0].__name__}")
     return value

@@ -1,4 +1,4 @@
-"""What a training looks at: views in random order, and the dial values they are rendered at, all by one seed."""
+"""Random sampling of the training views and of the dial values that they are rendered at."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from clod_adapter.training.state import OTHER_RUN
 
 
 class ViewSampler:
-    """ViewSampler for as long as it is asked, the same in every process that has the same seed.
+    """Samples views and dial values from ``config.seed``; the same in every process.
 
     Attributes:
-        order: the views to come in this round, by number, the next one last.
+        order: the numbers of the remaining views of this round, the next one last.
     """
 
     def __init__(self, views: tuple[View, ...], config: AdaptConfig) -> None:
@@ -25,7 +25,7 @@ class ViewSampler:
         self.order: list[int] = []
 
     def draw(self) -> tuple[View, list[float]]:
-        """A view (each once per round) and the dial values it is rendered at."""
+        """The next view (each one once per round) and the dial values that it is rendered at."""
         if not self.order:
             self.order = self.random.permutation(len(self.views)).tolist()
         view, config = self.views[self.order.pop()], self.config
@@ -36,7 +36,7 @@ class ViewSampler:
         return view, [1.0 if full else drawn]
 
     def state(self) -> tuple[dict[str, Any], tuple[int, ...]]:
-        """All that the draws to come depend on: the generator's state, and the order."""
+        """Everything that later samples depend on: the generator's state, and the order."""
         return dict(self.random.bit_generator.state), tuple(self.order)
 
     def restore(self, random: dict[str, Any], order: tuple[int, ...]) -> None:
@@ -50,5 +50,5 @@ class ViewSampler:
         try:
             self.random.bit_generator.state = random
         except (KeyError, OverflowError, TypeError, ValueError) as error:
-            raise ClodError(f"the training state's random state is damaged ({error!r}); start afresh") from error
+            raise ClodError(f"the training state's random state is damaged ({error!r}); start over") from error
         self.order = list(order)

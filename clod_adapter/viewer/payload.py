@@ -15,13 +15,13 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from clod_adapter._support.text import as_text
+from clod_adapter._support.version import package_version
 from clod_adapter.calibration import Calibration
 from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import OPAQUE, Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.ply.columns import SIGMA, column_map, inria_dtype
 from clod_adapter.io.ply.header import write_comments
-from clod_adapter.version import package_version
 
 ROWS = 1 << 14  # per block
 

@@ -19,9 +19,10 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize
+from clod_adapter.progress import Phase, Progress
 from clod_adapter.render import render
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.state import Progress, TrainingState
+from clod_adapter.training.state import TrainingState
 from clod_adapter.training.target_count import target_curve
 from scenes import capture, gaussians
 
@@ -214,7 +215,7 @@ def test_a_block_resumes_with_the_same_bits(
     for part in (again, learned[1]):
         assert part.values.keys() == once.values.keys()
         assert all(torch.equal(value, once.values[name]) for name, value in part.values.items())
-    for phase in ("beside", "targets", "quotas"):  # each wait is reported
+    for phase in (Phase.CONTEXT, Phase.TARGET_IMAGES, Phase.TARGET_COUNTS):  # each wait is reported
         assert [one[1:] for one in told if one[0] == phase] == [(k + 1, len(views)) for k in range(len(views))]
 
 

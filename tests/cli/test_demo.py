@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from clod_adapter.cli import demo
-from clod_adapter.cli.adapt import result, resume, run
+from clod_adapter.cli.adapt import report, resume
+from clod_adapter.cli.adapt.result import Measured
 from clod_adapter.cli.main import build_parser
 
 PICTURES = ("dial.png", "curve.png")
@@ -33,8 +32,7 @@ def short(monkeypatch: pytest.MonkeyPatch, capture: Any) -> None:
 
     monkeypatch.setattr(demo, "prepare", prepare)
     monkeypatch.setattr(demo, "draw", draw)
-    real, few = run.decide, partial(replace, iters=2)
-    monkeypatch.setattr(run, "decide", lambda args, base, scene, config, *a: real(args, base, scene, few(config), *a))
+    monkeypatch.setattr(demo, "ADAPT_STEPS", 2)
 
 
 def test_says_where_things_are_and_what_is_next(clod: Any, short: None, tmp_path: Path) -> None:
@@ -42,9 +40,9 @@ def test_says_where_things_are_and_what_is_next(clod: Any, short: None, tmp_path
     done = clod("demo", "--out", "here")
     assert done.code == 0, done
     assert f"everything is in {tmp_path / 'here'}" in done.out and "clod-adapt YOURS.ply" in done.out
-    report = json.loads(clod("demo", "--out", "here", "--quiet", "--json").out)
-    assert report["command"] == "demo" and report["folder"] == "here"
-    assert report["pictures"] == {"dial": "here/dial.png", "curve": "here/curve.png"}
+    found = json.loads(clod("demo", "--out", "here", "--quiet", "--json").out)
+    assert found["command"] == "demo" and found["folder"] == "here"
+    assert found["pictures"] == {"dial": "here/dial.png", "curve": "here/curve.png"}
     made = {path.name for path in (tmp_path / "here").iterdir()}
     assert made == {"capture", "base.ply", "gallery.ply", "gallery.safetensors", "gallery.json", *PICTURES}
 
@@ -53,11 +51,11 @@ def test_pictures_that_were_not_drawn_are_not_reported(
     clod: Any, short: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr(result, "measure_result", lambda *_: ([], [], True))
+    monkeypatch.setattr(report, "measure_result", lambda *_: Measured(interrupted=True))
     (tmp_path / "demo").mkdir()
     (tmp_path / "demo" / "dial.png").write_text("an earlier run's of clod_adapter")
     done = clod("demo", "--json")
-    assert done.code == 0 and json.loads(done.out)["pictures"] == {} and "no pictures" in done.err
+    assert done.code == 0 and json.loads(done.out)["pictures"] == {} and "no figures" in done.err
     assert not any((tmp_path / "demo" / name).exists() for name in PICTURES)
 
 
@@ -114,6 +112,6 @@ def test_goes_on_with_what_was_interrupted(
         patch.setattr(resume, "package_version", lambda: "0.0.7")
         done = clod("demo")
     assert done.code == 2 and f"{state.relative_to(tmp_path)}: is of version" in done.err, done
-    assert "remove it to start afresh" in done.err and "--resume" not in done.err and state.exists()
+    assert "delete it to start over" in done.err and "--resume" not in done.err and state.exists()
     done = clod("demo", "--json")
     assert done.code == 0 and json.loads(done.out)["resumed_from"] == 1 and not state.exists(), done

@@ -1,9 +1,10 @@
-"""The instruments of ``clod-adapt eval``: the base by rank, other files at matched counts, popping, more metrics."""
+"""``clod-adapt eval``: its rows, and its comparisons: pruned base, other files, popping, more metrics."""
 
 from __future__ import annotations
 
 import json
 import re
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,53 @@ import clod_adapter
 from clod_adapter.cli import comparisons
 
 TINY = ("--iters", 3, "--quiet", "--max-sv", 4, "--out", "dial.ply")
+ROW = {"virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"}
 
 
 @pytest.fixture
 def adapted(clod: Any, capture: Any, tmp_path: Path) -> Path:
     assert clod(capture.ply, "--images", capture.scene, *TINY).code == 0
     return tmp_path / "dial.ply"
+
+
+def notes_of(report: Any) -> list[str]:
+    """Without the one on LPIPS and FLIP, which depends on what is installed."""
+    return [note for note in report["notes"] if not note.startswith("without ")]
+
+
+def test_eval_prints_one_object(spawn: Any, clod: Any, capture: Any, tmp_path: Path) -> None:
+    clod(capture.ply, "--images", capture.scene, *TINY)
+    process = spawn("eval", "dial.ply", "--images", capture.scene, "--sv", "1", "2.5", "--json", cwd=tmp_path)
+    out, err = process.communicate(timeout=100)
+    assert process.returncode == 0, err
+    report = json.loads(out)
+    assert (report["model"], report["scene"], report["base_count"]) == ("dial.ply", str(capture.scene), 300)
+    assert [row["virtual_scale"] for row in report["rows"]] == [1, 2.5]
+    for row in report["rows"]:
+        assert set(row) - {"lpips", "flip"} == ROW and row["in_view"] <= row["kept"]
+        assert row["kept_share"] == row["kept"] / 300 and row["frame_ms"] > 0
+        assert 0 < row["psnr"] < 100 and 0 < row["ssim"] <= 1
+    assert "PSNR dB" in err and "PSNR dB" not in out
+
+
+def test_eval_of_a_plain_file(clod: Any, capture: Any) -> None:
+    done = clod("eval", capture.ply, "--images", capture.scene, "--json")
+    report = json.loads(done.out)
+    assert [row["virtual_scale"] for row in report["rows"]] == [1, 2, 3, 5]
+    assert {row["kept_share"] for row in report["rows"]} == {1.0} and len({row["psnr"] for row in report["rows"]}) == 1
+    assert report["attenuation"] is None and "has no sigma_d" in done.err
+    shown = clod("eval", capture.ply, "--images", capture.scene, "--quiet")
+    assert len(shown.out.splitlines()) == 5 and shown.err == ""
+
+
+def test_eval_stays_within_what_was_trained(clod: Any, capture: Any) -> None:
+    for max_sv, dials in ((2.5, [1, 2, 2.5]), (1, [1]), (7, [1, 2, 3, 5, 7])):
+        clod(capture.ply, "--images", capture.scene, *TINY, "--max-sv", max_sv)
+        report = json.loads(clod("eval", "dial.ply", "--images", capture.scene, "--json").out)
+        assert [row["virtual_scale"] for row in report["rows"]] == dials and notes_of(report) == []
+    done = clod("eval", "dial.ply", "--images", capture.scene, "--sv", 8, "--json")
+    (note,) = notes_of(json.loads(done.out))
+    assert note.startswith("trained up to s = 7") and note in done.err
 
 
 def test_base_by_rank(clod: Any, capture: Any, adapted: Path) -> None:
@@ -36,7 +78,7 @@ def test_base_by_rank(clod: Any, capture: Any, adapted: Path) -> None:
     top = base.opacity_logits.argsort(descending=True)[: round(kept[4])]
     (want,) = clod_adapter.evaluate(base.select(top), views, [1.0])
     assert report["ranked"][2]["row"]["psnr"] == pytest.approx(want.psnr, abs=1e-4)
-    block = done.err[done.err.index("cut to the same counts by rank") :].splitlines()[2:]
+    block = done.err[done.err.index("pruned to the same counts") :].splitlines()[2:]
     by = ["opacity", "removal"]  # and error
     assert [line.split()[0] for line in block[:7]] == ["base", "s=1", *by, "s=4", *by]
     assert report["against"] == [] and report["popping"] == []
@@ -55,7 +97,7 @@ def test_against_at_matched_counts(clod: Any, capture: Any, adapted: Path, tmp_p
     assert note in done.err and "at most" in note
     for own, row in zip(report["against"][2:], report["rows"], strict=True):  # with itself: the same rows again
         assert own["theirs"]["psnr"] == row["psnr"] and own["ours"]["kept"] == pytest.approx(row["kept"], rel=2e-3)
-    assert "the dial value that keeps as many" in done.err
+    assert "the dial value with the same count" in done.err
 
 
 def test_against_files_of_one_name(clod: Any, capture: Any, adapted: Path, tmp_path: Path) -> None:
@@ -91,7 +133,11 @@ def test_popping(clod: Any, capture: Any, adapted: Path) -> None:
 def test_no_dial_does_not_pop(clod: Any, capture: Any) -> None:
     done = clod("eval", capture.ply, "--images", capture.scene, "--sv", 1, 2, "--popping", "--json")
     report = json.loads(done.out)
-    assert done.code == 0 and report["popping"] == [] and any("no popping" in note for note in report["notes"])
+    assert (
+        done.code == 0
+        and report["popping"] == []
+        and any("popping is not measured" in note for note in report["notes"])
+    )
 
 
 def test_interrupt_keeps_what_is_measured(
@@ -102,7 +148,7 @@ def test_interrupt_keeps_what_is_measured(
     def evaluate(*args: Any, **rest: Any) -> Any:
         calls.append(args)
         if len(calls) == 3:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
         return real(*args, **rest)
 
     monkeypatch.setattr(comparisons, "evaluate", evaluate)
@@ -130,5 +176,5 @@ def test_base_must_be_unadapted(clod: Any, capture: Any, adapted: Path) -> None:
     done = clod("eval", adapted, "--images", capture.scene, "--base", adapted)
     assert (done.code, done.out) == (2, "")
     assert done.err.startswith(f"clod-adapt: error: {adapted}: has a dial (sigma_d); give --base the checkpoint")
-    assert done.err.rstrip().endswith("or give it to --against")
+    assert done.err.rstrip().endswith("or use --against")
     assert len(done.err.splitlines()) == 1

@@ -16,11 +16,12 @@ import pytest
 import torch
 
 import clod_adapter
-from clod_adapter.cli.adapt import files, result
+from clod_adapter.cli.adapt import files
+from clod_adapter.cli.adapt import report as reporting
 from clod_adapter.cli.adapt.progress import ProgressDisplay
 from clod_adapter.cli.shared import pages
 from clod_adapter.errors import ClodError
-from clod_adapter.training.loop import Progress
+from clod_adapter.progress import Phase, Progress
 from clod_adapter.training.objective import Objective
 from clod_adapter.training.state_file import load_state
 from scenes import stripped
@@ -86,7 +87,7 @@ def test_an_error_while_training(
         done = clod(*words, *quiet)
     assert done.code == 1 and names(tmp_path) == [STATE], done
     assert "ZeroDivisionError: of ours" in done.err and "please report it" in done.err.splitlines()[-1]
-    assert f"--resume goes on from step 5, which is in {STATE}\n" in done.err
+    assert f"--resume resumes from step 5, which is in {STATE}\n" in done.err
     assert_goes_on(clod, words, tmp_path, 5, whole)
 
 
@@ -96,15 +97,16 @@ def test_an_error_of_what_follows_the_training(
     """Such as the page, or the look at the held-out views."""
     call = ProgressDisplay.__call__
 
-    def failing(self: ProgressDisplay, progress: Progress) -> None:
-        call(self, progress)
-        if progress.phase == "train" and progress.done == 7:
+    def failing(self: ProgressDisplay, progress: Progress) -> bool:
+        going = call(self, progress)
+        if progress.phase == Phase.TRAINING and progress.done == 7:
             fail()
+        return going
 
     with monkeypatch.context() as patch:
         patch.setattr(ProgressDisplay, "__call__", failing)
         done = clod(*words)
-    assert done.code == 1 and names(tmp_path) == [STATE] and "goes on from step 7" in done.err, done
+    assert done.code == 1 and names(tmp_path) == [STATE] and "resumes from step 7" in done.err, done
     assert_goes_on(clod, words, tmp_path, 7, whole)
 
 
@@ -118,7 +120,7 @@ def test_a_loss_that_is_not_finite(
     report = json.loads(done.out)
     assert done.code == 1 and names(tmp_path) == sorted([*OUTPUTS, STATE]), done
     assert report["interrupted"] and report["steps"] == 5 and len(report["rows"]) > 2
-    assert any("what was learned before is written: the loss of step 6 is not finite" in n for n in report["notes"])
+    assert any("the result so far is written: the loss of step 6 is not finite" in n for n in report["notes"])
     assert clod_adapter.load(tmp_path / "dial.ply").gaussians.sigma_d.isfinite().all()
     assert_goes_on(clod, words, tmp_path, 5, whole)
 
@@ -132,7 +134,7 @@ def test_gradients_that_are_not_finite_are_told(
 
     pull_changed(monkeypatch, 6, spoil)
     done = clod(*words)
-    assert done.code == 0 and "1 Gaussians stayed where they were in some steps: their gradients" in done.err, done
+    assert done.code == 0 and "1 Gaussians were not moved by some steps: their gradients" in done.err, done
     found = clod_adapter.load(tmp_path / "dial.ply").gaussians
     assert all(value.isfinite().all() for value in found.tensors().values())
 
@@ -153,21 +155,19 @@ def test_an_error_while_writing(
         patch.setattr(files, "save", raising)
         done = clod(*words)
     assert done.code == code and names(tmp_path) == [STATE], done
-    assert load_state(tmp_path / STATE)[0].steps == ITERS and f"--resume goes on from step {ITERS}, which" in done.err
+    assert load_state(tmp_path / STATE)[0].steps == ITERS and f"--resume resumes from step {ITERS}, which" in done.err
     assert ("please report it" in done.err) == (code == 1)
     assert_goes_on(clod, words, tmp_path, ITERS, whole)
 
 
-@pytest.mark.parametrize("step", ["measure_result", "write_measured"])
 def test_an_error_while_measuring(
-    clod: Any, words: list[Any], whole: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+    clod: Any, words: list[Any], whole: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The files are there, not measured."""
+    """The state is saved by then."""
     with monkeypatch.context() as patch:
-        patch.setattr(result, step, fail)
+        patch.setattr(reporting, "measure_result", fail)
         done = clod(*words)
-    assert done.code == 1 and names(tmp_path) == sorted([*OUTPUTS, STATE]), done
-    assert "the result was not measured" in json.loads((tmp_path / "dial.json").read_text())["notes"]
+    assert done.code == 1 and names(tmp_path) == [STATE], done
     assert_goes_on(clod, words, tmp_path, ITERS, whole)
 
 
@@ -191,16 +191,17 @@ def test_a_folder_that_is_gone(
     words = [capture.ply, "--images", capture.scene, *TINY, "out/dial.ply"]
     call = ProgressDisplay.__call__
 
-    def removing(self: ProgressDisplay, progress: Progress) -> None:
-        call(self, progress)
-        if progress.phase == "train" and progress.done == 4:
+    def removing(self: ProgressDisplay, progress: Progress) -> bool:
+        going = call(self, progress)
+        if progress.phase == Phase.TRAINING and progress.done == 4:
             shutil.rmtree("out")
+        return going
 
     with monkeypatch.context() as patch:
         patch.setattr(ProgressDisplay, "__call__", removing)
         done = clod(*words)
     (kept,) = tmp_path.glob(f"temporary/*/{STATE}")
-    said = f"step {ITERS} is in {kept}: move it to out/{STATE}, and --resume goes on from there"
+    said = f"step {ITERS} is in {kept}: move it to out/{STATE}, and --resume resumes from there"
     assert done.code == 2 and done.err.splitlines()[-2] == said, done
     assert "error: out/dial.safetensors: folder out does not exist; create it first" in done.err.splitlines()[-1]
     (tmp_path / "out").mkdir()
@@ -214,7 +215,7 @@ def test_nowhere_to_save(clod: Any, capture: Any, tmp_path: Path, monkeypatch: p
     """The one error is that of the output."""
     (tmp_path / "out").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
-    monkeypatch.setattr(result, "write", lambda *_: shutil.rmtree("out") or fail())
+    monkeypatch.setattr(reporting, "write", lambda *_: shutil.rmtree("out") or fail())
     monkeypatch.setattr(
         "clod_adapter.cli.adapt.resume.save_state", lambda path, *_: (_ for _ in ()).throw(ClodError("full"))
     )

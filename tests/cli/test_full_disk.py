@@ -59,7 +59,7 @@ def test_adapting(clod: Any, capture: Any, tmp_path: Path, room: Room) -> None:
         assert held(tmp_path) == earlier
     with room(ply + 5000):
         done = clod(*words, "--report")
-    assert done.code == 0 and "there is no page: " in done.err
+    assert done.code == 0 and "the page was not written: " in done.err
     now = held(tmp_path)
     assert now.keys() == earlier.keys() and not any(now[name] == earlier[name] for name in now)
 
@@ -79,7 +79,7 @@ def test_a_page(
 
     monkeypatch.setattr(page, "write_page", later)
     done = clod(*words)
-    assert done.code == 0 and "there is no page: " in done.err and "File too large" in done.err, done
+    assert done.code == 0 and "the page was not written: " in done.err and "File too large" in done.err, done
     assert held(tmp_path) == earlier
 
 

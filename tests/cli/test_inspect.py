@@ -33,7 +33,7 @@ def test_a_plain_file_on_one_screen(clod: Any, capture: Any) -> None:
 
 def test_a_dial_and_its_calibration(clod: Any, files: Path) -> None:
     done = clod("inspect", "dial.ply")
-    assert done.code == 0 and "written by   clod-adapter" in done.out and "s = 1 to 5, soft cut" in done.out
+    assert done.code == 0 and "written by   clod-adapter" in done.out and "s = 1 to 5, soft culling" in done.out
     lines = done.out.splitlines()
     at = next(k for k, line in enumerate(lines) if "Gaussians" in line and "PSNR" in line)
     table = [line.split() for line in lines[at + 1 : at + 9]]

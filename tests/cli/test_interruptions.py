@@ -25,17 +25,16 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 import clod_adapter
-from clod_adapter.cli.adapt import files, resume
+from clod_adapter._support.version import package_version
+from clod_adapter.cli.adapt import inputs as adapt_inputs
+from clod_adapter.cli.adapt import resume
 from clod_adapter.cli.adapt import run as adapt_command
 from clod_adapter.cli.shared import inputs
-from clod_adapter.cli.shared import measure as evaluate_command
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.interrupts import GracefulStop
-from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.training.loop import Progress
+from clod_adapter.progress import Phase, Progress
 from clod_adapter.training.state_file import load_state
-from clod_adapter.version import package_version
 from scenes import stripped
 
 OUTPUTS = ["dial.json", "dial.ply", "dial.safetensors"]
@@ -217,7 +216,7 @@ def test_one_interrupt_while_training(
     report = json.loads((tmp_path / "dial.json").read_text())
     assert code == 0 and report["interrupted"] and report["resumed_from"] is None, log
     assert names(tmp_path) == sorted([*OUTPUTS, STATE]) and load_state(tmp_path / STATE)[0].steps == report["steps"]
-    assert f"--resume goes on from step {report['steps']}, which is in {STATE}" in log and "SIGTERM" not in log
+    assert f"--resume resumes from step {report['steps']}, which is in {STATE}" in log and "SIGTERM" not in log
     assert_whole(tmp_path)
     code, log = server.run(tmp_path, *words, "--resume")
     assert code == 0 and f"resuming {STATE} from step {report['steps']}" in log, log
@@ -300,17 +299,17 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_full_disk(
     server: Server, words: list[Any], capture: Any, small_disk: Path, undisturbed: tuple[Path, float]
 ) -> None:
-    """The state fits once, the outputs do not: the last state is saved elsewhere, and --resume goes on from there."""
+    """The state fits once, the outputs do not: the last state is saved elsewhere, and --resume resumes from there."""
     before = fingerprints(capture.ply, capture.scene)
     code, log = server.run(small_disk, *words)
     assert code == 2 and names(small_disk) == [STATE], log
     *_, last = log.splitlines()
     assert re.match(r"clod-adapt: error: dial.ply: cannot be written: (No space left on device|\d+ requested)", last)
-    assert log.count("the run goes on") == 1 and load_state(small_disk / STATE)[0].steps == 1, log
+    assert log.count("the run continues") == 1 and load_state(small_disk / STATE)[0].steps == 1, log
     assert fingerprints(capture.ply, capture.scene) == before
     subprocess.run(["mount", "-o", "remount,size=1m", str(small_disk)], check=True)
     (kept,) = small_disk.parent.glob(f"clod-adapt-*/{STATE}")
-    assert f"step {ITERS} is in {kept}: move it to {STATE}, and --resume goes on from there\n" in log
+    assert f"step {ITERS} is in {kept}: move it to {STATE}, and --resume resumes from there\n" in log
     shutil.move(kept, small_disk / STATE)
     code, log = server.run(small_disk, *words, "--resume")
     assert code == 0 and f"resuming {STATE} from step {ITERS}" in log, log
@@ -338,8 +337,8 @@ def broken_off(clod: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (("--iters", 13), "is of a run with --iters 12; give what it was begun with"),
-        (("--seed", 5, "--time-budget", 9), "is of a run with no --time-budget, --seed 0; give"),
+        (("--iters", 13), "is of a run with --iters 12; use the original arguments"),
+        (("--seed", 5, "--time-budget", 9), "is of a run with no --time-budget, --seed 0; use"),
         (("--form", "paper"), "is of a run with another --form"),
     ],
 )
@@ -355,7 +354,7 @@ def test_other_settings_are_refused(
     words = (capture.ply, "--images", capture.scene, *TINY)
     broken_off(*words)
     before = fingerprints(tmp_path)
-    monkeypatch.setattr(adapt_command, "read_checkpoint", lambda *_: pytest.fail("read"))
+    monkeypatch.setattr(adapt_inputs, "read_checkpoint", lambda *_: pytest.fail("read"))
     done = clod(*words, *changes, "--resume")
     assert done.code == 2 and done.err.count("\n") == 1, done
     assert f"error: {STATE}: {message}" in done.err and fingerprints(tmp_path) == before
@@ -374,7 +373,7 @@ def test_other_inputs_are_refused(
         (capture.ply, "fewer", "is of other photographs than fewer"),
     ):
         done = clod(ply if ply is capture.ply else "other.ply", "--images", scene, *TINY, "--resume")
-        assert done.code == 2 and f"error: {STATE}: {what}; give what" in done.err, done
+        assert done.code == 2 and f"error: {STATE}: {what}; use the" in done.err, done
     monkeypatch.setattr(resume, "package_version", lambda: "0.0.7")
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--resume")
     assert (
@@ -388,12 +387,12 @@ def test_other_inputs_are_refused(
         save_file(broken, tmp_path / STATE, file.metadata())
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--resume")
     assert done.code == 2 and done.err.splitlines()[-1] == (
-        f"clod-adapt: error: {STATE}: the training state has first.means that cannot be; remove it to start afresh"
+        f"clod-adapt: error: {STATE}: the training state has impossible values of first.means; delete it to start over"
     )
     (tmp_path / STATE).write_bytes(state[:-9])
     for words in ([], ["--resume"]):  # what is no state, an adapter say, is not replaced either
         done = clod(capture.ply, "--images", capture.scene, *TINY, *words)
-        assert done.code == 2 and f"error: {STATE}: is no training state or damaged" in done.err
+        assert done.code == 2 and f"error: {STATE}: is not a training state or is damaged" in done.err
 
 
 def test_the_same_gaussians_in_another_file(clod: Any, capture: Any, tmp_path: Path, broken_off: Any) -> None:
@@ -407,7 +406,7 @@ def test_the_same_gaussians_in_another_file(clod: Any, capture: Any, tmp_path: P
 
 def test_a_read_only_folder(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere, so chmod proves nothing
-    monkeypatch.setattr(adapt_command, "read_checkpoint", lambda *_: pytest.fail("read"))
+    monkeypatch.setattr(adapt_inputs, "read_checkpoint", lambda *_: pytest.fail("read"))
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--resume")
     assert done.code == 2 and "is not writable" in done.err and done.err.count("\n") == 1 and names(tmp_path) == []
 
@@ -424,12 +423,12 @@ def test_without_resume_a_state_is_replaced_only_by_the_next(
     words = (capture.ply, "--images", capture.scene, *TINY)
     broken_off(*words)
     before, seen = (tmp_path / STATE).read_bytes(), []
-    look = adapt_command.look_at_base
+    look = adapt_command.with_base_rows
     monkeypatch.setattr(
-        adapt_command, "look_at_base", lambda *a: seen.append((tmp_path / STATE).read_bytes()) or look(*a)
+        adapt_command, "with_base_rows", lambda *a: seen.append((tmp_path / STATE).read_bytes()) or look(*a)
     )
     done = clod(*words, "--seed", 4)
-    assert done.code == 0 and f"{STATE} has step 1 of a run that was interrupted" in done.err and seen == [before]
+    assert done.code == 0 and f"{STATE} has step 1 of an interrupted run" in done.err and seen == [before]
     assert names(tmp_path) == OUTPUTS
 
 
@@ -448,7 +447,7 @@ def test_a_state_that_cannot_be_saved_costs_a_warning(
     monkeypatch.setattr(resume, "SAVE_EVERY", 0.0)
     monkeypatch.setattr(resume, "SAVE_COST", 1e9)
     done = clod(*words, "--seed", 4)
-    assert done.code == 0 and done.err.count(f"will not know of it: {STATE}: cannot be written: No space") == 1
+    assert done.code == 0 and done.err.count(f"will not find it: {STATE}: cannot be written: No space") == 1
     assert names(tmp_path) == sorted([*OUTPUTS, STATE]) and (tmp_path / STATE).read_bytes() == before
 
 
@@ -470,46 +469,21 @@ def test_saves_take_their_share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     clock, saved = [0.0], []
     monkeypatch.setattr(resume.time, "perf_counter", lambda: clock[0])
 
-    def save(path: Path, state: int, belongs: Any) -> None:
+    def save(path: Path, state: int, run_of: Any) -> None:
         saved.append(state)
         clock[0] += 0.1
 
     monkeypatch.setattr(resume, "save_state", save)
-    saver = resume.Saver(tmp_path / STATE, False, AdaptConfig(), Console(quiet=True), GracefulStop())
-    follow = saver.watching(lambda progress: None)
+    saver = resume.Saver(tmp_path / STATE, {}, None, Console(quiet=True), GracefulStop())
+    follow = saver.saving(lambda progress: None)
     for step in range(1, 601):
         clock[0] += 0.1
-        follow(Progress("train", step, 600, clock[0], step / 600, 0.1, lambda: None, lambda step=step: step))
+        follow(Progress(Phase.TRAINING, step, 600, clock[0], state=lambda step=step: step))
     assert saved[0] == 1 and 0.012 < saver.seconds / clock[0] <= 0.015 and saver.saves == len(saved) > 5
 
 
-def test_an_interrupt_between_measuring_and_writing(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All was measured, so that nothing is left to skip: the run ends as if undisturbed."""
-    calibrate = files.calibrate
-    monkeypatch.setattr(files, "calibrate", lambda *a: signal.raise_signal(signal.SIGINT) or calibrate(*a))
-    done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
-    assert done.code == 0 and json.loads(done.out)["calibration"] and names(tmp_path) == OUTPUTS, done
-
-
-def test_a_frame_outlives_an_interrupt(capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Raised within a compiled kernel it would end as a SystemError."""
-    frames: list[float] = []
-
-    def evaluate(*_: Any, progress: Any, **__: Any) -> list[Any]:
-        signal.raise_signal(signal.SIGINT)
-        frames.append(1.0)
-        progress(1, 2)
-        pytest.fail("not stopped")
-
-    monkeypatch.setattr(evaluate_command, "evaluate", evaluate)
-    assert evaluate_command.measure(capture.gaussians, [None], [1.0, 2.0], Console(quiet=True)) == ([], True)
-    assert frames == [1.0]
-
-
 def test_sigterm_before_training(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(adapt_command, "prepare_kernels", lambda *_: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.setattr(adapt_inputs, "prepare_kernels", lambda *_: signal.raise_signal(signal.SIGTERM))
     done = clod(capture.ply, "--images", capture.scene, *TINY)
     assert done.code == 130 and done.err.splitlines()[-1] == "clod-adapt: interrupted" and names(tmp_path) == []
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL

@@ -76,21 +76,21 @@ def test_every_checkpoint_at_every_range(run: Any, clod: Any, tmp_path: Path) ->
 @pytest.mark.usefixtures("blank_figure")
 def test_resumes_what_is_unfinished_or_changed(run: Any, tmp_path: Path) -> None:
     first = run()
-    assert first.code == 0 and "there already" not in first.err, first
+    assert first.code == 0 and "done already" not in first.err, first
     folder = tmp_path / "robustness"
     before = stamps(folder)
     assert len(before) == 10
     (folder / "cells" / "masked_sv1.safetensors").unlink()
     (folder / "robustness.png").unlink()
     again = run()
-    assert again.code == 0 and "5 of 6 cells are there already" in again.err
+    assert again.code == 0 and "5 of 6 cells are done already" in again.err
     changed = {name for name, stamp in stamps(folder).items() if stamp != before.get(name)}
     assert changed == {"masked_sv1.safetensors", "masked_sv1.json"} and (folder / "robustness.png").exists()
     other = run("--seed", 1)  # the baselines do not depend on it
-    assert "2 of 6 cells are there already: plain_base, masked_base" in other.err
+    assert "2 of 6 cells are done already: plain_base, masked_base" in other.err
     before = stamps(folder)
     Path("masked.ply").write_bytes(Path("plain.ply").read_bytes())
-    assert "3 of 6 cells are there already: plain_base, plain_sv1, plain_sv3" in run("--seed", 1).err
+    assert "3 of 6 cells are done already: plain_base, plain_sv1, plain_sv3" in run("--seed", 1).err
     assert {name for name, stamp in stamps(folder).items() if stamp != before[name]} == {
         f"masked_{what}" for what in ("base.json", "sv1.json", "sv1.safetensors", "sv3.json", "sv3.safetensors")
     }
@@ -192,7 +192,7 @@ def test_cells_must_be_a_folder_that_can_be_written(
 def test_the_scene_is_looked_at_once(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     calls, real = [], command.scene_fingerprint
     monkeypatch.setattr(command, "scene_fingerprint", lambda scene: calls.append(scene) or real(scene))
-    monkeypatch.setattr(command, "run_cells", lambda *_: True)
+    monkeypatch.setattr(command, "run_cells", lambda *_: {})
     assert run().code == 130 and len(calls) == 1
 
 

@@ -44,7 +44,7 @@ def test_serves_until_it_is_interrupted(spawn: Any, capture: Any, dialled: Path,
 
 
 @pytest.mark.parametrize(
-    ("dial", "opens", "said"), [(True, 4, "the page's dial ends at s = 4"), (False, 1, "no dial to be at s = 9")]
+    ("dial", "opens", "said"), [(True, 4, "the page's dial ends at s = 4"), (False, 1, "s = 9 has no effect")]
 )
 def test_a_dial_value_that_the_page_does_not_have_is_noted(
     spawn: Any, capture: Any, dialled: Path, tmp_path: Path, dial: bool, opens: float, said: str

@@ -99,7 +99,9 @@ def test_capture_is_written_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(module, "bake", lambda tables: tables)
     seen: list[tuple[int, int]] = []
     folder = tmp_path / "capture"
-    write_gallery(folder, width=32, height=24, count=9, points=500, progress=lambda *done: seen.append(done))
+    write_gallery(
+        folder, width=32, height=24, count=9, points=500, progress=lambda now: seen.append((now.done, now.total))
+    )
     assert seen == [(k, 9) for k in range(1, 10)]
     names = [f"view_{k:03d}.png" for k in range(9)]
     assert sorted(p.name for p in (folder / "images").iterdir()) == names

@@ -30,7 +30,7 @@ def test_matching_dial_keeps_as_many() -> None:
 def test_rankings() -> None:
     base, scene = capture(n=60, views=4, width=24, height=18)
     seen = []
-    orders = rankings(base, scene.train, lambda *a: seen.append(a))
+    orders = rankings(base, scene.train, lambda now: seen.append((now.done, now.total)))
     assert seen[-1] == (len(scene.train), len(scene.train))
     values = {"opacity": base.opacity_logits, "removal error": removal_error(base, scene.train)}
     assert list(orders) == list(values)

@@ -156,7 +156,7 @@ def test_frames_are_timed_where_nothing_is_stored(monkeypatch: pytest.MonkeyPatc
 
 def test_frame_times_of_a_real_clock() -> None:
     calls: list[tuple[int, int]] = []
-    times = frame_times(adapted(20, 0), ring(2, 48, 36), progress=lambda done, total: calls.append((done, total)))
+    times = frame_times(adapted(20, 0), ring(2, 48, 36), progress=lambda now: calls.append((now.done, now.total)))
     assert [s for s, _ in times] == pytest.approx([MAX_SV ** (k / 5) for k in range(6)])
     assert all(0 < taken < 1e4 for _, taken in times)
     assert calls == [(6 * k, 24) for k in range(1, 5)]  # two cameras, twice

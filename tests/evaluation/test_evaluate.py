@@ -57,7 +57,7 @@ def test_rows_are_the_renders() -> None:
     some = attach(gaussians(200, 1, 0), sigma_d, AttenuationConfig(scene_distance=4.0))
     views = photograph(gaussians(200, 1, 0), ring(3, 32, 24))
     seen = []
-    rows = evaluate(some, views, [1.0, 2.0], progress=lambda *a: seen.append(a), repeats=2)
+    rows = evaluate(some, views, [1.0, 2.0], progress=lambda now: seen.append((now.done, now.total)), repeats=2)
     assert seen == [(k, 6) for k in range(1, 7)]
     for row in rows:
         assert all(type(value) is float for value in (row.psnr, row.ssim, row.kept, row.frame_ms))

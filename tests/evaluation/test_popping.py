@@ -63,7 +63,7 @@ def test_a_switch_between_models_and_a_dial() -> None:
 def test_the_dial_sweep_is_its_renders() -> None:
     some, camera = dialled(), ring(3, 32, 24)[1]
     seen = []
-    result = dial_popping(some, camera, 3.0, steps=4, progress=lambda *a: seen.append(a))
+    result = dial_popping(some, camera, 3.0, steps=4, progress=lambda now: seen.append((now.done, now.total)))
     images = [render(some, camera, 3 ** (k / 4)).image.clamp(0, 1) for k in range(5)]
     want = [255 * float((b - a).square().mean().sqrt()) for a, b in zip(images[:-1], images[1:], strict=True)]
     assert result.changes == pytest.approx(want) and seen == [(k, 4) for k in range(1, 5)]

@@ -12,7 +12,7 @@ from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.evaluation.robustness import adapt_at_range, baseline, distribution, most_opaque, scene_fingerprint
-from clod_adapter.training.loop import Progress
+from clod_adapter.progress import Phase, Stopped
 from scenes import capture, gaussians
 
 
@@ -21,7 +21,7 @@ def test_a_range_is_adapted_and_measured_beyond_it() -> None:
     frames: list[tuple[int, int]] = []
     outcome = adapt_at_range(
         base, scene, AdaptConfig(iters=20, max_sv=2), [1.0, 2.0, 4.0], fingerprint="f",
-        measured=lambda done, total: frames.append((done, total)),
+        progress=lambda now: frames.append((now.done, now.total)),
     )  # fmt: skip
     assert [row["virtual_scale"] for row in outcome.rows] == [1, 2, 4]
     kept = [row["kept"] for row in outcome.rows]
@@ -32,22 +32,20 @@ def test_a_range_is_adapted_and_measured_beyond_it() -> None:
     assert frames[-1] == (3 * len(scene.test), 3 * len(scene.test))
 
 
-def test_an_interrupted_adaptation_is_no_cell() -> None:
+@pytest.mark.parametrize("phase", [Phase.IMPORTANCE, Phase.TRAINING, Phase.EVALUATION])
+def test_an_interrupted_adaptation_is_no_cell(phase: Phase) -> None:
     base, scene = capture()
-
-    def stop(progress: Progress) -> None:
-        if progress.phase == "train" and progress.done == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        adapt_at_range(base, scene, AdaptConfig(iters=20), [1.0], fingerprint="f", follow=stop)
+    with pytest.raises(Stopped):
+        adapt_at_range(
+            base, scene, AdaptConfig(iters=4), [1.0], fingerprint="f", progress=lambda now: now.phase != phase
+        )  # fmt: skip
 
 
 def test_baseline_keeps_the_most_opaque() -> None:
     base, scene = capture()
     frames: list[tuple[int, int]] = []
     outcome = baseline(attach(base, torch.full((300,), 0.1)), scene.test, (1.0, 0.5, 0.1),
-                       measured=lambda done, total: frames.append((done, total)))  # fmt: skip
+                       progress=lambda now: frames.append((now.done, now.total)))  # fmt: skip
     assert [row["kept"] for row in outcome.rows] == [300, 150, 30]
     assert [row["kept_share"] for row in outcome.rows] == [1, 0.5, 0.1]
     few = most_opaque(base, 10)  # in the order of the file

@@ -24,6 +24,7 @@ from clod_adapter.initialization.importance import (
     usable_views,
 )
 from clod_adapter.initialization.pruning_order import pruning_order
+from clod_adapter.progress import Phase
 from clod_adapter.render import splat
 from scenes import gaussians, photograph, ring
 
@@ -66,7 +67,7 @@ def test_is_the_mean_over_views_and_reports_them() -> None:
     some = some.replace(means=torch.cat([some.means[:75], some.means[75:] + 1e3]))  # outside of every view
     (view,) = photograph(some, ring(1, 20, 16))
     seen = []
-    both = removal_error(some, [view, view], seed=3, progress=lambda *count: seen.append(count))
+    both = removal_error(some, [view, view], seed=3, progress=lambda now: seen.append((now.done, now.total)))
     assert seen == [(1, 2), (2, 2)]
     assert torch.equal(both, removal_error(some, [view, view], seed=3))
     assert not torch.equal(both, removal_error(some, [view, view], seed=4))
@@ -91,10 +92,11 @@ def test_initialization_renders_some_of_many_views(monkeypatch: pytest.MonkeyPat
         looked.clear()
         counts.clear()
         monkeypatch.setattr(importance, "MOST_VIEWS", most)
-        importance.initialize(some, views, AdaptConfig(), lambda *count: counts.append(count))
+        importance.initialize(some, views, AdaptConfig(), lambda now: counts.append((now.phase, now.done, now.total)))
         assert looked == [views[k].camera.name for k in expected]
-        assert counts[: len(looked)] == [("start", k + 1, len(looked)) for k in range(len(looked))]
-        assert {phase for phase, *_ in counts[len(looked) :]} == {"order"} and counts[-1] == ("order", 50, 50)
+        assert counts[: len(looked)] == [(Phase.IMPORTANCE, k + 1, len(looked)) for k in range(len(looked))]
+        assert {phase for phase, *_ in counts[len(looked) :]} == {Phase.PRUNING_ORDER}
+        assert counts[-1] == (Phase.PRUNING_ORDER, 50, 50)
 
 
 @pytest.mark.parametrize(("share", "exponent"), [(0.51, 1.5), (0.6, 1.0), (0.8, 2.5), (1.0, 1.5)])

@@ -51,7 +51,7 @@ def plainly(some: Gaussians, worth: Tensor) -> list[int]:
 def test_is_that_of_the_plain_twin(n: int, seed: int) -> None:
     some, seen = gaussians(n, 1, seed), []
     worth = torch.rand(n, generator=torch.Generator().manual_seed(seed))
-    order = pruning_order(some, worth, lambda *count: seen.append(count))
+    order = pruning_order(some, worth, lambda now: seen.append((now.done, now.total)))
     assert order.argsort().tolist() == plainly(some, worth), f"n {n}, seed {seed}"
     assert n < 60 or (seen == sorted(seen) and 0 < seen[0][0] < 30 and seen[-1] == (60, 60))
 
@@ -86,7 +86,7 @@ def test_many_in_one_place_are_moved_apart() -> None:
     # Of no worth and no size at all: ties, and nothing to divide by.
     for one in (alike, alike.replace(log_scales=torch.full((2000, 3), -400.0))):
         seen.clear()
-        order = pruning_order(one, torch.zeros(2000), lambda *count: seen.append(count))
+        order = pruning_order(one, torch.zeros(2000), lambda now: seen.append((now.done, now.total)))
         assert order.sort().values.equal(torch.arange(2000)) and len(seen) < 300
 
 

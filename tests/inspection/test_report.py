@@ -27,8 +27,8 @@ from clod_adapter.inspection.report import Inspection, inspect
 from clod_adapter.inspection.statistics import values_of
 from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.checkpoint import blank, load, save
+from clod_adapter.io.file_formats import write as save_as
 from clod_adapter.io.ply.columns import rows_of
-from clod_adapter.io.writers import write as save_as
 from clod_adapter.origin import NOWHERE
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.state_file import save_state
@@ -41,7 +41,7 @@ def table(n: int = 300, degree: int = 1, seed: int = 0) -> np.ndarray:
     """Rows in Inria's layout, unit quaternions, with something in every column that is used."""
     g = scenes.gaussians(n, degree, seed)
     g = g.replace(quats=torch.nn.functional.normalize(g.quats))
-    return rows_of({name: tensor.numpy() for name, tensor in g.tensors().items()}, degree)
+    return rows_of({name: tensor.numpy() for name, tensor in g.tensors().items()})
 
 
 def write(path: Path, vertex: np.ndarray, *, comments: tuple[str, ...] = (), order: str = "<") -> Path:
@@ -51,7 +51,7 @@ def write(path: Path, vertex: np.ndarray, *, comments: tuple[str, ...] = (), ord
 
 
 def kinds(found: Inspection) -> dict[str, int]:
-    return {oddity.kind: oddity.count for oddity in found.oddities}
+    return {anomaly.kind: anomaly.count for anomaly in found.anomalies}
 
 
 def adapted(path: Path, n: int = 40) -> Path:
@@ -98,7 +98,7 @@ def test_a_plain_file(tmp_path: Path) -> None:
     assert (v.total, v.count, v.dropped, splat.sh_degree, v.used_sh_degree) == (300, 300, {}, 1, 1)
     assert found.what == "a splat, PLY" and "Inria" in (found.writer or "") and splat.encoding == "binary little-endian"
     assert splat.columns[0] == ("x", "float32") and len(splat.columns) == len(vertex.dtype.names)
-    assert (found.oddities, found.left_out, found.notes, splat.extra, splat.origin) == ((), (), (), (), NOWHERE)
+    assert (found.anomalies, found.left_out, found.notes, splat.extra, splat.origin) == ((), (), (), (), NOWHERE)
     for axis, spread in zip("xyz", v.position, strict=True):
         assert (spread.least, spread.greatest) == (vertex[axis].min(), vertex[axis].max())
         assert [spread.low, spread.median, spread.high] == pytest.approx(np.quantile(vertex[axis], (0.01, 0.5, 0.99)))
@@ -148,7 +148,7 @@ def test_what_is_dropped_is_what_load_drops(tmp_path: Path, seed: int) -> None:
     assert v.position[0].greatest == float(base.gaussians.means[:, 0].max())
 
 
-def test_oddities_are_counted(tmp_path: Path) -> None:
+def test_anomalies_are_counted(tmp_path: Path) -> None:
     vertex = table(600)
     vertex["opacity"][:3] = np.inf
     for name in "xyz":
@@ -187,8 +187,8 @@ def test_values_that_look_activated_are_taken_so(tmp_path: Path) -> None:
     found = inspect(write(tmp_path / "a.ply", vertex))
     want = inspect(write(tmp_path / "b.ply", plain))
     assert found.splat is not None and want.splat is not None
-    assert [o.kind for o in found.oddities] == ["activated", "activated"]
-    assert all("--activated both" in o.says for o in found.oddities)
+    assert [o.kind for o in found.anomalies] == ["activated", "activated"]
+    assert all("--activated both" in o.says for o in found.anomalies)
     assert found.splat.values.scale.median == pytest.approx(want.splat.values.scale.median, rel=1e-5)
     assert found.splat.values.opacity.median == pytest.approx(want.splat.values.opacity.median, rel=1e-5)
 
@@ -271,7 +271,7 @@ def test_other_formats(tmp_path: Path) -> None:
         ("a.ply", b"version https://git-lfs.github.com/spec/v1\n", "Git LFS pointer"),
         ("a.ckpt", b"PK\x03\x04", "Nerfstudio"),
         ("a.safetensors", b"version https://git-lfs.github.com/spec/v1\n", "Git LFS pointer"),
-        ("a.safetensors", b"xxxxxxxxxxxxxxxx", "no safetensors file or damaged"),
+        ("a.safetensors", b"xxxxxxxxxxxxxxxx", "not a safetensors file, or damaged"),
         ("a.pt", b"PK\x03\x04", "damaged or truncated"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "mesh or a point"),
     ],

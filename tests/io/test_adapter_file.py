@@ -70,7 +70,7 @@ def test_what_a_trimmed_result_has_is_kept(tmp_path: Path, count: int, degree: i
     for change in ({"base_count": count + 8}, {"base_count": -1}, {"base_count": "9"}, {}):
         text = json.dumps(about | {"trimmed": change})
         save_file(tensors, tmp_path / "b", {"clod_adapter": text})
-        with pytest.raises(ClodError, match="description is damaged"):
+        with pytest.raises(ClodError, match="settings are damaged"):
             load_adapter(tmp_path / "b")
     more = {"kept": torch.full_like(tensors["kept"], 255)}
     save_file(tensors | more, tmp_path / "b", {"clod_adapter": json.dumps(about)})
@@ -79,18 +79,6 @@ def test_what_a_trimmed_result_has_is_kept(tmp_path: Path, count: int, degree: i
     else:
         with pytest.raises(ClodError, match=r"Adapter.kept is bool \[\d+\], it must be bool with \d+ set"):
             load_adapter(tmp_path / "b")
-
-
-def test_settings_of_an_earlier_version_are_read_as_before(tmp_path: Path) -> None:
-    """It had other defaults, and wrote no reference distance."""
-    save_adapter(tmp_path / "a", adapter())
-    with safe_open(tmp_path / "a", framework="pt") as file:
-        about = json.loads(file.metadata()["clod_adapter"])
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    text = json.dumps(about | {"attenuation": {"scene_distance": 2.5}})
-    save_file(tensors, tmp_path / "b", {"clod_adapter": text})
-    want = AttenuationConfig(tau=1 / 255, cut="hard", scene_distance=2.5, reference_distance=2.5)
-    assert load_adapter(tmp_path / "b").attenuation == want
 
 
 @pytest.mark.parametrize("value", [{1, 2}, torch.ones(1), float("nan"), object()])
@@ -126,7 +114,7 @@ def test_unreadable(tmp_path: Path) -> None:
     with pytest.raises(ClodError, match="Git LFS pointer"):
         load_adapter(tmp_path / "pointer")
     save_file({"a": torch.ones(1)}, tmp_path / "other")
-    with pytest.raises(ClodError, match="no clod-adapter"):
+    with pytest.raises(ClodError, match="not an adapter"):
         load_adapter(tmp_path / "other")
 
 
@@ -160,13 +148,12 @@ def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject) 
         ({"base_sha256": 5}, "base_sha256 is 5"),
         ({"package_version": 1}, "package_version is 1"),
         ({"package_version": "1\n2"}, "printable"),
-        ({"format_version": "x"}, "description is damaged"),
+        ({"format_version": "x"}, "settings are damaged"),
         ({"attenuation": {"tau": 2.0}}, "tau is 2.0"),
-        ({"attenuation": {"new_field": 1}}, "new_field"),
-        ({"attenuation": 3}, "description is damaged"),
-        ({"config": [1]}, "config is .1., not an object"),
+        ({"attenuation": 3}, "settings are damaged"),
+        ({"config": [1]}, "config is .1., not a dict"),
         ({"trimmed": {"sh_degree": "3"}}, "sh_degree is '3', it must be one of 0, 1, 2, 3, 4"),
-        ({"trimmed": [1]}, "description is damaged"),
+        ({"trimmed": [1]}, "settings are damaged"),
     ],
 )
 def test_other_descriptions(tmp_path: Path, change: dict[str, object], message: str) -> None:
@@ -208,7 +195,7 @@ def write_raw(path: Path, header: str, data: bytes = b"") -> Path:
 def test_descriptions_made_to_break_the_reader(tmp_path: Path) -> None:
     for text in ("[" * 100_000, '{"format": ' * 50_000, "1" * 10_000, "nul", '"\\ud800"'):
         path = write_raw(tmp_path / "a", json.dumps({"__metadata__": {"clod_adapter": text}}))
-        with pytest.raises(ClodError, match="description is damaged"):
+        with pytest.raises(ClodError, match="settings are damaged"):
             load_adapter(path)
     odd = {"sigma_d": {"dtype": "a\nb\x1b[2J", "shape": [1], "data_offsets": [0, 4]}}
     with pytest.raises(ClodError) as caught:

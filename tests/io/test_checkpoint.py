@@ -13,37 +13,25 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
-from clod_adapter.adapter import attach, extract
+from clod_adapter.adapter import attach, detach, extract, trim
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io import checkpoint as checkpoint_file
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
-from clod_adapter.io.checkpoint import load, save
+from clod_adapter.io.checkpoint import load, save, trimmed
+from clod_adapter.io.file_formats import write as save_as
+from clod_adapter.io.ply.columns import column_map
+from formats import model
 
 RESTS = (0, 9, 24, 45, 72)
 CONFIG = AttenuationConfig(tau=0.02, eps=1e-7, normalizer="quantile", quantile=1 / 3, max_sv=7.0)
 
 
 def needed(degree: int) -> list[str]:
+    groups = column_map(degree)
     rest = [f"f_rest_{i}" for i in range(RESTS[degree])]
-    names = [
-        "x",
-        "y",
-        "z",
-        "f_dc_0",
-        "f_dc_1",
-        "f_dc_2",
-        "opacity",
-        "scale_0",
-        "scale_1",
-        "scale_2",
-        "rot_0",
-        "rot_1",
-        "rot_2",
-        "rot_3",
-    ]
-    return names[:6] + rest + names[6:]
+    return [*groups["means"], *groups["sh0"], *rest, "opacity", *groups["log_scales"], *groups["quats"]]
 
 
 def make(n: int, names: list[str], seed: int = 0, types: dict[str, str] | None = None) -> np.ndarray:
@@ -183,7 +171,7 @@ def test_sigma_without_header_uses_defaults(tmp_path: Path) -> None:
 @pytest.mark.parametrize("comment", ["tau banana", "tau 7", "normalizer mean", "scene_distance nan"])
 def test_unusable_setting(tmp_path: Path, comment: str) -> None:
     path = write(tmp_path / "in.ply", make(2, [*needed(0), "sigma_d"]), comments=(f"clod_adapter {comment}",))
-    with pytest.raises(ClodError, match="header comment is unusable"):
+    with pytest.raises(ClodError, match="its settings are damaged"):
         load(path)
 
 
@@ -393,10 +381,12 @@ def test_no_gaussians_are_not_written(tmp_path: Path) -> None:
 
 
 def test_a_file_that_goes_away_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write(tmp_path / "in.ply", make(1, needed(0)))
-    gather = checkpoint_file._gather
-    monkeypatch.setattr(checkpoint_file, "_gather", lambda *args: (path.unlink(), gather(*args))[1])
-    with pytest.raises(ClodError, match="in.ply: cannot be read"):
+    """Of a format that a library reads; a PLY is read once (ply/test_body)."""
+    path = tmp_path / "in.safetensors"
+    save_as(path, detach(model(1)))
+    usable = checkpoint_file.usable_rows
+    monkeypatch.setattr(checkpoint_file, "usable_rows", lambda *args: (path.unlink(), usable(*args))[1])
+    with pytest.raises(ClodError, match="in.safetensors: cannot be read"):
         load(path)
 
 
@@ -458,3 +448,23 @@ def test_the_header_names_the_version_that_is_given(tmp_path: Path) -> None:
     base = load(write(tmp_path / "in.ply", make(1, needed(0))))
     save(tmp_path / "out.ply", attach(base.gaussians), base, version="7.8.9")
     assert "comment clod_adapter version 7.8.9" in read_back(tmp_path / "out.ply")[0]
+
+
+@pytest.mark.parametrize("degree", [None, 1, 0])
+@pytest.mark.parametrize("rows", [None, [1, 4, 8]])
+def test_a_trimmed_checkpoint_keeps_its_other_columns(
+    tmp_path: Path, rows: list[int] | None, degree: int | None
+) -> None:
+    checkpoint = load(write(tmp_path / "base.ply", make(9, ["label", *reversed(needed(2))], types={"label": "u1"})))
+    kept = None if rows is None else torch.isin(torch.arange(9), torch.tensor(rows))
+    less = trimmed(checkpoint, kept, degree)
+    want = trim(checkpoint.gaussians, kept, degree)
+    save(tmp_path / "less.ply", less.gaussians, less)
+    found = load(tmp_path / "less.ply")
+    for name, value in want.tensors().items():
+        assert torch.equal(found.gaussians.tensors()[name], value), name
+    assert found.vertex["label"].tolist() == checkpoint.vertex["label"][rows or slice(None)].tolist()
+    names = [name for name in checkpoint.vertex.dtype.names if name in found.vertex.dtype.names]
+    assert list(found.vertex.dtype.names) == names  # in the order of the file
+    assert less.fingerprint == checkpoint.fingerprint
+    assert trimmed(checkpoint, None, None) is checkpoint

@@ -10,7 +10,7 @@ import torch
 
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.io.checkpoint import load
-from clod_adapter.io.writers import write
+from clod_adapter.io.file_formats import write
 from formats import model, splat_transform
 
 

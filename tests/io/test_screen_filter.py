@@ -4,61 +4,25 @@ from __future__ import annotations
 
 import re
 import zlib
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from clod_adapter.adapter import detach, extract
+from clod_adapter.adapter import detach
 from clod_adapter.config import CLASSIC, FILTERS, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.formats.models import load_model
-from clod_adapter.io.formats.spz_reader import load_spz
-from clod_adapter.io.ply.constants import filter_constants, filter_of
-from clod_adapter.io.screen_filter import is_antialiased, likely, parse_words, tagged, words_of
-from clod_adapter.io.writers import write
+from clod_adapter.io.file_formats import write
+from clod_adapter.io.ply.constants import constant_settings, filter_constants
+from clod_adapter.io.screen_filter import implied_filter, is_antialiased, tagged
 from formats import model
 
 OTHER = ScreenFilter(variance=0.123456789, compensate=True)
 SUFFIXES = [".ply", ".glb", ".spz", ".safetensors", ".pt"]
-
-
-@pytest.mark.parametrize("screen_filter", [*FILTERS.values(), OTHER, ScreenFilter(variance=1.0)], ids=str)
-@pytest.mark.parametrize("dial", [True, False])
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_every_format_keeps_it(tmp_path: Path, suffix: str, dial: bool, screen_filter: ScreenFilter) -> None:
-    path, g = tmp_path / f"a{suffix}", model(1).replace(screen_filter=screen_filter)
-    write(path, g if dial else detach(g))
-    found = load(path)
-    assert found.gaussians.screen_filter == screen_filter
-    assert found.filter_known == (dial or screen_filter != CLASSIC)
-    assert suffix == ".ply" or load_model(path).gaussians.screen_filter == screen_filter
-    save(tmp_path / "again.ply", found.gaussians, found)
-    assert load(tmp_path / "again.ply").gaussians.screen_filter == screen_filter
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_nothing_is_written_of_the_usual_one(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"a{suffix}"
-    write(path, model(1))
-    data = path.read_bytes()
-    data = zlib.decompress(data, wbits=31) if suffix == ".spz" else data
-    assert b"screen_filter" not in data and b"SplatRenderMode" not in data and b"compensate" not in data
-
-
-@pytest.mark.parametrize("screen_filter", [FILTERS["mip"], CLASSIC], ids=["mip", "off"])
-def test_an_adapter_brings_its_own(tmp_path: Path, screen_filter: ScreenFilter) -> None:
-    base = detach(model(1))
-    adapted = model(1).replace(screen_filter=screen_filter)
-    save_adapter(tmp_path / "a.safetensors", extract(base, adapted, fingerprint="0", config={}))
-    again = load_adapter(tmp_path / "a.safetensors")
-    assert again.screen_filter == screen_filter
-    assert again.apply(base.replace(screen_filter=FILTERS["on"])).screen_filter == screen_filter
-    assert (b"screen_filter" in (tmp_path / "a.safetensors").read_bytes()) == (screen_filter != CLASSIC)
 
 
 def test_the_comments_of_other_programs_stay_true() -> None:
@@ -75,42 +39,11 @@ def test_antialiased() -> None:
     assert not is_antialiased(["SplatRenderMode: default", "antialiased 0", "not antialiased 1"])
 
 
-def test_what_other_programs_say() -> None:
-    assert likely((), ("x", "y")) == likely(("antialiased 0",), ()) == CLASSIC
-    assert likely((), ("x", "filter_3D")) == FILTERS["mip"]
-    assert likely(("Exported from Brush", "SplatRenderMode: mip"), ()) == FILTERS["mip"]  # Brush's has 0.1 px^2
-    assert likely(("SplatRenderMode: mip",), ()) == likely(("antialiased 1",), ()) == FILTERS["on"]
-
-
-def test_words() -> None:
-    for each in (*FILTERS.values(), OTHER):
-        assert [parse_words(words.split(" ", 1)[1]) for words in words_of(each)] == [each] * (each != CLASSIC)
-
-
-@pytest.mark.parametrize("words", ["", "0.3", "0.3 yes", "x True", "0 True", "nan True", "0.3 True 1"])
-def test_a_damaged_comment_is_named(tmp_path: Path, words: str) -> None:
-    write(tmp_path / "a.ply", model(0).replace(screen_filter=FILTERS["on"]))
-    data = (tmp_path / "a.ply").read_bytes().replace(b"screen_filter 0.3 True", f"screen_filter {words}".encode())
-    (tmp_path / "a.ply").write_bytes(data)
-    with pytest.raises(ClodError, match=r"a.ply: a clod_adapter header comment is unusable"):
-        load(tmp_path / "a.ply")
-
-
-@pytest.mark.parametrize(
-    "entry",
-    ["null", "[]", "{}", '{"variance": 0.3}', '{"variance": "a", "compensate": true}',
-     '{"variance": 0.3, "compensate": 1}', '{"variance": -1, "compensate": true}'],
-)  # fmt: skip
-def test_a_damaged_description_is_named(tmp_path: Path, entry: str) -> None:
-    write(tmp_path / "a.spz", model(0).replace(screen_filter=FILTERS["on"]))
-    data = zlib.decompress((tmp_path / "a.spz").read_bytes(), wbits=31)
-    whole = b'{"compensate": true, "variance": 0.3}'
-    assert whole in data
-    gzip = zlib.compressobj(wbits=31)
-    damaged = gzip.compress(data.replace(whole, entry.ljust(len(whole)).encode()[: len(whole)])) + gzip.flush()
-    (tmp_path / "a.spz").write_bytes(damaged)
-    with pytest.raises(ClodError, match=r"a.spz: "):
-        load_spz(tmp_path / "a.spz")
+def test_what_other_programs_state() -> None:
+    assert implied_filter((), ("x", "y")) == implied_filter(("antialiased 0",), ()) == CLASSIC
+    assert implied_filter((), ("x", "filter_3D")) == FILTERS["mip"]
+    assert implied_filter(("Exported from Brush", "SplatRenderMode: mip"), ()) == FILTERS["mip"]  # Brush's has 0.1 px^2
+    assert implied_filter(("SplatRenderMode: mip",), ()) == implied_filter(("antialiased 1",), ()) == FILTERS["on"]
 
 
 def test_the_flag_of_spz(tmp_path: Path) -> None:
@@ -170,12 +103,13 @@ def test_columns_keep_it_where_comments_are_dropped(tmp_path: Path, screen_filte
     (tmp_path / "a.ply").write_bytes(data)
     found = load(tmp_path / "a.ply")
     assert found.gaussians.screen_filter == screen_filter and found.filter_known and found.comments == ()
-    assert filter_of(filter_constants(screen_filter)) == (screen_filter if screen_filter != CLASSIC else None)
+    stored = constant_settings(filter_constants(screen_filter)).get("screen_filter")
+    assert stored == (asdict(screen_filter) if screen_filter != CLASSIC else None)
     write(tmp_path / "b.ply", detach(found.gaussians))
     assert not any(name.startswith("clod_") for name in load(tmp_path / "b.ply").vertex.dtype.names or ())
 
 
 def test_a_damaged_column_is_named(tmp_path: Path) -> None:
     with_column(tmp_path / "a.ply", model(1), "clod_screen_variance", -1.0)
-    with pytest.raises(ClodError, match=r"a.ply: a clod_adapter column is unusable \(variance is -1.0"):
+    with pytest.raises(ClodError, match=r"a.ply: its settings are damaged \(variance is -1.0"):
         load(tmp_path / "a.ply")

@@ -14,7 +14,7 @@ from clod_adapter.initialization import importance
 from clod_adapter.initialization.importance import removal_error
 from clod_adapter.render import render
 from clod_adapter.training import ablation
-from clod_adapter.training.ablation import band_losses, effect, largest_change, seen
+from clod_adapter.training.ablation import effect, largest_change, seen, sh_degree_losses
 from scenes import capture, gaussians, photograph, ring
 
 LIMIT = 0.02
@@ -35,27 +35,27 @@ def with_bands(base: Gaussians, *sizes: float) -> Gaussians:
 def test_sh_degrees_that_matter_and_that_do_not() -> None:
     truth, cameras = with_bands(gaussians(200, 0, 3), 0.3, 1e-4, 1e-5), ring(4, 48, 36)
     views = photograph(truth, cameras)
-    found = list(band_losses(truth, views, LIMIT))
+    found = list(sh_degree_losses(truth, views, LIMIT))
     assert [degree for degree, _ in found] == [3, 2, 1]
     assert found[0][1] < LIMIT and found[1][1] < LIMIT and found[2][1] > 1
     # From where one matters on, nothing below it is looked at: whether its removal does harm or good.
     strong = with_bands(truth, 0.3, 1e-4, 0.3)
     for photographs in (photograph(strong, cameras), views):
-        ((degree, loss),) = band_losses(strong, photographs, LIMIT)
+        ((degree, loss),) = sh_degree_losses(strong, photographs, LIMIT)
         assert degree == 3 and loss > 1
     # A view that gains makes up for none that loses.
     mixed = (*photograph(strong, cameras[:2]), *photograph(strong.without_bands(2), cameras[2:]))
-    ((_, change),) = band_losses(strong, mixed, LIMIT)
-    of_each = [loss for view in mixed for _, loss in band_losses(strong, [view], LIMIT)]
+    ((_, change),) = sh_degree_losses(strong, mixed, LIMIT)
+    of_each = [loss for view in mixed for _, loss in sh_degree_losses(strong, [view], LIMIT)]
     assert change == pytest.approx(sum(of_each) / 4) and min(of_each) > 1
 
 
 def test_empty_sh_degrees_are_worth_nothing(captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch) -> None:
     base, scene = captured
-    assert dict(band_losses(with_bands(base, 0.3, 0, 0), scene.train, LIMIT)).keys() == {1, 2, 3}
+    assert dict(sh_degree_losses(with_bands(base, 0.3, 0, 0), scene.train, LIMIT)).keys() == {1, 2, 3}
     monkeypatch.setattr(ablation, "render", lambda *_: pytest.fail("rendered for nothing"))
-    assert list(band_losses(with_bands(base, 0, 0, 0), scene.train, LIMIT)) == [(3, 0.0), (2, 0.0), (1, 0.0)]
-    assert list(band_losses(base.without_bands(0), scene.train, LIMIT)) == []
+    assert list(sh_degree_losses(with_bands(base, 0, 0, 0), scene.train, LIMIT)) == [(3, 0.0), (2, 0.0), (1, 0.0)]
+    assert list(sh_degree_losses(base.without_bands(0), scene.train, LIMIT)) == []
 
 
 def hidden() -> tuple[Gaussians, Scene, torch.Tensor]:
@@ -86,7 +86,7 @@ def test_seen_is_what_changes_a_pixel_when_it_is_removed(monkeypatch: pytest.Mon
     monkeypatch.setattr(ablation, "MOST_VIEWS", most_views)
     told: list[tuple[int, int]] = []
     error = removal_error(base, importance.spread(scene.train, most_views))
-    found = seen(base, scene.train, error, 0, lambda done, total: told.append((done, total)))
+    found = seen(base, scene.train, error, 0, lambda now: told.append((now.done, now.total)))
     assert found.tolist() == matters.tolist()
     assert not found[24:46].any() and found[:24].all() and found[46:].any()
     assert most_views > 2 or ((error > 0).sum() < found.sum() and told == [(k, 4) for k in range(1, 5)])

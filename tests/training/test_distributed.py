@@ -40,13 +40,13 @@ def test_one_alone_exchanges_with_itself(peers: ProcessGroup) -> None:
 def test_adapting_alone_changes_no_bit(peers: ProcessGroup) -> None:
     base, scene = capture(n=60, views=4)
     config = AdaptConfig(iters=3, batch=2)
-    want, found = adapt(base, scene, config), adapt(base, scene, config, peers=peers)
+    want, found = adapt(base, scene, config), adapt(base, scene, config, group=peers)
     for name, tensor in want.gaussians.tensors().items():
         assert torch.equal(found.gaussians.tensors()[name], tensor), name
     assert found.waiting > 0 and want.waiting == want.exchanging == 0 and found.lost is None
     peers.size = 3
     with pytest.raises(ClodError, match="batch is 2, it must be at least 3, a view for each of the processes"):
-        adapt(base, scene, config, peers=peers)
+        adapt(base, scene, config, group=peers)
 
 
 def test_what_is_sent_arrives() -> None:
@@ -66,7 +66,7 @@ def test_what_is_sent_arrives() -> None:
 
 def test_a_loss_is_told_from_other_errors() -> None:
     with (
-        pytest.raises(ProcessLost, match=r"gone \(Connection closed by peer \[127.0.0.1\]:1\)$"),
+        pytest.raises(ProcessLost, match=r"ended \(Connection closed by peer \[127.0.0.1\]:1\)$"),
         distributed._losses(),
     ):
         raise RuntimeError("[/a/b/pair.cc:547] Connection closed by peer [127.0.0.1]:1. This may be caused by\nmore")

@@ -25,10 +25,12 @@ from clod_adapter.initialization import importance
 from clod_adapter.initialization.importance import initialize, scene_distance
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.losses import photometric_loss
+from clod_adapter.progress import Phase, Progress, Stopped
 from clod_adapter.render import render, splat
-from clod_adapter.training import loop, objective
-from clod_adapter.training.loop import Adapted, Progress, TrainingState, adapt
+from clod_adapter.training import objective
+from clod_adapter.training.loop import Adapted, TrainingState, adapt
 from clod_adapter.training.objective import TrainableSubset
+from clod_adapter.training.trainer import Trainer
 from scenes import capture, gaussians, photograph, ring
 
 SCALES = (1.0, 1.5, 2.0, 3.0, 5.0)
@@ -67,7 +69,7 @@ def test_pictures_get_better(captured: tuple[Gaussians, Scene], trained: tuple[A
         rows = zip(evaluate(before, views, SCALES), evaluate(trained[0].gaussians, views, SCALES), strict=True)
         for old, new in rows:
             assert new.psnr > old.psnr + 0.5, f"s {new.virtual_scale}"
-    losses = [p.loss for p in trained[1] if p.phase == "train"]
+    losses = [p.loss for p in trained[1] if p.phase == Phase.TRAINING]
     assert losses[-1] < 0.7 * losses[0]
 
 
@@ -111,14 +113,17 @@ def captured_views(captured: tuple[Gaussians, Scene]):
 def test_progress_is_reported(captured: tuple[Gaussians, Scene], trained: tuple[Adapted, list[Progress]]) -> None:
     result, seen = trained
     views, n = len(captured[1].train), len(captured[0])
-    begun = [p for p in seen if p.phase != "train"]
+    begun = [p for p in seen if p.phase != Phase.TRAINING]
     counts = [(p.phase, p.done, p.total) for p in begun]
-    assert counts[:views] == [("start", k + 1, views) for k in range(views)]
-    assert all(c[0] == "order" and c[2] == n for c in counts[views:]) and counts[-1] == ("order", n, n)
+    assert counts[:views] == [(Phase.IMPORTANCE, k + 1, views) for k in range(views)]
+    assert all(c[0] == Phase.PRUNING_ORDER and c[2] == n for c in counts[views:]) and counts[-1] == (
+        Phase.PRUNING_ORDER,
+        n,
+        n,
+    )
     steps = seen[len(begun) :]
-    assert [(p.phase, p.done, p.total) for p in steps] == [("train", k + 1, 120) for k in range(120)]
+    assert [(p.phase, p.done, p.total) for p in steps] == [(Phase.TRAINING, k + 1, 120) for k in range(120)]
     assert all(a.share < b.share and a.seconds <= b.seconds for a, b in zip(steps, steps[1:], strict=False))
-    assert all(a.seconds <= b.seconds for a, b in zip(begun, begun[1:], strict=False))
     assert begun[-1].share == steps[-1].share == 1
     assert all(p.loss != p.loss for p in begun) and all(p.loss > 0 for p in steps)
     assert result.steps == 120 and not result.interrupted and result.seconds > 0 and result.start_seconds > 0
@@ -168,7 +173,7 @@ def test_continues_from_a_sigma(captured: tuple[Gaussians, Scene], trained: tupl
     first, seen = trained[0].gaussians, []
     config = config_of(iters=1, max_sv=3.0)
     result = adapt(first, captured[1], config, seen.append)
-    assert [p.phase for p in seen] == ["train"]
+    assert [p.phase for p in seen] == [Phase.TRAINING]
     moved = (result.gaussians.sigma_d / first.sigma_d).log().abs()
     assert moved.max() <= 1.01e-2  # a step of log sigma
     assert result.gaussians.attenuation == replace(first.attenuation, max_sv=3.0)
@@ -198,8 +203,8 @@ def test_rows_that_are_only_drawn_keep_their_units_when_resumed(
     settings = AttenuationConfig(scene_distance=distance, reference_distance=4.0)
     base = attach(base, torch.linspace(0.3, 3, len(base)) * 4 / distance, settings)
     part, states = TrainableSubset(len(base) // 2), dict[int, TrainingState]()
-    whole = adapt(base, scene, config_of(iters=4), states_of({2}, states), part=part)
-    again = adapt(base, scene, config_of(iters=4), None, states[2], part=part)
+    whole = adapt(base, scene, config_of(iters=4), states_of({2}, states), subset=part)
+    again = adapt(base, scene, config_of(iters=4), None, states[2], subset=part)
     assert_equal(again.gaussians, whole.gaussians)
     rest = slice(len(base) // 2, None)
     torch.testing.assert_close(whole.gaussians.sigma_d[rest], base.sigma_d[rest] * distance)
@@ -303,7 +308,12 @@ def test_every_picture_has_the_filter_of_the_checkpoint(
     for module in (objective, importance):
         monkeypatch.setattr(module, "splat", lambda g, *rest: seen.add(g.screen_filter) or splat(g, *rest))
     shown = []
-    result = adapt(base, captured[1], config_of(iters=4), lambda now: shown.append(now.gaussians().screen_filter))
+    result = adapt(
+        base,
+        captured[1],
+        config_of(iters=4),
+        lambda now: shown.append(now.gaussians().screen_filter) if now.gaussians else None,
+    )
     assert seen == set(shown) == {result.gaussians.screen_filter} == {FILTERS["mip"]}
 
 
@@ -344,7 +354,7 @@ def test_a_batch_sums_what_its_views_ask(captured: tuple[Gaussians, Scene]) -> N
         scene.train[:2],
         config_of(batch=2, sampling="pair"),
     )
-    run = loop._Run(begun, views, config, None)
+    run = Trainer(begun, views, config)
     draws = [(view, [1.0, 2.0]) for view in views]
     one, two = (run.objective.gradient_sum(run.parameters, [draw]) for draw in draws)
     both = run.objective.gradient_sum(run.parameters, draws)
@@ -354,7 +364,7 @@ def test_a_batch_sums_what_its_views_ask(captured: tuple[Gaussians, Scene]) -> N
     before = run.parameters["sh0"].clone()
     run.step(0.0)
     longest = (run.parameters["sh0"] - before).abs().max()
-    assert longest == pytest.approx(2**0.5 * config.lr_sh0, rel=1e-2) and run.draws.order == []
+    assert longest == pytest.approx(2**0.5 * config.lr_sh0, rel=1e-2) and run.sampler.order == []
 
 
 def test_only_the_first_rows_are_trained(captured: tuple[Gaussians, Scene]) -> None:
@@ -368,13 +378,13 @@ def test_only_the_first_rows_are_trained(captured: tuple[Gaussians, Scene]) -> N
             states.append(copy.deepcopy(progress.state()))
 
     config = config_of(iters=20, average=0.5)
-    found = adapt(begun, scene, config, keep, part=TrainableSubset(few)).gaussians
+    found = adapt(begun, scene, config, keep, subset=TrainableSubset(few)).gaussians
     for name, value in found.tensors().items():
         rounding = 1e-6 if name == "sigma_d" else 0.0  # its logarithm is what training holds
         torch.testing.assert_close(value[few:], begun.tensors()[name][few:], rtol=rounding, atol=0.0)
         assert not torch.equal(value[:few], begun.tensors()[name][:few]), name
-    assert_equal(adapt(begun, scene, config, None, states[0], part=TrainableSubset(few)).gaussians, found)
-    without = adapt(begun.select(torch.arange(few)), scene, config, part=TrainableSubset(few)).gaussians
+    assert_equal(adapt(begun, scene, config, None, states[0], subset=TrainableSubset(few)).gaussians, found)
+    without = adapt(begun.select(torch.arange(few)), scene, config, subset=TrainableSubset(few)).gaussians
     assert not torch.equal(without.sh0, found.sh0[:few])
 
 
@@ -424,7 +434,7 @@ def test_the_outcome_is_the_mean_of_the_last_steps(
     seen: list[Gaussians] = []
 
     def keep(progress: Progress) -> None:
-        if progress.phase == "train":
+        if progress.phase == Phase.TRAINING:
             now = progress.gaussians()
             seen.append(now.replace(**{name: value.clone() for name, value in now.tensors().items()}))
 
@@ -442,19 +452,40 @@ def test_a_time_budget_ends_it(captured: tuple[Gaussians, Scene]) -> None:
     assert adapt(*captured, config_of(iters=3, time_budget=60.0)).steps == 3
 
 
-def test_an_interrupt_returns_what_there_is(captured: tuple[Gaussians, Scene]) -> None:
+def test_a_listener_that_stops_returns_the_result_so_far(captured: tuple[Gaussians, Scene]) -> None:
     states = []
 
-    def stop(p: Progress) -> None:
-        if p.phase == "train":
+    def stop(p: Progress) -> bool:
+        if p.phase == Phase.TRAINING:
             states.append({name: value.clone() for name, value in p.gaussians().tensors().items()})
-            if p.done == 5:
-                raise KeyboardInterrupt
+        return p.done != 5 or p.phase != Phase.TRAINING
 
     result = adapt(*captured, config_of(iters=50), stop)
-    assert result.interrupted and result.steps == 5
+    assert result.interrupted and not result.signalled and result.steps == 5
     for name, value in result.gaussians.tensors().items():
         assert torch.equal(value, states[-1][name]) and value.isfinite().all() and not value.requires_grad, name
+
+
+@pytest.mark.parametrize("phase", [Phase.IMPORTANCE, Phase.PRUNING_ORDER])
+def test_a_listener_that_stops_before_training(captured: tuple[Gaussians, Scene], phase: Phase) -> None:
+    with pytest.raises(Stopped):
+        adapt(*captured, config_of(iters=5), lambda now: now.phase != phase)
+
+
+def test_an_update_that_fails_leaves_no_state_to_save(
+    captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its parameters are of no whole step."""
+    seen: list[Progress] = []
+
+    def fail(*_: Any) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("clod_adapter.training.trainer.add_to_mean", fail)
+    with pytest.raises(MemoryError):
+        adapt(*captured, config_of(iters=6, average=0.5), seen.append)
+    with pytest.raises(ClodError, match="failed while it updated the parameters"):
+        seen[-1].state()
 
 
 def states_of(steps: set[int], found: dict[int, TrainingState]) -> Callable[[Progress], None]:
@@ -502,7 +533,7 @@ def test_a_resumed_run_ends_with_the_same_bits(captured: tuple[Gaussians, Scene]
         assert_equal(again.gaussians, whole.gaussians)
         assert (again.steps, again.interrupted, again.start_seconds) == (12, False, whole.start_seconds), steps
         assert again.seconds > state.seconds
-    assert {p.phase for p in seen} == {"train"} and [p.done for p in seen[:11]] == list(range(2, 13))
+    assert {p.phase for p in seen} == {Phase.TRAINING} and [p.done for p in seen[:11]] == list(range(2, 13))
     later: dict[int, TrainingState] = {}
     adapt(base, scene, config, states_of({11}, later), copy.deepcopy(states[6]))
     assert {name: later[11].tensors[name].equal(value) for name, value in states[11].tensors.items()} == dict.fromkeys(
@@ -544,9 +575,7 @@ def test_a_state_of_something_else_is_refused(captured: tuple[Gaussians, Scene])
     for impossible in (
         {"tensors": damaged}, {"steps": 0}, {"averaged": -1}, {"averaged": 9}, {"seconds": math.nan}, {"seconds": -1.0},
     ):  # fmt: skip
-        with pytest.raises(
-            ClodError, match="steps or seconds that cannot be|steps.* that cannot be|of other Gaussians"
-        ):
+        with pytest.raises(ClodError, match="impossible counts|impossible values of steps|of other Gaussians"):
             adapt(base, scene, config, None, replace(state, **impossible))
     for name, value in (
         ("parameter.means", math.nan), ("parameter.opacity_logits", math.inf), ("first.sh0", math.inf),
@@ -554,7 +583,7 @@ def test_a_state_of_something_else_is_refused(captured: tuple[Gaussians, Scene])
     ):  # fmt: skip
         tensors = {n: t.clone() for n, t in state.tensors.items()}
         tensors[name][7] = value
-        with pytest.raises(ClodError, match="the training state.*; start afresh"):
+        with pytest.raises(ClodError, match="the training state.*; start over"):
             adapt(base, scene, config, None, replace(state, tensors=tensors))
     for broken in ({}, {**state.random, "state": {"state": -1, "inc": "x"}}):
         with pytest.raises(ClodError, match="random state is damaged"):
@@ -670,7 +699,7 @@ def test_a_loss_that_is_not_finite_ends_training_before_its_step(
         result = adapt(*captured, config, watch)
     assert result.steps == 4 and result.interrupted and result.lost is None
     assert re.fullmatch(r"the loss of step 5 is not finite \(view_\d.png\)", result.failed)
-    assert [p.done for p in told if p.state] == [1, 2, 3, 4, 4] and told[-1].lost == result.failed
+    assert [p.done for p in told if p.state] == [1, 2, 3, 4, 4] and told[-1].error == result.failed
     assert all(value.isfinite().all() for value in result.gaussians.tensors().values())
     assert_equal(adapt(*captured, config, None, states[4]).gaussians, whole)
 
@@ -686,8 +715,8 @@ def test_an_error_is_told_with_the_state_before_it(
         raise ZeroDivisionError("in a rasterizer")
 
     def watch(progress: Progress) -> None:
-        lost.append(progress.lost)
-        if progress.lost:
+        lost.append(progress.error)
+        if progress.error:
             states[progress.done] = copy.deepcopy(progress.state())
 
     with monkeypatch.context() as patch:

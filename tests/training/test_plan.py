@@ -16,9 +16,10 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize, removal_error
+from clod_adapter.progress import Phase, Progress, Stopped
 from clod_adapter.render import render
 from clod_adapter.training import planner
-from clod_adapter.training.loop import Progress, adapt
+from clod_adapter.training.loop import adapt
 from clod_adapter.training.objective import Objective
 from clod_adapter.training.plan import NAMES, RATES, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
@@ -64,18 +65,20 @@ def test_where_all_is_needed_training_is_what_it_was(captured: tuple[Gaussians, 
     base, scene = captured
     plan = make_plan(base, scene, CONFIG)
     assert set(verdicts(plan).values()) == {"kept", "trained"} and plan.kept is None
-    assert [state.steps for state in plan.begun] == [6] and plan.config == CONFIG
+    assert plan.begun.steps == 6 and plan.config == CONFIG
     steps: list[int] = []
-    begun = weakref.ref(plan.begun[0])
+    begun, states, freed = weakref.ref(plan.begun), [plan.begun], replace(plan, begun=None)
+    again = plan.adapt(scene)
+    del plan
 
     def follow(now: Progress) -> None:
         steps.append(now.done)
         assert begun() is None  # its tensors are not held twice while training runs
 
-    planned = plan.adapt(scene, follow)
+    planned = freed.adapt(scene, follow, states.pop())
     assert steps == list(range(7, 41)) and planned.steps == 40
-    assert_equal(plan.whole(base, planned.gaussians), adapt(base, scene, CONFIG).gaussians)
-    assert not plan.begun and plan.adapt(scene).steps == 40  # and from the beginning the next time
+    assert_equal(freed.whole(base, planned.gaussians), adapt(base, scene, CONFIG).gaussians)
+    assert_equal(again.gaussians, planned.gaussians)  # a plan can be used again
 
 
 def test_the_same_plan_again(captured: tuple[Gaussians, Scene]) -> None:
@@ -119,27 +122,27 @@ def test_bands_both_ways(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     faint = base.replace(shN=1e-5 * base.shN)
     plan = make_plan(faint, scene, CONFIG)
-    assert verdicts(plan)["SH band 1"] == "left out" and plan.sh_degree == 0
+    assert verdicts(plan)["SH degree 1"] == "left out" and plan.sh_degree == 0
     lean = plan.adapt(scene).gaussians
     assert lean.sh_degree == 0 and torch.equal(plan.whole(faint, lean).shN, faint.shN)
-    assert plan.trims(faint) and plan.bound(faint, scene).number == pytest.approx(0, abs=0.02)
+    assert plan.trims(faint) and plan.trimming_effect(faint, scene).number == pytest.approx(0, abs=0.02)
     plan = make_plan(base, scene, CONFIG)
-    assert verdicts(plan)["SH band 1"] == "kept" and plan.sh_degree == 1 and not plan.trims(base)
+    assert verdicts(plan)["SH degree 1"] == "kept" and plan.sh_degree == 1 and not plan.trims(base)
 
 
 def test_empty_bands_are_one_line(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     empty = base.replace(shN=torch.zeros(len(base), 15, 3))
     plan = make_plan(empty, scene, CONFIG, Override(keep=ALL - {"bands"}))
-    assert plan.decisions[0].what == "SH band 1 to 3" and plan.decisions[0].number == 0 and plan.sh_degree == 0
+    assert plan.decisions[0].what == "SH degree 1 to 3" and plan.decisions[0].number == 0 and plan.sh_degree == 0
     assert not any("SH" in decision.what for decision in plan.decisions[1:])
 
 
-@pytest.mark.parametrize("overrule", [Override(), Override(keep=ALL), Override(leave_out=frozenset({"bands"}))])
-def test_no_bands_are_neither_kept_nor_left_out_as_asked(captured: tuple[Gaussians, Scene], overrule: Override) -> None:
+@pytest.mark.parametrize("override", [Override(), Override(keep=ALL), Override(leave_out=frozenset({"bands"}))])
+def test_no_bands_are_neither_kept_nor_left_out_as_asked(captured: tuple[Gaussians, Scene], override: Override) -> None:
     base, scene = captured
-    plan = make_plan(base.without_bands(0), scene, CONFIG, overrule)
-    assert plan.decisions[0] == Decision("SH bands", "left out", None, "", "there are none")
+    plan = make_plan(base.without_bands(0), scene, CONFIG, override)
+    assert plan.decisions[0] == Decision("SH degrees", "left out", None, "", "there are none")
 
 
 def test_tuned_bands_come_back_in_their_place(captured: tuple[Gaussians, Scene]) -> None:
@@ -174,17 +177,17 @@ def test_a_short_time_budget_is_not_spent_on_judging(captured: tuple[Gaussians, 
     """What was done of it is gone on from."""
     base, scene = captured
     plan = make_plan(base, scene, replace(CONFIG, time_budget=1e-4))
-    assert [state.steps for state in plan.begun] == [1] and not plan.frozen
+    assert plan.begun.steps == 1 and not plan.frozen
     assert plan.adapt(scene).steps == 1
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_decision_can_be_overruled(
+def test_each_decision_can_be_overridden(
     captured: tuple[Gaussians, Scene], name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     base, scene = with_unseen(captured[0])[0], captured[1]
-    for measure in ("band_losses", "effect"):
-        monkeypatch.setattr(planner, measure, lambda *_: pytest.fail("measured what is settled"))
+    for measure in ("sh_degree_losses", "effect"):
+        monkeypatch.setattr(planner, measure, lambda *_: pytest.fail("measured a fixed decision"))
     kept = make_plan(base, scene, CONFIG, Override(keep=ALL))
     assert kept.kept is None and kept.sh_degree == 1 and kept.frozen == () and not kept.begun
     gone = make_plan(base, scene, CONFIG, Override(ALL - {name}, frozenset({name})))
@@ -192,13 +195,13 @@ def test_each_decision_can_be_overruled(
     assert (gone.frozen, gone.sh_degree, gone.kept is not None) == expected
     (verdict,) = {decision.verdict for decision in gone.decisions if decision.name == name}
     assert verdict == ("frozen" if name in RATES else "left out")
-    assert all(decision.why.startswith("as asked") for decision in gone.decisions if decision.name != "unseen")
+    assert all(decision.why.startswith("as requested") for decision in gone.decisions if decision.name != "unseen")
 
 
 def test_misuse() -> None:
-    with pytest.raises(ClodError, match=r"'colour' is nothing that a plan decides; it decides bands, unseen, means"):
+    with pytest.raises(ClodError, match=r"'colour' is not part of a plan; the names are bands, unseen, means"):
         Override(keep=frozenset({"colour"}))
-    with pytest.raises(ClodError, match="'quats' is to be both kept and left out"):
+    with pytest.raises(ClodError, match="'quats' is both kept and left out"):
         Override(frozenset({"quats", "bands"}), frozenset({"quats"}))
     base, scene = capture(20)
     with pytest.raises(ClodError, match="no training views"):
@@ -222,7 +225,7 @@ def test_a_start_with_which_none_leave_leaves_none_out(captured: tuple[Gaussians
     base, before = with_unseen(captured[0])
     config = replace(CONFIG, start=begin)
     plan = make_plan(base, captured[1], config, Override(keep=ALL - {"unseen"}))
-    assert plan.kept is None and plan.decisions[1].name == "unseen" and "not looked for" in plan.decisions[1].why
+    assert plan.kept is None and plan.decisions[1].name == "unseen" and "not measured" in plan.decisions[1].why
     asked = make_plan(base, captured[1], config, Override(ALL - {"unseen"}, frozenset({"unseen"})))
     assert asked.kept is not None and not asked.kept[~before].any()
 
@@ -241,14 +244,12 @@ def test_what_reading_left_out_is_told(captured: tuple[Gaussians, Scene]) -> Non
     assert plan.decisions[-1] == Decision("undistortion", "left out", None, "", "the cameras are pinholes")
 
 
-@pytest.mark.parametrize("phase", ["bands", "start", "order", "probe"])
-def test_an_interrupt_ends_the_plan(captured: tuple[Gaussians, Scene], phase: str) -> None:
-    def follow(now: Progress) -> None:
-        if now.phase == phase:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        make_plan(*captured, CONFIG, progress=follow)
+@pytest.mark.parametrize("phase", [Phase.SH_DEGREES, Phase.IMPORTANCE, Phase.PRUNING_ORDER, Phase.FIRST_STEPS])
+def test_a_listener_ends_the_plan(captured: tuple[Gaussians, Scene], phase: Phase) -> None:
+    with pytest.raises(Stopped):
+        make_plan(*captured, CONFIG, progress=lambda now: now.phase != phase)
+    with pytest.raises(Stopped):  # at the last step of the phase
+        make_plan(*captured, CONFIG, progress=lambda now: now.phase != phase or now.done < now.total)
 
 
 def test_a_probe_that_fails_leaves_the_failure_to_the_training(
@@ -274,10 +275,10 @@ def test_going_on_with_what_was_frozen(captured: tuple[Gaussians, Scene], monkey
     first = make_plan(base, scene, config, Override(leave_out=frozenset({"means"})))
     states: list[Any] = []
 
-    def stop(now: Progress) -> None:
-        if now.phase == "train" and now.done == 25 and now.state is not None:
+    def stop(now: Progress) -> bool:
+        if now.done == 25 and now.state is not None:
             states.append(now.state())
-            raise KeyboardInterrupt
+        return now.done < 25
 
     first.adapt(scene, stop)
     monkeypatch.setattr(planner, "effect", lambda *_: pytest.fail("judged again"))

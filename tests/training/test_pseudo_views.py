@@ -49,7 +49,7 @@ def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
 
 def test_cameras_are_proper_and_see_the_scene(blob: clod.Gaussians) -> None:
     told: list[tuple[int, int]] = []
-    cameras = place_cameras(blob, views=12, progress=lambda *at: told.append(at))
+    cameras = place_cameras(blob, views=12, progress=lambda now: told.append((now.done, now.total)))
     assert told[-1][0] == told[-1][1] == len(told)
     assert len(cameras) == 12 and len({c.name for c in cameras}) == 12
     for camera in cameras:
@@ -91,13 +91,11 @@ def test_the_images_are_the_checkpoints_own(blob: clod.Gaussians, with_dial: boo
     own, cameras, told = blob, scenes.ring(9, 40, 30), []
     if with_dial:
         own = clod.attach(blob, torch.full((len(blob),), 0.3), clod.AttenuationConfig(scene_distance=4.0))
-    scene = render_pseudo_views(own, cameras, progress=lambda *at: told.append(at))
+    scene = render_pseudo_views(own, cameras, progress=lambda now: told.append((now.done, now.total)))
     assert [view.camera for view in scene.test] == [cameras[0], cameras[8]] and len(scene.train) == 7
     image, plain = ((clod.render(g, cameras[1]).image.clamp(0, 1) * 255).round().byte() for g in (own, blob))
     assert torch.equal(scene.train[0].image, image) and torch.equal(image, plain) != with_dial
-    assert "7 placed cameras to train on, 2 held out, 40x30" in scene.notes[0] and told == [
-        (k, 9) for k in range(1, 10)
-    ]
+    assert "7 pseudo views to train on, 2 held out, 40x30" in scene.notes[0] and told == [(k, 9) for k in range(1, 10)]
     assert render_pseudo_views(own, cameras[:1]).test == ()
 
 
@@ -124,7 +122,7 @@ def test_few_photographs_get_pseudo_views(blob: clod.Gaussians) -> None:
     assert lighter.lr_means == config.lr_means / 2 and lighter.lr_sigma == config.lr_sigma
     faint = blob.replace(opacity_logits=torch.full((len(blob),), -4.6))  # too faint to place a camera by
     scene, lighter = add_pseudo_views(faint, clod.Scene(views[:2], ()), config)
-    assert scene.train == views[:2] and "none of the checkpoint's own pictures can be added" in scene.notes[-1]
+    assert scene.train == views[:2] and "no pseudo views can be added" in scene.notes[-1]
     assert clod.adapt(faint, scene, lighter).steps == 1
 
 

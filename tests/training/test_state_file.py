@@ -79,6 +79,6 @@ def test_files_that_are_no_state_are_refused(tmp_path: Path, state: TrainingStat
 
 
 def assert_refused(path: Path) -> None:
-    with pytest.raises(ClodError, match="is no training state or damaged") as caught:
+    with pytest.raises(ClodError, match="is not a training state or is damaged") as caught:
         load_state(path)
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)

@@ -72,7 +72,10 @@ def test_more_gaussians_than_16_bits_count(show: Any, files: Any) -> None:
 
 def test_a_dial_beyond_the_trained_is_said(files: Any, gaussians: Gaussians) -> None:
     path = str(files.save(gaussians))
-    for sv, said in (("5", []), ("9", ["the page's dial ends at s = 5, as far as was trained for, and opens there"])):
+    for sv, said in (
+        ("5", []),
+        ("9", ["the page's dial ends at s = 5, the largest value trained for, and opens there"]),
+    ):
         assert prepare(build_parser("view").parse_args([path, "--sv", sv]), Console(quiet=True))[1]["notes"] == said
 
 

@@ -13,7 +13,7 @@ import clod_adapter
 import scenes
 from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.writers import write
+from clod_adapter.io.file_formats import write
 from clod_adapter.render import render
 from shown import Shown, assert_same, drop
 

@@ -1,18 +1,20 @@
-"""Gaussians as numpy arrays: checked before they are written, made into Gaussians after they are read."""
+"""Gaussians as numpy arrays, checked before writing and after reading; conversions of their values."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
+from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import check_target
-from clod_adapter.io.regular import refuse_irregular
+from clod_adapter.io.settings import Metadata
+from clod_adapter.io.sniff import refuse_irregular
 
 _TINY = float(np.finfo(np.float32).tiny)
 # The axes in which each spherical harmonic is odd, in the order of ``Gaussians.shN``.
@@ -25,7 +27,7 @@ _ODD = (
 
 
 def arrays_of(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """The float32 arrays of ``Gaussians.tensors``, fit to be written to ``path``.
+    """The float32 arrays of ``Gaussians.tensors``, checked for writing.
 
     Raises:
         ClodError: there are none, a value is not finite (opacity = +inf aside), a rotation is zero, or the target
@@ -47,12 +49,7 @@ def arrays_of(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
     return arrays
 
 
-def gaussians_of(
-    path: Path,
-    arrays: Mapping[str, np.ndarray],
-    attenuation: AttenuationConfig | None,
-    screen_filter: ScreenFilter = CLASSIC,
-) -> Gaussians:
+def gaussians_of(path: Path, arrays: Mapping[str, np.ndarray], metadata: Metadata) -> Gaussians:
     """Gaussians of the arrays, as float32.
 
     Raises:
@@ -61,16 +58,17 @@ def gaussians_of(
     tensors = {name: torch.from_numpy(np.array(array, np.float32, order="C")) for name, array in arrays.items()}
     if not all(tensor.ndim and len(tensor) for tensor in tensors.values()):
         raise ClodError(f"{path}: has no Gaussians in it; export it again")
+    screen_filter = metadata.screen_filter or CLASSIC
     try:
-        return Gaussians(**tensors, attenuation=attenuation, screen_filter=screen_filter)
+        return Gaussians(**tensors, attenuation=metadata.attenuation, screen_filter=screen_filter)
     except ClodError as error:
         raise ClodError(f"{path}: {error}; export it again") from error
 
 
 def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarray]:
-    """The same Gaussians turned half way round ``x`` or ``z``, between axes with y down and with y up.
+    """The Gaussians under a half turn about ``x`` or ``z``, between axes with y down and with y up.
 
-    Exact, and undone by itself. With ``P`` the turn (two signs), means become ``P mu``, rotations ``P R P``, which
+    Exact, and its own inverse. With ``P`` the turn (two signs), means become ``P mu``, rotations ``P R P``, which
     gives the same ellipsoids, and harmonics change sign where they are odd in an odd number of the axes that flip.
     """
     signs = {name: np.float32(1 if name == axis else -1) for name in "xyz"}
@@ -117,28 +115,33 @@ def scales_of(path: Path, log_scales: np.ndarray) -> np.ndarray:
 
 
 def logs_of(scales: np.ndarray) -> np.ndarray:
-    """The inverse of ``scales_of``, in float64; of what is 0 or less, that of the least number."""
+    """The inverse of ``scales_of``, in float64; values of 0 or less are read as float32's smallest number."""
     with np.errstate(invalid="ignore"):  # a NaN that signals
         return np.log(np.maximum(scales.astype(np.float64), _TINY))
 
 
 def colours_of(sh0: np.ndarray, opacities: np.ndarray) -> np.ndarray:
-    """``[N, 4]`` uint8 RGBA, as seen without the higher harmonics."""
+    """``[N, 4]`` uint8 RGBA of SH degree 0."""
     colours = 0.5 + SH_C0 * sh0.reshape(-1, 3).astype(np.float64)
     return bytes_of(255 * np.concatenate([colours, opacities[:, None]], 1))
 
 
 def bytes_of(values: np.ndarray) -> np.ndarray:
-    """The nearest of 0 to 255."""
+    """Rounded to 0 to 255."""
     return np.clip(np.round(values), 0, 255).astype(np.uint8)
 
 
 def logits_of_bytes(levels: np.ndarray) -> np.ndarray:
-    """Logits of opacities in 255ths; the first and the last are taken at a quarter of a level from 0 and 1.
+    """Logits of opacities in 255ths; the first and last level are read as a quarter of a level from 0 and 1.
 
-    All that is nearer to 0 or 1 was rounded to them, and no reader is given infinite values.
+    So no logit is infinite.
     """
     return logit(np.clip(levels.astype(np.float64), 0.25, 254.75) / 255)
+
+
+def sha256_of(data: bytes) -> str:
+    """SHA-256, hex."""
+    return hashlib.sha256(data).hexdigest()
 
 
 def read_whole(path: Path) -> bytes:

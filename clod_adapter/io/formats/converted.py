@@ -1,4 +1,4 @@
-"""Formats that splat-transform reads, PlayCanvas's converter: through it, where it is installed."""
+"""Formats that splat-transform, PlayCanvas's converter, reads: through it, where it is installed."""
 
 from __future__ import annotations
 
@@ -6,25 +6,21 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from clod_adapter.errors import ClodError
+from clod_adapter.io.file_formats import Model
 from clod_adapter.io.formats.splat_transform import SplatTransform
-from clod_adapter.io.ply.body import read_element
-from clod_adapter.io.ply.columns import sh_degree_of
-from clod_adapter.io.ply.header import read_head
-from clod_adapter.io.regular import read_start
-from clod_adapter.io.rows import Rows
-from clod_adapter.io.sniff import refuse_known
+from clod_adapter.io.sniff import read_start, refuse_known
 
 LIMIT_S = 1800.0  # five million Gaussians take about a minute
 
 
 def check_converted(path: Path, version: str = "") -> SplatTransform:
-    """What reads it; refuses no file, something else whatever its name, and what cannot be converted here.
+    """The converter; refuses a file that is something else, or that cannot be converted here.
 
     Args:
-        version: of the format, where only one is read in this way.
+        version: of the format, where only one version is read in this way.
 
     Raises:
-        ClodError: it is, or splat-transform is not here, or too old.
+        ClodError: the file is something else, or splat-transform is missing or too old.
     """
     refuse_known(path, read_start(path))
     try:
@@ -36,21 +32,26 @@ def check_converted(path: Path, version: str = "") -> SplatTransform:
         ) from error
 
 
-def read_converted(path: Path) -> Rows:
-    """The Gaussians that splat-transform makes a PLY of.
+def load_converted(path: Path, version: str = "") -> Model:
+    """The Gaussians of the PLY that splat-transform converts the file to; ``version`` as in ``check_converted``.
 
     Raises:
-        ClodError: it is not here, or cannot read the file.
+        ClodError: splat-transform is missing, or cannot read the file.
     """
-    tool = check_converted(path)
+    from clod_adapter.io.formats.arrays import gaussians_of  # here: check_converted needs no torch
+    from clod_adapter.io.ply.columns import column_map, in_shape, read_table
+    from clod_adapter.io.ply.rows import read_ply
+    from clod_adapter.io.settings import Metadata
+
+    tool = check_converted(path, version)
     with TemporaryDirectory() as folder:
         converted = Path(folder) / "converted.ply"
         try:
             tool.run(path, converted, timeout=LIMIT_S)
         except ClodError as error:
             raise ClodError(f"{path}: cannot be read ({error}); copy or export it again") from error
-        head = read_head(converted)
-        degree = sh_degree_of(converted, head.ply)
-        vertex = read_element(converted, head)
+        rows = read_ply(converted)
+    values = {name: read_table(rows.vertex, group) for name, group in column_map(rows.sh_degree).items()}
     note = f"quantised: {path.suffix} stores positions, scales, rotations and colours in a few bits each"
-    return Rows(vertex, degree, notes=(note, f"read through splat-transform {tool.version}"), settled=True)
+    notes = (note, f"read through splat-transform {tool.version}")
+    return Model(gaussians_of(path, in_shape(values), Metadata()), Metadata(), notes)

@@ -2,26 +2,25 @@
 
 One POINTS primitive, every attribute float32: activated opacities and scales, rotations of unit length as xyzw,
 spherical harmonics up to degree 3 with a VEC3 for each coefficient, and 8-bit ``COLOR_0`` for readers without the
-extension. The numbers are those of the checkpoint: glTF's y is up and its x goes left, so the node turns them half way
-round z, and moves them where they have an origin. ``asset.extras.clod_adapter`` is the description (``card``).
+extension. The values are the checkpoint's: glTF's y is up and its x goes left, so the node has a half turn
+about z, and a translation where there is an origin. ``asset.extras.clod_adapter`` holds the document (``metadata``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from clod_adapter.calibration import Calibration
+from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.file_formats import History
 from clod_adapter.io.formats.arrays import arrays_of, colours_of, normalized, scales_of, sigmoid
 from clod_adapter.io.formats.metadata import KEY, write_metadata
-from clod_adapter.origin import NOWHERE, Origin
-from clod_adapter.version import package_version
+from clod_adapter.origin import Origin
 
 EXTENSION = "KHR_gaussian_splatting"
 SIGMA = "_SIGMA_D"
@@ -38,20 +37,12 @@ def coefficient(degree: int, index: int) -> str:
     return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}"
 
 
-def write_glb(
-    path: str | Path,
-    gaussians: Gaussians,
-    about: Sequence[str] = (),
-    *,
-    origin: Origin = NOWHERE,
-    calibration: Calibration | None = None,
-) -> tuple[str, ...]:
-    """Writes to float32's rounding of the activations; ``writers.write`` has the arguments and errors."""
+def write_glb(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+    """Writes with float32's rounding of the activations; arguments and errors as ``file_formats.write``."""
     try:
         import pygltflib
     except ModuleNotFoundError as error:
         raise ClodError(f"{path}: .glb needs pygltflib; install it: pip install 'clod-adapter[export]'") from error
-    path = Path(path)
     columns, dropped = _columns(path, gaussians)
     size = sum(array.nbytes for array in columns.values())
     if size >= _LIMIT - (1 << 20):
@@ -59,10 +50,10 @@ def write_glb(
     gltf = pygltflib.GLTF2(
         asset=pygltflib.Asset(generator=f"clod-adapter {package_version()}"),
         extensionsUsed=[EXTENSION], scene=0, scenes=[pygltflib.Scene(nodes=[0])],
-        nodes=[pygltflib.Node(mesh=0, rotation=HALF_TURN, translation=_in_gltf(origin))],
+        nodes=[pygltflib.Node(mesh=0, rotation=HALF_TURN, translation=_in_gltf(history.origin))],
         buffers=[pygltflib.Buffer(byteLength=size)],
     )  # fmt: skip
-    gltf.asset.extras = {KEY: write_metadata(gaussians, about, origin, calibration)}
+    gltf.asset.extras = {KEY: write_metadata(gaussians, history)}
     offset = 0
     for index, (name, array) in enumerate(columns.items()):
         view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": pygltflib.ARRAY_BUFFER}
@@ -88,7 +79,7 @@ def _in_gltf(origin: Origin) -> list[float] | None:
 
 
 def _columns(path: Path, gaussians: Gaussians) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """The attributes, and what the extension has no room for."""
+    """The attributes, and a line for what the extension does not store."""
     arrays = arrays_of(path, gaussians)
     scales = scales_of(path, arrays["log_scales"])
     opacities = sigmoid(arrays["opacity_logits"]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Reading Gaussians from glTF binary files with ``KHR_gaussian_splatting``, without trusting their numbers."""
+"""Reads Gaussians from glTF binary files with ``KHR_gaussian_splatting``, and checks every offset and count."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 from numpy.lib import recfunctions as rec
 
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.formats.arrays import gaussians_of, half_turn, logit, logs_of, read_whole
+from clod_adapter.io.file_formats import Model
+from clod_adapter.io.formats.arrays import gaussians_of, half_turn, logit, logs_of, read_whole, sha256_of
 from clod_adapter.io.formats.glb import COLOR_SPACE, DEGREE, EXTENSION, HALF_TURN, SIGMA, coefficient
-from clod_adapter.io.formats.metadata import KEY, Model, read_card, settings_of
+from clod_adapter.io.formats.metadata import KEY, parse_metadata
 from clod_adapter.origin import AXES, NOWHERE, Origin, origin_of
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
@@ -32,26 +32,21 @@ IDENTITY = [0.0, 0.0, 0.0, 1.0]  # as xyzw
 _FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
 
 
-def read_glb(path: str | Path) -> Gaussians:
-    """The Gaussians of a file; ``load_glb`` gives what it says about them too."""
-    return load_glb(path).gaussians
-
-
-def load_glb(path: str | Path) -> Model:
+def load_glb(path: Path) -> Model:
     """Reads the first primitive with the extension, into the axes of checkpoints: y down.
 
-    A node that is not turned holds numbers in glTF's own axes, which are turned back here; files of ours hold those
-    of the checkpoint.
+    Under a node without a rotation the values are in glTF's own axes, and are turned here; files of this package have
+    the half turn in the node and store the checkpoint's values.
 
     Raises:
         ClodError: the file cannot be read, is damaged, has no such primitive or a compressed one, or its node stands
             below another, is scaled, or turned in another way.
     """
-    path = Path(path)
     try:
-        gltf, binary = _chunks(read_whole(path))
+        data = read_whole(path)
+        gltf, binary = _chunks(data)
         (mesh, primitive), *others = _find(gltf)
-        attributes, doubts = primitive["attributes"], _doubts(primitive, len(others))
+        attributes, ignored = primitive["attributes"], _ignored(primitive, len(others))
         arrays = {key: _read(gltf, binary, attributes[name], width) for key, (name, width) in _ATTRIBUTES.items()}
         degree = 0
         while degree < DEGREE and coefficient(degree + 1, 0) in attributes:
@@ -67,13 +62,12 @@ def load_glb(path: str | Path) -> Model:
         raise ClodError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
     except (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
         raise ClodError(f"{path}: is damaged or no such .glb ({error!r:.80}); {_REMEDY}") from error
-    card, notes = read_card(path, text, len(arrays["means"]))
+    metadata = parse_metadata(path, text, dial="sigma_d" in arrays)
     stored = _stored(arrays) if turned else half_turn(_stored(arrays), "z")
-    if moved != card.origin:  # not as we wrote it
+    if moved != metadata.origin:  # another program moved the node
         stored["means"], moved = _moved(stored["means"], moved)
-        card = replace(card, origin=moved)
-    attenuation = settings_of(card) if "sigma_d" in arrays else None
-    return Model(gaussians_of(path, stored, attenuation, card.screen_filter), card, (*doubts, *notes))
+        metadata = replace(metadata, origin=moved)
+    return Model(gaussians_of(path, stored, metadata), metadata, tuple(ignored), sha256=sha256_of(data))
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -92,12 +86,12 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
         found.setdefault(kind, data[start + 8 : start + 8 + size])
         start += 8 + size
     if _JSON not in found:
-        raise ClodError("has no description in it; export it again")
+        raise ClodError("has no JSON chunk; export it again")
     return json.loads(found[_JSON]), found.get(_BIN, b"")
 
 
 def _find(gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
-    """The primitives with Gaussians, of which there is one at least, each after the number of its mesh."""
+    """The primitives with Gaussians, at least one, each after the number of its mesh."""
     found = [
         (number, primitive)
         for number, mesh in enumerate(gltf.get("meshes", []))
@@ -113,8 +107,8 @@ def _find(gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
     return found
 
 
-def _doubts(primitive: dict[str, Any], others: int) -> list[str]:
-    """What of the file is not heeded."""
+def _ignored(primitive: dict[str, Any], others: int) -> list[str]:
+    """Notes on the parts of the file that are not used."""
     space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
     notes = [f"its colours are in {space!r:.40}, and taken as {COLOR_SPACE}"] if space != COLOR_SPACE else []
     return notes + ([f"{others} more primitives with Gaussians in it are left out"] if others else [])
@@ -148,7 +142,7 @@ def _whole(value: Any) -> int:
 
 
 def _placed(gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
-    """Whether the mesh's node makes the half turn, and the origin, in the axes of checkpoints, that it moves to."""
+    """Whether the node of the mesh makes the half turn, and its translation as an origin in the axes of checkpoints."""
     nodes: list[dict[str, Any]] = gltf.get("nodes", [])
     number = next((number for number, node in enumerate(nodes) if node.get("mesh") == mesh), -1)
     node = nodes[number] if number >= 0 else {}
@@ -160,19 +154,19 @@ def _placed(gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
         raise ClodError("its node is scaled or turned, which is not undone here; apply the transform and export again")
     x, y, z = (float(value) for value in node.get("translation", [0, 0, 0]))
     if not np.isfinite([x, y, z]).all():
-        raise ClodError("its node moves it by what is not finite; export it again")
+        raise ClodError("its node has a translation that is not finite; export it again")
     return turned, (0.0 - x, 0.0 - y, z)
 
 
 def _moved(means: np.ndarray, by: Origin) -> tuple[np.ndarray, Origin]:
-    """Means, and what they are relative to: moved where that is not far, as float32 has digits for it there."""
+    """Means and their origin; an origin near 0 is added to the means, where float32 has enough digits."""
     wide = means.astype(np.float64) + by
     far = origin_of(rec.unstructured_to_structured(wide, names=list(AXES)))
     return (means, by) if any(far) else (wide.astype(np.float32), NOWHERE)
 
 
 def _stored(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """As checkpoints store them."""
+    """The values as checkpoints store them."""
     quats = np.roll(arrays["quats"], 1, axis=1)
     logits = logit(np.clip(arrays["opacity_logits"], 0, 1))
     return {

@@ -1,7 +1,7 @@
-"""Checkpoints of gsplat's trainer, ``.pt``: the one format here that is a pickle, of which only tensors are taken.
+"""Checkpoints of gsplat's trainer, ``.pt``: the only format that is a pickle, of which only tensors are read.
 
-Those written here have one more tensor among the ``splats``, ``sigma_d``, and beside them the description (``card``)
-as a string under ``clod_adapter``. The trainer and its viewers take the tensors that they know, by name.
+Files of this package have one more tensor among the ``splats``, ``sigma_d``, and the JSON document (``metadata``) as a
+string under ``clod_adapter``. The trainer and its viewers read the tensors that they know, by name.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
 from clod_adapter.io.formats.metadata import KEY
 from clod_adapter.io.ply.columns import SIGMA
-from clod_adapter.io.regular import read_start, utf8_name
-from clod_adapter.io.sniff import refuse
+from clod_adapter.io.settings import damaged
+from clod_adapter.io.sniff import read_start, refuse, utf8_name
 
 # As gsplat's trainer names its parameters, and as they are called here.
 NAMES = {
@@ -78,11 +78,10 @@ def _check_pickle(path: Path, data: bytes) -> None:
 
 
 def read_splats(path: Path) -> tuple[dict[str, np.ndarray], str | None]:
-    """The parameters by gsplat's names, float32, of one number of rows and fitting shapes; and the description, if any.
+    """The parameters by gsplat's names, float32, in matching shapes; and the JSON document, if any.
 
-    The values are as in Inria's layout: scales are logarithms, opacities logits. What ``sigma_d``, if there, means,
-    ``pt_model.load_pt`` tells. Read with ``weights_only``: a pickle that calls anything but what makes tensors is
-    refused, and nothing is called.
+    Scales are logarithms, opacities logits, as in Inria's layout. Read with ``weights_only``: a pickle that calls
+    anything but what makes tensors is refused, and nothing is called.
 
     Raises:
         ClodError: not such a checkpoint, damaged, or more than tensors.
@@ -101,7 +100,7 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], str | None]:
     _check_shapes(path, values)
     text = checkpoint.get(KEY)
     if text is not None and not isinstance(text, str):
-        raise ClodError(f"{path}: its description is damaged (a {type(text).__name__}); export the file again")
+        raise damaged(path, TypeError(f"a {type(text).__name__}, not text"))
     return values, text
 
 

@@ -1,38 +1,28 @@
-"""Models as checkpoints of gsplat's trainer, both ways; ``pt`` is the careful part of the reading."""
+"""Models as checkpoints of gsplat's trainer; ``pt`` checks the pickle and reads its tensors."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
-from clod_adapter.calibration import Calibration
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.file_formats import History, Model
 from clod_adapter.io.formats.arrays import arrays_of, gaussians_of
-from clod_adapter.io.formats.metadata import KEY, Model, metadata_text, read_card, settings_of, write_metadata
+from clod_adapter.io.formats.metadata import KEY, metadata_text, parse_metadata, write_metadata
 from clod_adapter.io.formats.pt import FRAME, NAMES, read_splats
 from clod_adapter.io.ply.columns import SIGMA
-from clod_adapter.origin import NOWHERE, Origin
 
 
-def write_pt(
-    path: str | Path,
-    gaussians: Gaussians,
-    about: Sequence[str] = (),
-    *,
-    origin: Origin = NOWHERE,
-    calibration: Calibration | None = None,
-) -> tuple[str, ...]:
-    """Writes every value as it is; ``writers.write`` has the arguments and errors."""
-    path = Path(path)
+def write_pt(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+    """Writes every value unchanged; arguments and errors as ``file_formats.write``."""
     arrays = arrays_of(path, gaussians)
     splats = {name: torch.from_numpy(arrays[ours]) for name, ours in NAMES.items()}
     if SIGMA in arrays:
         splats[SIGMA] = torch.from_numpy(arrays[SIGMA])
-    text = metadata_text(write_metadata(gaussians, about, origin, calibration))
+    text = metadata_text(write_metadata(gaussians, history))
     # By way of memory, as the entries of a file are named after it, and this one's name is temporary.
     buffer = io.BytesIO()
     torch.save({"step": 0, "splats": splats, KEY: text}, buffer)
@@ -41,16 +31,14 @@ def write_pt(
     return ()
 
 
-def load_pt(path: str | Path) -> Model:
+def load_pt(path: Path) -> Model:
     """Reads a checkpoint of gsplat's trainer, or one written here.
 
     Raises:
-        ClodError: as ``pt.read_splats``, or the description is damaged.
+        ClodError: as ``pt.read_splats``, or its settings are damaged.
     """
-    path = Path(path)
     values, text = read_splats(path)
-    card, notes = read_card(path, text, len(values["means"]))
-    attenuation = settings_of(card) if SIGMA in values else None
+    metadata = parse_metadata(path, text, dial=SIGMA in values)
     arrays = {NAMES.get(name, name): value for name, value in values.items()}
-    notes += [] if card.version else [FRAME]
-    return Model(gaussians_of(path, arrays, attenuation, card.screen_filter), card, tuple(notes))
+    notes = () if metadata.described else (FRAME,)
+    return Model(gaussians_of(path, arrays, metadata), metadata, notes, activation_unknown=not metadata.described)

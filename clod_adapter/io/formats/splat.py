@@ -1,21 +1,20 @@
 """``.splat``: the 32-byte rows of antimatter15's web viewer, which many others read.
 
 A row is the position and the standard deviations, three float32 each, then four bytes of RGBA and four of the rotation
-(wxyz, ``128 q + 128``). Colours are those seen without higher bands; neither these nor sigma_d have room. The largest
+(wxyz, ``128 q + 128``). Colours are those of SH degree 0; higher degrees and sigma_d are not stored. The largest
 and most opaque come first (by volume times opacity), as viewers draw what has arrived.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from clod_adapter.calibration import Calibration
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.file_formats import History, Model
 from clod_adapter.io.formats.arrays import (
     arrays_of,
     bytes_of,
@@ -26,26 +25,17 @@ from clod_adapter.io.formats.arrays import (
     normalized,
     read_whole,
     scales_of,
+    sha256_of,
     sigmoid,
 )
-from clod_adapter.io.formats.metadata import Metadata, Model
-from clod_adapter.origin import NOWHERE, Origin
+from clod_adapter.io.settings import Metadata
 
+QUANTISED = "quantised: colours, opacities and rotations in 8 bits, no view-dependent colour"
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
 
-def write_splat(
-    path: str | Path,
-    gaussians: Gaussians,
-    about: Sequence[str] = (),
-    *,
-    origin: Origin = NOWHERE,
-    calibration: Calibration | None = None,
-) -> tuple[str, ...]:
-    """Writes Gaussians without a dial; ``about`` and ``calibration`` have no room. ``writers.write`` has the rest."""
-    path = Path(path)
-    if gaussians.sigma_d is not None:
-        raise ClodError(f"{path}: .splat has no room for sigma_d; choose a dial value to bake")
+def write_splat(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+    """Writes Gaussians without a dial, and no text; arguments and errors as ``file_formats.write``."""
     arrays = arrays_of(path, gaussians)
     scales = scales_of(path, arrays["log_scales"])
     opacities = sigmoid(arrays["opacity_logits"])
@@ -60,24 +50,18 @@ def write_splat(
         temporary.write_bytes(rows[order].tobytes())
     notes = ["colours, opacities and rotations are rounded to 8 bits, and the rows are in another order"]
     notes += ["view-dependent colour is dropped"] if arrays["shN"].any() else []
-    return (*notes, *(["the origin is dropped: coordinates are relative to it"] if any(origin) else []))
+    return (*notes, *(["the origin is dropped: coordinates are relative to it"] if any(history.origin) else []))
 
 
-def read_splat(path: str | Path) -> Gaussians:
-    """The Gaussians of a file, SH degree 0."""
-    return load_splat(path).gaussians
-
-
-def load_splat(path: str | Path) -> Model:
-    """Reads rows as ``write_splat`` writes them.
+def load_splat(path: Path) -> Model:
+    """Reads rows as ``write_splat`` writes them; SH degree 0.
 
     Raises:
-        ClodError: the file cannot be read, or is no whole number of rows.
+        ClodError: the file cannot be read, or is not a whole number of rows.
     """
-    path = Path(path)
     data = read_whole(path)
     if not data or len(data) % _ROW.itemsize:
-        raise ClodError(f"{path}: {len(data)} bytes are no .splat file, whose rows have 32; copy or export it again")
+        raise ClodError(f"{path}: {len(data)} bytes are not a .splat file, whose rows have 32; copy or export it again")
     rows = np.frombuffer(data, _ROW)
     rgba = rows["rgba"].astype(np.float32)
     arrays = {
@@ -86,4 +70,4 @@ def load_splat(path: str | Path) -> Model:
         "opacity_logits": logits_of_bytes(rows["rgba"][:, 3]), "shN": np.zeros((len(rows), 0, 3)),
         "sh0": ((rgba[:, None, :3] / 255) - 0.5) / SH_C0,
     }  # fmt: skip
-    return Model(gaussians_of(path, arrays, None), Metadata())
+    return Model(gaussians_of(path, arrays, Metadata()), Metadata(), (QUANTISED,), sha256=sha256_of(data))

@@ -11,8 +11,8 @@ know; most do not even read so far. Two are written:
 - Adobe's of the axes, which says that they are a checkpoint's (x right, y down, z ahead). The format's own are
   OpenGL's, but the reference's ``ply_to_spz``, splat-transform, SuperSplat and gsply all leave those of the PLY, so
   that turned numbers would be upside down in them;
-- ours, ``RECORD``: the length of the description (``card``) as uint32, the description, then sigma_d as float16, which
-  keeps it to 5e-4. What is larger than there is room for becomes the largest, 65504, which is no decay: it takes less
+- ours, ``RECORD``: the length of the JSON document (``metadata``) as uint32, the document, then sigma_d as float16, to
+  5e-4. What is larger than there is room for becomes the largest, 65504, which is no decay: it takes less
   than ``(d' s)^2 1.2e-10`` of an opacity.
 """
 
@@ -21,19 +21,17 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.file_formats import History
 from clod_adapter.io.formats.arrays import arrays_of, bytes_of, normalized, sigmoid
 from clod_adapter.io.formats.metadata import metadata_text, write_metadata
-from clod_adapter.origin import NOWHERE, Origin
 from clod_adapter.units import estimated_distance, known_distance, with_distance
 
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
@@ -51,15 +49,8 @@ _SIGMA_MOST = float(np.finfo(np.float16).max)
 _FAR = 100.0  # world units: a typical distance from which on some sigma_d that fade at high dial values are beyond that
 
 
-def write_spz(
-    path: str | Path,
-    gaussians: Gaussians,
-    about: Sequence[str] = (),
-    *,
-    origin: Origin = NOWHERE,
-    calibration: Calibration | None = None,
-) -> tuple[str, ...]:
-    """Writes to the format's 8 bits or so; ``writers.write`` has the arguments and errors.
+def write_spz(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+    """Writes with the format's quantisation, about 8 bits; arguments and errors as ``file_formats.write``.
 
     Positions have as many of their 24 bits for the fraction as they leave, 20 at most. A few Gaussians at an enormous
     distance, as many checkpoints have them, would leave the rest too few: see ``_nearer``.
@@ -67,7 +58,7 @@ def write_spz(
     Raises:
         ClodError: more than 10,000,000 Gaussians, or a scene that reaches farther than 4,000,000, besides.
     """
-    path, gaussians = Path(path), _within_float16(gaussians)
+    gaussians = _within_float16(gaussians)
     arrays, bits, moved = _nearer(arrays_of(path, gaussians))
     if len(gaussians) > MOST or bits < 1:
         raise ClodError(
@@ -79,9 +70,8 @@ def write_spz(
     flags = EXTENDED | (ANTIALIASED if screen_filter.compensate else 0)
     header = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, bits, flags, 0)
     parts = [header, *_packed(arrays, bits, degree), struct.pack("<III", AXES, 4, RDF)]
-    says = (gaussians.sigma_d is not None, any(origin), calibration is not None, about, screen_filter != CLASSIC)
-    if any(says):
-        text = metadata_text(write_metadata(gaussians, about, origin, calibration)).encode()
+    if gaussians.sigma_d is not None or history != History() or screen_filter != CLASSIC:
+        text = metadata_text(write_metadata(gaussians, history)).encode()
         sigma = np.clip(arrays.get("sigma_d", np.zeros(0)), -_SIGMA_MOST, _SIGMA_MOST).astype("<f2").tobytes()
         parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(sigma), len(text)) + text + sigma)
     with atomic_path(path) as temporary:

@@ -1,4 +1,4 @@
-"""Reading SPZ files up to version 3, ours and others', without trusting their sizes."""
+"""Reads SPZ files, and checks every size in them."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ import numpy as np
 
 from clod_adapter.config import FILTERS, SH_COUNTS
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.formats.arrays import gaussians_of, half_turn, logits_of_bytes, read_whole
-from clod_adapter.io.formats.metadata import Model, read_card, settings_of
+from clod_adapter.io.file_formats import Model
+from clod_adapter.io.formats.arrays import gaussians_of, half_turn, logits_of_bytes, read_whole, sha256_of
+from clod_adapter.io.formats.converted import load_converted
+from clod_adapter.io.formats.metadata import parse_metadata
 from clod_adapter.io.formats.spz import ANTIALIASED, AXES, COLOR, EXTENDED, HEADER, MAGIC, MAGNITUDE, MOST, RDF, RECORD
 from clod_adapter.io.screen_filter import TAG
 from clod_adapter.units import in_world_units
 
+QUANTISED = "quantised: positions in 24 bits, scales, opacities and harmonics in 8, rotations in 10 or 8"
 _BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10
 _CONVERT = "convert it: splat-transform IN.spz OUT.ply"
 _TURNS = {RDF: "", 4: "x", 7: "z"}  # right, up, back; left, up, forward
@@ -25,19 +27,18 @@ _UNTURNED = struct.pack("<I", RDF)
 _SMALL = 1 << 24  # bytes that any file may
 
 
-def read_spz(path: str | Path) -> Gaussians:
-    """The Gaussians of a file; ``load_spz`` gives what it says about them too."""
-    return load_spz(path).gaussians
+def load_spz(path: Path) -> Model:
+    """Reads versions 2 and 3, SH degree 0 to 4; version 4 is converted by splat-transform.
 
-
-def load_spz(path: str | Path) -> Model:
-    """Reads versions 2 and 3, SH degree 0 to 4; values are the middles of what was rounded to them.
+    A quantised value is read as the middle of its interval.
 
     Raises:
         ClodError: the file cannot be read, is damaged, of another version, or unpacks to far more than it could hold.
     """
-    path = Path(path)
-    data = _unpacked(path, read_whole(path))
+    whole = read_whole(path)
+    if whole.startswith(MAGIC.to_bytes(4, "little")):
+        return load_converted(path, " of version 4")
+    data = _unpacked(path, whole)
     magic, version, count, degree, bits, flags, _ = HEADER.unpack_from(data)
     if magic != MAGIC or version not in (2, 3) or degree not in SH_COUNTS or bits > 24 or count > MOST:
         raise ClodError(f"{path}: is no SPZ file of version 2 or 3 (version {version}, {count} Gaussians); {_CONVERT}")
@@ -52,23 +53,20 @@ def load_spz(path: str | Path) -> Model:
         start += count * size
     records = _records(data[end:]) if flags & EXTENDED else {}
     text, sigma = _ours(path, records[RECORD], count) if RECORD in records else (None, None)
-    card, notes = read_card(path, text, count)
-    if flags & ANTIALIASED and not card.screen_filter.compensate:  # of another program, as ours say more
-        card = replace(card, screen_filter=FILTERS["on"], about=(*card.about, TAG))
+    metadata = parse_metadata(path, text, dial=sigma is not None)
     arrays = _unquantized(columns, bits, bands)
     arrays = _in_our_axes(path, arrays, records.get(AXES, _UNTURNED))
     if sigma is not None:
         arrays["sigma_d"] = sigma
-    attenuation = settings_of(card) if sigma is not None else None
-    gaussians = in_world_units(gaussians_of(path, arrays, attenuation, card.screen_filter))
-    if card.attenuation is not None:
-        card = replace(card, attenuation=gaussians.attenuation)
-    return Model(gaussians, card, tuple(notes))
+    gaussians = in_world_units(gaussians_of(path, arrays, metadata))
+    metadata = replace(metadata, attenuation=gaussians.attenuation)
+    if flags & ANTIALIASED and not gaussians.screen_filter.compensate:  # by another program, which states no variance
+        gaussians = gaussians.replace(screen_filter=FILTERS["on"])
+        metadata = replace(metadata, about=(*metadata.about, TAG))
+    return Model(gaussians, metadata, (QUANTISED,), sha256=sha256_of(whole))
 
 
 def _unpacked(path: Path, data: bytes) -> bytes:
-    if data[:4] == MAGIC.to_bytes(4, "little"):
-        raise ClodError(f"{path}: is an SPZ file of version 4; {_CONVERT}")
     if data[:2] != b"\x1f\x8b":
         raise ClodError(f"{path}: is no SPZ file; copy or export it again")
     limit = max(_SMALL, _BOMB * len(data))
@@ -96,7 +94,7 @@ def _records(data: bytes) -> dict[int, bytes]:
 
 
 def _ours(path: Path, body: bytes, count: int) -> tuple[bytes, np.ndarray | None]:
-    """Our record's description, and sigma_d if it is there."""
+    """The JSON document of our record, and sigma_d if it is there."""
     length = struct.unpack_from("<I", body)[0] if len(body) >= 4 else 0
     rest = len(body) - 4 - length
     if rest not in (0, 2 * count):
@@ -106,10 +104,10 @@ def _ours(path: Path, body: bytes, count: int) -> tuple[bytes, np.ndarray | None
 
 
 def _in_our_axes(path: Path, arrays: dict[str, np.ndarray], record: bytes) -> dict[str, np.ndarray]:
-    """As Adobe's record says; without one as they are, as the field's converters leave them."""
+    """Turned as Adobe's record states; without a record unchanged, as converters write them."""
     (axes,) = struct.unpack("<I", record) if len(record) == 4 else (0,)
     if axes not in _TURNS:
-        raise ClodError(f"{path}: its axes are of kind {axes}, which is not undone here; {_CONVERT}")
+        raise ClodError(f"{path}: its axes are of kind {axes}, which this reader does not know; {_CONVERT}")
     return half_turn(arrays, _TURNS[axes]) if _TURNS[axes] else arrays
 
 

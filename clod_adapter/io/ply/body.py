@@ -1,45 +1,116 @@
-"""The rows of a PLY. Not plyfile's reader, which allocates whatever the header claims and is slow on ascii."""
+"""The rows of a PLY, read in one pass with the hash of the file.
+
+Not plyfile's reader, which allocates the rows that the header states and is slow on ascii.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import io
 import itertools
 import os
 import warnings
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, cast
 
 import numpy as np
-from plyfile import PlyElement, PlyListProperty
+from plyfile import PlyData, PlyElement, PlyListProperty
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.ply.header import Head
+from clod_adapter.io.ply import header
+from clod_adapter.io.ply.header import Head, parse_head
+from clod_adapter.io.sniff import refuse_irregular
+
+_PIECE = 1 << 20  # bytes; hashed while they are in the processor's cache
 
 
-def read_element(path: Path, head: Head, name: str = "vertex") -> np.ndarray:
-    """``[N]`` structured array of an element, by default the vertices, in file order and type, native byte order.
+@dataclass(frozen=True)
+class PlyFile:
+    """A PLY as read.
 
-    That element must be there and have no lists (``sh_degree_of`` and ``check_packed`` see to it). The file's length
-    is compared with the rows that the header claims before anything is allocated for them. Elements after it are not
-    read.
+    Attributes:
+        head: its header.
+        elements: by name, ``[N]`` structured arrays in file order and type, native byte order.
+        sha256: hex, of the very bytes that were parsed.
+    """
+
+    head: Head
+    elements: dict[str, np.ndarray]
+    sha256: str
+
+
+def read_elements(path: Path, choose: Callable[[Path, PlyData], Collection[str]]) -> PlyFile:
+    """Reads a PLY from start to end, once.
+
+    The length of the file is compared with the rows that the header states before anything is allocated for them.
+
+    Args:
+        choose: called with ``path`` and the header; the names of the elements to parse, which must be there and have
+            no lists. It may refuse the file.
 
     Raises:
-        ClodError: the file is shorter than its header says, damaged, or has lists before the element.
+        ClodError: the file cannot be read, is shorter than its header states, damaged, or has lists before the last
+            of those elements.
     """
     try:
-        with open(path, "rb") as file:
-            _check_length(path, head, os.fstat(file.fileno()).st_size)
-            file.seek(head.size)
-            return _read_text(file, head, name) if head.ply.text else _read_binary(path, file, head, name)
+        refuse_irregular(path)
+        with open(path, "rb", buffering=0) as raw:
+            source = _Hashed(raw)
+            start = source.take_start(header.HEADER_LIMIT)
+            head = parse_head(path, start)
+            wanted = choose(path, head.ply)
+            _check_length(path, head, os.fstat(raw.fileno()).st_size)
+            source.back_to(head.size)
+            with io.BufferedReader(source, _PIECE) as file:
+                read = _read_text if head.ply.text else _read_binary
+                elements = read(path, cast(io.BufferedReader, file), head, wanted)
+                while source.read(_PIECE):  # to the end, for the hash
+                    pass
+            return PlyFile(head, elements, source.digest.hexdigest())
     except OSError as error:
         raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    except (ValueError, TypeError, MemoryError) as error:  # numpy's; a ValueError of text that is no number, too
+    except (ValueError, TypeError, MemoryError) as error:  # numpy's, also of text that is not a number
+        if "\0" in str(path):
+            raise ClodError(f"{path}: cannot be read ({error}); check the path") from error
         raise ClodError(f"{path}: damaged or truncated ({error}); copy or export it again") from error
 
 
+class _Hashed(io.RawIOBase):
+    """A file whose bytes are hashed as they are read."""
+
+    def __init__(self, raw: io.FileIO) -> None:
+        self.raw, self.digest, self._start, self._again = raw, hashlib.sha256(), b"", memoryview(b"")
+
+    def take_start(self, size: int) -> bytes:
+        """The first ``size`` bytes, or all where there are fewer."""
+        while len(self._start) < size and (piece := self.raw.read(size - len(self._start))):
+            self._start += piece
+        self.digest.update(self._start)
+        return self._start
+
+    def back_to(self, position: int) -> None:
+        """The next byte that is read is that at ``position``, which was within the start."""
+        self._again = memoryview(self._start)[position:]
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        target = memoryview(buffer)[:_PIECE]
+        if self._again:
+            count = min(len(target), len(self._again))
+            target[:count], self._again = self._again[:count], self._again[count:]
+            return count
+        count = self.raw.readinto(target) or 0
+        self.digest.update(target[:count])
+        return count
+
+
 def _check_length(path: Path, head: Head, length: int) -> None:
-    """Refuses a file that cannot hold the rows of its header, each of which takes at least so many bytes."""
-    least = head.size - (1 if head.ply.text else 0)  # the last line may do without its end
+    """Refuses a file that is too short for the least bytes that the rows of its header take."""
+    least = head.size - (1 if head.ply.text else 0)  # the last line may lack its end
     for element, count in zip(head.ply, head.counts, strict=True):
         least += count * _least_bytes(element, head.ply.text)
     if least > length:
@@ -57,34 +128,45 @@ def _least_bytes(element: PlyElement, text: bool) -> int:
     return sum(np.dtype(kind).itemsize for kind in kinds)
 
 
-def _read_text(file: BinaryIO, head: Head, name: str) -> np.ndarray:
-    element, count, before = _element(head, name)
-    with (
-        io.TextIOWrapper(file, "ascii") as text,
-        warnings.catch_warnings(action="ignore"),  # of blank lines, and of no lines at all
-        np.errstate(over="ignore"),
-    ):
-        lines = itertools.islice(text, sum(rows for _, rows in before), None)
-        rows = np.loadtxt(lines, element.dtype("="), comments=None, max_rows=count, ndmin=1)
+def _read_text(path: Path, file: io.BufferedReader, head: Head, wanted: Collection[str]) -> dict[str, np.ndarray]:
+    found = dict[str, np.ndarray]()
+    lines = io.TextIOWrapper(file, "ascii")
+    with warnings.catch_warnings(action="ignore"), np.errstate(over="ignore"):  # of blank lines, or none at all
+        for element, count in zip(head.ply, head.counts, strict=True):
+            if element.name in wanted:
+                part = itertools.islice(lines, count) if len(wanted) > len(found) + 1 else lines
+                rows = np.loadtxt(part, element.dtype("="), comments=None, max_rows=count, ndmin=1)
+                found[element.name] = _complete(rows, count)
+                if len(found) == len(wanted):
+                    break
+            else:
+                for _ in itertools.islice(lines, count):
+                    pass
+    lines.detach()
+    return found
+
+
+def _read_binary(path: Path, file: io.BufferedReader, head: Head, wanted: Collection[str]) -> dict[str, np.ndarray]:
+    found = dict[str, np.ndarray]()
+    for element, count in zip(head.ply, head.counts, strict=True):
+        if len(found) == len(wanted):
+            break
+        if any(isinstance(p, PlyListProperty) for p in element.properties):
+            names = ", ".join(name for name in wanted if name not in found)
+            raise ClodError(f"{path}: element {element.name} has lists and stands before {names}; write it last")
+        if element.name in wanted:
+            rows = np.empty(count, element.dtype(head.ply.byte_order))
+            size = file.readinto(rows.view(np.uint8).data) if rows.nbytes else 0
+            _complete(rows[: size // max(rows.itemsize, 1)], count)
+            found[element.name] = rows.astype(element.dtype("="), copy=False)
+        else:
+            left = count * _least_bytes(element, False)
+            while left and (piece := file.read(min(left, _PIECE))):
+                left -= len(piece)
+    return found
+
+
+def _complete(rows: np.ndarray, count: int) -> np.ndarray:
     if len(rows) != count:
         raise ValueError(f"{len(rows)} of {count} rows are there")
     return rows
-
-
-def _read_binary(path: Path, file: BinaryIO, head: Head, name: str) -> np.ndarray:
-    element, count, before = _element(head, name)
-    for other, rows in before:
-        if any(isinstance(p, PlyListProperty) for p in other.properties):
-            raise ClodError(f"{path}: element {other.name} has lists and stands before {name}; write it last")
-        file.seek(rows * _least_bytes(other, False), os.SEEK_CUR)
-    found = np.fromfile(file, element.dtype(head.ply.byte_order), count)
-    if len(found) != count:
-        raise ValueError(f"{len(found)} of {count} rows are there")
-    return found.astype(element.dtype("="), copy=False)
-
-
-def _element(head: Head, name: str) -> tuple[PlyElement, int, list[tuple[PlyElement, int]]]:
-    """The element, its rows, and the elements before it with theirs."""
-    elements = list(zip(head.ply, head.counts, strict=True))
-    at = next(k for k, (element, _) in enumerate(elements) if element.name == name)
-    return *elements[at], elements[:at]

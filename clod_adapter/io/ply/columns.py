@@ -1,6 +1,6 @@
 """The columns of a splat PLY: what they are called and which files are not plain splats.
 
-The names ``f_dc_*`` and ``f_rest_*`` exist nowhere else; the reader and the writer share this map.
+Reader and writer share the map of names.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from plyfile import PlyData, PlyListProperty
 
 from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
+from clod_adapter.origin import AXES, NOWHERE, Origin
 
 SIGMA = "sigma_d"
 MASKS = ("masks_0", "masks_1")
@@ -44,24 +45,42 @@ def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
     }
 
 
-def rows_of(attributes: Mapping[str, np.ndarray], sh_degree: int) -> np.ndarray:
-    """``[N]`` rows in Inria's layout of the values of each Gaussians attribute, ``[N, ...]``."""
-    columns, count = column_map(sh_degree), len(attributes["means"])
-    vertex = np.zeros(count, inria_dtype(sh_degree))
+def rows_of(attributes: Mapping[str, np.ndarray], origin: Origin = NOWHERE) -> np.ndarray:
+    """``[N]`` rows in Inria's layout of the values of each Gaussians attribute, ``[N, ...]``; sigma_d last.
+
+    Args:
+        origin: what the means are relative to, world units; where it is not 0, x, y and z are doubles.
+    """
+    count, coefficients = len(attributes["means"]), attributes["shN"].shape[1] + 1
+    sh_degree = next(degree for degree, number in SH_COUNTS.items() if number == coefficients)
+    columns = column_map(sh_degree) | ({SIGMA: (SIGMA,)} if SIGMA in attributes else {})
+    vertex = np.zeros(count, inria_dtype(sh_degree, origin, dial=SIGMA in attributes))
     for attribute, group in columns.items():
         flat = attributes[attribute].reshape(count, len(group))
         for k, column in enumerate(group):
-            vertex[column] = flat[:, k]
+            shift = origin[k] if attribute == "means" else 0.0
+            vertex[column] = flat[:, k].astype(np.float64) + shift if shift else flat[:, k]
     return vertex
 
 
-def inria_dtype(sh_degree: int) -> np.dtype:
-    """The rows of the file that Inria's trainer writes, normals included."""
+def in_shape(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The attributes' columns ``[N, P]`` in the shapes of ``Gaussians``, as views."""
+    arrays = dict(values)
+    for name in ("opacity_logits", SIGMA):
+        if name in arrays:
+            arrays[name] = arrays[name][:, 0]
+    for name in ("sh0", "shN"):
+        arrays[name] = arrays[name].reshape(len(arrays[name]), arrays[name].shape[1] // 3, 3)
+    return arrays
+
+
+def inria_dtype(sh_degree: int, origin: Origin = NOWHERE, *, dial: bool = False) -> np.dtype:
+    """The rows of the file that Inria's trainer writes, normals included; doubles for positions with an origin."""
     groups = column_map(sh_degree)
     rest = sorted(groups["shN"], key=lambda name: int(name.rsplit("_", 1)[1]))  # the map lists them by coefficient
     names = [*groups["means"], "nx", "ny", "nz", *groups["sh0"], *rest]
-    names += [*groups["opacity_logits"], *groups["log_scales"], *groups["quats"]]
-    return np.dtype([(name, "f4") for name in names])
+    names += [*groups["opacity_logits"], *groups["log_scales"], *groups["quats"], *([SIGMA] if dial else [])]
+    return np.dtype([(name, "f8" if any(origin) and name in AXES else "f4") for name in names])
 
 
 def read_table(vertex: np.ndarray, names: Iterable[str]) -> np.ndarray:
@@ -78,7 +97,7 @@ def read_table(vertex: np.ndarray, names: Iterable[str]) -> np.ndarray:
 
 
 def sh_degree_of(path: Path, header: PlyData) -> int:
-    """The SH degree of a file with plain Gaussians, judged by its header.
+    """The SH degree of a file with plain Gaussians, by its header.
 
     Raises:
         ClodError: the file holds something else, or a needed column is missing or of a wrong type.

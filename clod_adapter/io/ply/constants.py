@@ -1,7 +1,7 @@
-"""Settings as columns of one value each, for the tools that keep the columns of a PLY and drop its comments.
+"""Settings as constant columns, for tools that keep the columns of a PLY and drop its comments.
 
-A setting that is not the default stands in a float column whose name begins with ``clod_``, before ``sigma_d``: all
-that is needed to read sigma_d right. ``max_sv``, which only says how far the dial was trained, has none.
+A setting that is not the default is stored in a float column whose name begins with ``clod_``, before ``sigma_d``.
+``max_sv``, the end of the trained range, has no column: reading sigma_d does not need it.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ import numpy as np
 
 from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
+from clod_adapter.io.settings import FILTER
 
 PREFIX = "clod_"
 TAU, EPS, HARD, QUANTILE, MAX = "clod_tau", "clod_eps", "clod_hard_cut", "clod_quantile", "clod_max"
 VARIANCE, COMPENSATE = "clod_screen_variance", "clod_compensate"
-DIGITS = 6  # decimal digits that any float32 holds
+DIGITS = 6  # decimal digits that every float32 holds
 
 
 def dial_constants(config: AttenuationConfig | None) -> dict[str, float]:
-    """The columns, by name, of the settings of a dial in world units that are not the defaults."""
+    """The columns, by name, of settings that are not the defaults; sigma_d in world units."""
     if config is None:
         return {}
     usual = AttenuationConfig()
@@ -33,8 +34,14 @@ def dial_constants(config: AttenuationConfig | None) -> dict[str, float]:
     return found | ({MAX: 1.0} if config.normalizer == "max" else {})
 
 
-def dial_settings(constants: Mapping[str, float]) -> dict[str, Any]:
-    """The inverse: fields of ``AttenuationConfig``, as far as the columns tell; others are left out."""
+def filter_constants(screen_filter: ScreenFilter) -> dict[str, float]:
+    """The columns, by name, of a screen-space filter that is not the classic one."""
+    found = {VARIANCE: screen_filter.variance} if screen_filter.variance != CLASSIC.variance else {}
+    return found | ({COMPENSATE: 1.0} if screen_filter.compensate else {})
+
+
+def constant_settings(constants: Mapping[str, float]) -> dict[str, Any]:
+    """The settings in the columns, as ``settings.read_metadata`` takes them; the inverse of the two functions above."""
     found: dict[str, Any] = {}
     for column, name in ((TAU, "tau"), (EPS, "eps"), (QUANTILE, "quantile")):
         if column in constants:
@@ -43,35 +50,21 @@ def dial_settings(constants: Mapping[str, float]) -> dict[str, Any]:
         found["cut"] = "hard"
     if QUANTILE in constants or constants.get(MAX):
         found["normalizer"] = "max" if constants.get(MAX) else "quantile"
-    return found
-
-
-def filter_constants(screen_filter: ScreenFilter) -> dict[str, float]:
-    """The columns, by name, of a screen-space filter, as far as it is not the usual one."""
-    found = {VARIANCE: screen_filter.variance} if screen_filter.variance != CLASSIC.variance else {}
-    return found | ({COMPENSATE: 1.0} if screen_filter.compensate else {})
-
-
-def filter_of(constants: Mapping[str, float]) -> ScreenFilter | None:
-    """The inverse; None where no column tells.
-
-    Raises:
-        ClodError: a value is out of range.
-    """
-    if VARIANCE not in constants and COMPENSATE not in constants:
-        return None
-    variance = constants.get(VARIANCE, CLASSIC.variance)
-    return ScreenFilter(variance=variance, compensate=bool(constants.get(COMPENSATE)))
+    values: dict[str, Any] = {"attenuation": found} if found else {}
+    if VARIANCE in constants or COMPENSATE in constants:
+        variance = constants.get(VARIANCE, CLASSIC.variance)
+        values[FILTER] = {"variance": variance, "compensate": bool(constants.get(COMPENSATE))}
+    return values
 
 
 def read_constants(path: Path, vertex: np.ndarray) -> dict[str, float]:
-    """The value of each column whose name begins with ``clod_``, as ``simplest`` has it.
+    """The value of each column whose name begins with ``clod_``, by ``simplest``.
 
     Args:
-        vertex: ``[N]`` rows as they are in the file, N > 0.
+        vertex: ``[N]`` rows of the file.
 
     Raises:
-        ClodError: a column has more than one value: rows with different settings were put together.
+        ClodError: a column has more than one value, as in a merge of files with different settings.
     """
     found = {}
     for name in vertex.dtype.names or ():
@@ -80,14 +73,14 @@ def read_constants(path: Path, vertex: np.ndarray) -> dict[str, float]:
             if not (values == values[0]).all():
                 raise ClodError(
                     f"{path}: property {name} must be one value for all rows and has several, so files of different "
-                    "settings were put together; give one of them"
+                    "settings were merged; give one of them"
                 )
             found[name] = simplest(values[0])
     return found
 
 
 def simplest(value: Any) -> float:
-    """The simplest number that float32 rounds to ``value``: what was meant, and so read as it was written.
+    """The simplest number that float32 rounds to ``value``, which is the number that was written.
 
     The shortest decimal; where that has more than six digits, 1/n if that is one for a whole n (1/255).
     """

@@ -1,25 +1,23 @@
 """PlayCanvas's compressed PLY, which SuperSplat, splat-transform and gsplat's exporter write: 32 bits an attribute.
 
-Gaussians stand in blocks of 256. Of each block the element ``chunk`` has the ranges of position, logarithmic scale and,
-in newer files, colour; ``vertex`` has where in its block's ranges each Gaussian lies: position and scale in 11, 10 and
-11 bits, the three smaller parts of the unit quaternion in 10 bits each and which part is missing in 2, colour and
-opacity in 8 bits each. ``sh``, where it is there, has the higher harmonics in 8 bits, between -4 and 4.
+Gaussians form chunks of 256. The element ``chunk`` stores the ranges of position, logarithmic scale and, if newer,
+colour; ``vertex`` stores each Gaussian within the ranges of its chunk: position and scale in 11, 10 and 11 bits, the
+three smaller components of the unit quaternion in 10 bits each and the index of the largest in 2, colour and opacity in
+8 bits each. The optional element ``sh`` stores the higher harmonics in 8 bits, between -4 and 4.
 
 Source: splat-transform 3.7, ``read-ply``; gsplat, ``exporter.splat2ply_bytes_compressed``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from plyfile import PlyData, PlyListProperty
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.ply.body import read_element
 from clod_adapter.io.ply.columns import column_map, degree_of, inria_dtype
-from clod_adapter.io.ply.header import Head, all_comments
-from clod_adapter.io.rows import Rows
 
 BLOCK = 256
 _BITS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -35,7 +33,7 @@ def is_packed(header: PlyData) -> bool:
 
 
 def check_packed(path: Path, header: PlyData) -> int:
-    """The SH degree of such a file, judged by its header.
+    """The SH degree of such a file, by its header.
 
     Raises:
         ClodError: an element or a property is missing or of another type.
@@ -48,19 +46,25 @@ def check_packed(path: Path, header: PlyData) -> int:
     return degree_of(path, rest)
 
 
-def read_packed(path: Path, head: Head) -> Rows:
-    """The Gaussians of such a file.
+def packed_elements(header: PlyData) -> tuple[str, ...]:
+    """The elements that ``unpack`` needs."""
+    return ("chunk", "vertex", "sh") if "sh" in header and header["sh"].properties else ("chunk", "vertex")
 
-    An opacity of 0 or 255 is one that was rounded to it, and is taken as a quarter of a step within: neither ends as an
-    infinite logit.
+
+def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> np.ndarray:
+    """``[N]`` rows in Inria's layout of the Gaussians of such a file.
+
+    An opacity of 0 or 255 becomes a quarter of a step within, so that no logit is infinite.
+
+    Args:
+        degree: of the spherical harmonics, from ``check_packed``.
 
     Raises:
-        ClodError: as ``check_packed``; the file is damaged, or has fewer blocks than its Gaussians need.
+        ClodError: there are fewer chunks or harmonics than Gaussians.
     """
-    from clod_adapter.gaussians import SH_C0  # here and not above, as check_packed does without torch
+    from clod_adapter.gaussians import SH_C0  # here: check_packed needs no torch
 
-    degree = check_packed(path, head.ply)
-    chunks, packed = read_element(path, head, "chunk"), read_element(path, head)
+    chunks, packed = elements["chunk"], elements["vertex"]
     if len(chunks) * BLOCK < len(packed):
         raise ClodError(
             f"{path}: is damaged: {len(packed)} Gaussians need {-(-len(packed) // BLOCK)} chunks, and it has "
@@ -83,8 +87,8 @@ def read_packed(path: Path, head: Head) -> Rows:
     for name, values in zip(columns["quats"], _rotations(packed["packed_rotation"]), strict=True):
         vertex[name] = values
     if degree:
-        _read_harmonics(path, head, vertex)
-    return Rows(vertex, degree, all_comments(head.ply), (NOTE,), settled=True)
+        _unpack_harmonics(path, elements["sh"], vertex)
+    return vertex
 
 
 def _require(path: Path, header: PlyData, element: str, names: tuple[str, ...], kind: str) -> None:
@@ -122,8 +126,7 @@ def _rotations(bits: np.ndarray) -> np.ndarray:
     ])  # fmt: skip
 
 
-def _read_harmonics(path: Path, head: Head, vertex: np.ndarray) -> None:
-    table = read_element(path, head, "sh")
+def _unpack_harmonics(path: Path, table: np.ndarray, vertex: np.ndarray) -> None:
     if len(table) != len(vertex):
         raise ClodError(f"{path}: is damaged: {len(table)} harmonics for {len(vertex)} Gaussians; export it again")
     levels = np.arange(256, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Whether a sigma_d that stands in a file without settings can mean what the defaults make of it."""
+"""Whether the default settings fit the sigma_d of a file without settings."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ DOUBTFUL = 0.25
 
 
 @torch.no_grad()
-def judge(means: Tensor, opacity_logits: Tensor, sigma_d: Tensor, config: AttenuationConfig) -> list[str]:
-    """A line on what the reading keeps at s = 1 from the nominal distance, a warning where that is too little.
+def check_plausible(means: Tensor, opacity_logits: Tensor, sigma_d: Tensor, config: AttenuationConfig) -> list[str]:
+    """A line with the share kept at s = 1 from the nominal distance; a warning where it is too small.
 
-    Too small a sigma_d shows so: one in units of the typical distance (as earlier versions wrote), or of a file whose
-    positions were enlarged. Too large a one does not. Nothing is said for other normalisers than ``scene``, which no
-    scale changes.
+    A sigma_d that is too small gives a small share: one in units of the typical distance (as earlier versions wrote),
+    or of a file whose positions were enlarged. One that is too large is not detected. Empty for normalisers other than
+    ``scene``, which are invariant to scale.
 
     Args:
         means: ``[N, 3]`` world units; the others ``[N]``, finite but for opacity_logits of +inf; N > 0.

@@ -1,7 +1,7 @@
-"""What the numbers in a checkpoint stand for, where it is not Inria's logits and logarithms: made those on reading.
+"""Converts values that are not Inria's logits and logarithms to these on reading.
 
-Two cases. Some trainers and tools store opacities, or scales, already activated, which only their range tells.
-Mip-Splatting (Yu et al., CVPR 2024, equation 9) stores a filter beside them, ``filter_3D``, that its renderer applies.
+Some trainers and tools store activated opacities or scales, which only their range shows. Mip-Splatting (Yu et al.,
+CVPR 2024, equation 9) stores a filter beside them, ``filter_3D``, that its renderer applies.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from clod_adapter.io.ply.columns import column_map, read_table
 Activated = Literal["none", "opacity", "scales", "both"]
 FILTER = "filter_3D"
 _OPACITY, _SCALES = ("opacity",), column_map(0)["log_scales"]
-_FEW = 10  # fewer Gaussians may have any range
-_FAINTEST = -0.1  # logit of 0.475; trainers leave fainter Gaussians than that, and files of |a| dip just below 0
+_FEW = 10  # Gaussians; fewer may have any range
+_FAINTEST = -0.1  # logit of 0.475; trainers keep fainter Gaussians, and files of |a| reach just below 0
 _TINY = float(np.finfo(np.float32).tiny)
 _OPAQUE = 1 - 2.0**-24  # the largest float32 below 1
 
@@ -27,14 +27,14 @@ _OPAQUE = 1 - 2.0**-24  # the largest float32 below 1
 def as_stored_by_inria(
     path: Path, vertex: np.ndarray, activated: Activated | None
 ) -> tuple[np.ndarray, Activated, list[str]]:
-    """The rows with logit opacities, logarithmic scales, no ``filter_3D``; what was activated; a line on each change.
+    """Rows with logit opacities, logarithmic scales and no ``filter_3D``; what was activated; a line for each change.
 
     Args:
         vertex: ``[N]`` as read; modified.
-        activated: which of the values are activated where their range leaves it open; None to refuse then.
+        activated: which values are activated, where their range allows both; None to refuse then.
 
     Raises:
-        ClodError: the range leaves it open and ``activated`` is None, or ``activated`` is no such choice.
+        ClodError: the range allows both and ``activated`` is None, or ``activated`` is not a valid choice.
     """
     if activated is not None and activated not in get_args(Activated):
         raise ClodError(f"activated is {activated!r}, it must be one of {', '.join(get_args(Activated))}")
@@ -55,10 +55,10 @@ def as_stored_by_inria(
 
 
 def in_question(vertex: np.ndarray) -> dict[str, tuple[float, float]]:
-    """The range of "opacity" and of "scales", of each if it looks activated."""
+    """The range of "opacity" and of "scales", where it looks activated."""
     opacity, scales = _table(vertex, _OPACITY), _table(vertex, _SCALES)
     found = {}
-    # Half of the values at most 1: not so of logits whose faint ones were pruned.
+    # At most half of the values above 1: not true of logits whose faint ones were pruned.
     if (extent := _range(opacity, _FAINTEST)) and np.nanmedian(opacity) <= 1:
         found["opacity"] = extent
     if extent := _range(scales, 0.0):
@@ -67,13 +67,13 @@ def in_question(vertex: np.ndarray) -> dict[str, tuple[float, float]]:
 
 
 def choice_of(found: Iterable[str]) -> Activated:
-    """What to say of values in question if they are activated."""
+    """The choice of ``Activated`` for these values."""
     kinds = set(found)
     return "both" if len(kinds) == 2 else "opacity" if "opacity" in kinds else "scales" if kinds else "none"
 
 
 def _range(values: np.ndarray, least: float) -> tuple[float, float] | None:
-    """The smallest and the largest, if none is below ``least`` and they are enough to tell anything."""
+    """The smallest and the largest, if none is below ``least`` and there are at least ``_FEW``."""
     values = values[np.isfinite(values).all(1)]
     if len(values) < _FEW:
         return None
@@ -86,7 +86,7 @@ def _question(found: dict[str, tuple[float, float]]) -> str:
     choice = choice_of(found)
     return (
         f"has {ranges}, which looks like activated values where a 3DGS file has logits (opacity) and logarithms "
-        f"(scales); if they are, say --activated {choice}, and if not, --activated none (activated= in Python)"
+        f"(scales); if they are, give --activated {choice}, if not, --activated none (activated= in Python)"
     )
 
 
@@ -102,7 +102,7 @@ def _take_logits(vertex: np.ndarray) -> str:
 def _fused(vertex: np.ndarray) -> np.ndarray:
     """With the filter ``f``: scales ``sqrt(s^2 + f^2)``, opacity ``a sqrt(det(s^2) / det(s^2 + f^2))``, in logs."""
     scales, logits = _table(vertex, _SCALES), _table(vertex, _OPACITY)
-    with np.errstate(all="ignore"):  # what is not finite stays so, and its row is dropped later
+    with np.errstate(all="ignore"):  # values that are not finite stay so; their rows are dropped later
         size = np.log(np.abs(_table(vertex, (FILTER,))))
         wider = 0.5 * np.logaddexp(2 * scales, 2 * size)
         log_opacity = -np.logaddexp(0, -logits) + (scales - wider).sum(1, keepdims=True)

@@ -1,7 +1,7 @@
-"""The rows of an output: the base's with the values that changed written in, constants, and last ``sigma_d``.
+"""The rows of an output: the base's with changed values, constant columns, and last ``sigma_d``.
 
-They are made and written some thousands at a time, so that no second copy of a large file is ever held, and because
-picking columns out of rows that stay in the processor's cache is several times as fast.
+Rows are written in blocks that fit in the processor's cache, which is several times as fast, and a large file is never
+held twice.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.ply.columns import SIGMA, column_map, read_table
 from clod_adapter.io.ply.constants import PREFIX
+from clod_adapter.io.ply.rows import ROWS
 from clod_adapter.origin import AXES, Origin, relative
-
-ROWS = 4096  # in a block
 
 
 def write_rows(
@@ -34,7 +33,7 @@ def write_rows(
         vertex: ``[N]`` the base's rows, of which ``gaussians`` are the Gaussians.
         origin: what the means are relative to; where it is not 0 coordinates become doubles.
         comments: of the element, in the header.
-        constants: by name, float columns of one value each (``ply_constants``); those of the base do not go along.
+        constants: by name, float columns of one value each (``constants``); those of the base are dropped.
 
     Raises:
         ClodError: a new value is not finite.

@@ -1,4 +1,4 @@
-"""Refusing damaged COLMAP models before COLMAP reads them, which trusts its files."""
+"""Refuses damaged COLMAP models before COLMAP, which trusts its files, reads them."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import struct
 from pathlib import Path
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.regular import refuse_irregular
 from clod_adapter.io.scene.colmap_library import pycolmap
+from clod_adapter.io.sniff import refuse_irregular
 
 
 def check_records(model: Path) -> None:
@@ -34,17 +34,6 @@ def check_records(model: Path) -> None:
             at = len(data) + 1
         if at > len(data):
             raise ClodError(f"{path}: is truncated or damaged; copy or export the model again")
-
-
-def check_name(model: Path, name: str) -> None:
-    """Refuses an image name that no file can have, or that is not safe to print.
-
-    Raises:
-        ClodError: it holds control characters, or is longer than file systems allow.
-    """
-    parts = name.encode(errors="surrogatepass").replace(b"\\", b"/").split(b"/")
-    if not name.isprintable() or len(name) > 4000 or max(map(len, parts)) > 255:
-        raise ClodError(f"{model}: image name {name[:40]!r} ({len(name)} characters) is no file's name; rename it")
 
 
 def _count(data: bytes, at: int) -> int:

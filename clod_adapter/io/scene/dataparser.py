@@ -1,6 +1,6 @@
 """The frame that nerfstudio trained in: ``dataparser_transforms.json``, which ns-train writes beside its config.yml.
 
-nerfstudio turns, moves and scales the cameras that it is given, trains in that frame and exports its splats in it. With
+nerfstudio rotates, moves and scales its cameras, trains in that frame and exports its splats in it. With
 ``transform`` the file's 3x4 matrix ``[R | t]`` and ``scale`` its number, a point ``x`` of the world that the data came
 in (COLMAP's, where ``ns-process-data`` or the colmap dataparser turned it first) is in that frame
 

@@ -1,4 +1,4 @@
-"""Every file of a scene that reading it may open, by name alone: for what must not be written over."""
+"""Every file that reading a scene may open, by name alone, so that no output overwrites one."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ DESCRIPTIONS = (
     "dataparser_transforms.json",
 )  # fmt: skip
 PATHS = ("file_path", "mask_path", "depth_file_path")  # of a frame
-ENDINGS = ("", ".png", ".jpg", ".jpeg")  # that a frame's path may lack
+ENDINGS = ("", ".png", ".jpg", ".jpeg")  # that the path of a frame may omit
 
 
 def scene_files(folder: Path) -> Iterator[Path]:
-    """The model's files or the transforms', photographs, masks and depths; some of the names may not be there.
+    """The files of the model or the transforms, photographs, masks and depths; some may not exist.
 
-    A damaged file names none: whoever reads it says so.
+    A damaged file gives no names; its reader refuses it.
 
     Raises:
         ClodError: the folder has no cameras.
@@ -77,7 +77,7 @@ def _names_in_json(path: Path) -> Iterator[str]:
 
 
 def _on_disk(name: str) -> str:
-    """The name as the system has it; empty for what can be none."""
+    """The name as the file system encodes it; empty for an impossible one."""
     try:
         return file_name(name.replace("\\", "/")) if "\0" not in name else ""
     except UnicodeEncodeError:

@@ -1,10 +1,12 @@
-"""Where a scene has its cameras and photographs. Apart from what reads them, so that a wrong folder is refused at once.
+"""Where a scene has its cameras and photographs, and where undistorted ones are cached.
 
-Reading them takes pycolmap and torch, which take a second or two to import.
+Needs neither pycolmap nor torch, so that a wrong folder is refused before they are imported.
 """
 
 from __future__ import annotations
 
+import os
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from os.path import isfile
@@ -16,7 +18,8 @@ from clod_adapter.errors import ClodError
 TRANSFORMS = ("transforms_train.json", "transforms.json")
 SMALLER = ("images_2", "images_4", "images_8")  # copies at a part of the size, as Mip-NeRF 360 and Inria's code have
 RAW = "input"  # Inria's name for the photographs before they are undistorted into images
-MISSING = 0.5  # the share of a scene's photographs that may be
+MISSING = 0.5  # the share of photographs that may be missing
+LONGEST_NAME, LONGEST_PART = 4000, 255  # characters of a path, bytes of one of its parts
 
 
 def find_cameras(folder: Path) -> Path:
@@ -75,7 +78,7 @@ def find_photographs(
     Raises:
         ClodError: a name is there twice or leads out of the folder, or more than half of the photographs are missing.
     """
-    parts = [tuple(map(file_name, inside(name, cameras))) for name in names]
+    parts = [tuple(map(file_name, name_parts(name, cameras))) for name in names]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise ClodError(f"{cameras}: has image {twice[0]} more than once; export it again")
     roots = [each for each in photograph_folders(folder, cameras) if raw or each.name != RAW or each == folder]
@@ -98,16 +101,37 @@ def find_photographs(
     return paths, notes
 
 
-def inside(name: str, cameras: Path) -> tuple[str, ...]:
-    """The parts of a photograph's name; it is split at / and at the \\ of files made on Windows.
+def name_parts(name: str, cameras: Path) -> tuple[str, ...]:
+    """The parts of a photograph's name, split at / and at the \\ of files made on Windows.
 
     Raises:
-        ClodError: the name is empty, leads out of the folder it is looked for in, or is no name of a file.
+        ClodError: the name is empty, not UTF-8, longer than file systems allow, holds control characters, or leads out
+            of the folder of photographs.
     """
     if as_text(name) != name:
-        raise ClodError(f"{cameras}: image name {name[:80]} is no text in UTF-8; rename the photograph, there too")
+        raise ClodError(f"{cameras}: image name {as_text(name)[:80]!r} is not UTF-8; rename the photograph, there too")
     path = PureWindowsPath(name)
-    controls = any(sign < " " or "\x7f" <= sign <= "\x9f" for sign in name)
-    if not path.parts or path.anchor or ".." in path.parts or controls:
+    if any(sign < " " or "\x7f" <= sign <= "\x9f" for sign in name) or len(name) > LONGEST_NAME:
+        raise ClodError(f"{cameras}: image name {name[:40]!r} ({len(name)} characters) is no file's name; rename it")
+    if not path.parts or path.anchor or ".." in path.parts:
         raise ClodError(f"{cameras}: image name {name[:80]!r} leaves the images folder or is no name; rename it there")
+    if max(len(part.encode()) for part in path.parts) > LONGEST_PART:
+        raise ClodError(f"{cameras}: image name {name[:40]!r} ({len(name)} characters) is no file's name; rename it")
     return path.parts
+
+
+def user_caches() -> Path:
+    """``$XDG_CACHE_HOME``, or where the platform has its users' caches; it need not be there.
+
+    Raises:
+        ClodError: there is neither that nor a home folder.
+    """
+    if chosen := os.environ.get("XDG_CACHE_HOME"):
+        return Path(chosen)
+    try:
+        home = Path.home()
+    except RuntimeError as error:
+        raise ClodError("no home folder to keep undistorted photographs in; set XDG_CACHE_HOME to a folder") from error
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", home / "AppData" / "Local"))
+    return home / "Library" / "Caches" if sys.platform == "darwin" else home / ".cache"

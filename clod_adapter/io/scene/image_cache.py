@@ -1,4 +1,4 @@
-"""Photographs that are read when they are looked at, of which only the latest stay in memory."""
+"""Photographs that are read on access; the most recently used stay in memory."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from clod_adapter.cameras import StoredView, View
 
 
 class ImageCache:
-    """Pixels of photographs: those looked at last, of at most ``limit`` bytes together.
+    """Pixels of photographs, least recently used dropped first, of at most ``limit`` bytes in total.
 
-    The one in use may be larger than that by itself, and is then not kept.
+    A single photograph larger than ``limit`` is not kept.
 
     Attributes:
-        limit: bytes; held: bytes that are kept now.
+        limit: bytes; held: bytes in memory now.
         reads: how often a photograph was read again.
     """
 
@@ -27,7 +27,7 @@ class ImageCache:
         self._lock, self._count = threading.Lock(), 0
 
     def store(self, view: View, read: Callable[[], Tensor]) -> View:
-        """The view without its pixels, which ``read`` gives again; they are kept for as long as there is room."""
+        """The view without its pixels, which are kept while there is room and else come from ``read``."""
         with self._lock:
             key, self._count = self._count, self._count + 1
         self._keep(key, view.image)

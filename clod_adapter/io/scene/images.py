@@ -1,4 +1,4 @@
-"""Photographs as people have them, decoded to 8-bit RGB."""
+"""Photographs of any common format, decoded to 8-bit RGB."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from PIL import Image, UnidentifiedImageError
 from clod_adapter.errors import ClodError
 
 Note = tuple[str, str]
-"""What was done to a photograph, with {} for what differs between photographs, and that: a size, say."""
+"""A change to a photograph, with {} for the part that differs between photographs, and that part."""
 
 
 class Photograph(NamedTuple):
-    """A photograph as a pinhole camera has it.
+    """A photograph of a pinhole camera.
 
     Attributes:
         pixels: 8-bit RGB, at the size that is used.
         K: ``[3, 3]`` the intrinsics of that camera.
         source: width and height in the file.
-        notes: on what it took.
+        notes: on the changes.
     """
 
     pixels: Image.Image
@@ -35,31 +35,31 @@ class Photograph(NamedTuple):
 
 TRANSPARENT: Note = ("have transparency: laid over black", "")
 
-LARGE = 1 << 26  # pixels of a photograph that is brought down before anything else is done to it
-BAND = 64  # rows of what is made of one, at a time
+LARGE = 1 << 26  # pixels; a larger photograph is reduced first
+BAND = 64  # rows of the reduced photograph that are made at a time
 
 _TURNS = {
     5: Image.Transpose.TRANSPOSE,
     6: Image.Transpose.ROTATE_270,
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
-}  # what an EXIF orientation that swaps width and height asks for
+}  # of EXIF orientations that swap width and height
 _ORIENTATION, _BITS, _PLANES = 0x0112, 258, 284  # tags of EXIF and TIFF
 
 
 def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Image.Image, tuple[int, int], list[Note]]:
-    """The file as 8-bit RGB in the shape of its camera, its size in the file, and notes on what that took.
+    """The file as 8-bit RGB in the shape of its camera, its size in the file, and notes on the changes.
 
-    16 bits per channel are brought to 8, grey becomes RGB, transparency is laid over black. Colour profiles are not
-    applied. The EXIF rotation is not either, as COLMAP does not, unless the photograph has its camera's shape only
+    16 bits per channel are reduced to 8, grey becomes RGB, transparency is composited over black. Colour profiles are
+    not applied. The EXIF rotation is not either, as COLMAP does not, unless the photograph has its camera's shape only
     once it is turned: then the model was made from turned copies.
 
-    One of more than LARGE pixels is brought down by a whole factor first, to ``2 max_width`` or more: a JPEG while it
-    is decoded, others by the mean over squares of pixels.
+    A photograph of more than LARGE pixels is first reduced by an integer factor, to ``2 max_width`` or more: a JPEG
+    by its decoder, others by the mean over squares of pixels.
 
     Args:
         width, height: the camera's; the photograph may be of another size, but not of another shape.
-        max_width: the width that is made of it in the end.
+        max_width: its final width at most.
 
     Raises:
         ClodError: the file cannot be decoded, has too many pixels, or another shape than the camera.
@@ -88,7 +88,11 @@ def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Ima
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height, from the file's header; raises ClodError where that cannot be read."""
+    """Width and height, from the file's header.
+
+    Raises:
+        ClodError: the header cannot be read.
+    """
     with _opened(path) as source:
         return source.size
 
@@ -151,7 +155,7 @@ def _converted(source: Image.Image, deep: bool, notes: list[Note]) -> Image.Imag
 
 
 class Room:
-    """Pixels that may be worked on at a time, by all threads together; a photograph of more is worked on alone."""
+    """A limit of the pixels in work in all threads together; a larger photograph is processed alone."""
 
     def __init__(self, pixels: int) -> None:
         self.pixels, self.taken = pixels, 0
@@ -159,7 +163,7 @@ class Room:
 
     @contextmanager
     def of(self, pixels: int) -> Iterator[None]:
-        """Waits until there is room for so many."""
+        """Waits until there is room for ``pixels``."""
         with self._changed:
             while self.taken and self.taken + pixels > self.pixels:
                 self._changed.wait()

@@ -18,7 +18,7 @@ from clod_adapter._kernels.memory import release
 from clod_adapter._support.workers import in_order
 from clod_adapter.cameras import Camera, Scene, View, in_its_unit
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap_model import read_model
+from clod_adapter.io.scene.colmap import read_model
 from clod_adapter.io.scene.dataparser import trained_frame
 from clod_adapter.io.scene.folder import find_cameras, find_photographs
 from clod_adapter.io.scene.image_cache import ImageCache
@@ -26,6 +26,7 @@ from clod_adapter.io.scene.images import LARGE, TRANSPARENT, Note, Photograph, R
 from clod_adapter.io.scene.posed import HUGE, TEST_EVERY, PosedImage, held_out
 from clod_adapter.io.scene.transforms import MASKS, read_transforms
 from clod_adapter.origin import NOWHERE
+from clod_adapter.progress import Listener, Phase, tell
 
 MOST_AT_ONCE = 8  # photographs of full size in memory
 ROOM = Room(1 << 28)  # their pixels in memory, of 4 bytes each while they are decoded
@@ -37,7 +38,7 @@ def load_scene(
     test_every: int = TEST_EVERY,
     max_width: int = 1600,
     origin: Sequence[float] = NOWHERE,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Listener | None = None,
     cache: ImageCache | None = None,
 ) -> Scene:
     """Reads posed photographs: a COLMAP model (binary or text, any version) or a transforms.json, and its images.
@@ -63,7 +64,7 @@ def load_scene(
         max_width: wider images are scaled down to this many pixels, with Pillow's bicubic filter as
             in Inria's code; the intrinsics follow, and a note says so.
         origin: ``[3]`` what the cameras' world is to be relative to, in its units: ``Checkpoint.origin``.
-        progress: called with (images loaded, images in all).
+        progress: called in ``Phase.PHOTOGRAPHS`` after each image.
         cache: keeps the photographs, where not all are to be in memory; they are then read again when looked at.
 
     Raises:
@@ -99,7 +100,7 @@ def _load(
     present: Sequence[tuple[PosedImage, Path]],
     folder: Path,
     max_width: int,
-    progress: Callable[[int, int], None] | None,
+    progress: Listener | None,
     keep: ImageCache | None,
 ) -> tuple[list[View], list[tuple[int, int]], list[Note]]:
     """The views of the images, their sizes in the files, and notes. Each worker holds one of full size at a time."""
@@ -115,8 +116,7 @@ def _load(
                 views.append(keep.store(view, partial(_again, load)) if keep else view)
                 sizes.append(size)
                 notes += remarks
-                if progress:
-                    progress(len(views), len(present))
+                tell(progress, Phase.PHOTOGRAPHS, len(views), len(present))
     return views, sizes, notes
 
 
@@ -130,18 +130,18 @@ def _left_out(
         pinhole, masked: whether all cameras are pinholes, and whether the scene has masks.
     """
     whole, used = sum(3 * w * h for w, h in sizes), sum(3 * view.camera.width * view.camera.height for view in views)
-    found = [("exposure", "each photograph counts as it is: no light is balanced between them")]
+    found = [("exposure", "not modelled: photographs are used without exposure compensation")]
     if pinhole:
         found.append(("undistortion", f"all {len(views)} cameras are pinholes"))
     if TRANSPARENT not in notes:
         found.append(("alpha", f"none of {len(views)} photographs has transparency"))
     if not masked:
-        found.append(("masks", "the scene has none"))
+        found.append(("masks", "the scene has no masks"))
     if used < whole:
         kept = f"{used / 1e6:,.3g} MB of the {whole / 1e6:,.3g} MB in the files"
         found.append(("pixels", f"kept are {kept}: photographs are scaled as they are decoded"))
     else:
-        found.append(("scaling", f"all {len(views)} photographs are used at the size they have"))
+        found.append(("scaling", f"all {len(views)} photographs are used at full resolution"))
     return tuple(found)
 
 

@@ -1,4 +1,4 @@
-"""What a scene says of a photograph, whichever file says it."""
+"""A photograph's pose and camera, of a COLMAP model or a transforms file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap_library import pycolmap
 
 TEST_EVERY = 8  # one view in this many is held out
-HUGE = 1e9  # world units and pixels; what is beyond is damage, and may not fit float32
+HUGE = 1e9  # world units and pixels; larger values are damage, and may not fit float32
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class PosedImage:
         name: its path in the folder of photographs, parts joined by /.
         viewmat: ``[4, 4]`` float64, world to camera, OpenCV axes.
         camera: any of COLMAP's perspective models; pixel centres lie at +0.5.
-        held_out: whether the scene says it is for testing; None where it says nothing.
+        held_out: whether the scene marks it for testing; None where the scene marks none.
     """
 
     name: str
@@ -33,18 +33,18 @@ class PosedImage:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether straight lines are straight in it: no distortion, or only coefficients of 0."""
+        """Whether it has no distortion, or only coefficients of 0."""
         return self.camera.is_perspective_pinhole() and self.camera.is_undistorted()
 
     def relative_to(self, origin: Sequence[float]) -> PosedImage:
-        """In a world that begins at ``origin [3]``; in float64, as far from 0 float32 has no digits left."""
+        """In a world with its origin at ``origin [3]``; in float64, as float32 lacks digits far from 0."""
         viewmat = self.viewmat.copy()
         viewmat[:3, 3] += viewmat[:3, :3] @ np.asarray(origin, np.float64)
         return replace(self, viewmat=viewmat)
 
 
 def held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:
-    """Names of the images that are for testing: as the scene says, else the 0th and every ``test_every``-th.
+    """Names of the test images: those that the scene marks, else the 0th and every ``test_every``-th.
 
     A single image is for training.
     """
@@ -57,7 +57,7 @@ def check_posed(image: PosedImage, source: Path) -> PosedImage:
     """The image as it is.
 
     Raises:
-        ClodError: its camera or pose is not finite, too large, or nothing that undistorting makes a pinhole.
+        ClodError: its camera or pose is not finite, too large, or cannot be undistorted to a pinhole.
     """
     camera = image.camera
     if not camera.is_perspective_pinhole() and not camera.is_perspective_fisheye():

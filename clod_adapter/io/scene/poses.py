@@ -1,4 +1,4 @@
-"""The cameras of a scene without its photographs, which nobody has to have or to decode."""
+"""The cameras of a scene without its photographs, which need not exist."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 
 from clod_adapter.cameras import Camera, camera_extent, near_plane
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap_model import read_model
+from clod_adapter.io.scene.colmap import read_model
 from clod_adapter.io.scene.dataparser import trained_frame
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.io.scene.posed import TEST_EVERY, held_out
@@ -24,15 +24,15 @@ def load_cameras(
     """The cameras that ``scene.load_scene`` would give photographs to, sorted by name, and notes.
 
     A distorted one is the pinhole of the same focal length and centre, not that of its undistorted photograph. Of a
-    transforms.json that says no size, cameras whose photograph is missing too are left out.
+    transforms.json without sizes, cameras whose photograph is missing too are left out.
 
     Args:
         folder: the scene's, usually the one with ``sparse/0/`` or ``transforms.json``.
         origin: ``[3]`` what the world is to be relative to, in its units: ``Checkpoint.origin``.
-        training: leaves out those that ``load_scene`` holds out.
+        training: excludes those that ``load_scene`` holds out.
 
     Raises:
-        ClodError: no cameras there, or none that is usable.
+        ClodError: there are no cameras, or none is usable.
     """
     folder = Path(folder)
     source = find_cameras(folder)
@@ -51,7 +51,7 @@ def load_cameras(
         notes.append(f"{unsized} of {len(images)} cameras left out: neither {source.name} nor a photograph has a size")
     if not cameras:
         raise ClodError(
-            f"{source}: says no photograph's size, and none of them is there; put them beside it, or w and h into it"
+            f"{source}: has no size of a photograph, and no photograph is there; put them beside it, or w and h into it"
         )
     extent = camera_extent(cameras)
     cameras = [camera for camera in cameras if camera.name not in testing]

@@ -15,7 +15,7 @@ import numpy as np
 from clod_adapter._support.text import file_name
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap_library import pycolmap
-from clod_adapter.io.scene.folder import inside
+from clod_adapter.io.scene.folder import name_parts
 from clod_adapter.io.scene.images import image_size
 from clod_adapter.io.scene.posed import PosedImage, check_posed
 
@@ -93,7 +93,7 @@ def read_json(path: Path) -> Any:
 
 
 def _name(path: Path, file_path: str) -> str:
-    name = "/".join(inside(file_path, path))
+    name = "/".join(name_parts(file_path, path))
     endings = ("", ".png", ".jpg", ".jpeg")  # isfile, as it is False for what can be no path
     return next((name + ending for ending in endings if isfile(path.parent / file_name(name + ending))), name)
 

@@ -1,4 +1,4 @@
-"""Photographs of distorted cameras made those of pinhole cameras, and kept so that it is done once."""
+"""Undistorts photographs to those of pinhole cameras, and caches the results."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from PIL import Image, PngImagePlugin
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.scene.caches import user_caches
 from clod_adapter.io.scene.colmap_library import pycolmap
+from clod_adapter.io.scene.folder import user_caches
 from clod_adapter.io.scene.images import Photograph
 from clod_adapter.io.scene.posed import PosedImage
 
-_KEY = "clod-adapter"  # of what a kept picture says of itself
+_KEY = "clod-adapter"  # of the text in a cached PNG
 
 
 def undistort(path: Path, pixels: Image.Image, camera: pycolmap.Camera) -> tuple[Image.Image, pycolmap.Camera]:
-    """As ``colmap image_undistorter`` does by default: bilinear, the same focal length, cut to what has no blank pixel.
+    """As ``colmap image_undistorter`` by default: bilinear, the same focal length, cropped to have no blank pixel.
 
     Args:
         path: the photograph's, for messages.
@@ -44,9 +44,7 @@ def undistort(path: Path, pixels: Image.Image, camera: pycolmap.Camera) -> tuple
 
 
 def cache_folder(scene: Path) -> Path:
-    """Where the undistorted photographs of this scene are kept, made if it is missing.
-
-    In ``$XDG_CACHE_HOME``, or where the platform has its users' caches.
+    """The cache folder of a scene's undistorted photographs in ``user_caches()``; created if missing.
 
     Raises:
         ClodError: it cannot be made or written to.
@@ -67,11 +65,10 @@ def cache_folder(scene: Path) -> Path:
 
 
 def kept(folder: Path, image: PosedImage, path: Path, max_width: int, make: Callable[[], Photograph]) -> Photograph:
-    """What ``make`` gives, from ``folder`` where it is there from an earlier run.
+    """The result of ``make``, from ``folder`` where an earlier run has cached it.
 
-    One PNG for each photograph, which appears whole or not at all, so a run that is interrupted goes on where it was.
-    Its name is a hash of all that it depends on: the photograph's path, size and time of change, the camera,
-    ``max_width`` and the libraries' versions.
+    One PNG for each photograph, written atomically. Its name is a hash of its inputs: the photograph's path,
+    size and modification time, the camera, ``max_width`` and the libraries' versions.
     """
     state, camera = path.stat(), image.camera
     made_of = (

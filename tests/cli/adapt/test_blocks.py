@@ -19,8 +19,8 @@ from clod_adapter.blocks.memory import MemoryPlan, plan_for_limit
 from clod_adapter.cli.adapt import memory as memory_option
 from clod_adapter.cli.adapt import progress as follower
 from clod_adapter.cli.adapt import resume
+from clod_adapter.progress import Phase, Progress
 from clod_adapter.training.objective import Objective
-from clod_adapter.training.state import Progress
 from scenes import stripped
 
 BLOCKS = 3
@@ -80,7 +80,7 @@ def test_jobs_end_as_one_process_does(adapt: Callable[..., Any], whole: dict[str
     for number in (3, 1):
         done = adapt("jobs.ply", "--block", number)
         assert done.code == 0 and (tmp_path / f"jobs.block{number}.pass1.safetensors").exists()
-    assert "of pass 1, blocks [2] are to come" in done.out and not (tmp_path / "jobs.ply").exists()
+    assert "pass 1: blocks [2] are missing" in done.out and not (tmp_path / "jobs.ply").exists()
     done = adapt("jobs.ply", "--block", 1)
     assert done.code == 2 and "the second needs the first of all: run --block 2 first" in done.err
     assert adapt("jobs.ply", "--block", 2).code == 0
@@ -100,26 +100,27 @@ def test_a_killed_block_goes_on(
     adapt: Callable[..., Any], whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Killed after its fifth step: the same command goes on from the state that was saved, and ends the same."""
-    watching = resume.Saver.watching
+    saving = resume.Saver.saving
 
     class Killed(BaseException):
         pass
 
-    def dying(self: resume.Saver, follow: Callable[[Progress], None]) -> Callable[[Progress], None]:
-        call = watching(self, follow)
+    def dying(self: resume.Saver, listener: Any) -> Any:
+        call = saving(self, listener)
 
-        def step(progress: Progress) -> None:
+        def step(progress: Progress) -> Any:
             self.due = 0.0
-            call(progress)
-            if progress.phase == "train" and progress.done == 5 and "block2.pass1" in str(self.path):
+            going = call(progress)
+            if progress.phase == Phase.TRAINING and progress.done == 5 and "block2.pass1" in str(self.path):
                 raise Killed
+            return going
 
         return step
 
-    monkeypatch.setattr(resume.Saver, "watching", dying)
+    monkeypatch.setattr(resume.Saver, "saving", dying)
     with pytest.raises(Killed):
         adapt("again.ply")
-    monkeypatch.setattr(resume.Saver, "watching", watching)
+    monkeypatch.setattr(resume.Saver, "saving", saving)
     left = sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("again"))
     assert left == [
         "again.block1.pass1.safetensors", "again.block2.pass1.resume.safetensors", "again.start.safetensors"
@@ -148,7 +149,7 @@ def test_what_cannot_be(clod: Callable[..., Any], capture: Any, adapt: Callable[
     given = [capture.ply, "--images", capture.scene]
     for words, message in (
         (["--memory", "8"], "--memory is '8'; give a number and its unit, as in 8GB"),
-        (["--block", "2"], "--block is of a run in blocks, which --memory makes; give it too"),
+        (["--block", "2"], "--block needs --memory, which splits the scene in blocks; give both"),
         (["--memory", "8GB", "--block", "0"], "--block is '0'; give start, or the number of a block, from 1"),
         (["--memory", "8GB", "--block", "two"], "--block is 'two'; give start, or the number of a block, from 1"),
         (["--memory", "100MB"], "--memory is 100 MB, and 300 Gaussians take at least"),
@@ -167,7 +168,7 @@ def test_what_fits_is_as_without(clod: Callable[..., Any], capture: Any, tmp_pat
     for name, more in (("a", []), ("b", ["--memory", "8GB"])):
         done = clod(*given, "--out", f"{name}.ply", *more)
         assert done.code == 0
-    assert "the whole at once" in done.err and "training" in done.err
+    assert "the whole scene at once" in done.err and "training" in done.err
     assert outputs(tmp_path, "a") == outputs(tmp_path, "b")
 
 
@@ -181,7 +182,7 @@ def test_another_limit_goes_on_with_no_other_blocks(
             memory_option, "plan_for_limit", lambda *args, n=blocks: replace(plan_for_limit(*args), blocks=n)
         )
         done = adapt("a.ply")
-        assert done.code == 2 and f"is of a run in 3 blocks, and --memory 8GB makes {blocks}; give" in done.err
+        assert done.code == 2 and f"is of a run in 3 blocks, and --memory 8GB makes {blocks}; use" in done.err
     assert not (tmp_path / "a.ply").exists()
 
 
@@ -190,7 +191,9 @@ def test_what_fits_as_one_job(clod: Callable[..., Any], capture: Any, tmp_path: 
     given = [capture.ply, "--images", capture.scene, "--iters", 3, "--max-sv", 3, "--memory", "8GB", "--out", "[a].ply"]
     assert clod(*given, "--block", 1).code == 0
     done = clod(*given)
-    assert done.code == 0 and "block 1 of 1, pass" not in done.err and "start of 1 blocks is there" in done.err
+    assert (
+        done.code == 0 and "block 1 of 1, pass" not in done.err and "the initialization of 1 blocks exists" in done.err
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["[a].json", "[a].ply", "[a].safetensors"]
 
 
@@ -278,7 +281,7 @@ def test_an_error_in_a_block_leaves_its_state(
     monkeypatch.setattr(Objective, "gradient_sum", failing)
     done = adapt("a.ply", "--quiet")
     state = "a.block1.pass1.resume.safetensors"
-    assert done.code == 1 and f"the same command goes on from step 5, which is in {state}\n" in done.err, done
+    assert done.code == 1 and f"the same command resumes from step 5, which is in {state}\n" in done.err, done
     done = adapt("a.ply")
     assert done.code == 0 and f"resuming {state} from step 5" in done.err and outputs(tmp_path, "a") == whole
 
@@ -288,14 +291,14 @@ def test_ctrl_c_leaves_what_is_finished(
 ) -> None:
     call = follower.ProgressDisplay.__call__
 
-    def pressed(self: follower.ProgressDisplay, progress: Progress) -> None:
-        if progress.phase == "train" and progress.done == 3 and "block 2 of 3, pass 1" in self.labels["train"]:
+    def pressed(self: follower.ProgressDisplay, progress: Progress) -> bool:
+        if progress.phase == Phase.TRAINING and progress.done == 3 and "block 2 of 3, pass 1" in self.training:
             self.stop.requests += 1
-        call(self, progress)
+        return call(self, progress)
 
     monkeypatch.setattr(follower.ProgressDisplay, "__call__", pressed)
     done = adapt("a.ply")
-    assert done.code == 130 and "pass 1 of 2: stopped after step 3; the same command goes on with it" in done.err
+    assert done.code == 130 and "pass 1 of 2: stopped after step 3; the same command resumes it" in done.err
     assert (tmp_path / "a.block1.pass1.safetensors").exists() and not (tmp_path / "a.ply").exists()
     monkeypatch.setattr(follower.ProgressDisplay, "__call__", call)
     assert adapt("a.ply").code == 0 and outputs(tmp_path, "a") == whole

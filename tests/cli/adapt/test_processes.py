@@ -184,7 +184,7 @@ def test_three_with_uneven_shares(server: Server, words: list[Any], tmp_path: Pa
 
 
 def test_a_loss_that_is_not_finite_ends_both(server: Server, words: list[Any], tmp_path: Path) -> None:
-    """After the same step, whichever has it; what was learned before is written and measured."""
+    """After the same step, whichever has it; the result so far is written and measured."""
     spoil = (
         "from dataclasses import replace; from clod_adapter.training.objective import Objective\n"
         "pull, steps = Objective.gradient_sum, []\n"
@@ -217,21 +217,22 @@ def test_the_second_is_killed(server: Server, words: list[Any], tmp_path: Path) 
     report = run.report()
     steps = report["steps"]
     assert report["interrupted"] and report["rows"] == [] and steps > 0
-    assert any(f"training ended at step {steps}: a process that trained along is gone" in n for n in report["notes"])
-    assert f"--resume goes on from step {steps}, which is in {STATE}" in run.log(0)
+    assert any(f"training ended at step {steps}: a process of the group has ended" in n for n in report["notes"])
+    assert f"--resume resumes from step {steps}, which is in {STATE}" in run.log(0)
     assert load_state(run.folder / STATE)[0].steps == steps
 
 
 def test_the_launcher_s_signals_end_no_writing(server: Server, words: list[Any], tmp_path: Path) -> None:
     """It sends one for the loss, and others pass theirs on: while the files are written, and right to the end."""
     pressed = (
-        "import argparse; from clod_adapter.cli.adapt import result as outcome\n"
+        "import argparse; from clod_adapter.cli.adapt import report, result\n"
         "def pressing(real):\n"
         "    def call(*arguments, **more):\n"
         "        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGTERM): signal.raise_signal(number)\n"
         "        return real(*arguments, **more)\n"
         "    return call\n"
-        "for name in ('explain', 'write', 'print_summary'): setattr(outcome, name, pressing(getattr(outcome, name)))\n"
+        "result.explain = pressing(result.explain)\n"
+        "for name in ('write', 'print_summary'): setattr(report, name, pressing(getattr(report, name)))\n"
         "main.json = argparse.Namespace(dumps=pressing(json.dumps))"
     )
     run = server.start(tmp_path / "run", *words, *LONG, "--quiet", "--json", before={0: pressed})
@@ -283,13 +284,15 @@ def test_a_loss_before_the_first_step(server: Server, words: list[Any], tmp_path
     run = server.start(tmp_path / "run", *words, *TINY, before={1: on_gpus})
     assert run.wait() == [2, 2] and run.log(1) == "" and list(run.folder.iterdir()) == [], run.log(0)
     why = "process 1: 2 processes on a machine with 1 GPUs; start as many as there are"
-    assert run.log(0).count("error:") == 1 and f"; {why}; nothing was learned by then, so start again\n" in run.log(0)
+    assert run.log(0).count("error:") == 1 and f"; {why}; this was before the first step, so start again\n" in run.log(
+        0
+    )
 
 
 def test_the_first_is_killed(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
     """The state that it saved last is there, for any number of processes; the others wait for the launcher's signal."""
-    slowly = "from clod_adapter.training.loop import _Run; real = _Run.step\n"
-    slowly += "def step(*a):\n    processes.time.sleep(0.05)\n    real(*a)\n_Run.step = step"
+    slowly = "from clod_adapter.training.trainer import Trainer; real = Trainer.step\n"
+    slowly += "def step(*a):\n    processes.time.sleep(0.05)\n    real(*a)\nTrainer.step = step"
     run = server.start(tmp_path / "run", *words, *TINY, before={0: slowly})
     run.wait_for_state()
     os.kill(run.pids[0], signal.SIGKILL)
@@ -345,7 +348,7 @@ def test_torchrun_and_a_loss(words: list[Any], tmp_path: Path) -> None:
     children = subprocess.run(["ps", "-o", "pid=", "--ppid", str(run.pid)], capture_output=True, text=True).stdout
     os.kill(next(pid for pid in map(int, children.split()) if b"\0RANK=1\0" in environment_of(pid)), signal.SIGKILL)
     out, err = run.communicate(timeout=100)
-    assert "a process that trained along is gone" in err and err.count("2 processes (gloo)") == 1, err
+    assert "a process of the group has ended" in err and err.count("2 processes (gloo)") == 1, err
     assert launched.report()["interrupted"] and json.loads(out)["steps"] == load_state(tmp_path / STATE)[0].steps
 
 
@@ -371,7 +374,7 @@ def test_where_a_process_stands(monkeypatch: pytest.MonkeyPatch, environment: di
     for name, value in {**environment, **where}.items():
         monkeypatch.setenv(name, value)
     if want is None:
-        with pytest.raises(ClodError, match="which cannot be; start the processes with torchrun"):
+        with pytest.raises(ClodError, match="inconsistent .*; start the processes with torchrun"):
             launched()
     else:
         assert launched() == want

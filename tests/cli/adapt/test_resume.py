@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from clod_adapter.cli.adapt import plan
-from clod_adapter.cli.adapt.resume import Saver
+from clod_adapter.cli.adapt.resume import Resumed, RunKey, Saver, find_state, identify
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.interrupts import GracefulStop
 from clod_adapter.config import AdaptConfig
@@ -29,7 +28,7 @@ from scenes import capture
 
 CONFIG = AdaptConfig(iters=3, max_sv=3.0, average=0.7)
 QUIET = Console(quiet=True)
-ASKED = Namespace(keep_in=["means"], leave_out=[])
+ASKED = {"--with": ["means"], "--without": []}
 
 
 class Saved:
@@ -37,31 +36,26 @@ class Saved:
 
     def __init__(self, path: Path) -> None:
         self.base, self.scene = capture(40, views=4, width=16, height=12)
-        saver = self._saver(path, resume=False)
-        plan._settle(ASKED, saver)
-        saver.belongs["frozen"] = ["scales"]
-
-        def stop(progress: Any) -> None:
-            if progress.done == 2 and progress.state:
-                raise KeyboardInterrupt
-
-        adapt(self.base, self.scene, CONFIG, saver.watching(stop))
+        run_of = self._key(None) | {"overruled": ASKED, "frozen": ["scales"]}
+        saver = Saver(path, run_of, None, QUIET, GracefulStop())
+        adapt(self.base, self.scene, CONFIG, saver.saving(lambda now: now.done < 2 or not now.state))
         self.tensors = load_file(path)
         with safe_open(path, framework="pt") as file:
             self.about = json.loads(file.metadata()[KEY])
 
-    def _saver(self, path: Path, resume: bool) -> Saver:
-        saver = Saver(path, resume, CONFIG, QUIET, GracefulStop())
-        saver.belong(self.base, self.scene, "base.ply", "images")
-        return saver
+    def _key(self, resumed: Resumed | None) -> RunKey:
+        files = Namespace(ply="base.ply", images="images")
+        return identify(resumed, self.base, self.scene, CONFIG, files, QUIET)
 
     def go_on(self, path: Path) -> Gaussians:
         """All that the command does with a state."""
-        saver = self._saver(path, resume=True)
-        plan._settle(ASKED, saver)
-        assert all(isinstance(name, str) for name in saver.frozen or [])
-        json.dumps(saver.found, allow_nan=True)
-        return adapt(self.base, self.scene, CONFIG, resume=saver.state).gaussians
+        resumed = find_state(path, True, CONFIG, QUIET)
+        assert resumed
+        self._key(resumed)
+        resumed.check_override(ASKED)
+        assert all(isinstance(name, str) for name in resumed.frozen)
+        json.dumps(resumed.run_of, allow_nan=True)
+        return adapt(self.base, self.scene, CONFIG, resume=resumed.state).gaussians
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +68,7 @@ def assert_read_or_refused(saved: Saved, path: Path, tensors: dict[str, torch.Te
     try:
         found = saved.go_on(path)
     except ClodError as error:
-        assert "\n" not in str(error) and ("start afresh" in str(error) or "give " in str(error)), error
+        assert "\n" not in str(error) and ("start over" in str(error) or "use " in str(error)), error
     else:
         assert all(value.isfinite().all() for value in found.tensors().values()), about
 

@@ -17,15 +17,15 @@ from PIL import Image
 from plyfile import PlyData
 
 import clod_adapter
-from clod_adapter.cli.adapt import files, result
-from clod_adapter.cli.adapt import run as adapt_command
-from clod_adapter.cli.shared import measure as eval_command
+from clod_adapter.cli.adapt import files, inputs, result, setup
+from clod_adapter.cli.adapt import report as reporting
+from clod_adapter.cli.shared import measure
 from clod_adapter.cli.shared.report import machine_name, report_dials
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.scene.colmap import write_model
-from clod_adapter.training.loop import Progress
+from clod_adapter.progress import Phase, Progress, tell
 from scenes import stripped
 
 THREE = ["dial.json", "dial.ply", "dial.safetensors"]
@@ -69,7 +69,7 @@ def test_says_what_it_did(clod: Any, capture: Any) -> None:
     table = [line.split() for line in done.out.splitlines()[1:11]]
     assert [line[0] for line in table] == ["dial", "base", "1", "1.25", "1.5", "2", "2.5", "3", "4", "plain"]
     assert len({len(line) for line in done.out.splitlines()[1:11]}) == 1  # aligned
-    assert "plain: what a viewer that does not know the dial makes of dial.ply" in done.out
+    assert "plain: dial.ply in a viewer that does not know the dial" in done.out
     assert f"clod-adapt eval dial.ply --images {shlex.quote(str(capture.scene))} --sv 1 4" in done.out
     assert "300 Gaussians, SH degree 1" in done.err and "8 photographs to train on, 2 held out, 64x48" in done.err
     assert "trained 12 steps" in done.err and "\r" not in done.err
@@ -200,9 +200,8 @@ def test_interrupt_with_nothing_to_write(
     def adapt(base: Any, scene: Any, config: Any, progress: Any, resume: Any, **rest: Any) -> Any:
         for _ in range(presses):
             signal.raise_signal(signal.SIGINT)
-        if presses == 1:
-            progress(Progress("start", 1, 8, 0.1, 0.1, 0.0, lambda: base))
-        pytest.fail("went on")
+        tell(progress, Phase.IMPORTANCE, 1, 8)
+        pytest.fail("continued")
 
     monkeypatch.setattr("clod_adapter.training.plan.adapt", adapt)
     done = clod(capture.ply, "--images", capture.scene, *TINY)
@@ -211,26 +210,32 @@ def test_interrupt_with_nothing_to_write(
 
 
 def test_interrupt_of_the_measuring(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = eval_command.evaluate
+    """The frame is finished, and what is measured by then is reported."""
+    real = measure.evaluate
 
-    def evaluate(gaussians: Any, views: Any, dials: list[float], **rest: Any) -> Any:
-        if dials == [2.0]:
-            raise KeyboardInterrupt
-        return real(gaussians, views, dials, **rest)
+    def evaluate(gaussians: Any, views: Any, dials: list[float], progress: Any, **rest: Any) -> Any:
+        def press(now: Progress) -> Any:
+            if now.total == 7 * len(views) and now.done == 3 * len(views) + 1:
+                signal.raise_signal(signal.SIGINT)
+            return progress(now)
 
-    monkeypatch.setattr(eval_command, "evaluate", evaluate)
+        return real(gaussians, views, dials, progress=press, **rest)
+
+    monkeypatch.setattr(measure, "evaluate", evaluate)
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
     report = json.loads(done.out)
     assert done.code == 0 and [row["virtual_scale"] for row in report["rows"]] == [1, 1.25, 1.5]
     assert "measurements were interrupted" in report["notes"][0] in done.err and report["interrupted"] is False
+    assert report["calibration"] is None and clod_adapter.load(tmp_path / "dial.ply").calibration is None
     assert names(tmp_path) == sorted([*THREE, STATE])
+    done = clod("eval", "dial.ply", "--images", capture.scene, "--psnr-drop", 1)
+    assert done.code == 2 and "no calibration in its header" in done.err
 
 
-@pytest.mark.parametrize("step", ["extract", "save_adapter", "save"])
-def test_one_interrupt_after_training_loses_nothing(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+def test_an_interrupt_at_the_end_of_training_skips_the_measurement(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    press_during(monkeypatch, step, 1)
+    press_during(monkeypatch, result, "extract", 1)
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
     report = json.loads(done.out)
     assert done.code == 0 and names(tmp_path) == sorted([*THREE, STATE]) and report["steps"] == 12
@@ -243,17 +248,22 @@ def test_one_interrupt_after_training_loses_nothing(
     assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
 
 
-def test_a_second_interrupt_aborts_the_writing(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("presses", [1, 2])
+@pytest.mark.parametrize(("module", "step"), [(files, "save_adapter"), (files, "save"), (reporting, "calibrate")])
+def test_an_interrupt_of_the_writing(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: Any, step: str, presses: int
 ) -> None:
-    press_during(monkeypatch, "save_adapter", 2)
-    done = clod(capture.ply, "--images", capture.scene, *TINY)
-    assert (done.code, names(tmp_path)) == (130, [STATE])
+    """One press lets it finish, without a page; two leave the state."""
+    pytest.importorskip("matplotlib")
+    press_during(monkeypatch, module, step, presses)
+    done = clod(capture.ply, "--images", capture.scene, *TINY, "--report", "--json")
+    assert (done.code, names(tmp_path)) == ((0, THREE) if presses == 1 else (130, [STATE])), done
+    if presses == 1:
+        assert json.loads(done.out)["calibration"] and clod_adapter.load(tmp_path / "dial.ply").calibration
 
 
-def press_during(monkeypatch: pytest.MonkeyPatch, step: str, presses: int) -> None:
+def press_during(monkeypatch: pytest.MonkeyPatch, module: Any, step: str, presses: int) -> None:
     """Ctrl-C at the beginning of a step of the command."""
-    module = result if step == "extract" else files
     real = getattr(module, step)
 
     def interrupted(*args: Any, **rest: Any) -> Any:
@@ -267,7 +277,7 @@ def press_during(monkeypatch: pytest.MonkeyPatch, step: str, presses: int) -> No
 def test_a_report_is_of_the_files_beside_it(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An earlier run's stays with its files until all three are replaced; a kill while measuring leaves the new."""
+    """An earlier run's stays with its files until all three are replaced, once, after they are measured."""
     for name in THREE:
         (tmp_path / name).write_text(EARLIER)
     save, seen = files.save, []
@@ -276,15 +286,10 @@ def test_a_report_is_of_the_files_beside_it(
         save(*args, **rest)
         seen.append({(tmp_path / name).read_text() for name in THREE})
 
-    def killed(*_: Any) -> None:
-        raise SystemExit(9)
-
     monkeypatch.setattr(files, "save", watched)
-    monkeypatch.setattr(result, "measure_result", killed)
-    assert clod(capture.ply, "--images", capture.scene, *TINY).code == 9
+    assert clod(capture.ply, "--images", capture.scene, *TINY).code == 0
     report = json.loads((tmp_path / "dial.json").read_text())
-    assert seen == [{EARLIER}] and names(tmp_path) == sorted([*THREE, STATE])
-    assert (report["rows"], report["steps"], report["notes"]) == ([], 12, ["the result was not measured"])
+    assert seen == [{EARLIER}] and names(tmp_path) == THREE and len(report["rows"]) == 7
     assert report["ply_bytes"] == (tmp_path / "dial.ply").stat().st_size
 
 
@@ -310,8 +315,8 @@ def test_a_full_disk_leaves_the_earlier_files(
 
 
 def test_an_unusable_config_fails_before_the_work(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(adapt_command, "asdict", lambda config: {"time_budget": float("inf")})
-    monkeypatch.setattr(adapt_command, "read_checkpoint", lambda *_: pytest.fail("read"))
+    monkeypatch.setattr(setup, "asdict", lambda config: {"time_budget": float("inf")})
+    monkeypatch.setattr(inputs, "read_checkpoint", lambda *_: pytest.fail("read"))
     done = clod(capture.ply, "--images", capture.scene, *TINY)
     assert done.code == 2 and "not plain JSON" in done.err
 
@@ -333,16 +338,16 @@ def test_without_photographs(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert done.code == 0 and names(tmp_path) == THREE, done
     assert report["scene"] is None and report["teacher"] == "checkpoint" and report["seconds"]["place"] > 0
     assert len(report["notes"]) == 1 and report["notes"][0] in done.err
-    assert re.match(r"no photographs: 84 placed cameras to train on, 12 held out, 496x368, ", report["notes"][0])
+    assert re.match(r"no photographs: 84 pseudo views to train on, 12 held out, 496x368, ", report["notes"][0])
     assert "held-out photographs" not in done.err and "other coordinates" not in done.err
-    assert re.search(r"where there are any:\n  clod-adapt eval dial.ply --images DIR --sv 1 4$", done.err, re.M)
+    assert re.search(r"if there are any:\n  clod-adapt eval dial.ply --images DIR --sv 1 4$", done.err, re.M)
     # The teacher is the base itself, but for the rounding to bytes.
     assert report["base_rows"][0]["psnr"] > 50 > report["rows"][-1]["psnr"] and len(report["rows"]) == 7
     assert clod("apply", capture.ply, "dial.safetensors", "-o", "same.ply").code == 0
     assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
     assert report["calibration"]["against"] == "checkpoint"
     (note, *_) = json.loads(clod("export", "dial.ply", "--psnr-drop", 1, "-o", "plain.ply", "--json").out)["notes"]
-    assert "against the checkpoint's own pictures" in note
+    assert "against renders of the checkpoint" in note
     photographs = json.loads(clod("eval", "dial.ply", "--images", capture.scene, "--sv", 1, 4, "--json").out)["rows"]
     assert photographs[0]["psnr"] > 20 and photographs[0]["psnr"] > photographs[1]["psnr"]
 
@@ -392,59 +397,21 @@ def test_the_calibration_is_in_all_three_files(clod: Any, capture: Any, tmp_path
     assert report["ply_bytes"] == (tmp_path / "dial.ply").stat().st_size
 
 
-def test_without_measurements_there_is_no_calibration(
+def test_without_a_calibration_the_files_are_written_all_the_same(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(result, "measure_result", lambda *_: ([], [], True))
-    report = json.loads(clod(capture.ply, "--images", capture.scene, *TINY, "--json").out)
-    assert report["calibration"] is None and clod_adapter.load(tmp_path / "dial.ply").calibration is None
-    done = clod("eval", "dial.ply", "--images", capture.scene, "--psnr-drop", 1)
-    assert done.code == 2 and "no calibration in its header" in done.err
+    def infinite(*_: Any) -> None:
+        raise ClodError("a PSNR is infinite")
 
-
-def test_a_calibration_that_cannot_be_written_leaves_what_was_there(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real = files.save
-
-    def save(*args: Any, calibration: Any = None, **rest: Any) -> None:
-        if calibration is not None:
-            raise ClodError("dial.ply: cannot be written: No space left on device")
-        real(*args, **rest)
-
-    monkeypatch.setattr(files, "save", save)
+    monkeypatch.setattr(reporting, "calibrate", infinite)
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
     report = json.loads(done.out)
-    assert done.code == 0 and "without the calibration" in done.err and len(report["rows"]) == 7
+    assert done.code == 0 and "the files have no calibration" in done.err and len(report["rows"]) == 7
     assert report["calibration"] is None and names(tmp_path) == THREE
     assert clod_adapter.load_adapter(tmp_path / "dial.safetensors").calibration is None
-    assert clod("apply", capture.ply, "dial.safetensors", "-o", "same.ply").code == 0
-    assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
 
 
-@pytest.mark.parametrize("presses", [1, 2])
-def test_interrupt_while_the_calibration_is_written(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, presses: int
-) -> None:
-    """One press lets it finish; two leave the pair without it. Either pair is whole."""
-    real = files.save
-
-    def save(*args: Any, **rest: Any) -> None:
-        for _ in range(presses if rest.get("calibration") else 0):
-            signal.raise_signal(signal.SIGINT)
-        real(*args, **rest)
-
-    pytest.importorskip("matplotlib")
-    monkeypatch.setattr(files, "save", save)
-    done = clod(capture.ply, "--images", capture.scene, *TINY, "--report")  # the page is not begun any more
-    assert done.code == (0 if presses == 1 else 130)
-    assert names(tmp_path) == (THREE if presses == 1 else sorted([*THREE, STATE]))
-    stored = clod_adapter.load(tmp_path / "dial.ply").calibration
-    assert (stored is not None) == (presses == 1)
-    assert stored == clod_adapter.load_adapter(tmp_path / "dial.safetensors").calibration
-
-
-def test_few_photographs_get_company(clod: Any, capture: Any, tmp_path: Path) -> None:
+def test_few_photographs_get_pseudo_views(clod: Any, capture: Any, tmp_path: Path) -> None:
     shutil.copytree(capture.scene, tmp_path / "few")
     names = sorted(path for path in (tmp_path / "few" / "images").iterdir())
     for name in names[1:5]:
@@ -453,7 +420,7 @@ def test_few_photographs_get_company(clod: Any, capture: Any, tmp_path: Path) ->
     assert done.code == 0, done
     report = json.loads(done.out)
     (note,) = [note for note in report["notes"] if "photographs to train on" in note]
-    assert note in done.err and "16 of the checkpoint's own pictures" in note
+    assert note in done.err and "16 pseudo views" in note
     assert report["config"]["lr_means"] == AdaptConfig().lr_means / 2
     assert report["config"]["lr_sigma"] == AdaptConfig().lr_sigma
 

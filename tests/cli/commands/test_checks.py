@@ -1,9 +1,16 @@
+"""Bad input is refused in one line, before torch is imported."""
+
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import clod_adapter
 from clod_adapter.cli.commands.checks import check_scene
 from clod_adapter.cli.commands.render import check_folder
 from clod_adapter.errors import ClodError
@@ -56,3 +63,176 @@ def test_where_photographs_may_be(scenes: Path, scene: str, out: str) -> None:
 
 def test_beside_a_models_images_there_is_room(scenes: Path) -> None:
     check_folder(Path("colmap/renders"), Path("colmap"))
+
+
+@pytest.fixture
+def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
+    """Things that may be given by mistake."""
+    (tmp_path / "text.ply").write_text("hello")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "cut.ply").write_bytes(capture.ply.read_bytes()[:-100])
+    (tmp_path / "mine.ply").write_bytes(capture.ply.read_bytes())
+    (tmp_path / "folder.ply").mkdir()
+    clod_adapter.save(tmp_path / "dialled.ply", clod_adapter.attach(capture.gaussians))
+    scene = capture.scene
+    return {"PLY": capture.ply, "SCENE": scene, "SCENE/images": scene / "images", "DIALLED": Path("dialled.ply")}
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("", "arguments are required: PLY .*--help"),
+        ("PLY --images", "--images: expected one argument"),
+        ("missing.ply --images SCENE", "missing.ply: .*No such file.*check the path"),
+        ("text.ply --images SCENE", "text.ply: is not a PLY.*convert"),
+        ("cut.ply --images SCENE", "cut.ply: .*truncated.*again"),
+        ("PLY --images nowhere", "nowhere: is not a folder; give"),
+        ("PLY --images empty", "empty: no COLMAP model.*give the folder"),
+        ("PLY --images SCENE --max-sv 0.5", "--max-sv is 0.5, it must be at least 1"),
+        ("PLY --images SCENE --max-sv nan", "--max-sv is nan"),
+        ("PLY --images SCENE --max-sv 300", "--max-sv is 300, it must be below 50"),
+        ("PLY --images SCENE --max-sv big", "--max-sv: invalid float value: 'big'"),
+        ("PLY --images SCENE --iters -1", "--iters is -1, it must be at least 0"),
+        ("PLY --images SCENE --seed -1", "--seed is -1, it must be at least 0"),
+        ("PLY --images SCENE --time-budget 0", "--time-budget is 0.0, it must be positive"),
+        ("PLY --images SCENE --time-budget inf", "--time-budget is inf, it must be"),
+        ("PLY --images SCENE --time-budget nan", "--time-budget is nan, it must be"),
+        ("PLY --images SCENE --device tpu", "invalid choice: 'tpu'"),
+        ("PLY --images SCENE --out nowhere/dial.ply", "nowhere/dial.ply: folder nowhere does not exist; create"),
+        ("PLY --images SCENE --out dial.splat", "dial.splat: .*must end in .ply"),
+        ("PLY --images SCENE --out folder.ply", "folder.ply: is a folder"),
+        ("mine.ply --images SCENE --out mine.ply", "mine.ply: is an input file.*choose another"),
+        ("mine.ply --images SCENE --out ./empty/../mine.ply", "mine.ply: is an input file"),
+        ("eval missing.ply --images SCENE", "missing.ply: .*check the path"),
+        ("eval PLY --images SCENE --against PLY text.ply", "text.ply: is not a PLY"),
+        ("eval PLY --images SCENE --base missing.ply", "missing.ply: .*check the path"),
+        ("eval PLY --images SCENE --sv 1 0.5", "--sv has 0.5, dial values must be at least 1"),
+        ("eval PLY --images SCENE --sv", "--sv: expected at least one argument.*clod-adapt eval --help"),
+        ("eval PLY --images SCENE --keep 10", "base.ply: has no sigma_d, which --keep needs; adapt it first"),
+        ("eval PLY --images SCENE --keep 0", "--keep has 0, it must be positive"),
+        ("eval PLY --images SCENE --keep 1.5", "--keep: invalid int value"),
+        ("eval PLY --images SCENE --fps nan", "--fps has nan, it must be positive"),
+        ("eval PLY --images SCENE --psnr-drop -1", "--psnr-drop has -1, it must be positive"),
+        ("eval PLY --images SCENE --sv 2 --keep 10", "--keep: not allowed with argument --sv"),
+        ("eval DIALLED --images SCENE --psnr-drop 1", "dialled.ply: has no calibration .* --psnr-drop needs; adapt it"),
+        ("render PLY --images SCENE", "required: -o/--out"),
+        ("render PLY --images SCENE -o pictures --sv 0", "--sv has 0"),
+        ("render PLY --images nowhere -o pictures", "nowhere: is not a folder"),
+        ("render PLY --images SCENE -o text.ply", "text.ply: text.ply is a file; choose another --out"),
+        ("render PLY --images SCENE -o SCENE", "the scene's own photographs may be there"),
+        ("render PLY --images SCENE -o SCENE/images", "the scene's own photographs may be there"),
+        (
+            "render PLY --images SCENE -o pictures --views banana",
+            "--views: no photograph is named 'banana'; .* 000.png, 001",
+        ),
+        ("export DIALLED", "required: -o/--out"),
+        ("export DIALLED -o x", "x: --out must end in one of .ply, .*, which is the format"),
+        ("export DIALLED -o .ply --sv 2", ".ply: --out must end in one of"),
+        ("export DIALLED -o x.splat", "x.splat: .splat cannot store sigma_d; choose a dial value .* format .*.ply"),
+        ("export DIALLED -o x.splat --sv 2 --order extinction", "x.splat: .splat sorts the Gaussians itself"),
+        ("export DIALLED -o dialled.ply --sv 2", "dialled.ply: is an input file"),
+        ("export DIALLED -o folder.ply --sv 2", "folder.ply: is a folder"),
+        ("export DIALLED -o nowhere/x.glb", "nowhere/x.glb: folder nowhere does not exist"),
+        ("export DIALLED -o x.ply --fps 60", "dialled.ply: has no calibration .* --fps needs"),
+        ("export DIALLED -o x.ply --sv 2 3", "unrecognized arguments: 3"),
+        ("export DIALLED -o x.ply --sv 0.5", "--sv has 0.5, dial values must be"),
+        ("export DIALLED -o x.ply --sv 2 --levels 1,2", "--levels gives the dial values; give no other"),
+        (
+            "export DIALLED -o x.ply --levels 1,4,2",
+            "--levels: '1,4,2' must be ascending dial values of at least 1",
+        ),
+        ("export DIALLED -o x.ply --levels 0,1", "--levels: '0,1' must be"),
+        ("export DIALLED -o x.ply --levels nan,2", "--levels: 'nan,2' must be"),
+        ("export DIALLED -o x.ply --levels 1,inf", "--levels: '1,inf' must be"),
+        ("export DIALLED -o x.ply --levels 1,,2", "--levels: '1,,2' must be"),
+        ("export DIALLED -o x --lod-meta", "--lod-meta needs several levels; give them"),
+        ("export DIALLED -o x.ply --lod-meta --levels 1,2", "x.ply: with --lod-meta, --out names the folder"),
+        ("export DIALLED -o lod-meta.json --lod-meta --levels 1,2", "--out names the folder for lod-meta.json"),
+        ("export DIALLED -o x.ply --sv 2 --camera 003", "--camera needs the scene of the photograph"),
+        (
+            "export DIALLED -o x.ply --images SCENE",
+            "--images is used for baking, --order and .html",
+        ),
+        (
+            "export DIALLED -o x.ply --camera 003 --images SCENE",
+            "--camera needs a dial value to bake; give one",
+        ),
+        ("export DIALLED -o x.ply --sv 2 --camera 003 --images nowhere", "nowhere: is not a folder"),
+        (
+            "export DIALLED -o x.ply --sv 2 --camera banana --images SCENE",
+            "--camera: no photograph is named 'banana'; .* like 000.png, 001",
+        ),
+        ("export PLY -o x.ply --sv 2", "base.ply: has no sigma_d, so no dial value can be baked"),
+        ("export PLY -o x.ply --levels 1,2", "base.ply: has no sigma_d, so no dial value can be baked"),
+        ("export PLY -o x.ply --keep 2", "base.ply: has no sigma_d, which --keep needs"),
+        ("export PLY -o x.ply --order extinction", "base.ply: has no sigma_d to order its Gaussians by"),
+        ("export text.ply -o x.glb", "text.ply: is not a PLY"),
+        ("apply PLY missing.safetensors -o x.ply", "missing.safetensors: .*No such file"),
+        ("apply PLY text.ply -o x.ply", "text.ply: is not a safetensors file"),
+        ("apply mine.ply text.ply -o mine.ply", "mine.ply: is an input file"),
+        ("apply PLY text.ply -o text.ply", "text.ply: is an input file"),
+        ("apply PLY text.ply -o x.splat", "x.splat: .*must end in .ply"),
+    ],
+)
+def test_bad_input(clod: Any, bad: dict[str, Path], tmp_path: Path, line: str, said: str) -> None:
+    refuse(clod, bad, tmp_path, line, said)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("text.ply --images SCENE", "text.ply: is not a PLY"),
+        ("eval PLY --images SCENE --keep 0", "--keep has 0"),
+        ("render PLY --images SCENE", "required: -o/--out"),
+        ("export DIALLED -o dialled.ply --sv 2", "dialled.ply: is an input file"),
+        ("apply PLY text.ply -o x.ply", "text.ply: is not a safetensors file"),
+    ],
+)
+def test_bad_input_with_json(clod: Any, bad: dict[str, Path], tmp_path: Path, line: str, said: str) -> None:
+    refuse(clod, bad, tmp_path, f"{line} --json", said)
+
+
+def refuse(clod: Any, bad: dict[str, Path], tmp_path: Path, line: str, said: str) -> None:
+    """Exit code 2, an empty stdout, one last line on stderr that is the error, and files as they were."""
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    done = clod(*[bad.get(word, word) for word in line.split()])
+    assert (done.code, done.out) == (2, ""), done
+    errors = [line for line in done.err.splitlines() if "error" in line]
+    assert len(errors) == 1 and errors[0] == done.err.splitlines()[-1], done
+    assert errors[0].startswith("clod-adapt: error: ") and re.search(said, errors[0]), done
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("line", "code"),
+    [
+        ("--help", 0),
+        ("eval --help", 0),
+        ("--version", 0),
+        ("--nonsense", 2),
+        ("missing.ply --images SCENE", 2),
+        ("mesh.ply --images SCENE", 2),
+        ("PLY --images empty", 2),
+        ("PLY --images SCENE --max-sv 0", 2),
+        ("PLY --images SCENE --out nowhere/dial.ply", 2),
+        ("eval PLY --images SCENE --sv 0", 2),
+        ("eval PLY --images SCENE --keep 10", 2),
+        ("render --help", 0),
+        ("render PLY --images SCENE -o SCENE", 2),
+        ("export --help", 0),
+        ("export PLY --sv 2 -o x.ply", 2),
+        ("export DIALLED --psnr-drop 2 -o x.ply", 2),
+        ("export DIALLED -o x.splat", 2),
+        ("apply text.ply dial.safetensors -o dial.ply", 2),
+    ],
+)
+def test_help_and_refusals_do_without_torch(bad: dict[str, Path], tmp_path: Path, line: str, code: int) -> None:
+    (tmp_path / "mesh.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
+    words = [str(bad.get(word, word)) for word in line.split()]
+    script = (
+        "import sys\n"
+        "sys.modules.update(torch=None, pycolmap=None, numba=None)\n"  # importing one is an error
+        f"from clod_adapter.cli.main import main; sys.exit(main({words}))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == code and "Traceback" not in done.stderr, done.stderr

@@ -20,7 +20,8 @@ import inria_forks
 from clod_adapter import rasterizers
 from clod_adapter.cli.doctor import gpu as doctor_gpu
 from clod_adapter.cli.doctor import run, tools
-from clod_adapter.cli.shared.findings import Finding, Miniature, Off
+from clod_adapter.cli.doctor.checks import Check, CheckFailed
+from clod_adapter.cli.doctor.reference_scene import ReferenceScene
 from clod_adapter.errors import ClodError
 from clod_adapter.rasterizers import reference
 
@@ -30,8 +31,8 @@ NAMES = [
 ]  # fmt: skip
 
 
-def find(name: str) -> Finding:
-    return Finding.of(name, run.LOOKS[name])
+def find(name: str) -> Check:
+    return Check.run(name, run.PROBES[name])
 
 
 def program(folder: Path, name: str, script: str) -> None:
@@ -54,7 +55,7 @@ def test_here(clod: Any) -> None:
     for line in lines:
         assert (line[17:20] == "ok ") != (" -> " in line), line  # what is off has its line
     assert "cpu              ok   compiled for " in done.out and "RMS" in done.out
-    assert last.startswith("draws and trains on: cpu")
+    assert last.startswith("rendering and training backends: cpu")
 
 
 def test_json(clod: Any) -> None:
@@ -104,38 +105,39 @@ def turned(**given: Any) -> tuple[torch.Tensor, torch.Tensor]:
 def test_a_broken_picture(clod: Any, monkeypatch: pytest.MonkeyPatch, rasterize: Any) -> None:
     monkeypatch.setattr(rasterizers, "for_device", lambda device: rasterize)
     found = find("cpu")
-    assert not found.ok and found.found.startswith("it draws another picture than the reference") and found.fix
+    assert not found.ok and found.found.startswith("renders another image than the reference") and found.fix
 
 
 def test_nothing_draws(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rasterizers, "for_device", lambda device: wrong)
-    monkeypatch.setattr(run, "LOOKS", {name: run.LOOKS[name] for name in ("torch", "cpu", "gpu")})
+    monkeypatch.setattr(run, "PROBES", {name: run.PROBES[name] for name in ("torch", "cpu", "gpu")})
     done = clod("doctor")
-    assert done.code == 1 and done.out.splitlines()[-1] == "nothing draws here: mend torch, then cpu"
+    last = "no rendering backend works: fix torch first, then the CPU backend"
+    assert done.code == 1 and done.out.splitlines()[-1] == last
 
 
-def test_whatever_fails_is_a_finding() -> None:
-    def look() -> str:
+def test_any_error_is_a_result() -> None:
+    def probe() -> str:
         print("chatter")
         raise MemoryError("no room\nand more")
 
-    assert Finding.of("x", look) == Finding("x", False, "it failed with MemoryError: no room")
+    assert Check.run("x", probe) == Check("x", False, "failed with MemoryError: no room")
     compiled = SystemError("returned a result with an exception set")  # as Numba hands on a Ctrl-C
     compiled.__cause__ = KeyboardInterrupt()
     for interrupt in (KeyboardInterrupt(), compiled):
         with pytest.raises(type(interrupt)):
-            Finding.of("x", lambda raised=interrupt: (_ for _ in ()).throw(raised))
+            Check.run("x", lambda raised=interrupt: (_ for _ in ()).throw(raised))
 
 
 @pytest.mark.parametrize(
     ("script", "bus", "ok", "said", "fix"),
     [
         ("echo 'NVIDIA H200, 570.1, 143771 MiB'", True, True, "NVIDIA H200, 570.1, 143771 MiB", ""),
-        ("echo 'Driver/library version mismatch'; exit 18", True, False, "fails: Driver/library ver", "--gpus all"),
-        ("echo 'could not talk to the driver' >&2; exit 9", True, False, "fails: could not talk", "--gpus all"),
-        ("exit 0", True, False, "it lists no GPU", "--gpus all"),
+        ("echo 'Driver/library version mismatch'; exit 18", True, False, "failed: Driver/library ver", "--gpus all"),
+        ("echo 'could not talk to the driver' >&2; exit 9", True, False, "failed: could not talk", "--gpus all"),
+        ("exit 0", True, False, "no GPU listed", "--gpus all"),
         (None, True, False, "no nvidia-smi", "https://www.nvidia.com/drivers"),
-        (None, False, False, "no NVIDIA GPU on the PCI bus", "a machine with an NVIDIA GPU"),
+        (None, False, False, "no NVIDIA GPU on the PCI bus", "use a machine with an NVIDIA GPU"),
         ("sleep 5", True, False, "does not answer", "restart"),
     ],
 )
@@ -145,7 +147,7 @@ def test_driver(
     (tmp_path / "bus" / "0000:01").mkdir(parents=True)
     (tmp_path / "bus" / "0000:01" / "vendor").write_text("0x10de\n" if bus else "0x8086\n")
     monkeypatch.setattr(doctor_gpu, "PCI", tmp_path / "bus")
-    monkeypatch.setattr(doctor_gpu, "ASKING", 0.5)
+    monkeypatch.setattr(doctor_gpu, "TIMEOUT", 0.5)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}/bin" if script else str(tmp_path))
     if script:
         program(tmp_path, "nvidia-smi", script)
@@ -162,7 +164,7 @@ def test_torch_without_cuda(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
         assert not found.ok and found.found == f"torch {torch.__version__} is a CPU build"
         assert found.fix.startswith("pip install") and "--index-url https://download.pytorch.org/whl/cu" in found.fix
     monkeypatch.setenv("PATH", "")
-    assert find("cuda").fix.startswith("mend driver first, then pip install")
+    assert find("cuda").fix.startswith("fix driver first, then pip install")
     monkeypatch.setattr(torch.version, "hip", "6.4")
     assert find("cuda").found.endswith("is built for ROCm 6.4")
 
@@ -170,9 +172,12 @@ def test_torch_without_cuda(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("says", "fix"),
     [
-        ("Found no NVIDIA driver on your system.\nPlease check", "mend driver first"),
-        ("The NVIDIA driver on your system is too old (found version 11040)", "update NVIDIA's driver, or take a"),
-        ("CUDA error: no kernel image is available for execution on the device", "update NVIDIA's driver, or take a"),
+        ("Found no NVIDIA driver on your system.\nPlease check", "fix driver first"),
+        ("The NVIDIA driver on your system is too old (found version 11040)", "update NVIDIA's driver, or install a"),
+        (
+            "CUDA error: no kernel image is available for execution on the device",
+            "update NVIDIA's driver, or install a",
+        ),
     ],
 )
 def test_a_gpu_that_torch_cannot_use(monkeypatch: pytest.MonkeyPatch, says: str, fix: str) -> None:
@@ -188,12 +193,12 @@ def test_a_gpu_that_torch_cannot_use(monkeypatch: pytest.MonkeyPatch, says: str,
 
 def test_no_gsplat_and_an_old_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    assert find("gsplat") == Finding("gsplat", False, "not installed", "pip install 'clod-adapter[gpu]'")
+    assert find("gsplat") == Check("gsplat", False, "not installed", "pip install 'clod-adapter[gpu]'")
     old: Any = ModuleType("gsplat")
     old.__version__, old.__spec__ = "1.4.0+pt24cu124", object()
     monkeypatch.setitem(sys.modules, "gsplat", old)
     found = find("gsplat")
-    assert found == Finding("gsplat", False, "1.4.0+pt24cu124, 1.5.3 is needed", "pip install 'clod-adapter[gpu]'")
+    assert found == Check("gsplat", False, "1.4.0+pt24cu124, 1.5.3 is needed", "pip install 'clod-adapter[gpu]'")
 
 
 @pytest.mark.parametrize("toolkit", [None, "/usr/local/cuda"])
@@ -212,7 +217,7 @@ def test_gsplat_is_not_compiled(
     if toolkit:
         assert "not compiled yet; nvcc is in /usr/local/cuda" in found.found and found.fix.startswith("python -c")
     else:
-        assert "there is no nvcc" in found.found and found.fix.startswith("install the CUDA toolkit")
+        assert "no nvcc found" in found.found and found.fix.startswith("install the CUDA toolkit")
 
 
 def test_gsplat_draws(monkeypatch: pytest.MonkeyPatch, gpu: torch.device, tmp_path: Path) -> None:
@@ -223,12 +228,12 @@ def test_gsplat_draws(monkeypatch: pytest.MonkeyPatch, gpu: torch.device, tmp_pa
     (tmp_path / "gsplat_cuda" / "gsplat_cuda.so").write_bytes(b"")
     gsplat_in_torch.install(monkeypatch)
     found = find("gsplat")
-    assert found.ok and found.found.startswith("1.5.3; its picture is the reference's"), found
+    assert found.ok and found.found.startswith("1.5.3; renders the reference image"), found
     from gsplat import rendering
 
     real: Callable[..., Any] = rendering.rasterize_to_pixels
     monkeypatch.setattr(rendering, "rasterize_to_pixels", lambda *a, **k: [0.9 * x for x in real(*a, **k)])
-    assert "another picture" in find("gsplat").found
+    assert "another image" in find("gsplat").found
 
 
 def test_gpu_rasterizer(monkeypatch: pytest.MonkeyPatch, gpu: torch.device) -> None:
@@ -241,7 +246,7 @@ def test_gpu_rasterizer(monkeypatch: pytest.MonkeyPatch, gpu: torch.device) -> N
     assert (found.ok, found.found) == (False, "no rasterizer for device cuda: move the Gaussians")
     assert "pip install 'clod-adapter[gpu]'" in found.fix
     monkeypatch.setattr(rasterizers, "for_device", lambda device: wrong)
-    assert "another picture" in find("gpu").found
+    assert "another image" in find("gpu").found
 
 
 @pytest.mark.parametrize("fork", ["inria 2023", "inria 2024"])
@@ -251,7 +256,7 @@ def test_inrias_forks(monkeypatch: pytest.MonkeyPatch, gpu: torch.device, fork: 
     monkeypatch.setitem(sys.modules, "diff_gaussian_rasterization", installed)
     monkeypatch.delitem(sys.modules, "clod_adapter.integrations.inria", raising=False)
     found = find("inria")
-    assert found.ok and found.found.startswith("/somewhere/diff_gaussian_rasterization; its picture is"), found
+    assert found.ok and found.found.startswith("/somewhere/diff_gaussian_rasterization; renders the ref"), found
     monkeypatch.undo()
     sys.modules.pop("clod_adapter.integrations.inria", None)
 
@@ -317,9 +322,9 @@ def test_weights_that_are_missing_have_their_line(monkeypatch: pytest.MonkeyPatc
         raise perceptual.Unavailable("its network's weights are not at x", perceptual.WEIGHTS)
 
     monkeypatch.setitem(perceptual.METRICS, "lpips", none)
-    assert find("lpips") == Finding("lpips", False, "its network's weights are not at x", perceptual.WEIGHTS)
+    assert find("lpips") == Check("lpips", False, "its network's weights are not at x", perceptual.WEIGHTS)
     monkeypatch.setitem(perceptual.METRICS, "lpips", lambda: lambda image, target: 0.0)
-    assert "measures 0 of equal pictures and 0 of others" in find("lpips").found
+    assert "measures 0 for equal images and 0 for others" in find("lpips").found
 
 
 def test_browser(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -330,7 +335,7 @@ def test_browser(monkeypatch: pytest.MonkeyPatch) -> None:
     found = find("browser")
     assert not found.ok and "clod-adapt view --no-browser" in found.fix and "ssh -L" in found.fix
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.BackgroundBrowser("firefox"))
-    assert find("browser") == Finding("browser", True, "firefox")
+    assert find("browser") == Check("browser", True, "firefox")
 
 
 def test_limits_of_a_container(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -342,7 +347,7 @@ def test_limits_of_a_container(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     (tmp_path / "memory.current").write_text(f"{2**28}\n")
     found = find("cores")
     if threads > 1:
-        assert found == Finding("cores", False, f"{threads} threads on 1 cores", "OMP_NUM_THREADS=1 clod-adapt ...")
+        assert found == Check("cores", False, f"{threads} threads on 1 cores", "OMP_NUM_THREADS=1 clod-adapt ...")
     assert unlimited.ok and find("memory").found == "0.8 GB free of 1.0 GB"
     for name in ("cpu.max", "memory.max"):
         (tmp_path / name).write_text("max 100000\n" if name == "cpu.max" else "max\n")
@@ -365,10 +370,10 @@ def test_a_cache_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_pat
     assert find("cache").fix.startswith("set NUMBA_CACHE_DIR")
 
 
-def test_the_miniature_tells_small_differences() -> None:
+def test_the_reference_scene_tells_small_differences() -> None:
     """A level of 255 in every pixel is another picture; rounding is none."""
-    mini = Miniature.make()
+    mini = ReferenceScene.make()
     assert float((mini.image > 0.02).any(-1).float().mean()) > 0.3  # of the picture has something in it
     mini.compare(mini.image + 1e-5)
-    with pytest.raises(Off, match="another picture"):
+    with pytest.raises(CheckFailed, match="another image"):
         mini.compare(mini.image + 1 / 255)

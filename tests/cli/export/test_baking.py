@@ -53,7 +53,7 @@ def test_where_no_camera_is_known_some_are_placed(
     monkeypatch.setattr(baking, "PLACED", 3)
     old = without_viewpoints(dialled, tmp_path / "old.ply")
     report = exported(clod, old, "--sv", 2, "-o", "x.ply")
-    assert report["notes"] == [f"{old} stores no cameras, so 3 are placed; give --images, which is better"]
+    assert report["notes"] == [f"{old} stores no cameras: baked for 3 placed ones; --images gives a better result"]
     model = load(old)
     want = clod_adapter.bake(model.gaussians, 2.0, cameras=clod_adapter.place_cameras(model.gaussians, views=3))
     assert model.viewpoints == () and torch.equal(load("x.ply").gaussians.means, want.means)
@@ -66,9 +66,7 @@ def test_where_nothing_can_be_seen_no_camera_is_placed(clod: Any, dialled: Path,
     clod_adapter.save("faint.ply", faint)
     done = clod("export", "faint.ply", "--sv", 2, "-o", "x.ply")
     assert done.code == 2 and not Path("x.ply").exists()
-    assert done.err.splitlines()[-1].startswith(
-        "clod-adapt: error: faint.ply: it stores no cameras to bake for, and no "
-    )
+    assert done.err.splitlines()[-1].startswith("clod-adapt: error: faint.ply: no cameras stored to bake for, and no ")
     assert done.err.splitlines()[-1].endswith("; give --images")
 
 
@@ -92,16 +90,16 @@ def test_a_psnr_budget_is_true_of_the_file(clod: Any, capture: Any, dialled: Pat
 
 
 def test_a_psnr_that_no_file_has(clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = baking.Photographs.lost
-    monkeypatch.setattr(baking.Photographs, "lost", lambda *words: real(*words) + 1)
+    real = baking.Photographs.drop_of
+    monkeypatch.setattr(baking.Photographs, "drop_of", lambda *words: real(*words) + 1)
     done = clod("export", dialled, "--psnr-drop", 0.1, "--images", capture.scene, "-o", "x.ply")
     assert done.code == 2 and not Path("x.ply").exists()
-    assert " out of reach: the file of s = 1 is " in done.err.splitlines()[-1]
+    assert " out of reach: the file baked at s = 1 is " in done.err.splitlines()[-1]
 
 
 def test_without_photographs_the_figure_is_of_the_dial(clod: Any, dialled: Path) -> None:
     report = exported(clod, dialled, "--psnr-drop", 1, "-o", "x.ply")
-    assert "psnr" not in report["outputs"][0] and any("which is of the dial" in note for note in report["notes"])
+    assert "psnr" not in report["outputs"][0] and any("measured the dial" in note for note in report["notes"])
 
 
 @pytest.mark.parametrize(

@@ -23,10 +23,10 @@ from clod_adapter.cli.commands.export_formats import FORMATS, PACKED, level_path
 from clod_adapter.cli.shared import budgets
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.formats.safetensors import read_model_safetensors
+from clod_adapter.io.file_formats import FORMATS as FILE_FORMATS
+from clod_adapter.io.file_formats import WRITABLE, read_model
 from clod_adapter.io.formats.splat_transform import INSTALL
 from clod_adapter.io.ply.header import write_comments
-from clod_adapter.io.writers import WRITERS
 
 TOOL = """
 import json, pathlib, sys
@@ -123,7 +123,7 @@ def test_baking_for_a_camera(clod: Any, capture: Any, dialled: Path, monkeypatch
     want = clod_adapter.render(gaussians, camera, output["virtual_scale"])
     shown = clod_adapter.render(plain.gaussians, camera)
     torch.testing.assert_close(shown.image, want.image, atol=2e-5, rtol=0)
-    assert "exact from the camera of 003.png only" in done.err
+    assert "exact at the camera of 003.png only" in done.err
     assert any("for the camera at (" in comment for comment in plain.comments)
     seen = []
 
@@ -144,7 +144,7 @@ def test_a_camera_that_two_photographs_are(clod: Any, capture: Any, dialled: Pat
     monkeypatch.setattr(baking, "load_cameras", lambda *_: ([*twins, *rest], notes))
     words = ("export", dialled, "--sv", 2, "--images", capture.scene, "-o", "x.ply", "--camera")
     done = clod(*words, "a")
-    assert done.code == 2 and "--camera has 'a', which a.jpg and a.png are; give the whole name" in done.err
+    assert done.code == 2 and "--camera: 'a' matches a.jpg and a.png; give the full name" in done.err
     assert clod(*words, "a.png").code == 0
     twins = [replace(first, name="images/a.jpg"), replace(second, name="a.jpg")]
     assert clod(*words, "a.jpg").code == 0
@@ -193,12 +193,12 @@ def test_level_names() -> None:
 
 
 def test_every_format_is_in_the_help() -> None:
-    assert set(WRITERS) <= set(FORMATS) and not set(WRITERS) & set(PACKED)
-    for suffix, writer in WRITERS.items():
+    assert set(WRITABLE) <= set(FORMATS) and not set(WRITABLE) & set(PACKED)
+    for suffix, writer in ((suffix, FILE_FORMATS[suffix]) for suffix in WRITABLE):
         assert FORMATS[suffix].sigma == writer.carries_sigma, suffix
 
 
-@pytest.mark.parametrize("suffix", WRITERS)
+@pytest.mark.parametrize("suffix", WRITABLE)
 def test_every_format_is_written_with_its_dial_where_it_has_room(clod: Any, dialled: Path, suffix: str) -> None:
     words = () if FORMATS[suffix].sigma else ("--sv", 1)
     done = clod("export", dialled, "-o", f"x{suffix}", *words, "--json")
@@ -220,7 +220,7 @@ def test_the_dial_stays_as_it_is(clod: Any, dialled: Path, tmp_path: Path) -> No
     again = load("same.ply")
     assert same(again.gaussians, model.gaussians) and again.gaussians.attenuation == model.gaussians.attenuation
     assert again.calibration == model.calibration and again.notes == ()
-    assert same(read_model_safetensors("same.safetensors"), model.gaussians)
+    assert same(read_model("same.safetensors").gaussians, model.gaussians)
 
 
 def test_a_plain_file_is_converted(clod: Any, capture: Any) -> None:
@@ -237,7 +237,7 @@ def test_what_other_columns_there_were_is_said(clod: Any, dialled: Path, tmp_pat
     labelled["label"] = 7
     PlyData([PlyElement.describe(labelled, "vertex", comments=vertex.comments)]).write(tmp_path / "labelled.ply")
     report = json.loads(clod("export", "labelled.ply", "-o", "x.ply", "--json").out)
-    assert report["notes"] == ["columns left out: label"]
+    assert report["notes"] == ["columns dropped: label"]
     assert same(load("x.ply").gaussians, load(dialled).gaussians)
 
 
@@ -364,8 +364,8 @@ def test_packing(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
         done = clod("export", dialled, "--levels", "1,4", "-o", f"x{suffix}", "--json")
         report = json.loads(done.out)
         assert done.code == 0 and "splat-transform took" in done.err
-        assert "values are rounded, and the rows are in an order of splat-transform's" in report["notes"]
-        assert any("no GPU here" in note for note in report["notes"]) == (suffix == ".sog")
+        assert "splat-transform rounds values and sorts the Gaussians" in report["notes"]
+        assert any("without a GPU" in note for note in report["notes"]) == (suffix == ".sog")
         for output in report["outputs"]:
             said = json.loads(Path(output["file"]).read_text())
             assert said["words"][:5] == ["-w", "-g", "cpu", "-i", "1"] and len(said["words"]) == 7
@@ -395,8 +395,8 @@ def test_a_streaming_set(clod: Any, dialled: Path, tmp_path: Path, tool: Any) ->
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("-o", "."), ".: is the folder you are in; give --out the name of a new one"),
-        (("-o", "out", "--order", "extinction"), "a streaming set has an order of its own; leave out --order"),
+        (("-o", "."), ".: is the current folder; --out must name a new one"),
+        (("-o", "out", "--order", "extinction"), "--lod-meta sorts the Gaussians itself; remove --order"),
     ],
 )
 def test_a_streaming_set_that_cannot_be_is_refused_before_any_work(

@@ -64,7 +64,7 @@ def test_a_classic_checkpoint_stays_one_without_a_word(clod: Any, capture: Any, 
 def test_what_is_told_is_done(clod: Any, trained: tuple[Path, Path], tmp_path: Path, name: str) -> None:
     ply, scene = trained
     done = clod(ply, "--images", scene, *FAST, "--antialiasing", name)
-    assert done.code == 0 and "the photographs say" not in done.err, done
+    assert done.code == 0 and "by the photographs" not in done.err, done
     assert clod_adapter.load(tmp_path / "dial.ply").gaussians.screen_filter == FILTERS[name]
 
 
@@ -90,10 +90,10 @@ def test_a_file_that_says_is_believed_and_overruled_with_a_word(
     ply, scene = trained
     assert clod(ply, "--images", scene, *FAST, "--antialiasing", "mip").code == 0
     quiet = clod("eval", "dial.ply", "--images", scene, "--sv", 1, "--json")
-    assert "0.1 px^2 of blur" in quiet.err and "the photographs say" not in quiet.err
+    assert "0.1 px^2 of blur" in quiet.err and "by the photographs" not in quiet.err
     told = clod("eval", "dial.ply", "--images", scene, "--sv", 1, "--json", "--antialiasing", "off")
-    (note,) = [note for note in json.loads(told.out)["notes"] if "as told" in note]
-    assert "the file says 0.1 px^2 of blur, opacities compensated" in note and note in told.err
+    (note,) = [note for note in json.loads(told.out)["notes"] if "(--antialiasing)" in note]
+    assert "the file has 0.1 px^2 of blur, opacities compensated" in note and note in told.err
 
 
 def test_what_a_run_is_resumed_by_depends_on_the_filter(trained: tuple[Path, Path]) -> None:
@@ -110,9 +110,9 @@ def test_robustness_finds_out_for_each(clod: Any, capture: Any, trained: tuple[P
     assert done.code == 0 and "trained with antialiasing" in done.err
     assert max(row["psnr"] for row in report["cells"][0]["rows"]) > 45
     again = clod(*words)
-    assert "2 of 2 cells are there already" in again.err
+    assert "2 of 2 cells are done already" in again.err
     other = clod(*words, "--antialiasing", "off")
-    assert "cells are there already" not in other.err
+    assert "cells are done already" not in other.err
     assert max(row["psnr"] for row in json.loads(other.out)["cells"][0]["rows"]) < 35
 
 
@@ -122,7 +122,7 @@ def test_exports_carry_it_or_say_that_they_do_not(clod: Any, trained: tuple[Path
     done = clod("export", trained[0], "-o", out, "--antialiasing", "on", "--json")
     notes = [note for note in json.loads(done.out)["notes"] if "antialias" in note]
     assert len(notes) == (out in ("a.ply", "a.splat"))
-    assert all("most readers have to be told" in note and note in done.err for note in notes)
+    assert all("most readers need an option" in note and note in done.err for note in notes)
     if out in ("a.ply", "a.spz"):
         assert clod_adapter.load(out).gaussians.screen_filter == FILTERS["on"]
     done = clod("export", trained[0], "-o", out, "--json")
@@ -134,7 +134,10 @@ def test_exports_carry_it_or_say_that_they_do_not(clod: Any, trained: tuple[Path
 def test_inspect_says_it(clod: Any, trained: tuple[Path, Path]) -> None:
     assert clod("export", trained[0], "-o", "a.ply", "--antialiasing", "mip").code == 0
     done = clod("inspect", "a.ply")
-    assert "trained antialiased, and drawn so: 0.1 px^2 of blur, opacities compensated" in done.out + done.err
+    assert (
+        "trained with antialiasing: 0.1 px^2 of blur, opacities compensated"
+        in done.out + done.err
+    )
     assert json.loads(clod("inspect", "a.ply", "--json").out)["splat"]["screen_filter"]["variance"] == 0.1
 
 

@@ -74,7 +74,7 @@ def test_cuda_without_a_gpu_is_refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], capture: Any
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    for build, why in ((None, "is built without CUDA: install torch from"), ("12.4", "torch sees no NVIDIA GPU")):
+    for build, why in ((None, "is built without CUDA: install torch from"), ("12.4", "torch finds no NVIDIA GPU")):
         monkeypatch.setattr(torch.version, "cuda", build)
         words = ["eval", str(capture.ply), "--images", str(capture.scene), "--device", "cuda"]
         assert main(words) == 2

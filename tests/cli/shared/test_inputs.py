@@ -12,7 +12,7 @@ import torch
 from plyfile import PlyData
 
 from clod_adapter.cli.main import COMMANDS, build_parser
-from clod_adapter.io.writers import write
+from clod_adapter.io.file_formats import write
 from packing import write_packed
 
 TINY = ("--iters", 4, "--max-sv", 4, "--out", "dial.ply")

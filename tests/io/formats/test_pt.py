@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,6 @@ from hypothesis import strategies as st
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.formats.pt import check_pt
 
 DEGREES = {0: 0, 3: 1, 8: 2, 15: 3, 24: 4}
 
@@ -134,16 +131,3 @@ def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject) 
         load(path)
     except ClodError as error:
         assert str(path) in str(error)
-
-
-def test_the_check_does_without_torch(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.pt", {"splats": splats()})
-    check_pt(path)
-    code = (
-        "import sys, pathlib, clod_adapter.io.formats.pt as pt; "
-        f"pt.check_pt(pathlib.Path({str(path)!r})); sys.exit('torch' in sys.modules)"
-    )
-    root = Path(__file__).resolve().parents[2]
-    assert subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(root)}).returncode == 0
-    with pytest.raises(ClodError, match="missing.pt: cannot be read .No such file"):
-        check_pt(tmp_path / "missing.pt")

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import hashlib
 import os
 import time
 import tracemalloc
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +14,9 @@ from plyfile import PlyData, PlyElement
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load
-from clod_adapter.io.ply.body import read_element
+from clod_adapter.io.ply.body import read_elements
 from clod_adapter.io.ply.columns import inria_dtype
-from clod_adapter.io.ply.header import read_head
+from clod_adapter.io.ply.header import parse_head, read_head
 
 FORMATS = ("binary_little_endian", "binary_big_endian", "ascii")
 
@@ -97,7 +99,7 @@ def test_rows_are_those_of_plyfile(tmp_path: Path, order: str) -> None:
     text = order == "ascii"
     elements = [camera, PlyElement.describe(vertex, "vertex"), face]
     PlyData(elements, text=text, byte_order="=" if text else order).write(str(tmp_path / "in.ply"))
-    found = read_element(tmp_path / "in.ply", read_head(tmp_path / "in.ply"))
+    found = read_elements(tmp_path / "in.ply", lambda path, ply: ("vertex",)).elements["vertex"]
     expected = PlyData.read(str(tmp_path / "in.ply"))["vertex"].data
     assert found.dtype == vertex.dtype and found.dtype.isnative and found.flags.writeable
     for name in vertex.dtype.names:
@@ -131,3 +133,56 @@ def test_values_at_the_ends_warn_of_nothing(tmp_path: Path, kind: str) -> None:
     with warnings.catch_warnings(action="error"):
         loaded = load(tmp_path / "in.ply", activated="none")
     assert 0 < len(loaded.gaussians) < 20
+
+
+@pytest.mark.parametrize("order", ["<", ">", "ascii"])
+@pytest.mark.parametrize("limit", [1 << 20, 1500], ids=["whole", "pieces"])
+def test_the_fingerprint_is_of_the_bytes_that_were_parsed(
+    tmp_path: Path, order: str, limit: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever becomes of the file meanwhile: replaced, or overwritten in place; elements around the rows count too."""
+    monkeypatch.setattr("clod_adapter.io.ply.header.HEADER_LIMIT", limit)
+    path, text = tmp_path / "in.ply", order == "ascii"
+    data = {"text": text, "byte_order": "=" if text else order}
+    around = [PlyElement.describe(np.arange(3).astype([("n", "i4")]), name) for name in ("before", "after")]
+    files = []
+    for seed in (0, 1):
+        elements = [around[0], PlyElement.describe(rows(200, seed), "vertex"), around[1]]
+        PlyData(elements, **data).write(str(path))
+        files.append(path.read_bytes())
+    old, new = files
+    path.write_bytes(old)
+    assert load(path).fingerprint == hashlib.sha256(old).hexdigest()
+    real = parse_head
+
+    def replaced(*args: Any) -> Any:
+        (tmp_path / "new.ply").write_bytes(new)
+        os.replace(tmp_path / "new.ply", path)
+        return real(*args)
+
+    def overwritten(*args: Any) -> Any:
+        with open(path, "r+b") as file:
+            file.write(new)
+        return real(*args)
+
+    monkeypatch.setattr("clod_adapter.io.ply.body.parse_head", replaced)
+    found = load(path)
+    assert found.vertex.tobytes() == rows(200, 0).tobytes() or text
+    assert found.fingerprint == hashlib.sha256(old).hexdigest()
+    if len(old) == len(new):  # else the row counts or columns of one would be read from the other
+        path.write_bytes(old)
+        monkeypatch.setattr("clod_adapter.io.ply.body.parse_head", overwritten)
+        assert load(path).fingerprint == hashlib.sha256(old[:limit] + new[limit:]).hexdigest()
+
+
+def test_reading_takes_the_memory_of_the_rows_once(tmp_path: Path) -> None:
+    vertex = rows(60_000)
+    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(tmp_path / "in.ply"))
+    read_head(tmp_path / "in.ply")
+    tracemalloc.start()
+    try:
+        found = read_elements(tmp_path / "in.ply", lambda path, ply: ("vertex",))
+        assert tracemalloc.get_traced_memory()[1] < vertex.nbytes + (4 << 20)
+    finally:
+        tracemalloc.stop()
+    assert found.elements["vertex"].tobytes() == vertex.tobytes()

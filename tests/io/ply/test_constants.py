@@ -19,7 +19,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.inspection.report import inspect
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.ply.constants import dial_constants, dial_settings, simplest
+from clod_adapter.io.ply.constants import constant_settings, dial_constants, simplest
 from formats import splat_transform
 from scenes import camera, gaussians
 
@@ -120,8 +120,9 @@ def test_inspecting_reads_the_columns(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", EACH)
 def test_columns_are_the_settings(name: str) -> None:
-    found = dial_settings({key: simplest(np.float32(value)) for key, value in dial_constants(EACH[name]).items()})
     config = EACH[name]
+    columns = {key: simplest(np.float32(value)) for key, value in dial_constants(config).items()}
+    found = constant_settings(columns).get("attenuation", {})
     for field in ("tau", "cut", "eps", "normalizer"):
         assert found.get(field, getattr(AttenuationConfig(), field)) == getattr(config, field)
     assert config.normalizer != "quantile" or found["quantile"] == config.quantile

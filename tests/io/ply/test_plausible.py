@@ -13,7 +13,7 @@ from clod_adapter.config import AttenuationConfig
 from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.inspection.report import inspect
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.ply.plausible import judge
+from clod_adapter.io.ply.plausible import check_plausible
 from clod_adapter.units import estimated_distance
 from scenes import gaussians
 
@@ -47,7 +47,7 @@ def test_a_sigma_in_other_units_is_warned_of_with_its_number(tmp_path: Path) -> 
         assert note.startswith("warning: ") and "keeps 0% at s = 1" in note and "likely not what was adapted" in note
 
 
-def test_a_file_that_says_how_it_is_read_is_not_judged(tmp_path: Path) -> None:
+def test_a_file_that_says_how_it_is_read_is_not_check_plausibled(tmp_path: Path) -> None:
     undescribed(tmp_path / "a.ply", factor=0.05)
     assert load(tmp_path / "a.ply").notes == () and inspect(tmp_path / "a.ply").notes == ()
 
@@ -56,4 +56,4 @@ def test_a_file_that_says_how_it_is_read_is_not_judged(tmp_path: Path) -> None:
 def test_no_scale_changes_the_other_normalisers(normalizer: str) -> None:
     config = AttenuationConfig(normalizer=normalizer)
     some = gaussians(20, 0, 0)
-    assert judge(some.means, some.opacity_logits, torch.full((20,), 1e-6), config) == []
+    assert check_plausible(some.means, some.opacity_logits, torch.full((20,), 1e-6), config) == []

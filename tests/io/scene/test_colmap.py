@@ -12,9 +12,8 @@ import torch
 from PIL import Image
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap import write_model
+from clod_adapter.io.scene.colmap import read_model, write_model
 from clod_adapter.io.scene.colmap_library import pycolmap
-from clod_adapter.io.scene.colmap_model import read_model
 from clod_adapter.io.scene.load import load_scene
 from photographs import as_text, camera, model_of, pixels, pose, write_scene
 

@@ -13,8 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene import colmap, colmap_model, colmap_plain, colmap_records, undistort
-from clod_adapter.io.scene.colmap_model import read_model
+from clod_adapter.io.scene import colmap, colmap_plain, colmap_records, undistort
+from clod_adapter.io.scene.colmap import read_model
 from clod_adapter.io.scene.load import load_scene
 from photographs import LENSES, SIZE, as_text, camera, pixels, seen, write_scene
 
@@ -22,7 +22,7 @@ from photographs import LENSES, SIZE, as_text, camera, pixels, seen, write_scene
 @pytest.fixture
 def plain(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The package without pycolmap."""
-    for module in (colmap, colmap_model, colmap_records, undistort):
+    for module in (colmap, colmap_records, undistort):
         monkeypatch.setattr(module, "pycolmap", colmap_plain)
     return colmap_plain
 
@@ -73,8 +73,9 @@ def test_models_are_read_alike(tmp_path: Path, plain: Any, monkeypatch: pytest.M
     if form == "text":
         as_text(tmp_path)
     model = tmp_path / "sparse" / "0"
+    monkeypatch.setattr(colmap, "pycolmap", plain)
     ours, notes = read_model(model)
-    monkeypatch.setattr(colmap_model, "pycolmap", pycolmap)
+    monkeypatch.setattr(colmap, "pycolmap", pycolmap)
     theirs, others = read_model(model)
     assert [image.name for image in ours] == [image.name for image in theirs] and notes == others
     for one, other in zip(ours, theirs, strict=True):

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap_model import read_model
-from clod_adapter.io.scene.colmap_records import check_name, check_records
+from clod_adapter.io.scene.colmap import read_model
+from clod_adapter.io.scene.colmap_records import check_records
 from clod_adapter.io.scene.load import load_scene
 
 pycolmap = pytest.importorskip("pycolmap")  # which alone writes rigs, frames and text
@@ -82,15 +82,6 @@ def test_pipes_are_not_waited_for(tmp_path: Path, file: str) -> None:
     os.mkfifo(target / file)
     with pytest.raises(ClodError, match=f"{file}: .*not a regular file"):
         read_model(target)
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["a" * 300 + ".png", "a/" * 2500 + "b.png", "é" * 130, "a\x00b.png", "\x1b[2J.png", "a\nb.png", "\ud800.png"],
-)
-def test_names_that_no_file_has(tmp_path: Path, name: str) -> None:
-    with pytest.raises(ClodError, match="is no file's name"):
-        check_name(tmp_path, name)
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -74,7 +74,7 @@ def test_a_camera_without_a_size_is_left_out(tmp_path: Path) -> None:
 def test_where_no_camera_has_a_size_there_are_none(tmp_path: Path) -> None:
     frames = [{"file_path": "0.png", "transform_matrix": torch.eye(4).tolist()}]
     (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
-    with pytest.raises(ClodError, match="transforms.json: says no photograph's size.*put them beside it, or w"):
+    with pytest.raises(ClodError, match="transforms.json: has no size of a photograph.*put them beside it, or w"):
         load_cameras(tmp_path)
 
 

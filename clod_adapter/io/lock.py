@@ -1,4 +1,4 @@
-"""One run at a time writes an output: a second one would remove its temporaries and mix its files with the first's."""
+"""A lock on an output: of two runs that write it, the second would remove the temporaries of the first."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from clod_adapter.io.atomic import lock_file
 if sys.platform != "win32":
     import fcntl
 
-TRIES = 100  # of a lock whose file its last holder removes meanwhile
+TRIES = 100  # where the last holder removes the file meanwhile
 NOT_HERE = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)  # a file system without locks
 
 
 @contextmanager
 def output_lock(final: Path, *, of: Path | None = None, shared: bool = False) -> Iterator[None]:
-    """Within, no other process is within for the same ``final``.
+    """Holds the lock of ``final`` in the body.
 
-    The lock is that of a hidden file beside ``final`` (``flock``), so it ends with the process, however that ends. On
-    a file system without locks, and on Windows, nothing is locked.
+    It is that of a hidden file beside ``final`` (``flock``), and ends with the process, however that ends. On a file
+    system without locks, and on Windows, nothing is locked.
 
     Args:
-        final: in a folder that is there; the file itself need not be.
-        of: what the error names in its place.
-        shared: with others that share it, as the jobs of one run do.
+        final: in an existing folder; the file itself need not exist.
+        of: the name in the error, by default ``final``.
+        shared: with other shared holders, as the jobs of one run are.
 
     Raises:
-        ClodError: another process is within.
+        ClodError: another process holds it.
     """
     if sys.platform == "win32":
         yield
@@ -43,7 +43,7 @@ def output_lock(final: Path, *, of: Path | None = None, shared: bool = False) ->
         yield
     finally:
         if handle is not None:
-            with suppress(OSError):  # others share it: the last one removes the file
+            with suppress(OSError):  # other holders: the last one removes the file
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 path.unlink()
             os.close(handle)
@@ -74,11 +74,11 @@ def _locked(path: Path, name: Path, shared: bool) -> int | None:
                 os.pwrite(handle, str(os.getpid()).encode(), 0)
             return handle
         os.close(handle)
-    raise ClodError(f"{name}: other runs that write it come and go; choose another name")
+    raise ClodError(f"{name}: other runs keep writing it; choose another name")
 
 
 def _is_still(path: Path, handle: int) -> bool:
-    """Whether the lock is of the file that a next one would open."""
+    """Whether the path still names the locked file."""
     with suppress(FileNotFoundError):
         return os.path.samestat(os.stat(path), os.fstat(handle))
     return False

@@ -9,7 +9,7 @@ import pytest
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import remove_leftovers
-from clod_adapter.io.claims import output_lock
+from clod_adapter.io.lock import output_lock
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="locks are those of POSIX")
 
@@ -41,7 +41,7 @@ def test_jobs_share_it(tmp_path: Path) -> None:
 def test_a_killed_holder_holds_nothing(tmp_path: Path) -> None:
     final = tmp_path / "out.ply"
     code = (
-        "import os, sys; from pathlib import Path; from clod_adapter.io.claims import output_lock\n"
+        "import os, sys; from pathlib import Path; from clod_adapter.io.lock import output_lock\n"
         "with output_lock(Path(sys.argv[1])): os.kill(os.getpid(), 9)"
     )
     assert subprocess.run([sys.executable, "-c", code, str(final)], check=False).returncode == -9

@@ -96,7 +96,7 @@ def test_an_unusable_calibration_is_the_reason_given(clod: Any, dialled: Path, t
     extra = b"element face 0\nproperty list uchar int vertex_indices\nend_header"  # a note of its own, after it
     (tmp_path / "other.ply").write_bytes(data.replace(b"end_header", extra, 1))
     done = clod("export", "other.ply", "--psnr-drop", 1, "-o", "x.ply")
-    said = "other.ply: --psnr-drop: the calibration in the header is of 299 Gaussians and ignored, these are 300; adapt"
+    said = "other.ply: --psnr-drop: the calibration is of 299 Gaussians and ignored, these are 300; adapt"
     assert done.code == 2 and said in done.err and "not carried over" in done.err
 
 
@@ -161,12 +161,12 @@ def test_interrupted_rendering_leaves_what_is_finished(
 
 
 def test_names_that_would_collide_keep_their_suffix(capture: Any) -> None:
-    from clod_adapter.cli.render import files
+    from clod_adapter.cli.render import image_names
 
     view = clod_adapter.load_scene(capture.scene).test[0]
 
     def of(*names: str) -> list[str]:
-        return [str(p) for p in files([replace(view, camera=replace(view.camera, name=name)) for name in names])]
+        return [str(p) for p in image_names([replace(view, camera=replace(view.camera, name=name)) for name in names])]
 
     assert of("a.jpg", "b/a.jpg", "c\\a.JPG") == ["a.png", "b/a.png", "c/a.png"]
     assert of("a.jpg", "a.png") == ["a.jpg.png", "a.png.png"]
@@ -175,7 +175,7 @@ def test_names_that_would_collide_keep_their_suffix(capture: Any) -> None:
 def test_dial_values_beyond_the_trained_ones_are_noted(clod: Any, capture: Any, dialled: Path) -> None:
     for words in (("render", dialled, "--images", capture.scene, "-o", "out"), ("export", dialled, "-o", "plain.ply")):
         (note,) = json.loads(clod(*words, "--sv", 4.5, "--json").out)["notes"]
-        assert note == "trained up to s = 4; beyond that nothing was learned"
+        assert note == "trained up to s = 4; larger dial values were not trained"
 
 
 def test_baking_to_a_budget(clod: Any, dialled: Path, tmp_path: Path) -> None:

@@ -1,0 +1,124 @@
+"""The end of the pipeline: measures and writes the result, and reports."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from typing import Any
+
+from clod_adapter._support.version import package_version
+from clod_adapter.errors import ClodError
+
+from ..shared.budgets import calibrate
+from ..shared.console import duration
+from ..shared.files import Outputs, size
+from ..shared.interrupts import GracefulStop
+from ..shared.pages import AdaptPage
+from ..shared.report import Stopwatch, machine, table, write_report
+from .files import write
+from .inputs import Inputs
+from .memory import with_rows
+from .processes import describe_processes
+from .result import Measured, Result, measure_result
+from .setup import Setup
+
+
+def finish(
+    setup: Setup, inputs: Inputs, result: Result, page: AdaptPage | None, written: Callable[[bool], None]
+) -> dict[str, Any]:
+    """Measures the result, writes it once, and returns the report.
+
+    Args:
+        written: called once the files are written, with whether the run is complete.
+    """
+    measured = measure_result(setup, inputs, result)
+    stop = setup.stop if result.adapted.interrupted else GracefulStop(aborts=setup.stop.aborts)
+    before = stop.requests
+    with stop.listening():  # a first Ctrl-C lets the writing finish
+        report = write_result(setup, inputs, result, measured)
+    written(not result.adapted.interrupted and not measured.interrupted)
+    if page and not measured.interrupted and stop.requests == before:  # after the report
+        report = add_page(setup, result, page, report)
+    shown = table(measured.rows, inputs.base_rows, measured.plain) if measured.rows else ""
+    print_summary(setup.outputs, shown, setup.args, setup.watch)
+    return report
+
+
+def write_result(setup: Setup, inputs: Inputs, result: Result, measured: Measured) -> dict[str, Any]:
+    """Writes the three files, and returns the report."""
+    outputs, adapter = setup.outputs, result.adapter
+    base = with_rows(result.base, setup.args) if result.plan is None else result.base
+    if measured.rows and not measured.interrupted:
+        against = teacher(setup.args)
+        try:
+            table_of = calibrate(measured.rows, result.gaussians, inputs.scene, against, base.origin)
+            adapter = replace(adapter, calibration=table_of)
+        except ClodError as error:
+            setup.console.say(f"the files have no calibration, so --fps and --psnr-drop will not work: {error}")
+    report = describe(setup, inputs, result, measured)
+    with setup.console.status(f"writing {outputs.ply} ..."):
+        report = write(base, adapter, result.gaussians, outputs, report)
+    setup.console.say(f"wrote {outputs.adapter} and {outputs.ply}")
+    return report
+
+
+def describe(setup: Setup, inputs: Inputs, result: Result, measured: Measured) -> dict[str, Any]:
+    """The report, except the sizes of the files."""
+    args, adapted, adapter, plan = setup.args, result.adapted, result.adapter, result.plan
+    late = "the measurements were interrupted: only the dial values that were finished are reported"
+    notes = [*result.base.notes, *inputs.scene.notes, *inputs.notes, *result.notes]
+    if measured.interrupted:
+        setup.console.say(late)
+        notes.append(late)
+    report = {
+        "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
+        "teacher": teacher(args), "screen_filter": asdict(result.gaussians.screen_filter),
+        "base_count": adapter.base_count, "config": adapter.config, "attenuation": asdict(adapter.attenuation),
+        "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
+        "processes": describe_processes(adapted, inputs.config.batch), "outputs": setup.outputs.names(),
+        "sh_degree": result.gaussians.sh_degree, "device": str(result.gaussians.means.device),
+        "seconds": seconds(setup, result), "resumed_from": setup.resumed and setup.resumed.state.steps,
+        "alignment": inputs.alignment, "notes": notes, "base_rows": [row.as_dict() for row in inputs.base_rows],
+        "rows": [row.as_dict() for row in measured.rows],
+        "detached_row": measured.plain[0].as_dict() if measured.plain else None,
+        "plan": plan and plan.as_dict(), "memory": inputs.memory and asdict(inputs.memory),
+    }  # fmt: skip
+    return report | ({"exit_code": 1} if adapted.failed else {})
+
+
+def seconds(setup: Setup, result: Result) -> dict[str, float]:
+    """Wall times by phase."""
+    plan, adapted = result.plan, result.adapted
+    times = {"plan": sum(plan.seconds.values()) - plan.seconds["start"]} if plan else {}
+    times |= {"start": adapted.start_seconds, "train": adapted.seconds}
+    return {name: round(value, 3) for name, value in times.items()} | setup.watch.report()
+
+
+def teacher(args: argparse.Namespace) -> str:
+    return "checkpoint" if args.images is None else "photographs"
+
+
+def add_page(setup: Setup, result: Result, page: AdaptPage, report: dict[str, Any]) -> dict[str, Any]:
+    """Writes the page, and the report again with its files."""
+    path = setup.outputs.ply.with_suffix(".html")
+    with setup.watch.time("page"):
+        changes = page.write(path, report, result.gaussians, result.adapted.start_seconds)
+    report = report | changes | {"seconds": seconds(setup, result)}
+    write_report(setup.outputs.report, report)
+    return report
+
+
+def print_summary(outputs: Outputs, measured: str, args: argparse.Namespace, watch: Stopwatch) -> None:
+    if measured:
+        print(f"\n{measured}\n")
+        if "plain" in measured:
+            print(f"plain: {outputs.ply} in a viewer that does not know the dial\n")
+    for path in vars(outputs).values():
+        print(f"{size(path):>9}  {path}")
+    following = "other dial values:" if args.images is not None else "against photographs, if there are any:"
+    print(f"\n{duration(watch.total())} in all; next, {following}")
+    sv = " ".join(f"{s:g}" for s in sorted({1.0, args.max_sv}))
+    images = "DIR" if args.images is None else shlex.quote(args.images)
+    print(f"  clod-adapt eval {shlex.quote(str(outputs.ply))} --images {images} --sv {sv}")

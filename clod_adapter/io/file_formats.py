@@ -1,0 +1,155 @@
+"""The file formats of Gaussians, by the suffix of the file: one table, which needs no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from clod_adapter.errors import ClodError
+from clod_adapter.origin import NOWHERE, Origin
+
+if TYPE_CHECKING:
+    from clod_adapter.calibration import Calibration
+    from clod_adapter.gaussians import Gaussians
+    from clod_adapter.io.settings import Metadata
+
+
+class Model(NamedTuple):
+    """The content of a file.
+
+    Attributes:
+        gaussians: every row of the file, also rows with values that are not finite.
+        metadata: its settings.
+        notes: what the reader noticed, one line each, besides the notes of the metadata.
+        activation_unknown: whether opacities and scales may be activated already, as the format does not tell.
+        sha256: hex, of the bytes that were parsed; "" where a library reads the file.
+    """
+
+    gaussians: Gaussians
+    metadata: Metadata
+    notes: tuple[str, ...] = ()
+    activation_unknown: bool = False
+    sha256: str = ""
+
+
+class History(NamedTuple):
+    """Of Gaussians that are written: lines on it, what their means are relative to, and their calibration."""
+
+    about: tuple[str, ...] = ()
+    origin: Origin = NOWHERE
+    calibration: Calibration | None = None
+
+
+class Format(NamedTuple):
+    """A format: functions by module and name under ``clod_adapter.io``, imported when they are called.
+
+    Attributes:
+        read: a path to a ``Model``; of the PLY, to ``PlyRows``.
+        check: refuses, by the first bytes and without torch, a file that is not of the format.
+        has_dial: whether a file has a sigma_d; "" where none can.
+        write: called with path, Gaussians in world units and a ``History``; gives a line for each loss; "" where the
+            format is only read.
+        carries_sigma: whether sigma_d and its settings are written.
+    """
+
+    read: str
+    check: str
+    has_dial: str = ""
+    write: str = ""
+    carries_sigma: bool = False
+
+
+_CHECK, _DIAL = "formats.checks.check_model", "formats.checks.model_has_dial"
+_CONVERTED = Format("formats.converted.load_converted", "formats.converted.check_converted")
+PLY = Format("ply.rows.read_ply", "ply.rows.check_ply", "ply.rows.ply_has_dial", "formats.ply.write_ply", True)
+FORMATS = {
+    ".ply": PLY,
+    ".glb": Format("formats.glb_reader.load_glb", _CHECK, _DIAL, "formats.glb.write_glb", True),
+    ".spz": Format("formats.spz_reader.load_spz", _CHECK, _DIAL, "formats.spz.write_spz", True),
+    ".safetensors": Format(
+        "formats.safetensors.load_safetensors", _CHECK, _DIAL, "formats.safetensors.write_safetensors", True
+    ),
+    ".pt": Format("formats.pt_model.load_pt", "formats.pt.check_pt", _DIAL, "formats.pt_model.write_pt", True),
+    ".splat": Format("formats.splat.load_splat", _CHECK, "", "formats.splat.write_splat"),
+    ".sog": _CONVERTED,
+    ".ksplat": _CONVERTED,
+}
+WRITABLE = tuple(suffix for suffix, form in FORMATS.items() if form.write)
+
+
+def format_of(path: Path) -> Format:
+    """The format of a file, by its name alone, so that only a .pt is unpickled; any other name is a PLY's."""
+    return FORMATS.get(path.suffix.lower(), PLY)
+
+
+def check_readable(path: Path) -> None:
+    """Refuses, without torch, a file whose first bytes are not of its format.
+
+    Raises:
+        ClodError: they are not, or the file cannot be read.
+    """
+    _call(format_of(path).check, path)
+
+
+def file_has_dial(path: Path) -> bool:
+    """Whether the file has a sigma_d.
+
+    Raises:
+        ClodError: as ``check_readable``.
+    """
+    has_dial = format_of(path).has_dial
+    return bool(has_dial) and _call(has_dial, path)
+
+
+def read_model(path: str | Path) -> Model:
+    """The content of a file in any format but the PLY, which ``checkpoint.load`` reads.
+
+    Raises:
+        ClodError: the file is damaged, of another kind, or a package or program that its format needs is missing.
+    """
+    path = Path(path)
+    if format_of(path) is PLY:
+        raise ClodError(f"{path}: is read by clod_adapter.load")
+    check_readable(path)
+    return _call(format_of(path).read, path)
+
+
+def write(
+    path: str | Path,
+    gaussians: Gaussians,
+    about: Sequence[str] = (),
+    *,
+    origin: Origin = NOWHERE,
+    calibration: Calibration | None = None,
+) -> tuple[str, ...]:
+    """Writes Gaussians in the format of the name's suffix, whole or not at all, sigma_d in world units.
+
+    Args:
+        gaussians: with or without sigma_d.
+        about: lines on their history, printable ASCII, for formats that store text.
+        origin: what their means are relative to (``Checkpoint.origin``), world units.
+        calibration: of these Gaussians, for formats that store text.
+
+    Returns:
+        One line for each loss.
+
+    Raises:
+        ClodError: an unknown suffix, sigma_d for a format that does not carry it, no Gaussians, a value that is not
+            finite (opacity = +inf aside), a missing package, or the file cannot be written.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in WRITABLE:
+        raise ClodError(f"{path}: {suffix or 'no suffix'} is no format to write; choose one of {', '.join(WRITABLE)}")
+    if gaussians.sigma_d is not None and not FORMATS[suffix].carries_sigma:
+        raise ClodError(f"{path}: {Path(path).suffix} has no room for sigma_d; choose a dial value to bake")
+    from clod_adapter.units import in_world_units  # here: the table needs no torch
+
+    history = History(tuple(about), origin, calibration)
+    return _call(FORMATS[suffix].write, Path(path), in_world_units(gaussians), history)
+
+
+def _call(function: str, *args: Any) -> Any:
+    module, name = function.rsplit(".", 1)
+    return getattr(import_module(f"clod_adapter.io.{module}"), name)(*args)

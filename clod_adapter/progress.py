@@ -1,0 +1,90 @@
+"""Progress of long-running functions: what a listener is given, and how it stops them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # the command reports an interrupt without importing torch
+    from clod_adapter.gaussians import Gaussians
+
+
+class Phase(StrEnum):
+    """The part of a computation that is under way; its value is the label that is displayed."""
+
+    PHOTOGRAPHS = "photographs"
+    CAMERAS = "placing cameras"
+    PSEUDO_VIEWS = "pseudo views"
+    FINGERPRINT = "photographs' hash"
+    SH_DEGREES = "SH degrees"
+    IMPORTANCE = "importance"
+    PRUNING_ORDER = "pruning order"
+    FIRST_STEPS = "first steps"
+    TRIMMING = "effect of trimming"
+    COVERAGE = "block coverage"
+    CONTEXT = "context Gaussians"
+    TARGET_IMAGES = "target images"
+    TARGET_COUNTS = "target counts"
+    TRAINING = "training"
+    EVALUATION = "evaluation"
+    FRAME_TIMES = "frame times"
+    POPPING = "popping"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The state of a phase; given to the listener after each of its steps.
+
+    Attributes:
+        done, total: steps of the phase: views, Gaussians (pruning order), candidates (cameras) or training steps.
+        seconds: of training, 0 in other phases.
+        time_share: the share of the time budget that is used; 0 without one.
+        loss: running mean of the photometric loss, NaN in other phases.
+        gaussians: in training, gives the result so far (within the last ``average`` of the steps the mean). It shares
+            memory with the parameters, so use it within the listener.
+        state: in training, gives the ``TrainingState`` to resume from, likewise.
+        error: why training ends here: a process was lost, or a step failed.
+    """
+
+    phase: Phase
+    done: int
+    total: int
+    seconds: float = 0.0
+    time_share: float = 0.0
+    loss: float = math.nan
+    gaussians: Callable[[], Gaussians] | None = None
+    state: Callable[[], Any] | None = None
+    error: str | None = None
+
+    @property
+    def share(self) -> float:
+        """The share of the phase that is done, in [0, 1], by steps or by time budget, whichever is larger."""
+        return max(self.done / self.total if self.total else 1.0, self.time_share)
+
+
+Listener = Callable[[Progress], bool | None]
+"""Returns False to stop; True or None to go on."""
+
+
+class Stopped(Exception):
+    """A listener returned False, and there is no partial result to return."""
+
+
+def tell(listener: Listener | None, phase: Phase, done: int, total: int) -> None:
+    """Calls the listener.
+
+    Raises:
+        Stopped: it returned False.
+    """
+    if listener is not None and listener(Progress(phase, done, total)) is False:
+        raise Stopped(f"stopped at {phase} {done}/{total}")
+
+
+def within(listener: Listener | None, before: int, total: int, phase: Phase | None = None) -> Listener | None:
+    """The listener of a part of a phase of ``total`` steps, ``before`` of which come first."""
+    if listener is None:
+        return None
+    return lambda now: listener(replace(now, phase=phase or now.phase, done=before + now.done, total=total))

@@ -1,0 +1,43 @@
+"""Ctrl-C during training: it ends training after the step under way, so that no step is applied in part."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType
+
+
+class DeferredInterrupt:
+    """Records the first Ctrl-C (or SIGTERM) instead of raising KeyboardInterrupt; a second one raises it at once.
+
+    Replaces Python's own handler only, from ``begin`` to the end of the block. A handler that the application has
+    installed stays, as does the handler in a thread other than the main one, which signals do not reach.
+
+    Attributes:
+        received: whether there was one.
+    """
+
+    def __init__(self) -> None:
+        self.received = False
+        self._replaced: list[signal.Signals] = []
+
+    def begin(self) -> None:
+        """Starts to record; further calls do nothing."""
+        if self._replaced or threading.current_thread() is not threading.main_thread():
+            return
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(number) is signal.default_int_handler:
+                self._replaced.append(number)
+                signal.signal(number, self._record)
+
+    def __enter__(self) -> DeferredInterrupt:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number in self._replaced:
+            signal.signal(number, signal.default_int_handler)
+
+    def _record(self, number: int, frame: FrameType | None) -> None:
+        if self.received:
+            signal.default_int_handler(number, frame)
+        self.received = True

@@ -1,0 +1,180 @@
+"""One training run: parameters, optimizer and view sampler, and the step that changes them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from clod_adapter._kernels.threads import torch_on_one_thread
+from clod_adapter.adapter import ATTRIBUTES
+from clod_adapter.cameras import View, camera_extent
+from clod_adapter.config import AdaptConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.finite import LossNotFinite, require_finite, spoilt_rows
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.training.distributed import ProcessGroup
+from clod_adapter.training.objective import GradientSum, Objective, TrainableSubset
+from clod_adapter.training.optimizer import RowAdam, add_to_mean
+from clod_adapter.training.state import TrainingState
+from clod_adapter.training.view_sampler import ViewSampler
+from clod_adapter.units import in_world_units
+
+# Adam's decay rates per view. A batch takes their powers and multiplies learning rates by its square root, so that
+# each view has the same effect (Zhao et al., "On Scaling Up 3D Gaussian Splatting Training", ICLR 2025).
+BETA1, BETA2 = 0.9, 0.999
+
+
+class Trainer:
+    """Holds everything that training steps change.
+
+    Attributes:
+        parameters: tensors by name; the first ``objective.trained`` rows of those in ``stepped`` are trained.
+        mean: of the trained parameters over the last ``average`` of the steps; averaged: how many steps it has.
+        loss: running mean of the photometric loss, NaN before the first step.
+        done: steps; seconds: spent in them; start_seconds: spent before the first.
+        held: ``[trained]`` bool, rows that some step did not move because their gradient was not finite.
+    """
+
+    def __init__(
+        self, start: Gaussians, views: tuple[View, ...], config: AdaptConfig, subset: TrainableSubset | None = None,
+        group: ProcessGroup | None = None,
+    ) -> None:  # fmt: skip
+        subset = subset or TrainableSubset(len(start))
+        assert start.sigma_d is not None and start.attenuation is not None
+        self.config, self.group, self.sampler = config, group, ViewSampler(views, config)
+        rates = _learning_rates(config, _extent(start, views, subset))
+        # A frozen attribute requests no gradient from the rasterizer.
+        tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
+        self.objective = Objective(config, start.attenuation, tuple(tuned), subset, start.screen_filter)
+        self.decay, self.stepped = self.objective.decay, self.objective.stepped
+        self.decay_range = self.objective.decay_range
+        self.rates = rates | {self.decay: config.lr_sigma * math.sqrt(config.batch)}
+        own = {"dtype": torch.float32, "memory_format": torch.contiguous_format}
+        self.parameters = {
+            name: getattr(start, name).detach().to(**own, copy=name in self.stepped) for name in ATTRIBUTES
+        }
+        self.parameters[self.decay] = self.objective.parameter(start.sigma_d)
+        self.optimizer = RowAdam(self._trained(), beta1=BETA1**config.batch, beta2=BETA2**config.batch)
+        self.empty_sh: Tensor | None = None  # the whole shN of a base whose empty degrees were removed
+        self.done, self.seconds, self.start_seconds, self.loss = 0, 0.0, 0.0, math.nan
+        self.mean: dict[str, Tensor] = {}
+        self.averaged = 0
+        self.held = torch.zeros(subset.trained, dtype=torch.bool, device=start.means.device)
+        self._updating = False
+
+    @torch_on_one_thread()
+    def step(self, share_done: float) -> None:
+        """Samples views and dial values, sums the gradients of their losses, and updates the parameters once.
+
+        Raises:
+            LossNotFinite, or any error of the rasterizer: nothing has changed.
+        """
+        found = self._gradients()
+        self._updating = True
+        finite = ~spoilt_rows(found.gradients)
+        self.held |= ~finite
+        loss = found.loss / self.config.batch
+        self.loss = loss if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * loss
+        rates = {name: rate * self.config.lr_final**share_done for name, rate in self.rates.items()}
+        # The paper's count term has a gradient for opacities too, also of culled Gaussians.
+        everywhere = {self.decay} | ({"opacity_logits"} if self.config.count_term == "paper" else set())
+        for rows, names in ((found.kept & finite, set(self.stepped) - everywhere), (finite, everywhere)):
+            self.optimizer.step({name: found.gradients[name] for name in self.stepped if name in names}, rows, rates)
+        self.parameters[self.decay].clamp_(*self.decay_range)
+        if share_done >= 1 - self.config.average:  # the optimizer continues from the parameters, not from the mean
+            self.averaged += 1
+            add_to_mean(self.mean, self._trained(), self.averaged)
+        self.done += 1
+        self._updating = False
+
+    def _gradients(self) -> GradientSum:
+        """Of the losses of the next views; each process of a group computes those of its share of the batch.
+
+        If that fails, the next step samples the same views again.
+        """
+        before = self.sampler.state()
+        samples = [self.sampler.draw() for _ in range(self.config.batch)]
+        try:
+            found = self.objective.gradient_sum(self.parameters, self.group.share(samples) if self.group else samples)
+            found = self.group.sum(found) if self.group else found
+            if not math.isfinite(found.loss):
+                names = ", ".join(view.camera.name or "a view without a name" for view, _ in samples)
+                raise LossNotFinite(f"the loss of step {self.done + 1} is not finite ({names})")
+            return found
+        except Exception:
+            self.sampler.restore(*before)
+            raise
+
+    def state(self) -> TrainingState:
+        """Everything that later steps depend on; its tensors are the trainer's own.
+
+        Raises:
+            ClodError: a step failed while it updated the parameters.
+        """
+        if self._updating:
+            raise ClodError(f"step {self.done + 1} failed while it updated the parameters, so they cannot be saved")
+        random, order = self.sampler.state()
+        return TrainingState(
+            tensors=self._changing(), attenuation=self.objective.attenuation, random=random, order=order,
+            loss=self.loss, averaged=self.averaged, steps=self.done, seconds=self.seconds,
+            start_seconds=self.start_seconds,
+        )  # fmt: skip
+
+    def restore(self, state: TrainingState) -> None:
+        """The inverse of ``state``; copies its tensors.
+
+        Raises:
+            ClodError: it is of other Gaussians, views or settings, or damaged.
+        """
+        if state.averaged:
+            self.mean = {name: torch.empty_like(value) for name, value in self._trained().items()}
+        own = self._changing()
+        state.check(own)
+        self.sampler.restore(state.random, state.order)
+        for name, tensor in own.items():
+            tensor.copy_(state.tensors[name])
+        self.loss, self.averaged = state.loss, state.averaged
+        self.done, self.seconds, self.start_seconds = state.steps, state.seconds, state.start_seconds
+        require_finite(self.gaussians(), "the training state", "start over")
+
+    def gaussians(self) -> Gaussians:
+        """The result so far, in world units: the mean where there is one, else the parameters."""
+        rest = slice(self.objective.trained, None)
+        whole = all(len(self.parameters[name][rest]) == 0 for name in self.mean)
+        mean = self.mean if whole else {n: torch.cat([m, self.parameters[n][rest]]) for n, m in self.mean.items()}
+        parameters = self.parameters | mean
+        values = {name: parameters[name] for name in ATTRIBUTES}
+        if self.empty_sh is not None:
+            values["shN"] = self.empty_sh
+        dial: Any = {
+            "sigma_d": self.objective.sigma(parameters[self.decay]), "attenuation": self.objective.attenuation
+        }  # fmt: skip
+        return in_world_units(Gaussians(**values, **dial, screen_filter=self.objective.screen_filter))
+
+    def _trained(self) -> dict[str, Tensor]:
+        """Views of the rows of the parameters that steps change."""
+        return {name: self.parameters[name][: self.objective.trained] for name in self.stepped}
+
+    def _changing(self) -> dict[str, Tensor]:
+        """All tensors that steps change, named as in ``TrainingState``."""
+        kinds = {"parameter": self._trained(), **self.optimizer.state(), "mean": self.mean}
+        return {
+            f"{kind}.{name}": values[name] for kind, values in kinds.items() for name in self.stepped if name in values
+        }
+
+
+def _learning_rates(config: AdaptConfig, extent: float) -> dict[str, float]:
+    rates = {
+        "means": config.lr_means * extent, "quats": config.lr_quats, "log_scales": config.lr_scales,
+        "opacity_logits": config.lr_opacities, "sh0": config.lr_sh0, "shN": config.lr_shN,
+    }  # fmt: skip
+    return {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
+
+
+def _extent(start: Gaussians, views: tuple[View, ...], subset: TrainableSubset) -> float:
+    """The unit of position steps, world units: the cameras' extent, or their typical distance if it is 0."""
+    assert start.attenuation is not None
+    return subset.extent or camera_extent([view.camera for view in views]) or start.attenuation.scene_distance

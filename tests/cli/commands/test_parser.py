@@ -1,0 +1,38 @@
+"""``--help`` of every command, and the options that all have."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+
+from clod_adapter._support.version import package_version
+from clod_adapter.cli.main import COMMANDS, build_parser
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_out_has_a_short_form_wherever_there_is_one(clod: Any, command: str) -> None:
+    text = clod(*command.split(), "--help").out
+    short = re.search(r"\n  -o[ ,]", text) is not None  # Python 3.13 writes "-o, --out X", 3.12 "-o X, --out X"
+    assert ("--out " in text) == short == (command not in ("eval", "inspect", "view", "doctor"))
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help(clod: Any, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    done = clod(*command.split(), "--help")
+    assert done.code == 0 and done.out.startswith("usage: clod-adapt") and "--json" in done.out
+    assert max(map(len, done.out.splitlines())) <= 80
+    if not command:
+        assert all(f"clod-adapt {other}" in done.out for other in COMMANDS)
+        assert clod("--version").out.split() == ["clod-adapt", package_version()]
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_options_are_grouped(command: str) -> None:
+    """Inputs come first and general options last; none is outside a group."""
+    groups = [group for group in build_parser(command)._action_groups if group._group_actions]
+    titles = [group.title for group in groups]
+    assert titles[-1] == "general" and titles[0] == {"demo": "output", "doctor": "general"}.get(command, "input")
+    assert not {"positional arguments", "options"} & set(titles)

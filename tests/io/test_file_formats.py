@@ -1,0 +1,245 @@
+"""The contract of the formats: every one is written and read, and refused where it is damaged, in the same way."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import zlib
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from clod_adapter.adapter import detach, extract
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.inspection.report import inspect
+from clod_adapter.io.adapter_file import save_adapter
+from clod_adapter.io.checkpoint import load, save
+from clod_adapter.io.file_formats import (
+    FORMATS,
+    PLY,
+    WRITABLE,
+    check_readable,
+    file_has_dial,
+    format_of,
+    read_model,
+    write,
+)
+from formats import ABOUT, ATTENUATION, CALIBRATION, ORIGIN, damaged, model, rows_by_place, turned
+
+pytest.importorskip("pygltflib", reason="pygltflib is not installed")
+DIAL = tuple(suffix for suffix in WRITABLE if FORMATS[suffix].carries_sigma)
+BEGINNINGS = {".glb": b"glTF", ".spz": b"\x1f\x8b", ".pt": b"PK\x03\x04", ".ply": b"ply\n"}
+
+
+def of(suffix: str, degree: int = 1, count: int = 40) -> Gaussians:
+    """A model that the format carries."""
+    return model(degree, count) if suffix in DIAL else detach(model(degree, count))
+
+
+def same(suffix: str, g: Gaussians, again: Gaussians) -> None:
+    """To the precision of the format."""
+    loss = {".spz": (2.0**-20, 0.5001 / 16, 0.501 / 255, 0.51 / (0.15 * 255), 2.01 / 128, 5e-3, 2.0**-11)}.get(suffix)
+    means, scales, opacities, sh0, shN, angle, sigma = loss or (0, 1e-6, 1e-6, 0, 0, 1e-6, 0)
+    if suffix in (".pt", ".safetensors"):
+        scales = opacities = 0
+    bands = again.shN.shape[1]
+    assert bands == (g.shN.shape[1] if suffix in (".ply", ".pt", ".safetensors") else min(g.shN.shape[1], 15))
+    torch.testing.assert_close(again.means, g.means, rtol=0, atol=means)
+    torch.testing.assert_close(again.log_scales, g.log_scales, rtol=1e-6 if scales else 0, atol=scales)
+    torch.testing.assert_close(again.opacities, g.opacities, rtol=0, atol=opacities)
+    torch.testing.assert_close(again.sh0, g.sh0, rtol=0, atol=sh0)
+    near = g.shN[:, :bands].clamp(-1, 127 / 128) if loss else g.shN[:, :bands]
+    torch.testing.assert_close(again.shN, near, rtol=0, atol=shN)
+    assert turned(again.quats, g.quats) <= angle
+    assert again.sigma_d is not None and g.sigma_d is not None
+    most = g.sigma_d.clamp(max=65504) if loss else g.sigma_d  # the largest float16
+    torch.testing.assert_close(again.sigma_d, most, rtol=sigma, atol=1e-6 * sigma)
+
+
+def test_the_functions_of_the_table_are_there() -> None:
+    for form in FORMATS.values():
+        for function in filter(None, (form.read, form.check, form.has_dial, form.write)):
+            module, name = function.rsplit(".", 1)
+            assert callable(getattr(import_module(f"clod_adapter.io.{module}"), name))
+    assert format_of(Path("a.PT")) is FORMATS[".pt"]
+    assert format_of(Path("a.compressed.ply")) is format_of(Path("noname")) is PLY
+
+
+def test_the_table_and_the_checks_need_no_torch(tmp_path: Path) -> None:
+    for suffix in WRITABLE:
+        write(tmp_path / f"a{suffix}", of(suffix))
+    code = (
+        "import sys, pathlib; from clod_adapter.io.file_formats import *; "
+        f"[check_readable(pathlib.Path({str(tmp_path / 'a')!r} + suffix)) for suffix in WRITABLE]; "
+        "sys.exit('torch' in sys.modules)"
+    )
+    root = Path(__file__).resolve().parents[2]
+    assert subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(root)}).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("suffix", "degree", "far"),
+    [(suffix, (k + 2 * j) % 5, bool(j % 2)) for k, suffix in enumerate(DIAL) for j in range(3)],
+)
+def test_round_trip(tmp_path: Path, suffix: str, degree: int, far: bool) -> None:
+    g, origin, path = model(degree), ORIGIN if far else (0.0, 0.0, 0.0), tmp_path / f"a{suffix.upper()}"
+    notes = write(path, g, ABOUT, origin=origin, calibration=CALIBRATION)
+    assert ("above degree 3" in " ".join(notes)) == (degree == 4 and suffix in (".glb", ".spz"))
+    check_readable(path)
+    assert file_has_dial(path)
+    found = load(path, origin=origin if suffix == ".ply" else None)  # which a PLY does not store
+    same(suffix, g, found.gaussians)
+    assert (found.gaussians.attenuation, found.calibration, found.origin) == (ATTENUATION, CALIBRATION, origin)
+    assert found.filter_known and all(line in found.comments for line in ABOUT)
+    known = ("quantised", "opacity = +inf", "far from 0")
+    assert not [note for note in found.notes if not any(part in note for part in known)]
+    assert any("far from 0: read relative to (510000, -4096, 0.25)" in note for note in found.notes) == far
+    write(tmp_path / f"b{suffix}", g, ABOUT, origin=origin, calibration=CALIBRATION)
+    assert path.read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
+    seen = inspect(path)
+    assert seen.splat is not None and seen.splat.dial is not None and seen.splat.dial.calibration == CALIBRATION
+    save(tmp_path / "out.ply", found.gaussians, found, calibration=found.calibration)
+    again = load(tmp_path / "out.ply", origin=found.origin)
+    tensors = again.gaussians.tensors()
+    assert all(torch.equal(tensor, tensors[name]) for name, tensor in found.gaussians.tensors().items())
+    assert (again.gaussians.attenuation, again.calibration) == (ATTENUATION, CALIBRATION)
+
+
+@pytest.mark.parametrize("suffix", WRITABLE)
+def test_a_plain_model(tmp_path: Path, suffix: str) -> None:
+    g, path = detach(model(1)), tmp_path / f"a{suffix}"
+    write(path, g)
+    assert not file_has_dial(path)
+    found = load(path)
+    rows = torch.from_numpy(rows_by_place(g.means.numpy(), found.gaussians.means.numpy()))
+    assert found.gaussians.sigma_d is None and (found.gaussians.means[rows] - g.means).abs().max() <= 2.0**-20
+    assert any("quantised" in note for note in found.notes) == (suffix in (".spz", ".splat"))
+    data = path.read_bytes()
+    data = zlib.decompress(data, wbits=31) if suffix == ".spz" else data
+    assert b"screen_filter" not in data and b"SplatRenderMode" not in data and b"compensate" not in data
+    seen = inspect(path)
+    assert seen.splat is not None and seen.splat.dial is None
+    assert seen.what.endswith(suffix if suffix != ".ply" else "PLY")
+
+
+@pytest.mark.parametrize("suffix", WRITABLE)
+def test_nothing_is_half_written(tmp_path: Path, suffix: str) -> None:
+    plain = detach(model(1))
+    unfit = [
+        (plain.select(torch.zeros(40, dtype=torch.bool)), "no Gaussians to write"),
+        (plain.replace(sh0=plain.sh0 * torch.nan), "sh0 holds a value that is not finite"),
+        (plain.replace(quats=plain.quats * 0), "a rotation is zero"),
+    ]
+    if suffix in (".glb", ".splat"):
+        unfit.append((plain.replace(log_scales=torch.full((40, 3), 90.0)), "a scale is beyond"))
+    if suffix not in DIAL:
+        unfit.append((model(), "no room for sigma_d; choose a dial value to bake"))
+    for g, message in unfit:
+        with pytest.raises(ClodError, match=f"a{suffix}: .*{message}"):
+            write(tmp_path / f"a{suffix}", g)
+    with pytest.raises(ClodError, match="does not exist"):
+        write(tmp_path / "folder" / f"a{suffix}", plain)
+    with pytest.raises(ClodError, match="no format to write"):
+        write(tmp_path / "a.obj", plain)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("suffix", WRITABLE)
+def test_colours_of_any_size(tmp_path: Path, suffix: str) -> None:
+    plain, most = detach(model(1)), torch.finfo(torch.float32).max
+    write(tmp_path / f"a{suffix}", plain.replace(sh0=plain.sh0.sign() * most, shN=plain.shN.sign() * most))
+    again = load(tmp_path / f"a{suffix}").gaussians
+    assert len(again) == 40 and torch.equal(again.sh0.sign().unique(), torch.tensor([-1.0, 1.0]))
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_what_is_no_such_file_is_named(tmp_path: Path, suffix: str) -> None:
+    (tmp_path / f"folder{suffix}").mkdir()
+    os.mkfifo(tmp_path / f"pipe{suffix}")
+    (tmp_path / f"empty{suffix}").write_bytes(b"")
+    (tmp_path / f"pointer{suffix}").write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
+    (tmp_path / f"other{suffix}").write_bytes(b"what this is nobody knows")
+    expected = {
+        "missing": "cannot be read .No such file", "folder": "cannot be read", "pipe": "not a regular file",
+        "empty": "is empty", "pointer": "is a Git LFS pointer", "other": "",
+    }  # fmt: skip
+    for name, message in expected.items():
+        for read in (check_readable, load):
+            if name == "other" and read is check_readable and suffix in (".sog", ".ksplat"):
+                continue  # splat-transform tells
+            with pytest.raises(ClodError, match=f"{name}{suffix}: .*{message}"):
+                read(tmp_path / f"{name}{suffix}")
+
+
+@pytest.mark.parametrize("suffix", WRITABLE)
+@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data(), inside=st.booleans())
+def test_damage_is_never_another_exception(tmp_path: Path, suffix: str, data: st.DataObject, inside: bool) -> None:
+    """Of the file, or, of an SPZ, of its contents before compression."""
+    write(tmp_path / f"a{suffix}", of(suffix, 0, 5), calibration=CALIBRATION if suffix in DIAL else None)
+    whole, path = (tmp_path / f"a{suffix}").read_bytes(), tmp_path / f"damaged{suffix}"
+    if inside and suffix == ".spz":
+        gzip = zlib.compressobj(wbits=31)
+        path.write_bytes(gzip.compress(damaged(zlib.decompress(whole, 31), data)) + gzip.flush())
+    else:
+        path.write_bytes(damaged(whole, data))
+    try:
+        assert isinstance(load(path, activated="none").gaussians, Gaussians)
+    except ClodError as error:
+        assert str(error).isprintable() and str(path) in str(error)
+
+
+@pytest.mark.parametrize("suffix", WRITABLE)
+def test_truncation_is_refused(tmp_path: Path, suffix: str) -> None:
+    write(tmp_path / f"a{suffix}", of(suffix, 0, 5))
+    whole, path = (tmp_path / f"a{suffix}").read_bytes(), tmp_path / f"cut{suffix}"
+    for size in (1, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        with pytest.raises(ClodError, match=f"cut{suffix}: "):
+            load(path)
+
+
+def test_an_adapter_is_no_model(tmp_path: Path) -> None:
+    g = model(0)
+    save_adapter(tmp_path / "a.safetensors", extract(detach(g), g, fingerprint="ab", config={}))
+    for read in (check_readable, load):
+        with pytest.raises(ClodError, match="a.safetensors: is an adapter, not a model; clod-adapt apply BASE.ply"):
+            read(tmp_path / "a.safetensors")
+    with pytest.raises(ClodError, match="a.ply: is read by clod_adapter.load"):
+        read_model(tmp_path / "a.ply")
+
+
+def test_text_of_others_is_made_printable_ascii(tmp_path: Path) -> None:
+    write(tmp_path / "a.safetensors", model(0), ("caf\u00e9", "clod_adapter tau 0.5"))
+    found = load(tmp_path / "a.safetensors")
+    assert found.comments == ("caf?",) and found.gaussians.attenuation == ATTENUATION
+
+
+def test_opaque_gaussians_are_finite_in_a_ply(tmp_path: Path) -> None:
+    (note,) = write(tmp_path / "a.ply", model())
+    assert note == "1 opacities of +inf are written as 20, which is 1 too"
+    again = load(tmp_path / "a.ply").gaussians
+    assert torch.equal(again.opacities, model().opacities) and again.opacity_logits.isfinite().all()
+
+
+def test_unusable_rows_of_a_model_are_dropped(tmp_path: Path) -> None:
+    """As those of a PLY are; an infinite opacity stays, also where the output is a PLY."""
+    write(tmp_path / "a.pt", model(1), calibration=CALIBRATION)
+    checkpoint = torch.load(tmp_path / "a.pt", weights_only=True)
+    checkpoint["splats"]["scales"][3] = torch.nan
+    checkpoint["splats"]["quats"][4] = 0
+    torch.save(checkpoint, tmp_path / "a.pt")
+    found = load(tmp_path / "a.pt")
+    assert len(found.gaussians) == len(found.vertex) == 38 and found.calibration is None
+    for part in ("1 of 40 Gaussians dropped: a value is not finite", "1 of 40 Gaussians dropped: rotation is zero",
+                 "1 Gaussians have opacity = +inf", "is of 40 Gaussians and ignored, these are 38"):  # fmt: skip
+        assert any(part in note for note in found.notes)
+    save(tmp_path / "b.ply", found.gaussians, found)
+    assert torch.isposinf(load(tmp_path / "b.ply").gaussians.opacity_logits[0])

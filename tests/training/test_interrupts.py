@@ -1,0 +1,134 @@
+"""Ctrl-C at random moments of ``adapt`` itself, without the command around it."""
+
+from __future__ import annotations
+
+import random
+import signal
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+
+from clod_adapter import adapt
+from clod_adapter.config import AdaptConfig
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Phase, Progress
+from clod_adapter.training.interrupts import DeferredInterrupt
+from clod_adapter.training.loop import Adapted
+from scenes import capture
+
+ITERS, ROUNDS = 60, 12
+CONFIG = AdaptConfig(iters=ITERS, max_sv=3.0, average=0.5)
+SCENE = capture(60, views=4, width=16, height=12)
+
+
+@pytest.fixture(autouse=True)
+def default_handler() -> Iterator[None]:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def snapshot(gaussians: Gaussians) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in gaussians.tensors().items()}
+
+
+@pytest.fixture(scope="module")
+def undisturbed() -> tuple[dict[int, dict[str, torch.Tensor]], float]:
+    """The result after each step, and the seconds of training."""
+    after: dict[int, dict[str, torch.Tensor]] = {}
+
+    def keep(now: Progress) -> None:
+        if now.gaussians:
+            after[now.done] = snapshot(now.gaussians())
+
+    return after, adapt(*SCENE, CONFIG, keep).seconds
+
+
+def interrupted(step: int, seconds: float) -> tuple[Adapted, list[Progress]]:
+    """``adapt`` with a SIGINT so many seconds after a step."""
+    seen: list[Progress] = []
+    timer = threading.Timer(seconds, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT))
+
+    def listen(now: Progress) -> None:
+        if now.phase == Phase.TRAINING:
+            seen.append(now)
+            if now.done == step:
+                timer.start()
+
+    try:
+        return adapt(*SCENE, CONFIG, listen), seen
+    finally:
+        timer.join()
+
+
+def test_the_result_is_of_the_last_whole_step(
+    undisturbed: tuple[dict[int, dict[str, torch.Tensor]], float],
+) -> None:
+    after, seconds = undisturbed
+    draw, early = random.Random(3), 0
+    for _ in range(ROUNDS):
+        adapted, seen = interrupted(draw.randint(1, ITERS // 2), draw.uniform(0, 2 * seconds / ITERS))
+        assert adapted.interrupted and adapted.signalled and adapted.steps == len(seen)
+        for name, value in adapted.gaussians.tensors().items():
+            assert torch.equal(value, after[adapted.steps][name]), (adapted.steps, name)
+        early += adapted.steps < ITERS
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert early > ROUNDS / 2
+
+
+@pytest.mark.parametrize("where", ["spoilt_rows", "add_to_mean"])
+def test_an_interrupt_within_the_update(
+    undisturbed: tuple[dict[int, dict[str, torch.Tensor]], float], monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    """Before and after the parameters have moved: the step is completed, and the state resumes to the same bits."""
+    from clod_adapter.training import trainer
+
+    real, calls, states = getattr(trainer, where), [], []
+
+    def pressed(*given: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 5:
+            signal.raise_signal(signal.SIGINT)
+        return real(*given)
+
+    monkeypatch.setattr(trainer, where, pressed)
+    found = adapt(*SCENE, CONFIG, lambda now: states.append(now.state) if now.state else None)
+    assert found.interrupted and found.signalled
+    assert all(torch.equal(value, undisturbed[0][found.steps][n]) for n, value in found.gaussians.tensors().items())
+    whole = adapt(*SCENE, CONFIG, resume=states[-1]())
+    assert all(torch.equal(value, undisturbed[0][ITERS][n]) for n, value in whole.gaussians.tensors().items())
+
+
+def test_before_the_first_step_is_complete_it_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    def press(now: Progress) -> None:
+        if now.phase == Phase.PRUNING_ORDER:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        adapt(*SCENE, CONFIG, press)
+
+
+def test_a_second_one_is_raised_at_once_and_handlers_return() -> None:
+    with pytest.raises(KeyboardInterrupt), DeferredInterrupt() as interrupt:
+        interrupt.begin()
+        signal.raise_signal(signal.SIGINT)
+        assert interrupt.received
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_other_handlers_and_threads_are_left_alone() -> None:
+    heard: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
+    with DeferredInterrupt() as interrupt:
+        interrupt.begin()
+        signal.raise_signal(signal.SIGINT)
+    assert heard == [signal.SIGINT] and not interrupt.received
+    found: list[Adapted] = []
+    thread = threading.Thread(target=lambda: found.append(adapt(*SCENE, AdaptConfig(iters=2))))
+    thread.start()
+    thread.join()
+    assert found[0].steps == 2
