@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -25,7 +24,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.cli.main import main
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.splat_transform import VARIABLE
-from clod_adapter.io.ply.columns import column_map
+from clod_adapter.io.ply.columns import rows_of
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import render
 
@@ -97,21 +96,10 @@ def dialled(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _write_inria(path: Path, gaussians: Gaussians) -> Path:
     """A plain file as Inria's trainer writes it, normals included."""
-    columns = column_map(gaussians.sh_degree)
-    order = ["means", "", "sh0", "shN", "opacity_logits", "log_scales", "quats"]
-    names = [name for key in order for name in sorted(columns.get(key, ("nx", "ny", "nz")), key=_by_number)]
-    vertex = np.zeros(len(gaussians), [(name, "<f4") for name in names])
-    for key, group in columns.items():
-        values = getattr(gaussians, key).reshape(len(gaussians), -1).numpy()
-        for column, name in enumerate(group):
-            vertex[name] = values[:, column]
+    plain = gaussians.replace(sigma_d=None, attenuation=None)
+    vertex = rows_of({name: value.numpy() for name, value in plain.tensors().items()})
     PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
     return path
-
-
-def _by_number(name: str) -> tuple[int, str]:
-    number = name.rpartition("_")[2]
-    return (int(number) if number.isdigit() else 0, name)
 
 
 def _blob(count: int) -> Gaussians:
