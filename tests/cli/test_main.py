@@ -86,5 +86,5 @@ def test_an_unknown_error_is_a_traceback_and_where_to_report_it(
     lines = done.err.splitlines()
     assert done.code == 1 and done.out == "" and lines[0] == "Traceback (most recent call last):", done
     assert lines[-2] == "ZeroDivisionError: of ours" and 'raise ZeroDivisionError("of ours")' in done.err
-    assert lines[-1].startswith(f"clod-adapt: error: this is a fault of clod-adapt {package_version()}, not of what")
+    assert lines[-1].startswith(f"clod-adapt: error: this is a bug in clod-adapt {package_version()}, not in")
     assert "please report it, with the lines above" in lines[-1]
