@@ -27,6 +27,7 @@ from clod_adapter.io.formats.splat_transform import VARIABLE
 from clod_adapter.io.ply.columns import rows_of
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import render
+from scenes import looking
 
 fake_gpu.register()
 
@@ -116,11 +117,6 @@ def _blob(count: int) -> Gaussians:
 
 def _camera(angle: float) -> Camera:
     """On the circle of radius 5, looking at the origin, y down."""
-    forward = -torch.tensor([math.sin(angle), 0.1, math.cos(angle)])
-    forward = forward / forward.norm()
-    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
-    right = right / right.norm()
-    viewmat = torch.eye(4)
-    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat = looking(-torch.tensor([math.sin(angle), 0.1, math.cos(angle)]))
     viewmat[:3, 3] = torch.tensor([0.0, 0.0, 5.0])
     return Camera(viewmat, torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)

@@ -57,21 +57,24 @@ def gaussians(n: int, degree: int, seed: int, *, size: float = 0.08) -> Gaussian
     return Gaussians(s["means"], s["quats"], logs, logits, s["sh0"], s["shN"])
 
 
+def looking(towards: Tensor) -> Tensor:
+    """``[4, 4]`` world to camera of a camera at the origin, y down."""
+    forward = towards / towards.norm()
+    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
+    right = right / right.norm()
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    return viewmat
+
+
 def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Camera]:
     """Cameras on a circle around the origin, looking at it, at slightly different heights and distances."""
     cameras = []
     for k in range(count):
         turn = 2 * math.pi * k / count
-        eye = (
-            radius
-            * (1 + 0.1 * math.cos(3 * turn))
-            * torch.tensor([math.cos(turn), 0.2 * math.sin(2 * turn), math.sin(turn)])
-        )
-        forward = -eye / eye.norm()
-        right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
-        right = right / right.norm()
-        viewmat = torch.eye(4)
-        viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        eye = torch.tensor([math.cos(turn), 0.2 * math.sin(2 * turn), math.sin(turn)])
+        eye = radius * (1 + 0.1 * math.cos(3 * turn)) * eye
+        viewmat = looking(-eye)
         viewmat[:3, 3] = -viewmat[:3, :3] @ eye
         K = torch.tensor([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1.0]])
         cameras.append(Camera(viewmat, K, width, height, f"view_{k}.png"))
