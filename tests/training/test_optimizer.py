@@ -59,14 +59,17 @@ def test_fused_is_plain(seed: int, n: int = 203) -> None:
         torch.testing.assert_close(fused.parameters[name], plain.parameters[name], rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
 @pytest.mark.parametrize(
     ("steps", "beta1", "beta2", "epsilon"),
     [(12, 0.9, 0.999, 1e-15), (5, 0.5, 0.7, 1e-2), (220, 0.5, 0.8, 1e-15)],
     ids=["defaults", "others", "past the last bias correction that is stored, the 79th"],
 )
-def test_on_all_rows_it_is_torch_s_adam(steps: int, beta1: float, beta2: float, epsilon: float, n: int = 57) -> None:
+def test_on_all_rows_it_is_torch_s_adam(
+    kind: type[RowAdam], steps: int, beta1: float, beta2: float, epsilon: float, n: int = 57
+) -> None:
     ours, theirs = parameters(n), {name: p.requires_grad_() for name, p in parameters(n).items()}
-    optimizer = RowAdam(ours, beta1=beta1, beta2=beta2, epsilon=epsilon)
+    optimizer = kind(ours, beta1=beta1, beta2=beta2, epsilon=epsilon)
     adam = torch.optim.Adam(theirs.values(), lr=0.02, betas=(beta1, beta2), eps=epsilon)
     for step in range(steps):
         optimizer.step(gradients(n, step), everything(n), rates(0.02))
