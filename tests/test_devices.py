@@ -143,6 +143,15 @@ def test_placed_cameras_are_those_of_the_cpu(setup: Setup) -> None:
     assert all(view.image.device.type == "cpu" for view in pictures)
 
 
+def test_a_block(setup: Setup) -> None:
+    views, config = setup.scene.train[:2], replace(CONFIG, iters=2)
+    division = divide(setup.there.replace(sigma_d=None, attenuation=None), views, config, 2)
+    aimed = target_image(division.initial, 25, views[0])
+    assert aimed.device.type == "cpu" and aimed.dtype == torch.uint8  # photographs of a whole block
+    merged = merge(division, [adapt_block(division, views, config, block)[0] for block in range(2)])
+    assert merged.means.device == setup.device and bool(merged.sigma_d.isfinite().all())
+
+
 def test_a_step_of_training(setup: Setup) -> None:
     """Count terms and Adam, as the trainer uses them."""
     results = []
@@ -184,16 +193,6 @@ def test_a_training_is_that_of_the_cpu(setup: Setup) -> None:
     for name, value in own.tensors().items():
         # Adam's first steps are as long as their rate whichever way: where a slope is rounding, they may differ.
         assert float((mine.tensors()[name].cpu() - value).abs().median()) <= 1e-4, name
-
-
-def test_a_block(setup: Setup) -> None:
-    views, config = setup.scene.train[:2], replace(CONFIG, iters=2)
-    division = divide(setup.there.replace(sigma_d=None, attenuation=None), views, config, 2)
-    aimed = target_image(division.initial, 25, views[0])
-    assert aimed.device.type == "cpu" and aimed.dtype == torch.uint8  # photographs of a whole block
-    learned = [adapt_block(division, views, config, block)[0] for block in range(2)]
-    merged = merge(division, learned)
-    assert merged.means.device == setup.device and bool(merged.sigma_d.isfinite().all())
 
 
 def test_what_is_frozen_takes_no_gradient(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:

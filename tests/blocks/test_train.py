@@ -174,26 +174,22 @@ def test_merging_takes_each_row_from_its_block(divided: Division, learned: list[
         merge(divided, [*learned, learned[0]])
 
 
-def test_no_seams(captured: tuple[Gaussians, Scene], divided: Division, whole: Gaussians) -> None:
-    """Every picture here is across all borders, through a cloud that hides nothing: the hardest there is.
+def test_no_seams(
+    captured: tuple[Gaussians, Scene], divided: Division, learned: list[Learned], whole: Gaussians
+) -> None:
+    """Every image here is across all borders, through a cloud that hides nothing: the hardest there is.
 
     benchmarks/blocks.py measures it on captures.
     """
     base, scene = captured
     undivided = adapt(base, scene, CONFIG).gaussians
-    dials = (1.0, 3.0, 5.0)
-    begun = evaluate(divided.initial, scene.test, dials)
-    for before, one, other in zip(begun, *(evaluate(g, scene.test, dials) for g in (undivided, whole)), strict=True):
+    models, dials = (divided.initial, undivided, whole), (1.0, 3.0, 5.0)
+    for before, one, other in zip(*(evaluate(g, scene.test, dials) for g in models), strict=True):
         gained = (other.psnr - before.psnr) / (one.psnr - before.psnr)
         assert gained > 0.7, f"s {one.virtual_scale}"
         assert other.kept_share == pytest.approx(one.kept_share, abs=0.06)
-
-
-def test_the_second_pass_brings_blocks_into_accord(
-    captured: tuple[Gaussians, Scene], divided: Division, learned: list[Learned], whole: Gaussians
-) -> None:
-    views = captured[1].train
-    first, second = (evaluate(g, views, (3.0, 5.0)) for g in (merge(divided, learned), whole))
+    # The second pass brings the blocks into accord.
+    first, second = (evaluate(g, scene.train, (3.0, 5.0)) for g in (merge(divided, learned), whole))
     assert sum(row.psnr for row in second) > sum(row.psnr for row in first) + 0.5
 
 
