@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -25,7 +24,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.cli.main import main
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.splat_transform import VARIABLE
-from clod_adapter.io.ply.columns import column_map, inria_dtype
+from clod_adapter.io.ply.columns import rows_of
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import render
 from scenes import looking
@@ -98,10 +97,8 @@ def dialled(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _write_inria(path: Path, gaussians: Gaussians) -> Path:
     """A plain file as Inria's trainer writes it, normals included."""
-    vertex = np.zeros(len(gaussians), inria_dtype(gaussians.sh_degree))
-    for key, group in column_map(gaussians.sh_degree).items():
-        for name, values in zip(group, getattr(gaussians, key).reshape(len(gaussians), -1).T.numpy(), strict=True):
-            vertex[name] = values
+    plain = gaussians.replace(sigma_d=None, attenuation=None)
+    vertex = rows_of({name: value.numpy() for name, value in plain.tensors().items()})
     PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
     return path
 
@@ -120,7 +117,6 @@ def _blob(count: int) -> Gaussians:
 
 def _camera(angle: float) -> Camera:
     """On the circle of radius 5, looking at the origin, y down."""
-    viewmat = torch.eye(4)
-    viewmat[:3, :3] = looking(-torch.tensor([math.sin(angle), 0.1, math.cos(angle)]))
+    viewmat = looking(-torch.tensor([math.sin(angle), 0.1, math.cos(angle)]))
     viewmat[:3, 3] = torch.tensor([0.0, 0.0, 5.0])
     return Camera(viewmat, torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)

@@ -67,12 +67,14 @@ def dialled(n: int, degree: int, seed: int, **settings: Any) -> Gaussians:
     return gaussians(n, degree, seed).replace(sigma_d=sigma_d, attenuation=attenuation)
 
 
-def looking(forward: Tensor) -> Tensor:
-    """``[3, 3]`` rotation of the world, y down, for a camera that looks along this vector."""
-    forward = forward / forward.norm()
+def looking(towards: Tensor) -> Tensor:
+    """``[4, 4]`` world to camera of a camera at the origin, y down."""
+    forward = towards / towards.norm()
     right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
     right = right / right.norm()
-    return torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    return viewmat
 
 
 def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Camera]:
@@ -80,13 +82,9 @@ def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Ca
     cameras = []
     for k in range(count):
         turn = 2 * math.pi * k / count
-        eye = (
-            radius
-            * (1 + 0.1 * math.cos(3 * turn))
-            * torch.tensor([math.cos(turn), 0.2 * math.sin(2 * turn), math.sin(turn)])
-        )
-        viewmat = torch.eye(4)
-        viewmat[:3, :3] = looking(-eye)
+        eye = torch.tensor([math.cos(turn), 0.2 * math.sin(2 * turn), math.sin(turn)])
+        eye = radius * (1 + 0.1 * math.cos(3 * turn)) * eye
+        viewmat = looking(-eye)
         viewmat[:3, 3] = -viewmat[:3, :3] @ eye
         K = torch.tensor([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1.0]])
         cameras.append(Camera(viewmat, K, width, height, f"view_{k}.png"))
