@@ -18,7 +18,7 @@ from PIL import Image
 from clod_adapter.cameras import Camera
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.console import Console
-from clod_adapter.cli.view import prepare
+from clod_adapter.cli.view import make_page
 from clod_adapter.render import Rendering
 from clod_adapter.viewer.payload import page_config
 from clod_adapter.viewer.server import Server
@@ -137,7 +137,7 @@ def take(shown: Shown, path: Path) -> None:
 @contextmanager
 def serve(*words: object) -> Iterator[str]:
     """The address of what ``clod-adapt view`` serves for these words."""
-    answers, _ = prepare(build_parser("view").parse_args([str(word) for word in words]), Console(quiet=True))
+    answers, _ = make_page(build_parser("view").parse_args([str(word) for word in words]), Console(quiet=True))
     with Server(answers) as server:
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         yield server.url

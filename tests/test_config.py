@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from clod_adapter.config import CLASSIC, FILTERS, AdaptConfig, AttenuationConfig, ScreenFilter, describe
+from clod_adapter.config import CLASSIC, FILTERS, AdaptConfig, AttenuationConfig, ScreenFilter, field_descriptions
 from clod_adapter.errors import ClodError
 
 BOTH = {
@@ -57,8 +57,8 @@ def test_values_at_the_edge_are_taken() -> None:
 
 @pytest.mark.parametrize("kind", [AdaptConfig, AttenuationConfig, ScreenFilter])
 def test_every_field_has_help_and_a_default(kind: type) -> None:
-    texts = describe(kind)
-    assert list(texts) == [field.name for field in dataclasses.fields(kind)] and describe(kind()) == texts
+    texts = field_descriptions(kind)
+    assert list(texts) == [field.name for field in dataclasses.fields(kind)] and field_descriptions(kind()) == texts
     assert all(len(text) > 10 and text == text.strip().rstrip(".") for text in texts.values())
     with pytest.raises(TypeError):  # by keyword alone, as fields may move
         kind(0.5)

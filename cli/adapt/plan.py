@@ -30,7 +30,7 @@ def decide(setup: Setup, inputs: Inputs, display: ProgressDisplay) -> Plan:
     release_memory()  # of looking at all Gaussians, before only those that are kept are trained
     if args.trim and plan.trims(base):
         plan = _with_trimming_effect(plan, inputs, setup.console)
-    show(plan.decisions, setup.console)
+    show_plan(plan.decisions, setup.console)
     if args.trim and plan.kept is not None and args.images is None:
         setup.console.say("  no placed camera sees them, but other cameras may: --with unseen keeps them")
     return plan
@@ -44,7 +44,7 @@ def _with_trimming_effect(plan: Plan, inputs: Inputs, console: Console) -> Plan:
     return replace(plan, decisions=(*plan.decisions, effect), seconds=seconds)
 
 
-def show(decisions: Sequence[Decision], console: Console) -> None:
+def show_plan(decisions: Sequence[Decision], console: Console) -> None:
     """One aligned line per decision: part, action, measured effect, reason, and the option that overrides it."""
     lines = [(d.what, d.verdict, d.measured, d.why, _option(d)) for d in decisions]
     widths = [max(map(len, column)) for column in zip(*(line[:3] for line in lines), strict=True)]

@@ -41,7 +41,7 @@ POLL_EVERY = 0.05  # seconds between checks for work
 
 
 @dataclass(frozen=True)
-class Job:
+class TrainingJob:
     """What the others are sent: the arguments of ``adapt``, and the type of device that the first one trains on."""
 
     base: Gaussians
@@ -52,7 +52,7 @@ class Job:
     device: str
 
     @classmethod
-    def of(cls, plan: Plan, scene: Scene, state: TrainingState | None) -> Job:
+    def of(cls, plan: Plan, scene: Scene, state: TrainingState | None) -> TrainingJob:
         """The job of ``plan.adapt``, from ``state``."""
         lean = plan.lean
         return cls(lean, scene.train, plan.config, state, plan.subset, lean.means.device.type)
@@ -71,7 +71,7 @@ def leading() -> Iterator[None]:
 
 
 @contextmanager
-def together(make_job: Callable[[], Job], display: ProgressDisplay) -> Iterator[ProcessGroup | None]:
+def together(make_job: Callable[[], TrainingJob], display: ProgressDisplay) -> Iterator[ProcessGroup | None]:
     """The group to train with, after giving the job to the others; None for a single process.
 
     Raises:

@@ -23,7 +23,7 @@ from .blocks import Blocks
 from .inputs import Inputs, read_inputs, with_base_rows
 from .memory import without_rows
 from .plan import decide
-from .processes import Job, together
+from .processes import TrainingJob, together
 from .progress import ProgressDisplay
 from .report import finish
 from .result import make_result
@@ -33,10 +33,10 @@ from .setup import Setup
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     with output_lock(Outputs.of(args.ply, args.out).ply, shared=args.block is not None):
-        return adapt(args)
+        return adapt_and_report(args)
 
 
-def adapt(args: argparse.Namespace) -> dict[str, Any]:
+def adapt_and_report(args: argparse.Namespace) -> dict[str, Any]:
     """Runs the command; the caller holds the lock of the outputs."""
     setup = Setup.of(args)
     inputs = read_inputs(setup)
@@ -107,7 +107,7 @@ def train(
         return display(now)
 
     try:
-        with closing(display), together(lambda: Job.of(plan, scene, state), display) as group:
+        with closing(display), together(lambda: TrainingJob.of(plan, scene, state), display) as group:
             adapted = plan.adapt(scene, saver.saving(show), state, group)
     except StateRefused as error:
         raise saver.naming(error) from error

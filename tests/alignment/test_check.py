@@ -125,7 +125,7 @@ def test_nothing_to_show_does_not_fit(pair: tuple[Gaussians, list[View]], monkey
     assert guess_frame(none, views, found) is None
     with pytest.raises(ClodError, match="number of views"):
         check_alignment(base, [])
-    monkeypatch.setattr(check, "compare", lambda *_: torch.full((5,), math.nan))
+    monkeypatch.setattr(check, "compare_renders", lambda *_: torch.full((5,), math.nan))
     found = check_alignment(base, views)
     assert math.isnan(found.psnr) and math.isnan(found.margin) and not found.fits
 

@@ -13,7 +13,7 @@ import scenes
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import dial
 from clod_adapter.viewer import page, payload
-from clod_adapter.viewer.page import write_page
+from clod_adapter.viewer.page import write_viewer_page
 from shown import COUNTS, SIZE, Shown, serve
 
 
@@ -68,7 +68,7 @@ def test_one_file_needs_no_network(
     monkeypatch.setattr(payload, "ROWS", 100)
     path = files.save(gaussians)
     served, model = show(path, "--sv", 2), clod_adapter.load(path)
-    write_page(tmp_path / "page.html", model, base=model, cameras=scenes.ring(2, 320, 240), virtual_scale=2.0)
+    write_viewer_page(tmp_path / "page.html", model, base=model, cameras=scenes.ring(2, 320, 240), virtual_scale=2.0)
     assert (tmp_path / "page.html").read_text(encoding="utf-8").count('id="clod-model"') > 2
     with chromium.new_context(viewport=SIZE, offline=True) as context:
         alone = Shown(context.new_page()).ready((tmp_path / "page.html").as_uri())

@@ -19,7 +19,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.splat_transform import SplatTransform
 from clod_adapter.render import render
 from clod_adapter.viewer.packed import pack
-from clod_adapter.viewer.page import write_page
+from clod_adapter.viewer.page import write_viewer_page
 from clod_adapter.viewer.payload import Payload
 from shown import SIZE, Shown, assert_same
 
@@ -73,7 +73,7 @@ def test_a_packed_page_shows_its_contents(chromium: Any, tmp_path: Path, degree:
         pytest.skip(str(error))
     gaussians, camera = dialled(degree), scenes.camera(320, 240)
     clod_adapter.save(tmp_path / "model.ply", gaussians)
-    write_page(tmp_path / "page.html", clod_adapter.load(tmp_path / "model.ply"), tool=tool)
+    write_viewer_page(tmp_path / "page.html", clod_adapter.load(tmp_path / "model.ply"), tool=tool)
     held = unpacked(tmp_path / "page.html", tool)
     assert len(held) == 1000
     with chromium.new_context(viewport=SIZE, offline=True) as context:

@@ -69,7 +69,7 @@ def test_names_cannot_leave_their_element() -> None:
 def test_one_file_holds_everything(tmp_path: Path) -> None:
     clod_adapter.save(tmp_path / "model.ply", clod_adapter.attach(scenes.gaussians(50, 1, 0)))
     saved, cameras = clod_adapter.load(tmp_path / "model.ply"), scenes.ring(2, 20, 10)
-    page.write_page(tmp_path / "page.html", saved, base=saved, cameras=cameras, virtual_scale=2.0)
+    page.write_viewer_page(tmp_path / "page.html", saved, base=saved, cameras=cameras, virtual_scale=2.0)
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     config = json.loads(element(text, "clod-config"))
     for entry, name in ((config["model"], "clod-model"), (config["base"], "clod-base")):
@@ -80,7 +80,7 @@ def test_one_file_holds_everything(tmp_path: Path) -> None:
     policy = re.search('<meta http-equiv="Content-Security-Policy" content="([^"]*)">', text)
     assert policy and "default-src 'none'" in policy[1] and "'self'" not in policy[1]
     assert str(tmp_path) not in text
-    page.write_page(tmp_path / "alone.html", saved)
+    page.write_viewer_page(tmp_path / "alone.html", saved)
     text = (tmp_path / "alone.html").read_text(encoding="utf-8")
     assert json.loads(element(text, "clod-config"))["base"] is None and "clod-base" not in text
 
