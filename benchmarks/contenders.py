@@ -1,4 +1,4 @@
-"""The rasterizers that ``rasterize.py`` times, each in its own process: this package, the yardstick and gsplat."""
+"""The rasterizers that ``rasterize.py`` times, each in its own process: this package and the yardstick."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import peer_gsplat
 import torch
 import workloads
 from torch import Tensor
@@ -144,20 +143,6 @@ def yardstick_jobs(name: str, folder: Path, library: Path) -> Jobs:
 
     step_of(workload.changed("", FEW))()
     return {"step": step_of(workload), "pairs": lambda: int(kernel.count()[0])}
-
-
-def gsplat_jobs(name: str) -> Jobs:
-    workload = workloads.make(name)
-
-    def step_of(part: Workload) -> Callable[[], list[float]]:
-        fields = ("means", "quats", "scales", "opacities", "sh")
-        leaves = [getattr(part, field).clone().requires_grad_() for field in fields]
-        camera, black = part.camera, torch.zeros(3)
-        given = (*leaves, camera.viewmat, camera.K, camera.width, camera.height, black)
-        return lambda: timed_step(lambda: peer_gsplat.render(*given), leaves, part.weights)
-
-    step_of(workload.changed("", FEW))()
-    return {"step": step_of(workload)}
 
 
 def build_yardstick(source: Path, folder: Path) -> Path | None:

@@ -1,15 +1,13 @@
-"""Times of the CPU rasterizer and of two others, and its agreement with a float64 reference.
+"""Times of the CPU rasterizer and of a C++ baseline, and its agreement with a float64 reference.
 
     python benchmarks/rasterize.py                     # times on W1 and W2, of fewer Gaussians too
-    python benchmarks/rasterize.py --skip-gsplat
     python benchmarks/rasterize.py --accuracy          # image and gradients against float64 instead
-    python benchmarks/rasterize.py --extreme           # times of scenes that are unlike any capture instead
+    python benchmarks/rasterize.py --extreme           # times of extreme scenes instead
 
-The others are the yardstick (a hand-written C++ kernel in the shared folder, built with g++) and gsplat (see
-``peer_gsplat.py``); fields of an absent one are null. Each runs in its own process with 2 threads, all in turn step by
-step, so that drift of the machine affects all alike. Times are medians in milliseconds: ``forward_ms`` and ``both_ms``
-of one step with all gradients, ``render_ms`` of a frame without gradients. Memory is the peak of the steps beyond a
-warm process, gradients included.
+The baseline is the yardstick, a hand-written C++ kernel outside the repository, built with g++; its fields are null
+where it is absent. Each runs in its own process with 2 threads, in turn step by step, so that drift of the machine
+affects both alike. Times are medians in milliseconds: ``forward_ms`` and ``both_ms`` of one step with all gradients,
+``render_ms`` of a frame without gradients. Memory is the peak of the steps beyond a warm process, gradients included.
 """
 
 from __future__ import annotations
@@ -17,110 +15,94 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from argparse import Namespace
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import clod_adapter  # noqa: F401  # before torch: it sets how OpenMP's threads wait
 
 # isort: split
 import agreement
 import contenders
-import peer_gsplat
 import torch
 import workloads
-from common import ROOT, append, arguments
+from common import ROOT, Row, append, arguments
 from contenders import SHARES, THREADS, Worker
 
 FILE = "rasterize.jsonl"
 YARDSTICK = Path(os.environ.get("CLOD_YARDSTICK", ROOT.parent / "shared" / "yardstick"))
 WARM = 2  # first repeats that do not count
-GSPLAT_REPEATS = {"W1": 3, "W2": 1}  # it takes seconds
+REPEATS = 15
 EXTREME_REPEATS = 5
-Row = dict[str, Any]
 
 
 def main() -> None:
     parser = arguments(__doc__, record=FILE)
-    parser.add_argument("--workloads", nargs="+", choices=workloads.SIZES, default=list(workloads.SIZES))
-    parser.add_argument("--repeats", type=int, default=15, help="of ours and the yardstick (default: %(default)s)")
-    parser.add_argument("--skip-gsplat", action="store_true")
-    parser.add_argument("--yardstick", type=Path, default=YARDSTICK, metavar="DIR", help="default: $CLOD_YARDSTICK")
     modes = parser.add_mutually_exclusive_group()
     modes.add_argument("--accuracy", action="store_true", help="agreement with float64 instead of times; minutes")
     modes.add_argument("--extreme", action="store_true", help="times of extreme scenes instead, ours only")
     args = parser.parse_args()
     torch.set_num_threads(THREADS)
     if args.accuracy:
-        kind, table, rows = "accuracy", agreement.table, [agreement.compare(name) for name in args.workloads]
+        kind, table, rows = "accuracy", agreement.table, [agreement.compare(name) for name in workloads.SIZES]
     elif args.extreme:
         kind, table, rows = "extreme", extreme_table, extreme()
     else:
-        kind, table, rows = "speed", speed_table, speed(args)
+        kind, table, rows = "speed", speed_table, speed()
     print(table(rows), flush=True)
     for row in rows if args.record else []:
         append(FILE, {"benchmark": "rasterize", "kind": kind, **row})
 
 
-def speed(args: Namespace) -> list[Row]:
+def speed() -> list[Row]:
     """All times of each workload."""
     with tempfile.TemporaryDirectory() as folder:
-        library = contenders.build_yardstick(args.yardstick, Path(folder))
-        missing = "--skip-gsplat" if args.skip_gsplat else peer_gsplat.available()
-        if missing:
-            print(f"gsplat is left out: {missing}", file=sys.stderr)
+        library = contenders.build_yardstick(YARDSTICK, Path(folder))
         rows = []
-        for name in args.workloads:
+        for name in workloads.SIZES:
             peers = {"ours": Worker("ours", contenders.our_jobs, name)}
             if library:
-                peers["yardstick"] = Worker("yardstick", contenders.yardstick_jobs, name, args.yardstick, library)
-            if not missing:
-                peers["gsplat"] = Worker("gsplat", contenders.gsplat_jobs, name)
-            rows.append(time_workload(name, peers, args.repeats))
+                peers["yardstick"] = Worker("yardstick", contenders.yardstick_jobs, name, YARDSTICK, library)
+            rows.append(time_workload(name, peers))
             for worker in peers.values():
                 worker.close()
     return rows
 
 
-def time_workload(name: str, peers: dict[str, Worker], repeats: int) -> Row:
+def time_workload(name: str, peers: dict[str, Worker]) -> Row:
     """Steps of all peers in turn, then our frames of fewer Gaussians."""
-    steps: dict[str, list[Any]] = {peer: [] for peer in peers}
-    for repeat in range(repeats + WARM):
-        for peer, worker in peers.items():
-            if peer != "gsplat" or repeat < GSPLAT_REPEATS[name]:
-                steps[peer].append(worker("step"))
+    turns = range(REPEATS + WARM)
+    steps = [{peer: worker("step") for peer, worker in peers.items()} for _ in turns]
     memory = {peer: worker("memory") for peer, worker in peers.items()}
     pairs = peers["yardstick"]("pairs") if "yardstick" in peers else None
-    frames, kept = zip(*([peers["ours"](job) for job in ("frame", "kept")] for _ in range(repeats + WARM)), strict=True)
-    if None in [*steps["ours"], *frames, *kept]:
+    frames, kept = zip(*([peers["ours"](job) for job in ("frame", "kept")] for _ in turns), strict=True)
+    if None in [*(step["ours"] for step in steps), *frames, *kept]:
         sys.exit(f"our own process ended early on {name}")
     count, width, height, _ = workloads.SIZES[name]
-    row = {"workload": name, "gaussians": count, "width": width, "height": height, "pairs": pairs, "repeats": repeats}
-    for prefix, peer in (("", "ours"), ("yardstick_", "yardstick"), ("gsplat_", "gsplat")):
+    row = {"workload": name, "gaussians": count, "width": width, "height": height, "pairs": pairs, "repeats": REPEATS}
+    for prefix, peer in (("", "ours"), ("yardstick_", "yardstick")):
+        taken = [step[peer] for step in steps if step.get(peer)]
         for k, what in enumerate(("forward", "both")):
-            times = [step[k] for step in steps.get(peer, []) if step]
-            row[f"{prefix}{what}_ms"] = middle(times, peer)
+            times = [step[k] for step in taken]
+            row[f"{prefix}{what}_ms"] = middle(times)
             row[f"{prefix}{what}_best_ms"] = round(min(times), 2) if times else None
         row[prefix + "memory_mb"] = memory.get(peer)
-    row["render_ms"] = middle(frames, "ours")
-    for peer in ("yardstick", "gsplat"):
-        for what in ("forward", "both"):
-            theirs = row[f"{peer}_{what}_ms"]
-            row[f"{what}_ratio_{peer}"] = theirs and round(row[f"{what}_ms"] / theirs, 3)
+    row["render_ms"] = middle(frames)
+    for what in ("forward", "both"):
+        theirs = row[f"yardstick_{what}_ms"]
+        row[f"{what}_ratio_yardstick"] = theirs and round(row[f"{what}_ms"] / theirs, 3)
     return {**row, "kept": kept_rows(kept)}
 
 
-def middle(times: list[float], peer: str) -> float | None:
-    """The median, without the first repeats where there are many."""
-    counted = times if peer == "gsplat" else times[WARM:]
-    return round(median(counted), 2) if counted else None
+def middle(times: Sequence[float]) -> float | None:
+    """The median without the first repeats."""
+    return round(median(times[WARM:]), 2) if times[WARM:] else None
 
 
-def kept_rows(frames: list[list[float]]) -> list[Row]:
+def kept_rows(frames: Sequence[list[float]]) -> list[Row]:
     """Frames of the most opaque Gaussians, and their share of the full frame's time."""
     ways = [(way, share) for way in ("rows removed", "opacity 0") for share in SHARES]
-    times = [middle(list(column), "ours") for column in zip(*frames, strict=True)]
+    times = [middle(column) for column in zip(*frames, strict=True)]
     return [
         {"way": way, "share": share, "ms": ms, "fraction": round(ms / times[0], 3)}
         for (way, share), ms in zip(ways, times, strict=True)
@@ -133,13 +115,13 @@ def speed_table(rows: list[Row]) -> str:
         pairs = "" if row["pairs"] is None else f", {row['pairs'] / 1e6:.1f} M pairs of Gaussian and pixel"
         lines += [f"{row['workload']}: {row['gaussians']:,} Gaussians, {row['width']}x{row['height']}{pairs}"]
         lines += [f"  {'':10} {'forward ms':>10} {'best':>10} {'both ms':>10} {'best':>10} {'memory MB':>10}"]
-        for peer, prefix in (("ours", ""), ("yardstick", "yardstick_"), ("gsplat", "gsplat_")):
+        for peer, prefix in (("ours", ""), ("yardstick", "yardstick_")):
             fields = ("forward_ms", "forward_best_ms", "both_ms", "both_best_ms", "memory_mb")
             cells = [row[prefix + field] for field in fields]
             lines += [f"  {peer:10} " + " ".join(f"{'-' if cell is None else cell:>10}" for cell in cells)]
-        ratios = [f"{what} {row[f'{what}_ratio_{peer}']} of {peer}'s" for peer in ("yardstick", "gsplat")
-                  for what in ("forward", "both") if row[f"{what}_ratio_{peer}"]]  # fmt: skip
-        lines += [f"  ours takes {', '.join(ratios)}"] if ratios else []
+        if row["both_ratio_yardstick"]:
+            ratios = (f"{what} {row[f'{what}_ratio_yardstick']}" for what in ("forward", "both"))
+            lines += [f"  ours takes {', '.join(ratios)} of the yardstick's"]
         lines += [f"  a frame without gradients: {row['render_ms']} ms; of the most opaque Gaussians alone:"]
         lines += [f"    {k['share']:5.0%} {k['way']:13} {k['ms']:8.2f} ms {k['fraction']:5.0%}" for k in row["kept"]]
     return "\n".join(lines)
