@@ -17,6 +17,10 @@ from threading import Thread
 from typing import Any
 
 import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
+
+# isort: split
+import torch
+
 from clod_adapter.cli.shared.report import jsonable, machine
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -104,6 +108,11 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[object]], numbers_from: 
 def falling(values: Any) -> Any:
     """``[N]`` rows by falling value, equal ones in their order."""
     return values.argsort(descending=True, stable=True)
+
+
+def head(gaussians: clod.Gaussians, count: int) -> clod.Gaussians:
+    """The first ``count`` rows."""
+    return gaussians.select(torch.arange(count))
 
 
 def outcomes(report: Path) -> Row:

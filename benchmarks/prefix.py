@@ -20,8 +20,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-from common import append, arguments, checkpoint, falling, photographs, stored, table
+from common import append, arguments, checkpoint, falling, head, photographs, stored, table
 
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
@@ -81,10 +80,6 @@ def orders(adapted: clod.Gaussians, base: clod.Gaussians, views: tuple[clod.View
         "base, opacity": base.select(falling(base.opacity_logits)),
         "base, removal error": base.select(falling(removal_error(base, views, seed=0))),
     }
-
-
-def head(gaussians: clod.Gaussians, count: int) -> clod.Gaussians:
-    return gaussians.select(torch.arange(count))
 
 
 def print_table() -> None:

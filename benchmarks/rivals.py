@@ -1,8 +1,7 @@
 """Other methods on the same checkpoint and photographs, at fixed shares of the base's Gaussians.
 
-    python benchmarks/rivals.py plush_half bonsai146 --only merging ranking
-    python benchmarks/rivals.py plush_half bonsai146 --iters 1500 --seed 0 1 2
-    python benchmarks/rivals.py plush_half --only specialist --shares 0.12 --seconds 100
+    python benchmarks/rivals.py plush_half bonsai146 --iters 1500
+    python benchmarks/rivals.py plush_half bonsai146 --only specialist --shares 0.12
     python benchmarks/rivals.py --table                    # the rows as a Markdown table
 
 - ``merging``: ``splat-transform --decimate``, without training, one file per count;
@@ -19,15 +18,14 @@ from __future__ import annotations
 import argparse
 import json
 from dataclasses import asdict
-from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import torch
-from common import CACHE, append, arguments, checkpoint, falling, photographs, stored, table
+from common import CACHE, append, arguments, checkpoint, falling, head, photographs, stored, table
 from merging import Merger
 from torch import Tensor
-from tuning import RATES, Tuning, tune
+from tuning import Tuning, tune
 
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
@@ -46,16 +44,9 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--only", nargs="+", choices=RIVALS, default=RIVALS, help="some of the rivals")
     parser.add_argument("--shares", nargs="+", type=float, default=SHARES, help="of the base's Gaussians")
-    parser.add_argument("--iters", type=int, help="steps of tuning (default: 1500, without --seconds)")
-    parser.add_argument("--seconds", type=float, help="seconds of tuning, the rates' fall included")
+    parser.add_argument("--iters", type=int, default=1500, help="steps of tuning")
     parser.add_argument("--seed", nargs="+", type=int, default=[0])
-    parser.add_argument("--draw", choices=("uniform", "log"), default="log", help="how prefixes' shares are drawn")
-    parser.add_argument("--order", choices=ORDERS, default="removal error", help="of the prefixes")
-    parser.add_argument("--set", nargs="+", default=[], metavar="RATE=VALUE", help=f"a rate: {', '.join(RATES)}, final")
-    parser.add_argument("--cache", type=Path, default=CACHE, help="keeps the merged files")
     args = parser.parse_args()
-    if args.iters is None and args.seconds is None:
-        args.iters = 1500
     for scene in args.scenes:
         contest = Contest(scene, args)
         for rival in args.only:
@@ -86,32 +77,27 @@ class Contest:
         })  # fmt: skip
 
     def merging(self) -> None:
-        merger, rows = Merger.find(self.args.cache), []
+        merger, rows = Merger.find(CACHE), []
         for share, count in self.counts.items():
             merged, seconds = merger.merge(self.base, count)
             rows.append({**self.measure(merged, share), "seconds": seconds})
         self.record("merging", f"splat-transform {merger.version} --decimate", rows)
 
     def specialist(self) -> None:
-        merger = Merger.find(self.args.cache)
+        merger = Merger.find(CACHE)
         for share, count in self.counts.items():
             merged, seconds = merger.merge(self.base, count)
-            self.tune_all("specialist", merged, share, merge_seconds=seconds)
+            for seed in self.args.seed:
+                self.tune("specialist", "merged, then tuned", merged, seed, [share], merge_seconds=seconds)
 
     def tuned(self) -> None:
-        self.tune_all("tuned", self.base.gaussians, 1.0)
-
-    def tune_all(self, rival: str, start: clod.Gaussians, share: float, **more: Any) -> None:
         for seed in self.args.seed:
-            config = self.config(seed)
-            self.tune(rival, "merged, then tuned" if share < 1 else "tuned base", start, config, [share], **more)
+            self.tune("tuned", "tuned base", self.base.gaussians, seed, [1.0])
 
     def prefix(self) -> None:
         for seed in self.args.seed:
-            config, order = self.config(seed, draw=self.args.draw), self.args.order
-            start = self.base.gaussians.select(self.ranked(order, seed))
-            label = f"prefixes by {order}, lengths {config.draw}"
-            self.tune("prefix", label, start, config, [1.0, *self.counts], order=order)
+            start, label = self.base.gaussians.select(self.ranked(ORDERS[-1], seed)), f"prefixes by {ORDERS[-1]}"
+            self.tune("prefix", f"{label}, lengths log", start, seed, [1.0, *self.counts], order=ORDERS[-1])
 
     def ranking(self) -> None:
         for order in ORDERS:
@@ -119,28 +105,16 @@ class Contest:
             rows = [self.measure(head(ranked, count), share) for share, count in self.counts.items()]
             self.record("ranking", f"untouched, by {order}", rows)
 
-    def config(self, seed: int, **more: Any) -> Tuning:
-        values = {name: float(value) for name, _, value in (text.partition("=") for text in self.args.set)}
-        if not values.keys() <= RATES.keys() | {"final"}:
-            raise SystemExit(f"--set knows {', '.join(RATES)} and final, not {', '.join(values.keys() - RATES.keys())}")
-        final = {"final": values.pop("final")} if "final" in values else {}
-        limits = {"iters": self.args.iters, "seconds": self.args.seconds}
-        return Tuning(**limits, seed=seed, rates=RATES | values, **final, **more)
-
-    def tune(
-        self, rival: str, label: str, start: clod.Gaussians, config: Tuning, shares: list[float], **more: Any
-    ) -> None:
-        with self.console.meter(f"{self.scene}, {label}, seed {config.seed}") as meter:
+    def tune(self, rival: str, label: str, start: clod.Gaussians, seed: int, shares: list[float], **more: Any) -> None:
+        """Tunes for one share, or with random prefixes for several, and adds the row."""
+        config = Tuning(iters=self.args.iters, seed=seed, draw="log" if len(shares) > 1 else None)
+        with self.console.meter(f"{self.scene}, {label}, seed {seed}") as meter:
             done = tune(start, self.photographs.train, config, meter.update)
-        rows = [
-            self.measure(
-                head(done.gaussians, self.counts[share]) if len(shares) > 1 and share < 1 else done.gaussians, share
-            )
-            for share in shares
-        ]
-        self.record(
-            rival, label, rows, config=asdict(config), steps=done.steps, train_seconds=round(done.seconds, 2), **more
-        )
+        files = (head(done.gaussians, self.counts[share]) if config.draw and share < 1 else done.gaussians
+                 for share in shares)  # fmt: skip
+        rows = [self.measure(gaussians, share) for gaussians, share in zip(files, shares, strict=True)]
+        about = {"config": asdict(config), "steps": done.steps, "train_seconds": round(done.seconds, 2)}
+        self.record(rival, label, rows, **about, **more)
 
     def ranked(self, order: str, seed: int) -> Tensor:
         """``[N]`` rows of the base, the most important first."""
@@ -152,10 +126,6 @@ class Contest:
         else:
             worth = removal_error(gaussians, views, seed=seed)
         return falling(worth)
-
-
-def head(gaussians: clod.Gaussians, count: int) -> clod.Gaussians:
-    return gaussians.select(torch.arange(count))
 
 
 def contribution(gaussians: clod.Gaussians, views: tuple[clod.View, ...]) -> Tensor:

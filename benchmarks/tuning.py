@@ -28,31 +28,17 @@ class Tuning:
     """How a tuning is run.
 
     Attributes:
-        iters, seconds: its end, the first that comes; one of them may be None. The rates fall over it.
+        iters: steps, over which the learning rates fall exponentially to ``final`` of RATES.
         seed: of the order of the views, and of the prefixes' lengths.
-        rates: step size by attribute at the start; they fall exponentially to ``final`` of it.
-        draw: how a prefix's share of all is drawn from [shortest, 1]: "uniform" or "log"; None trains no prefixes.
+        draw: "log" draws a prefix's share of all log-uniformly from [shortest, 1]; None trains no prefixes.
     """
 
-    iters: int | None = None
-    seconds: float | None = None
+    iters: int
     seed: int = 0
     rates: dict[str, float] = field(default_factory=lambda: dict(RATES))
     final: float = 0.05
     draw: str | None = None
     shortest: float = 0.01
-
-    def share_done(self, steps: int, seconds: float) -> float:
-        if self.iters is None and self.seconds is None:
-            raise ValueError("Tuning needs iters or seconds")
-        by_steps = 0.0 if self.iters is None else steps / max(self.iters, 1)
-        return max(by_steps, seconds / self.seconds) if self.seconds else by_steps
-
-    def prefix(self, random: np.random.Generator, count: int) -> int:
-        """The length of a prefix of ``count`` Gaussians."""
-        uniform = random.random()
-        share = self.shortest + (1 - self.shortest) * uniform if self.draw == "uniform" else self.shortest**uniform
-        return max(round(share * count), 1)
 
 
 @dataclass(frozen=True)
@@ -84,14 +70,15 @@ def tune(
     # Compiled before the clock starts.
     _gradients(start, parameters, tuned, views[0], len(start) if config.draw else None)
     began, steps, mean = time.perf_counter(), 0, math.nan
-    while (share := config.share_done(steps, time.perf_counter() - began)) < 1:
+    while steps < config.iters:
+        share = steps / config.iters
         order = order or random.permutation(len(views)).tolist()
-        prefix = config.prefix(random, len(start)) if config.draw else None
+        prefix = max(round(config.shortest ** random.random() * len(start)), 1) if config.draw else None
         loss, gradients = _gradients(start, parameters, tuned, views[order.pop()], prefix)
         optimizer.step(gradients, everyone, {name: rate * config.final**share for name, rate in rates.items()})
         mean = loss if math.isnan(mean) else 0.98 * mean + 0.02 * loss
         steps += 1
-        progress(config.share_done(steps, time.perf_counter() - began), f"step {steps}, loss {mean:.4f}")
+        progress(steps / config.iters, f"step {steps}, loss {mean:.4f}")
     return Tuned(start.replace(**parameters), steps, time.perf_counter() - began)
 
 
