@@ -99,7 +99,6 @@ def main() -> None:
     parser = arguments(__doc__, table=print_table)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--ablations", action="store_true", help=f"every choice by itself, {ABLATION}")
-    parser.add_argument("--only", nargs="+", metavar="LABEL", choices=ABLATIONS, default=ABLATIONS, help="some choices")
     parser.add_argument("--leave-out", action="store_true", help="steps without some attributes, at three lengths each")
     parser.add_argument("--questions", action="store_true", help="print a table for each question, of the scenes")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a field of AdaptConfig")
@@ -112,7 +111,7 @@ def main() -> None:
         return
     runs = {args.label: dict(_setting(text) for text in args.set)}
     if args.ablations:
-        runs = {label: {**ABLATION, **ABLATIONS[label]} for label in args.only}
+        runs = {label: {**ABLATION, **ABLATIONS[label]} for label in ABLATIONS}
     if args.leave_out:
         runs = LEAVE_OUT
     for scene in args.scenes:

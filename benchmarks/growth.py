@@ -1,8 +1,6 @@
 """Time and memory of the commands by the number of Gaussians, and of adapting by the photographs.
 
     python benchmarks/growth.py                            # all of it: some 15 minutes, 12 GB of memory, 8 GB of disk
-    python benchmarks/growth.py --sizes 10000 100000       # some sizes
-    python benchmarks/growth.py --only inspect view        # some commands
     python benchmarks/growth.py --plot                     # runs nothing: the picture and the tables of the rows
 
 Runs each command in its own process on cities (``city.py``) that are made once and kept in benchmarks/cache. Measures
@@ -21,12 +19,12 @@ import subprocess
 import sys
 import tempfile
 import urllib.request
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import growth_page
 from common import CACHE, COMMAND, Process, Row, append, arguments
-from growth_rows import COMMANDS, FEW, FILE, FLOOR, SERIES_COUNT, SIZES, latest, tables
+from growth_rows import FEW, FILE, FLOOR, SERIES_COUNT, SIZES, latest, tables
 
 CITIES = CACHE / "growth"
 IMAGES, WIDTH, HEIGHT, STEPS, MAX_SV = 10, 640, 400, 8, 3
@@ -51,38 +49,30 @@ print(time.perf_counter() - began, time.process_time() - cpu)
 
 def main() -> None:
     parser = arguments(__doc__)
-    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, metavar="N", help="Gaussians (default: all)")
-    parser.add_argument(
-        "--only", nargs="+", default=(*COMMANDS, "images", "shapes"), choices=(*COMMANDS, "images", "shapes"),
-        help="commands, and the series of adapt over the number and the size of photographs (default: all)",
-    )  # fmt: skip
     parser.add_argument("--plot", action="store_true", help="run nothing")
     args = parser.parse_args()
     if not args.plot:
-        measure(args.sizes, args.only)
+        measure()
     rows = latest()
     growth_page.draw(rows)
     growth_page.fill_in("figures", tables(rows))
     growth_page.fill_in("paper", growth_page.on_paper(rows))
 
 
-def measure(sizes: Sequence[int], only: Sequence[str]) -> None:
+def measure() -> None:
     """Runs, and appends the rows."""
     CITIES.mkdir(parents=True, exist_ok=True)
     run_adapt(scene(FLOOR, IMAGES, WIDTH, HEIGHT))  # compiles the kernels
-    for count in sorted({FLOOR, *sizes}):
-        folder = scene(count, IMAGES, WIDTH, HEIGHT)
-        if "adapt" in only or not dial_of(folder).exists():
-            record("count", "adapt", folder, count, IMAGES, WIDTH, HEIGHT, run_adapt(folder) | order_seconds(folder))
-        for command in COMMANDS[1:]:
-            if command in only:
-                record("count", command, folder, count, IMAGES, WIDTH, HEIGHT, RUNS[command](folder))
-    for images in MANY if "images" in only else ():
-        folder = scene(SERIES_COUNT, images, *SMALL)
-        record("images", "adapt", folder, SERIES_COUNT, images, *SMALL, run_adapt(folder))
-    for width, height in SHAPES if "shapes" in only else ():
-        folder = scene(SERIES_COUNT, FEW, width, height)
-        record("shapes", "adapt", folder, SERIES_COUNT, FEW, width, height, run_adapt(folder))
+    for count in (FLOOR, *SIZES):
+        shape = count, IMAGES, WIDTH, HEIGHT
+        for command, run in RUNS.items():
+            record("count", command, *shape, run(scene(*shape)))
+    for images in MANY:
+        shape = SERIES_COUNT, images, *SMALL
+        record("images", "adapt", *shape, run_adapt(scene(*shape)))
+    for size in SHAPES:
+        shape = SERIES_COUNT, FEW, *size
+        record("shapes", "adapt", *shape, run_adapt(scene(*shape)))
 
 
 def scene(count: int, images: int, width: int, height: int) -> Path:
@@ -99,12 +89,11 @@ def dial_of(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}-dial.ply")
 
 
-def record(
-    series: str, command: str, folder: Path, count: int, images: int, width: int, height: int, found: Row
-) -> None:
+def record(series: str, command: str, count: int, images: int, width: int, height: int, found: Row) -> None:
+    file = scene(count, images, width, height) / "city.ply"
     append(FILE, {
         "series": series, "command": command, "gaussians": count, "images": images, "width": width, "height": height,
-        "file_bytes": (folder / "city.ply").stat().st_size, "busy": round(os.getloadavg()[0], 2), **found,
+        "file_bytes": file.stat().st_size, "busy": round(os.getloadavg()[0], 2), **found,
     })  # fmt: skip
 
 
@@ -173,7 +162,13 @@ def run_view(folder: Path) -> Row:
     return run.cost() | {"seconds": round(served, 3), "address_seconds": round(address, 3), "served_bytes": size}
 
 
-RUNS = {"eval": run_eval, "export": run_export, "inspect": run_inspect, "view": run_view}
+RUNS = {
+    "adapt": lambda folder: run_adapt(folder) | order_seconds(folder),
+    "eval": run_eval,
+    "export": run_export,
+    "inspect": run_inspect,
+    "view": run_view,
+}
 
 
 if __name__ == "__main__":
