@@ -1,6 +1,6 @@
 """Quality of checkpoints drawn with the screen-space filter of their training and with others.
 
-    python benchmarks/antialias.py [--iters 800] [--adapt 400] [--keep DIR] [SCENE ...]
+    python benchmarks/antialias.py [SCENE ...]
 
 No capture has a checkpoint that was trained antialiased. Substitutes are each scene's checkpoint with its attributes
 tuned on the training photographs with gsplat's antialiasing ("on") and with Mip-Splatting's filter ("mip"). Each
@@ -12,8 +12,6 @@ go to ``results/antialias.jsonl``.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -33,41 +31,35 @@ CLASSIC_FILES = {
     "bonsai146": ("pretrained.ply",),
 }  # fmt: skip
 TUNED = ("ci_banana", "plush_half")
+TUNED_STEPS, ADAPTED_STEPS = 800, 400
 DIALS = (1.0, 2.0, 3.0, 5.0)
 
 
 def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*", default=list(CLASSIC_FILES))
-    parser.add_argument("--iters", type=int, default=800, help="steps that a substitute is tuned for")
-    parser.add_argument("--adapt", type=int, default=400, help="steps that a substitute is adapted for")
-    parser.add_argument("--keep", type=Path, help="a folder that keeps the substitutes for other runs")
-    args = parser.parse_args()
-    with TemporaryDirectory() as temporary:
-        folder = args.keep or Path(temporary)
-        for name in args.scenes:
-            scene = photographs(name)
-            for file in CLASSIC_FILES[name]:
-                base = clod.load(capture(name) / file)
-                append(FILE, {"scene": name, "file": file, "trained": "off", **row(base.gaussians, scene)})
-            for trained, standin in standins(name, scene, args.iters, folder) if name in TUNED else ():
-                about = {"scene": name, "file": f"stand-in, {args.iters} steps", "trained": trained}
-                append(FILE, about | row(standin, scene))
-                for drawn in ("on", "off") if trained == "on" else ():
-                    for teacher in ("photographs", "checkpoint"):
-                        append(FILE, about | adapted(standin, scene, drawn, args.adapt, teacher))
+    for name in parser.parse_args().scenes:
+        scene = photographs(name)
+        for file in CLASSIC_FILES[name]:
+            base = clod.load(capture(name) / file)
+            append(FILE, {"scene": name, "file": file, "trained": "off", **row(base.gaussians, scene)})
+        for trained in ("on", "mip") if name in TUNED else ():
+            about = {"scene": name, "file": f"stand-in, {TUNED_STEPS} steps", "trained": trained}
+            standin = substitute(name, scene, trained)
+            append(FILE, about | row(standin, scene))
+            for drawn in ("on", "off") if trained == "on" else ():
+                for teacher in ("photographs", "checkpoint"):
+                    append(FILE, about | adapted(standin, scene, drawn, teacher))
 
 
-def standins(name: str, scene: clod.Scene, iters: int, folder: Path) -> Iterator[tuple[str, clod.Gaussians]]:
-    """(filter of the training, checkpoint) of each substitute; its file does not name the filter, as is usual."""
+def substitute(name: str, scene: clod.Scene, trained: str) -> clod.Gaussians:
+    """The scene's checkpoint tuned with a filter, written to a file that does not name the filter, as is usual."""
     base = checkpoint(name)
-    for trained in ("on", "mip"):
-        path = folder / f"{name}_{trained}_{iters}.ply"
-        if not path.exists():
-            start = base.gaussians.replace(screen_filter=FILTERS[trained])
-            tuned = tune(start, scene.train, Tuning(iters=iters), lambda share, text: None).gaussians
-            clod.save(path, tuned.replace(screen_filter=CLASSIC), base)
-        yield trained, clod.load(path).gaussians
+    start = base.gaussians.replace(screen_filter=FILTERS[trained])
+    tuned = tune(start, scene.train, Tuning(iters=TUNED_STEPS), lambda share, text: None).gaussians
+    with TemporaryDirectory() as folder:
+        clod.save(f"{folder}/tuned.ply", tuned.replace(screen_filter=CLASSIC), base)
+        return clod.load(f"{folder}/tuned.ply").gaussians
 
 
 def row(gaussians: clod.Gaussians, scene: clod.Scene) -> dict[str, Any]:
@@ -86,16 +78,16 @@ def row(gaussians: clod.Gaussians, scene: clod.Scene) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def adapted(gaussians: clod.Gaussians, scene: clod.Scene, drawn: str, iters: int, teacher: str) -> dict[str, Any]:
+def adapted(gaussians: clod.Gaussians, scene: clod.Scene, drawn: str, teacher: str) -> dict[str, Any]:
     """Adapted and drawn with one filter; the teacher is the photographs, or renders of the checkpoint."""
     start = gaussians.replace(screen_filter=FILTERS[drawn])
     own = clod.render_pseudo_views(start, clod.place_cameras(start)) if teacher == "checkpoint" else scene
-    result = clod.adapt(start, own, clod.AdaptConfig(max_sv=5, iters=iters))
+    result = clod.adapt(start, own, clod.AdaptConfig(max_sv=5, iters=ADAPTED_STEPS))
     rows = [
         {"s": r.virtual_scale, "psnr": round(r.psnr, 2), "kept": round(r.kept)}
         for r in evaluate(result.gaussians, scene.test, DIALS)
     ]
-    return {"adapted_with": drawn, "teacher": teacher, "iters": iters, "max_sv": 5, "seed": 0, "rows": rows}
+    return {"adapted_with": drawn, "teacher": teacher, "iters": ADAPTED_STEPS, "max_sv": 5, "seed": 0, "rows": rows}
 
 
 if __name__ == "__main__":

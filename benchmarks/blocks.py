@@ -35,6 +35,7 @@ from clod_adapter.training.loop import adapt
 
 DIALS = (1.0, 3.0, 5.0)
 SOLE = 0.9
+COUNT, IMAGES, ITERS, LIMITS = 2_000_000, 60, 40, ("none", "8GB", "3.5GB")  # of the city
 
 
 def db(error: float) -> float:
@@ -112,17 +113,16 @@ def seams(args: Namespace) -> None:
                 append("blocks.jsonl", {**about, **row, "rows": compare(after, whole, scene.test, masks)})
 
 
-def memory(args: Namespace) -> None:
+def memory(_: Namespace) -> None:
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(args.city or Path(temporary) / "city")
-        if not (folder / "city.ply").exists():
-            write_city(folder, args.count, args.images, 960, 540)
-        for limit in args.memory:
-            words = [folder / "city.ply", "--images", folder, "--iters", args.iters, "--quiet"]
+        folder = Path(temporary) / "city"
+        write_city(folder, COUNT, IMAGES, 960, 540)
+        for limit in LIMITS:
+            words = [folder / "city.ply", "--images", folder, "--iters", ITERS, "--quiet"]
             words += ["--out", Path(temporary) / "out.ply", *(() if limit == "none" else ("--memory", limit))]
             process = Process([*COMMAND, *words, "--json"])
             found = json.loads(process.out)
-            row = {"what": "memory", "count": args.count, "images": args.images, "memory": limit, "iters": args.iters}
+            row = {"what": "memory", "count": COUNT, "images": IMAGES, "memory": limit, "iters": ITERS}
             row |= {"peak_bytes": process.peak_bytes, "seconds": process.seconds}
             row |= {"plan": found.get("memory"), "steps": found["steps"], "rows": found["rows"]}
             append("blocks.jsonl", row | {"times": found["seconds"]})
@@ -137,11 +137,6 @@ def main() -> None:
     one.add_argument("--iters", type=int, default=AdaptConfig().iters)
     one.set_defaults(run=seams)
     other = commands.add_parser("memory")
-    other.add_argument("--count", type=int, default=2_000_000)
-    other.add_argument("--images", type=int, default=60)
-    other.add_argument("--iters", type=int, default=40)
-    other.add_argument("--memory", nargs="+", default=["none", "8GB", "3.5GB"], help="limits, none for without one")
-    other.add_argument("--city", help="a folder that benchmarks/city.py made (default: a temporary one)")
     other.set_defaults(run=memory)
     args = parser.parse_args()
     args.run(args)

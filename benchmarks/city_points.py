@@ -5,29 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import city_surfaces as surface
 import numpy as np
 import torch
-from city_surfaces import (
-    ASPHALT,
-    CAR,
-    FACADE,
-    FIELD,
-    GRASS,
-    PAVING,
-    PITCH,
-    ROOF,
-    SKY,
-    STREET,
-    TREE,
-    Surfaces,
-    extent,
-)  # fmt: skip
+from city_surfaces import FIELD, PITCH, SKY, TREE, Surfaces, extent
 
 from clod_adapter.config import SH_COUNTS
 from clod_adapter.rasterizers.reference import sh_basis
 
 # Gaussians per unit of area, relative to each other.
-DENSITY = {ASPHALT: 0.5, PAVING: 0.8, GRASS: 0.6, FACADE: 1.0, ROOF: 0.6, CAR: 6.0, TREE: 1.5}
+DENSITY = {surface.ASPHALT: 0.5, surface.PAVING: 0.8, surface.GRASS: 0.6, surface.FACADE: 1.0, surface.ROOF: 0.6,
+           surface.CAR: 6.0, TREE: 1.5}  # fmt: skip
 SUN = np.array([0.45, -0.75, -0.48])
 FIELDS = np.array([[0.42, 0.48, 0.25], [0.55, 0.52, 0.30], [0.30, 0.40, 0.22], [0.48, 0.42, 0.28]])
 
@@ -79,7 +67,7 @@ def pattern(surfaces: Surfaces, row: np.ndarray, spot: np.ndarray, random: np.ra
     """``[N, 3]`` float32 colour of the points at ``spot`` of surface ``row``: windows, markings, stains."""
     kind, color = surfaces.kind[row], surfaces.color[row].astype(np.float32)
     color *= (1 + random.normal(0, 0.05, (len(row), 1))).astype(np.float32)
-    wall = np.flatnonzero(kind == FACADE)
+    wall = np.flatnonzero(kind == surface.FACADE)
     along = spot[wall, 0] * np.linalg.norm(surfaces.u, axis=1)[row[wall]]
     up = spot[wall, 1] * np.linalg.norm(surfaces.v, axis=1)[row[wall]]
     storey, bay = np.floor(up / 3.2), np.floor(along / 2.6)
@@ -88,12 +76,12 @@ def pattern(surfaces: Surfaces, row: np.ndarray, spot: np.ndarray, random: np.ra
     pane = np.where((pick < 0.12)[:, None], [0.85, 0.75, 0.5], [0.13, 0.19, 0.27] + 0.25 * pick[:, None] ** 3)
     color[wall] *= (0.72 + 0.28 * (1 - np.exp(-up / 4)))[:, None]  # darker towards the street
     color[wall[window]] = pane[window]
-    road = np.flatnonzero(kind == ASPHALT)
+    road = np.flatnonzero(kind == surface.ASPHALT)
     at = surfaces.origin[row[road]] + spot[road, :1] * surfaces.u[row[road]] + spot[road, 1:] * surfaces.v[row[road]]
-    inside = (at[:, [0, 2]] - surfaces.origin[surfaces.kind == ASPHALT][0, [0, 2]]) % PITCH
+    inside = (at[:, [0, 2]] - surfaces.origin[surfaces.kind == surface.ASPHALT][0, [0, 2]]) % PITCH
     edge = np.minimum(inside, PITCH - inside)  # from the middles of the streets
     line = ((edge[:, 0] < 0.25) & (inside[:, 1] % 6 < 3)) | ((edge[:, 1] < 0.25) & (inside[:, 0] % 6 < 3))
-    line &= edge.max(1) > STREET / 2
+    line &= edge.max(1) > surface.STREET / 2
     color[road[line]] = [0.85, 0.85, 0.8]
     return color
 

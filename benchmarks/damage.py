@@ -74,10 +74,14 @@ def _describe(data: bytes, chance: random.Random) -> bytearray:
     return bytearray(len(changed).to_bytes(8, "little") + changed + data[8 + size :])
 
 
-def _document(data: bytes, chance: random.Random) -> bytearray:
-    """JSON with some of its values replaced."""
+def _document(data: bytes, chance: random.Random, as_text: float = 0.0) -> bytearray:
+    """JSON with some of its values replaced, or, with probability ``as_text``, damaged as text."""
+    if as_text and chance.random() < as_text:
+        text = bytearray(data)
+        damage(text, chance)
+        return text
     document = json.loads(data)
-    for _ in range(chance.choice((1, 1, 2, 4))):
+    for _ in range(1 if as_text else chance.choice((1, 1, 2, 4))):
         _replace(document, chance)
     return bytearray(json.dumps(document).encode())
 
@@ -116,13 +120,7 @@ def _packed(data: bytes, chance: random.Random) -> bytearray:
 def _glb(data: bytes, chance: random.Random) -> bytearray:
     """A glb whose JSON is damaged, as text or in a value, its lengths right again."""
     size = int.from_bytes(data[12:16], "little")
-    text = bytearray(data[20 : 20 + size])
-    if chance.random() < 0.3:
-        damage(text, chance)
-    else:
-        document = json.loads(text)
-        _replace(document, chance)
-        text = bytearray(json.dumps(document).encode())
+    text = _document(data[20 : 20 + size], chance, as_text=0.3)
     text += b" " * (-len(text) % 4)
     rest = data[20 + size :]
     head = data[:8] + (20 + len(text) + len(rest)).to_bytes(4, "little")

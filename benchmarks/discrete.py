@@ -1,7 +1,7 @@
 """Two levels of detail with a hard switch against one file with its dial: a picture and the measured jump.
 
     clod-adapt demo                                      # makes demo/gallery.ply and demo/capture
-    python benchmarks/discrete.py demo/gallery.ply demo/capture --view 0
+    python benchmarks/discrete.py
 
 docs/images/discrete_vs_continuous.png shows a held-out view in four strips from least to most detail, for two levels
 and for one file; below it PSNR and the change from frame to frame over a sweep. The two levels are the file at both
@@ -27,7 +27,7 @@ from clod_adapter.metrics import psnr
 from clod_adapter.report.style import BLUE, ORANGE, QUIET, new_figure, save_figure, tidy
 
 PICTURE = ROOT / "docs" / "images" / "discrete_vs_continuous.png"
-STRIPS = 4
+STRIPS, FRAMES = 4, 120
 NAMES = ("two levels, a hard switch", "one file, its dial")
 
 
@@ -48,25 +48,20 @@ class Sweep:
     psnr: list[float]
 
     def popping(self) -> Popping:
-        """How the picture changes from frame to frame."""
+        """The change of the image from frame to frame."""
         return popping.sweep(lambda _, j: self.images[j], self.dials)
 
 
 def main() -> None:
     parser = arguments(__doc__)
-    parser.add_argument("model", help="an adapted PLY")
-    parser.add_argument("images", help="its scene: photographs and COLMAP model")
-    parser.add_argument("--view", type=int, default=0, help="which of the held-out views (default: the first)")
-    parser.add_argument("--frames", type=int, default=120, help="of the sweep")
-    parser.add_argument("--out", type=Path, default=PICTURE)
-    args = parser.parse_args()
-    gaussians, view = clod.load(args.model).gaussians, clod.load_scene(args.images).test[args.view]
-    dial = sweep(gaussians, view, args.frames)
+    parser.add_argument("demo", nargs="?", default="demo", help="the folder of clod-adapt demo (default: demo)")
+    folder = Path(parser.parse_args().demo)
+    gaussians, view = clod.load(folder / "gallery.ply").gaussians, clod.load_scene(folder / "capture").test[0]
+    dial = sweep(gaussians, view, FRAMES)
     levels = hard_switch(dial)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    draw(args.out, view, levels, dial)
+    draw(PICTURE, view, levels, dial)
     append("discrete.jsonl", {
-        "benchmark": "discrete", "model": Path(args.model).name, "gaussians": len(gaussians), "frames": args.frames,
+        "benchmark": "discrete", "model": "gallery.ply", "gaussians": len(gaussians), "frames": FRAMES,
         "view": view.camera.name, "max_sv": dial.dials[-1], "switch": summary(levels), "dial": summary(dial),
     })  # fmt: skip
 

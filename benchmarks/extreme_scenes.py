@@ -106,23 +106,17 @@ def inside(base: clod.Gaussians, scene: Scene) -> Case:
 
 
 def opacity(value: float) -> Change:
-    def change(base: clod.Gaussians, scene: Scene) -> Case:
-        return Case(
-            base.replace(opacity_logits=torch.full_like(base.opacity_logits, math.log(value / (1 - value)))), scene
-        )
-
-    return change
+    logit = math.log(value / (1 - value))
+    return lambda base, scene: Case(base.replace(opacity_logits=torch.full_like(base.opacity_logits, logit)), scene)
 
 
 def flat(axes: int) -> Change:
     """The smallest ``axes`` axes a millionth of the largest: 1 for discs, 2 for needles."""
 
     def change(base: clod.Gaussians, scene: Scene) -> Case:
-        order = base.log_scales.argsort(1)
+        order = base.log_scales.argsort(1)[:, :axes]
         shrunk = base.log_scales.amax(1, keepdim=True) - RATIO
-        return Case(
-            base.replace(log_scales=base.log_scales.scatter(1, order[:, :axes], shrunk.expand(-1, axes))), scene
-        )
+        return Case(base.replace(log_scales=base.log_scales.scatter(1, order, shrunk.expand(-1, axes))), scene)
 
     return change
 

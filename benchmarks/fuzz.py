@@ -33,7 +33,7 @@ import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
 import torch
 from common import append, arguments
 from damage import mutate
-from mutants import FORMATS, Input, make, write, write_images
+from mutants import MAKERS, Input, write, write_images
 
 from clod_adapter.cli.adapt.resume import find_state
 from clod_adapter.cli.shared.console import Console
@@ -160,7 +160,7 @@ def work(kind: str, inputs: list[Input], seed: int, cases: range, folder: Path, 
 
 def run(kind: str, seed: int, cases: int, folder: Path) -> Tally:
     """All cases of a format, batch by batch; a process that dies or hangs loses its current case."""
-    tally, inputs = Tally(cases), make(kind, folder)
+    tally, inputs = Tally(cases), MAKERS[kind](folder)
     write_images(folder / "case" / "images")
     failures, fork = folder / "failures.jsonl", multiprocessing.get_context("fork")
     shared = fork.Array("q", 6, lock=False)
@@ -206,7 +206,7 @@ def again(kind: str, seed: int, number: int, folder: Path) -> None:
     """One case in this process, its files left in ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
-        inputs = make(kind, Path(scratch))
+        inputs = MAKERS[kind](Path(scratch))
     case = damaged(kind, inputs, seed, number)
     write_images(folder / "images")
     write(case, place(kind, folder))
@@ -216,7 +216,7 @@ def again(kind: str, seed: int, number: int, folder: Path) -> None:
 def main() -> None:
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("--cases", type=int, default=200_000, help="over all formats; of states a twentieth more")
-    parser.add_argument("--format", choices=FORMATS, help="this one alone")
+    parser.add_argument("--format", choices=MAKERS, help="this one alone")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--case", type=int, help="this one alone, in this process")
     parser.add_argument("--keep", type=Path, default=Path("case"), help="with --case: where its files go")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -20,9 +21,8 @@ from growth_rows import (
     megapixels,
     over_count,
     phase_of,
-    photographs,
     seconds_of,
-)  # fmt: skip
+)
 from PIL import Image
 
 from clod_adapter.report.style import QUIET, SERIES, label_log, new_figure, save_figure, tidy
@@ -102,7 +102,7 @@ def draw(rows: Sequence[Row]) -> None:
             points = seconds_of(rows, "adapt", phase)
             line(c, points, colour, f"{phase}  {growth(points)[0]:.2f}")
         guide(c, rows)
-        for series, x, colour in (("images", photographs, SERIES[0]), ("shapes", megapixels, SERIES[1])):
+        for series, x, colour in (("images", itemgetter("images"), SERIES[0]), ("shapes", megapixels, SERIES[1])):
             chosen = sorted((row for row in rows if row["series"] == series), key=x)
             name = "photographs" if series == "images" else "size of each"
             for key, style in (("start", "-"), ("step", "--"), ("evaluate", ":")):

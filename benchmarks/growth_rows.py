@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from operator import itemgetter
 
 import numpy as np
 from common import Row, stored
@@ -86,10 +87,6 @@ def bytes_a_gaussian(rows: Sequence[Row], command: str) -> tuple[float, float]:
     return each, low - each * n
 
 
-def photographs(row: Row) -> float:
-    return row["images"]
-
-
 def megapixels(row: Row) -> float:
     return row["width"] * row["height"] / 1e6
 
@@ -119,7 +116,7 @@ def tables(rows: Sequence[Row]) -> str:
         lines += ["", f"| adapt, {row['gaussians']:,}: up to | {' | '.join(peaks)} |", "|---" * (len(peaks) + 1) + "|"]
         per = " | ".join(f"{peak / row['gaussians']:,.0f}" for peak in peaks.values())
         lines.append(f"| resident bytes per Gaussian | {per} |")
-    for series, name, x in (("images", "photographs", photographs), ("shapes", "megapixels", megapixels)):
+    for series, name, x in (("images", "photographs", itemgetter("images")), ("shapes", "megapixels", megapixels)):
         chosen = sorted((row for row in rows if row["series"] == series), key=x)
         lines += ["", f"| adapt over {name} | seconds | start | step | evaluate | load | peak, GB |", "|---" * 7 + "|"]
         for row in chosen:

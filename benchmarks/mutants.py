@@ -38,22 +38,12 @@ sys.path.insert(0, str(ROOT / "tests"))
 from packing import write_packed  # noqa: E402
 
 Input = dict[str, bytes]
-FORMATS = ("ply", "safetensors", "states", "colmap", "transforms", "pt", "models")
 IMAGES = ("a.png", "b.png", "c.png")
 SIZE = (8, 6)
 CAMERAS = {
     "SIMPLE_PINHOLE": (9.0, 4, 3), "PINHOLE": (9.0, 9, 4, 3), "SIMPLE_RADIAL": (9.0, 4, 3, 0.02),
     "OPENCV": (9.0, 9, 4, 3, 0.01, 0, 0, 0.001),
 }  # fmt: skip
-
-
-def make(kind: str, folder: Path) -> list[Input]:
-    """The undamaged inputs of a format; ``folder`` is for files on the way."""
-    makers: dict[str, Callable[[Path], list[Input]]] = {
-        "ply": _plys, "safetensors": _adapters, "states": _states, "colmap": _models, "transforms": _transforms,
-        "pt": _pts, "models": _whole_models,
-    }  # fmt: skip
-    return makers[kind](folder)
 
 
 def write(case: Input, folder: Path) -> None:
@@ -211,3 +201,10 @@ def _whole_models(folder: Path) -> list[Input]:
             inputs.append({f"whole{suffix}": (folder / f"whole{suffix}").read_bytes()})
     packed = write_packed(folder / "whole.compressed.ply", base)
     return [*inputs, {packed.name: packed.read_bytes()}]
+
+
+# The undamaged inputs of each format; the folder is for files on the way.
+MAKERS: dict[str, Callable[[Path], list[Input]]] = {
+    "ply": _plys, "safetensors": _adapters, "states": _states, "colmap": _models, "transforms": _transforms,
+    "pt": _pts, "models": _whole_models,
+}  # fmt: skip

@@ -36,11 +36,10 @@ def main() -> None:
     parser.add_argument("--few", type=int, metavar="K", help="of the photographs to train on, only K, evenly spread")
     parser.add_argument("--iters", type=int, default=clod.AdaptConfig().iters)
     parser.add_argument("--max-sv", type=float, default=7.0)
-    parser.add_argument("--seed", type=int, default=0, help="of the training and of the placement")
     args = parser.parse_args()
     for scene in args.scenes:
         for kind in args.kinds:
-            run(scene, kind, clod.AdaptConfig(iters=args.iters, seed=args.seed, max_sv=args.max_sv), args.few)
+            run(scene, kind, clod.AdaptConfig(iters=args.iters, max_sv=args.max_sv), args.few)
 
 
 def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> None:

@@ -1,7 +1,7 @@
 """Savings and cost of the plan: the command with everything included, with the plan, and with --trim.
 
     python benchmarks/plan.py                               # every scene of the shared data, one row per run
-    python benchmarks/plan.py ci_banana --iters 300 --label short
+    python benchmarks/plan.py ci_banana --iters 300
     python benchmarks/plan.py --table                       # the last rows as Markdown, for docs/plan.md
 
 A scene is a folder of the shared data, followed by the name of the checkpoint where it is not ``pretrained``, or a file
@@ -31,15 +31,11 @@ def main() -> None:
     parser = arguments(__doc__, table=print_table)
     parser.add_argument("scenes", nargs="*", default=SCENES)
     parser.add_argument("--iters", type=int, default=1500)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--label", default="default", help="name of the rows")
     args = parser.parse_args()
     for scene in args.scenes:
         for way, options in WAYS.items():
-            for seed in args.seeds:
-                words = ["--iters", str(args.iters), "--seed", str(seed), *options]
-                about = {"benchmark": "plan", "scene": scene, "way": way, "label": args.label}
-                append(FILE, about | run(scene, words))
+            about = {"benchmark": "plan", "scene": scene, "way": way, "label": "default"}
+            append(FILE, about | run(scene, ["--iters", str(args.iters), *options]))
 
 
 def run(scene: str, options: list[str]) -> dict[str, Any]:

@@ -43,12 +43,12 @@ from common import ROOT, SHARED, append, arguments, outcomes
 
 FILE = "portability.jsonl"
 SPACED = os.fsdecode("a folder, spàced".encode())  # under an ASCII locale too
-PARALLEL = (
+PARALLEL = [
     "--numprocesses=auto",
     "--maxprocesses=4",
     "--dist=loadfile",
     "--no-loadscope-reorder",
-)  # as in the Makefile
+]  # as in the Makefile
 
 
 @dataclass(frozen=True)
@@ -73,11 +73,9 @@ CONDITIONS = {
     "no_root": Condition({}, ("unshare", "--user") if os.geteuid() == 0 else ()),
     "ignored_sigint": Condition({}, ("env", "--ignore-signal=INT")),
     "blocked_signals": Condition({}, ("env", "--block-signal=INT,TERM")),
-    "c_locale": Condition(
-        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "TZ": "Pacific/Kiritimati"},
-    ),
+    "c_locale": Condition({"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "TZ": "Pacific/Kiritimati"}),
     "folders": Condition(
-        {"TMPDIR": "{work}/tmp", "HOME": "{work}/home", "XDG_CACHE_HOME": "", "NUMBA_CACHE_DIR": "{work}/cache"},
+        {"TMPDIR": "{work}/tmp", "HOME": "{work}/home", "XDG_CACHE_HOME": "", "NUMBA_CACHE_DIR": "{work}/cache"}
     ),
     "no_pycolmap": Condition({"PYTHONPATH": "{work}/absent"}),
     "checkout": Condition(),

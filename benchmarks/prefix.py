@@ -12,8 +12,7 @@ opacities in the file:
 - ``own``, ``opacity``, ``removal error``: the adapted file as it is, by falling opacity, by falling removal error;
 - ``base, ...``: the untouched checkpoint in the adapted one's order of extinction, by opacity, by removal error.
 
-Rows of commit c0ce1ea have ``extinction`` and ``baked`` at the one distance d' = 1, and as ``extinction, views`` the
-order by the mean of log s* over the training cameras. Each run adds a row to ``results/prefix.jsonl``.
+Each run adds a row to ``results/prefix.jsonl``.
 """
 
 from __future__ import annotations

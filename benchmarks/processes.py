@@ -42,7 +42,6 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=1500, help="of each of the three runs")
     parser.add_argument("--speed-steps", type=int, default=60)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--part", nargs=3, metavar=("SCENE", "CONFIG", "FILE"), help=SUPPRESS)
     args = parser.parse_args()
     if args.part:
@@ -54,9 +53,12 @@ def main() -> None:
 
 
 def measure(scene: str, args: Namespace) -> None:
-    single = {"iters": args.views, "batch": 1, "seed": args.seed}
-    double = {"iters": args.views // 2, "batch": 2, "seed": args.seed}
-    runs = {"batch 1": (1, single), "batch 2": (1, double), "batch 2, two processes": (2, double)}
+    double = {"iters": args.views // 2, "batch": 2}
+    runs = {
+        "batch 1": (1, {"iters": args.views, "batch": 1}),
+        "batch 2": (1, double),
+        "batch 2, two processes": (2, double),
+    }
     results, quality = {}, {}
     test = photographs(scene).test
     for label, (processes, config) in runs.items():
@@ -64,7 +66,7 @@ def measure(scene: str, args: Namespace) -> None:
         quality[label] = {"steps": config["iters"], **spent, "rows": rows_of(results[label], test)}
     one, two = results["batch 2"].tensors(), results["batch 2, two processes"].tensors()
     append(FILE, {
-        "benchmark": "processes", "scene": scene, "views": args.views, "seed": args.seed,
+        "benchmark": "processes", "scene": scene, "views": args.views, "seed": 0,
         "gaussians": len(one["means"]), "quality": quality,
         "largest_difference": {name: float((one[name] - two[name]).abs().amax()) for name in one if one[name].numel()},
         "speed": speed(scene, {**double, "iters": args.speed_steps}, args.repeats),

@@ -1,17 +1,15 @@
 """From the command to the first training step: seconds by phase, and memory.
 
     python benchmarks/startup.py                         # everything, on plush_half; several minutes
-    python benchmarks/startup.py warm help --repeats 5   # two cases of it
+    python benchmarks/startup.py warm help               # two cases of it
     python benchmarks/startup.py --record                # and a row in results/startup.jsonl
 
 Times the command ``clod-adapt PLY --images DIR --iters 1`` from outside, by its messages and the seconds in its report:
 
 - ``help``: ``--help``, and the error for a checkpoint that does not exist;
-- ``warm``: with kernels cached by an earlier run, the median of the repeats;
+- ``warm``: with kernels cached by an earlier run, the median of three runs;
 - ``first``: with an empty cache, where kernels are compiled;
 - ``memory``: the peak of a longer training, beyond that of a process that only imports torch.
-
-Rows of commit 9c2b99e also have ``together`` and ``readonly``, which tests/kernels/test_compiling.py now checks.
 """
 
 from __future__ import annotations
@@ -21,13 +19,12 @@ import os
 import statistics
 import sys
 import tempfile
-from argparse import Namespace
 from pathlib import Path
 
 from common import COMMAND, Process, Row, append, arguments, capture
 
 FILE = "startup.jsonl"
-MEMORY_STEPS = 100
+SCENE, REPEATS, MEMORY_STEPS = "plush_half", 3, 100
 # Messages of the command on stderr at the end of a phase.
 SAID = {
     "checkpoint": r": [\d,]+ Gaussians, SH", "photographs": r": \d+ photographs to train on", "base": r"^base: ",
@@ -36,15 +33,15 @@ SAID = {
 PHASES = ("imports", "reading", "kernels", "base", "importance", "first_step", "to_first_step")
 
 
-def adapt_words(scene: str, out: Path, iters: int = 1) -> list[object]:
-    folder = capture(scene)
+def adapt_words(out: Path, iters: int = 1) -> list[object]:
+    folder = capture(SCENE)
     ply = folder / "pretrained.ply"
     return [*COMMAND, ply, "--images", folder, "--iters", iters, "--out", out / "dial.ply", "--json"]
 
 
-def adapt(scene: str, out: Path, cache: Path) -> tuple[Process, dict[str, float]]:
+def adapt(out: Path, cache: Path) -> tuple[Process, dict[str, float]]:
     """One run of one step, and its phases in seconds of wall time."""
-    run = Process(adapt_words(scene, out), SAID, environment={"NUMBA_CACHE_DIR": str(cache)})
+    run = Process(adapt_words(out), SAID, environment={"NUMBA_CACHE_DIR": str(cache)})
     seconds, at = json.loads(run.out)["seconds"], run.moments
     kernels = seconds.get("kernels", 0.0)
     durations = (
@@ -58,37 +55,37 @@ def compiles(run: Process) -> bool:
     return any("compiling kernels (first run only" in line for line in run.lines)
 
 
-def case_help(scene: str, work: Path, args: Namespace) -> Row:
+def case_help(work: Path) -> Row:
     row = {}
-    for name, words, code in (("help", ["--help"], 0), ("error", ["missing.ply", "--images", capture(scene)], 2)):
-        runs = [Process([*COMMAND, *words], code=code) for _ in range(args.repeats)]
+    for name, words, code in (("help", ["--help"], 0), ("error", ["missing.ply", "--images", capture(SCENE)], 2)):
+        runs = [Process([*COMMAND, *words], code=code) for _ in range(REPEATS)]
         row[f"{name}_seconds"] = round(statistics.median(run.seconds for run in runs), 3)
         row[f"{name}_cpu_seconds"] = round(statistics.median(run.cpu_seconds for run in runs), 3)
     return row
 
 
-def case_warm(scene: str, work: Path, args: Namespace) -> Row:
-    adapt(scene, work, work / "cache")
-    runs = [adapt(scene, work, work / "cache") for _ in range(args.repeats)]
+def case_warm(work: Path) -> Row:
+    adapt(work, work / "cache")
+    runs = [adapt(work, work / "cache") for _ in range(REPEATS)]
     assert not any(compiles(run) for run, _ in runs)
     phases = {name: round(statistics.median(times[name] for _, times in runs), 2) for name in PHASES}
     cpu = statistics.median(run.cpu["trained"] for run, _ in runs)
-    return {"phases": phases, "cpu_to_first_step": round(cpu, 2), "repeats": args.repeats}
+    return {"phases": phases, "cpu_to_first_step": round(cpu, 2), "repeats": REPEATS}
 
 
-def case_first(scene: str, work: Path, args: Namespace) -> Row:
-    run, phases = adapt(scene, work, work / "empty")
+def case_first(work: Path) -> Row:
+    run, phases = adapt(work, work / "empty")
     assert compiles(run)
     rounded = {name: round(value, 2) for name, value in phases.items()}
     return {"phases": rounded, "cpu_to_first_step": round(run.cpu["trained"], 2)}
 
 
-def case_memory(scene: str, work: Path, args: Namespace) -> Row:
+def case_memory(work: Path) -> Row:
     empty = Process([sys.executable, "-c", "import torch"])
     row: Row = {"torch_bytes": empty.peak_bytes, "steps": MEMORY_STEPS}
     for name in ("compiling", "cached"):
         cache = {"NUMBA_CACHE_DIR": str(work / "memory")}
-        run = Process(adapt_words(scene, work, MEMORY_STEPS), environment=cache)
+        run = Process(adapt_words(work, MEMORY_STEPS), environment=cache)
         row[f"{name}_bytes"] = run.peak_bytes - empty.peak_bytes
     return row
 
@@ -99,13 +96,11 @@ CASES = {"help": case_help, "warm": case_warm, "first": case_first, "memory": ca
 def main() -> None:
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("cases", nargs="*", choices=[[], *CASES], help="default: all of them")
-    parser.add_argument("--scene", default="plush_half")
-    parser.add_argument("--repeats", type=int, default=3)
     args = parser.parse_args()
-    row: Row = {"benchmark": "startup", "scene": args.scene, "load": round(os.getloadavg()[0], 2)}
+    row: Row = {"benchmark": "startup", "scene": SCENE, "load": round(os.getloadavg()[0], 2)}
     for case in args.cases or CASES:
         with tempfile.TemporaryDirectory() as work:
-            row[case] = CASES[case](args.scene, Path(work), args)
+            row[case] = CASES[case](Path(work))
         print(f"{case:9} {json.dumps(row[case])}", flush=True)
     if args.record:
         append(FILE, row)

@@ -1,7 +1,7 @@
 """Time of a training step by section and kernel, on real checkpoints.
 
     python benchmarks/step.py                  # plush_half and bonsai146
-    python benchmarks/step.py plush_half --record --label before
+    python benchmarks/step.py plush_half --record
 
 Wall times are means over the steps after the first few, with the default settings at the start of training.
 ``splat_share`` is the rasterizer's share of a step, forward and backward. A row names the commit of the imported
@@ -56,8 +56,6 @@ class Clock:
 def main() -> None:
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("scenes", nargs="*", default=["plush_half", "bonsai146"])
-    parser.add_argument("--steps", type=int, default=120)
-    parser.add_argument("--label", default="default")
     args = parser.parse_args()
     torch.set_num_threads(THREADS)
     clock = Clock()
@@ -68,8 +66,7 @@ def main() -> None:
     clock.wrap(cpu._Splat, "backward", "splat backward")
     clock.wrap(optimizer.RowAdam, "step", "optimiser")
     for scene in args.scenes:
-        row = {"benchmark": "step", "scene": scene, "label": args.label, "threads": THREADS,
-               **profile(scene, args.steps, clock)}  # fmt: skip
+        row = {"benchmark": "step", "scene": scene, "threads": THREADS, **profile(scene, 120, clock)}
         print(table(row), flush=True)
         if args.record:
             append(FILE, row)
