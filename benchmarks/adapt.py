@@ -49,11 +49,7 @@ QUESTIONS: dict[str, dict[str, dict[str, object]]] = {
         "log sigma, 1e-2": {"lr_sigma": 1e-2},
     },
     "normaliser": {"quantile": {"normalizer": "quantile"}, "max (the paper's)": {"normalizer": "max"}},
-    "cut": {
-        "hard": {"cut": "hard"},
-        "hard, tau 1/255": {"cut": "hard", "tau": 1 / 255},
-        "tau 0.05": {"tau": 0.05},
-    },
+    "cut": {"hard": {"cut": "hard"}, "hard, tau 1/255": {"cut": "hard", "tau": 1 / 255}, "tau 0.05": {"tau": 0.05}},
     "count": {
         "none": {"reg_weight": 0.0},
         "a quarter": {"reg_weight": clod.AdaptConfig().reg_weight / 4},

@@ -42,14 +42,10 @@ def main() -> None:
     parser.add_argument("scene", help="its capture")
     parser.add_argument("--label", default="", help="how the model was adapted")
     args = parser.parse_args()
-    measure(args.model, args.scene, args.label)
-
-
-def measure(model: str, scene: str, label: str) -> None:
-    adapted, views = clod.load(model).gaussians, photographs(scene)
+    adapted, views = clod.load(args.model).gaussians, photographs(args.scene)
     config = adapted.attenuation
     if config is None:
-        raise SystemExit(f"{model} has no sigma_d")
+        raise SystemExit(f"{args.model} has no sigma_d")
     training = [view.camera for view in views.train]
     cameras: dict[str, Sequence[clod.Camera | Viewpoint]] = {
         "images": training,
@@ -75,9 +71,9 @@ def measure(model: str, scene: str, label: str) -> None:
             counts[name], found[name] = len(gaussians), psnr(gaussians)
         rows.append({"virtual_scale": s, "count": counts, "psnr": found})
     append(FILE, {
-        "benchmark": "bake", "model": Path(model).name, "label": label, "scene": scene, "gaussians": len(adapted),
-        "views": len(views.test), "training_views": len(training), "stored": len(cameras["stored"]),
-        "placed": len(cameras["placed"]), "max_sv": config.max_sv, "rows": rows,
+        "benchmark": "bake", "model": Path(args.model).name, "label": args.label, "scene": args.scene,
+        "gaussians": len(adapted), "views": len(views.test), "training_views": len(training),
+        "stored": len(cameras["stored"]), "placed": len(cameras["placed"]), "max_sv": config.max_sv, "rows": rows,
     })  # fmt: skip
 
 

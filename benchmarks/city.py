@@ -143,17 +143,14 @@ def perturb(truth: Gaussians, seed: int = 0) -> Gaussians:
     return truth
 
 
-def write_city(
-    folder: str | Path, count: int, images: int, width: int, height: int, *, where: Where = "mixed", seed: int = 0,
-    sh_degree: int = 3,
-) -> None:  # fmt: skip
+def write_city(folder: str | Path, count: int, images: int, width: int, height: int, *, where: Where = "mixed") -> None:
     """Writes a perturbed checkpoint ``folder/city.ply`` and photographs of the truth as a COLMAP scene.
 
     Args:
         folder: does not exist or is empty; it appears when everything in it is complete.
     """
-    truth = city(count, seed=seed, sh_degree=sh_degree)
-    cameras = city_cameras(images, width, height, where=where, count=count, seed=seed)
+    truth = city(count)
+    cameras = city_cameras(images, width, height, where=where, count=count)
     with atomic_path(folder) as part:
         (part / "images").mkdir(parents=True)
         for camera in cameras:
@@ -162,7 +159,7 @@ def write_city(
         some = np.linspace(0, count - surrounding(count), 2000, endpoint=False).astype(np.int64)
         colors = ((0.5 + SH_C0 * truth.sh0[some, 0].numpy()).clip(0, 1) * 255).astype(np.uint8)
         write_model(part, cameras, [camera.name for camera in cameras], truth.means[some].numpy(), colors)
-        save(part / "city.ply", perturb(truth, seed))
+        save(part / "city.ply", perturb(truth))
 
 
 def main() -> None:
@@ -172,12 +169,8 @@ def main() -> None:
     parser.add_argument("--images", type=int, default=24, help="photographs (default: %(default)s)")
     parser.add_argument("--size", type=int, nargs=2, default=(640, 400), metavar=("W", "H"), help="of a photograph")
     parser.add_argument("--where", choices=("near", "far", "mixed"), default="mixed", help="cameras (default: mixed)")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--sh-degree", type=int, default=3)
     args = parser.parse_args()
-    write_city(
-        args.out, args.count, args.images, *args.size, where=args.where, seed=args.seed, sh_degree=args.sh_degree
-    )
+    write_city(args.out, args.count, args.images, *args.size, where=args.where)
 
 
 if __name__ == "__main__":

@@ -7,28 +7,15 @@ from collections.abc import Sequence
 from operator import itemgetter
 from typing import Any
 
+import growth_rows as fit
 import numpy as np
 from common import ROOT, Row
-from growth_rows import (
-    COMMANDS,
-    FEW,
-    FLOOR,
-    PHASES,
-    SERIES_COUNT,
-    bytes_a_gaussian,
-    exponent,
-    growth,
-    megapixels,
-    over_count,
-    phase_of,
-    seconds_of,
-)
 from PIL import Image
 
 from clod_adapter.report.style import QUIET, SERIES, label_log, new_figure, save_figure, tidy
 
 PICTURE, PAGE = ROOT / "docs" / "images" / "growth.png", ROOT / "docs" / "growth.md"
-# What is assumed of the city on paper, and of machines; the rest is measured.
+# What is assumed of the city on paper, and of machines; the rest is fit.
 CITY, PHOTOGRAPHS, SIZE = 100_000_000, 20_000, 1600 * 1000 / 1e6  # Gaussians; how many, of so many megapixels
 BORDER = 0.2  # Gaussians around a block that go along frozen, of its own
 BLOCK_STEPS, LOOKED_AT, HELD_OUT = 1500, 64, 64  # of a block; photographs for its start, and to measure it on
@@ -40,7 +27,7 @@ MEMORIES = (8, 16, 32, 64)  # GB for a job
 
 def on_paper(rows: Sequence[Row]) -> str:
     """The city in blocks for jobs of a given memory: number of blocks, hours, price. Markdown."""
-    each, rest = bytes_a_gaussian(rows, "adapt")
+    each, rest = fit.bytes_a_gaussian(rows, "adapt")
     lines = ["| a job's memory, GB | Gaussians in a block | blocks | hours a block, of them training | core-hours | "
              "hours on 64 cores | dollars | on one assumed GPU: hours | dollars |", "|---" * 9 + "|"]  # fmt: skip
     for memory in MEMORIES:
@@ -62,24 +49,24 @@ def block_seconds(rows: Sequence[Row], count: int) -> tuple[float, float]:
     In proportion from the largest city that was measured, the pruning order by n log n; a megapixel more of a
     photograph adds to each view what it does in the series over sizes.
     """
-    row = over_count(rows, "adapt")[-1]
+    row = fit.over_count(rows, "adapt")[-1]
     n, share = row["gaussians"], count / row["gaussians"]
-    shapes = sorted((each for each in rows if each["series"] == "shapes"), key=megapixels)[-2:]
+    shapes = sorted((each for each in rows if each["series"] == "shapes"), key=fit.megapixels)[-2:]
 
     def a_megapixel(phase: str, views: int) -> float:
         """Seconds that it adds to a phase, for each of the views that were rendered."""
         if len(shapes) < 2:
             return 0.0
         more = shapes[1]["phases"][phase] - shapes[0]["phases"][phase]
-        return max(more / (megapixels(shapes[1]) - megapixels(shapes[0])) / views, 0.0)
+        return max(more / (fit.megapixels(shapes[1]) - fit.megapixels(shapes[0])) / views, 0.0)
 
     trained, held_out = split(row["images"])
-    larger = SIZE - megapixels(row)
-    step = phase_of(row, "step") * share + larger * a_megapixel("step", 1)
-    importance = phase_of(row, "importance") / trained * share + larger * a_megapixel("start", split(FEW)[0])
-    evaluate = phase_of(row, "evaluate") / held_out * share + larger * a_megapixel("evaluate", split(FEW)[1])
-    order = phase_of(row, "order") * share * math.log(count) / math.log(n)
-    fixed = (phase_of(row, "load") + 2 * phase_of(row, "write")) * share
+    larger = SIZE - fit.megapixels(row)
+    step = fit.phase_of(row, "step") * share + larger * a_megapixel("step", 1)
+    importance = fit.phase_of(row, "importance") / trained * share + larger * a_megapixel("start", split(fit.FEW)[0])
+    evaluate = fit.phase_of(row, "evaluate") / held_out * share + larger * a_megapixel("evaluate", split(fit.FEW)[1])
+    order = fit.phase_of(row, "order") * share * math.log(count) / math.log(n)
+    fixed = (fit.phase_of(row, "load") + 2 * fit.phase_of(row, "write")) * share
     return BLOCK_STEPS * step, LOOKED_AT * importance + HELD_OUT * evaluate + order + fixed
 
 
@@ -93,43 +80,43 @@ def draw(rows: Sequence[Row]) -> None:
     """Four panels: seconds and memory of the commands, phases of adapting, adapting over photographs."""
     with new_figure((9.6, 7.2), layout="constrained") as figure:
         (a, b), (c, d) = figure.subplots(2, 2)
-        for command, colour in zip(COMMANDS, SERIES, strict=True):
-            points = seconds_of(rows, command)
-            line(a, points, colour, f"{command}  {growth(points)[0]:.2f}")
-            memory = [(row["gaussians"], row["peak_bytes"] / 1e9) for row in over_count(rows, command)]
-            line(b, memory, colour, f"{command}  {bytes_a_gaussian(rows, command)[0]:,.0f} B")
-        for phase, colour in zip(PHASES, (*SERIES, "#b8860b"), strict=True):
-            points = seconds_of(rows, "adapt", phase)
-            line(c, points, colour, f"{phase}  {growth(points)[0]:.2f}")
+        for command, colour in zip(fit.COMMANDS, SERIES, strict=True):
+            points = fit.seconds_of(rows, command)
+            line(a, points, colour, f"{command}  {fit.growth(points)[0]:.2f}")
+            memory = [(row["gaussians"], row["peak_bytes"] / 1e9) for row in fit.over_count(rows, command)]
+            line(b, memory, colour, f"{command}  {fit.bytes_a_gaussian(rows, command)[0]:,.0f} B")
+        for phase, colour in zip(fit.PHASES, (*SERIES, "#b8860b"), strict=True):
+            points = fit.seconds_of(rows, "adapt", phase)
+            line(c, points, colour, f"{phase}  {fit.growth(points)[0]:.2f}")
         guide(c, rows)
-        for series, x, colour in (("images", itemgetter("images"), SERIES[0]), ("shapes", megapixels, SERIES[1])):
+        for series, x, colour in (("images", itemgetter("images"), SERIES[0]), ("shapes", fit.megapixels, SERIES[1])):
             chosen = sorted((row for row in rows if row["series"] == series), key=x)
             name = "photographs" if series == "images" else "size of each"
             for key, style in (("start", "-"), ("step", "--"), ("evaluate", ":")):
-                points = [(row["images"] * megapixels(row), row["phases"][key]) for row in chosen]
-                line(d, points, colour, f"{key}, {name}  {exponent(points):.2f}", style)
+                points = [(row["images"] * fit.megapixels(row), row["phases"][key]) for row in chosen]
+                line(d, points, colour, f"{key}, {name}  {fit.exponent(points):.2f}", style)
         finish(a, "Seconds of a command, and exponent", "Gaussians", "seconds")
         finish(b, "Peak memory, and bytes a Gaussian", "Gaussians", "GB")
         finish(c, "Phases of adapting, and exponent", "Gaussians", "seconds; of one step")
         d.set_ylim(bottom=d.get_ylim()[0] / 8)  # room for six names
-        finish(d, f"Adapting {SERIES_COUNT:,} Gaussians", "megapixels of all photographs", "seconds; of one step")
+        finish(d, f"Adapting {fit.SERIES_COUNT:,} Gaussians", "megapixels of all photographs", "seconds; of one step")
         PICTURE.parent.mkdir(exist_ok=True)
         save_figure(figure, PICTURE)
     Image.open(PICTURE).convert("RGB").quantize(128).save(PICTURE, optimize=True)  # a third of the bytes
 
 
 def line(axes: Any, points: Sequence[tuple[float, float]], colour: str, label: str, style: str = "-") -> None:
-    shown = [(x, y) for x, y in points if y > 0 and x != FLOOR]
+    shown = [(x, y) for x, y in points if y > 0 and x != fit.FLOOR]
     if shown:
         axes.plot(*zip(*shown, strict=True), style, color=colour, marker="o", markersize=4, linewidth=1.6, label=label)
 
 
 def guide(axes: Any, rows: Sequence[Row]) -> None:
     """What n log n would be, through the last point of the pruning order."""
-    points = seconds_of(rows, "adapt", "order")
+    points = fit.seconds_of(rows, "adapt", "order")
     if points:
         n, seconds = points[-1]
-        x = np.array([size for size, _ in points if size != FLOOR], float)
+        x = np.array([size for size, _ in points if size != fit.FLOOR], float)
         axes.plot(x, seconds * x * np.log(x) / (n * math.log(n)), color=QUIET, linewidth=0.8, label="n log n")
 
 

@@ -52,7 +52,7 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
     views, placement = photographs, None
     if kind == "teacher":
         # Of the views to train on alone; none is held out of them.
-        views = clod.Scene(tuple(_own(base, view.camera) for view in photographs.train), ())
+        views = clod.Scene(tuple(render_pseudo_views(base, [view.camera]).train[0] for view in photographs.train), ())
     if kind == "placed":
         cameras = place_cameras(base, seed=config.seed)
         views = render_pseudo_views(base, cameras)
@@ -70,10 +70,6 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
         "steps": adapted.steps, "views_seconds": round(seconds, 2), "start_seconds": round(adapted.start_seconds, 2),
         "train_seconds": round(adapted.seconds, 2),
     })  # fmt: skip
-
-
-def _own(base: clod.Gaussians, camera: clod.Camera) -> clod.View:
-    return render_pseudo_views(base, [camera]).train[0]
 
 
 def distances(placed: list[clod.Camera], real: list[clod.Camera], reach: float) -> dict[str, list[float]]:

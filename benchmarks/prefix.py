@@ -12,7 +12,8 @@ opacities in the file:
 - ``own``, ``opacity``, ``removal error``: the adapted file as it is, by falling opacity, by falling removal error;
 - ``base, ...``: the untouched checkpoint in the adapted one's order of extinction, by opacity, by removal error.
 
-Each run adds a row to ``results/prefix.jsonl``.
+Each run adds a row to ``results/prefix.jsonl``; those of commit c0ce1ea have ``extinction`` and ``baked`` at the one
+distance d' = 1, and as ``extinction, views`` the order by the mean of log s* over the training cameras.
 """
 
 from __future__ import annotations
@@ -35,12 +36,8 @@ def main() -> None:
     parser.add_argument("scene", help="its capture")
     parser.add_argument("--base", default="pretrained", help="the capture's checkpoint that was adapted")
     args = parser.parse_args()
-    measure(args.model, args.scene, args.base)
-
-
-def measure(model: str, scene: str, base_name: str) -> None:
-    adapted, base = clod.load(model).gaussians, checkpoint(f"{scene}/{base_name}").gaussians
-    views, console = photographs(scene), Console()
+    adapted, base = clod.load(args.model).gaussians, checkpoint(f"{args.scene}/{args.base}").gaussians
+    views, console = photographs(args.scene), Console()
 
     def psnr(gaussians: clod.Gaussians, what: str, s: float = 1.0) -> tuple[float, float]:
         row = clod.evaluate(gaussians, views.test, [s])[0]
@@ -60,7 +57,7 @@ def measure(model: str, scene: str, base_name: str) -> None:
             drawn[what] = psnr(head(gaussians, count), what)[0] if count <= len(gaussians) else None
         rows.append({"virtual_scale": s, "count": count, "share": count / len(adapted), "psnr": drawn})
     append(FILE, {
-        "benchmark": "prefix", "model": Path(model).name, "scene": scene, "gaussians": len(adapted),
+        "benchmark": "prefix", "model": Path(args.model).name, "scene": args.scene, "gaussians": len(adapted),
         "all": {"adapted": psnr(clod.detach(adapted), "all, unfaded")[0], "base": psnr(base, "base")[0]}, "rows": rows,
     })  # fmt: skip
 

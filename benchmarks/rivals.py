@@ -22,8 +22,8 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from common import CACHE, append, arguments, checkpoint, falling, head, photographs, stored, table
-from merging import Merger
+from common import append, arguments, checkpoint, falling, head, photographs, stored, table
+from merging import find_tool, merge
 from torch import Tensor
 from tuning import Tuning, tune
 
@@ -77,16 +77,15 @@ class Contest:
         })  # fmt: skip
 
     def merging(self) -> None:
-        merger, rows = Merger.find(CACHE), []
+        rows = []
         for share, count in self.counts.items():
-            merged, seconds = merger.merge(self.base, count)
+            merged, seconds = merge(self.base, count)
             rows.append({**self.measure(merged, share), "seconds": seconds})
-        self.record("merging", f"splat-transform {merger.version} --decimate", rows)
+        self.record("merging", f"splat-transform {find_tool().version} --decimate", rows)
 
     def specialist(self) -> None:
-        merger = Merger.find(CACHE)
         for share, count in self.counts.items():
-            merged, seconds = merger.merge(self.base, count)
+            merged, seconds = merge(self.base, count)
             for seed in self.args.seed:
                 self.tune("specialist", "merged, then tuned", merged, seed, [share], merge_seconds=seconds)
 

@@ -15,9 +15,9 @@ import sys
 from collections.abc import Callable, Sequence
 from statistics import fmean
 
-from common import CACHE, RESULTS, ROOT, Row, append, arguments, checkpoint, photographs
+from common import RESULTS, ROOT, Row, append, arguments, checkpoint, photographs
 from common import stored as stored_rows
-from merging import Merger
+from merging import merge
 from tuning import Tuning, tune
 
 import clod_adapter as clod
@@ -90,7 +90,7 @@ def specialists(
     """Seconds and row of the specialist for each dial value; merging is within its time."""
     seconds, rows = [], []
     for s, count in zip(DIALS, counts, strict=True):
-        start, merging = Merger.find(CACHE).merge(base, count) if s > 1 else (base.gaussians, 0.0)
+        start, merging = merge(base, count) if s > 1 else (base.gaussians, 0.0)
         tuned = tune(start, views.train, Tuning(iters=iters), lambda share, text: follow(share))
         row = clod.evaluate(tuned.gaussians, views.test, [1.0])[0].as_dict()
         rows.append(row | {"virtual_scale": s, "kept_share": row["kept"] / len(base.gaussians)})

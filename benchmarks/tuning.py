@@ -49,10 +49,7 @@ class Tuned:
 
 
 def tune(
-    start: clod.Gaussians,
-    views: tuple[clod.View, ...],
-    config: Tuning,
-    progress: Callable[[float, str], None],
+    start: clod.Gaussians, views: tuple[clod.View, ...], config: Tuning, progress: Callable[[float, str], None]
 ) -> Tuned:
     """Minimises 0.8 L1 + 0.2 (1 - SSIM), a view a step, with Adam over all attributes of all Gaussians.
 
