@@ -47,6 +47,7 @@ for line in sys.stdin:
         log = os.open(about["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         for stream in (1, 2):
             os.dup2(log, stream)
+        torch.set_num_threads(1 if about["environment"] else 2)
         resume.SAVE_EVERY, resume.SAVE_COST = 0.0, 1e9  # a state after each step
         code = 1
         try:

@@ -28,7 +28,6 @@ from runs import OUTPUTS, STATE, Server, log_of, names, pressing, wait_for
 from scenes import stripped
 
 ITERS, KILLS = 24, 20
-THREADS = "torch.set_num_threads(2)"
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +89,7 @@ def test_kills_at_random_moments(
         shutil.copytree(want, folder) if chain % 2 else folder.mkdir()
         code = -signal.SIGKILL
         while code != 0:
-            child = server.start(folder, *words, "--resume", before=THREADS)
+            child = server.start(folder, *words, "--resume")
             if kills < KILLS:
                 began, after = time.monotonic(), draw.uniform(0, seconds)
                 while (lived := time.monotonic() - began) < after and not server.ask(ended=child):
