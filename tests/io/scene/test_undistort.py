@@ -163,6 +163,7 @@ def test_nowhere_to_keep_them(tmp_path: Path, cache: Path, monkeypatch: pytest.M
         ("OPENCV", [140, 140, 80, 60, 1e300, 0, 0, 0], "not usable"),
         ("SIMPLE_RADIAL", [-140, 80, 60, 0.1], "not usable"),
         ("PINHOLE", [140, 140, float("inf"), 60], "not usable"),
+        ("PINHOLE", [0, 140, 80, 60], "not usable"),
     ],
 )
 def test_cameras_that_cannot_be_undistorted(tmp_path: Path, kind: str, params: list[float], said: str) -> None:
