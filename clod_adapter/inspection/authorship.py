@@ -39,7 +39,7 @@ def looks_like(head: Head) -> str | None:
 
 def _by_layout(names: list[str]) -> str | None:
     if set(MASKS) <= set(names):
-        return "MaskGaussian's trainer as it was at first"
+        return "MaskGaussian's trainer, an early version"
     if FILTER in names:
         return "Mip-Splatting's trainer"
     plain = [name for name in names if name != SIGMA]

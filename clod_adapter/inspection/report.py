@@ -169,7 +169,7 @@ def _inspect_splat(
     )  # fmt: skip
     writer = looks_like(head) if head else f"clod-adapter {metadata.version}" if metadata.version else None
     if writer == NERFSTUDIO:
-        notes = [*notes, "in nerfstudio's own frame: its dataparser_transforms.json belongs into the scene's folder"]
+        notes = [*notes, "in nerfstudio's own frame: its dataparser_transforms.json belongs in the scene's folder"]
     return Inspection(
         path=str(path), size=path.stat().st_size, what=_what(path, source, splat), writer=writer, splat=splat,
         about=None, anomalies=tuple(_anomalies(splat, questions)),
@@ -226,31 +226,37 @@ def _anomalies(splat: Splat, questions: dict[str, tuple[float, float]]) -> list[
     for reason, gone in v.dropped.items():
         note("unusable", gone, f"{{count:,}} rows are not used: {reason}")
     note("infinite_opacity", v.infinite_opacity, "{count:,} have opacity = +inf, which is fully opaque")
-    note("doubles", v.doubles, "{count:,} stand exactly where another does")
-    note("far", v.far, f"{{count:,}} are {FAR:g} times as far out as nine tenths of the rest, or farther")
+    note("doubles", v.doubles, "{count:,} have the same position as another Gaussian")
+    note("far", v.far, f"{{count:,}} are at least {FAR:g} times as far from the centre as 90 % of all")
     note("giant", v.giant, "{count:,} are larger than half the scene")
     if splat.sh_degree and not v.used_sh_degree:
         note("empty_harmonics", 1, "all higher harmonics are 0: no view-dependent colour")
     if any(splat.origin):
-        found.append(Anomaly("far_from_0", 0, "the scene is far from 0: read relative to an origin of its own"))
+        found.append(Anomaly("far_from_0", 0, "coordinates are far from 0; they are read relative to a local origin"))
     wide = [name for name, kind in splat.columns if kind == "float64"]
     note("double_precision", len(wide), f"{{count}} properties are double: {_list(wide)}")
     if splat.screen_filter.compensate:
-        found.append(Anomaly("antialiased", 0, f"trained antialiased, and drawn so: {splat.screen_filter.description}"))
+        found.append(
+            Anomaly(
+                "antialiased",
+                0,
+                f"trained with antialiasing: {splat.screen_filter.description}",
+            )
+        )
     return found
 
 
 def _left_out(splat: Splat, notes: Sequence[str], changes: Sequence[str]) -> list[str]:
     v, lines = splat.values, []
     if gone := v.total - v.count:
-        lines.append(f"{gone:,} of {v.total:,} rows, which cannot be used")
+        lines.append(f"{gone:,} of {v.total:,} rows, which are not usable")
     lines += [note.removeprefix("not carried over to outputs: ") for note in notes if "carried over" in note]
     if any(name == FILTER for name, _ in splat.columns):
-        lines.append("filter_3D, which is fused into scale and opacity")
+        lines.append("filter_3D, which is merged into scale and opacity")
     if splat.sh_degree > v.used_sh_degree:
         lines.append(f"harmonics above degree {v.used_sh_degree}, which are 0: skipped in training, kept in the output")
     if splat.extra:
-        lines.append(f"nothing of {_list(splat.extra)}: they go along as they are")
+        lines.append(f"{_list(splat.extra)}: not used, copied to outputs")
     return lines + [change for change in changes if "taken as activated" in change]
 
 

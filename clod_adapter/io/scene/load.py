@@ -130,18 +130,18 @@ def _left_out(
         pinhole, masked: whether all cameras are pinholes, and whether the scene has masks.
     """
     whole, used = sum(3 * w * h for w, h in sizes), sum(3 * view.camera.width * view.camera.height for view in views)
-    found = [("exposure", "each photograph counts as it is: no light is balanced between them")]
+    found = [("exposure", "not modelled: photographs are used without exposure compensation")]
     if pinhole:
         found.append(("undistortion", f"all {len(views)} cameras are pinholes"))
     if TRANSPARENT not in notes:
         found.append(("alpha", f"none of {len(views)} photographs has transparency"))
     if not masked:
-        found.append(("masks", "the scene has none"))
+        found.append(("masks", "the scene has no masks"))
     if used < whole:
         kept = f"{used / 1e6:,.3g} MB of the {whole / 1e6:,.3g} MB in the files"
         found.append(("pixels", f"kept are {kept}: photographs are scaled as they are decoded"))
     else:
-        found.append(("scaling", f"all {len(views)} photographs are used at the size they have"))
+        found.append(("scaling", f"all {len(views)} photographs are used at full resolution"))
     return tuple(found)
 
 

@@ -88,7 +88,7 @@ def test_settings_of_the_option_and_of_the_file(clod: Any, trained: tuple[Path, 
     (note,) = [note for note in json.loads(told.out)["notes"] if "(--antialiasing)" in note]
     assert "the file has 0.1 px^2 of blur, opacities compensated" in note and note in told.err
     done = clod("inspect", "dial.ply")
-    assert "trained antialiased, and drawn so: 0.1 px^2 of blur, opacities compensated" in done.out + done.err
+    assert "trained with antialiasing: 0.1 px^2 of blur, opacities compensated" in done.out + done.err
     assert json.loads(clod("inspect", "dial.ply", "--json").out)["splat"]["screen_filter"]["variance"] == 0.1
 
 

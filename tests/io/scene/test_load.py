@@ -150,7 +150,7 @@ def test_what_the_scene_does_not_need(tmp_path: Path) -> None:
     assert set(spared) == {"undistortion", "alpha", "masks", "exposure", "scaling"}
     assert spared["undistortion"] == "all 3 cameras are pinholes"
     assert spared["alpha"] == "none of 3 photographs has transparency"
-    assert spared["scaling"] == "all 3 photographs are used at the size they have"
+    assert spared["scaling"] == "all 3 photographs are used at full resolution"
     scaled = dict(load_scene(tmp_path / "plain", max_width=20).left_out)
     assert "scaling" not in scaled
     assert scaled["pixels"].startswith("kept are 0.0027 MB of the 0.0108 MB in the files")  # 3 x 20x15 and 40x30, RGB
