@@ -130,16 +130,6 @@ def test_progress_is_over_all_cells(run: Any, monkeypatch: pytest.MonkeyPatch) -
     assert run("--quiet", "--out", "other").err == ""
 
 
-@pytest.mark.usefixtures("blank_figure")
-def test_checkpoints_of_one_name(clod: Any, capture: Any, tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        capture.write(tmp_path / name / "point_cloud.ply", capture.gaussians)
-    words = ("--images", capture.scene, "--max-sv", 1, "--iters", 1, "--json")
-    report = json.loads(clod("robustness", "a/point_cloud.ply", "b/point_cloud.ply", *words).out)
-    assert [c["checkpoint"] for c in report["checkpoints"]] == ["a_point_cloud", "b_point_cloud"]
-
-
 def test_what_cannot_be_read_leaves_no_folder(clod: Any, capture: Any, tmp_path: Path) -> None:
     scene = tmp_path / "scene"
     shutil.copytree(capture.scene, scene)

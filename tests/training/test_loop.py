@@ -264,15 +264,6 @@ def test_the_count_term_pulls_the_count_down(captured: Pair) -> None:
     assert kept[1] < 0.9 * kept[0]
 
 
-def test_only_sigma_where_other_rates_are_zero(captured: Pair) -> None:
-    still = {f"lr_{name}": 0.0 for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
-    result = adapt(*captured, config_of(iters=10, **still)).gaussians
-    for name in ATTRIBUTES:
-        assert torch.equal(getattr(result, name), getattr(captured[0], name)), name
-    want = initialize(captured[0], captured[1].train, config_of()).sigma_d
-    assert ((result.sigma_d / want - 1).abs() > 1e-3).any()
-
-
 @pytest.mark.parametrize(("rate", "evaluated"), [(0.0, 0), (1e-3, 3)])
 def test_splatting_gets_the_filter_and_no_empty_harmonics(
     captured: Pair, monkeypatch: pytest.MonkeyPatch, rate: float, evaluated: int
@@ -424,15 +415,12 @@ def test_a_listener_that_stops_returns_the_result_so_far(captured: Pair) -> None
         return p.done != 5 or p.phase != Phase.TRAINING
 
     result = adapt(*captured, config_of(iters=50), stop)
+    for phase in (Phase.IMPORTANCE, Phase.PRUNING_ORDER):
+        with pytest.raises(Stopped):
+            adapt(*captured, config_of(iters=5), lambda now, phase=phase: now.phase != phase)
     assert result.interrupted and not result.signalled and result.steps == 5
     for name, value in result.gaussians.tensors().items():
         assert torch.equal(value, states[-1][name]) and value.isfinite().all() and not value.requires_grad, name
-
-
-@pytest.mark.parametrize("phase", [Phase.IMPORTANCE, Phase.PRUNING_ORDER])
-def test_a_listener_that_stops_before_training(captured: Pair, phase: Phase) -> None:
-    with pytest.raises(Stopped):
-        adapt(*captured, config_of(iters=5), lambda now: now.phase != phase)
 
 
 def test_an_update_that_fails_leaves_no_state_to_save(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -455,19 +443,20 @@ def states_of(steps: set[int], found: dict[int, TrainingState]) -> Callable[[Pro
     return keep
 
 
+RATES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 RESUMED = {
     "ours": {},
     "paper": vars(AdaptConfig.paper(iters=12, max_sv=4.0)),
     "linear": {"parameter": "linear", "lr_shN": 0.0},
     "mean of all": {"average": 1.0, "max_sv": 1.0},
-    "few attributes": {"lr_means": 0.0, "lr_quats": 0.0, "average": 0.0},
+    "sigma_d alone": {f"lr_{name}": 0.0 for name in RATES} | {"average": 0.0},
 }
 
 
 @pytest.mark.parametrize(
     ("form", "kind"),
     [("ours", "fresh"), ("paper", "with a dial"), ("linear", "empty"), ("mean of all", "with a dial"),
-     ("few attributes", "fresh")],
+     ("sigma_d alone", "fresh")],
 )  # fmt: skip
 def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str, kind: str) -> None:
     """From within a round of views and at its end, before, at the beginning of and within the averaging, at the end."""
@@ -478,6 +467,9 @@ def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str, kind: 
         base = attach(base, torch.full((len(base),), 1.5), AttenuationConfig(scene_distance=4.0, max_sv=3.0))
     config, states = config_of(**{"iters": 12, **RESUMED[form]}), dict[int, TrainingState]()
     whole = adapt(base, scene, config, states_of({1, 6, 10, 11, 12}, states))
+    if form == "sigma_d alone":
+        assert all(torch.equal(getattr(whole.gaussians, name), getattr(base, name)) for name in ATTRIBUTES)
+    assert ((whole.gaussians.sigma_d / initialize(base, scene.train, config).sigma_d - 1).abs() > 1e-3).any()
     seen: list[Progress] = []
     for steps, state in states.items():
         again = adapt(base, scene, config, seen.append, copy.deepcopy(state))
@@ -540,27 +532,17 @@ def test_max_sv_of_one(captured: Pair) -> None:
     assert result.attenuation.max_sv == 1.0
 
 
-def test_one_gaussian_and_one_that_is_never_seen() -> None:
+def test_scenes_at_the_edge(captured: Pair) -> None:
+    """One Gaussian, one that is never seen, and all cameras in one place."""
     views = photograph(gaussians(20, 0, 0), ring(2, 20, 16))
     for means in ([[0.0, 0.0, 0.0]], [[1e3, 0.0, 0.0]]):
         one = gaussians(1, 0, 0).replace(means=torch.tensor(means))
         found = adapt(one, Scene(views, ()), config_of(iters=5)).gaussians
         assert all(value.isfinite().all() for value in found.tensors().values())
-
-
-def test_cameras_in_one_place_move_means_all_the_same(captured: Pair) -> None:
-    """By the distances in their pictures, as their own are 0."""
+    # Cameras in one place move means by the distances in their images, as their own are 0.
     base, scene = captured
     found = adapt(base, Scene(scene.train[:1] * 2, ()), config_of(iters=3)).gaussians
     assert camera_extent([scene.train[0].camera] * 2) == 0 and not found.means.equal(base.means)
-
-
-def test_what_cannot_be_adapted_is_named(captured: Pair) -> None:
-    base, scene = captured
-    with pytest.raises(ClodError, match="no training views"):
-        adapt(base, Scene((), scene.test))
-    with pytest.raises(ClodError, match="no Gaussians"):
-        adapt(gaussians(0, 1, 0), scene)
 
 
 @pytest.mark.parametrize(
@@ -580,8 +562,12 @@ def test_infinite_opacities_stay(captured: Pair, config: AdaptConfig, logit: flo
     assert all(value.isfinite().all() for name, value in found.tensors().items() if name != "opacity_logits")
 
 
-def test_a_base_that_is_not_finite_is_refused(captured: Pair) -> None:
+def test_inputs_that_cannot_be_adapted_are_refused(captured: Pair) -> None:
     base, scene = captured
+    with pytest.raises(ClodError, match="no training views"):
+        adapt(base, Scene((), scene.test))
+    with pytest.raises(ClodError, match="no Gaussians"):
+        adapt(gaussians(0, 1, 0), scene)
     for name, value in (("sh0", math.inf), ("log_scales", -math.inf), ("opacity_logits", math.nan)):
         values = getattr(base, name).clone()
         values[5:7] = value

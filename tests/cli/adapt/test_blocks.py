@@ -18,13 +18,14 @@ from clod_adapter.blocks import memory
 from clod_adapter.blocks.file import KEY, load_block, save_block
 from clod_adapter.blocks.memory import MemoryPlan, plan_for_limit
 from clod_adapter.cli.adapt import memory as memory_option
-from clod_adapter.cli.adapt import progress as follower
 from clod_adapter.cli.adapt import resume
+from clod_adapter.cli.adapt.progress import ProgressDisplay
 from clod_adapter.progress import Phase, Progress
 from runs import change_step, fail, names
 from scenes import stripped
 
 BLOCKS = 3
+KINDS = ("json", "ply", "safetensors")
 
 
 @pytest.fixture
@@ -98,14 +99,17 @@ def test_jobs_end_as_one_process_does(adapt: Callable[..., Any], whole: dict[str
     assert not [path for path in tmp_path.iterdir() if "block" in path.name or "start" in path.name]
 
 
-def test_a_killed_block_goes_on(
-    adapt: Callable[..., Any], whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Killed after its fifth step: the same command goes on from the state that was saved, and ends the same."""
-    saving = resume.Saver.saving
+def of_run(config: Any) -> bool:
+    """Not of the run that prepares the kernels."""
+    return bool(config.max_sv == 3)
 
-    class Killed(BaseException):
-        pass
+
+class Killed(BaseException):
+    """Ends a run without any of its own handling."""
+
+
+def kill(patch: pytest.MonkeyPatch) -> None:
+    saving = resume.Saver.saving
 
     def dying(self: resume.Saver, listener: Any) -> Any:
         call = saving(self, listener)
@@ -119,17 +123,46 @@ def test_a_killed_block_goes_on(
 
         return step
 
-    monkeypatch.setattr(resume.Saver, "saving", dying)
-    with pytest.raises(Killed):
-        adapt("again.ply")
-    monkeypatch.setattr(resume.Saver, "saving", saving)
-    left = sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("again"))
-    assert left == [
-        "again.block1.pass1.safetensors", "again.block2.pass1.resume.safetensors", "again.start.safetensors"
-    ]  # fmt: skip
-    done = adapt("again.ply")
-    assert done.code == 0 and "resuming again.block2.pass1.resume.safetensors from step 5" in done.err
-    assert outputs(tmp_path, "again") == whole
+    patch.setattr(resume.Saver, "saving", dying)
+
+
+def press(patch: pytest.MonkeyPatch) -> None:
+    call = ProgressDisplay.__call__
+
+    def pressed(self: ProgressDisplay, progress: Progress) -> bool:
+        if progress.phase == Phase.TRAINING and progress.done == 3 and "block 2 of 3, pass 1" in self.training:
+            self.stop.requests += 1
+        return call(self, progress)
+
+    patch.setattr(ProgressDisplay, "__call__", pressed)
+
+
+@pytest.mark.parametrize(
+    ("ended", "code", "said", "state", "steps"),
+    [
+        (kill, None, "", "a.block2.pass1.resume.safetensors", 5),
+        (press, 130, "pass 1 of 2: stopped after step 3; the same command", "a.block2.pass1.resume.safetensors", 3),
+        (lambda patch: change_step(patch, 6, fail, of_run), 1, "the same command resumes from step 5, which is in "
+         "a.block1.pass1.resume.safetensors\n", "a.block1.pass1.resume.safetensors", 5),
+    ],
+    ids=["killed", "ctrl-c", "error"],
+)  # fmt: skip
+def test_a_block_that_was_ended_is_resumed(
+    adapt: Any, whole: dict[str, bytes], tmp_path: Path, ended: Any, code: Any, said: str, state: str, steps: int
+) -> None:
+    """The same command keeps finished blocks, resumes the one that was ended, and gives the same files."""
+    with pytest.MonkeyPatch.context() as patch:
+        ended(patch)
+        if code is None:
+            with pytest.raises(Killed):
+                adapt("a.ply")
+        else:
+            done = adapt("a.ply", *(["--quiet"] if code == 1 else []))
+            assert done.code == code and said in done.err, done
+    finished = ["a.block1.pass1.safetensors"] if "block2" in state else []
+    assert names(tmp_path) == sorted([*finished, state, "a.start.safetensors"])
+    done = adapt("a.ply")
+    assert done.code == 0 and f"resuming {state} from step {steps}" in done.err and outputs(tmp_path, "a") == whole
 
 
 def test_files_of_another_run_are_refused(
@@ -191,26 +224,17 @@ def test_what_cannot_be(clod: Callable[..., Any], capture: Any, adapt: Callable[
 
 
 def test_what_fits_is_as_without(clod: Callable[..., Any], capture: Any, tmp_path: Path) -> None:
-    """The limit alone changes nothing, however few photographs stay in memory."""
-    given = [capture.ply, "--images", capture.scene, "--iters", 6, "--max-sv", 3]
-    for name, more in (("a", []), ("b", ["--memory", "8GB"])):
-        done = clod(*given, "--out", f"{name}.ply", *more)
-        assert done.code == 0
-    assert "the whole scene at once" in done.err and "training" in done.err
-    assert outputs(tmp_path, "a") == outputs(tmp_path, "b")
-
-
-def test_what_fits_as_one_job(clod: Callable[..., Any], capture: Any, tmp_path: Path) -> None:
-    """The work of the job is in the outputs, and its files are removed, whatever their name's letters mean."""
-    given = [capture.ply, "--images", capture.scene, "--iters", 3, "--max-sv", 3, "--memory", "8GB", "--out", "[a].ply"]
-    assert clod(*given, "--block", 1).code == 0
-    done = clod(*given)
+    """A limit that is large enough changes nothing, also as a job, whose files are then removed."""
+    given = [capture.ply, "--images", capture.scene, "--iters", 6, "--max-sv", 3, "--out"]
+    assert clod(*given, "a.ply").code == 0
+    done = clod(*given, "b.ply", "--memory", "8GB")
+    assert done.code == 0 and "the whole scene at once" in done.err and "training" in done.err
+    assert clod(*given, "[c].ply", "--memory", "8GB", "--block", 1).code == 0
+    done = clod(*given, "[c].ply", "--memory", "8GB")
     assert done.code == 0 and "block 1 of 1, pass" not in done.err
-    assert "the initialization of 1 blocks exists" in done.err and names(tmp_path) == [
-        "[a].json",
-        "[a].ply",
-        "[a].safetensors",
-    ]
+    assert "the initialization of 1 blocks exists" in done.err
+    assert names(tmp_path) == sorted(f"{name}.{kind}" for name in ("[c]", "a", "b") for kind in KINDS)
+    assert outputs(tmp_path, "a") == outputs(tmp_path, "b")
 
 
 def test_opaque_gaussians_are_handed_on(clod: Callable[..., Any], capture: Any, forced: None, tmp_path: Path) -> None:
@@ -226,11 +250,6 @@ def test_opaque_gaussians_are_handed_on(clod: Callable[..., Any], capture: Any, 
     assert torch.equal(found.isinf(), logits.isinf()) and not found.isnan().any()
 
 
-def of_run(config: Any) -> bool:
-    """Not of the run that prepares the kernels."""
-    return bool(config.max_sv == 3)
-
-
 def test_a_block_whose_loss_is_not_finite_ends_early(
     adapt: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -242,32 +261,3 @@ def test_a_block_whose_loss_is_not_finite_ends_early(
     assert done.code == 1 and any(note in each for each in report["notes"]) and len(report["rows"]) > 2, done
     assert "block 1 of 3, pass 1 of 2: ended after step 2: the loss of step 3" in done.err
     assert clod_adapter.load(tmp_path / "a.ply").gaussians.sigma_d is not None
-
-
-def test_an_error_in_a_block_leaves_its_state(
-    adapt: Callable[..., Any], whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    change_step(monkeypatch, 6, fail, of_run)
-    done = adapt("a.ply", "--quiet")
-    state = "a.block1.pass1.resume.safetensors"
-    assert done.code == 1 and f"the same command resumes from step 5, which is in {state}\n" in done.err, done
-    done = adapt("a.ply")
-    assert done.code == 0 and f"resuming {state} from step 5" in done.err and outputs(tmp_path, "a") == whole
-
-
-def test_ctrl_c_leaves_what_is_finished(
-    adapt: Callable[..., Any], whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    call = follower.ProgressDisplay.__call__
-
-    def pressed(self: follower.ProgressDisplay, progress: Progress) -> bool:
-        if progress.phase == Phase.TRAINING and progress.done == 3 and "block 2 of 3, pass 1" in self.training:
-            self.stop.requests += 1
-        return call(self, progress)
-
-    monkeypatch.setattr(follower.ProgressDisplay, "__call__", pressed)
-    done = adapt("a.ply")
-    assert done.code == 130 and "pass 1 of 2: stopped after step 3; the same command resumes it" in done.err
-    assert (tmp_path / "a.block1.pass1.safetensors").exists() and not (tmp_path / "a.ply").exists()
-    monkeypatch.setattr(follower.ProgressDisplay, "__call__", call)
-    assert adapt("a.ply").code == 0 and outputs(tmp_path, "a") == whole

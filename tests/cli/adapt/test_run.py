@@ -24,7 +24,6 @@ from clod_adapter.cli.shared.report import machine_name, report_dials
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import write_model
-from clod_adapter.progress import Progress
 from runs import OUTPUTS, STATE, names, pressing
 from scenes import stripped
 
@@ -149,12 +148,8 @@ def test_interrupt_of_the_measuring(clod: Any, capture: Any, tmp_path: Path, mon
     real = measure.evaluate
 
     def evaluate(gaussians: Any, views: Any, dials: list[float], progress: Any, **rest: Any) -> Any:
-        def press(now: Progress) -> Any:
-            if now.total == 7 * len(views) and now.done == 3 * len(views) + 1:
-                signal.raise_signal(signal.SIGINT)
-            return progress(now)
-
-        return real(gaussians, views, dials, progress=press, **rest)
+        pressed = pressing(progress, signal.SIGINT, at=3 * len(views) + 1)
+        return real(gaussians, views, dials, progress=pressed if len(dials) == 7 else progress, **rest)
 
     monkeypatch.setattr(measure, "evaluate", evaluate)
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
