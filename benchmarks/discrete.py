@@ -24,7 +24,7 @@ from clod_adapter.cli.shared.console import Console
 from clod_adapter.evaluation import popping
 from clod_adapter.evaluation.popping import Popping
 from clod_adapter.metrics import psnr
-from clod_adapter.report.style import BLUE, ORANGE, QUIET, new_figure, save, tidy
+from clod_adapter.report.style import BLUE, ORANGE, QUIET, new_figure, save_figure, tidy
 
 PICTURE = ROOT / "docs" / "images" / "discrete_vs_continuous.png"
 STRIPS = 4
@@ -135,7 +135,7 @@ def draw(path: Path, view: clod.View, levels: Sweep, dial: Sweep) -> None:
             axes.set_xticks(ticks, [f"{s:g}" for s in ticks])
             axes.set_xticks([], minor=True)
             axes.legend(frameon=False, fontsize=8.5)
-        save(figure, path)
+        save_figure(figure, path)
 
 
 def draw_strips(axes: Any, name: str, frames: Sweep) -> None:

@@ -88,7 +88,7 @@ def read(kind: str, folder: Path, case: Input, number: int) -> None:
         load_adapter(folder / next(iter(case)))
     elif kind == "states":
         resumed = find_state(folder / next(iter(case)), True, clod.AdaptConfig(), Console(quiet=True))
-        if resumed is None or resumed.frozen is None:
+        if resumed is None:
             raise AssertionError("the state was not read")
     else:
         clod.load(folder / next(iter(case)), activated=None if number % 2 else "both")

@@ -25,7 +25,7 @@ from growth_rows import (
 )  # fmt: skip
 from PIL import Image
 
-from clod_adapter.report.style import QUIET, SERIES, label_log, new_figure, save, tidy
+from clod_adapter.report.style import QUIET, SERIES, label_log, new_figure, save_figure, tidy
 
 PICTURE, PAGE = ROOT / "docs" / "images" / "growth.png", ROOT / "docs" / "growth.md"
 # What is assumed of the city on paper, and of machines; the rest is measured.
@@ -114,7 +114,7 @@ def draw(rows: Sequence[Row]) -> None:
         d.set_ylim(bottom=d.get_ylim()[0] / 8)  # room for six names
         finish(d, f"Adapting {SERIES_COUNT:,} Gaussians", "megapixels of all photographs", "seconds; of one step")
         PICTURE.parent.mkdir(exist_ok=True)
-        save(figure, PICTURE)
+        save_figure(figure, PICTURE)
     Image.open(PICTURE).convert("RGB").quantize(128).save(PICTURE, optimize=True)  # a third of the bytes
 
 

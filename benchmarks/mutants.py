@@ -128,7 +128,7 @@ def _states(folder: Path) -> list[Input]:
             tensors, clod.AttenuationConfig(), random.bit_generator.state, (2, 0), 0.1, len(kinds) - 3, 1, 0.5, 0.5
         )
         belongs = {"version": package_version(), "config": asdict(clod.AdaptConfig()), "base_sha256": "0" * 64}
-        save_state(folder / "a.safetensors", state, belongs | {"frozen": ["quats"], "overruled": {"--with": ["sh0"]}})
+        save_state(folder / "a.safetensors", state, belongs | {"overruled": {"--with": ["sh0"]}})
         inputs.append({"a.safetensors": (folder / "a.safetensors").read_bytes()})
     return inputs
 

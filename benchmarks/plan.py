@@ -18,15 +18,13 @@ from typing import Any
 
 from common import COMMAND, SHARED, Process, append, arguments, stored, table
 
-from clod_adapter.training.plan import NAMES
-
 FILE = "plan.jsonl"
 SCENES = (
     "plush_half", "plush_half/pretrained_mask", "bonsai146", "ci_banana", "splats/lod_tiles/lod1_tile_0_0.5x.ply",
     "splats/playbot_lod4_from_sog.ply",
 )  # fmt: skip
 DIALS = (1.0, 3.0, 5.0)
-WAYS = {"everything": ["--with", *NAMES], "plan": [], "plan, trimmed": ["--trim"]}
+WAYS = {"everything": ["--with", "bands", "unseen"], "plan": [], "plan, trimmed": ["--trim"]}
 
 
 def main() -> None:
@@ -74,11 +72,14 @@ def print_table() -> None:
             last[row["scene"], row["steps"], row["way"]] = row
     lines, decisions = [], []
     for (scene, steps, way), row in last.items():
-        times = [f"{row['seconds'][phase]:.1f}" for phase in ("plan", "start", "train")]
+        # Rows from before attributes were only frozen by hand also have a time, and decisions, of attributes.
+        plan = sum(row["plan"]["seconds"].get(part, 0.0) for part in ("bands", "unseen", "trim"))
+        times = [f"{seconds:.1f}" for seconds in (plan, row["seconds"]["start"], row["seconds"]["train"])]
         sizes = [f"{row['ply_mb']:.1f}", f"{row['adapter_mb']:.2f}", f"{row['peak_mb']:.0f}"]
         lines.append([scene, steps, way, *times, *sizes, *(f"{r['psnr']:.2f} ({r['kept']:,.0f})" for r in row["rows"])])
         for made in row["plan"]["decisions"] if way == "plan, trimmed" else ():
-            decisions.append([scene, made["what"], made["verdict"], f"{made['measured']} {made['why']}"])
+            if made["verdict"] != "trained":
+                decisions.append([scene, made["what"], made["verdict"], f"{made['measured']} {made['why']}"])
     heads = ["scene", "steps", "run", "plan s", "start s", "train s", "PLY MB", "adapter MB", "peak MB"]
     print(table([*heads, *(f"dB at {s:g} (kept)" for s in DIALS)], lines, 3), end="\n\n")
     print(table(["scene", "item", "decision", "number"], decisions))

@@ -9,7 +9,7 @@ from stability_popping import STEPS as LENGTHS_OF_STEPS
 from stability_popping import SWEEPS, TOGETHER
 from stability_stiffness import CONFIG, CONVERGED, LENGTHS, OPTIMIZERS, STEPS, curves
 
-from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, QUIET, label_log, new_figure, save, tidy
+from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, QUIET, label_log, new_figure, save_figure, tidy
 
 
 def stiffness(rows: list[dict[str, Any]], path: Path) -> None:
@@ -49,7 +49,7 @@ def stiffness(rows: list[dict[str, Any]], path: Path) -> None:
         figure.legend(
             *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False, fontsize=8.5
         )
-        save(figure, path)
+        save_figure(figure, path)
 
 
 def popping(rows: list[dict[str, Any]], path: Path) -> None:
@@ -90,4 +90,4 @@ def popping(rows: list[dict[str, Any]], path: Path) -> None:
         figure.legend(
             handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize=8.5
         )
-        save(figure, path)
+        save_figure(figure, path)

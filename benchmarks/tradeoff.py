@@ -23,7 +23,7 @@ import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.report import page
 from clod_adapter.report.charts import draw_training, error, inline_svg, training_chart
-from clod_adapter.report.style import new_figure, save
+from clod_adapter.report.style import new_figure, save_figure
 
 FILE = "tradeoff.jsonl"
 PAGE = ROOT / "docs" / "error_vs_time.html"
@@ -145,7 +145,7 @@ def plot(scene: str, max_sv: float) -> None:
         for k, (axes, s) in enumerate(zip(figure.subplots(1, len(dials), squeeze=False)[0], dials, strict=True)):
             draw_training(axes, lines(curves(rows, k)), rows[-1]["base"]["psnr"])
             axes.set_title(f"s = {s:g}", loc="left", fontsize=10, weight="bold")
-        save(figure, PICTURE)
+        save_figure(figure, PICTURE)
     write(scene, max_sv, rows, dials)
     print(f"{PICTURE}\n{PAGE}")
 
@@ -164,7 +164,7 @@ def write(scene: str, max_sv: float, rows: list[dict[str, Any]], dials: list[flo
         body.append(page.section(f"s = {s:g}: {title}", page.chart(svg, CAPTION)))
         cells += [(f"s = {s:g}, {label}", [row_of(*point) for point in points]) for label, points in found.items()]
     head = ("seconds", "PSNR dB", "mean squared error, thousandths", "Gaussians kept")
-    body.append(page.section("All rows", page.table(head, cells)))
+    body.append(page.section("All rows", page.html_table(head, cells)))
     facts = rows[-1]["machine"] | {"max_sv": max_sv, "command": f"python benchmarks/tradeoff.py {scene}"}
     facts["commits"] = ", ".join(sorted({row["commit"] for row in rows}))
     body.append(page.section("What it was run with", page.facts(facts)))

@@ -26,7 +26,7 @@ import clod_adapter as clod
 from clod_adapter.adapter import detach
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.io.formats.splat_transform import SplatTransform
-from clod_adapter.viewer.page import write_page
+from clod_adapter.viewer.page import write_viewer_page
 
 sys.path.insert(0, str(ROOT / "tests"))
 import browser  # noqa: E402
@@ -137,7 +137,7 @@ def adapted(name: str) -> Path:
 
 
 def page_size(model: clod.Checkpoint, folder: Path, tool: SplatTransform | None) -> int:
-    write_page(folder / "page.html", model, tool=tool)
+    write_viewer_page(folder / "page.html", model, tool=tool)
     return (folder / "page.html").stat().st_size
 
 

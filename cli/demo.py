@@ -38,10 +38,10 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     check_extra()
     make_folder(folder)
     with output_lock(folder / "demo", of=folder):
-        return show(args, folder)
+        return run_demo(args, folder)
 
 
-def show(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+def run_demo(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Runs the demo; the caller holds the lock of the folder."""
     console, watch = Console(args.quiet), Stopwatch()
     capture, base, model = folder / "capture", folder / "base.ply", folder / "gallery.ply"
@@ -51,7 +51,7 @@ def show(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         raise ClodError(f"{base}: exists without {capture}, so the demo did not make it; choose another --out")
     prepare_kernels(console)
     with announced_compiling(console):
-        prepare(capture, base, console)
+        make_inputs(capture, base, console)
     report = adapt.run(adapt_arguments(args, base, capture, model))
     for path in pictures.values():  # of an earlier run
         path.unlink(missing_ok=True)
@@ -87,7 +87,7 @@ def print_next(folder: Path, pictures: dict[str, Path], watch: Stopwatch) -> Non
     print("next, a splat of your own:\n  clod-adapt YOURS.ply --images YOUR_SCENE")
 
 
-def prepare(capture: Path, base: Path, console: Console) -> None:
+def make_inputs(capture: Path, base: Path, console: Console) -> None:
     """Makes the capture and the base checkpoint, unless they exist."""
     # Here and not above: the ray tracer brings scikit-image, whose absence check_extra is to report first.
     from clod_adapter.demo.fit import fit_base

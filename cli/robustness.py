@@ -75,12 +75,12 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         interrupted = len(done) < len(missing)
         if not found:
             raise Stopped("stopped before the first cell was finished")
-        report = describe(args, cells, found, interrupted, [*scene.notes, *notes]) | {
+        report = describe_cells(args, cells, found, interrupted, [*scene.notes, *notes]) | {
             "views": len(scene.test), "machine": machine(), "seconds": watch.report(),
             "outputs": {k: str(v) for k, v in outputs.items()},
         }  # fmt: skip
         write_outputs(report, outputs, Path(args.images).resolve().name)
-    print_summary(report, outputs, watch)
+    print_cells(report, outputs, watch)
     return report
 
 
@@ -155,7 +155,7 @@ def position(cell: Cell, scene: Scene, now: Progress) -> tuple[float, str]:
     return (1 - measuring) * (begin + (end - begin) * now.share), text
 
 
-def describe(
+def describe_cells(
     args: argparse.Namespace,
     cells: Sequence[Cell],
     found: dict[str, dict[str, Any]],
@@ -189,7 +189,7 @@ def write_outputs(report: dict[str, Any], outputs: dict[str, Path], scene: str) 
     write_report(outputs["json"], report)
 
 
-def print_summary(report: dict[str, Any], outputs: dict[str, Path], watch: Stopwatch) -> None:
+def print_cells(report: dict[str, Any], outputs: dict[str, Path], watch: Stopwatch) -> None:
     """One line per cell: its first and last row."""
     width = max(len(cell["checkpoint"]) for cell in report["cells"])
     print(f"\n{'checkpoint':<{max(width, 10)}}  range     at the first              at the last")

@@ -27,7 +27,7 @@ MODEL, BASE = "/files/model", "/files/base"
 def run(args: argparse.Namespace) -> None:
     """Prints the address, or with --json the report, and serves the page until it is interrupted."""
     console = Console(args.quiet)
-    answers, report = prepare(args, console)
+    answers, report = make_page(args, console)
     with Server(answers, args.port) as server:
         report |= {"url": server.url, "port": server.port}
         # Here, and not by main after the command: a script needs the address while the page is served.
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> None:
             console.say("ended")
 
 
-def prepare(args: argparse.Namespace, console: Console) -> tuple[dict[str, Answer], dict[str, Any]]:
+def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Answer], dict[str, Any]]:
     """The answers of the server by path, and the report."""
     model, base = with_filter(read_checkpoint(args.model, console, args.activated), args, console), None
     if args.base:

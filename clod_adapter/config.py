@@ -229,6 +229,6 @@ class AdaptConfig:
         )  # fmt: skip
 
 
-def describe(config: Any) -> dict[str, str]:
+def field_descriptions(config: Any) -> dict[str, str]:
     """Help text by field name."""
     return {f.name: f.metadata["help"] for f in fields(config)}

@@ -22,7 +22,6 @@ class Phase(StrEnum):
     SH_DEGREES = "SH degrees"
     IMPORTANCE = "importance"
     PRUNING_ORDER = "pruning order"
-    FIRST_STEPS = "first steps"
     TRIMMING = "effect of trimming"
     COVERAGE = "block coverage"
     CONTEXT = "context Gaussians"

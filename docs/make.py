@@ -15,7 +15,7 @@ import clod_adapter  # noqa: F401  (before torch)
 from clod_adapter.cli.commands.adapt import ADAPT
 from clod_adapter.cli.commands.command import Command
 from clod_adapter.cli.main import COMMANDS, PROG, build_parser
-from clod_adapter.config import AdaptConfig, AttenuationConfig, describe
+from clod_adapter.config import AdaptConfig, AttenuationConfig, field_descriptions
 
 HERE = Path(__file__).resolve().parent
 PICTURE = HERE / "images" / "equation.png"
@@ -83,10 +83,10 @@ def settings_page() -> str:
     """Every field of the two configs with its default and, if different, its value in the paper's own form."""
     ours, paper, travels = AdaptConfig(), AdaptConfig.paper(), AttenuationConfig()
     rows = []
-    for name, text in describe(AdaptConfig).items():
+    for name, text in field_descriptions(AdaptConfig).items():
         value, other = getattr(ours, name), getattr(paper, name)
         rows.append(f"| `{name}` | {shown(value)} | {shown(other) if other != value else ''} | {text} |")
-    about = describe(AttenuationConfig)
+    about = field_descriptions(AttenuationConfig)
     fields = [f"| `{name}` | {shown(getattr(travels, name))} | {text} |" for name, text in about.items()]
     return SETTINGS.format(rows="\n".join(rows), fields="\n".join(fields))
 
@@ -107,7 +107,7 @@ def equation_picture(path: Path) -> None:
 
     from clod_adapter.attenuation import attenuate
     from clod_adapter.config import AttenuationConfig
-    from clod_adapter.report.style import INK, ORANGE, QUIET, label_log, new_figure, save, shades, tidy
+    from clod_adapter.report.style import INK, ORANGE, QUIET, label_log, new_figure, save_figure, shades, tidy
 
     def drawn(sigma: float, distances: Sequence[float], dials: Sequence[float], cut: str) -> list[float]:
         config, logit = AttenuationConfig(tau=TAU, cut=cut), torch.tensor([OPACITY]).logit()
@@ -138,7 +138,7 @@ def equation_picture(path: Path) -> None:
             axes.set_ylim(0, 0.9)
             axes.tick_params(colors=QUIET)
             tidy(axes)
-        save(figure, path)
+        save_figure(figure, path)
 
 
 def main() -> None:

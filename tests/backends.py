@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
+import sys
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -53,3 +56,13 @@ BACKENDS = {
     "cuda, gsplat in torch": Backend("cuda", dtype=torch.float64),
     "cuda": Backend("cuda", "cuda", repeats=False, looser=50.0),
 }
+
+
+def fresh_copy(monkeypatch: pytest.MonkeyPatch, name: str, package: str, installed: ModuleType | None) -> ModuleType:
+    """A second copy of ``clod_adapter.integrations.NAME``, imported while ``package`` is this module, or absent."""
+    monkeypatch.setitem(sys.modules, package, installed)
+    spec = importlib.util.find_spec(f"clod_adapter.integrations.{name}")
+    assert spec is not None and spec.loader is not None
+    copy = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(copy)
+    return copy

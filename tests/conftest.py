@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -25,9 +24,10 @@ from clod_adapter.cameras import Camera
 from clod_adapter.cli.main import main
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.splat_transform import VARIABLE
-from clod_adapter.io.ply.columns import column_map
+from clod_adapter.io.ply.columns import rows_of
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import render
+from scenes import looking
 
 fake_gpu.register()
 
@@ -49,7 +49,7 @@ def shared_data() -> Callable[[str], Path]:
 
 @pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
-    """The one browser of a test process, in which Playwright allows no second; skips where there is none."""
+    """The one browser of a test process (Playwright allows no second); skips where there is none."""
     with browser.launch() as chromium:
         yield chromium
 
@@ -62,7 +62,7 @@ def without_splat_transform(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @dataclass(frozen=True)
 class Capture:
-    """A scene folder with ten 64x48 photographs, the checkpoint they are pictures of, and how to write such a one."""
+    """A scene folder with ten 64x48 photographs, the checkpoint they show, and a writer of such checkpoints."""
 
     scene: Path
     ply: Path
@@ -88,7 +88,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 @pytest.fixture(scope="session")
 def dialled(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The capture's checkpoint with a dial up to 4 and its calibration, as the main job leaves it."""
+    """The capture's checkpoint with a dial up to 4 and its calibration, as clod-adapt writes it."""
     path = tmp_path_factory.mktemp("dialled") / "dial.ply"
     words = [capture.ply, "--images", capture.scene, "--iters", 12, "--max-sv", 4, "--out", path, "--quiet", "--json"]
     assert main([str(word) for word in words]) == 0
@@ -97,21 +97,10 @@ def dialled(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _write_inria(path: Path, gaussians: Gaussians) -> Path:
     """A plain file as Inria's trainer writes it, normals included."""
-    columns = column_map(gaussians.sh_degree)
-    order = ["means", "", "sh0", "shN", "opacity_logits", "log_scales", "quats"]
-    names = [name for key in order for name in sorted(columns.get(key, ("nx", "ny", "nz")), key=_by_number)]
-    vertex = np.zeros(len(gaussians), [(name, "<f4") for name in names])
-    for key, group in columns.items():
-        values = getattr(gaussians, key).reshape(len(gaussians), -1).numpy()
-        for column, name in enumerate(group):
-            vertex[name] = values[:, column]
+    plain = gaussians.replace(sigma_d=None, attenuation=None)
+    vertex = rows_of({name: value.numpy() for name, value in plain.tensors().items()})
     PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
     return path
-
-
-def _by_number(name: str) -> tuple[int, str]:
-    number = name.rpartition("_")[2]
-    return (int(number) if number.isdigit() else 0, name)
 
 
 def _blob(count: int) -> Gaussians:
@@ -128,11 +117,6 @@ def _blob(count: int) -> Gaussians:
 
 def _camera(angle: float) -> Camera:
     """On the circle of radius 5, looking at the origin, y down."""
-    forward = -torch.tensor([math.sin(angle), 0.1, math.cos(angle)])
-    forward = forward / forward.norm()
-    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
-    right = right / right.norm()
-    viewmat = torch.eye(4)
-    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat = looking(-torch.tensor([math.sin(angle), 0.1, math.cos(angle)]))
     viewmat[:3, 3] = torch.tensor([0.0, 0.0, 5.0])
     return Camera(viewmat, torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)

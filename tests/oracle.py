@@ -119,11 +119,8 @@ def assert_agrees(
 
 def assert_same(a: Result, b: Result, **tolerance: Any) -> None:
     """Asserts equality: bit for bit, or within ``torch.testing.assert_close``'s tolerances."""
-    for name, x, y in [
-        ("image", a.image, b.image),
-        ("alpha", a.alpha, b.alpha),
-        *((name, a.gradients[name], b.gradients[name]) for name in a.gradients),
-    ]:
+    pairs = [("image", a.image, b.image), ("alpha", a.alpha, b.alpha)]
+    for name, x, y in [*pairs, *((name, a.gradients[name], b.gradients[name]) for name in a.gradients)]:
         if tolerance:
             torch.testing.assert_close(x, y, **tolerance, msg=lambda m, name=name: f"{name}: {m}")
         else:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
 
@@ -57,21 +59,32 @@ def gaussians(n: int, degree: int, seed: int, *, size: float = 0.08) -> Gaussian
     return Gaussians(s["means"], s["quats"], logs, logits, s["sh0"], s["shN"])
 
 
+def dialled(n: int, degree: int, seed: int, **settings: Any) -> Gaussians:
+    """With a sigma_d that is log-normal around e, 0 in every 50th row, and attenuation settings (soft culling)."""
+    sigma_d = (torch.randn(n, generator=torch.Generator().manual_seed(seed + 1)) + 1).exp()
+    sigma_d[::50] = 0.0
+    attenuation = AttenuationConfig(**{"tau": 0.02, "cut": "soft", "scene_distance": 3.0} | settings)
+    return gaussians(n, degree, seed).replace(sigma_d=sigma_d, attenuation=attenuation)
+
+
+def looking(towards: Tensor) -> Tensor:
+    """``[4, 4]`` world to camera of a camera at the origin, y down."""
+    forward = towards / towards.norm()
+    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
+    right = right / right.norm()
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    return viewmat
+
+
 def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Camera]:
     """Cameras on a circle around the origin, looking at it, at slightly different heights and distances."""
     cameras = []
     for k in range(count):
         turn = 2 * math.pi * k / count
-        eye = (
-            radius
-            * (1 + 0.1 * math.cos(3 * turn))
-            * torch.tensor([math.cos(turn), 0.2 * math.sin(2 * turn), math.sin(turn)])
-        )
-        forward = -eye / eye.norm()
-        right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
-        right = right / right.norm()
-        viewmat = torch.eye(4)
-        viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        eye = torch.tensor([math.cos(turn), 0.2 * math.sin(2 * turn), math.sin(turn)])
+        eye = radius * (1 + 0.1 * math.cos(3 * turn)) * eye
+        viewmat = looking(-eye)
         viewmat[:3, 3] = -viewmat[:3, :3] @ eye
         K = torch.tensor([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1.0]])
         cameras.append(Camera(viewmat, K, width, height, f"view_{k}.png"))
@@ -106,3 +119,11 @@ def stripped(data: bytes) -> bytes:
         return re.sub(rb"(?m)^(comment clod_adapter calibrated .*) \S+$", rb"\1", data)
     text = re.sub(rb'\\"frame_ms\\": [0-9.e-]+', b"", data[8:])
     return text.replace(b" ", b"")  # the header is padded with spaces to a whole number of words
+
+
+def with_unseen(base: Gaussians, count: int = 40) -> tuple[Gaussians, Tensor]:
+    """``base`` with ``count`` Gaussians outside every image in between, and ``[N]`` bool: the rows of ``base``."""
+    far = base.select(torch.arange(count)).replace(means=base.means[:count] + torch.tensor([0.0, 90.0, 0.0]))
+    order = torch.randperm(len(base) + count, generator=torch.Generator().manual_seed(4))
+    values = {name: torch.cat([value, far.tensors()[name]])[order] for name, value in base.tensors().items()}
+    return base.replace(**values), order < len(base)

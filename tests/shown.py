@@ -18,7 +18,7 @@ from PIL import Image
 from clod_adapter.cameras import Camera
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.console import Console
-from clod_adapter.cli.view import prepare
+from clod_adapter.cli.view import make_page
 from clod_adapter.render import Rendering
 from clod_adapter.viewer.payload import page_config
 from clod_adapter.viewer.server import Server
@@ -94,14 +94,30 @@ def assert_same(shown: Shown, wanted: Rendering, keep: Path) -> None:
     assert abs(counts["kept"] - kept) <= COUNTS * kept and counts["total"] == len(wanted.kept)
 
 
-def drop(shown: Shown, name: str, data: bytes) -> None:
-    """Drops a file on the page."""
-    script = """([name, data]) => {
+def drop(shown: Shown, name: str, data: bytes, *, wait: int = 0, fails: bool = False) -> None:
+    """Drops a file on the page that can be read after ``wait`` milliseconds, or never."""
+    script = """([name, data, wait, fails]) => {
         const all = new DataTransfer();
         all.items.add(new File([Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0))], name));
-        document.body.dispatchEvent(new DragEvent("drop", { dataTransfer: all, bubbles: true, cancelable: true }));
+        const event = new DragEvent("drop", { dataTransfer: all, bubbles: true, cancelable: true });
+        if (wait || fails) {
+            const file = all.files[0], read = file.arrayBuffer.bind(file);
+            const later = new Promise((resolve) => setTimeout(resolve, wait));
+            file.arrayBuffer = () => later.then(() => fails ? Promise.reject(new DOMException("")) : read());
+            Object.defineProperty(event, "dataTransfer", { value: { files: [file] } });
+        }
+        document.body.dispatchEvent(event);
     }"""
-    shown.page.evaluate(script, [name, base64.b64encode(data).decode()])
+    shown.page.evaluate(script, [name, base64.b64encode(data).decode(), wait, fails])
+
+
+def message(shown: Shown, name: str) -> str:
+    """The page's error message about the file, once there is one; the message is then dismissed."""
+    shown.until(f"document.getElementById('message').textContent.includes('{name}')")
+    said = shown.text("#message")
+    shown.page.click("#dismiss")
+    assert shown.page.is_hidden("#message")
+    return said
 
 
 def fold(shown: Shown, open: bool) -> None:
@@ -121,7 +137,7 @@ def take(shown: Shown, path: Path) -> None:
 @contextmanager
 def serve(*words: object) -> Iterator[str]:
     """The address of what ``clod-adapt view`` serves for these words."""
-    answers, _ = prepare(build_parser("view").parse_args([str(word) for word in words]), Console(quiet=True))
+    answers, _ = make_page(build_parser("view").parse_args([str(word) for word in words]), Console(quiet=True))
     with Server(answers) as server:
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         yield server.url

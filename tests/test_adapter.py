@@ -61,28 +61,19 @@ def test_applying_is_the_result(names: list[str], scale: float, seed: int, bands
         assert ((getattr(result, name) - getattr(adapted, name)).abs() <= step).all()
 
 
-def test_differences_are_half_the_size() -> None:
-    base = gaussians()
-    adapter = extract(base, adapt(base, ["sh0"]), fingerprint="f", config={})
-    assert {name: update.dtype for name, update in adapter.updates.items()} == {"sh0": torch.float16}
-
-
-def test_overflowing_differences_are_kept_as_values() -> None:
-    base = gaussians()
-    adapted = adapt(base, ["means"], 1e6)
+@pytest.mark.parametrize(
+    ("unit", "step", "dtype"),
+    [(1.0, 0.01, torch.float16), (1.0, 1e6, torch.float32), (1e-4, 1e-7, torch.float32)],
+    ids=["half the size", "overflow", "underflow"],
+)
+def test_the_type_of_a_difference(unit: float, step: float, dtype: torch.dtype) -> None:
+    """Half floats where they can hold it; new values where it overflows, or is below what float16 resolves."""
+    base = gaussians(50)
+    base = base.replace(means=unit * base.means)
+    adapted = adapt(base, ["means"], step)
     adapter = extract(base, adapted, fingerprint="f", config={})
-    assert adapter.updates["means"].dtype == torch.float32
-    assert bits(adapter.apply(base))["means"] == bits(adapted)["means"]
-
-
-def test_tiny_differences_keep_their_precision() -> None:
-    """Those of a scene in small units are below what float16 tells apart."""
-    base = gaussians(50, 0, 0)
-    step = 1e-7 * torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
-    adapted = attach(base.replace(means=1e-4 * base.means + step))
-    adapter = extract(base.replace(means=1e-4 * base.means), adapted, fingerprint="", config={})
-    assert adapter.updates["means"].dtype == torch.float32
-    assert torch.equal(adapter.apply(base.replace(means=1e-4 * base.means)).means, adapted.means)
+    assert {name: update.dtype for name, update in adapter.updates.items()} == {"means": dtype}
+    assert dtype == torch.float16 or bits(adapter.apply(base))["means"] == bits(adapted)["means"]
 
 
 def test_infinite_logits() -> None:
@@ -108,33 +99,28 @@ def test_unchanged_values_keep_their_bits() -> None:
     assert bits(result)["means"][:3] == bits(base)["means"][:3]
 
 
-def test_disabled_means_the_base() -> None:
-    base = gaussians()
-    on = attach(base)
+def test_attach_and_detach() -> None:
+    """Without sigma_d the dial does nothing and comes off without a trace; with it, it is the one that was given."""
+    base, sigma_d = gaussians(), torch.rand(6)
+    on, chosen = attach(base), attach(base, sigma_d, CONFIG)
     assert on.attenuation == AttenuationConfig(tau=1 / 255, cut="hard") and bits(detach(on)) == bits(base)
-    assert attach(base, torch.ones(len(base))).attenuation == AttenuationConfig()
     assert detach(on).sigma_d is None and detach(on).attenuation is None
+    assert (on.sigma_d == SIGMA_MAX).all() and attach(base, sigma_d).attenuation == AttenuationConfig()
     distance = torch.logspace(-6, 4, 1000)
     for sigma in (torch.tensor(SIGMA_MAX), torch.tensor(SIGMA_MAX, dtype=torch.float64)):
         assert (torch.exp(-(distance**2) / (2 * sigma**2 + 1e-8)).float() == 1).all()
-    assert (on.sigma_d == SIGMA_MAX).all()
-
-
-def test_attach_gives_the_dial() -> None:
-    sigma_d = torch.rand(6)
-    on = attach(gaussians(), sigma_d, CONFIG)
-    assert on.sigma_d is sigma_d and on.attenuation is CONFIG
+    assert chosen.sigma_d is sigma_d and chosen.attenuation is CONFIG
     with pytest.raises(ClodError, match="sigma_d"):
-        attach(gaussians(), torch.rand(5), CONFIG)
+        attach(base, torch.rand(5), CONFIG)
 
 
-def test_an_old_dial_of_the_base_plays_no_part() -> None:
+def test_extracting_ignores_a_dial_of_the_base_and_drops_graphs() -> None:
     base = gaussians()
-    adapted = adapt(base, ["sh0"])
     old = attach(base, torch.ones(6))
-    fresh = extract(base, adapted, fingerprint="f", config={})
-    again = extract(old, adapted, fingerprint="f", config={})
+    adapted = adapt(base, ["sh0"]).replace(sh0=(base.sh0 + 1).requires_grad_(), sigma_d=torch.rand(6).requires_grad_())
+    fresh, again = (extract(each, adapted, fingerprint="f", config={}) for each in (base, old))
     assert bits(fresh.apply(old)) == bits(again.apply(base))
+    assert not fresh.sigma_d.requires_grad and not fresh.updates["sh0"].requires_grad
 
 
 def test_a_different_base_is_refused() -> None:
@@ -161,14 +147,7 @@ def test_extract_refuses_what_is_no_adaptation() -> None:
             extract(base, attach(base.replace(sh0=torch.full((6, 1, 3), bad))), fingerprint="f", config={})
 
 
-def test_training_tensors_are_let_go() -> None:
-    base = gaussians()
-    adapted = base.replace(means=(base.means + 1).requires_grad_())
-    adapter = extract(base, attach(adapted, torch.ones(6).requires_grad_()), fingerprint="f", config={})
-    assert not adapter.sigma_d.requires_grad and not adapter.updates["means"].requires_grad
-
-
-def test_adapter_checks_its_tensors() -> None:
+def test_an_adapter_checks_its_fields() -> None:
     with pytest.raises(ClodError, match="float32"):
         Adapter(torch.ones(3).double(), CONFIG, {}, "f", {})
     with pytest.raises(ClodError, match="'colour'"):
@@ -176,6 +155,12 @@ def test_adapter_checks_its_tensors() -> None:
     for bad in ("1.0\nproperty float x", "1.0ä"):
         with pytest.raises(ClodError, match="version"):
             Adapter(torch.ones(3), CONFIG, {}, "f", {}, bad)
+    adapter = extract(gaussians(3), attach(gaussians(3)), fingerprint="f", config={})
+    for kept in (torch.ones(4, dtype=torch.bool), torch.ones(3), torch.ones(3, 1, dtype=torch.bool)):
+        with pytest.raises(ClodError, match="Adapter.kept is .* it must be bool with 3 set"):
+            replace(adapter, kept=kept)
+    with pytest.raises(ClodError, match="Adapter.sh_degree is 7"):
+        replace(adapter, sh_degree=7)
 
 
 @pytest.mark.parametrize("degree", [None, 1, 0])
@@ -192,12 +177,3 @@ def test_a_trimmed_result(degree: int | None) -> None:
     if degree == 1:
         with pytest.raises(ClodError, match="it has SH degree 0, the adapter 1"):
             adapter.apply(base.without_bands(0))
-
-
-def test_rows_that_do_not_fit() -> None:
-    adapter = extract(gaussians(3), attach(gaussians(3)), fingerprint="f", config={})
-    for kept in (torch.ones(4, dtype=torch.bool), torch.ones(3), torch.ones(3, 1, dtype=torch.bool)):
-        with pytest.raises(ClodError, match="Adapter.kept is .* it must be bool with 3 set"):
-            replace(adapter, kept=kept)
-    with pytest.raises(ClodError, match="Adapter.sh_degree is 7"):
-        replace(adapter, sh_degree=7)

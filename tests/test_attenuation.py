@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from functools import partial
 
 import mpmath
 import pytest
@@ -13,11 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from clod_adapter.attenuation import (
-    SIGMA_MAX,
-    attenuate,
-    log_attenuation,
-)
+from clod_adapter.attenuation import SIGMA_MAX, attenuate, log_attenuation
 from clod_adapter.errors import ClodError
 from clod_adapter.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.training.target_count import soft_count
@@ -44,10 +39,14 @@ from exact import (
     unit,
 )
 
+# Each eps, each dial value and both types: pairs.
+PAIRS = pytest.mark.parametrize(
+    ("eps", "scale", "dtype"),
+    [(eps, scale, DTYPES[(i + j) % 2]) for i, eps in enumerate(EPSILONS) for j, scale in enumerate(SCALES)],
+)
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("eps", EPSILONS)
-@pytest.mark.parametrize("scale", SCALES)
+
+@PAIRS
 def test_log_attenuation_and_its_slope_match_mpmath(dtype: torch.dtype, eps: float, scale: float) -> None:
     sigma, d = (t.to(dtype) for t in grid(SIGMAS, DISTANCES))
     sigma.requires_grad_()
@@ -61,9 +60,7 @@ def test_log_attenuation_and_its_slope_match_mpmath(dtype: torch.dtype, eps: flo
     assert_close(sigma.grad, slopes, ulps=4)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("eps", EPSILONS)
-@pytest.mark.parametrize("scale", SCALES)
+@PAIRS
 def test_opacities_and_their_gradients_match_mpmath(dtype: torch.dtype, eps: float, scale: float) -> None:
     inputs = grid(LOGITS, SIGMAS, DISTANCES)
     logits, sigma, d = (t.to(dtype) for t in inputs)
@@ -101,20 +98,6 @@ def test_nothing_is_kept_once_the_threshold_passes_1(dtype: torch.dtype, cut: st
         out = attenuate(logits, sigma, d, s, config(tau, 0.0, cut=cut))
         assert not out.keep.any() and (out.drawn == 0).all()
         assert all((slope == 0).all() for slope in torch.autograd.grad(out.drawn.sum(), (logits, sigma)))
-
-
-def test_gradcheck() -> None:
-    generator = torch.Generator().manual_seed(0)
-    draw = [torch.rand(12, generator=generator, dtype=torch.float64) for _ in range(3)]
-    logits, sigma, d = (8 * draw[0] - 4).requires_grad_(), (draw[1] + 0.05).requires_grad_(), draw[2]
-
-    def both(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        out = attenuate(a, b, d, 2.5, config(eps=1e-2))
-        return out.opacities, out.log_opacities
-
-    assert torch.autograd.gradcheck(both, (logits, sigma))
-    assert torch.autograd.gradcheck(lambda a, b: both(a, b)[0], (logits, sigma))
-    assert torch.autograd.gradcheck(lambda b: log_attenuation(b, d, 2.5, 1e-2), (sigma,))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -161,58 +144,30 @@ def test_what_is_kept_is_what_is_drawn(dtype: torch.dtype, cut: str) -> None:
         assert torch.equal(out.drawn > 0, out.keep)
 
 
-def test_gradcheck_of_the_soft_cut() -> None:
-    """Of Gaussians that fade; and finite gradients of those far above and below the cut, 0 of those that have left."""
-    chosen = config(0.02, 1e-8, cut="soft")
-    d = torch.linspace(0.2, 1, 9, dtype=torch.float64)
-    logits = torch.linspace(-1, 5, 9, dtype=torch.float64).requires_grad_()
-    share = torch.linspace(1.05, 1.45, 9, dtype=torch.float64)  # a'' / (tau s)
-    sigma = (d * 2.5 / (2 * (logits.detach().sigmoid() / (share * 0.02 * 2.5)).log()).sqrt()).requires_grad_()
-    faded = attenuate(logits, sigma, d, 2.5, chosen)
-    assert ((faded.drawn / faded.opacities - 2 * (share - 1)).abs() < 1e-6).all()
-    assert torch.autograd.gradcheck(lambda a, b: attenuate(a, b, d, 2.5, chosen).drawn, (logits, sigma))
+def test_the_soft_cut_has_finite_gradients_at_the_edges() -> None:
     edge = torch.tensor([-math.inf, -math.inf, math.inf, 9.0, -9.0, 2.0], dtype=torch.float64).requires_grad_()
     wide = torch.tensor([1.0, 0.0, SIGMA_MAX, 1e9, 1.0, 1e-9], dtype=torch.float64).requires_grad_()
-    out = attenuate(edge, wide, torch.ones(6, dtype=torch.float64), 2.5, chosen)
+    out = attenuate(edge, wide, torch.ones(6, dtype=torch.float64), 2.5, config(0.02, cut="soft"))
     slopes = torch.autograd.grad(out.drawn.sum(), (edge, wide))
     assert all(slope.isfinite().all() for slope in slopes)
     assert all((slope[[0, 1, 4, 5]] == 0).all() for slope in slopes) and slopes[0][3] > 0
-
-
-def test_the_soft_cut_is_continuous() -> None:
-    """The largest step of a sweep halves with its length; that of the hard cut stays tau s."""
-    d = torch.linspace(0.2, 1, 40, dtype=torch.float64)
-    logits, sigma = torch.linspace(-3, 6, 40, dtype=torch.float64), torch.linspace(0.3, 2, 40, dtype=torch.float64)
-
-    def largest(cut: str, steps: int) -> float:
-        dials = [1 + 9 * k / steps for k in range(steps + 1)]
-        drawn = torch.stack([attenuate(logits, sigma, d, s, config(0.02, cut=cut)).drawn for s in dials])
-        return float(drawn.diff(dim=0).abs().max())
-
-    assert largest("soft", 2000) < 0.55 * largest("soft", 1000)
-    assert largest("hard", 2000) > 0.02
 
 
 @pytest.mark.parametrize(
     ("tau", "max_sv", "bound"), [(1e-4, 5.0, 0.736), (0.02, 5.0, 2.73), (0.02, 20.0, 4.29), (0.1, 9.0, 4.29)]
 )
 def test_the_soft_cut_has_a_steepest_slope(tau: float, max_sv: float, bound: float) -> None:
-    """Per unit of log s, whatever the opacity, sigma_d and distance; it is reached, and the hard cut knows none."""
+    """Per unit of log s, for any opacity, sigma_d and distance. It is reached; the hard cut has none."""
     a = torch.linspace(0.05, 0.9999, 30, dtype=torch.float64)[:, None].expand(30, 400).flatten()
-    sigma = torch.logspace(-1, 1.5, 400, dtype=torch.float64).repeat(30)
-    step, slopes = 1e-4, {}
+    sigma, step, slopes = torch.logspace(-1, 1.5, 400, dtype=torch.float64).repeat(30), 1e-4, {}
+
+    def drawn(cut: str, log_s: float) -> Tensor:
+        return attenuate(a.logit(), sigma, torch.ones_like(a), math.exp(log_s), config(tau, cut=cut)).drawn
+
     for cut in ("soft", "hard"):
         at = torch.linspace(0, math.log(max_sv) - step, 60).tolist()
-        drawn = [
-            [
-                attenuate(a.logit(), sigma, torch.ones_like(a), math.exp(x), config(tau, cut=cut)).drawn
-                for x in (s, s + step)
-            ]
-            for s in at
-        ]
-        slopes[cut] = max(float((after - before).abs().max()) for before, after in drawn) / step
-    assert 0.95 * bound < slopes["soft"] < bound
-    assert slopes["hard"] > 4 * bound
+        slopes[cut] = max(float((drawn(cut, x + step) - drawn(cut, x)).abs().max()) for x in at) / step
+    assert 0.95 * bound < slopes["soft"] < bound < slopes["hard"] / 4
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -314,21 +269,19 @@ def test_activated_opacities_give_what_their_logits_do(cut: str, dtype: torch.dt
 
 @pytest.mark.parametrize("cut", ["hard", "soft"])
 def test_gradients_of_activated_opacities(cut: str) -> None:
-    """Against finite differences where there are such, and by hand at 0 and 1."""
-    settings = config(0.02, cut=cut)
+    """Against finite differences, and by hand at 0 and 1, where logits are infinite."""
+
+    def drawn(a: Tensor, sigma: Tensor, d: list[float], s: float) -> Tensor:
+        return attenuate(a, sigma, torch.tensor(d).double(), s, config(0.02, cut=cut), activated=True).drawn
+
     a = torch.tensor([0.05, 0.3, 0.9, 0.999, 0.041], dtype=torch.float64, requires_grad=True)
     sigma = torch.tensor([2.0, 0.7, 0.4, 30.0, 9.0], dtype=torch.float64, requires_grad=True)
-    d = torch.tensor([0.1, 0.4, 0.3, 0.0, 0.2], dtype=torch.float64)
-    kept = attenuate(a, sigma, d, 2.0, settings, activated=True).keep
-    assert kept.all()
-    drawn = partial(attenuate, activated=True)
-    assert torch.autograd.gradcheck(lambda a, sigma: drawn(a, sigma, d, 2.0, settings).drawn, (a, sigma))
+    assert (drawn(a, sigma, [0.1, 0.4, 0.3, 0.0, 0.2], 2.0) > 0).all()
+    assert torch.autograd.gradcheck(lambda *x: drawn(*x, [0.1, 0.4, 0.3, 0.0, 0.2], 2.0), (a, sigma))
     ends = torch.tensor([0.0, 1.0, 0.0, 1.0], dtype=torch.float64, requires_grad=True)
     reach = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
-    result = drawn(ends, reach, torch.tensor([0.5, 0.5, 0.0, 0.0]).double(), 1.0, settings)
-    assert result.keep.tolist() == [False, True, False, True]
-    slope_a, slope_sigma = torch.autograd.grad(result.drawn.sum(), [ends, reach])
+    found = drawn(ends, reach, [0.5, 0.5, 0.0, 0.0], 1.0)
+    assert (found > 0).tolist() == [False, True, False, True]
+    slope_a, slope_sigma = (slope.tolist() for slope in torch.autograd.grad(found.sum(), [ends, reach]))
     factor = math.exp(-0.125)
-    assert slope_a.tolist() == pytest.approx([0, factor, 0, 1]) and slope_sigma.tolist() == pytest.approx(
-        [0, factor * 0.25, 0, 0]
-    )
+    assert slope_a == pytest.approx([0, factor, 0, 1]) and slope_sigma == pytest.approx([0, factor / 4, 0, 0])

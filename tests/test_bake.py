@@ -25,29 +25,9 @@ CONFIG = AttenuationConfig(scene_distance=4.0)
 CUTS = pytest.mark.parametrize("cut", ["hard", "soft"])
 
 
-def sphere(n: int = 200, cut: str = "hard") -> Gaussians:
-    """All at the reference distance from ``camera()``."""
-    some, eye = gaussians(n, 1, 5), camera().position
-    away = some.means - eye
-    sigma = torch.rand(n, generator=torch.Generator().manual_seed(1)) * 2 + 0.1
-    return attach(
-        some.replace(means=eye + 4.0 * away / away.norm(dim=1, keepdim=True)), sigma, replace(CONFIG, cut=cut)
-    )
-
-
 def at_one_place(some: Gaussians) -> Gaussians:
     """All at d' = 1 from ``camera()`` with a ``scene_distance`` of 4, exactly."""
     return some.replace(means=camera().position.add(torch.tensor([0.0, 0.0, 4.0])).expand(len(some), 3))
-
-
-@CUTS
-@pytest.mark.parametrize("s", [1.0, 2.0, 4.5])
-def test_the_same_picture_for_a_camera(s: float, cut: str) -> None:
-    some = sphere(cut=cut)
-    want, baked = render(some, camera(), s), bake(some, s, camera())
-    assert baked.sigma_d is None and baked.attenuation is None and 0 < len(baked) < 200
-    assert len(baked) == want.kept.sum()
-    torch.testing.assert_close(render(baked, camera()).image, want.image, atol=2e-5, rtol=0)
 
 
 @CUTS
@@ -89,24 +69,18 @@ def spread(n: int = 300, normalizer: str = "scene", cut: str = "soft") -> Gaussi
     return attach(gaussians(n, 1, 7), sigma, replace(CONFIG, cut=cut, normalizer=normalizer))
 
 
-@CUTS
-@pytest.mark.parametrize("normalizer", ["scene", "quantile", "max"])
-def test_for_a_camera_it_is_the_same_picture_from_there(cut: str, normalizer: str) -> None:
+@pytest.mark.parametrize(
+    ("cut", "normalizer", "s"),
+    [("soft", "scene", 1.0), ("hard", "quantile", 2.5), ("soft", "max", 2.5), ("hard", "scene", 4.5)],
+)
+def test_for_a_camera_it_is_the_same_image_from_there(cut: str, normalizer: str, s: float) -> None:
     some = spread(normalizer=normalizer, cut=cut)
-    want, baked = render(some, camera(), 2.5), bake(some, 2.5, camera())
-    assert 0 < len(baked) < 300 and len(baked) == want.kept.sum()
+    want, baked = render(some, camera(), s), bake(some, s, camera())
+    assert baked.sigma_d is None and baked.attenuation is None and 0 < len(baked) < 300
+    assert len(baked) == want.kept.sum()
     torch.testing.assert_close(render(baked, camera()).image, want.image, atol=2e-5, rtol=0)
-    elsewhere = bake(some, 2.5, cameras=ring(4, 61, 45))
-    assert (render(elsewhere, camera()).image - want.image).abs().max() > 0.01  # which is what the camera is for
-
-
-def test_for_a_camera_a_count_is_exact() -> None:
-    some = spread()
-    few, many = len(bake(some, CONFIG.max_sv, camera())), len(bake(some, 1.0, camera()))
-    assert few + 10 < many
-    for wanted in range(few, many, 7):
-        s = dial_for(some, keep=wanted, cameras=[camera()]).virtual_scale
-        assert len(bake(some, s, camera())) == wanted
+    elsewhere = bake(some, s, cameras=ring(4, 61, 45))
+    assert (render(elsewhere, camera()).image - want.image).abs().max() > 0.01 or s == 1
 
 
 @pytest.mark.parametrize("cameras", [[camera()], ring(3, 61, 45)], ids=["one", "several"])
@@ -144,27 +118,29 @@ def test_for_several_cameras_every_gaussian_has_one_distance() -> None:
     assert torch.equal(bake(some, s, cameras=places).means, baked.means)
 
 
-def test_a_count_of_the_file_is_exact() -> None:
-    some, cameras = spread(), ring(3, 61, 45)
-    few, many = (len(bake(some, s, cameras=cameras)) for s in (3.0, 1.0))
+@pytest.mark.parametrize("several", [False, True])
+def test_a_solved_count_is_the_number_of_rows(several: bool) -> None:
+    some, cameras = spread(), ring(3, 61, 45) if several else [camera()]
+
+    def rows(s: float) -> int:
+        return len(bake(some, s, cameras=cameras) if several else bake(some, s, camera()))
+
+    few, many = rows(3.0), rows(1.0)
     assert few + 10 < many
     for wanted in range(few, many, 7):
-        s = dial_for(some, keep=wanted, cameras=cameras, baked=True).virtual_scale
-        assert len(bake(some, s, cameras=cameras)) == wanted
+        assert rows(dial_for(some, keep=wanted, cameras=cameras, baked=several).virtual_scale) == wanted
 
 
 def test_bad_calls_are_named() -> None:
-    with pytest.raises(ClodError, match="no sigma_d"):
-        bake(gaussians(3, 0, 0), 1.0)
-    with pytest.raises(ClodError, match="virtual_scale is 0.5"):
-        bake(sphere(), 0.5, camera())
-    with pytest.raises(ClodError, match="no Gaussian is kept at s = 200"):
-        bake(sphere(), 200.0, camera())
-    with pytest.raises(ClodError, match="either camera or cameras"):
-        bake(sphere(), 2.0)
-    with pytest.raises(ClodError, match="either camera or cameras"):
-        bake(sphere(), 2.0, camera(), cameras=[camera()])
-    with pytest.raises(ClodError, match="no camera is given"):
-        order_by_extinction(sphere(), [])
-    with pytest.raises(ClodError, match="no pruning order"):
-        order_by_extinction(gaussians(3, 0, 0), [camera()])
+    some, plain = spread(), gaussians(3, 0, 0)
+    for message, call in {
+        "no sigma_d": lambda: bake(plain, 1.0),
+        "virtual_scale is 0.5": lambda: bake(some, 0.5, camera()),
+        "no Gaussian is kept at s = 200": lambda: bake(some, 200.0, camera()),
+        "either camera or cameras": lambda: bake(some, 2.0),
+        "either camera or cameras;": lambda: bake(some, 2.0, camera(), cameras=[camera()]),
+        "no camera is given": lambda: order_by_extinction(some, []),
+        "no pruning order": lambda: order_by_extinction(plain, [camera()]),
+    }.items():
+        with pytest.raises(ClodError, match=message):
+            call()

@@ -85,9 +85,15 @@ def test_refused(bad: dict[str, Any], said: str) -> None:
         Calibration(**{**GOOD, **bad})
 
 
+def dialled(path: Path, **more: Any) -> Path:
+    calibration = Calibration(**{**GOOD, "total": 4, **more})
+    save(path, attach(gaussians(4, 0, 0), torch.ones(4)), calibration=calibration)
+    return path
+
+
 def edited(path: Path, old: bytes, new: bytes) -> Path:
     data = path.read_bytes()
-    assert old in data
+    assert old in data, data[:2000]
     path.write_bytes(data.replace(old, new))
     return path
 
@@ -108,25 +114,17 @@ def edited(path: Path, old: bytes, new: bytes) -> Path:
     ],
 )
 def test_a_damaged_table_does_not_cost_the_file(tmp_path: Path, old: bytes, new: bytes, said: str) -> None:
-    path, places = tmp_path / "a.ply", (Viewpoint(1.5, 2.5, 3.5, 4.5),)
-    calibration = Calibration(**{**GOOD, "total": 4, "viewpoints": places})
-    save(path, attach(gaussians(4, 0, 0), torch.ones(4)), calibration=calibration)
+    path = dialled(tmp_path / "a.ply", viewpoints=(Viewpoint(1.5, 2.5, 3.5, 4.5),))
     loaded = load(edited(path, old, new))
     assert loaded.calibration is None and loaded.gaussians.sigma_d is not None
     assert any(re.search(said, note) for note in loaded.notes), loaded.notes
 
 
-def test_what_does_not_say_is_against_photographs(tmp_path: Path) -> None:
-    path, calibration = tmp_path / "a.ply", Calibration(**{**GOOD, "total": 4})
-    save(path, attach(gaussians(4, 0, 0), torch.ones(4)), calibration=calibration)
-    assert load(edited(path, b" 8 photographs", b" 8")).calibration == calibration
-    about = calibration.as_dict()
-    assert about.pop("against") == "photographs" and Calibration.from_dict(about) == calibration
-
-
-def test_a_base_s_table_is_not_passed_on(tmp_path: Path) -> None:
-    save(tmp_path / "a.ply", attach(gaussians(4, 0, 0), torch.ones(4)), calibration=Calibration(**{**GOOD, "total": 4}))
-    base = load(tmp_path / "a.ply")
+def test_a_table_without_its_kind_is_against_photographs_and_not_passed_on(tmp_path: Path) -> None:
+    about = Calibration(**GOOD).as_dict()
+    assert about.pop("against") == "photographs" and Calibration.from_dict(about) == Calibration(**GOOD)
+    base = load(edited(dialled(tmp_path / "a.ply"), b" 8 photographs", b" 8"))
+    assert base.calibration == Calibration(**{**GOOD, "total": 4})
     save(tmp_path / "b.ply", base.gaussians, base)
     assert load(tmp_path / "b.ply").calibration is None
     assert b"calibrated" not in (tmp_path / "b.ply").read_bytes()

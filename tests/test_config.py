@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from clod_adapter.config import CLASSIC, FILTERS, AdaptConfig, AttenuationConfig, ScreenFilter, describe, require
+from clod_adapter.config import CLASSIC, FILTERS, AdaptConfig, AttenuationConfig, ScreenFilter, field_descriptions
 from clod_adapter.errors import ClodError
 
 BOTH = {
@@ -29,18 +29,15 @@ ADAPT = BOTH | {
 }  # fmt: skip
 SCREEN = {"variance": [0.0, 9e-4, 101.0, -0.3, math.inf, math.nan], "compensate": [1, "yes", None]}
 ATTENUATION = BOTH | {"scene_distance": [0.0, -1.0, math.inf, math.nan]}
-BAD = [
-    (kind, name, value)
-    for kind, table in ((AdaptConfig, ADAPT), (AttenuationConfig, ATTENUATION), (ScreenFilter, SCREEN))
-    for name, values in table.items()
-    for value in values
-]
+TABLES = {AdaptConfig: ADAPT, AttenuationConfig: ATTENUATION, ScreenFilter: SCREEN}
 
 
-@pytest.mark.parametrize(("kind", "name", "value"), BAD, ids=lambda v: v.__name__ if isinstance(v, type) else str(v))
-def test_impossible_values_are_named(kind: type, name: str, value: object) -> None:
-    with pytest.raises(ClodError, match=f"^{name} is {value}, it must be "):
-        kind(**{name: value})
+@pytest.mark.parametrize("kind", [AdaptConfig, AttenuationConfig, ScreenFilter])
+def test_impossible_values_are_named(kind: type) -> None:
+    for name, values in TABLES[kind].items():
+        for value in values:
+            with pytest.raises(ClodError, match=f"^{name} is {value}, it must be "):
+                kind(**{name: value})
 
 
 EDGES = {
@@ -50,26 +47,21 @@ EDGES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", EDGES)
-def test_values_at_the_edge_are_taken(name: str) -> None:
-    assert getattr(AdaptConfig(**{name: EDGES[name]}), name) == EDGES[name]
+def test_values_at_the_edge_are_taken() -> None:
+    for name, value in EDGES.items():
+        assert getattr(AdaptConfig(**{name: value}), name) == value
+    AttenuationConfig(tau=0.19, max_sv=5.0)  # something must pass the threshold at the end of the dial
+    with pytest.raises(ClodError, match="below 1/max_sv = 0.2"):
+        AttenuationConfig(tau=0.21, max_sv=5.0)
 
 
 @pytest.mark.parametrize("kind", [AdaptConfig, AttenuationConfig, ScreenFilter])
 def test_every_field_has_help_and_a_default(kind: type) -> None:
-    kind()
-    texts = describe(kind)
-    assert list(texts) == [field.name for field in dataclasses.fields(kind)]
+    texts = field_descriptions(kind)
+    assert list(texts) == [field.name for field in dataclasses.fields(kind)] and field_descriptions(kind()) == texts
     assert all(len(text) > 10 and text == text.strip().rstrip(".") for text in texts.values())
-    assert describe(kind()) == texts
-
-
-@pytest.mark.parametrize("kind", [AdaptConfig, AttenuationConfig, ScreenFilter])
-def test_frozen_and_by_keyword(kind: type) -> None:
-    with pytest.raises(TypeError):
+    with pytest.raises(TypeError):  # by keyword alone, as fields may move
         kind(0.5)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        kind().tau = 0.5
 
 
 def test_what_travels_with_the_file() -> None:
@@ -89,18 +81,6 @@ def test_the_papers_form() -> None:
     assert AdaptConfig.paper(reg_weight=0.0).reg_weight == 0  # its own ablation
     # What it does not say is not what was chosen for ours.
     assert (paper.average, paper.temperature, paper.lr_final, paper.lr_scales) == (0.0, 0.5, 0.05, 8e-3)
-
-
-def test_something_survives_the_cut() -> None:
-    AttenuationConfig(tau=0.19, max_sv=5.0)
-    with pytest.raises(ClodError, match="below 1/max_sv = 0.2"):
-        AttenuationConfig(tau=0.21, max_sv=5.0)
-
-
-def test_require() -> None:
-    require(True, "a", 1, "b")
-    with pytest.raises(ClodError, match="^a is 1, it must be b$"):
-        require(False, "a", 1, "b")
 
 
 def test_filters_by_their_names() -> None:

@@ -99,21 +99,16 @@ def test_render_and_its_gradients(setup: Setup) -> None:
         assert float((mine - slopes[1][name]).norm()) <= 2e-2 * float(slopes[1][name].norm()) + 1e-7, name
 
 
-def test_the_start_and_what_it_goes_by(setup: Setup) -> None:
+@pytest.mark.parametrize("kind", ["importance", "error", "constant", "identity"])
+def test_the_initialization(setup: Setup, kind: str) -> None:
     assert len(usable_views(setup.there, setup.scene.train)) == len(setup.scene.train)
-    for kind in ("importance", "error", "constant", "identity"):
-        config = replace(CONFIG, start=kind)
-
-        def begun(model: Gaussians, config: AdaptConfig = config) -> Tensor:
-            plain = model.replace(sigma_d=None, attenuation=None)
-            return initialize(plain, setup.scene.train, config).sigma_d
-
-        mine, want = on_both(setup, begun)
-        assert mine.device == setup.device
-        torch.testing.assert_close(mine.cpu().log(), want.log(), rtol=0.02, atol=0.02)
+    plain, config = {"sigma_d": None, "attenuation": None}, replace(CONFIG, start=kind)
+    mine, want = on_both(setup, lambda model: initialize(model.replace(**plain), setup.scene.train, config).sigma_d)
+    assert mine.device == setup.device
+    torch.testing.assert_close(mine.cpu().log(), want.log(), rtol=0.02, atol=0.02)
 
 
-def test_numbers(setup: Setup) -> None:
+def test_numbers(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rows, counts, dial values, popping, alignment, orders: the CPU's, within what two rasterizers differ by."""
     cameras, test = setup.cameras, setup.scene.test
     rows, want = on_both(setup, lambda model: evaluate(model, test, [1.0, 3.0]))
@@ -135,11 +130,8 @@ def test_numbers(setup: Setup) -> None:
     ):
         mine, own = on_both(setup, run)
         assert float(mine) == pytest.approx(float(own), rel=5e-3)
-
-
-def test_frame_times(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.import_module("clod_adapter.evaluation.budget"), "TIMED_REPEATS", 1)
-    assert all(taken > 0 for _, taken in frame_times(setup.there, setup.cameras[:1]))
+    assert all(taken > 0 for _, taken in frame_times(setup.there, cameras[:1]))
 
 
 def test_placed_cameras_are_those_of_the_cpu(setup: Setup) -> None:
@@ -149,6 +141,15 @@ def test_placed_cameras_are_those_of_the_cpu(setup: Setup) -> None:
     small = replace(placed[0][0], K=placed[0][0].K / 31, width=16, height=12)
     pictures = render_pseudo_views(setup.there, [small]).train
     assert all(view.image.device.type == "cpu" for view in pictures)
+
+
+def test_a_block(setup: Setup) -> None:
+    views, config = setup.scene.train[:2], replace(CONFIG, iters=2)
+    division = divide(setup.there.replace(sigma_d=None, attenuation=None), views, config, 2)
+    aimed = target_image(division.initial, 25, views[0])
+    assert aimed.device.type == "cpu" and aimed.dtype == torch.uint8  # photographs of a whole block
+    merged = merge(division, [adapt_block(division, views, config, block)[0] for block in range(2)])
+    assert merged.means.device == setup.device and bool(merged.sigma_d.isfinite().all())
 
 
 def test_a_step_of_training(setup: Setup) -> None:
@@ -169,9 +170,8 @@ def test_a_step_of_training(setup: Setup) -> None:
         torch.testing.assert_close(mine, results[1][name], rtol=1e-5, atol=1e-5)
 
 
-def test_a_whole_training_after_its_plan(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plan measures, the training goes on from its probe, and what was left out is put back."""
-    monkeypatch.setattr(importlib.import_module("clod_adapter.training.planner"), "PROBE", 1)
+def test_a_whole_training_after_its_plan(setup: Setup) -> None:
+    """What the plan leaves out is put back after training."""
     plain, scene = setup.there.replace(sigma_d=None, attenuation=None), Scene(setup.scene.train[:2], ())
     config = AdaptConfig(iters=10, max_sv=4.0)
     plan = make_plan(plain, scene, config)
@@ -192,16 +192,6 @@ def test_a_training_is_that_of_the_cpu(setup: Setup) -> None:
     for name, value in own.tensors().items():
         # Adam's first steps are as long as their rate whichever way: where a slope is rounding, they may differ.
         assert float((mine.tensors()[name].cpu() - value).abs().median()) <= 1e-4, name
-
-
-def test_a_block(setup: Setup) -> None:
-    views, config = setup.scene.train[:2], replace(CONFIG, iters=2)
-    division = divide(setup.there.replace(sigma_d=None, attenuation=None), views, config, 2)
-    aimed = target_image(division.initial, 25, views[0])
-    assert aimed.device.type == "cpu" and aimed.dtype == torch.uint8  # photographs of a whole block
-    learned = [adapt_block(division, views, config, block)[0] for block in range(2)]
-    merged = merge(division, learned)
-    assert merged.means.device == setup.device and bool(merged.sigma_d.isfinite().all())
 
 
 def test_what_is_frozen_takes_no_gradient(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,18 +14,15 @@ from scenes import camera, gaussians, ring
 CONFIG = AttenuationConfig(scene_distance=4.0)
 
 
-def test_it_is_a_geometric_mean() -> None:
+def test_the_typical_distance_is_a_geometric_mean() -> None:
     means, cameras = gaussians(30, 0, 0).means, ring(3, 8, 6)
     logs = [normalized_distances(means, each, CONFIG).log() for each in cameras]
     torch.testing.assert_close(typical_distance(means, cameras, CONFIG), (sum(logs) / 3).exp())
+    alone = typical_distance(means, [camera()], CONFIG)  # of one camera: that one's, bit for bit
+    assert torch.equal(alone, normalized_distances(means, camera(), CONFIG))
     on_top = cameras[0].position.repeat(30, 1)  # of one camera, whose distance counts as 1e-6
     apart = (cameras[0].position - cameras[1].position).norm() / 4
     torch.testing.assert_close(typical_distance(on_top, cameras[:2], CONFIG), (1e-6 * apart).sqrt().expand(30))
-
-
-def test_of_one_camera_it_is_that_ones_bit_for_bit() -> None:
-    means = gaussians(30, 0, 0).means
-    assert torch.equal(typical_distance(means, [camera()], CONFIG), normalized_distances(means, camera(), CONFIG))
 
 
 @pytest.mark.parametrize("normalizer", ["scene", "quantile", "max"])
@@ -40,19 +37,16 @@ def test_a_viewpoint_stands_for_its_camera(normalizer: str) -> None:
     torch.testing.assert_close(typical_distance(means, back, config), want, rtol=1e-5, atol=0)
 
 
-def looking_down_z(fx: float = 100.0) -> Camera:
-    viewmat = torch.eye(4)
-    viewmat[2, 3] = 2.0  # the camera is at z = -2
-    return Camera(viewmat, torch.tensor([[fx, 0, 50], [0, 100, 40], [0, 0, 1]]), width=100, height=80)
-
-
 def test_distances_are_divided_by_the_configured_normalizer() -> None:
+    """At depth 1 of this camera at z = -2 the image is x in [-0.5, 0.5) and y in [-0.4, 0.4)."""
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 2.0
+    camera = Camera(viewmat, torch.tensor([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]]), width=100, height=80)
     # Along the axis at distances 1..10, then one behind the camera, one outside the image, one too near.
     axis = torch.tensor([[0.0, 0.0, z - 2.0] for z in range(1, 11)])
     unseen = torch.tensor([[0.0, 0.0, -52.0], [30.0, 0.0, -1.0], [0.0, 0.0, -1.995]])
     means = torch.cat([axis, unseen])
     distances = (means - torch.tensor([0.0, 0.0, -2.0])).norm(dim=1)
-    camera = looking_down_z()
     for kind, other, want in [
         ("scene", {"scene_distance": 4.0}, 4.0),
         ("max", {}, 10.0),
@@ -63,22 +57,12 @@ def test_distances_are_divided_by_the_configured_normalizer() -> None:
         chosen = config(normalizer=kind, **other)
         assert normalizing_distance(distances, means, camera, chosen).item() == want
         torch.testing.assert_close(normalized_distances(means, camera, chosen), distances / want)
-    assert normalizing_distance(distances[10:12], means[10:12], camera, config(normalizer="max")).item() == 50.0
-
-
-def test_normalizing_distance_at_the_edges() -> None:
-    camera = looking_down_z()
-    at_camera = torch.tensor([[0.0, 0.0, -2.0]], requires_grad=True)
-    for kind in ("max", "quantile", "scene"):
-        found = normalized_distances(at_camera, camera, config(normalizer=kind))
+        found = normalized_distances(camera.position[None].requires_grad_(), camera, chosen)
         assert found.tolist() == [0.0] and not found.requires_grad
-        assert normalized_distances(torch.empty(0, 3), camera, config(normalizer=kind)).shape == (0,)
-
-
-def test_frustum_follows_the_image_border() -> None:
-    # At depth 1, fx = fy = 100 and the principal point (50, 40): x in [-0.5, 0.5), y in [-0.4, 0.4).
+        assert normalized_distances(torch.empty(0, 3), camera, chosen).shape == (0,)
+    largest = config(normalizer="max")
+    assert normalizing_distance(distances[10:12], means[10:12], camera, largest).item() == 50.0
     for x, y, inside in [(-0.49, 0, True), (-0.51, 0, False), (0.49, 0, True), (0.51, 0, False), (0, 0.41, False)]:
-        means = torch.tensor([[0.0, 0.0, -1.0], [x, y, -1.0]])
-        distances = torch.tensor([1.0, 9.0])
-        found = normalizing_distance(distances, means, looking_down_z(), config(normalizer="max"))
+        pair = torch.tensor([[0.0, 0.0, -1.0], [x, y, -1.0]])
+        found = normalizing_distance(torch.tensor([1.0, 9.0]), pair, camera, largest)
         assert found.item() == (9.0 if inside else 1.0), (x, y)

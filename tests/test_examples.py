@@ -22,8 +22,13 @@ EXAMPLES = {int(path.name[:2]): path for path in sorted(FOLDER.glob("[0-9]*.py")
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    """Runs an example by its number with these arguments, in the test's folder; returns what it printed."""
+    """Runs an example by its number with these arguments, in the test's folder; returns what it printed.
+
+    Training takes 5 steps.
+    """
     monkeypatch.chdir(tmp_path)
+    adapt = clod_adapter.adapt
+    monkeypatch.setattr(clod_adapter, "adapt", lambda base, scene, config: adapt(base, scene, type(config)(iters=5)))
 
     def start(number: int, *words: object) -> str:
         monkeypatch.setattr(sys, "argv", [EXAMPLES[number].name, *map(str, words)])
@@ -33,11 +38,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     return start
 
 
-def test_both(run: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    adapt = clod_adapter.adapt
-    monkeypatch.setattr(
-        clod_adapter, "adapt", lambda base, scene, config: adapt(base, scene, config.__class__(iters=5))
-    )
+def test_training_and_rendering(run: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     printed = run(1, capture.ply, capture.scene, "dial.ply")
     assert "dial 5:" in printed and clod_adapter.load("dial.ply").gaussians.sigma_d is not None
     for scene, size in (((), (320, 240)), ((capture.scene,), (64, 48))):
@@ -47,14 +48,13 @@ def test_both(run: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monkey
         pictures = [Image.open(name) for name in names]
         assert {picture.size for picture in pictures} == {size}
         assert len({picture.tobytes() for picture in pictures}) == 4
+    scene = clod_adapter.load_scene(capture.scene)
+    monkeypatch.setattr(clod_adapter, "load_scene", lambda folder, origin: clod_adapter.Scene(scene.train, (), ()))
+    assert "of 300 Gaussians" in run(2, capture.ply, capture.scene)  # without held-out views
 
 
-def test_far_from_0_they_do_the_same(run: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_far_from_0_they_do_the_same(run: Any, capture: Any, tmp_path: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")  # which alone moves models
-    adapt = clod_adapter.adapt
-    monkeypatch.setattr(
-        clod_adapter, "adapt", lambda base, scene, config: adapt(base, scene, config.__class__(iters=5))
-    )
     far, by = tmp_path / "far", np.array([437_123.0, -4_481_010.0, 1_000.0])
     shutil.copytree(capture.scene, far)
     model = pycolmap.Reconstruction(str(far / "sparse" / "0"))
@@ -73,12 +73,6 @@ def test_far_from_0_they_do_the_same(run: Any, capture: Any, tmp_path: Path, mon
     assert np.abs(np.asarray(one, float) - np.asarray(other, float)).mean() < 1
 
 
-def test_a_scene_without_held_out_views(run: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = clod_adapter.load_scene(capture.scene)
-    monkeypatch.setattr(clod_adapter, "load_scene", lambda folder, origin: clod_adapter.Scene(scene.train, (), ()))
-    assert "of 300 Gaussians" in run(2, capture.ply, capture.scene)
-
-
 def test_budgets(run: Any, dialled: Path, capture: Any) -> None:
     printed = run(5, dialled, capture.scene).splitlines()
     names = ["50% of", "25% of", "10% of", "0.1 dB", "0.5 dB", "1 dB", "10 frames", "30 frames", "60 frames"]
@@ -92,21 +86,18 @@ def test_the_adapter_goes_on_and_off(run: Any, dialled: Path, capture: Any, tmp_
     printed = run(6, capture.ply, dialled.with_suffix(".safetensors"), "again.ply")
     assert "changed: sigma_d, " in printed and f"{capture.ply}, bit for bit" in printed
     assert (tmp_path / "again.ply").read_bytes() == dialled.read_bytes()
-
-
-def test_another_base_is_refused(run: Any, dialled: Path, capture: Any, tmp_path: Path) -> None:
     other = capture.write(tmp_path / "other.ply", capture.gaussians.replace(sh0=capture.gaussians.sh0 + 1))
     with pytest.raises(SystemExit, match="a different base was given"):
-        run(6, other, dialled.with_suffix(".safetensors"))
-    assert not (tmp_path / "again.ply").exists()
+        run(6, other, dialled.with_suffix(".safetensors"), "other_again.ply")
+    assert not (tmp_path / "other_again.ply").exists()
 
 
-@pytest.mark.parametrize("number", [1, 2, 5, 6])
-def test_misuse_is_explained(run: Any, number: int) -> None:
-    with pytest.raises(SystemExit, match=f"python examples/{EXAMPLES[number].name}"):
-        run(number)
-    with pytest.raises(SystemExit, match="error: (missing.ply|nowhere): .*check the path"):
-        run(number, "missing.ply", "nowhere")
+def test_misuse_is_explained(run: Any) -> None:
+    for number in (1, 2, 5, 6):
+        with pytest.raises(SystemExit, match=f"python examples/{EXAMPLES[number].name}"):
+            run(number)
+        with pytest.raises(SystemExit, match="error: (missing.ply|nowhere): .*check the path"):
+            run(number, "missing.ply", "nowhere")
 
 
 def test_the_list_names_them_all() -> None:

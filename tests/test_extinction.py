@@ -30,10 +30,14 @@ from exact import (
     rows,
 )
 
+# Each eps, each tau and both types: pairs.
+PAIRS = pytest.mark.parametrize(
+    ("eps", "tau", "dtype"),
+    [(eps, tau, DTYPES[(i + j) % 2]) for i, eps in enumerate(EPSILONS) for j, tau in enumerate(TAUS)],
+)
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("eps", EPSILONS)
-@pytest.mark.parametrize("tau", TAUS)
+
+@PAIRS
 def test_extinction_scale_matches_mpmath(dtype: torch.dtype, eps: float, tau: float) -> None:
     inputs = grid(LOGITS, SIGMAS, DISTANCES)
     logits, sigma, d = (t.to(dtype) for t in inputs)
@@ -44,9 +48,7 @@ def test_extinction_scale_matches_mpmath(dtype: torch.dtype, eps: float, tau: fl
     assert_close(got, want, allowed, floor=torch.finfo(dtype).tiny / tau)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("eps", EPSILONS)
-@pytest.mark.parametrize("tau", TAUS)
+@PAIRS
 def test_sigma_for_extinction_matches_mpmath(dtype: torch.dtype, eps: float, tau: float) -> None:
     inputs = grid(LOGITS[2:], DISTANCES, [0.0, 1e-6, 0.3, 1.0, 1.75, 1.999, 6.0, 100.0, 1e4])
     got = sigma_for_extinction(*(t.to(dtype) for t in inputs), config(tau, eps)).double()

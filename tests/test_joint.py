@@ -7,13 +7,14 @@ import json
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+import inria_forks
 from clod_adapter import attenuation
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.blocks.divide import divide
@@ -116,25 +117,16 @@ def gsplat(model: Gaussians) -> list[Tensor]:
 
 
 def inria(model: Gaussians) -> list[Tensor]:
-    """The centres and opacities that diff-gaussian-rasterization is called with."""
-
-    class Rasterizer(nn.Module):
-        def __init__(self, raster_settings: Any) -> None:
-            super().__init__()
-            self.raster_settings = raster_settings
-
-        def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor) -> list[Tensor]:
-            return [means3D, opacities]
-
-    installed, view = ModuleType("diff_gaussian_rasterization"), CAMERAS[0]
-    installed.GaussianRasterizer, installed.GaussianRasterizationSettings = Rasterizer, object  # type: ignore[attr-defined]
-    settings = SimpleNamespace(
-        prefiltered=False, viewmatrix=view.viewmat.T, image_width=view.width, image_height=view.height, tanfovx=0.5,
-        tanfovy=0.4, campos=view.position,
-    )  # fmt: skip
-    rasterizer = copy_with("inria", installed, "diff_gaussian_rasterization").GaussianRasterizer(settings)
+    """What a fork of diff-gaussian-rasterization draws."""
+    installed = inria_forks.module("inria 2023")
+    ours = copy_with("inria", installed, "diff_gaussian_rasterization")
+    rasterizer = ours.GaussianRasterizer(inria_forks.settings_of(installed.GaussianRasterizationSettings, CAMERAS[0]))
+    given = {
+        "means3D": model.means, "means2D": torch.zeros(N, 3), "opacities": model.opacities[:, None],
+        "shs": torch.cat([model.sh0, model.shN], 1), "scales": model.scales, "rotations": model.quats,
+    }  # fmt: skip
     dial = {"sigma_d": model.sigma_d, "attenuation": model.attenuation, "virtual_scale": DIAL}
-    return rasterizer(model.means, torch.zeros(N, 3), model.opacities, **dial)
+    return [rasterizer(**given, **dial)[0]]
 
 
 def blocks(model: Gaussians) -> list[Any]:

@@ -43,7 +43,7 @@ def test_another_distance_is_the_same_dial(distance: float, eps: float, s: float
     torch.testing.assert_close(found[1][possible], found[0][possible], rtol=1e-6, atol=1e-9)
 
 
-def test_what_is_no_number_of_the_equation_stays() -> None:
+def test_special_values_and_other_normalisers_keep_their_sigma() -> None:
     sigma = torch.tensor([0.0, -1.0, SIGMA_MAX, 2.0])
     some = attach(gaussians(4, 0, 0), sigma, AttenuationConfig(scene_distance=8.0))
     there = in_world_units(some)
@@ -51,9 +51,6 @@ def test_what_is_no_number_of_the_equation_stays() -> None:
     assert there.sigma_d[3].item() == pytest.approx(16.0)
     assert in_world_units(there) is there and in_world_units(gaussians(4, 0, 0)).attenuation is None
     assert there.attenuation == AttenuationConfig(reference_distance=8.0)
-
-
-def test_other_normalisers_keep_their_sigma() -> None:
     for normalizer in ("max", "quantile"):
         some = dialled(normalizer=normalizer)
         there = in_world_units(some)
@@ -81,23 +78,17 @@ def test_the_estimate_is_of_the_scene_and_not_of_its_farthest() -> None:
     assert estimated_distance(means[:0]) == 1.0 and estimated_distance(means[:1]) == 1.0
 
 
-def test_in_a_scene_of_tiny_units_eps_hides_no_sigma() -> None:
-    some = dialled(scene_distance=1e-4)
+@pytest.mark.parametrize("typical", [1e-4, 0.006, 3.0, 4.2e5])
+def test_eps_hides_no_sigma_and_is_the_same_after_each_training(typical: float) -> None:
+    some = dialled(scene_distance=typical)
     there = in_world_units(some)
-    assert there.attenuation is not None and there.attenuation.eps == 1e-16
-    torch.testing.assert_close(there.sigma_d, 1e-4 * some.sigma_d)
-    back = with_distance(there, 1e-4)
-    torch.testing.assert_close(back.sigma_d, some.sigma_d)
-    assert in_world_units(dialled(scene_distance=0.1)).attenuation.eps == 1e-8  # type: ignore[union-attr]
-
-
-@pytest.mark.parametrize("typical", [3e-4, 0.006, 3.0, 612.34, 4.2e5])
-def test_eps_is_the_same_after_each_training(typical: float) -> None:
-    there = in_world_units(dialled(scene_distance=typical))
+    torch.testing.assert_close(there.sigma_d, typical * some.sigma_d, rtol=1e-4, atol=1e-6 * typical)
+    torch.testing.assert_close(with_distance(there, typical).sigma_d, some.sigma_d, rtol=1e-4, atol=1e-6)
     again = there
     for _ in range(4):  # as one training after the other has it
         again = in_world_units(with_distance(again, typical))
     assert there.attenuation is not None and again.attenuation is not None
     assert again.attenuation.eps == pytest.approx(there.attenuation.eps, rel=1e-3)
-    assert typical < 0.01 or again.attenuation.eps == 1e-8
+    assert typical < 0.01 or again.attenuation.eps == there.attenuation.eps == 1e-8
+    assert typical > 1e-4 or there.attenuation.eps == 1e-16
     torch.testing.assert_close(again.sigma_d, there.sigma_d, rtol=1e-4, atol=1e-6)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.blocks.divide import DIALS, Division
-from clod_adapter.blocks.file import checked, damaged, load_block, save_block
+from clod_adapter.blocks.file import checked, load_block, refused_if_damaged, save_block
 from clod_adapter.blocks.train import Learned
 from clod_adapter.cameras import View
 from clod_adapter.config import AttenuationConfig
@@ -76,7 +76,7 @@ class BlockFiles:
         checked(self.start, tensors, shapes)
         if tensors["block"].unique().tolist() != list(range(count)):
             raise ClodError(f"{self.start}: a block has no Gaussians; delete it to make it again")
-        with damaged(self.start):
+        with refused_if_damaged(self.start):
             settings, extent = AttenuationConfig(**about["attenuation"]), float(about["extent"])
         begun = base.replace(sigma_d=tensors["sigma_d"].to(device), attenuation=settings)
         division = Division(begun, tensors["block"].to(device), tensors["seen"], tensors["kept"], extent)
@@ -96,7 +96,7 @@ class BlockFiles:
         values, about = load_block(path, self._of(block, number))
         shapes = {name: (t.dtype, (len(rows), *t.shape[1:])) for name, t in division.initial.tensors().items()}
         checked(path, values, {n: shape for n, shape in shapes.items() if n in values or n == "sigma_d"})
-        with damaged(path):
+        with refused_if_damaged(path):
             steps, seconds = int(about["steps"]), float(about["seconds"])
         return Learned(rows, {name: value.to(rows.device) for name, value in values.items()}, steps, seconds)
 

@@ -14,32 +14,26 @@ from clod_adapter.training.planner import make_plan
 from ..shared.console import Console
 from .inputs import Inputs
 from .progress import ProgressDisplay
-from .resume import RunKey
 from .setup import Setup
 
 
-def decide(setup: Setup, inputs: Inputs, display: ProgressDisplay, run_of: RunKey) -> tuple[Plan, RunKey]:
-    """Makes the plan and prints it; returns it with the key of the run, which then includes the decisions.
+def decide(setup: Setup, inputs: Inputs, display: ProgressDisplay) -> Plan:
+    """Makes the plan and prints it.
 
     Raises:
-        ClodError: the run to resume had other ``--with`` or ``--without``.
         Stopped: Ctrl-C.
     """
-    args, resumed, base, scene = setup.args, setup.resumed, inputs.base.gaussians, inputs.scene
-    requested = {"--with": sorted(args.keep_in), "--without": sorted(args.leave_out)}
-    if resumed:
-        resumed.check_override(requested)
+    args, base = setup.args, inputs.base.gaussians
     override = Override(frozenset(args.keep_in), frozenset(args.leave_out))
-    frozen = resumed.frozen if resumed else None
-    plan = make_plan(base, scene, inputs.config, override, display, resumed=frozen)
+    plan = make_plan(base, inputs.scene, inputs.config, override, display)
     display.close()
     release_memory()  # of looking at all Gaussians, before only those that are kept are trained
     if args.trim and plan.trims(base):
         plan = _with_trimming_effect(plan, inputs, setup.console)
-    show(plan.decisions, setup.console)
+    show_plan(plan.decisions, setup.console)
     if args.trim and plan.kept is not None and args.images is None:
         setup.console.say("  no placed camera sees them, but other cameras may: --with unseen keeps them")
-    return plan, run_of | {"overruled": requested, "frozen": plan.frozen}
+    return plan
 
 
 def _with_trimming_effect(plan: Plan, inputs: Inputs, console: Console) -> Plan:
@@ -50,7 +44,7 @@ def _with_trimming_effect(plan: Plan, inputs: Inputs, console: Console) -> Plan:
     return replace(plan, decisions=(*plan.decisions, effect), seconds=seconds)
 
 
-def show(decisions: Sequence[Decision], console: Console) -> None:
+def show_plan(decisions: Sequence[Decision], console: Console) -> None:
     """One aligned line per decision: part, action, measured effect, reason, and the option that overrides it."""
     lines = [(d.what, d.verdict, d.measured, d.why, _option(d)) for d in decisions]
     widths = [max(map(len, column)) for column in zip(*(line[:3] for line in lines), strict=True)]
@@ -64,5 +58,5 @@ def show(decisions: Sequence[Decision], console: Console) -> None:
 def _option(decision: Decision) -> str:
     if not decision.name:
         return ""
-    option = "--without" if decision.verdict in ("kept", "trained") else "--with"
+    option = "--without" if decision.verdict == "kept" else "--with"
     return f"{option} {decision.name}"

@@ -41,7 +41,7 @@ POLL_EVERY = 0.05  # seconds between checks for work
 
 
 @dataclass(frozen=True)
-class Job:
+class TrainingJob:
     """What the others are sent: the arguments of ``adapt``, and the type of device that the first one trains on."""
 
     base: Gaussians
@@ -52,7 +52,7 @@ class Job:
     device: str
 
     @classmethod
-    def of(cls, plan: Plan, scene: Scene, state: TrainingState | None) -> Job:
+    def of(cls, plan: Plan, scene: Scene, state: TrainingState | None) -> TrainingJob:
         """The job of ``plan.adapt``, from ``state``."""
         lean = plan.lean
         return cls(lean, scene.train, plan.config, state, plan.subset, lean.means.device.type)
@@ -71,7 +71,7 @@ def leading() -> Iterator[None]:
 
 
 @contextmanager
-def together(make_job: Callable[[], Job], display: ProgressDisplay) -> Iterator[ProcessGroup | None]:
+def together(make_job: Callable[[], TrainingJob], display: ProgressDisplay) -> Iterator[ProcessGroup | None]:
     """The group to train with, after giving the job to the others; None for a single process.
 
     Raises:
@@ -137,10 +137,8 @@ def _train(number: int, launch: Launch, stop: GracefulStop) -> None:
         job: Any = group.broadcast(None)
         if job.device == "cuda":
             _take_gpu(launch)
-        base, scene, begun = job.base.to(job.device), Scene(job.views, ()), [job.state]
-        config, subset = job.config, job.subset
-        del job  # frees the state as soon as it is restored
-        adapt(base, scene, config, stop.heeding(), begun.pop(), subset=subset, group=group)
+        base, scene = job.base.to(job.device), Scene(job.views, ())
+        adapt(base, scene, job.config, stop.heeding(), job.state, subset=job.subset, group=group)
 
 
 def _take_gpu(launch: Launch) -> None:

@@ -21,7 +21,7 @@ from .files import write
 from .inputs import Inputs
 from .memory import with_rows
 from .processes import describe_processes
-from .result import Measured, Result, measure_result
+from .result import Measurements, Result, measure_result
 from .setup import Setup
 
 
@@ -46,7 +46,7 @@ def finish(
     return report
 
 
-def write_result(setup: Setup, inputs: Inputs, result: Result, measured: Measured) -> dict[str, Any]:
+def write_result(setup: Setup, inputs: Inputs, result: Result, measured: Measurements) -> dict[str, Any]:
     """Writes the three files, and returns the report."""
     outputs, adapter = setup.outputs, result.adapter
     base = with_rows(result.base, setup.args) if result.plan is None else result.base
@@ -57,14 +57,14 @@ def write_result(setup: Setup, inputs: Inputs, result: Result, measured: Measure
             adapter = replace(adapter, calibration=table_of)
         except ClodError as error:
             setup.console.say(f"the files have no calibration, so --fps and --psnr-drop will not work: {error}")
-    report = describe(setup, inputs, result, measured)
+    report = describe_run(setup, inputs, result, measured)
     with setup.console.status(f"writing {outputs.ply} ..."):
         report = write(base, adapter, result.gaussians, outputs, report)
     setup.console.say(f"wrote {outputs.adapter} and {outputs.ply}")
     return report
 
 
-def describe(setup: Setup, inputs: Inputs, result: Result, measured: Measured) -> dict[str, Any]:
+def describe_run(setup: Setup, inputs: Inputs, result: Result, measured: Measurements) -> dict[str, Any]:
     """The report, except the sizes of the files."""
     args, adapted, adapter, plan = setup.args, result.adapted, result.adapter, result.plan
     late = "the measurements were interrupted: only the dial values that were finished are reported"

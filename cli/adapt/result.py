@@ -39,7 +39,7 @@ class Result:
 
 
 @dataclass(frozen=True)
-class Measured:
+class Measurements:
     """The result's rows: over the dial, and without the dial, as a viewer shows it that does not know it."""
 
     rows: tuple[Row, ...] = ()
@@ -79,17 +79,17 @@ def training_notes(inputs: Inputs, adapter: Adapter, adapted: Adapted) -> list[s
     return notes
 
 
-def measure_result(setup: Setup, inputs: Inputs, result: Result) -> Measured:
+def measure_result(setup: Setup, inputs: Inputs, result: Result) -> Measurements:
     """Measures the result on the held-out views, unless the run is to end now.
 
     That is after a Ctrl-C that came when training was complete, and if the launcher ends the processes.
     """
     if setup.stop.requests > 0 and not result.adapted.interrupted or hurried(result.adapted):
-        return Measured(interrupted=True)
+        return Measurements(interrupted=True)
     views, console = inputs.scene.test, setup.console
     with setup.watch.time("evaluate"):
         rows, interrupted = measure(result.gaussians, views, report_dials(inputs.config.max_sv), console)
         if interrupted:
-            return Measured(tuple(rows), (), True)
+            return Measurements(tuple(rows), (), True)
         plain, interrupted = measure(detach(result.gaussians), views, [1.0], console, "plain")
-    return Measured(tuple(rows), tuple(plain), interrupted)
+    return Measurements(tuple(rows), tuple(plain), interrupted)

@@ -34,7 +34,7 @@ SAVE_EVERY = 5.0  # seconds between saves, at least
 SAVE_COST = 0.015  # largest share of the training time that saving may take, except the first save
 
 RunKey = dict[str, Any]
-"""Identifies a run, in its state file: version, config, hashes of base and views, overrides, frozen attributes."""
+"""Identifies a run, in its state file: version, config, hashes of base and views, overrides."""
 
 
 @dataclass(frozen=True)
@@ -49,24 +49,20 @@ class Resumed:
     state: TrainingState
     run_of: RunKey
 
-    @property
-    def frozen(self) -> list[str]:
-        """The attributes that the plan of the run froze."""
-        return list(self.run_of.get("frozen", []))
-
     def check_inputs(self, run_of: RunKey, checkpoint: str, source: str) -> None:
-        """Raises ClodError if base or views are others; ``checkpoint`` and ``source`` name them in the message."""
+        """Raises ClodError if base, views, ``--with`` or ``--without`` are others.
+
+        Args:
+            checkpoint, source: names of base and views in the message.
+        """
         for key, what in (
             ("base_sha256", f"another checkpoint than {checkpoint}"),
             ("views_sha256", f"other photographs than {source}"),
         ):
             if self.run_of.get(key) != run_of[key]:
                 raise ClodError(f"{self.path}: is of {what}; {ORIGINAL}")
-
-    def check_override(self, requested: dict[str, list[str]]) -> None:
-        """Raises ClodError if the run had other ``--with`` or ``--without``, which changes its tensors."""
         then = self.run_of.get("overruled", {})
-        if then != requested:
+        if then != run_of.get("overruled", {}):  # they change the tensors
             words = " ".join(" ".join((option, *names)) for option, names in then.items() if names)
             raise ClodError(f"{self.path}: is of a run with {words or 'no --with or --without'}; {ORIGINAL}")
 
@@ -95,9 +91,9 @@ def find_state(path: Path, resume: bool, config: AdaptConfig, console: Console) 
             console.say(f"there is no {path} to resume from: starting from the beginning")
         return None
     state, run_of = load_state(path)
-    if (wrong := _wrong_entry(run_of)) is not None:
+    if not _is_override(override := run_of.get("overruled", {})):
         raise ClodError(
-            f"{path}: is not a training state or is damaged (its record has {wrong} {run_of[wrong]!r:.60}); "
+            f"{path}: is not a training state or is damaged (its record has overruled {override!r:.60}); "
             "delete it to start over"
         )
     found = Resumed(path, state, run_of)
@@ -119,13 +115,14 @@ def identify(
     resumed: Resumed | None, base: Gaussians, scene: Scene, config: AdaptConfig, args: argparse.Namespace,
     console: Console,
 ) -> RunKey:  # fmt: skip
-    """The key of a run on these Gaussians and views, without its plan.
+    """The key of a run on these Gaussians and views, with these ``--with`` and ``--without``.
 
     Raises:
         ClodError: ``resumed`` is of others.
     """
     hashes = {"base_sha256": _fingerprint(base), "views_sha256": scene_fingerprint(scene)}
-    run_of = settings_key(config) | hashes
+    requested = {"--with": sorted(args.keep_in), "--without": sorted(args.leave_out)}
+    run_of = settings_key(config) | hashes | {"overruled": requested}
     check_resumed(resumed, run_of, args.ply, args.images or "the pseudo views", console)
     return run_of
 
@@ -252,18 +249,10 @@ def _tell(text: str) -> None:
         print(text, file=sys.stderr)
 
 
-def _wrong_entry(run_of: RunKey) -> str | None:
-    """The entry of a wrong type, of those whose contents are used."""
-    frozen, override = run_of.get("frozen", []), run_of.get("overruled", {})
-    if not _is_words(frozen):
-        return "frozen"
-    if not isinstance(override, dict) or not all(map(_is_words, override.values())):
-        return "overruled"
-    return None
-
-
-def _is_words(value: object) -> bool:
-    return isinstance(value, list) and all(isinstance(word, str) for word in value)
+def _is_override(value: object) -> bool:
+    """Whether it has names by option."""
+    lists = value.values() if isinstance(value, dict) else (None,)
+    return all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists)
 
 
 def _as_option(name: str, value: object) -> str:

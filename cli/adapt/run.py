@@ -14,7 +14,7 @@ from clod_adapter.io.lock import output_lock
 from clod_adapter.progress import Progress
 from clod_adapter.rasterizers.cpu import release_memory
 from clod_adapter.training.plan import Plan
-from clod_adapter.training.state import Adapted, StateRefused, TrainingState
+from clod_adapter.training.state import Adapted, StateRefused
 
 from ..shared.console import duration
 from ..shared.files import Outputs
@@ -23,7 +23,7 @@ from .blocks import Blocks
 from .inputs import Inputs, read_inputs, with_base_rows
 from .memory import without_rows
 from .plan import decide
-from .processes import Job, together
+from .processes import TrainingJob, together
 from .progress import ProgressDisplay
 from .report import finish
 from .result import make_result
@@ -33,10 +33,10 @@ from .setup import Setup
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     with output_lock(Outputs.of(args.ply, args.out).ply, shared=args.block is not None):
-        return adapt(args)
+        return adapt_and_report(args)
 
 
-def adapt(args: argparse.Namespace) -> dict[str, Any]:
+def adapt_and_report(args: argparse.Namespace) -> dict[str, Any]:
     """Runs the command; the caller holds the lock of the outputs."""
     setup = Setup.of(args)
     inputs = read_inputs(setup)
@@ -52,12 +52,11 @@ def adapt_whole(setup: Setup, inputs: Inputs) -> dict[str, Any]:
     inputs = with_base_rows(setup, inputs)
     with setup.stop.listening():  # until training has ended, so that a Ctrl-C loses nothing
         display = show_progress(setup, inputs)
-        plan, run_of = decide(setup, inputs, display, run_of)
-        states, plan = [setup.resumed.state if setup.resumed else plan.begun], replace(plan, begun=None)
+        plan = decide(setup, inputs, display)
         page = make_page(setup, inputs)
         saver = Saver(setup.outputs.state, run_of, setup.resumed, setup.console, setup.stop)
         with saver.rescuing():
-            adapted = train(setup, inputs, plan, states, display, saver, page)
+            adapted = train(setup, inputs, plan, display, saver, page)
             result = make_result(setup, inputs, plan, adapted)
     with saver.rescuing():
         return finish(setup, inputs, result, page, lambda complete: saver.close(complete))
@@ -89,19 +88,16 @@ def make_page(setup: Setup, inputs: Inputs) -> AdaptPage | None:
 
 
 def train(
-    setup: Setup, inputs: Inputs, plan: Plan, states: list[TrainingState | None], display: ProgressDisplay,
-    saver: Saver, page: AdaptPage | None,
-) -> Adapted:  # fmt: skip
+    setup: Setup, inputs: Inputs, plan: Plan, display: ProgressDisplay, saver: Saver, page: AdaptPage | None
+) -> Adapted:
     """Trains as planned; returns the result for all Gaussians.
-
-    Args:
-        states: the state to start from, which is removed: it is freed once training has copied it.
 
     Raises:
         ClodError: the state to resume from does not fit.
         KeyboardInterrupt: a second Ctrl-C.
     """
     base, console, scene = inputs.base.gaussians, setup.console, inputs.scene
+    state = setup.resumed.state if setup.resumed else None
 
     def show(now: Progress) -> bool:
         part = now.gaussians
@@ -111,8 +107,8 @@ def train(
         return display(now)
 
     try:
-        with closing(display), together(lambda: Job.of(plan, scene, states[0]), display) as group:
-            adapted = plan.adapt(scene, saver.saving(show), states.pop(), group)
+        with closing(display), together(lambda: TrainingJob.of(plan, scene, state), display) as group:
+            adapted = plan.adapt(scene, saver.saving(show), state, group)
     except StateRefused as error:
         raise saver.naming(error) from error
     saver.keep()

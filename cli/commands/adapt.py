@@ -127,8 +127,9 @@ plan:
   Printed before training: action, measured effect, option that overrides it.
   Higher SH degrees (bands) are excluded if training views change by less than
   0.02 dB without them, Gaussians (unseen) if they change no pixel of a training
-  view. An attribute is frozen if tuning it gains less than 0.02 dB (from 300
-  steps). Excluded values are in OUT.ply unchanged, or with --trim not at all.
+  view. Attributes (means, quats, scales, opacities, sh0) are tuned unless
+  --without freezes them. Excluded values are in OUT.ply unchanged, or with
+  --trim not at all.
 
 alignment:
   Renders of eight views are compared with the photographs. If the photographs'

@@ -42,7 +42,7 @@ def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fp
     for value in values:
         if not 0 < value < math.inf:
             raise ClodError(f"{option} has {value:g}, it must be positive and finite")
-    if not has_dial(model):
+    if not model_has_dial(model):
         raise ClodError(f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ...")
     needed = name != "keep" and name not in measured
     if needed and format_of(Path(model)) is PLY and not _has_calibration(model):  # others fail when read
@@ -56,7 +56,7 @@ def _has_calibration(model: str) -> bool:
     return any(comment.startswith(f"{PREFIX}{ROW} ") for comment in all_comments(read_head(Path(model)).ply))
 
 
-def has_dial(model: str) -> bool:
+def model_has_dial(model: str) -> bool:
     """Whether the file's header has a sigma_d."""
     return file_has_dial(Path(model))
 

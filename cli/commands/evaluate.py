@@ -10,7 +10,7 @@ from clod_adapter.errors import ClodError
 from ..shared.dials import BUDGETS, add_dial_options
 from ..shared.files import labels
 from ..shared.outputs import check_outputs
-from .checks import check_checkpoint, check_dials, check_scene, has_dial, page_files
+from .checks import check_checkpoint, check_dials, check_scene, model_has_dial, page_files
 from .command import Command
 from .options import add_activated, add_antialiasing, add_device, add_images
 
@@ -47,7 +47,7 @@ def check_evaluate(args: Namespace) -> None:
         check_checkpoint(path)
     if args.base:
         check_checkpoint(args.base)
-        if has_dial(args.base):
+        if model_has_dial(args.base):
             raise ClodError(
                 f"{args.base}: has a dial (sigma_d); give --base the checkpoint that was adapted, or use --against"
             )

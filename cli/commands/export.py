@@ -13,7 +13,7 @@ from clod_adapter.io.formats.splat_transform import SplatTransform
 
 from ..shared.dials import add_dial_options, given_budget
 from ..shared.outputs import check_outputs
-from .checks import check_checkpoint, check_dials, check_scene, has_dial
+from .checks import check_checkpoint, check_dials, check_scene, model_has_dial
 from .command import Command
 from .export_formats import FORMATS, LOD_META, PACKED, PAGE, format_table, level_paths, suffix_of, suffixes
 from .options import add_activated, add_antialiasing, add_device
@@ -67,7 +67,7 @@ def check_export(args: Namespace) -> None:
     check_export_outputs(args)
     check_dials(args, args.model, measured=measured_budgets(args))
     check_checkpoint(args.model)
-    dial = has_dial(args.model)
+    dial = model_has_dial(args.model)
     if bakes and not dial:
         raise ClodError(f"{args.model}: has no sigma_d, so no dial value can be baked; export it without one")
     if args.order and not dial:

@@ -14,7 +14,7 @@ PAGE = ".html"
 
 
 @dataclass(frozen=True)
-class Format:
+class ExportFormat:
     """A format and its lines in --help.
 
     Attributes:
@@ -30,18 +30,18 @@ class Format:
 
 # Written by splat-transform, which sorts rows along a space-filling curve.
 PACKED = {
-    ".sog": Format(("8 to 16 bits, SH from a palette; by splat-transform",), ordered=False, sigma=False),
-    ".compressed.ply": Format(("8 to 11 bits; by splat-transform",), ordered=False, sigma=False),
+    ".sog": ExportFormat(("8 to 16 bits, SH from a palette; by splat-transform",), ordered=False, sigma=False),
+    ".compressed.ply": ExportFormat(("8 to 11 bits; by splat-transform",), ordered=False, sigma=False),
 }
 FORMATS = {
-    ".ply": Format(("exact; baked, in Inria's layout",)),
-    ".glb": Format(("float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D)")),
-    ".spz": Format(("6 to 24 bits, SH degree up to 3, sigma_d 16-bit floats",)),
-    ".safetensors": Format(("exact; for Python",)),
-    ".pt": Format(("exact; layout of gsplat's trainer",)),
-    ".splat": Format(("8 bits, SH degree 0",), ordered=False, sigma=False),
+    ".ply": ExportFormat(("exact; baked, in Inria's layout",)),
+    ".glb": ExportFormat(("float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D)")),
+    ".spz": ExportFormat(("6 to 24 bits, SH degree up to 3, sigma_d 16-bit floats",)),
+    ".safetensors": ExportFormat(("exact; for Python",)),
+    ".pt": ExportFormat(("exact; layout of gsplat's trainer",)),
+    ".splat": ExportFormat(("8 bits, SH degree 0",), ordered=False, sigma=False),
     **PACKED,
-    PAGE: Format(
+    PAGE: ExportFormat(
         ("the viewer with the splat, in one file;", "exact, or 8 to 16 bits by splat-transform"),
         ordered=False,
     ),

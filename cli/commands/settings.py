@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from clod_adapter.config import AdaptConfig, describe
+from clod_adapter.config import AdaptConfig, field_descriptions
 from clod_adapter.errors import ClodError
 
 from ..shared.launch import launched
@@ -24,7 +24,7 @@ DEFAULTS = {"iters": "1500 divided by the batch", "batch": "1 per process"}
 
 def add_settings(options: _ActionsContainer, without: Sequence[str] = ()) -> None:
     """Adds the options except the fields in ``without``, which a command has in another form."""
-    helps, defaults = describe(AdaptConfig), AdaptConfig()
+    helps, defaults = field_descriptions(AdaptConfig), AdaptConfig()
     for name, (metavar, kind) in OPTIONS.items():
         if name in without:
             continue

@@ -18,7 +18,7 @@ from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
 from clod_adapter.io.ply.header import PREFIX
 from clod_adapter.origin import NOWHERE
-from clod_adapter.viewer.page import write_page
+from clod_adapter.viewer.page import write_viewer_page
 
 from ..commands.export_formats import LOD_META, PACKED, PAGE, suffix_of
 from ..shared.console import Console, duration
@@ -107,10 +107,10 @@ class Export:
         try:
             tool = SplatTransform.find()
         except ClodError as error:
-            write_page(path, self.model, cameras=self.cameras, virtual_scale=virtual_scale)
+            write_viewer_page(path, self.model, cameras=self.cameras, virtual_scale=virtual_scale)
             return (f"the splat in the page is not packed, which would make the page five times smaller: {error}",)
         with ticking(self.console, f"splat-transform {tool.version}, {len(self.gaussians):,} Gaussians") as tick:
-            write_page(
+            write_viewer_page(
                 path, self.model, cameras=self.cameras, virtual_scale=virtual_scale, tool=tool, progress=tick
             )  # fmt: skip
         return ("the splat in the page is packed: values are rounded",)

@@ -104,7 +104,7 @@ def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
     for view in views:
         seen |= in_frustum(gaussians.means, view.camera)
     in_view = float(seen.float().mean()) if len(seen) else 0.0
-    compared = [row for view in views if (row := compare(gaussians, view)) is not None]
+    compared = [row for view in views if (row := compare_renders(gaussians, view)) is not None]
     if not compared:
         return Alignment(0, in_view, *[math.nan] * 5)
     table = torch.stack(compared)
@@ -116,7 +116,7 @@ def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
     )  # fmt: skip
 
 
-def compare(gaussians: Gaussians, view: View) -> Tensor | None:
+def compare_renders(gaussians: Gaussians, view: View) -> Tensor | None:
     """``[5]`` means over pixels and channels; None if the photograph is one colour.
 
     Squared error of the render over black, of the render over white, and of the photograph's mean colour (its

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from clod_adapter.alignment.check import CLEAR, Alignment, check_alignment, compare
+from clod_adapter.alignment.check import CLEAR, Alignment, check_alignment, compare_renders
 from clod_adapter.alignment.frames import Frame, centres_of, focus_of, into_file, known_frames
 from clod_adapter.cameras import View
 from clod_adapter.gaussians import Gaussians
@@ -89,7 +89,7 @@ class _Stage:
     def score(self, viewmats: Tensor) -> float:
         """Correlation in [-1, 1] of the photographs with renders from these poses (``[V, 4, 4]``, of all views)."""
         moved = _moved(self.views, viewmats[self.index])
-        rows = [row for view in moved if (row := compare(self.gaussians, view)) is not None]
+        rows = [row for view in moved if (row := compare_renders(self.gaussians, view)) is not None]
         if not rows:
             return -1.0
         _, _, constant, rendered, shared = torch.stack(rows).sum(0).tolist()

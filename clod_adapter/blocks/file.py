@@ -49,7 +49,7 @@ def load_block(path: Path, belongs: dict[str, Any]) -> tuple[dict[str, Tensor], 
         ClodError: the file cannot be read, is damaged, or is of another run than ``belongs``.
     """
     refuse_irregular(path, "remove it")
-    with damaged(path):
+    with refused_if_damaged(path):
         tensors, metadata = read_tensors(path)
         found = json.loads(metadata[KEY])
         about, theirs = dict(found["about"]), dict(found["belongs"])
@@ -65,7 +65,7 @@ def load_block(path: Path, belongs: dict[str, Any]) -> tuple[dict[str, Tensor], 
 
 
 @contextmanager
-def damaged(path: Path) -> Iterator[None]:
+def refused_if_damaged(path: Path) -> Iterator[None]:
     """Turns errors of reading a file, raised within, into a ClodError that names it."""
     try:
         yield

@@ -15,7 +15,7 @@ from PIL import Image
 from clod_adapter.cameras import Camera
 from clod_adapter.config import require
 from clod_adapter.demo import textures as tx
-from clod_adapter.demo.lightmaps import bake
+from clod_adapter.demo.lightmaps import bake_light
 from clod_adapter.demo.paths import path_cameras
 from clod_adapter.demo.raytrace import Tables, camera_rays, encode_srgb, render_linear, trace_rays
 from clod_adapter.demo.shapes import Finish, SceneBuilder
@@ -110,7 +110,7 @@ class Gallery:
 
 def make_gallery(samples: int = 3) -> Gallery:
     """Builds the room and bakes its light, which takes several seconds."""
-    return Gallery(bake(unlit_room()), samples)
+    return Gallery(bake_light(unlit_room()), samples)
 
 
 def unlit_room() -> Tables:

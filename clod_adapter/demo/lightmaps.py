@@ -77,7 +77,7 @@ def bounced_light(tables: Any, where: np.ndarray, uv: np.ndarray, jitter: np.nda
         out[k, 0], out[k, 1], out[k, 2] = r / (n * n), g / (n * n), b / (n * n)
 
 
-def bake(tables: Tables, lamp_rays: int = 5, bounce_rays: int = 8, bounces: int = 2) -> Tables:
+def bake_light(tables: Tables, lamp_rays: int = 5, bounce_rays: int = 8, bounces: int = 2) -> Tables:
     """The scene, lit by its lamps.
 
     Args:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from clod_adapter.report.style import BLUE, INK, ORANGE, QUIET, label_log, new_figure, save, tidy
+from clod_adapter.report.style import BLUE, INK, ORANGE, QUIET, label_log, new_figure, save_figure, tidy
 
 
 @dataclass(frozen=True)
@@ -58,13 +58,13 @@ def dial_strip(
             for row, aspect in enumerate(rows):
                 tall = cell * aspect
                 axes = figure.add_axes((left / across, (top - tall) / down, cell / across, tall / down))
-                show(axes, panel.image, crop, enlarged=row == 1)
+                shown_panel(axes, panel.image, crop, enlarged=row == 1)
                 top -= tall + gap
             write_caption(figure, panel, (left + cell / 2) / across, top, down)
-        save(figure, path)
+        save_figure(figure, path)
 
 
-def show(axes: Any, image: np.ndarray, crop: tuple[int, int, int, int] | None, enlarged: bool) -> None:
+def shown_panel(axes: Any, image: np.ndarray, crop: tuple[int, int, int, int] | None, enlarged: bool) -> None:
     """Shows an image, or with `enlarged` its crop, in the axes; the whole image gets an outline of the crop."""
     axes.axis("off")
     pixels = image if image.dtype == np.uint8 else np.clip(image, 0, 1)
@@ -113,7 +113,7 @@ def quality_curve(
         below.set_ylabel("SSIM")
         below.set_xlabel("Gaussians kept (log scale)")
         label_log(below.xaxis)
-        save(figure, path)
+        save_figure(figure, path)
 
 
 def draw_curve(

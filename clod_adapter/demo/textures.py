@@ -78,10 +78,10 @@ def tone(image: Image.Image, dark: Colour, light: Colour) -> np.ndarray:
     """Maps the brightness of an image to a gradient between two colours, see `toned`."""
     grey = np.asarray(image.convert("L").resize((SIDE, SIDE), Image.Resampling.LANCZOS), np.float32)
     low, high = np.percentile(grey, [2, 98])
-    return blend(dark, light, np.clip((grey - low) / (high - low), 0, 1))
+    return mixed(dark, light, np.clip((grey - low) / (high - low), 0, 1))
 
 
-def blend(dark: Colour, light: Colour, share: np.ndarray) -> np.ndarray:
+def mixed(dark: Colour, light: Colour, share: np.ndarray) -> np.ndarray:
     """Linear colours between two sRGB colours, mixed in sRGB by `share` ``[h, w]``."""
     mixed = np.array(dark) + share[..., None] * (np.array(light) - np.array(dark))
     return decode_srgb(np.clip(mixed, 0, 255))
@@ -89,7 +89,7 @@ def blend(dark: Colour, light: Colour, share: np.ndarray) -> np.ndarray:
 
 def plain(colour: Colour) -> np.ndarray:
     """One colour."""
-    return blend(colour, colour, np.zeros((2, 2)))
+    return mixed(colour, colour, np.zeros((2, 2)))
 
 
 def plaster(colour: Colour, contrast: float, seed: int, side: int = 256) -> np.ndarray:
@@ -100,7 +100,7 @@ def plaster(colour: Colour, contrast: float, seed: int, side: int = 256) -> np.n
         n = 6 * 2**octave
         noise = Image.fromarray(random.normal(size=(n, n)).astype(np.float32))
         clouds += np.asarray(noise.resize((side, side), Image.Resampling.BICUBIC)) / 2**octave
-    return blend(shaded(colour, 1 - contrast), shaded(colour, 1 + contrast), 0.5 + clouds / 4)
+    return mixed(shaded(colour, 1 - contrast), shaded(colour, 1 + contrast), 0.5 + clouds / 4)
 
 
 def planks(dark: Colour, light: Colour, rows: int = 12, seed: int = 3) -> np.ndarray:
@@ -114,11 +114,11 @@ def planks(dark: Colour, light: Colour, rows: int = 12, seed: int = 3) -> np.nda
     second = ((y - ends) % 1 > 0.5).astype(int)
     tone = 0.5 + tone + random.uniform(-0.4, 0.4, (rows, 2))[board, second]
     joint = (x % 1 < 0.05) | ((y - ends) % 0.5 < 0.006)
-    return blend(dark, light, np.where(joint, -0.6, np.clip(tone, -0.2, 1.2)))
+    return mixed(dark, light, np.where(joint, -0.6, np.clip(tone, -0.2, 1.2)))
 
 
 def chequers(columns: int, rows: int, one: Colour, other: Colour) -> np.ndarray:
     """A chequerboard with soft-edged squares."""
     y, x = np.mgrid[0.5:SIDE, 0.5:SIDE] / SIDE
     wave = np.sin(np.pi * columns * x) * np.sin(np.pi * rows * y)
-    return blend(one, other, np.clip(0.5 + 12 * wave, 0, 1))
+    return mixed(one, other, np.clip(0.5 + 12 * wave, 0, 1))

@@ -33,7 +33,7 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         return read_tensors(path)
 
 
-def read_metadata(path: Path) -> dict[str, str]:
+def read_tensor_metadata(path: Path) -> dict[str, str]:
     """The metadata alone, without torch.
 
     Raises:

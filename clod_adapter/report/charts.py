@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from clod_adapter.report.series import Series
-from clod_adapter.report.style import GRID, INK, PAPER, QUIET, SERIES, label_log, new_figure, save
+from clod_adapter.report.style import GRID, INK, PAPER, QUIET, SERIES, label_log, new_figure, save_figure
 
 Draw = Callable[[Any], None]
 SIZE = (7.2, 4.1)  # inches
@@ -18,7 +18,7 @@ STEPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # dB between grid line
 MARKERS = "oDs^vPX"
 
 
-def write_png(path: str | Path, draw: Draw) -> None:
+def write_chart(path: str | Path, draw: Draw) -> None:
     """Draws a chart into a PNG file.
 
     Raises:
@@ -26,7 +26,7 @@ def write_png(path: str | Path, draw: Draw) -> None:
     """
     with new_figure(SIZE, layout="constrained") as figure:
         draw(figure)
-        save(figure, path)
+        save_figure(figure, path)
 
 
 def chart_file(page: Path, name: str) -> Path:
@@ -65,7 +65,7 @@ def rendering_chart(series: Sequence[Series]) -> Draw:
                 _note(axes, f"s = {row['virtual_scale']:g}", point)
         axes.set_xscale("log")
         axes.set_xlabel("milliseconds per frame (log scale)")
-        finish(axes)
+        finish_axes(axes)
 
     return draw
 
@@ -91,7 +91,7 @@ def draw_training(axes: Any, curves: Sequence[Mapping[str, Any]], base_psnr: flo
         axes.axhline(error(base_psnr), color=INK, linestyle="--", linewidth=1.1, label="base, unadapted")
     axes.set_xscale("log")
     axes.set_xlabel("seconds of adapting (log scale)")
-    finish(axes)
+    finish_axes(axes)
 
 
 def error(psnr: float) -> float:
@@ -103,7 +103,7 @@ def _note(axes: Any, text: str, at: tuple[float, float]) -> None:
     axes.annotate(text, at, (-5, -11), textcoords="offset points", ha="right", fontsize=8, color=QUIET)
 
 
-def finish(axes: Any) -> None:
+def finish_axes(axes: Any) -> None:
     """Axes of an error chart: log error on the left, with ticks at round PSNR values, which are on the right."""
     axes.set_yscale("log")
     axes.margins(x=0.09, y=0.12)

@@ -103,7 +103,7 @@ def chart(svg: str, caption: str) -> str:
     return f'<figure><div class="chart">{svg}</div><figcaption>{escape(caption)}</figcaption></figure>'
 
 
-def table(head: Sequence[str], groups: Iterable[tuple[str, Sequence[Sequence[str]]]]) -> str:
+def html_table(head: Sequence[str], groups: Iterable[tuple[str, Sequence[Sequence[str]]]]) -> str:
     """A table of groups, each with a heading and rows of cells."""
     lines = ["<tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
     for name, rows in groups:
@@ -122,7 +122,7 @@ def strip(pictures: Sequence[Picture]) -> str:
     return f'<div class="strip">{"".join(cells)}</div>'
 
 
-def dial(frames: Sequence[Picture], others: Mapping[str, Picture]) -> str:
+def dial_figure(frames: Sequence[Picture], others: Mapping[str, Picture]) -> str:
     """A slider over the frames, in order of dial values; an image of ``others`` is shown while its button is held."""
     height, width = frames[0].image.shape[:2]
     images = [_frame(picture) for picture in frames] + [_frame(picture, name) for name, picture in others.items()]

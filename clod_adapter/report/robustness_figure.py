@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from clod_adapter.report.style import INK, ORANGE, QUIET, label_log, new_figure, save, shades, tidy
+from clod_adapter.report.style import INK, ORANGE, QUIET, label_log, new_figure, save_figure, shades, tidy
 
 PANELS = ("PSNR (dB)", "SSIM", "opacity", "decay sigma_d (log scale)")
 
@@ -42,7 +42,7 @@ def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], titl
         for panel, label in zip(grid[-1], ("Gaussians kept (log scale)",) * 2 + PANELS[2:], strict=True):
             panel.set_xlabel(label)
         _legend(figure, colours)
-        save(figure, path)
+        save_figure(figure, path)
 
 
 def _quality(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, str]) -> None:

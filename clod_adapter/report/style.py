@@ -55,7 +55,7 @@ def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
         yield Figure(figsize=inches, dpi=DPI, facecolor=PAPER, **options)
 
 
-def save(figure: Any, path: str | Path) -> None:
+def save_figure(figure: Any, path: str | Path) -> None:
     """Writes the figure atomically."""
     # Text in a PNG by which a later run recognizes its own output.
     about = {"Software": f"clod-adapter {package_version()}"} if Path(path).suffix.lower() == ".png" else {}

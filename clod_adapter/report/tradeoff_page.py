@@ -9,7 +9,7 @@ from typing import Any
 
 from clod_adapter.io.atomic import atomic_paths
 from clod_adapter.report import page
-from clod_adapter.report.charts import chart_file, inline_svg, rendering_chart, training_chart, write_png
+from clod_adapter.report.charts import chart_file, inline_svg, rendering_chart, training_chart, write_chart
 from clod_adapter.report.page import Picture
 from clod_adapter.report.series import Series, series_of
 
@@ -75,7 +75,7 @@ def write_tradeoff_report(
     kicker = f"clod-adapter {report['version']}, {'evaluation' if report['command'] == 'eval' else 'adaptation'} report"
     with atomic_paths(path, *outputs.values()) as (temporary, *pngs):
         for chart, draw in zip(pngs, charts.values(), strict=True):
-            write_png(chart, draw)
+            write_chart(chart, draw)
         page.write_page(temporary, _title(report), kicker, body, {"report": report, "training": training})
     return {"page": path, **outputs}
 
@@ -155,7 +155,7 @@ def _pictures(frames: Sequence[Picture], others: Mapping[str, Picture]) -> list[
         text = (
             "One held-out view. Each position of the slider is a render at that dial value; hold a button to compare."
         )
-        found.append(page.section("The dial", page.paragraph(text, "quiet"), page.dial(frames, others)))
+        found.append(page.section("The dial", page.paragraph(text, "quiet"), page.dial_figure(frames, others)))
     few = [frames[k] for k in dict.fromkeys(round(k * (len(frames) - 1) / 3) for k in range(4))]
     found.append(page.section("Side by side", page.strip([*others.values(), *few])))
     return found
@@ -180,7 +180,7 @@ def _rows(series: Sequence[Series]) -> str:
             for row in one.rows
         ]  # fmt: skip
         groups.append((one.label, rows))
-    return page.section("All rows", page.table(head, groups)) if groups else ""
+    return page.section("All rows", page.html_table(head, groups)) if groups else ""
 
 
 def _plan(report: Mapping[str, Any]) -> str:
@@ -188,7 +188,9 @@ def _plan(report: Mapping[str, Any]) -> str:
     decisions = (report.get("plan") or {}).get("decisions", ())  # none of a training in blocks
     rows = [[made[name] for name in ("what", "verdict", "measured", "why")] for made in decisions]
     return (
-        page.section("Plan", page.table(("part", "action", "measured effect", "reason"), [("", rows)])) if rows else ""
+        page.section("Plan", page.html_table(("part", "action", "measured effect", "reason"), [("", rows)]))
+        if rows
+        else ""
     )
 
 

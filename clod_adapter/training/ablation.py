@@ -1,4 +1,4 @@
-"""Effect on the training views of removing SH degrees or Gaussians, and of training an attribute."""
+"""Effect on the training views of removing SH degrees or Gaussians."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def sh_degree_losses(base: Gaussians, views: Sequence[View], limit: float) -> It
     for degree in range(used, 0, -1):
         less = base.without_bands(degree - 1)
         without = [psnr(render(less, view.camera).image, view.image) for view in views]
-        change = _mean_change(with_all, without)
+        change = fmean(abs(_difference(a, b)) for a, b in zip(with_all, without, strict=True))
         yield degree, change
         if not change < limit:
             return
@@ -68,36 +68,6 @@ def largest_change(
         lost.append(_difference(psnr(with_all, view.image), psnr(without, view.image)))
         tell(progress, Phase.TRIMMING, done, len(views))
     return largest, fmean(lost) if lost else 0.0
-
-
-@torch.no_grad()
-def effect(
-    name: str, before: Gaussians, after: Gaussians, views: Sequence[View], dials: Sequence[float], limit: float
-) -> tuple[float, float]:
-    """Effect of the change of one attribute from ``before`` to ``after``: (dB, the dial value where it was measured).
-
-    The mean over ``views`` of the absolute change of PSNR against the photographs when the attribute alone is reset.
-    Absolute, because early steps are long and may lower PSNR even where training the attribute helps in the end.
-    Measured at each of ``dials`` until one is at least ``limit``; otherwise the largest.
-    """
-    old, new = getattr(before, name), getattr(after, name)
-    most = (0.0, dials[0])
-    if torch.equal(old, new):
-        return most
-    back = after.replace(**{name: old})
-    for s in dials:
-        most = max(most, (_mean_change(_errors(after, views, s), _errors(back, views, s)), s))
-        if most[0] >= limit:
-            break
-    return most
-
-
-def _errors(gaussians: Gaussians, views: Sequence[View], s: float) -> list[float]:
-    return [psnr(render(gaussians, view.camera, s).image, view.image) for view in views]
-
-
-def _mean_change(these: Sequence[float], those: Sequence[float]) -> float:
-    return fmean(abs(_difference(a, b)) for a, b in zip(these, those, strict=True))
 
 
 def _difference(this: float, that: float) -> float:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
@@ -24,7 +23,6 @@ from clod_adapter.training.state import TrainingState
 RATES = {
     "means": "lr_means", "quats": "lr_quats", "scales": "lr_scales", "opacities": "lr_opacities", "sh0": "lr_sh0",
 }  # fmt: skip
-FIELDS = {"scales": "log_scales", "opacities": "opacity_logits"}  # of Gaussians, where they are called otherwise
 NAMES = ("bands", "unseen", *RATES)
 
 
@@ -34,7 +32,7 @@ class Decision:
 
     Attributes:
         what: the part of the checkpoint.
-        verdict: "kept" or "left out", of an attribute "trained" or "frozen".
+        verdict: "kept", "left out", or of an attribute "frozen".
         number: the measured effect, in ``unit``; None if nothing was measured.
         why: what the number is, or the reason if there is none.
         name: the name in NAMES by which ``Override`` changes it; empty if there is nothing to change.
@@ -58,6 +56,8 @@ class Decision:
 @dataclass(frozen=True)
 class Override:
     """Decisions that are fixed in advance, without a measurement; both sets are subsets of NAMES.
+
+    Attributes are trained unless ``leave_out`` has them.
 
     Raises:
         ClodError: a name is unknown, or in both sets.
@@ -83,10 +83,7 @@ class Plan:
         kept: ``[N]`` bool, the rows that are trained; None for all.
         sh_degree: the SH degree that is trained.
         config: with learning rate 0 for frozen attributes.
-        begun: the state after the first steps, if they were done to make the plan; else None. ``adapt`` starts from a
-            copy of it.
-        seconds: wall time of "bands", "unseen" (beyond the initialization) and "probe" (beyond the training steps), and
-            of the initialization, "start".
+        seconds: wall time of "bands", of "unseen" beyond the initialization, and of the initialization, "start".
     """
 
     decisions: tuple[Decision, ...]
@@ -94,13 +91,7 @@ class Plan:
     kept: Tensor | None
     sh_degree: int
     config: AdaptConfig
-    begun: TrainingState | None = None
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def frozen(self) -> tuple[str, ...]:
-        """The names of the attributes that are not trained."""
-        return tuple(name for name, rate in RATES.items() if not getattr(self.config, rate))
+    seconds: dict[str, float]
 
     @cached_property
     def lean(self) -> Gaussians:
@@ -119,10 +110,8 @@ class Plan:
         resume: TrainingState | None = None,
         group: ProcessGroup | None = None,
     ) -> Adapted:
-        """``loop.adapt`` of ``lean``, from ``resume`` or ``begun``."""
-        states = [self.begun if resume is None else resume]
-        del resume  # so that the state, if it is the caller's last reference, is freed once training has copied it
-        return adapt(self.lean, scene, self.config, progress, states.pop(), subset=self.subset, group=group)
+        """``loop.adapt`` of ``lean``."""
+        return adapt(self.lean, scene, self.config, progress, resume, subset=self.subset, group=group)
 
     def whole(self, base: Gaussians, lean: Gaussians) -> Gaussians:
         """``lean`` after training, together with what was left out: the base's values and the initial sigma_d.
@@ -161,9 +150,3 @@ class Plan:
         seconds = {name: round(value, 3) for name, value in self.seconds.items()}
         decisions = [asdict(decision) | {"measured": decision.measured} for decision in self.decisions]
         return {"decisions": decisions, "seconds": seconds}
-
-
-def freezing(config: AdaptConfig, names: Collection[str]) -> AdaptConfig:
-    """The settings with learning rate 0 for these attributes."""
-    rates: dict[str, Any] = {RATES[name]: 0.0 for name in names}
-    return replace(config, **rates)

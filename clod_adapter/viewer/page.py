@@ -32,7 +32,7 @@ def served_page(config: Mapping[str, Any]) -> bytes:
     return b"".join(_document(config, (), ""))
 
 
-def write_page(
+def write_viewer_page(
     path: str | Path,
     model: Checkpoint,
     *,

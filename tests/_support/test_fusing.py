@@ -1,4 +1,4 @@
-"""Compiled formulas are the plain ones, in values and gradients, at every dial value without compiling anew."""
+"""Compiled formulas equal the plain ones, in values and gradients, at all dial values from one compilation."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DIALS = (1.0, 2.5, 6.0)
 
 @pytest.fixture
 def everything_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Here too, and however few the rows; and each test from the start."""
+    """On the CPU too, for any number of rows, and again in each test."""
     monkeypatch.setattr(Fused, "compiles", lambda self, first: not self._failed)
     for name in ("_from_logits", "_from_centres", "_from_opacities"):
         monkeypatch.setattr(attenuation, name, Fused(getattr(attenuation, name).plain))
@@ -35,7 +35,7 @@ def everything_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def faster(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Traced, decomposed, split into a way forward and a way back, and run without a compiler, which costs minutes."""
+    """Traces, decomposes and splits into forward and backward, without a compiler, which takes minutes."""
     if not locale.getencoding().upper().startswith("UTF"):
         pytest.skip("torch's compiler reads files of its own, which are UTF-8, in the locale's encoding")
     compile_, backend = torch.compile, "aot_eager_decomp_partition"
@@ -66,7 +66,9 @@ def results(given: dict[str, Tensor], view: Camera, config: AttenuationConfig, f
     return found
 
 
-def test_traced_it_is_the_same_from_one_graph(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+def test_one_traced_graph_gives_the_same_results(
+    monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
     def donates() -> Any:
         """A setting of the user's own compiled code too; torch 2.4 has none."""
         return getattr(torch._functorch.config, "donated_buffer", None)
@@ -88,7 +90,7 @@ def test_traced_it_is_the_same_from_one_graph(monkeypatch: pytest.MonkeyPatch, r
     reason="compiling takes minutes on a busy machine: done on a GPU, or with CLOD_COMPILE=1",
 )
 @pytest.mark.parametrize("form", ["seen", "logits", "opacities"])
-def test_compiled_it_is_the_same_to_rounding(request: pytest.FixtureRequest, form: str) -> None:
+def test_compiled_results_are_the_same_to_rounding(request: pytest.FixtureRequest, form: str) -> None:
     where = "cuda" if torch.cuda.is_available() else "cpu"
     given = {name: value.to(where) for name, value in inputs().items()}
     want = results(given, camera(), SOFT, form)
@@ -104,47 +106,34 @@ def assert_same(found: list[Tensor], want: list[Tensor]) -> None:
         torch.testing.assert_close(mine.float(), expected.float(), rtol=1e-5, atol=1e-6, equal_nan=True)
 
 
-def test_a_failure_to_compile_is_said_once_and_survived(
+def test_a_failure_to_compile_warns_once_and_falls_back(
     monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     want = results(inputs(), camera(), SOFT, "logits")
     request.getfixturevalue("everything_compiles")
 
-    def broken(function: Any, **kwargs: Any) -> Any:
-        def run(*args: Any, **kwargs: Any) -> Any:
-            raise RuntimeError("triton not found\nand more")
+    def fail(error: Exception) -> Any:
+        raise error
 
-        return run
-
-    monkeypatch.setattr(torch, "compile", broken)
+    monkeypatch.setattr(torch, "compile", lambda f, **_: lambda *a, **k: fail(RuntimeError("triton not found\nmore")))
     with pytest.warns(UserWarning, match=r"torch.compile fails here \(triton not found\)") as seen:
         found = results(inputs(), camera(), SOFT, "logits")
     assert len([w for w in seen if "torch.compile" in str(w.message)]) == 1
     assert all(torch.equal(a, b) for a, b in zip(found, want, strict=True))
-
-
-def test_running_out_of_memory_is_not_a_failure_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*args: Any) -> Any:
-        raise torch.OutOfMemoryError("full")
-
-    fused = Fused(lambda x: x)
-    monkeypatch.setattr(fused, "_compiled", full)
+    fused = Fused(lambda x: x)  # running out of memory is not a failure to compile
+    monkeypatch.setattr(fused, "_compiled", lambda *_: fail(torch.OutOfMemoryError("full")))
     with pytest.raises(torch.OutOfMemoryError):
         fused.compiled(torch.zeros(1))
     assert not fused._failed
 
 
-def test_only_many_rows_on_a_gpu_are_worth_it() -> None:
-    class Row:
-        def __init__(self, on_gpu: bool, rows: int) -> None:
-            self.is_cuda, self.rows = on_gpu, rows
+def test_only_many_rows_on_a_gpu_are_compiled() -> None:
+    class Rows(list[int]):
+        is_cuda = True
 
-        def __len__(self) -> int:
-            return self.rows
-
-    fused = Fused(lambda x: x)
-    assert fused.compiles(Row(True, fusing.ROWS))
-    assert not fused.compiles(Row(True, fusing.ROWS - 1)) and not fused.compiles(Row(False, fusing.ROWS))
+    fused, many = Fused(lambda x: x), Rows(range(fusing.ROWS))
+    assert fused.compiles(many)  # type: ignore[arg-type]
+    assert not fused.compiles(Rows(many[1:])) and not fused.compiles(torch.zeros(fusing.ROWS))  # type: ignore[arg-type]
 
 
 def test_a_traced_step_of_adam_is_the_plain_one(monkeypatch: pytest.MonkeyPatch, request: Any, n: int = 50) -> None:

@@ -22,9 +22,6 @@ def test_names_as_text(name: str, text: str) -> None:
     assert as_text(name) == text and text.encode()
 
 
-def test_names_on_disk() -> None:
+def test_names_on_disk_and_in_errors() -> None:
     assert os.fsencode(file_name("gärten/日本.ply")) == "gärten/日本.ply".encode()
-
-
-def test_an_error_that_names_a_file_can_be_printed() -> None:
     assert str(ClodError("a\udcff.ply: is damaged\x1b[2J")) == "a\\xff.ply: is damaged [2J"

@@ -17,7 +17,7 @@ from clod_adapter._support.workers import Worker, in_order, some
 
 @pytest.fixture
 def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No workers yet, and little patience."""
+    """No workers yet, and a short timeout."""
     monkeypatch.setattr(workers, "_workers", [])
     monkeypatch.setattr(workers, "LOOK_SECONDS", 0.02)
 
@@ -32,7 +32,7 @@ def test_results_come_in_order(fresh: None) -> None:
     assert list(in_order([], 3)) == []
 
 
-def test_an_error_ends_it_once_all_that_was_begun_is_done(fresh: None) -> None:
+def test_an_error_is_raised_once_all_started_calls_are_done(fresh: None) -> None:
     done, asked = [], []
 
     def call(number: int) -> None:
@@ -51,24 +51,23 @@ def test_an_error_ends_it_once_all_that_was_begun_is_done(fresh: None) -> None:
     assert sorted(done) == sorted(set(asked) - {1}) and len(asked) < 10
 
 
-def test_threads_that_the_system_refuses(fresh: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise RuntimeError("can't start new thread")
-
-    monkeypatch.setattr(_thread, "start_new_thread", refuse)
-    with pytest.raises(MemoryError, match="a thread cannot be started"):
-        some(1)
-
-
-def test_threads_that_die_before_they_run(fresh: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As where there is no memory left for their stack: the system has started them, and they never say a word."""
+@pytest.mark.parametrize("refused", [True, False])
+def test_threads_that_do_not_start(fresh: None, monkeypatch: pytest.MonkeyPatch, refused: bool) -> None:
+    """The system refuses them, or starts them and they end at once, as without memory for their stack."""
     start = _thread.start_new_thread
-    monkeypatch.setattr(_thread, "start_new_thread", lambda *_: start(lambda: None, ()))
-    with pytest.raises(MemoryError, match="a thread was started and does not run"):
+
+    def start_none(*_: object) -> int:
+        if refused:
+            raise RuntimeError("can't start new thread")
+        return start(lambda: None, ())
+
+    monkeypatch.setattr(_thread, "start_new_thread", start_none)
+    said = "a thread cannot be started" if refused else "a thread was started and does not run"
+    with pytest.raises(MemoryError, match=said):
         some(1)
 
 
-def test_threads_that_die_with_work_before_them(fresh: None) -> None:
+def test_threads_that_end_before_their_work(fresh: None) -> None:
     def kernel(worker: int, count: int, out: torch.Tensor) -> None:
         out[worker] = count
 
@@ -87,7 +86,7 @@ def test_threads_that_die_with_work_before_them(fresh: None) -> None:
     assert out.tolist() == [2, 2]
 
 
-def test_a_worker_holds_nothing_once_it_is_done(fresh: None) -> None:
+def test_a_worker_holds_no_reference_once_it_is_done(fresh: None) -> None:
     """An idle thread that held a tensor while the interpreter ends would abort the process."""
 
     class Held:

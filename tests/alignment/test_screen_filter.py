@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from clod_adapter.alignment.screen_filter import MOST_VIEWS, compare_filters
+from clod_adapter.alignment.screen_filter import compare_filters
 from clod_adapter.cameras import View
 from clod_adapter.config import FILTERS
 from clod_adapter.evaluation.evaluate import evaluate
@@ -13,32 +13,24 @@ from clod_adapter.gaussians import Gaussians
 from scenes import gaussians, photograph, ring
 
 
-def fine(seed: int = 0) -> Gaussians:
-    """Of a pixel and less in pictures 48 wide, where filters differ."""
-    return gaussians(1500, 0, seed, size=0.025)
-
-
 def seen_with(name: str, views: int = 5) -> tuple[Gaussians, tuple[View, ...]]:
-    """A checkpoint as a file without a word on its filter, and photographs of it drawn with ``name``."""
-    truth = fine().replace(screen_filter=FILTERS[name])
-    noisy = truth.sh0 + 0.1 * torch.randn(truth.sh0.shape, generator=torch.Generator().manual_seed(1))
-    return fine().replace(sh0=noisy), photograph(truth, ring(views, 48, 36))
+    """A checkpoint that does not name its filter, and photographs of it drawn with ``name``.
+
+    Its Gaussians are of a pixel and less in images 48 wide, where filters differ.
+    """
+    fine = gaussians(1500, 0, 0, size=0.025)
+    noisy = fine.sh0 + 0.1 * torch.randn(fine.sh0.shape, generator=torch.Generator().manual_seed(1))
+    return fine.replace(sh0=noisy), photograph(fine.replace(screen_filter=FILTERS[name]), ring(views, 48, 36))
 
 
-@pytest.mark.parametrize("name", FILTERS)
-@pytest.mark.parametrize("expected", FILTERS)
+@pytest.mark.parametrize(("name", "expected"), [("off", "on"), ("on", "mip"), ("mip", "off")])
 def test_the_filter_of_the_photographs_is_found(name: str, expected: str) -> None:
     base, views = seen_with(name)
     found = compare_filters(base, views, expected)
-    assert (found.chosen, found.expected, found.screen_filter) == (name, expected, FILTERS[name])
-    assert max(found.psnr, key=found.psnr.__getitem__) == name and found.psnr.keys() == FILTERS.keys()
-
-
-def test_numbers_are_psnrs_and_their_means() -> None:
-    base, views = seen_with("on", MOST_VIEWS)
-    found = compare_filters(base, views)
     (row,) = evaluate(base.replace(screen_filter=FILTERS["mip"]), views, [1.0])
     assert found.psnr["mip"] == pytest.approx(row.psnr, abs=1e-3)
+    assert (found.chosen, found.expected, found.screen_filter) == (name, expected, FILTERS[name])
+    assert max(found.psnr, key=found.psnr.__getitem__) == name and found.psnr.keys() == FILTERS.keys()
 
 
 def test_where_nothing_is_clear_the_expected_one_stays() -> None:

@@ -56,11 +56,7 @@ def already(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
 
 @pytest.mark.parametrize(
     ("condition", "holds"),
-    [
-        ("ignored_sigint", {"ignored"}),
-        ("blocked_signals+folders", {"blocked", "spaced"}),
-        ("c_locale", {"ascii"}),
-    ],
+    [("ignored_sigint", {"ignored"}), ("blocked_signals+folders", {"blocked", "spaced"}), ("c_locale", {"ascii"})],
 )
 def test_a_condition_and_its_counts(tmp_path: Path, already: set[str], condition: str, holds: set[str]) -> None:
     if condition == "c_locale" and not str(tmp_path).isascii():

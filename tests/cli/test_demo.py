@@ -12,7 +12,7 @@ import pytest
 
 from clod_adapter.cli import demo
 from clod_adapter.cli.adapt import report, resume
-from clod_adapter.cli.adapt.result import Measured
+from clod_adapter.cli.adapt.result import Measurements
 from clod_adapter.cli.main import build_parser
 
 PICTURES = ("dial.png", "curve.png")
@@ -30,7 +30,7 @@ def short(monkeypatch: pytest.MonkeyPatch, capture: Any) -> None:
         for path in pictures.values():
             path.write_bytes(b"")
 
-    monkeypatch.setattr(demo, "prepare", prepare)
+    monkeypatch.setattr(demo, "make_inputs", prepare)
     monkeypatch.setattr(demo, "draw", draw)
     monkeypatch.setattr(demo, "ADAPT_STEPS", 2)
 
@@ -51,7 +51,7 @@ def test_pictures_that_were_not_drawn_are_not_reported(
     clod: Any, short: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr(report, "measure_result", lambda *_: Measured(interrupted=True))
+    monkeypatch.setattr(report, "measure_result", lambda *_: Measurements(interrupted=True))
     (tmp_path / "demo").mkdir()
     (tmp_path / "demo" / "dial.png").write_text("an earlier run's of clod_adapter")
     done = clod("demo", "--json")

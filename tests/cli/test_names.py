@@ -81,7 +81,7 @@ def test_models_of_such_names_are_read_again(clod: Any, odd: Path, tmp_path: Pat
 
 def test_the_view(odd: Path, tmp_path: Path) -> None:
     words = [str(odd / f"{ODD}_dial.ply"), "--images", str(odd / ODD), "--base", str(odd / f"{ODD}.ply"), "--quiet"]
-    answers, _ = view.prepare(build_parser("view").parse_args(words), view.Console(True))
+    answers, _ = view.make_page(build_parser("view").parse_args(words), view.Console(True))
     assert b"gr\\\\xfcn_dial.ply" in b"".join(answers["/"].blocks())
 
 

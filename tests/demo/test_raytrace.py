@@ -1,4 +1,4 @@
-"""The ray tracer and its light against configurations whose answer is known."""
+"""The ray tracer and its light in configurations of known result."""
 
 from __future__ import annotations
 
@@ -34,18 +34,14 @@ def shoot(tables: Tables, origins: ArrayLike, directions: ArrayLike) -> np.ndarr
     return out
 
 
-def test_camera_facing_a_wall_sees_its_texture_the_right_way_round() -> None:
+def test_a_camera_facing_a_wall() -> None:
+    """It sees the texture upright and unmirrored; larger pixels are averages over their area."""
     texture = np.random.default_rng(0).random((64, 64, 3), np.float32)
-    seen = render_linear(wall(texture).tables(), camera(64, 640.0), samples=1)
-    np.testing.assert_allclose(seen, texture, atol=0.01)
-
-
-def test_pixels_are_area_averages() -> None:
-    texture = np.random.default_rng(0).random((64, 64, 3), np.float32)
-    seen = render_linear(wall(texture).tables(), camera(16, 160.0), samples=4)
+    scene = wall(texture).tables()
+    np.testing.assert_allclose(render_linear(scene, camera(64, 640.0), samples=1), texture, atol=0.01)
     want = texture.reshape(16, 4, 16, 4, 3).mean((1, 3))
-    # texels are interpolated, so a pixel's rim also sees its neighbours
-    assert np.abs(seen - want).mean() < 0.03
+    # Texels are interpolated, so the border of a pixel also has its neighbours' colours.
+    assert np.abs(render_linear(scene, camera(16, 160.0), samples=4) - want).mean() < 0.03
 
 
 def test_fine_pattern_far_away_turns_grey_and_not_into_moire() -> None:
@@ -63,7 +59,7 @@ def test_edges_are_covered_by_area() -> None:
     assert np.unique(coverage.round(3)).size > 5
 
 
-def test_distances_are_exact() -> None:
+def test_distances_and_colours_are_exact() -> None:
     scene = SceneBuilder({"white": WHITE})
     scene.ball((0, 0, 5), 2.0, Finish("white"))
     scene.column((10, 0, 5), 1.0, 2.0, Finish("white"), Finish("white"))
@@ -72,15 +68,9 @@ def test_distances_are_exact() -> None:
     directions = np.array([[0, 0, 1], [0, 0, 1], [0, 1, 0], [0, 0, 1], [0, 0, 1], [0, 1, 0]])
     distance = shoot(scene.tables(), origins, directions)[:, 3]
     np.testing.assert_allclose(distance, [3, 4, 3, np.inf, 5 - np.sqrt(2), 3], atol=1e-9)
-
-
-def test_the_back_of_a_panel_is_black_but_hides_what_lies_behind() -> None:
     scene = wall(WHITE)
-    scene.panel((0, 0, 5), (0, 0, -1), (1, 1), Finish("white"))
+    scene.panel((0, 0, 5), (0, 0, -1), (1, 1), Finish("white"))  # the back of a panel is black and opaque
     np.testing.assert_allclose(shoot(scene.tables(), [[0, 0, 0]], [[0, 0, 1]]), [[0, 0, 0, 5]])
-
-
-def test_srgb_round_trip() -> None:
     codes = np.arange(256, dtype=np.uint8)
     np.testing.assert_array_equal(encode_srgb(decode_srgb(codes)), codes)
 

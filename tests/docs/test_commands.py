@@ -47,28 +47,19 @@ def short(**settings: Any) -> AdaptConfig:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=IDS)
-def test_what_is_not_run_has_options_that_there_are(page: Path) -> None:
-    unrun = [words for block in blocks(page) if block.language in SHELL for words in block.commands()]
-    said = [command.split() for command in spoken(page, "clod-adapt")]
-    for words in [*unrun, *said]:
+def test_named_options_exist(page: Path) -> None:
+    """Of all commands in a page, those that are not run among them; the reasons for not running are above a block."""
+    written, text = blocks(page), page.read_text(encoding="utf-8")
+    commands = [words for block in written if block.language in SHELL for words in block.commands()]
+    for words in [*commands, *(command.split() for command in spoken(page, "clod-adapt"))]:
         if words[0] == "clod-adapt":
             parse(words)
-
-
-@pytest.mark.parametrize("page", PAGES, ids=IDS)
-def test_benchmarks_have_the_options_that_are_named(page: Path) -> None:
+    shared = (ROOT / "benchmarks" / "common.py").read_text(encoding="utf-8")
     for command in spoken(page, "python benchmarks/"):
         script, *words = command.split()[1:]
-        folder = ROOT / "benchmarks"
-        source = (ROOT / script).read_text(encoding="utf-8") + (folder / "common.py").read_text(encoding="utf-8")
+        source = (ROOT / script).read_text(encoding="utf-8") + shared
         for option in re.findall(r"--[a-z][a-z-]*", " ".join(words)):
             assert f'"{option}"' in source, f"{page.name}: {command}: no {option}"
-
-
-def test_the_reasons_are_reasons() -> None:
-    for page in PAGES:
-        for block in blocks(page):
-            assert not block.reason or len(block.reason.split()) >= 3, f"{block.place}: {block.reason}"
-        # A marker that stands above no block would be one that somebody believes in.
-        marked = page.read_text(encoding="utf-8").count("<!-- not run:")
-        assert marked == sum(bool(block.reason) for block in blocks(page)), page.name
+    for block in written:
+        assert not block.reason or len(block.reason.split()) >= 3, f"{block.place}: {block.reason}"
+    assert text.count("<!-- not run:") == sum(bool(block.reason) for block in written), page.name

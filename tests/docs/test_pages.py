@@ -33,23 +33,9 @@ def keys(value: Any) -> Iterator[str]:
 
 def test_every_field_of_the_reports_is_explained(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
     explained = set(re.findall(r"`([a-z_0-9]+)`", (DOCS / "report.md").read_text(encoding="utf-8")))
-    model, scene = str(desk / "pretrained_clod.ply"), str(desk / "scene")
-    base = str(desk / "pretrained.ply")
-    words = [
-        "eval",
-        model,
-        "--images",
-        scene,
-        "--sv",
-        "1",
-        "3",
-        "--base",
-        base,
-        "--against",
-        base,
-        "--popping",
-        "--quiet",
-    ]
+    model, base, scene = (str(desk / name) for name in ("pretrained_clod.ply", "pretrained.ply", "scene"))
+    words = ["eval", model, "--images", scene, "--sv", "1", "3", "--popping", "--quiet"]
+    words += ["--base", base, "--against", base]
     capsys.readouterr()
     assert main([*words, "--json"]) == 0
     measured = json.loads(capsys.readouterr().out)

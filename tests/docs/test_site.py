@@ -96,7 +96,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_nothing_is_fetched_from_elsewhere(site: Path) -> None:
+def test_the_built_site(site: Path) -> None:
+    """It loads nothing from elsewhere, its search has all pages and docstrings, and it publishes pages only."""
     pages = sorted(site.glob("*.html"))
     assert len(pages) > len(list(DOCS.glob("*.md")))
     for page in pages:
@@ -106,17 +107,9 @@ def test_nothing_is_fetched_from_elsewhere(site: Path) -> None:
         assert not far, f"{page.name} fetches {far}"
     for style in site.rglob("*.css"):
         assert not re.search(r"url\([\"']?(https?:)?//|@import", style.read_text(encoding="utf-8")), style.name
-
-
-def test_the_search_knows_the_pages_and_the_docstrings(site: Path) -> None:
     index = json.loads((site / "search" / "search_index.json").read_text(encoding="utf-8"))
-    places = {entry["location"].partition("#")[0] for entry in index["docs"]}
-    assert {f"{page.stem}.html" for page in DOCS.glob("*.md")} == places
-    assert {"api.html#clod_adapter.io.checkpoint.load", "api.html#clod_adapter.training.loop.adapt"} <= {
-        entry["location"] for entry in index["docs"]
-    }
-    assert (site / "search" / "search_index.js").is_file()  # what a page opened from a folder searches
-
-
-def test_only_pages_are_published(site: Path) -> None:
+    entries = {entry["location"] for entry in index["docs"]}
+    assert {f"{page.stem}.html" for page in DOCS.glob("*.md")} == {entry.partition("#")[0] for entry in entries}
+    assert {"api.html#clod_adapter.io.checkpoint.load", "api.html#clod_adapter.training.loop.adapt"} <= entries
+    assert (site / "search" / "search_index.js").is_file()  # for pages opened from a folder
     assert not list(site.rglob("*.py")) and not list(site.rglob("*.md"))

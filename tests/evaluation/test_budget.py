@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
 import pytest
 import torch
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from clod_adapter.adapter import attach
@@ -45,8 +46,7 @@ def test_counts_are_exact_up_to_ties(n: int, seed: int, views: int, share: float
     some, cameras = adapted(n, seed, normalizer), ring(views, 48, 36)
     most, fewest = kept(some, cameras, 1.0), kept(some, cameras, MAX_SV)
     wanted = fewest + round(share * (most - fewest))
-    if wanted == 0:
-        return
+    assume(wanted > 0)
     solved = dial_for(some, keep=wanted / views, cameras=cameras)
     found = kept(some, cameras, solved.virtual_scale)
     assert 1 <= solved.virtual_scale <= MAX_SV and solved.note == ""
@@ -59,21 +59,13 @@ def test_counts_are_exact_up_to_ties(n: int, seed: int, views: int, share: float
 
 
 def test_ties_are_culled_together() -> None:
-    row = adapted(6, 0)
-    same = row.replace(
-        means=torch.zeros(6, 3), opacity_logits=torch.tensor([2.0, 2, 2, 2, 3, 5]), sigma_d=torch.ones(6)
-    )
-    camera = ring(1, 48, 36)
+    row, camera = adapted(6, 0), ring(1, 48, 36)
+    logits = torch.tensor([2.0, 2, 2, 2, 3, 5])
+    same = row.replace(means=torch.zeros(6, 3), opacity_logits=logits, sigma_d=torch.ones(6))
     solved = dial_for(same, keep=4, cameras=camera)
     assert kept(same, camera, solved.virtual_scale) == 2
     assert kept(same, camera, solved.virtual_scale * (1 - 1e-6)) == 6
     assert kept(same, camera, dial_for(same, keep=1, cameras=camera).virtual_scale) == 1
-
-
-def test_a_mean_need_not_be_whole() -> None:
-    some, cameras = adapted(500, 3), ring(4, 48, 36)
-    wanted = (kept(some, cameras, 2.0) // 4) + 0.75
-    assert kept(some, cameras, dial_for(some, keep=wanted, cameras=cameras).virtual_scale) == 4 * wanted
 
 
 def test_counts_out_of_reach() -> None:
@@ -103,16 +95,13 @@ def table(psnr: Sequence[float], times: Sequence[float] = ()) -> Calibration:
         ([30, 30.5, 29.5], 0.25, 2 * 2**0.75),  # from s = 1, not from the best
         ([30, 28, 29.5, 27], 1, math.sqrt(2)),  # spent where it first is
         ([30, 29, 28], 2, 4),
+        ([30, 29, 28.25], 3, 4),  # out of reach
     ],
 )
 def test_psnr_drop(psnr: list[float], drop: float, dial_value: float) -> None:
     solved = dial_for(adapted(3, 0), psnr_drop=drop, calibration=table(psnr))
     assert solved.virtual_scale == pytest.approx(dial_value, rel=1e-12)
-
-
-def test_a_drop_that_never_comes() -> None:
-    solved = dial_for(adapted(3, 0), psnr_drop=3, calibration=table([30, 29, 28.25]))
-    assert solved.virtual_scale == 4.0 and solved.note.startswith("only 1.75 dB are lost at s = 4")
+    assert drop < 3 or solved.note.startswith("only 1.75 dB are lost at s = 4")
 
 
 @settings(deadline=None, max_examples=100)
@@ -136,19 +125,15 @@ def test_the_drop_is_not_exceeded_before(psnr: list[float], drop: float) -> None
         ([20, 10, 5], 1000 / 15, math.sqrt(2)),
         ([20, 10, 12, 5], 1000 / 11, 4 * 2 ** (1 / 7)),  # reached for good, not in passing
         ([20, 10, 5], 200, 4),
+        ([20, 10, 5], 30, 1),  # s = 1 is fast enough
     ],
 )
 def test_frame_rate(times: list[float], fps: float, dial_value: float) -> None:
     calibration = table([30] * len(times), times)
     solved = dial_for(adapted(3, 0), fps=fps, calibration=calibration)
-    assert solved.virtual_scale == pytest.approx(dial_value, rel=1e-12) and solved.note == ""
-
-
-def test_frame_rates_out_of_reach() -> None:
-    calibration = table([30] * 3, [20, 10, 5])
-    solved = dial_for(adapted(3, 0), fps=30, calibration=calibration)
-    assert (solved.virtual_scale, solved.note) == (1.0, "s = 1 draws 50 frames a second already")
-    with pytest.raises(ClodError, match="at s = 4, .* takes 5.0 ms, 200 a second"):
+    assert solved.virtual_scale == pytest.approx(dial_value, rel=1e-12)
+    assert solved.note == ("s = 1 draws 50 frames a second already" if fps == 30 else "")
+    with pytest.raises(ClodError, match="at s = [48], .* takes 5.0 ms, 200 a second"):
         dial_for(adapted(3, 0), fps=201, calibration=calibration)
 
 
@@ -184,15 +169,15 @@ def test_bad_calls_are_named() -> None:
     for budgets in ({}, {"keep": 3, "fps": 3}):
         with pytest.raises(ClodError, match="exactly one of keep, psnr_drop and fps"):
             dial_for(some, cameras=camera, **budgets)
-    for name in ("keep", "psnr_drop", "fps"):
-        for value in (0, -1, math.nan, math.inf):
-            with pytest.raises(ClodError, match=f"{name} is .*, it must be positive and finite"):
-                dial_for(some, cameras=camera, **{name: value})
+    for name, value in itertools.product(("keep", "psnr_drop", "fps"), (0, -1, math.nan, math.inf)):
+        with pytest.raises(ClodError, match=f"{name} is .*, it must be positive and finite"):
+            dial_for(some, cameras=camera, **{name: value})
     with pytest.raises(ClodError, match="no sigma_d"):
         dial_for(gaussians(3, 0, 0), keep=1, cameras=camera)
-    with pytest.raises(ClodError, match="needs the calibration table"):
-        dial_for(some, psnr_drop=1)
-    with pytest.raises(ClodError, match="no camera is given"):
-        dial_for(some, keep=1)
-    with pytest.raises(ClodError, match="a calibration or cameras"):
-        dial_for(some, fps=1)
+    for name, message in (
+        ("psnr_drop", "needs the calibration"),
+        ("keep", "no camera"),
+        ("fps", "a calibration or cam"),
+    ):
+        with pytest.raises(ClodError, match=message):
+            dial_for(some, **{name: 1})

@@ -53,13 +53,17 @@ def test_counts_by_hand() -> None:
 
 
 def test_rows_are_the_renders() -> None:
-    some = attach(gaussians(200, 1, 0), torch.full((200,), 0.8), AttenuationConfig(scene_distance=4.0))
+    sigma_d = torch.full((200,), 0.8, requires_grad=True)
+    some = attach(gaussians(200, 1, 0), sigma_d, AttenuationConfig(scene_distance=4.0))
     views = photograph(gaussians(200, 1, 0), ring(3, 32, 24))
     seen = []
     rows = evaluate(some, views, [1.0, 2.0], progress=lambda now: seen.append((now.done, now.total)), repeats=2)
     assert seen == [(k, 6) for k in range(1, 7)]
+    (row,) = evaluate(some, views, [1.0], metrics={"flip": lambda image, _: float(image.requires_grad)})
+    assert row.flip == 0  # no graph is left behind, whatever requires a gradient
     for row in rows:
-        renders = [render(some, view.camera, row.virtual_scale) for view in views]
+        with torch.no_grad():
+            renders = [render(some, view.camera, row.virtual_scale) for view in views]
         metrics = [psnr_ssim(r.image, view.image) for r, view in zip(renders, views, strict=True)]
         assert row.psnr == pytest.approx(sum(m[0] for m in metrics) / 3)
         assert row.ssim == pytest.approx(sum(m[1] for m in metrics) / 3)
@@ -83,35 +87,16 @@ def test_of_no_gaussians() -> None:
     assert (row.kept, row.kept_share, row.in_view, row.psnr) == (0, 0, 0, math.inf)
 
 
-def test_nothing_to_learn_from() -> None:
-    """Evaluation leaves no graph behind, whatever requires a gradient."""
-    some = row_of_four()
-    some = some.replace(sigma_d=some.sigma_d.requires_grad_())
-    view = View(camera(20, 16), torch.zeros(16, 20, 3, dtype=torch.uint8))
-    (row,) = evaluate(some, [view], [1.0])
-    assert all(type(value) is float for value in (row.psnr, row.ssim, row.kept, row.frame_ms))
-
-
-def test_bad_calls_are_named() -> None:
-    view = View(camera(20, 16), torch.zeros(16, 20, 3, dtype=torch.uint8))
-    with pytest.raises(ClodError, match="no held-out views"):
-        evaluate(row_of_four(), [], [1.0])
-    with pytest.raises(ClodError, match="no dial values"):
-        evaluate(row_of_four(), [view], [])
-    with pytest.raises(ClodError, match="virtual_scale is 0.5"):
-        evaluate(row_of_four(), [view], [1.0, 0.5])
-
-
-@pytest.mark.parametrize(
-    ("dials", "repeats", "said"),
-    [
-        ([1.0, math.nan], 1, "virtual_scale is nan"),
-        ([1.0, math.inf], 1, "virtual_scale is inf"),
-        ([1.0], 0, "repeats is 0, it must be at least 1"),
-    ],
-)
-def test_bad_calls_cost_nothing(dials: list[float], repeats: int, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_calls_are_named_before_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.modules[evaluate.__module__], "render", lambda *_: pytest.fail("rendered"))
-    view = View(camera(20, 16), torch.zeros(16, 20, 3, dtype=torch.uint8))
-    with pytest.raises(ClodError, match=said):
-        evaluate(row_of_four(), [view], dials, repeats=repeats)
+    views = [View(camera(20, 16), torch.zeros(16, 20, 3, dtype=torch.uint8))]
+    for given, dials, repeats, message in (
+        ([], [1.0], 1, "no held-out views"),
+        (views, [], 1, "no dial values"),
+        (views, [1.0, 0.5], 1, "virtual_scale is 0.5"),
+        (views, [1.0, math.nan], 1, "virtual_scale is nan"),
+        (views, [1.0, math.inf], 1, "virtual_scale is inf"),
+        (views, [1.0], 0, "repeats is 0, it must be at least 1"),
+    ):
+        with pytest.raises(ClodError, match=message):
+            evaluate(row_of_four(), given, dials, repeats=repeats)

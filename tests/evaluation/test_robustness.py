@@ -48,17 +48,12 @@ def test_baseline_keeps_the_most_opaque() -> None:
                        progress=lambda now: frames.append((now.done, now.total)))  # fmt: skip
     assert [row["kept"] for row in outcome.rows] == [300, 150, 30]
     assert [row["kept_share"] for row in outcome.rows] == [1, 0.5, 0.1]
+    few = most_opaque(base, 10)  # in the order of the file
+    assert torch.equal(few.means, base.means[base.opacities >= few.opacities.min()]) and len(few) == 10
     (whole,) = evaluate(base, scene.test, [1.0])  # a dial that the base has plays no part
     assert outcome.rows[0]["psnr"] == whole.psnr > outcome.rows[2]["psnr"]
     assert outcome.adapter is None and "log10_sigma_d" not in outcome.distribution
     assert frames == [(k + 1, 3 * len(scene.test)) for k in range(3 * len(scene.test))]
-
-
-def test_most_opaque_keeps_the_order() -> None:
-    model = gaussians(50, 1, 3)
-    few = most_opaque(model, 10)
-    threshold = few.opacities.min()
-    assert torch.equal(few.means, model.means[model.opacities >= threshold]) and len(few) == 10
 
 
 def test_distribution() -> None:

@@ -29,18 +29,17 @@ from clod_adapter.render import splat
 from scenes import gaussians, photograph, ring
 
 CONFIG = AttenuationConfig(tau=1 / 255, cut="hard", scene_distance=4.0)
+REVERSED = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # looks the other way
 
 
 def changes(some: Gaussians, view: View) -> Tensor:
-    """``[N, pixels]`` what removing each Gaussian alone does to the picture. Opacity is its only factor, so
-    where nothing is clamped and no pixel ends the first order is all there is."""
+    """``[N, pixels]``: what removing each Gaussian alone does to the image.
+
+    Opacity is its only factor: where nothing is clamped and no pixel ends, the first order is exact.
+    """
     whole, _ = splat(some, some.opacities, view.camera)
-    rows = []
-    for i in range(len(some)):
-        without = some.opacities.clone()
-        without[i] = 0
-        rows.append((splat(some, without, view.camera)[0] - whole).flatten())
-    return torch.stack(rows).double()
+    without = some.opacities.repeat(len(some), 1).fill_diagonal_(0)
+    return torch.stack([(splat(some, each, view.camera)[0] - whole).flatten() for each in without]).double()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -65,6 +64,7 @@ def test_estimates_the_exact_removal_error(seed: int, draws: int = 150) -> None:
 
 def test_is_the_mean_over_views_and_reports_them() -> None:
     some = gaussians(100, 1, 0)
+    some = some.replace(means=torch.cat([some.means[:75], some.means[75:] + 1e3]))  # outside of every view
     (view,) = photograph(some, ring(1, 20, 16))
     seen = []
     both = removal_error(some, [view, view], seed=3, progress=lambda now: seen.append((now.done, now.total)))
@@ -74,6 +74,13 @@ def test_is_the_mean_over_views_and_reports_them() -> None:
     assert both.shape == (100,) and not both.requires_grad and (both >= 0).all()
     once = removal_error(some, [view], seed=3)
     assert (both >= once / 2).all()  # the same first draw, and a second one
+    assert (both[75:] == 0).all() and (both[:75] > 0).any()
+    assert torch.equal(removal_error(some, []), torch.zeros(100))
+    blind = View(dataclasses.replace(view.camera, viewmat=REVERSED @ view.camera.viewmat), view.image)
+    few = gaussians(20, 0, 0)
+    assert [each is view for each in usable_views(few, [view, blind, view])] == [True, True]
+    with pytest.raises(ClodError, match="in front of any of the 1 training cameras"):
+        usable_views(few, [blind])
 
 
 def test_initialization_renders_some_of_many_views(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,16 +99,7 @@ def test_initialization_renders_some_of_many_views(monkeypatch: pytest.MonkeyPat
         assert counts[-1] == (Phase.PRUNING_ORDER, 50, 50)
 
 
-def test_what_no_view_shows_counts_nothing() -> None:
-    some = gaussians(50, 0, 0)
-    some = some.replace(means=torch.cat([some.means[:25], some.means[25:] + 1e3]))
-    found = removal_error(some, photograph(some, ring(2, 20, 16)))
-    assert (found[25:] == 0).all() and (found[:25] > 0).any()
-    assert torch.equal(removal_error(some, []), torch.zeros(50))
-
-
-@pytest.mark.parametrize("exponent", [1.0, 1.5, 2.5])
-@pytest.mark.parametrize("share", [0.51, 0.6, 0.8, 1.0])
+@pytest.mark.parametrize(("share", "exponent"), [(0.51, 1.5), (0.6, 1.0), (0.8, 2.5), (1.0, 1.5)])
 def test_shares_kept_follow_the_curve(share: float, exponent: float, n: int = 1000) -> None:
     """At the distances it was made for, ``1 / (s^p + (1/share - 1) s^-p)``, to one Gaussian."""
     g = torch.Generator().manual_seed(0)
@@ -114,38 +112,27 @@ def test_shares_kept_follow_the_curve(share: float, exponent: float, n: int = 10
         assert abs(kept.sum().item() - n * want) <= 1, f"s {s}"
         if kept.any() and not kept.all():
             assert importance[kept].min() > importance[~kept].max(), f"s {s}"
+    # Where all importances are equal, as where no view sees any, the counts follow it all the same.
+    sigma = sigma_from_importance(some, torch.zeros(n), distances, CONFIG, share=share, exponent=exponent)
+    assert abs(attenuate(some.opacity_logits, sigma, distances, 1.0, CONFIG).keep.sum().item() - n * share) <= 1
+    none = gaussians(0, 0, 0)
+    empty = sigma_from_importance(none, none.means[:, 0], none.means[:, 0], CONFIG, share=share, exponent=exponent)
+    assert empty.shape == (0,)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_sigma_grows_with_importance(seed: int, n: int = 200) -> None:
     """All else equal; and whatever the opacity, those of small importance are culled first."""
-    g = torch.Generator().manual_seed(seed)
-    importance = torch.rand(n, generator=g)
+    importance = torch.rand(n, generator=torch.Generator().manual_seed(seed))
     distances, order = torch.full((n,), 0.7), importance.argsort()
-    alike = gaussians(n, 0, 0).replace(opacity_logits=torch.full((n,), 1.0))
-    sigma = sigma_from_importance(alike, importance, distances, CONFIG, share=0.7, exponent=1.5)
-    assert (sigma[order].diff() > 0).all() and sigma.isfinite().all(), f"seed {seed}"
-    some = gaussians(n, 0, seed)
-    sigma = sigma_from_importance(some, importance, distances, CONFIG, share=0.7, exponent=1.5)
-    culled_at = extinction_scale(some.opacity_logits, sigma, distances, CONFIG)
-    lasting = (some.opacities * 255 * 0.99 > culled_at)[
-        order
-    ]  # the others are kept for as long as their opacity allows
+    alike, some = gaussians(n, 0, 0).replace(opacity_logits=torch.full((n,), 1.0)), gaussians(n, 0, seed)
+    sigmas = [sigma_from_importance(g, importance, distances, CONFIG, share=0.7, exponent=1.5) for g in (alike, some)]
+    assert (sigmas[0][order].diff() > 0).all() and sigmas[0].isfinite().all(), f"seed {seed}"
+    culled_at = extinction_scale(some.opacity_logits, sigmas[1], distances, CONFIG)
+    # The others are kept for as long as their opacity allows.
+    lasting = (some.opacities * 255 * 0.99 > culled_at)[order]
     assert lasting.sum() > n / 2
     assert (culled_at[order][lasting].diff() >= -1e-4).all(), f"seed {seed}"
-
-
-def test_equal_importance_is_ranked_all_the_same() -> None:
-    """Nothing is known (no Gaussian in any view): the counts still follow the curve."""
-    some = gaussians(100, 0, 0).replace(opacity_logits=torch.zeros(100))
-    sigma = sigma_from_importance(some, torch.zeros(100), torch.ones(100), CONFIG, share=0.6, exponent=1.5)
-    assert abs(attenuate(some.opacity_logits, sigma, torch.ones(100), 1.0, CONFIG).keep.sum().item() - 60) <= 1
-
-
-def test_of_no_gaussians() -> None:
-    none = gaussians(0, 0, 0)
-    sigma = sigma_from_importance(none, torch.empty(0), torch.empty(0), CONFIG, share=0.6, exponent=1.5)
-    assert sigma.shape == (0,)
 
 
 def test_the_orders_of_the_initialization() -> None:
@@ -157,13 +144,13 @@ def test_the_orders_of_the_initialization() -> None:
         importance.initialize(some, views, AdaptConfig(start=name)) for name in ("error", "importance")
     )
 
-    def leaving(dialled: Gaussians) -> Tensor:
+    def culling_order(dialled: Gaussians) -> Tensor:
         d = typical_distance(some.means, [view.camera for view in views], dialled.attenuation)
         return extinction_scale(dialled.opacity_logits, dialled.sigma_d, d, dialled.attenuation).argsort()
 
-    assert torch.equal(leaving(by_error)[100:180], error.argsort(stable=True)[100:180])
+    assert torch.equal(culling_order(by_error)[100:180], error.argsort(stable=True)[100:180])
     order = pruning_order(some, error.sqrt() * some.opacities)
-    assert torch.equal(leaving(by_default)[100:180], order.argsort()[100:180])
+    assert torch.equal(culling_order(by_default)[100:180], order.argsort()[100:180])
     assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
 
 
@@ -190,14 +177,3 @@ def test_a_checkpoint_of_faint_gaussians_keeps_its_picture() -> None:
     assert dialled.attenuation is not None and dialled.sigma_d is not None and dialled.attenuation.tau < 0.01 / 5
     d = normalized_distances(base.means, views[0].camera, dialled.attenuation)
     assert attenuate(base.opacity_logits, dialled.sigma_d, d, 1.0, dialled.attenuation).keep.float().mean() > 0.5
-
-
-def test_views_of_nothing_are_left_out() -> None:
-    some = gaussians(20, 0, 0)
-    views = photograph(some, ring(3, 24, 18))
-    back = torch.diag(torch.tensor([-1.0, 1, -1, 1]))
-    away = dataclasses.replace(views[0].camera, viewmat=back @ views[0].camera.viewmat)
-    blind = View(away, views[0].image)
-    assert usable_views(some, [views[0], blind, views[1]]) == views[:2]
-    with pytest.raises(ClodError, match="in front of any of the 1 training cameras"):
-        usable_views(some, [blind])

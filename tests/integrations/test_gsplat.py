@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import gc
-import importlib
-import importlib.util
 import inspect
-import sys
 import weakref
 from collections.abc import Callable
 from types import ModuleType, SimpleNamespace
@@ -17,6 +14,7 @@ import torch
 from torch import Tensor
 
 import gsplat_in_torch
+from backends import fresh_copy
 from clod_adapter.attenuation import attenuate
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, AttenuationConfig
@@ -28,7 +26,7 @@ from scenes import camera, ring, scene
 
 N, WIDTH, HEIGHT = 40, 40, 28
 SOFT = AttenuationConfig(tau=0.02, cut="soft", scene_distance=4.0, max_sv=5.0)
-WHOLE = AttenuationConfig(tau=0.02, max_sv=5.0)  # what has an opacity above tau and no decay stays as it is
+WHOLE = AttenuationConfig(tau=0.02, max_sv=5.0)  # does not change an opacity above tau without decay
 STORED = (
     "means quats scales opacities colors viewmats Ks width height near_plane=0.01 far_plane=10000000000.0 "
     "radius_clip=0.0 eps2d=0.3 sh_degree=None packed=True tile_size=16 backgrounds=None render_mode='RGB' "
@@ -76,23 +74,16 @@ def test_the_signature_is_gsplats_and_three_more(tools: Tools) -> None:
     assert names(tools.ours) == STORED.split() + OURS
 
 
-def standing_in(monkeypatch: pytest.MonkeyPatch, module: ModuleType | None) -> ModuleType:
-    """A second copy of the wrapper, made while ``module`` is all there is of gsplat."""
-    monkeypatch.setitem(sys.modules, "gsplat", module)
-    spec = importlib.util.find_spec("clod_adapter.integrations.gsplat")
-    assert spec is not None and spec.loader is not None
-    copy = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(copy)
-    return copy
-
-
-def test_without_gsplat_the_signature_and_the_arguments_are_passed_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_signature_and_the_arguments_without_gsplat(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where gsplat is absent, the error has the install line; a stand-in gets all arguments."""
+    with pytest.raises(ImportError, match="pip install gsplat==1.5.3"):
+        fresh_copy(monkeypatch, "gsplat", "gsplat", None)
     space: dict[str, Any] = {}
     parameters = ", ".join(STORED.replace("<RollingShutterType.GLOBAL:4>", "'GLOBAL'").split())
     exec(f"def rasterization({parameters}):\n    return locals()", space)
     module = ModuleType("gsplat")
     module.rasterization = space["rasterization"]
-    wrapper = standing_in(monkeypatch, module)
+    wrapper = fresh_copy(monkeypatch, "gsplat", "gsplat", module)
     assert names(wrapper.rasterization) == [*names(space["rasterization"]), *OURS]
     given, views = arguments(N, 1)
     plain = wrapper.rasterization(*given.values(), *views.values(), 0.3, packed=False)
@@ -101,11 +92,6 @@ def test_without_gsplat_the_signature_and_the_arguments_are_passed_on(monkeypatc
     same(passed.pop("opacities"), faded(given, views, torch.full((N,), 1e9), 1.0, SOFT)[0])
     want = space["rasterization"](*given.values(), *views.values())
     assert all(passed[name] is want[name] for name in passed)
-
-
-def test_where_gsplat_is_absent_the_install_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ImportError, match="pip install gsplat==1.5.3"):
-        standing_in(monkeypatch, None)
 
 
 def arguments(n: int, cameras: int, batch: tuple[int, ...] = (), **dtype: Any) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -147,21 +133,17 @@ def same(ours: Any, theirs: Any) -> None:
         assert ours == theirs
 
 
-LAYOUTS = {
-    "one camera": {"cameras": 1},
-    "three cameras": {"cameras": 3},
-    "two scenes of one camera": {"cameras": 1, "batch": (2,)},
-    "two scenes of three cameras": {"cameras": 3, "batch": (2,)},
-}
-
-
-@pytest.mark.parametrize("packed", [True, False], ids=["packed", "unpacked"])
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_without_fading_it_is_gsplats_own_call(tools: Tools, layout: str, packed: bool) -> None:
-    """Every value of meta among it, where nothing fades and gsplat can draw all cameras in one call."""
-    given, views = arguments(N, device=tools.device, **LAYOUTS[layout])
+@pytest.mark.parametrize(
+    ("cameras", "batch", "packed"),
+    [(1, (), False), (3, (), True), (3, (), False), (1, (2,), True), (3, (2,), True), (3, (2,), False)],
+)
+def test_without_fading_it_is_gsplats_own_call(
+    tools: Tools, cameras: int, batch: tuple[int, ...], packed: bool
+) -> None:
+    """With every value of meta, where nothing fades and gsplat can draw all cameras in one call."""
+    given, views = arguments(N, cameras, batch, device=tools.device)
     given["opacities"] = given["opacities"].clamp(min=0.03)
-    if packed and tools.device == "cuda" and "scenes" in layout:
+    if packed and tools.device == "cuda" and batch:
         pytest.skip("gsplat 1.5.3's packed projection takes the first scene's opacities for all")
     options = {"sh_degree": 1, "packed": packed, "render_mode": "RGB+ED", "rasterize_mode": "antialiased"}
     theirs = tools.theirs(**given, **views, **options)
@@ -172,28 +154,34 @@ def test_without_fading_it_is_gsplats_own_call(tools: Tools, layout: str, packed
 
 
 @pytest.mark.parametrize("name", FILTERS)
-def test_with_the_file_s_filter_it_draws_our_picture(tools: Tools, name: str) -> None:
-    """Told by gsplat's own arguments; the compensation comes after the dial, as in ``render``."""
-    given, views = arguments(N, 1, device=tools.device)
+def test_it_matches_render_with_each_screen_filter(tools: Tools, name: str) -> None:
+    """Image, alpha and the gradient of sigma_d; the filter is in gsplat's own arguments, and applied after the dial."""
+    given, views = arguments(N, 1)
     given["scales"] = 0.2 * given["scales"]
-    sigma_d, mode = reach(N, device=tools.device), "antialiased" if FILTERS[name].compensate else "classic"
-    options = {"sh_degree": 1, "rasterize_mode": mode, "eps2d": FILTERS[name].variance}
-    ours = tools.ours(**given, **views, **options, sigma_d=sigma_d, virtual_scale=2.0, attenuation=SOFT)
-    own = Gaussians(
+    sigma = [reach(N).requires_grad_(), reach(N).to(tools.device).requires_grad_()]
+    options = {"rasterize_mode": "antialiased" if FILTERS[name].compensate else "classic", "sh_degree": 1}
+    options |= {"eps2d": FILTERS[name].variance, "virtual_scale": 2.0, "attenuation": SOFT}
+    moved = {k: v.to(tools.device) if isinstance(v, Tensor) else v for k, v in (given | views).items()}
+    image, alpha, _ = tools.ours(**moved, **options, sigma_d=sigma[1])
+    model = Gaussians(
         given["means"], given["quats"], given["scales"].log(), given["opacities"].logit(), given["colors"][:, :1],
-        given["colors"][:, 1:], sigma_d, SOFT, FILTERS[name],
-    ).to("cpu")  # fmt: skip
-    want = render(own, camera(WIDTH, HEIGHT), 2.0).image
-    torch.testing.assert_close(ours[0][0].cpu(), want, rtol=1e-3, atol=1e-3)
-    usual = render(own.replace(screen_filter=FILTERS["off"]), camera(WIDTH, HEIGHT), 2.0).image
-    assert name == "off" or float((want - usual).abs().max()) > 0.02
+        given["colors"][:, 1:], sigma[0], SOFT, FILTERS[name],
+    )  # fmt: skip
+    own = render(model, camera(WIDTH, HEIGHT), 2.0)
+    torch.testing.assert_close(image[0].cpu(), own.image, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(alpha[0, :, :, 0].cpu(), own.alpha, rtol=1e-3, atol=2e-3)
+    pairs = zip((own.image, image), sigma, strict=True)
+    want, found = (torch.autograd.grad(picture.sum(), s, retain_graph=True)[0].cpu() for picture, s in pairs)
+    assert float((found - want).norm()) < 0.01 * float(want.norm())
+    usual = render(model.replace(screen_filter=FILTERS["off"]), camera(WIDTH, HEIGHT), 2.0).image
+    assert name == "off" or float((own.image - usual).detach().abs().max()) > 0.02
 
 
-@pytest.mark.parametrize("cut", ["hard", "soft"])
-@pytest.mark.parametrize("packed", [True, False], ids=["packed", "unpacked"])
-@pytest.mark.parametrize("cameras", [1, 3])
+@pytest.mark.parametrize(
+    ("cameras", "packed", "cut"), [(1, True, "hard"), (1, False, "soft"), (3, True, "soft"), (3, False, "hard")]
+)
 def test_faded_it_is_gsplat_camera_by_camera(tools: Tools, cameras: int, packed: bool, cut: str) -> None:
-    """Pictures, alphas, and the gradients of all that is differentiated, the projected centres' among them."""
+    """Images, alphas, and all gradients, those of the projected centres included."""
     config = AttenuationConfig(tau=0.02, cut=cut, normalizer="quantile", max_sv=5.0)
     given, views = arguments(N, cameras, device=tools.device)
     leaves = {name: value.clone().requires_grad_() for name, value in given.items()}
@@ -233,8 +221,7 @@ def test_faded_it_is_gsplat_camera_by_camera(tools: Tools, cameras: int, packed:
         torch.testing.assert_close(getattr(points[0], kind), want, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("packed", [True, False], ids=["packed", "unpacked"])
-def test_its_slope_by_sigma_is_that_of_finite_differences(tools: Tools, packed: bool) -> None:
+def test_the_gradient_of_sigma_d_matches_finite_differences(tools: Tools) -> None:
     if tools.device == "cuda":
         pytest.skip("gsplat's kernels are float32's")
     given, views = arguments(12, 2, dtype=torch.float64)
@@ -242,30 +229,12 @@ def test_its_slope_by_sigma_is_that_of_finite_differences(tools: Tools, packed: 
     weights = torch.rand(2, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1)).double()
 
     def loss(sigma_d: Tensor) -> Tensor:
-        options = {"sh_degree": 1, "packed": packed, "sigma_d": sigma_d, "virtual_scale": 1.5, "attenuation": SOFT}
+        options = {"sh_degree": 1, "sigma_d": sigma_d, "virtual_scale": 1.5, "attenuation": SOFT}
         return (tools.ours(**given, **views, **options)[0] * weights).sum()
 
     sigma_d = (0.8 + reach(12, dtype=torch.float64)).requires_grad_()
-    # The rasterizer leaves out what is fainter than 1/255: a jump that finite differences may meet.
+    # The rasterizer culls alphas below 1/255: a jump that finite differences may meet.
     assert torch.autograd.gradcheck(loss, sigma_d, eps=1e-7, atol=1e-4, rtol=1e-4)
-
-
-def test_it_draws_what_the_package_draws(tools: Tools) -> None:
-    """Picture, alpha and the gradient of sigma_d, against ``render`` with the package's own rasterizer."""
-    given, views = arguments(N, 1)
-    colors, logs, logits = given["colors"], given["scales"].log(), given["opacities"].logit()
-    base = Gaussians(given["means"], given["quats"], logs, logits, colors[:, :1], colors[:, 1:])
-    sigma = [reach(N).requires_grad_(), reach(N).to(tools.device).requires_grad_()]
-    model = base.replace(sigma_d=sigma[0], attenuation=SOFT)
-    own = render(model, Camera(views["viewmats"][0], views["Ks"][0], WIDTH, HEIGHT), 2.0)
-    moved = {k: v.to(tools.device) if isinstance(v, Tensor) else v for k, v in (given | views).items()}
-    image, alpha, _ = tools.ours(**moved, sh_degree=1, sigma_d=sigma[1], virtual_scale=2.0, attenuation=SOFT)
-    torch.testing.assert_close(image[0].cpu(), own.image, rtol=1e-3, atol=2e-3)
-    torch.testing.assert_close(alpha[0, :, :, 0].cpu(), own.alpha, rtol=1e-3, atol=2e-3)
-    slopes = [
-        torch.autograd.grad(picture.sum(), s)[0].cpu() for picture, s in zip((own.image, image), sigma, strict=True)
-    ]
-    assert float((slopes[0] - slopes[1]).norm()) < 0.01 * float(slopes[0].norm())
 
 
 def test_colours_and_backgrounds_of_each_camera(tools: Tools) -> None:
@@ -278,8 +247,8 @@ def test_colours_and_backgrounds_of_each_camera(tools: Tools) -> None:
 
 
 @pytest.mark.parametrize("packed", [True, False], ids=["packed", "unpacked"])
-def test_gsplats_strategy_takes_its_meta(tools: Tools, packed: bool) -> None:
-    """The statistics that gsplat densifies by: of the caller's rows, and the same where nothing fades."""
+def test_gsplats_strategy_accepts_its_meta(tools: Tools, packed: bool) -> None:
+    """gsplat's densification statistics are of the caller's rows, and the same where nothing fades."""
     from gsplat import DefaultStrategy
 
     given, views = arguments(N, 3, device=tools.device)
@@ -302,8 +271,8 @@ def test_gsplats_strategy_takes_its_meta(tools: Tools, packed: bool) -> None:
     assert float(states[0]["grad2d"].max()) > 0
 
 
-def test_nothing_stays_in_memory(tools: Tools) -> None:
-    """The hooks that carry the gradients hold nothing that holds them, with or without a backward pass."""
+def test_memory_is_released(tools: Tools) -> None:
+    """The gradients' hooks make no reference cycle, with or without a backward pass."""
     given, views = arguments(N, 2, device=tools.device)
     given["means"].requires_grad_()
     gc.collect()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from types import ModuleType
 from typing import Any
 
@@ -12,6 +10,7 @@ import torch
 from torch import Tensor
 
 import inria_forks
+from backends import fresh_copy
 from clod_adapter.attenuation import attenuate
 from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.distances import normalized_distances
@@ -26,13 +25,7 @@ DIAL = 2.0
 
 
 def wrapper(monkeypatch: pytest.MonkeyPatch, installed: ModuleType | None) -> ModuleType:
-    """A copy of our module, made while ``installed`` is the rasterizer there is."""
-    monkeypatch.setitem(sys.modules, "diff_gaussian_rasterization", installed)
-    spec = importlib.util.find_spec("clod_adapter.integrations.inria")
-    assert spec is not None and spec.loader is not None
-    copy = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(copy)
-    return copy
+    return fresh_copy(monkeypatch, "inria", "diff_gaussian_rasterization", installed)
 
 
 def arguments(*further: str, device: str = "cpu") -> dict[str, Any]:
@@ -62,13 +55,10 @@ def reach() -> Tensor:
     return (0.2 + torch.rand(N, generator=torch.Generator().manual_seed(7))).requires_grad_()
 
 
-@pytest.mark.parametrize("normalizer", ["scene", "quantile"])
 @pytest.mark.parametrize("name", inria_forks.FORKS)
-def test_it_draws_what_the_fork_draws_of_the_kept_rows(
-    name: str, normalizer: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_draws_the_kept_rows_as_the_fork_does(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     further, results = inria_forks.FORKS[name].further, inria_forks.FORKS[name].results.split()
-    fork, settings = inria_forks.module(name), config(normalizer=normalizer)
+    fork, settings = inria_forks.module(name), config(normalizer="quantile" if name == "w-pose" else "scene")
     raster_settings = inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
     given, sigma_d = arguments(*further), reach()
     result = faded(given, sigma_d, settings)
@@ -98,10 +88,10 @@ def test_it_draws_what_the_fork_draws_of_the_kept_rows(
     ("fork", "settings", "name"),
     [("inria 2024", {"antialiasing": True}, "on"), ("mip-splatting", {"kernel_size": 0.1}, "mip")],
 )
-def test_with_the_file_s_filter_it_draws_our_picture(
+def test_it_matches_render_with_a_screen_filter(
     fork: str, settings: dict[str, Any], name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Told by the fork's own settings; the compensation comes after the dial, as in ``render``."""
+    """From the fork's own settings; the compensation is applied after the dial, as in ``render``."""
     module, given, sigma_d = inria_forks.module(fork), arguments(), reach()
     given["scales"] = 0.2 * given["scales"]
     black = inria_forks.settings_of(module.GaussianRasterizationSettings, VIEW, bg=torch.zeros(3), **settings)
@@ -131,8 +121,8 @@ def test_without_sigma_d_it_is_the_fork(name: str, monkeypatch: pytest.MonkeyPat
         assert torch.equal(mine, want)
 
 
-def test_who_is_left_out_is_out_of_sight_of_a_fork_that_culls_at_zero(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From many places, as rounding has a point at the camera's centre now before it and now behind."""
+def test_culled_rows_are_invisible_to_a_fork_that_culls_at_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From many positions: by rounding, a point at the camera's centre is in front of it or behind it."""
     monkeypatch.setattr(inria_forks, "NEAREST", 0.0)
     fork, given, sigma_d = inria_forks.module("inria 2024"), arguments(), torch.full((N,), 1e-3)
     for view in ring(31, 48, 36):
@@ -143,13 +133,11 @@ def test_who_is_left_out_is_out_of_sight_of_a_fork_that_culls_at_zero(monkeypatc
 
 def test_by_position(monkeypatch: pytest.MonkeyPatch) -> None:
     fork = inria_forks.module("w-pose")
-    ours = wrapper(monkeypatch, fork).GaussianRasterizer(
-        inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
-    )
+    settings = inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
+    ours = wrapper(monkeypatch, fork).GaussianRasterizer(settings)
     g, theta = arguments(), torch.zeros(3)
     more = {"sigma_d": reach(), "virtual_scale": DIAL, "attenuation": config()}
-    order = ("means3D", "means2D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
-    by_position = ours(*(g.get(name) for name in order), theta, theta, **more)
+    by_position = ours(*(g.get(name) for name in inria_forks.CALL.split()), theta, theta, **more)
     assert torch.equal(by_position[0], ours(**g, theta=theta, rho=theta, **more)[0])
 
 
@@ -185,12 +173,8 @@ def test_the_installed_fork() -> None:
     want = fork.GaussianRasterizer(raster_settings)(**rows)
     got = GaussianRasterizer(raster_settings)(**given, sigma_d=sigma_d.cuda(), virtual_scale=DIAL, attenuation=config())
     torch.testing.assert_close(got[0], want[0], rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(
-        torch.autograd.grad(got[0].sum(), sigma_d)[0],
-        torch.autograd.grad(want[0].sum(), sigma_d)[0],
-        rtol=1e-3,
-        atol=1e-3,
-    )
+    found, expected = (torch.autograd.grad(result[0].sum(), sigma_d)[0] for result in (got, want))
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
 
 
 def _full_projection() -> Tensor:

@@ -1,4 +1,4 @@
-"""The page for writers of renderers and the two examples beside it say what is so."""
+"""The code and the defaults of docs/writing_a_renderer.md, and its two examples."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DIALS = (1, 2, 3, 5)
 def my_opacity(
     opacity: float, sigma: float, distance: float, scale: float, eps: float, tau: float, soft: bool
 ) -> float:
-    """float32's, of the package."""
+    """The package's, in float32."""
     config = AttenuationConfig(eps=eps, tau=tau, cut="soft" if soft else "hard", max_sv=1)
     values = (torch.tensor([value], dtype=torch.float32) for value in (opacity, sigma, distance))
     return float(attenuate(*values, scale, config, activated=True).drawn)
@@ -46,18 +46,22 @@ def adapted(capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> cl
     return gaussians
 
 
+def block(word: str) -> str:
+    """The page's Python block with this word."""
+    (found,) = (text for text in re.findall(r"```python\n(.*?)```", PAGE, re.S) if word in text)
+    return str(found)
+
+
 def test_its_golden_loop_runs() -> None:
-    (block,) = (text for text in re.findall(r"```python\n(.*?)```", PAGE, re.S) if "golden" in text)
-    exec(block, {"my_opacity": my_opacity})
+    exec(block("golden"), {"my_opacity": my_opacity})
     with pytest.raises(AssertionError):
-        exec(block, {"my_opacity": lambda *row: my_opacity(*row) * 1.001})
+        exec(block("golden"), {"my_opacity": lambda *row: my_opacity(*row) * 1.001})
 
 
 def test_its_hook_runs(adapted: clod_adapter.Gaussians) -> None:
-    (block,) = (text for text in re.findall(r"```python\n(.*?)```", PAGE, re.S) if ".hook(" in text)
     names: dict[str, Any] = {"means": adapted.means, "opacities": adapted.opacities, "viewmat": torch.eye(4)}
     Path("adapted.ply").rename("model.ply")
-    exec(block, names | {"clod_adapter": clod_adapter, "K": torch.eye(3), "width": 2, "height": 2}, names)
+    exec(block(".hook("), names | {"clod_adapter": clod_adapter, "K": torch.eye(3), "width": 2, "height": 2}, names)
     want = Hook(adapted.sigma_d, adapted.attenuation, 3.0)(adapted.means, adapted.opacities, torch.eye(4))
     assert torch.equal(names["opacities"], want[0]) and torch.equal(names["keep"], want[1])
 

@@ -1,4 +1,4 @@
-"""Compiled kernels: cached where that is possible, and working where it is not."""
+"""Compiled kernels: cached where that is possible, and correct where it is not."""
 
 from __future__ import annotations
 
@@ -11,49 +11,48 @@ from typing import Any
 
 import pytest
 
-CACHE = "from clod_adapter._kernels import tiles; print(type(tiles.radix_sort._cache).__name__)"
+Start = Callable[..., subprocess.Popen[str]]
 
 
 def test_kernels_are_cached() -> None:
-    done = subprocess.run([sys.executable, "-c", CACHE], capture_output=True, text=True, check=False)
+    code = "from clod_adapter._kernels import tiles; print(type(tiles.radix_sort._cache).__name__)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "_Cache", done.stderr
 
 
-def test_a_switch_that_turns_compiling_off(capture: Any, tmp_path: Path) -> None:
+def test_compiling_is_disabled(capture: Any, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "clod_adapter", str(capture.ply), "--out", str(tmp_path / "dial.ply")]
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and os.listdir(tmp_path) == []
-    assert done.stderr == ("clod-adapt: error: NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it\n")
+    assert done.stderr == "clod-adapt: error: NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it\n"
 
 
 @pytest.fixture
-def number(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
-    """Starts a process that prints what a kernel of one line gives for ``[1.0]``; ``version`` is added to it."""
+def number(tmp_path: Path) -> Start:
+    """Starts a process that prints the result of a one-line kernel for ``[1.0]``: 1 + ``version``.
+
+    The versions differ in the kernels' stamp, as they do where a part of the kernel in another file changed.
+    """
+    (tmp_path / "sums.py").write_text(
+        "from clod_adapter._kernels import compiling\n"
+        "from constant import VERSION\n"
+        "compiling._STAMP = str(VERSION)\n"
+        "@compiling.kernel\n"
+        "def f(x):\n"
+        "    return x[0] + VERSION\n"
+    )
 
     def start(version: int, before: str = "", kind: str = "float32", cache: str = "") -> subprocess.Popen[str]:
-        """The versions differ in the kernels' stamp, as they do where a part of the kernel in another file changed."""
         (tmp_path / "constant.py").write_text(f"VERSION = {version}.0")
-        (tmp_path / "sums.py").write_text(
-            "from clod_adapter._kernels import compiling\n"
-            "from constant import VERSION\n"
-            "compiling._STAMP = str(VERSION)\n"
-            "@compiling.kernel\n"
-            "def f(x):\n"
-            "    return x[0] + VERSION\n"
-        )
         code = f"import sums, os, numpy\n{before}\nprint(sums.f(numpy.ones(1, numpy.{kind})))"
         root = str(Path(__file__).resolve().parents[2])
-        path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", ""), root])
-        places = {
-            "NUMBA_CACHE_DIR": cache or str(tmp_path / "cache"),
-            "PYTHONPATH": path,
-            "PYTHONDONTWRITEBYTECODE": "1",
-        }
-        return subprocess.Popen(
-            [sys.executable, "-c", code], env=os.environ | places, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        )  # fmt: skip
+        environment = os.environ | {
+            "NUMBA_CACHE_DIR": cache or str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1",
+            "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", ""), root]),
+        }  # fmt: skip
+        pipe = subprocess.PIPE
+        return subprocess.Popen([sys.executable, "-c", code], env=environment, text=True, stdout=pipe, stderr=pipe)
 
     return start
 
@@ -64,10 +63,8 @@ def said(process: subprocess.Popen[str]) -> str:
     return out.strip()
 
 
-def test_a_process_that_dies_while_it_writes_leaves_nothing_wrong(
-    number: Callable[..., subprocess.Popen[str]],
-) -> None:
-    """Above all not the code of the version before."""
+def test_a_process_that_dies_while_it_writes_does_no_harm(number: Start) -> None:
+    """In particular, the code of the version before is not used."""
     assert said(number(1)) == "2.0"
     for written, version in ((0, 5), (1, 7)):
         dies = f"left = [os.replace] * {written}\nos.replace = lambda *a: left.pop()(*a) if left else os._exit(9)"
@@ -75,20 +72,17 @@ def test_a_process_that_dies_while_it_writes_leaves_nothing_wrong(
         assert said(number(version)) == f"{version + 1}.0"
 
 
-def test_a_folder_that_cannot_be_written_only_costs_the_cache(
-    number: Callable[..., subprocess.Popen[str]], monkeypatch: pytest.MonkeyPatch
+def test_without_a_writable_folder_or_disk_space_only_the_cache_is_lost(
+    number: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    full = "def full(*_): raise OSError(28, 'No space left on device')\nos.replace = full"
+    assert said(number(1, full)) == "2.0" and said(number(1)) == "2.0"
     monkeypatch.setenv("NUMBA_CACHE_LOCATOR_CLASSES", "UserProvidedCacheLocator")
     process = number(1, "print(type(sums.f._cache).__name__)", cache=os.path.join(os.devnull, "cache"))
     assert said(process) == "NullCache\n2.0"
 
 
-def test_a_full_disk_costs_the_cache_only(number: Callable[..., subprocess.Popen[str]]) -> None:
-    full = "def full(*_): raise OSError(28, 'No space left on device')\nos.replace = full"
-    assert said(number(1, full)) == "2.0" and said(number(1)) == "2.0"
-
-
-def test_a_damaged_file_is_compiled_again(number: Callable[..., subprocess.Popen[str]], tmp_path: Path) -> None:
+def test_a_damaged_file_is_compiled_again(number: Start, tmp_path: Path) -> None:
     assert said(number(1)) == "2.0"
     files = [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
     whole = {path: path.read_bytes() for path in files}
@@ -99,8 +93,8 @@ def test_a_damaged_file_is_compiled_again(number: Callable[..., subprocess.Popen
         assert whole and all(len(path.read_bytes()) == len(data) for path, data in whole.items())
 
 
-def test_several_processes_at_once(number: Callable[..., subprocess.Popen[str]]) -> None:
-    """With different variants, on an empty cache; what they leave serves all."""
+def test_several_processes_at_once(number: Start) -> None:
+    """Of different variants, on an empty cache; the cache then serves all of them."""
     kinds = ("float32", "float64", "float32")
     assert [said(process) for process in [number(1, kind=kind) for kind in kinds]] == ["2.0"] * 3
     hits = "import atexit; atexit.register(lambda: print(sum(sums.f.stats.cache_hits.values())))"

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from clod_adapter.errors import ClodError
-from clod_adapter.report.charts import error, inline_svg, rendering_chart, training_chart, write_png
+from clod_adapter.report.charts import error, inline_svg, rendering_chart, training_chart, write_chart
 from clod_adapter.report.series import Series
 from clod_adapter.report.style import new_figure, shades
 
@@ -52,12 +52,12 @@ def test_training() -> None:
 
 def test_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
-    write_png(tmp_path / "chart.png", rendering_chart([DIAL, BASE]))
+    write_chart(tmp_path / "chart.png", rendering_chart([DIAL, BASE]))
     pixels = np.asarray(Image.open(tmp_path / "chart.png").convert("RGB"))
     assert min(pixels.shape[:2]) > 500 and 0.005 < (pixels < 128).any(2).mean() < 0.3
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ClodError, match=re.escape("pip install 'clod-adapter[plots]'")):
-        write_png(tmp_path / "other.png", training_chart(CURVES, None))
+        write_chart(tmp_path / "other.png", training_chart(CURVES, None))
     assert not (tmp_path / "other.png").exists()
 
 
@@ -69,9 +69,6 @@ def test_svg_has_the_pages_colours_and_fonts() -> None:
     assert {"var(--ink)", "var(--quiet)", "var(--series-1)", "var(--series-2)"} <= set(re.findall(r"var\([^)]*\)", svg))
     assert not re.findall(r"#(?!000000|ffffff)[0-9a-f]{6}", svg) and "DejaVu" not in svg
     assert "base &amp; co" in svg
-
-
-def test_shades_go_from_light_to_dark() -> None:
-    for count in (1, 2, 5):
+    for count in (1, 2, 5):  # from light to dark
         sums = [sum(bytes.fromhex(colour[1:])) for colour in shades(count)]
         assert len(sums) == count and sums == sorted(sums, reverse=True) and len(set(sums)) == count

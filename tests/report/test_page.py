@@ -46,8 +46,8 @@ def picture(level: float, title: str = NASTY) -> Picture:
 def test_a_page(tmp_path: Path) -> None:
     body = [
         page.section(NASTY, page.paragraph(NASTY), page.tiles([(NASTY, "1", NASTY)]), page.facts({NASTY: NASTY})),
-        page.dial([picture(0.0), picture(0.5), picture(1.0)], {"photograph": picture(0.2)}), page.bullets([NASTY]),
-        page.strip([picture(0.3)]), page.table(["x", NASTY], [(NASTY, [["1", NASTY]])]),
+        page.dial_figure([picture(0.0), picture(0.5), picture(1.0)], {"photograph": picture(0.2)}), page.bullets([NASTY]),
+        page.strip([picture(0.3)]), page.html_table(["x", NASTY], [(NASTY, [["1", NASTY]])]),
         page.chart("<svg></svg>", NASTY),
     ]  # fmt: skip
     data = {"rows": [{"note": NASTY, "psnr": None}]}
@@ -70,15 +70,12 @@ def test_a_page(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
-def test_pictures_are_what_was_given(kind: type) -> None:
+def test_images_in_a_page(kind: type) -> None:
+    """They keep their pixels; wide ones are scaled down."""
     ramp = np.linspace(0, 255, 32 * 24 * 3).reshape(24, 32, 3)
     image = ramp.astype(np.uint8) if kind is np.uint8 else (ramp / 255).astype(np.float32)
-    head, _, data = page.data_url(image).partition(",")
-    decoded = Image.open(io.BytesIO(base64.b64decode(data)))
-    assert head == "data:image/webp;base64" and decoded.size == (32, 24)
+    urls = [page.data_url(each) for each in (image, np.zeros((300, 2000, 3), kind))]
+    assert all(url.startswith("data:image/webp;base64,") for url in urls)
+    decoded, wide = (Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))) for url in urls)
+    assert decoded.size == (32, 24) and wide.size == (1000, 150)
     assert np.abs(np.asarray(decoded.convert("RGB")).astype(float) - ramp).mean() < 4
-
-
-def test_wide_pictures_are_scaled_down() -> None:
-    data = page.data_url(np.zeros((300, 2000, 3), np.uint8)).partition(",")[2]
-    assert Image.open(io.BytesIO(base64.b64decode(data))).size == (1000, 150)

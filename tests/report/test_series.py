@@ -37,13 +37,10 @@ def test_an_evaluation_with_comparisons() -> None:
     }  # fmt: skip
 
 
-def test_a_plain_model_is_no_dial() -> None:
+def test_a_plain_model_and_missing_measurements() -> None:
     (plain,) = series_of({"rows": [row(1), row(2)], "attenuation": None})
     (dial,) = series_of({"rows": [row(1), row(2)], "attenuation": {"tau": 0.02}})
     assert (plain.label, plain.dial, dial.label, dial.dial) == ("the file, no dial", False, "dial, one file", True)
-
-
-def test_what_was_not_measured_is_left_out() -> None:
     assert series_of({"rows": [], "base_rows": [], "detached_row": None}) == []
     (one,) = series_of({"rows": [row(1, None), row(2)]})
     assert [r["virtual_scale"] for r in one.rows] == [2]

@@ -37,19 +37,16 @@ def test_one_alone_exchanges_with_itself(peers: ProcessGroup) -> None:
     assert peers.waiting > 0 and peers.exchanging > 0
 
 
-def test_adapting_with_nobody_else_changes_no_bit(peers: ProcessGroup) -> None:
+def test_adapting_alone_changes_no_bit(peers: ProcessGroup) -> None:
     base, scene = capture(n=60, views=4)
     config = AdaptConfig(iters=3, batch=2)
     want, found = adapt(base, scene, config), adapt(base, scene, config, group=peers)
     for name, tensor in want.gaussians.tensors().items():
         assert torch.equal(found.gaussians.tensors()[name], tensor), name
     assert found.waiting > 0 and want.waiting == want.exchanging == 0 and found.lost is None
-
-
-def test_a_view_for_each_process(peers: ProcessGroup) -> None:
     peers.size = 3
     with pytest.raises(ClodError, match="batch is 2, it must be at least 3, a view for each of the processes"):
-        adapt(*capture(n=20, views=4), AdaptConfig(batch=2), group=peers)
+        adapt(base, scene, config, group=peers)
 
 
 def test_what_is_sent_arrives() -> None:

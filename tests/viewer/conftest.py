@@ -14,7 +14,6 @@ import torch
 
 import clod_adapter
 import scenes
-from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from shown import SIZE, Shown, fold, serve, take
 
@@ -84,9 +83,7 @@ def files(tmp_path: Path) -> Files:
 @pytest.fixture(scope="session")
 def gaussians() -> Gaussians:
     """400 Gaussians of SH degree 1 with a dial."""
-    plain = scenes.gaussians(400, 1, 5)
-    sigma_d = torch.linspace(0.05, 6, 400)
-    return plain.replace(sigma_d=sigma_d, attenuation=AttenuationConfig(tau=0.02, cut="soft", scene_distance=3.0))
+    return scenes.dialled(400, 1, 5).replace(sigma_d=torch.linspace(0.05, 6, 400))
 
 
 @pytest.fixture(scope="session")

@@ -7,26 +7,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 import clod_adapter
 import scenes
-from clod_adapter.cli.main import build_parser
-from clod_adapter.cli.shared.console import Console
-from clod_adapter.cli.view import prepare
-from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import dial
 from clod_adapter.viewer import page, payload
-from clod_adapter.viewer.page import write_page
+from clod_adapter.viewer.page import write_viewer_page
 from shown import COUNTS, SIZE, Shown, serve
 
 
-def test_a_file_without_sigma_d_says_why_there_is_no_dial(show: Any, files: Any, plain: Gaussians) -> None:
-    shown = show(files.save(plain, "plain.ply"))
+def test_a_file_without_sigma_d_has_no_dial(show: Any, files: Any, plain: Gaussians) -> None:
+    """The page says why; it shows the file's name as text."""
+    name = "<img src=x onerror=clod=1><script>clod=1<!script>&amp;'\".ply"
+    shown = show(files.save(plain, name))
+    assert shown.text("#title") == name and shown.page.title() == name and shown.page.query_selector("img") is None
     assert shown.page.is_disabled("#dial") and shown.page.is_disabled("#target") and shown.page.is_disabled("#equation")
     said = shown.text("#no-dial")
-    assert "plain.ply has no sigma_d" in said and "clod-adapt plain.ply" in said
+    assert f"{name} has no sigma_d" in said and f"clod-adapt {name}" in said
     assert shown.counts() == {"total": 400, "kept": 400, "drawn": shown.counts()["drawn"]}
     assert shown.picture().max() > 50
     shown.page.keyboard.press("]")
@@ -37,7 +35,7 @@ def test_a_file_without_sigma_d_says_why_there_is_no_dial(show: Any, files: Any,
 
 
 def test_a_model_that_cannot_be_fetched_is_an_error(tab: Any, files: Any, gaussians: Gaussians) -> None:
-    """And keys do nothing without one."""
+    """Keys then do nothing."""
     with serve(files.save(gaussians)) as url:
         tab.route("**/files/model", lambda route: route.fulfill(body=b"ply\nformat"))
         shown = Shown(tab)
@@ -51,18 +49,10 @@ def test_a_model_that_cannot_be_fetched_is_an_error(tab: Any, files: Any, gaussi
         assert shown.errors == [] and shown.text("#target-note") == ""
 
 
-def test_a_name_is_text_on_the_page(show: Any, files: Any, plain: Gaussians) -> None:
-    name = "<img src=x onerror=clod=1><script>clod=1<!script>&amp;'\".ply"
-    shown = show(files.save(plain, name))
-    assert shown.text("#title") == name and shown.page.title() == name and name in shown.text("#no-dial")
-    assert shown.page.query_selector("img") is None
-
-
 def test_more_gaussians_than_16_bits_count(show: Any, files: Any) -> None:
     count = 100_000
-    many = scenes.gaussians(count, 0, 6, size=0.003)
-    sigma_d = torch.randn(count, generator=torch.Generator().manual_seed(0)).exp()
-    many = many.replace(sigma_d=sigma_d, attenuation=AttenuationConfig(tau=0.02, cut="soft", scene_distance=3.0))
+    many = scenes.dialled(count, 0, 6)
+    many = many.replace(log_scales=many.log_scales - 3.3)
     shown, camera = show(files.save(many), "--sv", 3), scenes.camera(320, 240)
     shown.camera(camera)
     kept = int(dial(many, camera, 3.0).keep.sum())
@@ -70,33 +60,16 @@ def test_more_gaussians_than_16_bits_count(show: Any, files: Any) -> None:
     assert shown.picture().max() > 50
 
 
-def test_a_dial_beyond_the_trained_is_said(files: Any, gaussians: Gaussians) -> None:
-    path = str(files.save(gaussians))
-    for sv, said in (
-        ("5", []),
-        ("9", ["the page's dial ends at s = 5, the largest value trained for, and opens there"]),
-    ):
-        assert prepare(build_parser("view").parse_args([path, "--sv", sv]), Console(quiet=True))[1]["notes"] == said
-
-
-def test_one_file_holds_more_than_one_text_node_may(
-    tab: Any, files: Any, gaussians: Gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_one_file_needs_no_network(
+    chromium: Any, show: Any, files: Any, gaussians: Gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The data goes on in further elements."""
+    """Its data, which may be larger than a text node, continues in further elements."""
     monkeypatch.setattr(page, "LETTERS", 20_000)
     monkeypatch.setattr(payload, "ROWS", 100)
-    write_page(tmp_path / "page.html", clod_adapter.load(files.save(gaussians)))
-    text = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert text.count('id="clod-model"') > 2
-    shown = Shown(tab).ready((tmp_path / "page.html").as_uri())
-    assert shown.counts()["total"] == 400 and shown.errors == []
-
-
-def test_one_file_needs_no_network(chromium: Any, show: Any, files: Any, gaussians: Gaussians, tmp_path: Path) -> None:
     path = files.save(gaussians)
-    served = show(path, "--sv", 2)
-    model = clod_adapter.load(path)
-    write_page(tmp_path / "page.html", model, base=model, cameras=scenes.ring(2, 320, 240), virtual_scale=2.0)
+    served, model = show(path, "--sv", 2), clod_adapter.load(path)
+    write_viewer_page(tmp_path / "page.html", model, base=model, cameras=scenes.ring(2, 320, 240), virtual_scale=2.0)
+    assert (tmp_path / "page.html").read_text(encoding="utf-8").count('id="clod-model"') > 2
     with chromium.new_context(viewport=SIZE, offline=True) as context:
         alone = Shown(context.new_page()).ready((tmp_path / "page.html").as_uri())
         for shown in (served, alone):

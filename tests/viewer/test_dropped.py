@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import re
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.file_formats import write
 from clod_adapter.render import render
-from shown import Shown, assert_same, drop
+from shown import Shown, assert_same, drop, message
 
 CAMERA = scenes.camera(320, 240)
 
@@ -52,12 +53,10 @@ def test_every_ply_layout_gives_the_same_picture(
 
 def test_settings_are_read_without_comments(shown: Shown, files: Any, gaussians: Gaussians, artefacts: Path) -> None:
     """Other tools remove comments: columns hold the settings too. A file of an earlier version has its defaults."""
+    paper = {"tau": 1 / 255, "cut": "hard", "normalizer": "max"}
     cases: dict[str, tuple[dict[str, Any], list[str]]] = {
-        "default.ply": ({}, []),
-        "paper.ply": ({"tau": 1 / 255, "cut": "hard", "normalizer": "max"}, []),
-        "tau.ply": ({"tau": 0.013}, []),
-        "old.ply": ({}, ["clod_adapter max_sv 4.0"]),
-    }
+        "default.ply": ({}, []), "paper.ply": (paper, []), "old.ply": ({}, ["clod_adapter max_sv 4.0"]),
+    }  # fmt: skip
     for name, (settings, comments) in cases.items():
         model = gaussians.replace(attenuation=AttenuationConfig(**settings))
         rows = PlyData.read(str(files.save(model)), mmap=False)["vertex"].data
@@ -88,21 +87,20 @@ def test_the_screen_filter_of_the_file_is_used(
         assert_same(shown, render(found, CAMERA), artefacts / f"filter_{form}.png")
 
 
-def test_a_broken_file_is_an_error_and_leaves_the_picture(shown: Shown, model: Path) -> None:
+def test_a_damaged_file_is_an_error_and_leaves_the_picture(shown: Shown, model: Path) -> None:
     data = model.read_bytes()
-    broken = (
+    damaged = (
         ("cut.ply", data[:-100], "truncated"),
         ("head.ply", data[:300], "truncated"),
         ("words.ply", b"good morning", "no splat"),
         ("empty.ply", b"", "empty"),
         ("mesh.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "mesh"),
+        ("cut.spz", gzip.compress(bytes(100), mtime=0)[:-9], "it is damaged, or too large"),
+        ("end.sog", b"PK\3\4" + bytes(60) + b"PK\5\6" + b"\xff" * 20, "it is damaged, or too large"),
+        ("folder", b"", "cannot read it"),
     )
     before = shown.picture()
-    for name, bad, said in broken:
-        drop(shown, name, bad)
-        shown.page.wait_for_selector("#message:not([hidden])")
-        assert name in shown.text("#message") and said in shown.text("#message")
-        assert shown.text("#title") == "model.ply"
-        shown.page.click("#dismiss")
-        assert shown.page.is_hidden("#message")
+    for name, content, said in damaged:
+        drop(shown, name, content, fails=name == "folder")
+        assert said in message(shown, name) and shown.text("#title") == "model.ply"
     assert np.array_equal(shown.picture(), before)

@@ -1,12 +1,12 @@
-"""The page as text: its parts in their places, and what it lets a browser do."""
+"""The page as text: its parts, its sources, its colours and its security policy."""
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -15,6 +15,7 @@ import scenes
 from clod_adapter.viewer import page
 from clod_adapter.viewer.payload import Payload, page_config
 
+PACKAGE = Path(clod_adapter.__file__).parent
 NASTY = "a</script><!--<script>alert(1)</script>&amp;'\".ply"
 
 
@@ -24,15 +25,8 @@ def element(text: str, name: str) -> str:
     return str(found)
 
 
-@pytest.fixture(scope="module")
-def saved(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    gaussians = clod_adapter.attach(scenes.gaussians(50, 1, 0))
-    path = tmp_path_factory.mktemp("page") / "model.ply"
-    clod_adapter.save(path, gaussians)
-    return clod_adapter.load(path)
-
-
-def test_the_parts_have_their_places() -> None:
+def test_parts_are_in_their_places_and_built_from_these_sources() -> None:
+    """After a change of the sources: npm ci && npm run build, in clod_adapter/viewer/web."""
     for place in page.PLACES:
         assert page._part(page.PAGE).count(place) == 1
     where = [page._part(page.PAGE).index(place) for place in page.PLACES]
@@ -40,6 +34,29 @@ def test_the_parts_have_their_places() -> None:
     for name in (page.PAGE, page.STYLE, page.SCRIPT):
         assert not re.search(r"""(?:src|href)=["']?https?:|@import|url\(["']?https?:""", page._part(name)), name
     assert not re.search("</script|<!--", page._part(page.SCRIPT)) and "</style" not in page._part(page.STYLE)
+    web = PACKAGE / "viewer" / "web"
+    if not web.is_dir():
+        pytest.skip("the sources of the page are in a checkout only")
+    lines = (PACKAGE / "viewer" / "static" / "SOURCES.sha256").read_text(encoding="utf-8").splitlines()
+    listed = {(web / name).resolve(): digest for digest, name in (line.split("  ") for line in lines)}
+    assert {path for path in (web / "src").rglob("*.*") if path.is_file()} <= set(listed)
+    for path, digest in listed.items():
+        assert hashlib.sha256(path.read_bytes()).hexdigest() == digest, f"{path} has changed since: build again"
+
+
+def colours(path: Path) -> list[dict[str, str]]:
+    """The colours that a style defines in light and in dark, by name; minified or not."""
+    style = re.sub(r"#fff(?=[;}])", "#ffffff", re.sub(r"\s", "", path.read_text(encoding="utf-8")))
+    blocks = re.findall(r":root\{(.*?)\}", style)
+    assert len(blocks) == 2
+    return [dict(re.findall(r"--([\w-]+):(#\w+)", block)) for block in blocks]
+
+
+def test_colours_are_those_of_the_report() -> None:
+    styles = (PACKAGE / "viewer" / "static" / "viewer.css", PACKAGE / "report" / "style.css")
+    for ours, theirs in zip(*map(colours, styles), strict=True):
+        assert {"paper", "card", "ink", "quiet", "line", "accent"} == set(ours)
+        assert ours.items() <= theirs.items()
 
 
 def test_names_cannot_leave_their_element() -> None:
@@ -49,9 +66,10 @@ def test_names_cannot_leave_their_element() -> None:
     assert "<script>alert" not in text
 
 
-def test_one_file_holds_everything(saved: Any, tmp_path: Path) -> None:
-    cameras = scenes.ring(2, 20, 10)
-    page.write_page(tmp_path / "page.html", saved, base=saved, cameras=cameras, virtual_scale=2.0)
+def test_one_file_holds_everything(tmp_path: Path) -> None:
+    clod_adapter.save(tmp_path / "model.ply", clod_adapter.attach(scenes.gaussians(50, 1, 0)))
+    saved, cameras = clod_adapter.load(tmp_path / "model.ply"), scenes.ring(2, 20, 10)
+    page.write_viewer_page(tmp_path / "page.html", saved, base=saved, cameras=cameras, virtual_scale=2.0)
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     config = json.loads(element(text, "clod-config"))
     for entry, name in ((config["model"], "clod-model"), (config["base"], "clod-base")):
@@ -61,12 +79,9 @@ def test_one_file_holds_everything(saved: Any, tmp_path: Path) -> None:
     assert len(config["cameras"]) == 2 and config["virtual_scale"] == 2.0
     policy = re.search('<meta http-equiv="Content-Security-Policy" content="([^"]*)">', text)
     assert policy and "default-src 'none'" in policy[1] and "'self'" not in policy[1]
-    assert str(tmp_path) not in text and str(saved.path.parent) not in text
-
-
-def test_without_a_base_there_is_none(saved: Any, tmp_path: Path) -> None:
-    page.write_page(tmp_path / "page.html", saved)
-    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert str(tmp_path) not in text
+    page.write_viewer_page(tmp_path / "alone.html", saved)
+    text = (tmp_path / "alone.html").read_text(encoding="utf-8")
     assert json.loads(element(text, "clod-config"))["base"] is None and "clod-base" not in text
 
 

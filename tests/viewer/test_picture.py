@@ -1,4 +1,4 @@
-"""The picture in the browser is ours: ``clod_adapter.render`` at the same camera and dial."""
+"""The browser's picture equals ``clod_adapter.render`` at the same camera and dial."""
 
 from __future__ import annotations
 
@@ -8,30 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 import scenes
 from clod_adapter.cameras import Camera
-from clod_adapter.config import FILTERS, AttenuationConfig, ScreenFilter
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.config import FILTERS, ScreenFilter
 from clod_adapter.render import render
 from shown import Shown, assert_alike, assert_same, take
-
-SOFT = AttenuationConfig(tau=0.02, cut="soft", scene_distance=3.0)
-
-
-def dialled(degree: int, attenuation: AttenuationConfig = SOFT, n: int = 1500) -> Gaussians:
-    """Long and flat Gaussians before and behind each other, whose sigma_d reach from gone to never fading."""
-    plain = scenes.gaussians(n, degree, 7)
-    generator = torch.Generator().manual_seed(8)
-    sigma_d = (torch.randn(n, generator=generator) + 1).exp()
-    sigma_d[::50] = 0.0
-    return plain.replace(sigma_d=sigma_d, attenuation=attenuation)
 
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_at_dial_values_and_without_the_equation(shown: Shown, files: Any, artefacts: Path, degree: int) -> None:
-    gaussians, camera = dialled(degree), scenes.camera(320, 240)
+    gaussians, camera = scenes.dialled(1500, degree, 7), scenes.camera(320, 240)
     take(shown, files.save(gaussians))
     shown.camera(camera)
     for s in (1.0, 3.0):
@@ -43,34 +30,33 @@ def test_at_dial_values_and_without_the_equation(shown: Shown, files: Any, artef
 
 
 @pytest.mark.parametrize(
-    ("attenuation", "screen_filter"),
+    ("settings", "screen_filter"),
     [
-        (AttenuationConfig(tau=0.02, cut="hard", normalizer="max"), FILTERS["on"]),
-        (AttenuationConfig(tau=1 / 255, cut="soft", normalizer="quantile", quantile=0.7), FILTERS["mip"]),
-        (AttenuationConfig(tau=0.05, cut="soft", eps=0.5, scene_distance=2.0), ScreenFilter(variance=2.0)),
+        ({"cut": "hard", "normalizer": "max"}, FILTERS["on"]),
+        ({"tau": 1 / 255, "normalizer": "quantile", "quantile": 0.7}, FILTERS["mip"]),
+        ({"tau": 0.05, "eps": 0.5, "scene_distance": 2.0}, ScreenFilter(variance=2.0)),
     ],
     ids=["hard, on", "quantile, mip", "eps, blur"],
 )
 def test_settings_and_screen_filters(
-    show: Any, files: Any, artefacts: Path, attenuation: AttenuationConfig, screen_filter: ScreenFilter
+    show: Any, files: Any, artefacts: Path, settings: dict[str, Any], screen_filter: ScreenFilter
 ) -> None:
-    """Of Gaussians of a pixel and less, where filters differ: the classic filter gives another picture."""
-    classic = dialled(1, attenuation)
+    """For Gaussians of a pixel and less, where filters differ: the classic filter gives another picture."""
+    classic = scenes.dialled(1500, 1, 7, **settings)
     classic = classic.replace(log_scales=classic.log_scales - 2.0)
     gaussians, camera = classic.replace(screen_filter=screen_filter), scenes.camera(320, 240)
-    name = f"{attenuation.normalizer}_{screen_filter.variance}"
     shown = show(files.save(gaussians), "--sv", 2)
     shown.camera(camera)
     wanted = render(gaussians, camera, 2.0)
     assert 0.05 < wanted.kept.float().mean() < 0.95
-    assert_same(shown, wanted, artefacts / f"{name}.png")
+    assert_same(shown, wanted, artefacts / f"filter_{screen_filter.variance}.png")
     with pytest.raises(AssertionError):
         assert_alike(shown.picture(), render(classic, camera, 2.0).pixels.numpy(), artefacts / "classic.png")
 
 
 def test_through_cameras_of_other_shapes(shown: Shown, files: Any, artefacts: Path) -> None:
-    """Upright, with the principal point in a corner, and in a unit so small that its near plane is nearer."""
-    gaussians = dialled(0)
+    """Portrait format, the principal point in a corner, and a small unit of length with a nearer near plane."""
+    gaussians = scenes.dialled(1500, 0, 7)
     take(shown, files.save(gaussians))
     for k, camera in enumerate([scenes.camera(180, 240, fov=100), scenes.camera(320, 240, off_centre=(0.1, 0.9))]):
         shown.camera(camera)
@@ -78,7 +64,7 @@ def test_through_cameras_of_other_shapes(shown: Shown, files: Any, artefacts: Pa
     size = 1e-3
     small = gaussians.replace(
         means=size * gaussians.means, log_scales=gaussians.log_scales + float(np.log(size)),
-        attenuation=replace(SOFT, scene_distance=3 * size),
+        attenuation=replace(gaussians.attenuation, scene_distance=3 * size),
     )  # fmt: skip
     viewmat = scenes.camera().viewmat.clone()
     viewmat[:3, 3] *= size
@@ -89,7 +75,7 @@ def test_through_cameras_of_other_shapes(shown: Shown, files: Any, artefacts: Pa
 
 
 def test_wipe_shows_both_sides(show: Any, files: Any, artefacts: Path) -> None:
-    gaussians, camera = dialled(0), scenes.camera(320, 240)
+    gaussians, camera = scenes.dialled(1500, 0, 7), scenes.camera(320, 240)
     plain = gaussians.replace(sigma_d=None, attenuation=None, sh0=-gaussians.sh0)
     shown = show(files.save(gaussians), "--base", files.save(plain, "base.ply"), "--sv", 3)
     shown.camera(camera)

@@ -11,7 +11,7 @@ from clod_adapter.io.formats.converted import check_converted
 from clod_adapter.io.formats.metadata import KEY
 from clod_adapter.io.ply.columns import SIGMA
 from clod_adapter.io.sniff import read_start, refuse, refuse_known
-from clod_adapter.io.tensor_file import read_metadata
+from clod_adapter.io.tensor_file import read_tensor_metadata
 
 NEW_SPZ = b"NGSP"  # first bytes of version 4, which splat-transform reads; earlier versions are gzipped
 _START: dict[str, tuple[bytes, ...]] = {".glb": (b"glTF",), ".spz": (b"\x1f\x8b", NEW_SPZ)}
@@ -31,7 +31,7 @@ def check_model(path: Path) -> None:
         check_converted(path, " of version 4")
     if suffix == ".splat" and path.stat().st_size % 32:
         raise ClodError(f"{path}: is not a .splat file, whose rows have 32 bytes; copy or export it again")
-    if suffix == ".safetensors" and '"clod-adapter"' in read_metadata(path).get(KEY, ""):
+    if suffix == ".safetensors" and '"clod-adapter"' in read_tensor_metadata(path).get(KEY, ""):
         raise ClodError(f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply {path.name} -o OUT.ply")
 
 

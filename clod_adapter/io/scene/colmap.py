@@ -19,7 +19,7 @@ from clod_adapter.io.scene.posed import PosedImage, check_posed
 from clod_adapter.origin import NOWHERE
 
 
-def read_model(model: Path) -> tuple[list[PosedImage], list[str]]:
+def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
     """The registered images of a model, sorted by name, and notes.
 
     Raises:

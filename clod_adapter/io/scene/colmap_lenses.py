@@ -93,7 +93,7 @@ def _eucm(u: np.ndarray, v: np.ndarray, k: Sequence[float]) -> Plane:
 
 
 @dataclass(frozen=True)
-class Model:
+class LensModel:
     """How many of a model's parameters there are, and how many of the first are focal lengths; two centres follow."""
 
     parameters: int
@@ -104,24 +104,24 @@ class Model:
 
 
 MODELS = {  # in the order of COLMAP's numbers
-    "SIMPLE_PINHOLE": Model(3, 1),
-    "PINHOLE": Model(4, 2),
-    "SIMPLE_RADIAL": Model(4, 1, _radial),
-    "RADIAL": Model(5, 1, _radial),
-    "OPENCV": Model(8, 2, _opencv),
-    "OPENCV_FISHEYE": Model(8, 2, _fisheye_radial, fisheye=True),
-    "FULL_OPENCV": Model(12, 2, _full_opencv),
-    "FOV": Model(5, 2, _fov, undistorted=False),
-    "SIMPLE_RADIAL_FISHEYE": Model(4, 1, _fisheye_radial, fisheye=True),
-    "RADIAL_FISHEYE": Model(5, 1, _fisheye_radial, fisheye=True),
-    "THIN_PRISM_FISHEYE": Model(12, 2, _thin_prism, fisheye=True),
-    "RAD_TAN_THIN_PRISM_FISHEYE": Model(16, 2, _rad_tan_thin_prism, fisheye=True),
-    "SIMPLE_DIVISION": Model(4, 1, _division),
-    "DIVISION": Model(5, 2, _division),
-    "SIMPLE_FISHEYE": Model(3, 1, lambda u, v, k: _fisheye(u, v), fisheye=True),
-    "FISHEYE": Model(4, 2, lambda u, v, k: _fisheye(u, v), fisheye=True),
-    "EUCM": Model(6, 2, _eucm, undistorted=False),
-    "EQUIRECTANGULAR": Model(2, 0),
+    "SIMPLE_PINHOLE": LensModel(3, 1),
+    "PINHOLE": LensModel(4, 2),
+    "SIMPLE_RADIAL": LensModel(4, 1, _radial),
+    "RADIAL": LensModel(5, 1, _radial),
+    "OPENCV": LensModel(8, 2, _opencv),
+    "OPENCV_FISHEYE": LensModel(8, 2, _fisheye_radial, fisheye=True),
+    "FULL_OPENCV": LensModel(12, 2, _full_opencv),
+    "FOV": LensModel(5, 2, _fov, undistorted=False),
+    "SIMPLE_RADIAL_FISHEYE": LensModel(4, 1, _fisheye_radial, fisheye=True),
+    "RADIAL_FISHEYE": LensModel(5, 1, _fisheye_radial, fisheye=True),
+    "THIN_PRISM_FISHEYE": LensModel(12, 2, _thin_prism, fisheye=True),
+    "RAD_TAN_THIN_PRISM_FISHEYE": LensModel(16, 2, _rad_tan_thin_prism, fisheye=True),
+    "SIMPLE_DIVISION": LensModel(4, 1, _division),
+    "DIVISION": LensModel(5, 2, _division),
+    "SIMPLE_FISHEYE": LensModel(3, 1, lambda u, v, k: _fisheye(u, v), fisheye=True),
+    "FISHEYE": LensModel(4, 2, lambda u, v, k: _fisheye(u, v), fisheye=True),
+    "EUCM": LensModel(6, 2, _eucm, undistorted=False),
+    "EQUIRECTANGULAR": LensModel(2, 0),
 }
 
 
@@ -135,7 +135,7 @@ class Lens:
     params: np.ndarray
 
     @property
-    def _model(self) -> Model:
+    def _model(self) -> LensModel:
         return MODELS[self.model_name]
 
     @property

@@ -18,7 +18,7 @@ from clod_adapter._kernels.memory import release
 from clod_adapter._support.workers import in_order
 from clod_adapter.cameras import Camera, Scene, View, in_its_unit
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap import read_model
+from clod_adapter.io.scene.colmap import read_colmap
 from clod_adapter.io.scene.dataparser import trained_frame
 from clod_adapter.io.scene.folder import find_cameras, find_photographs
 from clod_adapter.io.scene.image_cache import ImageCache
@@ -75,7 +75,7 @@ def load_scene(
         raise ClodError(f"test_every is {test_every}, max_width {max_width}; they must be at least 2 and 1")
     folder = Path(folder)
     cameras = find_cameras(folder)
-    images, notes = (read_transforms if cameras.is_file() else read_model)(cameras)
+    images, notes = (read_transforms if cameras.is_file() else read_colmap)(cameras)
     if not cameras.is_file() and (folder / "transforms.json").is_file():
         notes.append("the cameras are the COLMAP model's, not those of transforms.json")
     if frame := trained_frame(folder, cameras):

@@ -10,7 +10,7 @@ import torch
 
 from clod_adapter.cameras import Camera, camera_extent, near_plane
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap import read_model
+from clod_adapter.io.scene.colmap import read_colmap
 from clod_adapter.io.scene.dataparser import trained_frame
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.io.scene.posed import TEST_EVERY, held_out
@@ -36,7 +36,7 @@ def load_cameras(
     """
     folder = Path(folder)
     source = find_cameras(folder)
-    images, notes = (read_transforms if source.is_file() else read_model)(source)
+    images, notes = (read_transforms if source.is_file() else read_colmap)(source)
     if frame := trained_frame(folder, source):
         images, notes = frame.bring(images, source), [*notes, frame.note]
     testing = held_out(images, TEST_EVERY) if training else set()

@@ -15,7 +15,7 @@ import clod_adapter
 from clod_adapter.cli.adapt.resume import _fingerprint
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.console import Console
-from clod_adapter.cli.view import prepare
+from clod_adapter.cli.view import make_page
 from clod_adapter.config import CLASSIC, FILTERS
 from clod_adapter.io.scene.load import load_scene
 
@@ -132,7 +132,7 @@ def test_the_base_beside_a_model_is_drawn_alike(clod: Any, trained: tuple[Path, 
     assert clod(trained[0], "--images", trained[1], *FAST).code == 0
     words = ["dial.ply", "--base", str(trained[0])]
     for more, want in ((), FILTERS["on"]), (("--antialiasing", "off"), FILTERS["off"]):
-        answers, _ = prepare(build_parser("view").parse_args([*words, *more]), Console(quiet=True))
+        answers, _ = make_page(build_parser("view").parse_args([*words, *more]), Console(quiet=True))
         page = b"".join(answers["/"].blocks()).decode()
         found = re.findall(r'"screen_filter": ?({[^}]*})', page)
         assert [json.loads(each) for each in found] == [asdict(want)] * 2

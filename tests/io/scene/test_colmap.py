@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap import read_model, write_model
+from clod_adapter.io.scene.colmap import read_colmap, write_model
 from clod_adapter.io.scene.colmap_library import pycolmap
 from clod_adapter.io.scene.load import load_scene
 from photographs import as_text, camera, model_of, pixels, pose, write_scene
@@ -159,4 +159,4 @@ def test_a_model_that_cannot_be_read_is_named(tmp_path: Path, monkeypatch: pytes
 
     monkeypatch.setattr(Path, "read_bytes", refuse)
     with pytest.raises(ClodError, match="cameras.bin: cannot be read .Permission denied"):
-        read_model(tmp_path)
+        read_colmap(tmp_path)

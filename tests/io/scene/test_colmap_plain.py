@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene import colmap, colmap_plain, colmap_records, undistort
-from clod_adapter.io.scene.colmap import read_model
+from clod_adapter.io.scene.colmap import read_colmap
 from clod_adapter.io.scene.load import load_scene
 from photographs import LENSES, SIZE, as_text, camera, damage, pixels, seen, write_scene
 
@@ -75,9 +75,9 @@ def test_models_are_read_alike(tmp_path: Path, plain: Any, monkeypatch: pytest.M
         as_text(tmp_path)
     model = tmp_path / "sparse" / "0"
     monkeypatch.setattr(colmap, "pycolmap", plain)
-    ours, notes = read_model(model)
+    ours, notes = read_colmap(model)
     monkeypatch.setattr(colmap, "pycolmap", pycolmap)
-    theirs, others = read_model(model)
+    theirs, others = read_colmap(model)
     assert [image.name for image in ours] == [image.name for image in theirs] and notes == others
     for one, other in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(one.viewmat, other.viewmat, atol=1e-12)
@@ -143,7 +143,7 @@ def test_damage_is_never_another_exception(tmp_path: Path, plain: Any, data: st.
     shutil.copytree(whole / "sparse" / "0", damaged, dirs_exist_ok=True)
     damage(data, sorted(damaged.iterdir()))
     try:
-        read_model(damaged)
+        read_colmap(damaged)
     except ClodError as error:
         assert str(damaged) in str(error)
 
@@ -156,10 +156,10 @@ def test_damaged_text_is_never_another_exception(tmp_path: Path, plain: Any, tex
         "# two lines each\n1 1 0 0 0 0 0 0 1 a b.png\n\n2 1 0 0 0 0 0 1 1 c.png\n1 2 -1\n"
     )
     (tmp_path / "points3D.txt").write_text("1 0 0 1 255 0 0 0.5\n")
-    assert [image.name for image in read_model(tmp_path)[0]] == ["a b.png", "c.png"]
+    assert [image.name for image in read_colmap(tmp_path)[0]] == ["a b.png", "c.png"]
     (tmp_path / f"{file}.txt").write_text(text)
     try:
-        read_model(tmp_path)
+        read_colmap(tmp_path)
     except ClodError as error:
         assert str(tmp_path) in str(error)
 

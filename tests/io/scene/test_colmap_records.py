@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap import read_model
+from clod_adapter.io.scene.colmap import read_colmap
 from clod_adapter.io.scene.colmap_records import check_records
 from clod_adapter.io.scene.load import load_scene
 from photographs import damage
@@ -51,7 +51,7 @@ def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject, 
             path.unlink()
     damage(data, sorted(damaged.iterdir()))
     try:
-        read_model(damaged)
+        read_colmap(damaged)
     except ClodError as error:
         assert str(damaged) in str(error)
 
@@ -71,7 +71,7 @@ def test_pipes_are_not_waited_for(tmp_path: Path, file: str) -> None:
     (target / file).unlink(missing_ok=True)
     os.mkfifo(target / file)
     with pytest.raises(ClodError, match=f"{file}: .*not a regular file"):
-        read_model(target)
+        read_colmap(target)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -79,7 +79,7 @@ def test_long_and_steering_names_are_refused(tmp_path: Path, form: str) -> None:
     for name in ("a" * 300 + ".png", "\x1b[2Ja.png"):
         target = model(tmp_path, form, (name,))
         with pytest.raises(ClodError, match="is no file's name") as caught:
-            read_model(target)
+            read_colmap(target)
         assert "\x1b" not in str(caught.value)
 
 
