@@ -149,7 +149,9 @@ def test_no_steps_give_the_initialization(captured: Pair) -> None:
     for name in ATTRIBUTES:
         assert torch.equal(getattr(result.gaussians, name), getattr(base, name)), name
     torch.testing.assert_close(result.gaussians.sigma_d, want.sigma_d, rtol=1e-5, atol=0)  # by way of its logarithm
-    assert result.gaussians.attenuation == want.attenuation
+    assert result.gaussians.attenuation == want.attenuation and (want.sigma_d < SIGMA_MAX).all()
+    # At SIGMA_MAX no gradient reaches sigma_d, so a dial of attach is initialized, too.
+    assert_equal(adapt(attach(base), scene, config_of(iters=0)).gaussians, result.gaussians)
     base = base.replace(opacity_logits=base.opacity_logits.abs())  # so that all can last
     found = initialize(base, scene.train, config_of(start_share=0.7, exponent=1.5))
     assert found.attenuation.scene_distance == 1
@@ -213,23 +215,11 @@ def test_continuing_divides_by_the_typical_distance_again(captured: Pair, traine
     assert states == [pytest.approx(want)] and want > 2
     assert result.attenuation.reference_distance == pytest.approx(want)
     assert (result.sigma_d / first.sigma_d).log().abs().max() <= 1.01e-2  # a step of log sigma
-
-
-def test_a_file_s_own_settings_outlive_other_defaults(captured: Pair) -> None:
-    """A sigma_d learned under one tau and normaliser means something else under others."""
+    # A sigma_d learned under one tau and normalizer means something else under others: the file's are kept.
     own = AttenuationConfig(tau=0.02, eps=1e-6, normalizer="max", scene_distance=2.0, max_sv=4.0)
     dialled = attach(captured[0], torch.full((len(captured[0]),), 1.5), own)
     result = adapt(dialled, captured[1], config_of(iters=1, max_sv=3.0)).gaussians
     assert result.attenuation == replace(own, max_sv=3.0, scene_distance=1.0, reference_distance=2.0)
-
-
-def test_a_dial_that_does_nothing_is_started(captured: Pair) -> None:
-    """At SIGMA_MAX there is no gradient to learn from, so attach, then adapt must be as adapt alone."""
-    base, scene = captured
-    config = config_of(iters=0)
-    plain, attached = (adapt(g, scene, config).gaussians for g in (base, attach(base)))
-    assert_equal(plain, attached)
-    assert (plain.sigma_d < SIGMA_MAX).all()
 
 
 def test_every_sigma_of_the_start_feels_the_dial(captured: Pair) -> None:
