@@ -77,8 +77,8 @@ def test_a_folder_that_cannot_be_made(clod: Any, tmp_path: Path) -> None:
         assert done.code == 2 and said in done.err and done.err.count("\n") == 1, done
 
 
-@pytest.mark.parametrize("flags", [[], ["--quiet", "--json"]])
-def test_the_main_job_gets_its_own_defaults(flags: list[str]) -> None:
+def test_the_main_job_gets_its_own_defaults() -> None:
+    flags = ["--quiet", "--json"]
     args = build_parser("demo").parse_args(["--out=-odd", *flags])
     files = [Path("-odd") / name for name in ("base.ply", "capture", "gallery.ply")]
     given = demo.adapt_arguments(args, *files)
