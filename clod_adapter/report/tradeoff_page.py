@@ -187,11 +187,8 @@ def _plan(report: Mapping[str, Any]) -> str:
     """The plan: parts of the checkpoint that training skips for this scene."""
     decisions = (report.get("plan") or {}).get("decisions", ())  # none of a training in blocks
     rows = [[made[name] for name in ("what", "verdict", "measured", "why")] for made in decisions]
-    return (
-        page.section("Plan", page.html_table(("part", "action", "measured effect", "reason"), [("", rows)]))
-        if rows
-        else ""
-    )
+    columns = ("part", "action", "measured effect", "reason")
+    return page.section("Plan", page.html_table(columns, [("", rows)])) if rows else ""
 
 
 def _settings(report: Mapping[str, Any]) -> str:

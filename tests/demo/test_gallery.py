@@ -78,7 +78,7 @@ def test_points_lie_on_visible_surfaces(gallery: Gallery) -> None:
 
 
 def test_capture_is_written_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "bake", lambda tables: tables)
+    monkeypatch.setattr(module, "bake_light", lambda tables: tables)
     seen: list[tuple[int, int]] = []
     folder = tmp_path / "capture"
     write_gallery(

@@ -50,7 +50,7 @@ def test_labels_of_the_curve_do_not_overlap(tmp_path: Path, monkeypatch: pytest.
         picture = load(tmp_path / "curve.png")
         assert min(picture.shape[:2]) > 500 and 0.01 < (picture < 128).any(2).mean() < 0.5
     figures = []
-    monkeypatch.setattr(pictures, "save", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr(pictures, "save_figure", lambda figure, path: figures.append(figure))
     quality_curve(tmp_path / "curve.png", rows, base, "quality")
     renderer = FigureCanvasAgg(figures[0]).get_renderer()
     figures[0].draw(renderer)

@@ -46,7 +46,8 @@ def picture(level: float, title: str = NASTY) -> Picture:
 def test_a_page(tmp_path: Path) -> None:
     body = [
         page.section(NASTY, page.paragraph(NASTY), page.tiles([(NASTY, "1", NASTY)]), page.facts({NASTY: NASTY})),
-        page.dial_figure([picture(0.0), picture(0.5), picture(1.0)], {"photograph": picture(0.2)}), page.bullets([NASTY]),
+        page.dial_figure([picture(0.0), picture(0.5), picture(1.0)], {"photograph": picture(0.2)}),
+        page.bullets([NASTY]),
         page.strip([picture(0.3)]), page.html_table(["x", NASTY], [(NASTY, [["1", NASTY]])]),
         page.chart("<svg></svg>", NASTY),
     ]  # fmt: skip
