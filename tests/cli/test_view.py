@@ -43,17 +43,14 @@ def test_serves_until_it_is_interrupted(spawn: Any, capture: Any, dialled: Path,
     assert (process.returncode, out) == (0, "") and "Traceback" not in err and "GET" not in err, err
 
 
-def test_a_dial_value_that_the_page_does_not_have_is_noted(capture: Any, dialled: Path) -> None:
+def test_a_dial_value_that_the_page_does_not_have_is_noted(capture: Any, dialled: Path, capsys: Any) -> None:
     for path, opens, said in (
         (dialled, 4, "the page's dial ends at s = 4"), (capture.ply, 1, "s = 9 has no effect"),
     ):  # fmt: skip
-        answers, report = prepare(path, "--sv", 9)
+        answers, report = view.make_page(build_parser("view").parse_args([str(path), "--sv=9"]), view.Console(False))
         (config,) = re.findall(r'id="clod-config">(.*?)</script>', b"".join(answers["/"].blocks()).decode(), re.DOTALL)
         assert json.loads(config)["virtual_scale"] == opens and any(said in note for note in report["notes"])
-
-
-def prepare(*words: object) -> Any:
-    return view.prepare(build_parser("view").parse_args([str(word) for word in words]), view.Console(True))
+        assert said in capsys.readouterr().err
 
 
 def test_prints_the_address(spawn: Any, capture: Any, tmp_path: Path) -> None:
