@@ -24,7 +24,7 @@ from clod_adapter.cli.shared.report import machine_name, report_dials
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import write_model
-from clod_adapter.training import pseudo_views
+from clod_adapter.training import camera_placement
 from runs import OUTPUTS, STATE, names, pressing
 from scenes import stripped
 
@@ -233,9 +233,9 @@ def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -
 
 
 def test_without_photographs(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert (pseudo_views.WIDTH, pseudo_views.HEIGHT) == (496, 368)  # smaller here, for speed
-    monkeypatch.setattr(pseudo_views, "WIDTH", 186)
-    monkeypatch.setattr(pseudo_views, "HEIGHT", 138)
+    assert (camera_placement.WIDTH, camera_placement.HEIGHT) == (496, 368)  # smaller here, for speed
+    monkeypatch.setattr(camera_placement, "WIDTH", 186)
+    monkeypatch.setattr(camera_placement, "HEIGHT", 138)
     done = clod(capture.ply, *TINY, "--json")
     report = json.loads(done.out)
     assert done.code == 0 and names(tmp_path) == OUTPUTS, done

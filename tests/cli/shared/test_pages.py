@@ -56,8 +56,8 @@ def test_adapt(clod: Any, capture: Any, tmp_path: Path) -> None:
 def test_without_photographs_nothing_is_said_of_any(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("clod_adapter.training.pseudo_views.WIDTH", 62)
-    monkeypatch.setattr("clod_adapter.training.pseudo_views.HEIGHT", 46)
+    monkeypatch.setattr("clod_adapter.training.camera_placement.WIDTH", 62)
+    monkeypatch.setattr("clod_adapter.training.camera_placement.HEIGHT", 46)
     done = clod(capture.ply, *TINY, "--report", "--json")
     assert done.code == 0, done
     report, text = json.loads(done.out), (tmp_path / "dial.html").read_text(encoding="utf-8")
