@@ -22,7 +22,8 @@ from common import append, arguments, checkpoint, stored, table
 from common import photographs as photographs_of
 
 import clod_adapter as clod
-from clod_adapter.training.pseudo_views import add_pseudo_views, place_cameras, render_pseudo_views, typical_reach
+from clod_adapter.training.camera_placement import place_cameras, typical_reach
+from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
 
 FILE = "nophoto.jsonl"
 KINDS = ("photographs", "teacher", "placed", "complemented")

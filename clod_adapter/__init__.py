@@ -37,11 +37,12 @@ if TYPE_CHECKING:
     from clod_adapter.io.scene.load import load_scene
     from clod_adapter.progress import Phase, Progress, Stopped
     from clod_adapter.render import Rendering, render
+    from clod_adapter.training.camera_placement import place_cameras
     from clod_adapter.training.loop import Adapted, adapt
     from clod_adapter.training.objective import TrainableSubset
     from clod_adapter.training.plan import Decision, Override, Plan
     from clod_adapter.training.planner import make_plan
-    from clod_adapter.training.pseudo_views import place_cameras, render_pseudo_views
+    from clod_adapter.training.pseudo_views import render_pseudo_views
 
 # Imported on first use: torch takes a second or two, which the command's --help and most of its errors do without.
 on_first_use(__name__, {
@@ -59,7 +60,8 @@ on_first_use(__name__, {
     "io.scene.load": ("load_scene",),
     "io.checkpoint": ("Checkpoint", "load", "save"),
     "training.objective": ("TrainableSubset",),
-    "training.pseudo_views": ("render_pseudo_views", "place_cameras"),
+    "training.camera_placement": ("place_cameras",),
+    "training.pseudo_views": ("render_pseudo_views",),
     "training.plan": ("Decision", "Override", "Plan"),
     "training.planner": ("make_plan",),
     "progress": ("Phase", "Progress", "Stopped"),

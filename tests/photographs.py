@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import strategies as st
 from PIL import Image
 
 from clod_adapter.cameras import Camera
@@ -95,3 +96,17 @@ def seen(camera: pycolmap.Camera) -> np.ndarray:
 
 def psnr_of(picture: np.ndarray, other: np.ndarray) -> float:
     return float(-10 * np.log10(np.square((picture.astype(float) - other) / 255).mean() + 1e-9))
+
+
+def damage(data: st.DataObject, files: list[Path]) -> None:
+    """Cuts one of the files, or overwrites some of its bytes, as hypothesis draws."""
+    path = data.draw(st.sampled_from(files))
+    content = bytearray(path.read_bytes())
+    if data.draw(st.booleans()):
+        del content[data.draw(st.integers(0, len(content) - 1)) :]
+    else:
+        values = [b"\xff" * 8, b"\xff" * 4, b"\0" * 8, b"\0\0\0\x80", b"nan", b" ", b"-1", b"\n", b"#"]
+        for _ in range(data.draw(st.integers(1, 3))):
+            value, at = data.draw(st.sampled_from(values)), data.draw(st.integers(0, len(content) - 1))
+            content[at : at + len(value)] = value
+    path.write_bytes(content)

@@ -32,10 +32,11 @@ from clod_adapter.initialization.importance import initialize, usable_views
 from clod_adapter.losses import photometric_loss
 from clod_adapter.metrics import psnr_ssim
 from clod_adapter.rasterizers import cpu, cuda
+from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.planner import make_plan
-from clod_adapter.training.pseudo_views import place_cameras, render_pseudo_views
+from clod_adapter.training.pseudo_views import render_pseudo_views
 from clod_adapter.training.target_count import count_gradient, paper_count
 from fake_gpu import fake_gpu
 from scenes import capture, gaussians, ring

@@ -14,7 +14,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.poses import load_cameras
 from clod_adapter.progress import Stopped
-from clod_adapter.training.pseudo_views import place_cameras
+from clod_adapter.training.camera_placement import place_cameras
 
 from ..shared.console import Console
 from ..shared.inputs import read_scene

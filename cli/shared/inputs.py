@@ -13,7 +13,8 @@ from clod_adapter.io.scene.image_cache import ImageCache
 from clod_adapter.io.scene.load import load_scene
 from clod_adapter.origin import Origin
 from clod_adapter.progress import Phase
-from clod_adapter.training.pseudo_views import add_pseudo_views, place_cameras, render_pseudo_views
+from clod_adapter.training.camera_placement import place_cameras
+from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
 
 from .console import Console
 from .files import size

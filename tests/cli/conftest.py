@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from clod_adapter.cli.main import main
+from runs import Server
 
 ENDS = (signal.SIGINT, signal.SIGTERM)
 
@@ -69,3 +70,12 @@ def spawn() -> Callable[..., subprocess.Popen[str]]:
         return subprocess.Popen(command, cwd=cwd, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
     return start
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[Server]:
+    """Starts ``clod-adapt`` in processes that need no seconds to start."""
+    server = Server()
+    yield server
+    server.process.kill()
+    server.process.communicate()

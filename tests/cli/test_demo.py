@@ -59,14 +59,13 @@ def test_pictures_that_were_not_drawn_are_not_reported(
     assert not any((tmp_path / "demo" / name).exists() for name in PICTURES)
 
 
-@pytest.mark.parametrize(("module", "package"), [("matplotlib", "matplotlib"), ("skimage", "scikit-image")])
-def test_what_is_missing_is_said_at_the_start(
-    clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, package: str
-) -> None:
-    monkeypatch.setattr(demo, "EXTRA", {module: package})
-    monkeypatch.setitem(sys.modules, module, None)
-    done = clod("demo")
-    assert done.code == 2 and f"the demo needs {package}: pip install 'clod-adapter[demo]'" in done.err
+def test_a_missing_package_is_named_at_the_start(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module, package in (("matplotlib", "matplotlib"), ("skimage", "scikit-image")):
+        with monkeypatch.context() as patch:
+            patch.setattr(demo, "EXTRA", {module: package})
+            patch.setitem(sys.modules, module, None)
+            done = clod("demo")
+        assert done.code == 2 and f"the demo needs {package}: pip install 'clod-adapter[demo]'" in done.err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -78,20 +77,13 @@ def test_a_folder_that_cannot_be_made(clod: Any, tmp_path: Path) -> None:
         assert done.code == 2 and said in done.err and done.err.count("\n") == 1, done
 
 
-@pytest.mark.parametrize("flags", [[], ["--quiet", "--json"]])
-def test_the_main_job_gets_its_own_defaults(flags: list[str]) -> None:
+def test_the_main_job_gets_its_own_defaults() -> None:
+    flags = ["--quiet", "--json"]
     args = build_parser("demo").parse_args(["--out=-odd", *flags])
     files = [Path("-odd") / name for name in ("base.ply", "capture", "gallery.ply")]
     given = demo.adapt_arguments(args, *files)
-    words = [
-        "--images=-odd/capture",
-        "--max-sv=5",
-        "--iters=1000",
-        "--out=-odd/gallery.ply",
-        *flags,
-        "--",
-        "-odd/base.ply",
-    ]
+    words = ["--images=-odd/capture", "--max-sv=5", "--iters=1000", "--out=-odd/gallery.ply", *flags, "--"]
+    words.append("-odd/base.ply")
     assert vars(given) == vars(build_parser("").parse_args(words))
 
 

@@ -13,15 +13,9 @@ import torch
 
 import clod_adapter
 from clod_adapter.cli import comparisons
+from runs import pressing
 
-TINY = ("--iters", 3, "--quiet", "--max-sv", 4, "--out", "dial.ply")
 ROW = {"virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"}
-
-
-@pytest.fixture
-def adapted(clod: Any, capture: Any, tmp_path: Path) -> Path:
-    assert clod(capture.ply, "--images", capture.scene, *TINY).code == 0
-    return tmp_path / "dial.ply"
 
 
 def notes_of(report: Any) -> list[str]:
@@ -29,24 +23,23 @@ def notes_of(report: Any) -> list[str]:
     return [note for note in report["notes"] if not note.startswith("without ")]
 
 
-def test_eval_prints_one_object(spawn: Any, clod: Any, capture: Any, tmp_path: Path) -> None:
-    clod(capture.ply, "--images", capture.scene, *TINY)
-    process = spawn("eval", "dial.ply", "--images", capture.scene, "--sv", "1", "2.5", "--json", cwd=tmp_path)
-    out, err = process.communicate(timeout=100)
-    assert process.returncode == 0, err
-    report = json.loads(out)
-    assert (report["model"], report["scene"], report["base_count"]) == ("dial.ply", str(capture.scene), 300)
+def test_eval_prints_one_object(clod: Any, capture: Any, dialled: Path) -> None:
+    done = clod("eval", dialled, "--images", capture.scene, "--sv", "1", "2.5", "--json")
+    assert done.code == 0 and done.out.count("\n") == 1, done
+    report = json.loads(done.out)
+    assert (report["model"], report["scene"], report["base_count"]) == (str(dialled), str(capture.scene), 300)
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 2.5]
     for row in report["rows"]:
         assert set(row) - {"lpips", "flip"} == ROW and row["in_view"] <= row["kept"]
         assert row["kept_share"] == row["kept"] / 300 and row["frame_ms"] > 0
         assert 0 < row["psnr"] < 100 and 0 < row["ssim"] <= 1
-    assert "PSNR dB" in err and "PSNR dB" not in out
+    assert "PSNR dB" in done.err and "PSNR dB" not in done.out
 
 
 def test_eval_of_a_plain_file(clod: Any, capture: Any) -> None:
-    done = clod("eval", capture.ply, "--images", capture.scene, "--json")
+    done = clod("eval", capture.ply, "--images", capture.scene, "--popping", "--json")
     report = json.loads(done.out)
+    assert report["popping"] == [] and any("popping is not measured" in note for note in report["notes"])
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 2, 3, 5]
     assert {row["kept_share"] for row in report["rows"]} == {1.0} and len({row["psnr"] for row in report["rows"]}) == 1
     assert report["attenuation"] is None and "has no sigma_d" in done.err
@@ -56,7 +49,9 @@ def test_eval_of_a_plain_file(clod: Any, capture: Any) -> None:
 
 def test_eval_stays_within_what_was_trained(clod: Any, capture: Any) -> None:
     for max_sv, dials in ((2.5, [1, 2, 2.5]), (1, [1]), (7, [1, 2, 3, 5, 7])):
-        clod(capture.ply, "--images", capture.scene, *TINY, "--max-sv", max_sv)
+        sigma = torch.linspace(0.5, 5, 300)
+        model = clod_adapter.attach(capture.gaussians, sigma, clod_adapter.AttenuationConfig(max_sv=max_sv))
+        clod_adapter.save("dial.ply", model)
         report = json.loads(clod("eval", "dial.ply", "--images", capture.scene, "--json").out)
         assert [row["virtual_scale"] for row in report["rows"]] == dials and notes_of(report) == []
     done = clod("eval", "dial.ply", "--images", capture.scene, "--sv", 8, "--json")
@@ -64,8 +59,8 @@ def test_eval_stays_within_what_was_trained(clod: Any, capture: Any) -> None:
     assert note.startswith("trained up to s = 7") and note in done.err
 
 
-def test_base_by_rank(clod: Any, capture: Any, adapted: Path) -> None:
-    done = clod("eval", adapted, "--images", capture.scene, "--sv", 1, 4, "--base", capture.ply, "--json")
+def test_base_by_rank(clod: Any, capture: Any, dialled: Path) -> None:
+    done = clod("eval", dialled, "--images", capture.scene, "--sv", 1, 4, "--base", capture.ply, "--json")
     report = json.loads(done.out)
     assert report["base"] == str(capture.ply) and report["base_row"]["kept"] == 300 and report["interrupted"] is False
     assert [(entry["virtual_scale"], entry["by"]) for entry in report["ranked"]] == [
@@ -84,9 +79,9 @@ def test_base_by_rank(clod: Any, capture: Any, adapted: Path) -> None:
     assert report["against"] == [] and report["popping"] == []
 
 
-def test_against_at_matched_counts(clod: Any, capture: Any, adapted: Path, tmp_path: Path) -> None:
+def test_against_at_matched_counts(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     few = capture.write(tmp_path / "few.ply", capture.gaussians.select(torch.arange(60)))
-    words = ("eval", adapted, "--images", capture.scene, "--sv", 1, 2, "--json", "--against", few, capture.ply, adapted)
+    words = ("eval", dialled, "--images", capture.scene, "--sv", 1, 2, "--json", "--against", few, capture.ply, dialled)
     done = clod(*words)
     report = json.loads(done.out)
     pairs = [(Path(e["model"]).name, e["theirs"]["kept"], e["ours"]["kept"]) for e in report["against"]]
@@ -100,14 +95,14 @@ def test_against_at_matched_counts(clod: Any, capture: Any, adapted: Path, tmp_p
     assert "the dial value with the same count" in done.err
 
 
-def test_against_files_of_one_name(clod: Any, capture: Any, adapted: Path, tmp_path: Path) -> None:
+def test_against_files_of_one_name(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     paths = []
     for name, count in (("a", 60), ("b", 90)):
         (tmp_path / name).mkdir()
         few = capture.gaussians.select(torch.arange(count))
         paths.append(capture.write(tmp_path / name / "point_cloud.ply", few))
-    words = ("eval", adapted, "--images", capture.scene, "--sv", 1, "--json", "--against")
+    words = ("eval", dialled, "--images", capture.scene, "--sv", 1, "--json", "--against")
     report = json.loads(clod(*words, *paths, "--report", "page.html").out)
     assert [entry["label"] for entry in report["against"]] == ["a_point_cloud", "b_point_cloud"]
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
@@ -117,8 +112,8 @@ def test_against_files_of_one_name(clod: Any, capture: Any, adapted: Path, tmp_p
     assert twice.code == 2 and "point_cloud.ply: is given twice" in twice.err and "\n" not in twice.err.strip()
 
 
-def test_popping(clod: Any, capture: Any, adapted: Path) -> None:
-    done = clod("eval", adapted, "--images", capture.scene, "--sv", 1, 3, "--popping", "--json")
+def test_popping(clod: Any, capture: Any, dialled: Path) -> None:
+    done = clod("eval", dialled, "--images", capture.scene, "--sv", 1, 3, "--popping", "--json")
     dial, other, walk = json.loads(done.out)["popping"]
     assert (dial["moved"], other["moved"]) == ("dial, 000.png", "dial, 008.png")
     assert walk["moved"] == "camera, 002.png to 006.png, s = 3"
@@ -130,29 +125,11 @@ def test_popping(clod: Any, capture: Any, adapted: Path) -> None:
     assert re.search(r"^ +what moves +steps +mean", done.err, re.M) and "camera, 002.png to 006.png" in done.err
 
 
-def test_no_dial_does_not_pop(clod: Any, capture: Any) -> None:
-    done = clod("eval", capture.ply, "--images", capture.scene, "--sv", 1, 2, "--popping", "--json")
-    report = json.loads(done.out)
-    assert (
-        done.code == 0
-        and report["popping"] == []
-        and any("popping is not measured" in note for note in report["notes"])
-    )
-
-
 def test_interrupt_keeps_what_is_measured(
-    clod: Any, capture: Any, adapted: Path, monkeypatch: pytest.MonkeyPatch
+    clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real, calls = comparisons.evaluate, []
-
-    def evaluate(*args: Any, **rest: Any) -> Any:
-        calls.append(args)
-        if len(calls) == 3:
-            signal.raise_signal(signal.SIGINT)
-        return real(*args, **rest)
-
-    monkeypatch.setattr(comparisons, "evaluate", evaluate)
-    words = ("eval", adapted, "--images", capture.scene, "--sv", 1, 2, "--base", capture.ply, "--popping", "--json")
+    monkeypatch.setattr(comparisons, "evaluate", pressing(comparisons.evaluate, signal.SIGINT, at=3))
+    words = ("eval", dialled, "--images", capture.scene, "--sv", 1, 2, "--base", capture.ply, "--popping", "--json")
     done = clod(*words)
     report = json.loads(done.out)
     assert done.code == 0 and report["interrupted"] is True and len(report["rows"]) == 2
@@ -170,11 +147,3 @@ def test_more_metrics_are_columns(clod: Any, capture: Any, monkeypatch: pytest.M
     assert 0 < report["rows"][0]["flip"] < 1 and "lpips" not in report["rows"][0]
     table = done.err[done.err.index("  dial") :].splitlines()
     assert "FLIP" in table[0] and "LPIPS" not in table[0] and f"{report['rows'][0]['flip']:.4f}" in table[1]
-
-
-def test_base_must_be_unadapted(clod: Any, capture: Any, adapted: Path) -> None:
-    done = clod("eval", adapted, "--images", capture.scene, "--base", adapted)
-    assert (done.code, done.out) == (2, "")
-    assert done.err.startswith(f"clod-adapt: error: {adapted}: has a dial (sigma_d); give --base the checkpoint")
-    assert done.err.rstrip().endswith("or use --against")
-    assert len(done.err.splitlines()) == 1

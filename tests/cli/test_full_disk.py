@@ -91,18 +91,6 @@ def test_exports(clod: Any, dialled: Path, tmp_path: Path, room: Room, name: str
     assert held(tmp_path) == {name: b"earlier"}
 
 
-def test_levels(clod: Any, dialled: Path, tmp_path: Path, room: Room) -> None:
-    """Of several files the first fit; none is written."""
-    assert clod("export", dialled, "-o", "x.ply", "--levels", "1,3").code == 0
-    large, small = len(held(tmp_path)["x_s1.ply"]), len(held(tmp_path)["x_s3.ply"])
-    for path in tmp_path.iterdir():
-        path.unlink()
-    assert small < large
-    with room((small + large) // 2):
-        one_error(clod("export", dialled, "-o", "x.ply", "--levels", "1,3"))
-    assert held(tmp_path) == {}
-
-
 def test_pictures_and_applying(clod: Any, capture: Any, dialled: Path, tmp_path: Path, room: Room) -> None:
     with room(1000):
         one_error(clod("render", dialled, "--images", capture.scene, "-o", "pictures"))

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from clod_adapter._support.version import package_version
+from runs import fail
 
 
 def test_an_error_of_the_system_is_one_line(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -23,22 +24,23 @@ def test_an_error_of_the_system_is_one_line(clod: Any, capture: Any, monkeypatch
     assert done.err.splitlines()[-1].startswith("clod-adapt: error: some/file: No space left on device; check")
 
 
-def test_bad_input_exits_with_2(spawn: Any, tmp_path: Path) -> None:
-    process = spawn("missing.ply", "--images", ".", "--json", cwd=tmp_path)
-    out, err = process.communicate(timeout=60)
-    assert (process.returncode, out, err.count("\n")) == (2, "", 1)
-
-
-def test_importing_leaves_the_collector_on() -> None:
+def test_torch_is_imported_with_idle_threads_and_the_collector_on() -> None:
+    """The console entry sets OpenMP's waiting policy before torch can read it."""
     code = (
-        "import gc, sys\n"
+        "import sys, gc, os\n"
         "from argparse import Namespace\n"
+        "class Spy:\n"
+        "    def find_spec(self, name, *rest):\n"
+        "        if name == 'torch': print(os.environ.get('OMP_WAIT_POLICY'))\n"
+        "sys.meta_path.insert(0, Spy())\n"
         "from clod_adapter.cli.main import APPLY, import_command\n"
         "module = import_command(APPLY, Namespace(quiet=True))\n"
         "assert module is import_command(APPLY, Namespace(quiet=True)) and 'torch' in sys.modules\n"
         "assert gc.isenabled() and gc.get_freeze_count() > 1000\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split()[0] == "PASSIVE"
 
 
 def test_closed_pipe(spawn: Any, capture: Any, tmp_path: Path) -> None:
@@ -46,21 +48,6 @@ def test_closed_pipe(spawn: Any, capture: Any, tmp_path: Path) -> None:
     process.stdout.close()
     assert "Traceback" not in process.stderr.read()
     assert process.wait(timeout=60) == 1
-
-
-def test_threads_do_not_spin() -> None:
-    """The console entry sets OpenMP's waiting policy before torch can read it."""
-    code = (
-        "import sys, os\n"
-        "class Spy:\n"
-        "    def find_spec(self, name, *rest):\n"
-        "        if name == 'torch': print(os.environ.get('OMP_WAIT_POLICY'))\n"
-        "sys.meta_path.insert(0, Spy())\n"
-        "import clod_adapter.cli.adapt.run"
-    )
-    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout.split()[0] == "PASSIVE"
 
 
 def test_ctrl_c_within_compiled_code(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,13 +65,10 @@ def test_ctrl_c_within_compiled_code(clod: Any, capture: Any, monkeypatch: pytes
 def test_an_unknown_error_is_a_traceback_and_where_to_report_it(
     clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: object) -> None:
-        raise ZeroDivisionError("of ours")
-
     monkeypatch.setattr("clod_adapter.cli.shared.models.read_checkpoint", fail)
     done = clod("eval", capture.ply, "--images", capture.scene, "--json", "--quiet")
     lines = done.err.splitlines()
     assert done.code == 1 and done.out == "" and lines[0] == "Traceback (most recent call last):", done
     assert lines[-2] == "ZeroDivisionError: of ours" and 'raise ZeroDivisionError("of ours")' in done.err
-    assert lines[-1].startswith(f"clod-adapt: error: this is a bug in clod-adapt {package_version()}, not in")
+    assert lines[-1].startswith(f"clod-adapt: error: this is a bug in clod-adapt {package_version()}, not in the input")
     assert "please report it, with the lines above" in lines[-1]

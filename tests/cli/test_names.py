@@ -91,7 +91,7 @@ def test_names_within_a_transforms_file(clod: Any, dialled: Path, tmp_path: Path
     for words in (["export", "-o", "page.html"], ["eval"], ["render", "-o", "out"]):
         done = clod(words[0], dialled, "--images", scene, *words[1:])
         error = done.err.splitlines()[-1]
-        assert done.code == 2 and error.endswith("is no text in UTF-8; rename the photograph, there too"), done
+        assert done.code == 2 and error.endswith("is not UTF-8; rename the photograph, there too"), done
 
 
 @pytest.mark.usefixtures("without_splat_transform")

@@ -19,6 +19,7 @@ from PIL import Image
 import clod_adapter
 from clod_adapter.cli import robustness as command
 from clod_adapter.evaluation.robustness import BASELINE_SHARES
+from runs import pressing
 
 pytest.importorskip("matplotlib")
 OUTPUTS = ["robustness.csv", "robustness.json", "robustness.png"]
@@ -98,15 +99,8 @@ def test_resumes_what_is_unfinished_or_changed(run: Any, tmp_path: Path) -> None
 
 @pytest.mark.usefixtures("blank_figure")
 def test_ctrl_c_leaves_what_there_is(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls, real = [], command.adapt_at_range
-
-    def interrupted(*args: Any, **options: Any) -> Any:
-        calls.append(args)
-        if len(calls) == 2:
-            signal.raise_signal(signal.SIGINT)
-        return real(*args, **options)
-
-    monkeypatch.setattr(command, "adapt_at_range", interrupted)
+    calls, real = [], pressing(command.adapt_at_range, signal.SIGINT, at=2)
+    monkeypatch.setattr(command, "adapt_at_range", lambda *a, **options: calls.append(a) or real(*a, **options))
     done = run("--json")
     report, folder = json.loads(done.out), tmp_path / "robustness"
     assert done.code == 0 and report["interrupted"] and "plain_sv3 was not finished" in done.err
@@ -118,14 +112,10 @@ def test_ctrl_c_leaves_what_there_is(run: Any, tmp_path: Path, monkeypatch: pyte
 
 
 def test_ctrl_c_before_the_first_cell(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = command.baseline
-
-    def interrupted(*args: Any, **options: Any) -> Any:
-        signal.raise_signal(signal.SIGINT)
-        return real(*args, **options)
-
-    monkeypatch.setattr(command, "baseline", interrupted)
-    assert run().code == 130
+    calls, real = [], command.scene_fingerprint
+    monkeypatch.setattr(command, "scene_fingerprint", lambda scene: calls.append(scene) or real(scene))
+    monkeypatch.setattr(command, "baseline", pressing(command.baseline, signal.SIGINT))
+    assert run().code == 130 and len(calls) == 1
     assert [p.name for p in (tmp_path / "robustness").rglob("*")] == ["cells"]
 
 
@@ -138,41 +128,6 @@ def test_progress_is_over_all_cells(run: Any, monkeypatch: pytest.MonkeyPatch) -
     assert shares == sorted(shares) and shares[-1] == 100 and len(set(shares)) > 20
     assert list(dict.fromkeys(k for *_, k in lines)) == list("123456")
     assert run("--quiet", "--out", "other").err == ""
-
-
-@pytest.mark.usefixtures("blank_figure")
-def test_checkpoints_of_one_name(clod: Any, capture: Any, tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        capture.write(tmp_path / name / "point_cloud.ply", capture.gaussians)
-    words = ("--images", capture.scene, "--max-sv", 1, "--iters", 1, "--json")
-    report = json.loads(clod("robustness", "a/point_cloud.ply", "b/point_cloud.ply", *words).out)
-    assert [c["checkpoint"] for c in report["checkpoints"]] == ["a_point_cloud", "b_point_cloud"]
-
-
-@pytest.mark.parametrize(
-    ("line", "said"),
-    [
-        ("PLY PLY --images SCENE", "base.ply: is given twice"),
-        ("PLY --images SCENE --max-sv 1 0.5", "--max-sv is 0.5, it must be at least 1"),
-        ("PLY missing.ply --images SCENE", "missing.ply: .*check the path"),
-        ("PLY --images SCENE --out file", "file: file is a file; choose another --out"),
-        ("PLY --images nowhere", "nowhere: is not a folder"),
-    ],
-)
-def test_bad_input(clod: Any, capture: Any, tmp_path: Path, line: str, said: str) -> None:
-    (tmp_path / "file").write_text("mine")
-    given = {"PLY": capture.ply, "SCENE": capture.scene}
-    done = clod("robustness", *[given.get(word, word) for word in line.split()])
-    assert done.code == 2 and re.search(said, done.err) and [p.name for p in tmp_path.iterdir()] == ["file"], done
-
-
-def test_what_cannot_be_read_leaves_no_folder(clod: Any, capture: Any, tmp_path: Path) -> None:
-    scene = tmp_path / "scene"
-    shutil.copytree(capture.scene, scene)
-    (scene / "images" / "003.png").write_text("no picture")
-    done = clod("robustness", capture.ply, "--images", scene, "--iters", 1)
-    assert done.code == 2 and "003.png" in done.err and [p.name for p in tmp_path.iterdir()] == ["scene"], done
 
 
 def test_cells_must_be_a_folder_that_can_be_written(
@@ -189,15 +144,15 @@ def test_cells_must_be_a_folder_that_can_be_written(
         cells.write_text("mine")
 
 
-def test_the_scene_is_looked_at_once(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls, real = [], command.scene_fingerprint
-    monkeypatch.setattr(command, "scene_fingerprint", lambda scene: calls.append(scene) or real(scene))
-    monkeypatch.setattr(command, "run_cells", lambda *_: {})
-    assert run().code == 130 and len(calls) == 1
-
-
-def test_without_matplotlib_nothing_is_started(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_folder_without_readable_inputs_or_matplotlib(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(capture.scene, scene)
+    (scene / "images" / "003.png").write_text("no picture")
+    done = clod("robustness", capture.ply, "--images", scene, "--iters", 1)
+    assert done.code == 2 and "003.png" in done.err, done
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    done = run()
+    done = clod("robustness", capture.ply, "--images", capture.scene)
     assert done.code == 2 and "pip install 'clod-adapter[plots]'" in done.err
-    assert not (tmp_path / "robustness").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]

@@ -15,11 +15,13 @@ from clod_adapter import adapt
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Phase, Progress
+from clod_adapter.training import trainer
 from clod_adapter.training.interrupts import DeferredInterrupt
 from clod_adapter.training.loop import Adapted
+from runs import pressing
 from scenes import capture
 
-ITERS, ROUNDS = 60, 12
+ITERS, ROUNDS = 60, 8
 CONFIG = AdaptConfig(iters=ITERS, max_sv=3.0, average=0.5)
 SCENE = capture(60, views=4, width=16, height=12)
 
@@ -84,17 +86,8 @@ def test_an_interrupt_within_the_update(
     undisturbed: tuple[dict[int, dict[str, torch.Tensor]], float], monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
     """Before and after the parameters have moved: the step is completed, and the state resumes to the same bits."""
-    from clod_adapter.training import trainer
-
-    real, calls, states = getattr(trainer, where), [], []
-
-    def pressed(*given: Any) -> Any:
-        calls.append(1)
-        if len(calls) == 5:
-            signal.raise_signal(signal.SIGINT)
-        return real(*given)
-
-    monkeypatch.setattr(trainer, where, pressed)
+    states: list[Any] = []
+    monkeypatch.setattr(trainer, where, pressing(getattr(trainer, where), signal.SIGINT, at=5))
     found = adapt(*SCENE, CONFIG, lambda now: states.append(now.state) if now.state else None)
     assert found.interrupted and found.signalled
     assert all(torch.equal(value, undisturbed[0][found.steps][n]) for n, value in found.gaussians.tensors().items())

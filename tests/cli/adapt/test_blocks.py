@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from safetensors import safe_open
 
 import clod_adapter
 from clod_adapter.blocks import memory
-from clod_adapter.blocks.file import load_block
+from clod_adapter.blocks.file import KEY, load_block, save_block
 from clod_adapter.blocks.memory import MemoryPlan, plan_for_limit
 from clod_adapter.cli.adapt import memory as memory_option
-from clod_adapter.cli.adapt import progress as follower
 from clod_adapter.cli.adapt import resume
+from clod_adapter.cli.adapt.progress import ProgressDisplay
 from clod_adapter.progress import Phase, Progress
-from clod_adapter.training.objective import Objective
+from runs import change_step, fail, names
 from scenes import stripped
 
 BLOCKS = 3
+KINDS = ("json", "ply", "safetensors")
 
 
 @pytest.fixture
@@ -47,14 +49,16 @@ def adapt(clod: Callable[..., Any], capture: Any, forced: None) -> Callable[...,
     return run
 
 
-WHOLE: dict[str, bytes] = {}
+@pytest.fixture(scope="module")
+def kept() -> dict[str, bytes]:
+    return {}
 
 
 @pytest.fixture
-def whole(adapt: Callable[..., Any], tmp_path: Path) -> dict[str, bytes]:
-    """What one process leaves; run once."""
-    if WHOLE:
-        return WHOLE
+def whole(adapt: Callable[..., Any], tmp_path: Path, kept: dict[str, bytes]) -> dict[str, bytes]:
+    """The files of one process; run once."""
+    if kept:
+        return kept
     (tmp_path / "one.blocks.safetensors").write_bytes(b"the user's")
     done = adapt("one.ply", "--json")
     assert done.code == 0, done
@@ -62,11 +66,10 @@ def whole(adapt: Callable[..., Any], tmp_path: Path) -> dict[str, bytes]:
     assert report["memory"]["blocks"] == BLOCKS and report["steps"] == 27 and len(report["rows"]) > 2
     assert "in 3 blocks" in done.err and "block 3 of 3, pass 1 of 2: 100 Gaussians, 7 steps" in done.err
     assert report["seconds"]["start"] > 0
-    left = sorted(path.name for path in tmp_path.iterdir())
-    assert left == ["one.blocks.safetensors", "one.json", "one.ply", "one.safetensors"]
+    assert names(tmp_path) == ["one.blocks.safetensors", "one.json", "one.ply", "one.safetensors"]
     (tmp_path / "one.blocks.safetensors").unlink()
-    WHOLE.update(outputs(tmp_path, "one"))
-    return WHOLE
+    kept.update(outputs(tmp_path, "one"))
+    return kept
 
 
 def outputs(folder: Path, name: str) -> dict[str, bytes]:
@@ -96,14 +99,17 @@ def test_jobs_end_as_one_process_does(adapt: Callable[..., Any], whole: dict[str
     assert not [path for path in tmp_path.iterdir() if "block" in path.name or "start" in path.name]
 
 
-def test_a_killed_block_goes_on(
-    adapt: Callable[..., Any], whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Killed after its fifth step: the same command goes on from the state that was saved, and ends the same."""
-    saving = resume.Saver.saving
+def of_run(config: Any) -> bool:
+    """Not of the run that prepares the kernels."""
+    return bool(config.max_sv == 3)
 
-    class Killed(BaseException):
-        pass
+
+class Killed(BaseException):
+    """Ends a run without any of its own handling."""
+
+
+def kill(patch: pytest.MonkeyPatch) -> None:
+    saving = resume.Saver.saving
 
     def dying(self: resume.Saver, listener: Any) -> Any:
         call = saving(self, listener)
@@ -117,32 +123,87 @@ def test_a_killed_block_goes_on(
 
         return step
 
-    monkeypatch.setattr(resume.Saver, "saving", dying)
-    with pytest.raises(Killed):
-        adapt("again.ply")
-    monkeypatch.setattr(resume.Saver, "saving", saving)
-    left = sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("again"))
-    assert left == [
-        "again.block1.pass1.safetensors", "again.block2.pass1.resume.safetensors", "again.start.safetensors"
-    ]  # fmt: skip
-    done = adapt("again.ply")
-    assert done.code == 0 and "resuming again.block2.pass1.resume.safetensors from step 5" in done.err
-    assert outputs(tmp_path, "again") == whole
+    patch.setattr(resume.Saver, "saving", dying)
 
 
-def test_files_of_another_run_are_refused(adapt: Callable[..., Any], tmp_path: Path) -> None:
+def press(patch: pytest.MonkeyPatch) -> None:
+    call = ProgressDisplay.__call__
+
+    def pressed(self: ProgressDisplay, progress: Progress) -> bool:
+        if progress.phase == Phase.TRAINING and progress.done == 3 and "block 2 of 3, pass 1" in self.training:
+            self.stop.requests += 1
+        return call(self, progress)
+
+    patch.setattr(ProgressDisplay, "__call__", pressed)
+
+
+@pytest.mark.parametrize(
+    ("ended", "code", "said", "state", "steps"),
+    [
+        (kill, None, "", "a.block2.pass1.resume.safetensors", 5),
+        (press, 130, "pass 1 of 2: stopped after step 3; the same command", "a.block2.pass1.resume.safetensors", 3),
+        (lambda patch: change_step(patch, 6, fail, of_run), 1, "the same command resumes from step 5, which is in "
+         "a.block1.pass1.resume.safetensors\n", "a.block1.pass1.resume.safetensors", 5),
+    ],
+    ids=["killed", "ctrl-c", "error"],
+)  # fmt: skip
+def test_a_block_that_was_ended_is_resumed(
+    adapt: Any, whole: dict[str, bytes], tmp_path: Path, ended: Any, code: Any, said: str, state: str, steps: int
+) -> None:
+    """The same command keeps finished blocks, resumes the one that was ended, and gives the same files."""
+    with pytest.MonkeyPatch.context() as patch:
+        ended(patch)
+        if code is None:
+            with pytest.raises(Killed):
+                adapt("a.ply")
+        else:
+            done = adapt("a.ply", *(["--quiet"] if code == 1 else []))
+            assert done.code == code and said in done.err, done
+    finished = ["a.block1.pass1.safetensors"] if "block2" in state else []
+    assert names(tmp_path) == sorted([*finished, state, "a.start.safetensors"])
+    done = adapt("a.ply")
+    assert done.code == 0 and f"resuming {state} from step {steps}" in done.err and outputs(tmp_path, "a") == whole
+
+
+def test_files_of_another_run_are_refused(
+    adapt: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of other settings or another number of blocks, of another block or start, and damaged ones."""
+
+    def refused(message: str, *more: object) -> None:
+        done = adapt("a.ply", *more)
+        assert done.code == 2 and message in done.err and not (tmp_path / "a.ply").exists(), done
+
+    start, first, second = (tmp_path / f"a.{name}.safetensors" for name in ("start", "block1.pass1", "block2.pass1"))
     assert adapt("a.ply", "--block", 1).code == 0
-    done = adapt("a.ply", "--seed", 1)
-    assert done.code == 2 and "a.start.safetensors: is of a run with another settings; remove it" in done.err
-    (tmp_path / "a.block2.pass1.safetensors").write_bytes((tmp_path / "a.block1.pass1.safetensors").read_bytes())
-    done = adapt("a.ply")
-    assert done.code == 2 and "a.block2.pass1.safetensors: is of a run with another block" in done.err
-    (tmp_path / "a.block1.pass1.safetensors").write_bytes(b"no block")
-    done = adapt("a.ply")
-    assert done.code == 2 and "a.block1.pass1.safetensors: is no block or damaged" in done.err
-    (tmp_path / "a.block1.pass1.safetensors").unlink()
-    (tmp_path / "a.start.safetensors").write_bytes((tmp_path / "a.start.safetensors").read_bytes()[:-9])
-    assert "damaged" in adapt("a.ply").err and not (tmp_path / "a.ply").exists()
+    refused("a.start.safetensors: is of a run with another settings; remove it", "--seed", 1)
+    for blocks in (1, BLOCKS + 1):  # fewer would take more than the limit
+        with monkeypatch.context() as patch:
+            patch.setattr(memory_option, "plan_for_limit", lambda *a, n=blocks: replace(plan_for_limit(*a), blocks=n))
+            refused(f"is of a run in 3 blocks, and --memory 8GB makes {blocks}; use")
+    shutil.copy(first, second)
+    refused("a.block2.pass1.safetensors: is of a run with another block")
+    second.unlink()
+    with safe_open(start, "pt") as file:
+        belongs = json.loads(file.metadata()[KEY])["belongs"]
+    tensors, about = load_block(start, belongs)
+    save_block(start, tensors | {"block": tensors["block"].flip(0)}, about, belongs)  # of a machine that rounds unlike
+    refused("a.block1.pass1.safetensors: is of a run with another start; remove it")
+    first.write_bytes(b"no block")
+    refused("a.block1.pass1.safetensors: is no block or damaged")
+    first.unlink()
+    save_block(start, tensors, {"attenuation": about["attenuation"]}, belongs)
+    refused("damaged (KeyError('extent'))", "--block", 1)
+    for name, worse, message in (
+        ("block", tensors["block"].clamp(max=1), "a block has no Gaussians"),
+        ("sigma_d", tensors["sigma_d"][:-1], "its sigma_d is not that of this scene"),
+        ("kept", tensors["kept"] * float("nan"), "not finite"),
+    ):
+        save_block(start, tensors | {name: worse}, about, belongs)
+        refused(message, "--block", 1)
+    start.write_bytes(start.read_bytes()[:-9])
+    refused("damaged")
+    assert memory.MOST_BLOCKS > BLOCKS
 
 
 def test_what_cannot_be(clod: Callable[..., Any], capture: Any, adapt: Callable[..., Any], tmp_path: Path) -> None:
@@ -163,77 +224,17 @@ def test_what_cannot_be(clod: Callable[..., Any], capture: Any, adapt: Callable[
 
 
 def test_what_fits_is_as_without(clod: Callable[..., Any], capture: Any, tmp_path: Path) -> None:
-    """The limit alone changes nothing, however few photographs stay in memory."""
-    given = [capture.ply, "--images", capture.scene, "--iters", 6, "--max-sv", 3]
-    for name, more in (("a", []), ("b", ["--memory", "8GB"])):
-        done = clod(*given, "--out", f"{name}.ply", *more)
-        assert done.code == 0
-    assert "the whole scene at once" in done.err and "training" in done.err
+    """A limit that is large enough changes nothing, also as a job, whose files are then removed."""
+    given = [capture.ply, "--images", capture.scene, "--iters", 6, "--max-sv", 3, "--out"]
+    assert clod(*given, "a.ply").code == 0
+    done = clod(*given, "b.ply", "--memory", "8GB")
+    assert done.code == 0 and "the whole scene at once" in done.err and "training" in done.err
+    assert clod(*given, "[c].ply", "--memory", "8GB", "--block", 1).code == 0
+    done = clod(*given, "[c].ply", "--memory", "8GB")
+    assert done.code == 0 and "block 1 of 1, pass" not in done.err
+    assert "the initialization of 1 blocks exists" in done.err
+    assert names(tmp_path) == sorted(f"{name}.{kind}" for name in ("[c]", "a", "b") for kind in KINDS)
     assert outputs(tmp_path, "a") == outputs(tmp_path, "b")
-
-
-def test_another_limit_goes_on_with_no_other_blocks(
-    adapt: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Not with fewer, which would take more than the limit, and not without the work that is there."""
-    assert adapt("a.ply", "--block", "start").code == 0
-    for blocks in (1, BLOCKS + 1):
-        monkeypatch.setattr(
-            memory_option, "plan_for_limit", lambda *args, n=blocks: replace(plan_for_limit(*args), blocks=n)
-        )
-        done = adapt("a.ply")
-        assert done.code == 2 and f"is of a run in 3 blocks, and --memory 8GB makes {blocks}; use" in done.err
-    assert not (tmp_path / "a.ply").exists()
-
-
-def test_what_fits_as_one_job(clod: Callable[..., Any], capture: Any, tmp_path: Path) -> None:
-    """The work of the job is in the outputs, and its files are removed, whatever their name's letters mean."""
-    given = [capture.ply, "--images", capture.scene, "--iters", 3, "--max-sv", 3, "--memory", "8GB", "--out", "[a].ply"]
-    assert clod(*given, "--block", 1).code == 0
-    done = clod(*given)
-    assert (
-        done.code == 0 and "block 1 of 1, pass" not in done.err and "the initialization of 1 blocks exists" in done.err
-    )
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["[a].json", "[a].ply", "[a].safetensors"]
-
-
-def test_jobs_that_began_unlike(adapt: Callable[..., Any], tmp_path: Path) -> None:
-    """Of machines that round unlike: what was learned of one division is put into no other."""
-    assert adapt("a.ply", "--block", 1).code == 0
-    path = tmp_path / "a.start.safetensors"
-    from safetensors import safe_open
-
-    from clod_adapter.blocks.file import KEY, save_block
-
-    with safe_open(path, "pt") as file:
-        belongs = json.loads(file.metadata()[KEY])["belongs"]
-    tensors, about = load_block(path, belongs)
-    save_block(path, tensors | {"block": tensors["block"].flip(0)}, about, belongs)
-    done = adapt("a.ply")
-    assert done.code == 2 and "a.block1.pass1.safetensors: is of a run with another start; remove it" in done.err
-
-
-def test_a_start_that_was_tampered_with(adapt: Callable[..., Any], tmp_path: Path) -> None:
-    assert adapt("a.ply", "--block", "start").code == 0
-    path = tmp_path / "a.start.safetensors"
-    from safetensors import safe_open
-
-    from clod_adapter.blocks.file import KEY, save_block
-
-    with safe_open(path, "pt") as file:
-        found = json.loads(file.metadata()[KEY])
-    tensors, about = load_block(path, found["belongs"])
-    save_block(path, tensors, {"attenuation": about["attenuation"]}, found["belongs"])
-    assert "damaged (KeyError('extent'))" in adapt("a.ply", "--block", 1).err
-    for name, worse, message in (
-        ("block", tensors["block"].clamp(max=1), "a block has no Gaussians"),
-        ("sigma_d", tensors["sigma_d"][:-1], "its sigma_d is not that of this scene"),
-        ("kept", tensors["kept"] * float("nan"), "not finite"),
-    ):
-        save_block(path, tensors | {name: worse}, about, found["belongs"])
-        done = adapt("a.ply", "--block", 1)
-        assert done.code == 2 and message in done.err, done
-    assert memory.MOST_BLOCKS > BLOCKS
 
 
 def test_opaque_gaussians_are_handed_on(clod: Callable[..., Any], capture: Any, forced: None, tmp_path: Path) -> None:
@@ -253,52 +254,10 @@ def test_a_block_whose_loss_is_not_finite_ends_early(
     adapt: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The others do not, and all that was learned is written."""
-    pull, pulls = Objective.gradient_sum, count(1)
-
-    def spoilt(self: Objective, *given: Any) -> Any:
-        found = pull(self, *given)  # not of the run that prepares the kernels
-        return replace(found, loss=float("nan")) if self.config.max_sv == 3 and next(pulls) == 3 else found
-
-    monkeypatch.setattr(Objective, "gradient_sum", spoilt)
+    change_step(monkeypatch, 3, lambda found: replace(found, loss=float("nan")), of_run)
     done = adapt("a.ply", "--json")
     report = json.loads(done.out)
     note = "block 1 of 3, pass 1 of 2: the loss of step 3 is not finite"
     assert done.code == 1 and any(note in each for each in report["notes"]) and len(report["rows"]) > 2, done
     assert "block 1 of 3, pass 1 of 2: ended after step 2: the loss of step 3" in done.err
     assert clod_adapter.load(tmp_path / "a.ply").gaussians.sigma_d is not None
-
-
-def test_an_error_in_a_block_leaves_its_state(
-    adapt: Callable[..., Any], whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pull, pulls = Objective.gradient_sum, count(1)
-
-    def failing(self: Objective, *given: Any) -> Any:
-        if self.config.max_sv == 3 and next(pulls) == 6:
-            raise ZeroDivisionError
-        return pull(self, *given)
-
-    monkeypatch.setattr(Objective, "gradient_sum", failing)
-    done = adapt("a.ply", "--quiet")
-    state = "a.block1.pass1.resume.safetensors"
-    assert done.code == 1 and f"the same command resumes from step 5, which is in {state}\n" in done.err, done
-    done = adapt("a.ply")
-    assert done.code == 0 and f"resuming {state} from step 5" in done.err and outputs(tmp_path, "a") == whole
-
-
-def test_ctrl_c_leaves_what_is_finished(
-    adapt: Callable[..., Any], whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    call = follower.ProgressDisplay.__call__
-
-    def pressed(self: follower.ProgressDisplay, progress: Progress) -> bool:
-        if progress.phase == Phase.TRAINING and progress.done == 3 and "block 2 of 3, pass 1" in self.training:
-            self.stop.requests += 1
-        return call(self, progress)
-
-    monkeypatch.setattr(follower.ProgressDisplay, "__call__", pressed)
-    done = adapt("a.ply")
-    assert done.code == 130 and "pass 1 of 2: stopped after step 3; the same command resumes it" in done.err
-    assert (tmp_path / "a.block1.pass1.safetensors").exists() and not (tmp_path / "a.ply").exists()
-    monkeypatch.setattr(follower.ProgressDisplay, "__call__", call)
-    assert adapt("a.ply").code == 0 and outputs(tmp_path, "a") == whole

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,51 +22,15 @@ from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.launch import Launch, launched
 from clod_adapter.errors import ClodError
 from clod_adapter.training.state_file import load_state
+from runs import OUTPUTS, STATE, Server, log_of, names, wait_for
 
-STATE = "dial.resume.safetensors"
-OUTPUTS = ["dial.json", "dial.ply", "dial.safetensors"]
 TINY = ("--max-sv", 4, "--out", "dial.ply", "--batch", 2, "--iters", 12)
 LONG = (*TINY[:-1], 4000)  # ended by what happens to it
-
-# Imports everything once; a line on stdin starts a process, or asks how one ended.
-SERVER = """
-import json, os, signal, sys
-import torch
-torch.set_num_threads(1)  # a process that forks must have no threads
-from clod_adapter.cli import main
-from clod_adapter.cli.adapt import processes, resume
-from clod_adapter.cli.adapt import run as adapt
-from clod_adapter.cli.shared.console import Console
-from clod_adapter.cli.shared.kernels import prepare_kernels
-prepare_kernels(Console(quiet=True))
-print("ready", flush=True)
-for line in sys.stdin:
-    about = json.loads(line)
-    if "wait" in about:
-        print(os.waitstatus_to_exitcode(os.waitpid(about["wait"], 0)[1]), flush=True)
-        continue
-    child = os.fork()
-    if child == 0:
-        os.chdir(about["folder"])
-        os.environ.update(about["environment"])
-        log = os.open(about["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        for stream in (1, 2):
-            os.dup2(log, stream)
-        resume.SAVE_EVERY, resume.SAVE_COST = 0.0, 1e9
-        code = 1
-        try:
-            exec(about["before"])
-            code = main.main(about["words"])
-        finally:
-            sys.stdout.flush()
-            os._exit(code)
-    print(child, flush=True)
-"""
 
 
 @dataclass
 class Launched:
-    """Processes under way."""
+    """Processes started as torchrun starts them."""
 
     server: Server
     folder: Path
@@ -75,67 +38,31 @@ class Launched:
     store: Any  # which has to live as long as they do
 
     def log(self, rank: int) -> str:
-        return (self.folder / f"../{self.folder.name}.{rank}.log").read_text()
+        return log_of(self.folder, rank)
 
     def wait(self) -> list[int]:
-        """Exit codes; of a killed one the signal, negative."""
-        return [self.server.ask(wait=pid) for pid in self.pids]
-
-    def wait_for_state(self) -> None:
-        until = time.monotonic() + 60
-        while not (self.folder / STATE).exists():
-            assert time.monotonic() < until, self.log(0)
-            time.sleep(0.002)
+        return [self.server.wait(pid) for pid in self.pids]
 
     def report(self) -> dict[str, Any]:
-        assert sorted(path.name for path in self.folder.iterdir() if path.name != STATE) == OUTPUTS, self.log(0)
+        assert [name for name in names(self.folder) if name != STATE] == OUTPUTS, self.log(0)
         assert clod_adapter.load(self.folder / "dial.ply").gaussians.sigma_d is not None
         clod_adapter.load_adapter(self.folder / "dial.safetensors")
         return json.loads((self.folder / "dial.json").read_text())
 
 
-class Server:
-    """Starts ``clod-adapt`` as torchrun does, in processes that need no seconds to start."""
-
-    def __init__(self) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", SERVER], text=True, bufsize=1, stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
-        assert self.process.stdout.readline() == "ready\n"
-
-    def ask(self, **about: Any) -> int:
-        self.process.stdin.write(json.dumps(about) + "\n")
-        return int(self.process.stdout.readline())
-
-    def start(self, folder: Path, *words: object, size: int = 2, before: dict[int, str] | None = None) -> Launched:
-        """Starts ``size`` processes; ``before`` is code that one of them runs first."""
-        folder.mkdir(exist_ok=True)
-        store = dist.TCPStore("localhost", 0, is_master=True, wait_for_workers=False)
-        pids = []
-        for rank in range(size):
-            told = {
-                "RANK": rank, "WORLD_SIZE": size, "LOCAL_RANK": rank, "LOCAL_WORLD_SIZE": size,
-                "MASTER_ADDR": "localhost", "MASTER_PORT": store.port, "TORCHELASTIC_USE_AGENT_STORE": True,
-                "TORCHELASTIC_RESTART_COUNT": 0,
-            }  # fmt: skip
-            pids.append(
-                self.ask(
-                    folder=str(folder),
-                    log=f"{folder}.{rank}.log",
-                    words=[str(word) for word in words],
-                    environment={name: str(value) for name, value in told.items()},
-                    before=(before or {}).get(rank, ""),
-                )  # fmt: skip
-            )
-        return Launched(self, folder, pids, store)
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
-    server = Server()
-    yield server
-    server.process.kill()
-    server.process.communicate()
+def launch(server: Server, folder: Path, *words: object, size: int = 2, before: Any = None, wait: Any = "") -> Launched:
+    """Starts ``size`` processes; ``before`` is code that one of them runs first; returns once file ``wait`` exists."""
+    folder.mkdir(exist_ok=True)
+    store = dist.TCPStore("localhost", 0, is_master=True, wait_for_workers=False)
+    pids = []
+    for rank in range(size):
+        told = {
+            "RANK": rank, "WORLD_SIZE": size, "LOCAL_RANK": rank, "LOCAL_WORLD_SIZE": size, "MASTER_ADDR": "localhost",
+            "MASTER_PORT": store.port, "TORCHELASTIC_USE_AGENT_STORE": True, "TORCHELASTIC_RESTART_COUNT": 0,
+        }  # fmt: skip
+        pids.append(server.start(folder, *words, rank=rank, before=(before or {}).get(rank, ""), **told))
+    wait_for(folder / wait)
+    return Launched(server, folder, pids, store)
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +73,7 @@ def words(capture: Any) -> list[Any]:
 @pytest.fixture(scope="module")
 def alone(server: Server, words: list[Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One process with a batch of two."""
-    run = server.start(tmp_path_factory.mktemp("alone"), *words, *TINY, size=1)
+    run = launch(server, tmp_path_factory.mktemp("alone"), *words, *TINY, size=1)
     assert run.wait() == [0], run.log(0)
     assert run.report()["processes"]["count"] == 1
     return run.folder
@@ -163,7 +90,7 @@ def assert_close(folder: Path, want: Path) -> None:
 
 
 def test_two_end_where_one_does(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
-    run = server.start(tmp_path / "two", *words, *TINY, "--resume")
+    run = launch(server, tmp_path / "two", *words, *TINY, "--resume")
     assert run.wait() == [0, 0], run.log(0) + run.log(1)
     assert_close(run.folder, alone)
     report = run.report()
@@ -174,11 +101,10 @@ def test_two_end_where_one_does(server: Server, words: list[Any], alone: Path, t
     assert run.log(1) == "" and not (run.folder / STATE).exists()
 
 
-@pytest.mark.parametrize("more", [("--batch", 4), ("--batch", 3, "--form", "paper")])
-def test_three_with_uneven_shares(server: Server, words: list[Any], tmp_path: Path, more: Any) -> None:
-    settings = (*TINY[:-2], "--iters", 6, *more)
-    one, three = server.start(tmp_path / "one", *words, *settings, size=1), None
-    three = server.start(tmp_path / "three", *words, *settings, size=3)
+def test_three_with_uneven_shares(server: Server, words: list[Any], tmp_path: Path) -> None:
+    settings = (*TINY[:-2], "--iters", 6, "--batch", 4, "--form", "paper")
+    one = launch(server, tmp_path / "one", *words, *settings, size=1)
+    three = launch(server, tmp_path / "three", *words, *settings, size=3)
     assert [*one.wait(), *three.wait()] == [0, 0, 0, 0], three.log(0)
     assert_close(three.folder, one.folder)
 
@@ -193,7 +119,7 @@ def test_a_loss_that_is_not_finite_ends_both(server: Server, words: list[Any], t
         "    return replace(pull(self, *given), loss=float('nan') if len(steps) == 4 else 0.1)\n"
         "Objective.gradient_sum = spoilt"
     )
-    run = server.start(tmp_path / "run", *words, *TINY, before={1: spoil})
+    run = launch(server, tmp_path / "run", *words, *TINY, before={1: spoil})
     assert run.wait() == [1, 0], run.log(0) + run.log(1)
     report = run.report()
     assert report["interrupted"] and report["steps"] == 3 and len(report["rows"]) > 1
@@ -204,20 +130,23 @@ def test_a_loss_that_is_not_finite_ends_both(server: Server, words: list[Any], t
 def test_a_time_budget_ends_all_at_once(server: Server, words: list[Any], tmp_path: Path) -> None:
     """By the first one's clock: that of the second is far ahead."""
     ahead = "import clod_adapter.training.loop as t; at = t.time.perf_counter; t.time.perf_counter = lambda: 1e3 * at()"
-    run = server.start(tmp_path / "run", *words, *LONG, "--time-budget", 0.3, before={1: ahead})
+    run = launch(server, tmp_path / "run", *words, *LONG, "--time-budget", 0.3, before={1: ahead})
     assert run.wait() == [0, 0], run.log(0)
     assert 1 <= run.report()["steps"] < 4000 and not run.report()["interrupted"]
 
 
-def test_the_second_is_killed(server: Server, words: list[Any], tmp_path: Path) -> None:
-    run = server.start(tmp_path / "run", *words, *LONG)
-    run.wait_for_state()
+@pytest.mark.parametrize("launcher", ["alive", "gone"])  # whose store tells the reason and hears that all is over
+def test_the_second_is_killed(server: Server, words: list[Any], tmp_path: Path, launcher: str) -> None:
+    run = launch(server, tmp_path / "run", *words, *LONG, wait=STATE)
+    if launcher == "gone":
+        run.store = None
     os.kill(run.pids[1], signal.SIGKILL)
     assert run.wait() == [0, -signal.SIGKILL], run.log(0)
     report = run.report()
     steps = report["steps"]
     assert report["interrupted"] and report["rows"] == [] and steps > 0
-    assert any(f"training ended at step {steps}: a process of the group has ended" in n for n in report["notes"])
+    if launcher == "alive":
+        assert any(f"training ended at step {steps}: a process of the group has ended" in n for n in report["notes"])
     assert f"--resume resumes from step {steps}, which is in {STATE}" in run.log(0)
     assert load_state(run.folder / STATE)[0].steps == steps
 
@@ -235,20 +164,10 @@ def test_the_launcher_s_signals_end_no_writing(server: Server, words: list[Any],
         "for name in ('write', 'print_summary'): setattr(report, name, pressing(getattr(report, name)))\n"
         "main.json = argparse.Namespace(dumps=pressing(json.dumps))"
     )
-    run = server.start(tmp_path / "run", *words, *LONG, "--quiet", "--json", before={0: pressed})
-    run.wait_for_state()
+    run = launch(server, tmp_path / "run", *words, *LONG, "--quiet", "--json", before={0: pressed}, wait=STATE)
     os.kill(run.pids[1], signal.SIGKILL)
     assert run.wait() == [0, -signal.SIGKILL], run.log(0)
     assert json.loads(run.log(0))["steps"] == run.report()["steps"]
-
-
-def test_the_launcher_is_gone_too(server: Server, words: list[Any], tmp_path: Path) -> None:
-    """Its store cannot be asked for the reason, nor be told that all is over."""
-    run = server.start(tmp_path / "run", *words, *LONG)
-    run.wait_for_state()
-    run.store = None
-    os.kill(run.pids[1], signal.SIGKILL)
-    assert run.wait() == [0, -signal.SIGKILL] and run.report()["interrupted"], run.log(0)
 
 
 def test_a_loss_within_a_step_loses_none(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
@@ -261,12 +180,12 @@ def test_a_loss_within_a_step_loses_none(server: Server, words: list[Any], alone
         "    return real(*arguments)\n"
         "Objective.gradient_sum = pull"
     )
-    run = server.start(tmp_path / "run", *words, *TINY, before={1: fail})
+    run = launch(server, tmp_path / "run", *words, *TINY, before={1: fail})
     assert run.wait() == [0, 2], run.log(0)
     report = run.report()
     assert report["steps"] == 4 and report["interrupted"], run.log(0)
     assert "; process 1: no room for this view" in run.log(0) and run.log(1) == ""
-    again = server.start(run.folder, *words, *TINY, "--resume")
+    again = launch(server, run.folder, *words, *TINY, "--resume")
     assert again.wait() == [0, 0] and again.report()["resumed_from"] == 4, again.log(0)
     assert_close(run.folder, alone)
 
@@ -281,32 +200,29 @@ def test_a_loss_before_the_first_step(server: Server, words: list[Any], tmp_path
         "    return job\n"
         "processes.ProcessGroup.broadcast = broadcast; torch.cuda.device_count = lambda: 1"
     )
-    run = server.start(tmp_path / "run", *words, *TINY, before={1: on_gpus})
+    run = launch(server, tmp_path / "run", *words, *TINY, before={1: on_gpus})
     assert run.wait() == [2, 2] and run.log(1) == "" and list(run.folder.iterdir()) == [], run.log(0)
     why = "process 1: 2 processes on a machine with 1 GPUs; start as many as there are"
-    assert run.log(0).count("error:") == 1 and f"; {why}; this was before the first step, so start again\n" in run.log(
-        0
-    )
+    log = run.log(0)
+    assert log.count("error:") == 1 and f"; {why}; this was before the first step, so start again\n" in log
 
 
 def test_the_first_is_killed(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
     """The state that it saved last is there, for any number of processes; the others wait for the launcher's signal."""
     slowly = "from clod_adapter.training.trainer import Trainer; real = Trainer.step\n"
     slowly += "def step(*a):\n    processes.time.sleep(0.05)\n    real(*a)\nTrainer.step = step"
-    run = server.start(tmp_path / "run", *words, *TINY, before={0: slowly})
-    run.wait_for_state()
+    run = launch(server, tmp_path / "run", *words, *TINY, before={0: slowly}, wait=STATE)
     os.kill(run.pids[0], signal.SIGKILL)
     os.kill(run.pids[1], signal.SIGTERM)
     assert run.wait() == [-signal.SIGKILL, 0] and run.log(1) == "", run.log(1)
     assert [path.name for path in run.folder.iterdir() if not path.name.startswith(".tmp-")] == [STATE]
-    again = server.start(run.folder, *words, *TINY, "--resume", size=1)
+    again = launch(server, run.folder, *words, *TINY, "--resume", size=1)
     assert again.wait() == [0] and again.report()["resumed_from"] >= 1, again.log(0)
     assert_close(run.folder, alone)
 
 
 def test_an_interrupt_stops_all_after_the_same_step(server: Server, words: list[Any], tmp_path: Path) -> None:
-    run = server.start(tmp_path / "run", *words, *LONG)
-    run.wait_for_state()
+    run = launch(server, tmp_path / "run", *words, *LONG, wait=STATE)
     os.kill(run.pids[1], signal.SIGINT)  # either of them is enough
     assert run.wait() == [0, 0], run.log(0)
     report = run.report()
@@ -325,7 +241,7 @@ def test_an_interrupt_stops_all_after_the_same_step(server: Server, words: list[
 )
 def test_bad_input_is_said_once(server: Server, words: list[Any], tmp_path: Path, wrong: Any, message: str) -> None:
     given = wrong if "nowhere.ply" in wrong else (*words, *wrong)
-    run = server.start(tmp_path / "run", *given)
+    run = launch(server, tmp_path / "run", *given)
     codes = run.wait()
     assert codes[0] == 2 and run.log(0).count("\n") == 1 and f"clod-adapt: error: {message}" in run.log(0), run.log(0)
     assert run.log(1) == "" and list(run.folder.iterdir()) == []
@@ -340,7 +256,6 @@ def test_torchrun_and_a_loss(words: list[Any], tmp_path: Path) -> None:
         [*command, "-m", "clod_adapter", *map(str, words), *map(str, LONG), "--json"],
         cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
-    launched = Launched(None, tmp_path, [], None)
     until = time.monotonic() + 120
     while not (tmp_path / STATE).exists():
         assert time.monotonic() < until and run.poll() is None, run.communicate()[1]
@@ -349,7 +264,8 @@ def test_torchrun_and_a_loss(words: list[Any], tmp_path: Path) -> None:
     os.kill(next(pid for pid in map(int, children.split()) if b"\0RANK=1\0" in environment_of(pid)), signal.SIGKILL)
     out, err = run.communicate(timeout=100)
     assert "a process of the group has ended" in err and err.count("2 processes (gloo)") == 1, err
-    assert launched.report()["interrupted"] and json.loads(out)["steps"] == load_state(tmp_path / STATE)[0].steps
+    report = Launched(None, tmp_path, [], None).report()
+    assert report["interrupted"] and json.loads(out)["steps"] == load_state(tmp_path / STATE)[0].steps
 
 
 def environment_of(pid: int) -> bytes:
@@ -359,41 +275,35 @@ def environment_of(pid: int) -> bytes:
         return pytest.skip("there is no /proc to tell the processes apart by")
 
 
+AT = {"MASTER_ADDR": "localhost", "MASTER_PORT": "1"}
+
+
 @pytest.mark.parametrize(
     ("environment", "want"),
     [
         ({}, Launch()),
         ({"WORLD_SIZE": "4", "RANK": "1"}, Launch()),  # where nobody says where to meet
-        ({"WORLD_SIZE": "4", "RANK": "1", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2"}, Launch(1, 4, 1, 2)),
-        ({"WORLD_SIZE": "4", "RANK": "4"}, None),
-        ({"WORLD_SIZE": "4", "RANK": "one"}, None),
+        (AT | {"WORLD_SIZE": "4", "RANK": "1", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2"}, Launch(1, 4, 1, 2)),
+        (AT | {"WORLD_SIZE": "4", "RANK": "4"}, None),
+        (AT | {"WORLD_SIZE": "4", "RANK": "one"}, None),
     ],
 )
-def test_where_a_process_stands(monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], want: Any) -> None:
-    where = {"MASTER_ADDR": "localhost", "MASTER_PORT": "1"} if want != Launch() else {}
-    for name, value in {**environment, **where}.items():
+def test_rank_from_the_environment(monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], want: Any) -> None:
+    for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    if want is None:
+    if want:
+        assert launched() == want
+    else:
         with pytest.raises(ClodError, match="inconsistent .*; start the processes with torchrun"):
             launched()
-    else:
-        assert launched() == want
 
 
-@pytest.mark.parametrize(
-    ("words", "size", "want"),
-    [
-        ((), 1, (1, 1500)),
-        ((), 4, (4, 375)),
-        (("--batch", "3"), 2, (3, 500)),
-        (("--batch", "4000"), 1, (4000, 1)),
-        (("--iters", "100"), 4, (4, 100)),
-        (("--iters", "0"), 1, (1, 0)),
-    ],
-)
-def test_as_many_views_are_seen_by_default(monkeypatch: Any, words: Any, size: int, want: tuple[int, int]) -> None:
-    told = {"RANK": "0", "WORLD_SIZE": str(size), "MASTER_ADDR": "localhost", "MASTER_PORT": "1"}
-    for name, value in told.items():
-        monkeypatch.setenv(name, value)
-    config = make_config(build_parser("").parse_args(["x.ply", *words]))
-    assert (config.batch, config.iters) == want
+def test_default_steps_see_as_many_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    for words, size, want in (
+        ((), 1, (1, 1500)), ((), 4, (4, 375)), (("--batch", "3"), 2, (3, 500)), (("--batch", "4000"), 1, (4000, 1)),
+        (("--iters", "100"), 4, (4, 100)), (("--iters", "0"), 1, (1, 0)),
+    ):  # fmt: skip
+        for name, value in (AT | {"RANK": "0", "WORLD_SIZE": str(size)}).items():
+            monkeypatch.setenv(name, value)
+        config = make_config(build_parser("").parse_args(["x.ply", *words]))
+        assert (config.batch, config.iters) == want, words

@@ -1,11 +1,15 @@
-"""Damaged states: whatever a file to resume from holds, it is gone on from to a finite end, or refused in one line."""
+"""Resuming: a state of this run is continued to the same bits; one of another run, or a damaged one, is refused."""
 
 from __future__ import annotations
 
 import json
 import math
+import os
+import shutil
 from argparse import Namespace
+from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +17,27 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from clod_adapter._support.version import package_version
+from clod_adapter.cli.adapt import inputs as adapt_inputs
+from clod_adapter.cli.adapt import resume
+from clod_adapter.cli.adapt import run as adapt_command
 from clod_adapter.cli.adapt.resume import Resumed, RunKey, Saver, find_state, identify
+from clod_adapter.cli.shared import inputs
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.interrupts import GracefulStop
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Phase, Progress
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.state_file import KEY
-from scenes import capture
+from runs import OUTPUTS, STATE, names
+from scenes import capture as small_capture
+from scenes import stripped
 
 CONFIG = AdaptConfig(iters=3, max_sv=3.0, average=0.7)
 QUIET = Console(quiet=True)
@@ -35,7 +48,7 @@ class Saved:
     """A state after two of three steps, what it belongs to, and going on from a file like it."""
 
     def __init__(self, path: Path) -> None:
-        self.base, self.scene = capture(40, views=4, width=16, height=12)
+        self.base, self.scene = small_capture(40, views=4, width=16, height=12)
         saver = Saver(path, self._key(None), None, QUIET, GracefulStop())
         adapt(self.base, self.scene, CONFIG, saver.saving(lambda now: now.done < 2 or not now.state))
         self.tensors = load_file(path)
@@ -151,3 +164,146 @@ def test_the_undamaged_state_is_gone_on_from(saved: Saved, tmp_path: Path) -> No
     for name, value in want.tensors().items():
         assert torch.equal(found.tensors()[name], value), name
     assert saved.about["belongs"]["config"] == asdict(CONFIG)
+
+
+TINY = ("--iters", 12, "--max-sv", 4, "--out", "dial.ply")
+
+
+@pytest.fixture
+def words(capture: Any) -> list[Any]:
+    return [capture.ply, "--images", capture.scene, *TINY]
+
+
+@pytest.fixture
+def broken_off(clod: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Runs the command up to the end of training, before its last save: the state after step 1 is there."""
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    def run(*words: object) -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr(Saver, "keep", stop)
+            assert clod(*words).code == 130
+
+    return run
+
+
+def test_other_settings_are_refused(
+    clod: Any, words: list[Any], tmp_path: Path, broken_off: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken_off(*words)
+    before = (tmp_path / STATE).read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(adapt_inputs, "read_checkpoint", lambda *_: pytest.fail("read"))
+        for changes, message in (
+            (("--iters", 13), "is of a run with --iters 12; use the original arguments"),
+            (("--seed", 5, "--time-budget", 9), "is of a run with no --time-budget, --seed 0; use"),
+            (("--form", "paper"), "is of a run with another --form"),
+        ):
+            done = clod(*words, *changes, "--resume")
+            assert done.code == 2 and done.err.count("\n") == 1 and f"error: {STATE}: {message}" in done.err, done
+        patch.setattr(os, "access", lambda *_: False)  # root may write anywhere, so chmod proves nothing
+        done = clod(*words, "--resume")
+        assert done.code == 2 and "is not writable" in done.err and done.err.count("\n") == 1
+    assert names(tmp_path) == [STATE] and (tmp_path / STATE).read_bytes() == before
+
+
+def test_other_inputs_are_refused(
+    clod: Any, capture: Any, words: list[Any], tmp_path: Path, broken_off: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken_off(*words)
+    state = (tmp_path / STATE).read_bytes()
+    capture.write(tmp_path / "other.ply", capture.gaussians.select(torch.arange(300) < 299))
+    shutil.copytree(capture.scene, tmp_path / "fewer")
+    Image.new("RGB", (64, 48)).save(tmp_path / "fewer" / "images" / "003.png")
+    for ply, scene, what in (
+        ("other.ply", capture.scene, "is of another checkpoint than other.ply"),
+        (capture.ply, "fewer", "is of other photographs than fewer"),
+    ):
+        done = clod(ply, "--images", scene, *TINY, "--resume")
+        assert done.code == 2 and f"error: {STATE}: {what}; use the" in done.err, done
+    with monkeypatch.context() as patch:
+        patch.setattr(resume, "package_version", lambda: "0.0.7")
+        done = clod(*words, "--resume")
+    said = f"error: {STATE}: is of version {package_version()} of this package, not 0.0.7"
+    assert done.code == 2 and said in done.err
+    broken = dict(load_file(tmp_path / STATE))
+    broken["first.means"][0] = float("nan")
+    with safe_open(tmp_path / STATE, framework="pt") as file:
+        save_file(broken, tmp_path / STATE, file.metadata())
+    done = clod(*words, "--resume")
+    assert done.code == 2 and done.err.splitlines()[-1] == (
+        f"clod-adapt: error: {STATE}: the training state has impossible values of first.means; delete it to start over"
+    )
+    (tmp_path / STATE).write_bytes(state[:-9])
+    for more in ([], ["--resume"]):  # another file, such as an adapter, is not replaced either
+        done = clod(*words, *more)
+        assert done.code == 2 and f"error: {STATE}: is not a training state or is damaged" in done.err
+
+
+def test_the_same_inputs_of_other_names(clod: Any, capture: Any, words: Any, tmp_path: Path, broken_off: Any) -> None:
+    broken_off(*words)
+    shutil.copy(capture.ply, tmp_path / "moved.ply")
+    shutil.copytree(capture.scene, tmp_path / "moved")
+    done = clod("moved.ply", "--images", "moved", *TINY, "--resume")
+    assert done.code == 0 and f"resuming {STATE} from step 1" in done.err, done
+
+
+def test_without_a_state_or_without_resume(
+    clod: Any, words: list[Any], tmp_path: Path, broken_off: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Training starts at step 0; an earlier state stays until the next one replaces it, or fails to."""
+    done = clod(*words, "--resume", "--json")
+    assert done.code == 0 and f"there is no {STATE} to resume from: starting from the beginning" in done.err
+    assert json.loads(done.out)["resumed_from"] is None and names(tmp_path) == OUTPUTS
+    broken_off(*words)
+    before, seen, look = (tmp_path / STATE).read_bytes(), [], adapt_command.with_base_rows
+
+    def full(path: Path, *_: Any) -> None:
+        raise ClodError(f"{path}: cannot be written: No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(resume, "save_state", full)
+        patch.setattr(resume, "SAVE_EVERY", 0.0)
+        patch.setattr(resume, "SAVE_COST", 1e9)
+        done = clod(*words, "--seed", 4)
+    assert done.code == 0 and done.err.count(f"will not find it: {STATE}: cannot be written: No space") == 1
+    assert names(tmp_path) == sorted([*OUTPUTS, STATE]) and (tmp_path / STATE).read_bytes() == before
+    monkeypatch.setattr(
+        adapt_command, "with_base_rows", lambda *a: seen.append((tmp_path / STATE).read_bytes()) or look(*a)
+    )
+    done = clod(*words, "--seed", 4)
+    assert done.code == 0 and f"{STATE} has step 1 of an interrupted run" in done.err and seen == [before]
+    assert names(tmp_path) == OUTPUTS
+
+
+def test_resuming_without_photographs(
+    clod: Any, capture: Any, tmp_path: Path, broken_off: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inputs, "place_cameras", partial(inputs.place_cameras, views=4))
+    words = (capture.ply, "--iters", 3, "--max-sv", 2, "--out")
+    assert clod(*words, "whole.ply", "--quiet").code == 0
+    broken_off(*words, "dial.ply")
+    done = clod(*words, "dial.ply", "--resume", "--json")
+    assert done.code == 0 and json.loads(done.out)["resumed_from"] == 1
+    for kind in ("ply", "safetensors"):
+        assert stripped((tmp_path / f"dial.{kind}").read_bytes()) == stripped((tmp_path / f"whole.{kind}").read_bytes())
+
+
+def test_saves_take_their_share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the first step, then as often as saves of a tenth of a second take no more than 1.5 % of the time."""
+    clock, saved = [0.0], []
+    monkeypatch.setattr(resume.time, "perf_counter", lambda: clock[0])
+
+    def save(path: Path, state: int, run_of: Any) -> None:
+        saved.append(state)
+        clock[0] += 0.1
+
+    monkeypatch.setattr(resume, "save_state", save)
+    saver = Saver(tmp_path / STATE, {}, None, Console(quiet=True), GracefulStop())
+    follow = saver.saving(lambda progress: None)
+    for step in range(1, 601):
+        clock[0] += 0.1
+        follow(Progress(Phase.TRAINING, step, 600, clock[0], state=lambda step=step: step))
+    assert saved[0] == 1 and 0.012 < saver.seconds / clock[0] <= 0.015 and saver.saves == len(saved) > 5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -32,6 +33,7 @@ def scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_scenes(scenes: Path, scene: str) -> None:
     check_scene(scene)
     check_folder(Path("out"), Path(scene))
+    check_folder(Path("colmap/renders"), Path(scene))
 
 
 def test_no_scene(scenes: Path) -> None:
@@ -45,30 +47,21 @@ def test_no_scene(scenes: Path) -> None:
 @pytest.mark.parametrize(
     ("scene", "out"),
     [
-        ("colmap", "colmap"),
-        ("colmap", "colmap/images"),
-        ("colmap", "colmap/images_4/out"),
-        ("colmap", "colmap/input"),
-        ("colmap/sparse/0", "colmap/images/sub"),
-        ("colmap/images", "colmap/images/sub"),
-        ("nerf", "nerf"),
-        ("nerf", "nerf/train"),
-        ("nerf", "colmap/../nerf/train"),
+        ("colmap", "colmap"), ("colmap", "colmap/images"), ("colmap", "colmap/images_4/out"),
+        ("colmap", "colmap/input"), ("colmap/sparse/0", "colmap/images/sub"), ("colmap/images", "colmap/images/sub"),
+        ("nerf", "nerf"), ("nerf", "nerf/train"), ("nerf", "colmap/../nerf/train"),
     ],
-)
+)  # fmt: skip
 def test_where_photographs_may_be(scenes: Path, scene: str, out: str) -> None:
     with pytest.raises(ClodError, match="the scene's own photographs may be there"):
         check_folder(Path(out), Path(scene))
 
 
-def test_beside_a_models_images_there_is_room(scenes: Path) -> None:
-    check_folder(Path("colmap/renders"), Path("colmap"))
-
-
 @pytest.fixture
 def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
     """Things that may be given by mistake."""
-    (tmp_path / "text.ply").write_text("hello")
+    for name in ("text.ply", "a.txt", "broken.safetensors"):
+        (tmp_path / name).write_text("hello")
     (tmp_path / "empty").mkdir()
     (tmp_path / "cut.ply").write_bytes(capture.ply.read_bytes()[:-100])
     (tmp_path / "mine.ply").write_bytes(capture.ply.read_bytes())
@@ -84,7 +77,7 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("", "arguments are required: PLY .*--help"),
         ("PLY --images", "--images: expected one argument"),
         ("missing.ply --images SCENE", "missing.ply: .*No such file.*check the path"),
-        ("text.ply --images SCENE", "text.ply: is not a PLY.*convert"),
+        ("text.ply --images SCENE --json", "text.ply: is not a PLY.*convert"),
         ("cut.ply --images SCENE", "cut.ply: .*truncated.*again"),
         ("PLY --images nowhere", "nowhere: is not a folder; give"),
         ("PLY --images empty", "empty: no COLMAP model.*give the folder"),
@@ -109,38 +102,32 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("eval PLY --images SCENE --sv 1 0.5", "--sv has 0.5, dial values must be at least 1"),
         ("eval PLY --images SCENE --sv", "--sv: expected at least one argument.*clod-adapt eval --help"),
         ("eval PLY --images SCENE --keep 10", "base.ply: has no sigma_d, which --keep needs; adapt it first"),
-        ("eval PLY --images SCENE --keep 0", "--keep has 0, it must be positive"),
+        ("eval PLY --images SCENE --keep 0 --json", "--keep has 0, it must be positive"),
         ("eval PLY --images SCENE --keep 1.5", "--keep: invalid int value"),
         ("eval PLY --images SCENE --fps nan", "--fps has nan, it must be positive"),
         ("eval PLY --images SCENE --psnr-drop -1", "--psnr-drop has -1, it must be positive"),
         ("eval PLY --images SCENE --sv 2 --keep 10", "--keep: not allowed with argument --sv"),
         ("eval DIALLED --images SCENE --psnr-drop 1", "dialled.ply: has no calibration .* --psnr-drop needs; adapt it"),
-        ("render PLY --images SCENE", "required: -o/--out"),
+        ("render PLY --images SCENE --json", "required: -o/--out"),
         ("render PLY --images SCENE -o pictures --sv 0", "--sv has 0"),
         ("render PLY --images nowhere -o pictures", "nowhere: is not a folder"),
         ("render PLY --images SCENE -o text.ply", "text.ply: text.ply is a file; choose another --out"),
         ("render PLY --images SCENE -o SCENE", "the scene's own photographs may be there"),
         ("render PLY --images SCENE -o SCENE/images", "the scene's own photographs may be there"),
-        (
-            "render PLY --images SCENE -o pictures --views banana",
-            "--views: no photograph is named 'banana'; .* 000.png, 001",
-        ),
+        ("render PLY --images SCENE -o x --views banana", "--views: no photograph is named 'banana'; .* 000.png, 001"),
         ("export DIALLED", "required: -o/--out"),
         ("export DIALLED -o x", "x: --out must end in one of .ply, .*, which is the format"),
         ("export DIALLED -o .ply --sv 2", ".ply: --out must end in one of"),
         ("export DIALLED -o x.splat", "x.splat: .splat cannot store sigma_d; choose a dial value .* format .*.ply"),
         ("export DIALLED -o x.splat --sv 2 --order extinction", "x.splat: .splat sorts the Gaussians itself"),
-        ("export DIALLED -o dialled.ply --sv 2", "dialled.ply: is an input file"),
+        ("export DIALLED -o dialled.ply --sv 2 --json", "dialled.ply: is an input file"),
         ("export DIALLED -o folder.ply --sv 2", "folder.ply: is a folder"),
         ("export DIALLED -o nowhere/x.glb", "nowhere/x.glb: folder nowhere does not exist"),
         ("export DIALLED -o x.ply --fps 60", "dialled.ply: has no calibration .* --fps needs"),
         ("export DIALLED -o x.ply --sv 2 3", "unrecognized arguments: 3"),
         ("export DIALLED -o x.ply --sv 0.5", "--sv has 0.5, dial values must be"),
         ("export DIALLED -o x.ply --sv 2 --levels 1,2", "--levels gives the dial values; give no other"),
-        (
-            "export DIALLED -o x.ply --levels 1,4,2",
-            "--levels: '1,4,2' must be ascending dial values of at least 1",
-        ),
+        ("export DIALLED -o x.ply --levels 1,4,2", "--levels: '1,4,2' must be ascending dial values of at least 1"),
         ("export DIALLED -o x.ply --levels 0,1", "--levels: '0,1' must be"),
         ("export DIALLED -o x.ply --levels nan,2", "--levels: 'nan,2' must be"),
         ("export DIALLED -o x.ply --levels 1,inf", "--levels: '1,inf' must be"),
@@ -149,50 +136,43 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("export DIALLED -o x.ply --lod-meta --levels 1,2", "x.ply: with --lod-meta, --out names the folder"),
         ("export DIALLED -o lod-meta.json --lod-meta --levels 1,2", "--out names the folder for lod-meta.json"),
         ("export DIALLED -o x.ply --sv 2 --camera 003", "--camera needs the scene of the photograph"),
-        (
-            "export DIALLED -o x.ply --images SCENE",
-            "--images is used for baking, --order and .html",
-        ),
-        (
-            "export DIALLED -o x.ply --camera 003 --images SCENE",
-            "--camera needs a dial value to bake; give one",
-        ),
+        ("export DIALLED -o x.ply --images SCENE", "--images is used for baking, --order and .html"),
+        ("export DIALLED -o x.ply --camera 003 --images SCENE", "--camera needs a dial value to bake; give one"),
         ("export DIALLED -o x.ply --sv 2 --camera 003 --images nowhere", "nowhere: is not a folder"),
-        (
-            "export DIALLED -o x.ply --sv 2 --camera banana --images SCENE",
-            "--camera: no photograph is named 'banana'; .* like 000.png, 001",
-        ),
+        ("export DIALLED -o x.ply --sv 2 --camera no --images SCENE", "--camera: no photograph is named 'no'; .* 000"),
         ("export PLY -o x.ply --sv 2", "base.ply: has no sigma_d, so no dial value can be baked"),
         ("export PLY -o x.ply --levels 1,2", "base.ply: has no sigma_d, so no dial value can be baked"),
         ("export PLY -o x.ply --keep 2", "base.ply: has no sigma_d, which --keep needs"),
         ("export PLY -o x.ply --order extinction", "base.ply: has no sigma_d to order its Gaussians by"),
         ("export text.ply -o x.glb", "text.ply: is not a PLY"),
         ("apply PLY missing.safetensors -o x.ply", "missing.safetensors: .*No such file"),
-        ("apply PLY text.ply -o x.ply", "text.ply: is not a safetensors file"),
+        ("apply PLY text.ply -o x.ply --json", "text.ply: is not a safetensors file"),
         ("apply mine.ply text.ply -o mine.ply", "mine.ply: is an input file"),
         ("apply PLY text.ply -o text.ply", "text.ply: is an input file"),
         ("apply PLY text.ply -o x.splat", "x.splat: .*must end in .ply"),
+        ("eval DIALLED --images SCENE --base DIALLED", "has a dial .*; give --base the checkpoint.* --against$"),
+        ("eval PLY --images SCENE --report page.txt", "page.txt: --report names the page.*end in .html"),
+        ("eval PLY --images SCENE --report no/page.html", "no/page.html: folder no does not exist"),
+        ("inspect missing.ply", "missing.ply: "),
+        ("inspect missing.safetensors --json", "missing.safetensors: "),
+        ("inspect cut.ply --json", "cut.ply: "),
+        ("inspect broken.safetensors", "broken.safetensors: "),
+        ("inspect a.txt", "a.txt: "),
+        ("view missing.ply", "missing.ply: .*check the path"),
+        ("view PLY --base text.ply", "text.ply: is not a PLY"),
+        ("view PLY --images nowhere", "nowhere: is not a folder"),
+        ("view PLY --port 65536", "--port is 65536, it must be between 1 and 65535"),
+        ("view PLY --port x", "--port: invalid int value: 'x'"),
+        ("view PLY --sv 0.5", "--sv is 0.5, it must be at least 1"),
+        ("view PLY --sv nan", "--sv is nan"),
+        ("robustness PLY PLY --images SCENE", "base.ply: is given twice"),
+        ("robustness PLY --images SCENE --max-sv 1 0.5", "--max-sv is 0.5, it must be at least 1"),
+        ("robustness PLY missing.ply --images SCENE", "missing.ply: .*check the path"),
+        ("robustness PLY --images SCENE --out text.ply", "text.ply: text.ply is a file; choose another --out"),
+        ("robustness PLY --images nowhere", "nowhere: is not a folder"),
     ],
-)
+)  # fmt: skip
 def test_bad_input(clod: Any, bad: dict[str, Path], tmp_path: Path, line: str, said: str) -> None:
-    refuse(clod, bad, tmp_path, line, said)
-
-
-@pytest.mark.parametrize(
-    ("line", "said"),
-    [
-        ("text.ply --images SCENE", "text.ply: is not a PLY"),
-        ("eval PLY --images SCENE --keep 0", "--keep has 0"),
-        ("render PLY --images SCENE", "required: -o/--out"),
-        ("export DIALLED -o dialled.ply --sv 2", "dialled.ply: is an input file"),
-        ("apply PLY text.ply -o x.ply", "text.ply: is not a safetensors file"),
-    ],
-)
-def test_bad_input_with_json(clod: Any, bad: dict[str, Path], tmp_path: Path, line: str, said: str) -> None:
-    refuse(clod, bad, tmp_path, f"{line} --json", said)
-
-
-def refuse(clod: Any, bad: dict[str, Path], tmp_path: Path, line: str, said: str) -> None:
     """Exit code 2, an empty stdout, one last line on stderr that is the error, and files as they were."""
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     done = clod(*[bad.get(word, word) for word in line.split()])
@@ -203,36 +183,31 @@ def refuse(clod: Any, bad: dict[str, Path], tmp_path: Path, line: str, said: str
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize(
-    ("line", "code"),
-    [
-        ("--help", 0),
-        ("eval --help", 0),
-        ("--version", 0),
-        ("--nonsense", 2),
-        ("missing.ply --images SCENE", 2),
-        ("mesh.ply --images SCENE", 2),
-        ("PLY --images empty", 2),
-        ("PLY --images SCENE --max-sv 0", 2),
-        ("PLY --images SCENE --out nowhere/dial.ply", 2),
-        ("eval PLY --images SCENE --sv 0", 2),
-        ("eval PLY --images SCENE --keep 10", 2),
-        ("render --help", 0),
-        ("render PLY --images SCENE -o SCENE", 2),
-        ("export --help", 0),
-        ("export PLY --sv 2 -o x.ply", 2),
-        ("export DIALLED --psnr-drop 2 -o x.ply", 2),
-        ("export DIALLED -o x.splat", 2),
-        ("apply text.ply dial.safetensors -o dial.ply", 2),
-    ],
-)
-def test_help_and_refusals_do_without_torch(bad: dict[str, Path], tmp_path: Path, line: str, code: int) -> None:
+LINES = """
+--help | eval --help | --version | render --help | export --help
+--nonsense | missing.ply --images SCENE | mesh.ply --images SCENE | PLY --images empty
+PLY --images SCENE --max-sv 0 | PLY --images SCENE --out nowhere/dial.ply
+eval PLY --images SCENE --sv 0 | eval PLY --images SCENE --keep 10 | render PLY --images SCENE -o SCENE
+export PLY --sv 2 -o x.ply | export DIALLED --psnr-drop 2 -o x.ply | export DIALLED -o x.splat
+apply text.ply dial.safetensors -o dial.ply
+"""
+
+
+def test_help_and_refusals_do_without_torch(bad: dict[str, Path], tmp_path: Path) -> None:
     (tmp_path / "mesh.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
-    words = [str(bad.get(word, word)) for word in line.split()]
+    lines = [line.split() for line in LINES.replace("\n", " | ").split(" | ") if line]
     script = (
-        "import sys\n"
+        "import json, sys\n"
         "sys.modules.update(torch=None, pycolmap=None, numba=None)\n"  # importing one is an error
-        f"from clod_adapter.cli.main import main; sys.exit(main({words}))"
+        "from clod_adapter.cli.main import main\n"
+        "def code(words):\n"
+        "    try: return main(words)\n"
+        "    except SystemExit as done: return done.code or 0\n"
+        "codes = [code(words) for words in json.loads(sys.argv[1])]\n"
+        "print(json.dumps(codes)); sys.exit(code(['--nonsense']))"
     )
-    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == code and "Traceback" not in done.stderr, done.stderr
+    words = json.dumps([[str(bad.get(word, word)) for word in line] for line in lines])
+    done = subprocess.run([sys.executable, "-c", script, words], cwd=tmp_path, capture_output=True, text=True)
+    wanted = [0 if line[-1] in ("--help", "--version") else 2 for line in lines]
+    assert "Traceback" not in done.stderr and json.loads(done.stdout.splitlines()[-1]) == wanted, done
+    assert done.returncode == 2 and len(lines) == 18

@@ -24,17 +24,14 @@ def exported(clod: Any, *words: object) -> Any:
     return json.loads(done.out)
 
 
-def test_adapting_stores_the_training_cameras(capture: Any, dialled: Path) -> None:
-    model, scene = load(dialled), clod_adapter.load_scene(capture.scene)
-    assert model.gaussians.attenuation is not None and len(model.viewpoints) == len(scene.train) == 8
-    for found, view in zip(model.viewpoints, scene.train, strict=True):
-        assert found == viewpoint_of(view.camera, model.gaussians.means, model.gaussians.attenuation)
-
-
 def test_with_the_scene_it_is_for_the_training_cameras(clod: Any, capture: Any, dialled: Path) -> None:
+    model, train = load(dialled), clod_adapter.load_scene(capture.scene).train
+    assert model.gaussians.attenuation is not None and len(model.viewpoints) == len(train) == 8
+    for stored, view in zip(model.viewpoints, train, strict=True):
+        assert stored == viewpoint_of(view.camera, model.gaussians.means, model.gaussians.attenuation)
     report = exported(clod, dialled, "--sv", 2, "--images", capture.scene, "-o", "x.ply")
-    cameras = [view.camera for view in clod_adapter.load_scene(capture.scene).train]
-    want = clod_adapter.bake(load(dialled).gaussians, 2.0, cameras=cameras)
+    cameras = [view.camera for view in train]
+    want = clod_adapter.bake(model.gaussians, 2.0, cameras=cameras)
     found = load("x.ply").gaussians
     assert report["cameras"] == 8 and torch.equal(found.means, want.means)
     torch.testing.assert_close(found.opacity_logits, want.opacity_logits)
@@ -102,25 +99,13 @@ def test_without_photographs_the_figure_is_of_the_dial(clod: Any, dialled: Path)
     assert "psnr" not in report["outputs"][0] and any("measured the dial" in note for note in report["notes"])
 
 
-@pytest.mark.parametrize(
-    ("lost", "drop", "largest", "want"),
-    [
-        (lambda s: s, 3.0, 8.0, 3.0),
-        (lambda s: s, 9.0, 8.0, 8.0),
-        (lambda s: s, 1.0, 8.0, 1.0),
-        (lambda s: 0.0, 0.1, 1.0, 1.0),
-        (lambda s: 1 / s if s < 2 else s, 5.0, 20.0, 5.0),
-    ],
-)
-def test_the_largest_dial_value_within(
-    lost: Callable[[float], float], drop: float, largest: float, want: float
-) -> None:
-    tried = []
-
-    def measured(s: float) -> float:
-        tried.append(s)
-        return lost(s)
-
-    found = largest_within(measured, drop, largest)
-    assert lost(found) <= drop and want / 1.01 <= found <= want
-    assert len(tried) <= 2 + math.log2(math.log(20) / math.log(1.01))
+def test_the_largest_dial_value_within() -> None:
+    cases: list[tuple[Callable[[float], float], float, float, float]] = [
+        (lambda s: s, 3.0, 8.0, 3.0), (lambda s: s, 9.0, 8.0, 8.0), (lambda s: s, 1.0, 8.0, 1.0),
+        (lambda s: 0.0, 0.1, 1.0, 1.0), (lambda s: 1 / s if s < 2 else s, 5.0, 20.0, 5.0),
+    ]  # fmt: skip
+    for lost, drop, largest, want in cases:
+        tried: list[float] = []
+        found = largest_within(lambda s, lost=lost, tried=tried: tried.append(s) or lost(s), drop, largest)
+        assert lost(found) <= drop and want / 1.01 <= found <= want
+        assert len(tried) <= 2 + math.log2(math.log(20) / math.log(1.01))

@@ -14,16 +14,17 @@ import clod_adapter
 
 
 @pytest.mark.usefixtures("without_splat_transform")
-@pytest.mark.parametrize("sv", [None, 2])
+@pytest.mark.parametrize("sv", [None, 2, 9])
 def test_a_page_holds_the_splat_and_its_dial(clod: Any, dialled: Path, tmp_path: Path, sv: int | None) -> None:
     done = clod("export", dialled, "-o", "page.html", *(["--sv", sv] if sv else []), "--json")
-    assert done.code == 0 and "there-is-none" in done.err, done
-    assert "exact" not in done.err
-    (output,) = json.loads(done.out)["outputs"]
+    assert done.code == 0 and "there-is-none" in done.err and "exact" not in done.err, done
+    report = json.loads(done.out)
+    (output,) = report["outputs"]
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     (config,) = re.findall('id="clod-config">(.*?)</script>', text)
     model = json.loads(config)["model"]
-    assert json.loads(config)["virtual_scale"] == (sv or 1)
+    assert json.loads(config)["virtual_scale"] == min(sv or 1, 4)
+    assert any("dial ends at s = 4" in note for note in report["notes"]) == (sv == 9)
     (tmp_path / "held.ply").write_bytes(base64.b64decode(re.findall('id="clod-model">(.*?)</script>', text)[0]))
     held = clod_adapter.load(tmp_path / "held.ply")
     assert len(held.gaussians) == model["count"] == output["count"] and model["name"] == dialled.name
@@ -32,19 +33,11 @@ def test_a_page_holds_the_splat_and_its_dial(clod: Any, dialled: Path, tmp_path:
 
 
 def test_a_page_has_the_cameras_of_the_scene(clod: Any, dialled: Path, capture: Any, tmp_path: Path) -> None:
-    assert clod("export", dialled, "-o", "page.html", "--images", capture.scene).code == 0
+    done = clod("export", dialled, "-o", "page.html", "--images", capture.scene, "--sv", 2)
+    assert done.code == 0 and "Gaussians, initial dial value s = 2" in done.out and " of " not in done.out
     (config,) = re.findall('id="clod-config">(.*?)</script>', (tmp_path / "page.html").read_text(encoding="utf-8"))
     names = [camera["name"] for camera in json.loads(config)["cameras"]]
     assert names == sorted(path.name for path in (capture.scene / "images").iterdir())
-
-
-@pytest.mark.usefixtures("without_splat_transform")
-def test_the_summary_of_a_page(clod: Any, dialled: Path) -> None:
-    done = clod("export", dialled, "-o", "page.html", "--sv", 2)
-    assert "Gaussians, initial dial value s = 2" in done.out and " of " not in done.out
-    done = clod("export", dialled, "-o", "page.html", "--sv", 9, "--json")
-    report = json.loads(done.out)
-    assert report["outputs"][0]["virtual_scale"] == 4 and any("dial ends at s = 4" in note for note in report["notes"])
 
 
 @pytest.mark.parametrize("words", [("--levels", "1,2"), ("--order", "extinction")])

@@ -53,19 +53,10 @@ def test_found_out_tuned_and_stored(clod: Any, trained: tuple[Path, Path], tmp_p
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
 
 
-def test_a_classic_checkpoint_stays_one_without_a_word(clod: Any, capture: Any, tmp_path: Path) -> None:
-    done = clod(capture.ply, "--images", capture.scene, *FAST)
-    assert done.code == 0 and "ntialias" not in done.err, done
-    assert b"screen_filter" not in (tmp_path / "dial.ply").read_bytes()
-    assert json.loads(done.out)["screen_filter"] == {"variance": 0.3, "compensate": False}
-
-
-@pytest.mark.parametrize("name", ["off", "mip"])
-def test_what_is_told_is_done(clod: Any, trained: tuple[Path, Path], tmp_path: Path, name: str) -> None:
-    ply, scene = trained
-    done = clod(ply, "--images", scene, *FAST, "--antialiasing", name)
-    assert done.code == 0 and "by the photographs" not in done.err, done
-    assert clod_adapter.load(tmp_path / "dial.ply").gaussians.screen_filter == FILTERS[name]
+def test_a_classic_checkpoint_stays_one_without_a_note(dialled: Path) -> None:
+    report = json.loads(dialled.with_suffix(".json").read_text())
+    assert report["notes"] == [] and report["screen_filter"] == {"variance": 0.3, "compensate": False}
+    assert b"screen_filter" not in dialled.read_bytes()
 
 
 def test_measured_and_rendered_with_what_is_found_out(clod: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
@@ -84,16 +75,20 @@ def test_measured_and_rendered_with_what_is_found_out(clod: Any, trained: tuple[
     assert report["base_row"]["psnr"] > 45 and report["against"][0]["theirs"]["psnr"] > 45
 
 
-def test_a_file_that_says_is_believed_and_overruled_with_a_word(
-    clod: Any, trained: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_settings_of_the_option_and_of_the_file(clod: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
+    """``--antialiasing`` decides how a file is adapted; its result stores that, and an override of it is noted."""
     ply, scene = trained
-    assert clod(ply, "--images", scene, *FAST, "--antialiasing", "mip").code == 0
+    done = clod(ply, "--images", scene, *FAST, "--antialiasing", "mip")
+    assert done.code == 0 and "by the photographs" not in done.err, done
+    assert clod_adapter.load(tmp_path / "dial.ply").gaussians.screen_filter == FILTERS["mip"]
     quiet = clod("eval", "dial.ply", "--images", scene, "--sv", 1, "--json")
     assert "0.1 px^2 of blur" in quiet.err and "by the photographs" not in quiet.err
     told = clod("eval", "dial.ply", "--images", scene, "--sv", 1, "--json", "--antialiasing", "off")
     (note,) = [note for note in json.loads(told.out)["notes"] if "(--antialiasing)" in note]
     assert "the file has 0.1 px^2 of blur, opacities compensated" in note and note in told.err
+    done = clod("inspect", "dial.ply")
+    assert "trained with antialiasing: 0.1 px^2 of blur, opacities compensated" in done.out + done.err
+    assert json.loads(clod("inspect", "dial.ply", "--json").out)["splat"]["screen_filter"]["variance"] == 0.1
 
 
 def test_what_a_run_is_resumed_by_depends_on_the_filter(trained: tuple[Path, Path]) -> None:
@@ -129,13 +124,6 @@ def test_exports_carry_it_or_say_that_they_do_not(clod: Any, trained: tuple[Path
     assert not [note for note in json.loads(done.out)["notes"] if "antialias" in note]
     if out in ("a.ply", "a.spz"):
         assert clod_adapter.load(out).gaussians.screen_filter == CLASSIC
-
-
-def test_inspect_says_it(clod: Any, trained: tuple[Path, Path]) -> None:
-    assert clod("export", trained[0], "-o", "a.ply", "--antialiasing", "mip").code == 0
-    done = clod("inspect", "a.ply")
-    assert "trained with antialiasing: 0.1 px^2 of blur, opacities compensated" in done.out + done.err
-    assert json.loads(clod("inspect", "a.ply", "--json").out)["splat"]["screen_filter"]["variance"] == 0.1
 
 
 def test_the_base_beside_a_model_is_drawn_alike(clod: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:

@@ -134,11 +134,15 @@ def test_render_picks_views_and_solves_for_them(clod: Any, capture: Any, dialled
     assert every["virtual_scales"] == [1] and len(list((tmp_path / "all").iterdir())) == 10
 
 
-def test_render_reports_what_the_photographs_lack(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
+def test_notes_of_a_rendering(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
+    """Of a missing photograph, and of a dial value beyond the trained ones, which export notes, too."""
     shutil.copytree(capture.scene, tmp_path / "fewer")
     (tmp_path / "fewer" / "images" / "003.png").unlink()
-    report = json.loads(clod("render", dialled, "--images", "fewer", "-o", "out", "--json").out)
+    beyond = "trained up to s = 4; larger dial values were not trained"
+    report = json.loads(clod("render", dialled, "--images", "fewer", "-o", "out", "--sv", 4.5, "--json").out)
+    assert len(report["notes"]) == 2 and beyond in report["notes"], report
     assert any("missing and left out (003.png)" in note for note in report["notes"]), report
+    assert json.loads(clod("export", dialled, "-o", "x.ply", "--sv", 4.5, "--json").out)["notes"] == [beyond]
 
 
 def test_interrupted_rendering_leaves_what_is_finished(
@@ -170,12 +174,6 @@ def test_names_that_would_collide_keep_their_suffix(capture: Any) -> None:
 
     assert of("a.jpg", "b/a.jpg", "c\\a.JPG") == ["a.png", "b/a.png", "c/a.png"]
     assert of("a.jpg", "a.png") == ["a.jpg.png", "a.png.png"]
-
-
-def test_dial_values_beyond_the_trained_ones_are_noted(clod: Any, capture: Any, dialled: Path) -> None:
-    for words in (("render", dialled, "--images", capture.scene, "-o", "out"), ("export", dialled, "-o", "plain.ply")):
-        (note,) = json.loads(clod(*words, "--sv", 4.5, "--json").out)["notes"]
-        assert note == "trained up to s = 4; larger dial values were not trained"
 
 
 def test_baking_to_a_budget(clod: Any, dialled: Path, tmp_path: Path) -> None:

@@ -18,37 +18,18 @@ from clod_adapter.errors import ClodError
 from clod_adapter.rasterizers import cuda
 
 
-@pytest.fixture
-def gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """torch has one, as far as it says."""
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda *_: "NVIDIA Test 1")
-    monkeypatch.setattr(devices, "_fails", lambda: None)
-
-
-def test_without_a_gpu_auto_is_the_cpu_and_says_nothing(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_auto_and_named_devices(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without a GPU nothing is printed; a GPU is named, or the reason that it is not used."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert pick_device("auto", Console()) == pick_device("cpu", Console()) == torch.device("cpu")
     assert capsys.readouterr() == ("", "")
-
-
-@pytest.mark.usefixtures("gpu")
-def test_a_gpu_that_gsplat_draws_on_is_picked(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    for name, value in (("is_available", True), ("current_device", 0), ("get_device_name", "NVIDIA Test 1")):
+        monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
+    monkeypatch.setattr(devices, "_fails", lambda: None)
     monkeypatch.setattr(devices, "unusable", lambda: None)
     assert pick_device("auto", Console()) == pick_device("cuda", Console()) == torch.device("cuda", 0)
     assert capsys.readouterr().err.splitlines() == ["on NVIDIA Test 1"] * 2
     assert pick_device("cpu", Console()) == torch.device("cpu")
-
-
-@pytest.mark.usefixtures("gpu")
-def test_a_gpu_without_gsplat_is_named_in_a_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
     monkeypatch.setattr(devices, "unusable", lambda: "gsplat is absent: pip install gsplat==1.5.3")
     assert pick_device("auto", Console()) == torch.device("cpu")
     said = "on the CPU, although there is a GPU: gsplat is absent: pip install gsplat==1.5.3"

@@ -86,10 +86,7 @@ def test_other_formats_are_refused_before_the_work(clod: Any, tmp_path: Path, na
 
 @pytest.mark.parametrize("name", ["base.compressed.ply", "base.spz", "base.splat", "base.glb", "base.safetensors"])
 def test_other_formats_get_a_dial(clod: Any, capture: Any, tmp_path: Path, name: str) -> None:
-    if name.endswith(".ply"):
-        write_packed(tmp_path / name, capture.gaussians)
-    else:
-        write(tmp_path / name, capture.gaussians)
+    (write_packed if name.endswith(".ply") else write)(tmp_path / name, capture.gaussians)
     done = clod(name, "--images", capture.scene, *TINY)
     quantised = Path(name).suffix in (".ply", ".spz", ".splat")
     assert done.code == 0 and ("note: quantised" in done.err) == quantised, done

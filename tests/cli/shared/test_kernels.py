@@ -59,13 +59,6 @@ def test_compiling_is_announced_once(kept: bool, capsys: pytest.CaptureFixture[s
     assert [line.split(",")[0] for line in progress] == ["compiling  25%", "compiling  50%"]  # not of what is within
 
 
-def test_how_far_it_is_is_shown_where_it_is_known(capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
-    monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
-    with announced_compiling(Console()):
-        numba.njit(lambda x: x + 1)(1)
-    assert capsys.readouterr().err == "compiling kernels (first run only, well under a minute) ...\n"
-
-
 def test_nothing_is_said_without_compiling(capsys: pytest.CaptureFixture[str]) -> None:
     prepare_kernels(Console(quiet=True))
     prepare_kernels(Console())

@@ -13,8 +13,12 @@ from typing import Any
 import pytest
 
 from clod_adapter.cli.shared import pages
+from clod_adapter.cli.shared.console import Console
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
+from clod_adapter.training.loop import adapt
+from runs import OUTPUTS, names, pressing
+from scenes import capture as small_capture
 
 pytest.importorskip("matplotlib")
 TINY = ("--iters", 16, "--max-sv", 4, "--out", "dial.ply")
@@ -52,8 +56,8 @@ def test_adapt(clod: Any, capture: Any, tmp_path: Path) -> None:
 def test_without_photographs_nothing_is_said_of_any(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("clod_adapter.training.pseudo_views.WIDTH", 62)
-    monkeypatch.setattr("clod_adapter.training.pseudo_views.HEIGHT", 46)
+    monkeypatch.setattr("clod_adapter.training.camera_placement.WIDTH", 62)
+    monkeypatch.setattr("clod_adapter.training.camera_placement.HEIGHT", 46)
     done = clod(capture.ply, *TINY, "--report", "--json")
     assert done.code == 0, done
     report, text = json.loads(done.out), (tmp_path / "dial.html").read_text(encoding="utf-8")
@@ -71,32 +75,24 @@ def test_without_photographs_nothing_is_said_of_any(
 
 @pytest.mark.parametrize("lr", [0.0, 1e-3])
 def test_snapshots_do_not_change_with_the_training(lr: float) -> None:
-    """A copy is what was there at the time, the higher bands included where they are trained."""
-    from clod_adapter.cli.shared.console import Console
-    from clod_adapter.training.loop import adapt
-    from scenes import capture as make_capture
-
-    base, scene = make_capture()
+    """A copy holds the values of its time, the higher SH degrees included where they are trained."""
+    base, scene = small_capture()
     page = pages.AdaptPage(base, scene, AdaptConfig(iters=8, lr_shN=lr), Console(quiet=True))
     result = adapt(base, scene, page.config, page).gaussians
     first, last = page.snapshots[0][1], page.snapshots[-1][1]
     changed = {name for name, value in first.tensors().items() if not value.equal(last.tensors()[name])}
     assert {"means", "sh0", "sigma_d", "opacity_logits"} <= changed and ("shN" in changed) == (lr > 0)
-    assert all(value.equal(result.tensors()[name]) for name, value in last.tensors().items()) == (
-        page.snapshots[-1][0] == page.trained
-    )
+    whole = all(value.equal(result.tensors()[name]) for name, value in last.tensors().items())
+    assert whole == (page.snapshots[-1][0] == page.trained)
 
 
-def test_eval(clod: Any, capture: Any, tmp_path: Path) -> None:
-    clod(capture.ply, "--images", capture.scene, *TINY)
-    done = clod("eval", "dial.ply", "--images", capture.scene, "--report", "look.html", "--json")
+def test_eval(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
+    done = clod("eval", dialled, "--images", capture.scene, "--report", "look.html", "--json", "--base", capture.ply)
     report = json.loads(done.out)
     assert done.code == 0 and report["outputs"] == {"page": "look.html", "rendering": "look_rendering.png"}, done
     page = stored(tmp_path / "look.html")
     assert page["report"]["rows"] == report["rows"] and page["training"] is None
-    words = ("eval", "dial.ply", "--images", capture.scene, "--sv", 1, 4, "--base", capture.ply)
-    assert clod(*words, "--report", "both.html").code == 0
-    text = (tmp_path / "both.html").read_text(encoding="utf-8")
+    text = (tmp_path / "look.html").read_text(encoding="utf-8")
     assert 'data-name="base"' in text and "hold for base" in text
     plain = clod("eval", capture.ply, "--images", capture.scene, "--sv", 1, "--report", "plain.html")
     text = (tmp_path / "plain.html").read_text(encoding="utf-8")
@@ -106,14 +102,11 @@ def test_eval(clod: Any, capture: Any, tmp_path: Path) -> None:
 def test_ctrl_c_while_the_page_is_made_loses_nothing_else(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(*_: Any) -> Any:
-        signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(pages, "pictures", interrupted)
+    monkeypatch.setattr(pages, "pictures", pressing(pages.pictures, signal.SIGINT))
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--report", "--json")
     report = json.loads(done.out)
     assert done.code == 0 and report["rows"] and "the page was interrupted and not written" in report["notes"]
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["dial.json", "dial.ply", "dial.safetensors"]
+    assert names(tmp_path) == OUTPUTS
 
 
 @pytest.mark.parametrize("command", ["adapt", "eval"])
@@ -139,12 +132,6 @@ def test_refused_before_anything_is_done(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = ("--images", capture.scene)
-    for words, said in (
-        (("eval", capture.ply, *scene, "--report", "page.txt"), "page.txt: --report names the page.*end in .html"),
-        (("eval", capture.ply, *scene, "--report", "no/page.html"), "no/page.html: folder no does not exist"),
-    ):
-        done = clod(*words)
-        assert done.code == 2 and re.search(said, done.err), done
     for name, words in (("dial_adapting.png", (capture.ply, *scene, *TINY, "--report")),
                         ("page_rendering.png", ("eval", capture.ply, *scene, "--report", "page.html"))):  # fmt: skip
         (tmp_path / name / "mine").mkdir(parents=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.scene import colmap, colmap_plain, colmap_records, undistort
 from clod_adapter.io.scene.colmap import read_colmap
 from clod_adapter.io.scene.load import load_scene
-from photographs import LENSES, SIZE, as_text, camera, pixels, seen, write_scene
+from photographs import LENSES, SIZE, as_text, camera, damage, pixels, seen, write_scene
 
 
 @pytest.fixture
@@ -135,27 +136,16 @@ def test_lenses_that_fold_give_a_picture_or_a_plain_error(k: float) -> None:
 @settings(deadline=None, max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_damage_is_never_another_exception(tmp_path: Path, plain: Any, data: st.DataObject) -> None:
-    folder = tmp_path / "model"
-    if not folder.exists():
-        colmap.write_model(folder.parent, [camera(0), camera(1)], ["a.png", "b.png"], np.zeros((2, 3)))
-        (folder.parent / "sparse" / "0").rename(folder)
-        folder.with_name("whole").mkdir()
-        for path in folder.iterdir():
-            (folder.with_name("whole") / path.name).write_bytes(path.read_bytes())
-    for path in folder.with_name("whole").iterdir():
-        (folder / path.name).write_bytes(path.read_bytes())
-    path = data.draw(st.sampled_from(sorted(folder.iterdir())))
-    content = bytearray(path.read_bytes())
-    if data.draw(st.booleans()):
-        del content[data.draw(st.integers(0, len(content) - 1)) :]
-    else:
-        at, value = data.draw(st.integers(0, len(content) - 1)), data.draw(st.sampled_from([b"\xff" * 8, b"\0" * 8]))
-        content[at : at + len(value)] = value
-    path.write_bytes(content)
+    whole, damaged = tmp_path / "whole", tmp_path / "damaged"
+    if not whole.exists():
+        whole.mkdir()
+        colmap.write_model(whole, [camera(0), camera(1)], ["a.png", "b.png"], np.zeros((2, 3)))
+    shutil.copytree(whole / "sparse" / "0", damaged, dirs_exist_ok=True)
+    damage(data, sorted(damaged.iterdir()))
     try:
-        read_colmap(folder)
+        read_colmap(damaged)
     except ClodError as error:
-        assert str(folder) in str(error)
+        assert str(damaged) in str(error)
 
 
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])

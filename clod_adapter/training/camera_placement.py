@@ -1,0 +1,214 @@
+"""Cameras for a checkpoint without photographs, placed from its Gaussians alone.
+
+A checkpoint is accurate only where its photographs looked. Two properties of the Gaussians tell where that was:
+
+- Gaussians are a pixel or two large in their nearest cameras. The smallest ones therefore give the distance of the
+  cameras (``typical_reach``), and a rendering full of Gaussians many pixels wide shows a place without photographs.
+- The higher SH degrees start at 0 and are changed only by photographs, so their contribution to the colour is strong
+  in the directions from which a Gaussian was photographed and weak in others.
+
+Candidate cameras look at random Gaussians, preferably small opaque ones, from random directions. Each is scored by two
+small renderings (``_score``), and as many again are tried near the best. Of the good ones, cameras far from each other
+are chosen. The method needs no up direction, scene type or unit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from clod_adapter.cameras import Camera, near_plane
+from clod_adapter.config import require
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.progress import Listener, Phase, tell
+from clod_adapter.render import splat
+
+VIEWS = 96
+WIDTH, HEIGHT = 496, 368
+FIELD = 55.0  # horizontal, degrees: between a phone's 65 and the 35 of a portrait lens
+TRIES = 3  # candidates for each view, first anywhere, then as many near the best of those
+BEST = 0.2  # share of the first candidates that are good; later ones must score as high
+STEP = 0.2  # standard deviation of the offset from a good camera, of the reach, and of its unit direction
+LOOK = (80, 60)  # size of the renderings that a candidate is scored by
+SMALL, SMALL_PIXELS = 0.1, 2.0  # a tenth of the Gaussians is at most this many pixels large in the nearest cameras
+FAR = 4.0  # cameras stand at most this many times as far away as the scene is large
+VISIBLE = 0.05  # Gaussians of lower opacity are ignored
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A camera and its score (larger is better, no unit)."""
+
+    camera: Camera
+    score: float
+
+
+def place_cameras(
+    gaussians: Gaussians,
+    *,
+    views: int = VIEWS,
+    seed: int = 0,
+    field: float = FIELD,
+    progress: Listener | None = None,
+) -> list[Camera]:
+    """Places cameras about where the scene was photographed from.
+
+    Args:
+        gaussians: a checkpoint; a dial it has is ignored.
+        views: number of cameras, at least 1.
+        seed: of the candidate cameras.
+        field: horizontal field of view, degrees; ideally that of the original cameras.
+        progress: called in ``Phase.CAMERAS`` after each candidate.
+
+    Returns:
+        ``views`` cameras (fewer if fewer see anything) of 496x368 pixels, ordered so that every prefix is spread out.
+
+    Raises:
+        ClodError: no Gaussian is visible and finite, or no camera sees anything.
+        Stopped: ``progress`` returned False.
+    """
+    require(views >= 1, "views", views, "at least 1")
+    seen, generator = _usable(gaussians), torch.Generator().manual_seed(seed)
+    reach, tries, zoom = typical_reach(seen, field), TRIES * views, _zoom(field)
+    judged: list[Candidate] = []
+
+    def judge(cameras: Iterable[Camera]) -> None:
+        for camera in cameras:
+            judged.append(Candidate(camera, _score(seen, camera)))
+            tell(progress, Phase.CAMERAS, len(judged), 2 * tries)
+
+    judge(_anywhere(seen, tries, reach, zoom, generator))
+    good = _best(judged, math.inf, max(round(BEST * tries), 1))
+    if not good:
+        raise ClodError("no camera can be placed: the checkpoint is empty from every candidate camera")
+    judge(_beside(good, tries, reach, zoom, generator))
+    good = _best(judged, good[-1].score, views)
+    return [_resized(c.camera, WIDTH, HEIGHT, k) for k, c in enumerate(_spread(good, views, reach))]
+
+
+def typical_reach(gaussians: Gaussians, field: float = FIELD) -> float:
+    """Estimated distance between cameras and scene, world units.
+
+    The distance at which the smallest tenth of the visible Gaussians is at most SMALL_PIXELS pixels large; at most FAR
+    times the median distance of the Gaussians from their centre. ``field`` is the horizontal field of view, degrees.
+    """
+    footprint = _quantile(_size(gaussians), SMALL) * WIDTH * _zoom(field) / SMALL_PIXELS
+    from_centre = (gaussians.means - gaussians.means.median(0).values).norm(dim=1)
+    return min(footprint, FAR * _quantile(from_centre, 0.5)) or footprint
+
+
+def _usable(gaussians: Gaussians) -> Gaussians:
+    """The visible and finite Gaussians, without a dial. An infinite opacity logit is a fully opaque Gaussian."""
+    plain = gaussians.replace(sigma_d=None, attenuation=None)
+    rows = plain.opacities > VISIBLE
+    for values in plain.tensors().values():
+        if values.shape[1:].numel() and values is not plain.opacity_logits:
+            rows &= values.reshape(len(values), -1).isfinite().all(1)
+    if not rows.any():
+        raise ClodError("no camera can be placed: the checkpoint has no Gaussian that is visible and finite")
+    return plain.select(rows).without_empty_bands()
+
+
+def _anywhere(gaussians: Gaussians, count: int, reach: float, zoom: float, generator: torch.Generator) -> list[Camera]:
+    """Cameras towards Gaussians sampled by opacity over size, from uniform directions, at half to twice the reach."""
+    interest = gaussians.opacities / _size(gaussians).clamp(min=1e-12)
+    # torch.multinomial has a limit of 2^24 weights.
+    ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
+    drawn = torch.searchsorted(ends, torch.rand(count, generator=generator, dtype=torch.float64) * ends[-1])
+    targets = gaussians.means[drawn.clamp(max=len(gaussians) - 1).to(gaussians.means.device)].cpu()
+    sides = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    away = reach * 2 ** (2 * torch.rand(count, 1, generator=generator) - 1)
+    return [_looking(eye, target, zoom) for eye, target in zip(targets + away * sides, targets, strict=True)]
+
+
+def _beside(
+    candidates: list[Candidate], count: int, reach: float, zoom: float, generator: torch.Generator
+) -> list[Camera]:
+    """Cameras with random offsets of position and direction from the candidates, each in turn."""
+    steps = STEP * torch.randn(count, 2, 3, generator=generator)
+    cameras = []
+    for k in range(count):
+        camera = candidates[k % len(candidates)].camera
+        forward = camera.viewmat[2, :3] + steps[k, 0]
+        eye = camera.position + reach * steps[k, 1]
+        cameras.append(_looking(eye, eye + reach * forward, zoom))
+    return cameras
+
+
+def _best(judged: list[Candidate], least: float, count: int) -> list[Candidate]:
+    """By score: those of at least ``least``, or the first ``count`` if that is more, but no empty ones."""
+    ranked = sorted((c for c in judged if c.score > -math.inf), key=lambda c: -c.score)
+    return ranked[: max(count, sum(c.score >= least for c in ranked))]
+
+
+def _score(gaussians: Gaussians, camera: Camera) -> float:
+    """How likely a photograph was taken from here; -inf if the rendering is empty.
+
+    ``log h - 0.5 p - 2 e`` with h the mean magnitude of the higher SH degrees' colour, p the mean log size in pixels
+    (both weighted by alpha), e the share of pixels that are not covered.
+    """
+    higher = torch.zeros_like(gaussians.sh0)  # the colour is then 0.5 + that of the higher degrees
+    bands, alpha = splat(gaussians.replace(sh0=higher), gaussians.opacities, camera)
+    covered = float(alpha.sum())
+    if covered < 0.1 * alpha.numel():
+        return -math.inf
+    row = camera.viewmat[2].to(gaussians.means)
+    depths = gaussians.means @ row[:3] + row[3]
+    pixels = _size(gaussians) * WIDTH / camera.width * camera.K[0, 0] / depths.clamp(min=1e-6)
+    shade = (pixels.clamp(1e-3, 1e4).log() + 7)[:, None, None].expand(-1, 1, 3)  # positive, as colours are
+    sizes, _ = splat(
+        gaussians.replace(sh0=(shade - 0.5) / SH_C0, shN=gaussians.shN[:, :0]), gaussians.opacities, camera
+    )
+    size = float(sizes[..., 0].sum()) / covered - 7
+    empty = float((alpha < 0.9).float().mean())
+    strength = float((bands - 0.5 * alpha[..., None]).abs().mean(2).sum()) / covered if gaussians.sh_degree else 1.0
+    return math.log(strength + 1e-4) - 0.5 * size - 2 * empty
+
+
+def _spread(candidates: list[Candidate], count: int, reach: float) -> list[Candidate]:
+    """``count`` candidates by farthest-point sampling of position and direction, from the best one."""
+    places = torch.stack([torch.cat([c.camera.position / reach, c.camera.viewmat[2, :3]]) for c in candidates])
+    taken = [0]
+    gap = (places - places[0]).norm(dim=1)
+    while len(taken) < min(count, len(candidates)):
+        taken.append(int(gap.argmax()))
+        gap = gap.minimum((places - places[taken[-1]]).norm(dim=1))
+    return [candidates[k] for k in taken]
+
+
+def _looking(eye: Tensor, target: Tensor, zoom: float) -> Camera:
+    """A camera for scoring. The up direction is unknown; COLMAP's y axis usually points down."""
+    forward = torch.nn.functional.normalize(target - eye, dim=0)
+    down = torch.tensor([0.0, 1.0, 0.0]) if abs(float(forward[1])) < 0.99 else torch.tensor([0.0, 0.0, 1.0])
+    right = torch.nn.functional.normalize(torch.linalg.cross(down, forward), dim=0)
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    width, height = LOOK
+    K = torch.tensor([[zoom * width, 0, width / 2], [0, zoom * width, height / 2], [0, 0, 1.0]])
+    return Camera(viewmat, K, width, height, near=near_plane(float((target - eye).norm())))
+
+
+def _resized(camera: Camera, width: int, height: int, number: int) -> Camera:
+    focal = float(camera.K[0, 0]) / camera.width * width
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    return Camera(camera.viewmat, K, width, height, f"placed_{number:03}", camera.near)
+
+
+def _zoom(field: float) -> float:
+    """The focal length in image widths, of a horizontal field of view in degrees."""
+    return 0.5 / math.tan(math.radians(field) / 2)
+
+
+def _size(gaussians: Gaussians) -> Tensor:
+    """``[N]`` the largest standard deviation, world units."""
+    return gaussians.scales.amax(1)
+
+
+def _quantile(values: Tensor, share: float) -> float:
+    return float(values.kthvalue(max(round(share * len(values)), 1)).values)

@@ -1,0 +1,133 @@
+"""What tests of the main job share: the names of its files, errors on demand, and processes without a slow start."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clod_adapter.training.objective import Objective
+
+OUTPUTS = ["dial.json", "dial.ply", "dial.safetensors"]
+STATE = "dial.resume.safetensors"
+
+# Imports everything once; a line on stdin starts a process, or asks whether or how one ended.
+SERVER = """
+import json, os, signal, sys, tempfile
+import torch
+torch.set_num_threads(1)  # a process that forks must have no threads
+from clod_adapter.cli import main
+from clod_adapter.cli.adapt import processes, resume
+from clod_adapter.cli.adapt import run as adapt
+from clod_adapter.cli.shared.console import Console
+from clod_adapter.cli.shared.kernels import prepare_kernels
+prepare_kernels(Console(quiet=True))
+print("ready", flush=True)
+for line in sys.stdin:
+    about = json.loads(line)
+    if "ended" in about:
+        print(int(os.waitid(os.P_PID, about["ended"], os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None), flush=True)
+        continue
+    if "wait" in about:
+        print(os.waitstatus_to_exitcode(os.waitpid(about["wait"], 0)[1]), flush=True)
+        continue
+    child = os.fork()
+    if child == 0:
+        os.chdir(about["folder"])
+        tempfile.tempdir = os.path.dirname(about["folder"])
+        os.environ.update(about["environment"])
+        log = os.open(about["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        for stream in (1, 2):
+            os.dup2(log, stream)
+        torch.set_num_threads(1 if about["environment"] else 2)
+        resume.SAVE_EVERY, resume.SAVE_COST = 0.0, 1e9  # a state after each step
+        code = 1
+        try:
+            exec(about["before"])
+            code = main.main(about["words"])
+        finally:
+            sys.stdout.flush()
+            os._exit(code)
+    print(child, flush=True)
+"""
+
+
+class Server:
+    """Runs ``clod-adapt`` in real processes that need no seconds to start."""
+
+    def __init__(self) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", SERVER], text=True, bufsize=1, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        assert self.process.stdout.readline() == "ready\n"
+
+    def ask(self, **about: Any) -> int:
+        self.process.stdin.write(json.dumps(about) + "\n")
+        return int(self.process.stdout.readline())
+
+    def start(self, folder: Path, *words: object, rank: object = "", before: str = "", **environment: object) -> int:
+        """The process's id, valid until it is waited for; ``before`` is code that it runs first."""
+        return self.ask(
+            folder=str(folder), log=f"{folder}{rank}.log", words=[str(word) for word in words], before=before,
+            environment={name: str(value) for name, value in environment.items()},
+        )  # fmt: skip
+
+    def wait(self, pid: int) -> int:
+        """The exit code; of a killed process the signal, negative."""
+        return self.ask(wait=pid)
+
+    def run(self, folder: Path, *words: object) -> tuple[int, str]:
+        """Exit code and output."""
+        return self.wait(self.start(folder, *words)), log_of(folder)
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def log_of(folder: Path, rank: object = "") -> str:
+    return Path(f"{folder}{rank}.log").read_text()
+
+
+def wait_for(path: Path) -> None:
+    until = time.monotonic() + 60
+    while not path.exists():
+        assert time.monotonic() < until, f"{path} did not appear"
+        time.sleep(0.002)
+
+
+def fail(*_: Any, **__: Any) -> Any:
+    raise ZeroDivisionError("of ours")
+
+
+def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[..., Any]:
+    """``real``, which these signals interrupt at the beginning of its ``at``-th call."""
+    calls = count(1)
+
+    def pressed(*given: Any, **rest: Any) -> Any:
+        for number in numbers if next(calls) == at else ():
+            signal.raise_signal(number)
+        return real(*given, **rest)
+
+    return pressed
+
+
+def change_step(
+    patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any], only: Callable[[Any], bool] = lambda config: True
+) -> None:
+    """The gradients of the ``at``-th step from here, of runs that ``only`` names, are what ``change`` makes of them."""
+    real, steps = Objective.gradient_sum, count(1)
+
+    def changed(self: Objective, *given: Any) -> Any:
+        found = real(self, *given)
+        return change(found) if only(self.config) and next(steps) == at else found
+
+    patch.setattr(Objective, "gradient_sum", changed)

@@ -1,0 +1,83 @@
+"""Cameras placed from the Gaussians alone."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+import clod_adapter as clod
+import scenes
+from clod_adapter.training.camera_placement import FIELD, HEIGHT, WIDTH, place_cameras, typical_reach
+from clod_adapter.training.pseudo_views import render_pseudo_views
+
+
+@pytest.fixture(scope="module")
+def blob() -> clod.Gaussians:
+    return scenes.gaussians(400, 1, 0, size=0.05)
+
+
+def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
+    """An opaque sphere of small discs and a far floater, with SH degree 1 strong towards ``seen_from`` alone.
+
+    So training leaves them. Degree 1 is odd in the direction: on the half that is not seen it is 0.
+    """
+    k = torch.arange(n) + 0.5
+    z, turn = 1 - 2 * k / n, math.pi * (1 + 5**0.5) * k
+    means = torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], 1)
+    means = torch.cat([means, torch.tensor([[0.0, 0.0, 1e4]])])
+    logs = torch.full((n + 1, 3), 0.05).log()
+    logs[-1] = math.log(300.0)
+    facing = (torch.nn.functional.normalize(means, dim=1) @ seen_from).clamp(min=0)
+    shN = facing[:, None, None] * torch.stack([-seen_from[1], seen_from[2], -seen_from[0]])[None, :, None]
+    quats, sh0 = torch.tensor([[1.0, 0, 0, 0]]).repeat(n + 1, 1), torch.zeros(n + 1, 1, 3)
+    return clod.Gaussians(means, quats, logs, torch.full((n + 1,), 3.0), sh0, shN.repeat(1, 1, 3))
+
+
+def test_cameras_are_proper_and_see_the_scene(blob: clod.Gaussians) -> None:
+    told: list[tuple[int, int]] = []
+    cameras = place_cameras(blob, views=12, progress=lambda now: told.append((now.done, now.total)))
+    assert told[-1][0] == told[-1][1] == len(told)
+    assert len(cameras) == 12 and len({c.name for c in cameras}) == 12
+    for camera in cameras:
+        rotation = camera.viewmat[:3, :3]
+        assert camera.viewmat.isfinite().all() and torch.det(rotation) == pytest.approx(1, abs=1e-5)
+        assert torch.allclose(rotation @ rotation.T, torch.eye(3), atol=1e-5)
+        assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+        assert 2 * math.degrees(math.atan(WIDTH / 2 / float(camera.K[0, 0]))) == pytest.approx(FIELD)
+        assert clod.render(blob, camera).alpha.mean() > 0.02
+    forward = torch.stack([c.viewmat[2, :3] for c in cameras])
+    assert (forward @ forward.T).min() < 0  # from all around
+    plain = blob.replace(shN=blob.shN[:, :0])
+    one, two, other = (torch.stack([c.viewmat for c in place_cameras(plain, views=4, seed=k)]) for k in (1, 1, 2))
+    assert len(one) == 4 and torch.equal(one, two) and not torch.equal(one, other)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_cameras_stand_outside_where_higher_sh_degrees_were_trained(axis: int) -> None:
+    side = torch.eye(3)[axis]
+    truth = ball(1500, side)
+    positions = torch.stack([c.position for c in place_cameras(truth, views=12)])
+    assert (torch.nn.functional.normalize(positions, dim=1) @ side).mean() > 0.4
+    assert torch.cdist(positions, truth.means[:-1]).min() > 3 * 0.05 and positions.norm(dim=1).min() > 1
+
+
+def test_gaussians_that_are_not_finite_or_not_visible_are_ignored(blob: clod.Gaussians) -> None:
+    bad = scenes.gaussians(30, 1, 3)
+    bad.means[:10], bad.shN[10:20], bad.opacity_logits[20:] = math.inf, math.nan, -30.0
+    both = clod.Gaussians(**{name: torch.cat([value, bad.tensors()[name]]) for name, value in blob.tensors().items()})
+    one, other = ([c.viewmat.tolist() for c in place_cameras(g, views=4)] for g in (both, blob))
+    assert one == other
+    with pytest.raises(clod.ClodError, match="no Gaussian that is visible and finite"):
+        place_cameras(bad)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
+def test_cameras_are_placed_in_any_unit(blob: clod.Gaussians, unit: float) -> None:
+    other = blob.replace(means=blob.means * unit, log_scales=blob.log_scales + math.log(unit))
+    assert typical_reach(other) == pytest.approx(unit * typical_reach(blob), rel=1e-4)
+    here, there = (render_pseudo_views(g, place_cameras(g, views=8)) for g in (blob, other))
+    light = [torch.stack([view.image for view in scene.train]).float().mean().item() for scene in (here, there)]
+    assert light[0] > 5 and light[1] == pytest.approx(light[0], rel=0.3)  # roundings choose other cameras
