@@ -1,8 +1,7 @@
 """Image and gradients of the CPU rasterizer against ``rasterizers/reference.py`` in float64, patch by patch.
 
-The reference weighs every Gaussian at every pixel. To save memory, each patch of 16x16 pixels gets only the Gaussians
-whose ellipse of alpha 1/255 reaches it; the weight of all others is exactly 0. The gradients of the patches are summed
-and carried through the projection once.
+Each patch of 16x16 pixels gets only the Gaussians whose ellipse of alpha 1/255 reaches it; the weight of all others is
+exactly 0. The gradients of the patches are summed and carried through the projection once.
 
 Float32 rounding may change a decision: whether an alpha reaches 1/255, whether a pixel ends at transmittance 1e-4,
 which of two Gaussians is in front. A pixel is *unsure* where the reference is within a small relative margin of such a

@@ -17,8 +17,8 @@ from typing import Literal
 
 import numpy as np
 import torch
-from city_points import FIELD, Points, cover, facing, higher_degrees, shade, surround
-from city_surfaces import PITCH, blocks, build, extent
+from city_points import FIELD, cover, facing, higher_degrees, shade, surround
+from city_surfaces import PITCH, blocks, build, extent, joined
 from common import arguments
 from PIL import Image
 
@@ -46,10 +46,7 @@ def city(count: int, *, seed: int = 0, sh_degree: int = 3) -> Gaussians:
         raise SystemExit(f"a city needs at least 1000 Gaussians, not {count}")
     random = np.random.default_rng(seed)
     far = surrounding(count)
-    parts = (cover(build(count, random), count - far, random), surround(far, count, random))
-    names = ("position", "normal", "spacing", "kind", "color")
-    points = Points(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-    del parts
+    points = joined([cover(build(count, random), count - far, random), surround(far, count, random)])
     noise = random.standard_normal((count, 3), np.float32)
     low = points.kind >= FIELD
     flat = np.where(low, np.float32(0.7), np.float32(0.5)) * points.spacing

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -70,9 +71,10 @@ def build(count: int, random: np.random.Generator) -> Surfaces:
     ])  # fmt: skip
 
 
-def joined(parts: Sequence[Surfaces]) -> Surfaces:
-    names = ("origin", "u", "v", "normal", "kind", "color")
-    return Surfaces(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+def joined(parts: Sequence[Any]) -> Any:
+    """One of several dataclasses of arrays."""
+    names = [field.name for field in fields(parts[0])]
+    return type(parts[0])(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def rectangles(origin: np.ndarray, u: np.ndarray, v: np.ndarray, kind: int, color: np.ndarray) -> Surfaces:

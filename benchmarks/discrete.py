@@ -33,14 +33,7 @@ NAMES = ("two levels, a hard switch", "one file, its dial")
 
 @dataclass(frozen=True)
 class Sweep:
-    """Frames from most to least detail.
-
-    Attributes:
-        dials: the dial value of each frame.
-        images: ``[F, H, W, 3]`` clamped to [0, 1].
-        kept: Gaussians of each frame.
-        psnr: against the photograph, dB.
-    """
+    """F frames from most to least detail: dial values, ``[F, H, W, 3]`` in [0, 1], Gaussians, dB."""
 
     dials: list[float]
     images: Tensor
@@ -114,18 +107,15 @@ def draw(path: Path, view: clod.View, levels: Sweep, dial: Sweep) -> None:
         for axes, name, frames in zip(above.subplots(1, 2), NAMES, (levels, dial), strict=True):
             draw_strips(axes, name, frames)
         left, right = below.subplots(1, 2)
-        for axes, label in ((left, "PSNR on this view (dB)"), (right, "change in one frame (of 255)")):
-            axes.set_xlabel("from most detail to least: the dial s (log scale)")
-            axes.set_ylabel(label)
-            axes.set_xscale("log")
-            tidy(axes)
         for name, frames, colour in zip(NAMES, (levels, dial), (ORANGE, BLUE), strict=True):
             changes = frames.popping().changes
             left.plot(frames.dials, frames.psnr, color=colour, linewidth=1.8, label=name)
             label = f"{name}: largest {max(changes):.2g}"
             right.plot(frames.dials[1:], changes, color=colour, linewidth=1.8, label=label)
         right.set_ylim(bottom=0)
-        for axes in (left, right):
+        for axes, label in ((left, "PSNR on this view (dB)"), (right, "change in one frame (of 255)")):
+            axes.set(xscale="log", xlabel="from most detail to least: the dial s (log scale)", ylabel=label)
+            tidy(axes)
             ticks = [s for s in (1, 1.5, 2, 3, 4, 5, 7, 10, 15, 20) if s <= dial.dials[-1]]
             axes.set_xticks(ticks, [f"{s:g}" for s in ticks])
             axes.set_xticks([], minor=True)

@@ -11,12 +11,11 @@ without photographs. Each run is a process of its own. Rows go to ``results/plan
 from __future__ import annotations
 
 import json
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
-from common import COMMAND, SHARED, Process, append, arguments, stored, table
+from common import COMMAND, Process, append, arguments, capture, stored, table
 
 FILE = "plan.jsonl"
 SCENES = (
@@ -40,14 +39,13 @@ def main() -> None:
 
 def run(scene: str, options: list[str]) -> dict[str, Any]:
     """One ``clod-adapt`` in a process of its own: times, sizes, peak of memory, and the dial's rows."""
-    if not (SHARED / scene.partition("/")[0]).exists():
-        sys.exit(f"{SHARED / scene} is absent: set CLOD_SHARED_DATA to the folder that holds it")
-    words, source = [], SHARED / scene
-    if source.suffix != ".ply":
-        folder, _, checkpoint = scene.partition("/")
-        source, words = SHARED / folder / f"{checkpoint or 'pretrained'}.ply", ["--images", str(SHARED / folder)]
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "dial.ply"
+    name, _, file = scene.partition("/")
+    folder = capture(name)
+    source, words = folder / f"{file or 'pretrained'}.ply", ["--images", folder]
+    if file.endswith(".ply"):
+        source, words = folder / file, []
+    with tempfile.TemporaryDirectory() as temporary:
+        out = Path(temporary) / "dial.ply"
         process = Process([*COMMAND, source, *words, *options, "--out", out, "--quiet"])
         report = json.loads(out.with_suffix(".json").read_text())
     return {

@@ -1,18 +1,13 @@
 """Runs the test suite under conditions in which processors, users, shells and folders differ, and prints one table.
 
-    python benchmarks/portability.py                               # all conditions: an hour on two idle cores
-    python benchmarks/portability.py ignored_sigint c_locale       # two of them
-    python benchmarks/portability.py no_root+c_locale              # two of them at once
-    python benchmarks/portability.py one_thread --tests tests/io   # one of them, over some of the tests
-    python benchmarks/portability.py --record                      # and a row each in results/portability.jsonl
+    python benchmarks/portability.py --record                          # all conditions: an hour on two idle cores
+    python benchmarks/portability.py plain no_root+c_locale --tests tests/io   # one, and two of them at once
 
 Run by another virtual environment's Python it tests the versions that are installed there (docs/dependencies.md). The
 exit code is 1 where a test failed or a condition could not be had. The conditions:
 
 - ``plain``: as ``make test`` runs it;
-- ``aten_default``, ``aten_avx2``: torch's loops without vectors, and with those of 2013;
-- ``mkl_compatible``: the results that MKL gives on every processor;
-- ``numba_generic``: kernels compiled for the oldest processor of the architecture;
+- ``aten_default``, ``aten_avx2``, ``mkl_compatible``, ``numba_generic``: vector instructions of older processors;
 - ``one_thread``, ``one_core``: a single thread; as many as otherwise, on one core;
 - ``no_root``: for root, in a user namespace without root's rights; for others ``plain`` is that;
 - ``ignored_sigint``, ``blocked_signals``: as a script's background job, and below a program that blocks signals;

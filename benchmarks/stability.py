@@ -18,7 +18,7 @@ import stability_plots
 import stability_popping
 import stability_scenes
 import stability_stiffness
-from common import RESULTS, ROOT, Row, about, arguments, stored
+from common import RESULTS, ROOT, about, arguments, stored
 
 from clod_adapter.cli.shared.report import jsonable
 
@@ -44,18 +44,11 @@ def main() -> None:
         lines = [json.dumps(row) for part in PARTS for row in rows[part]]
         (RESULTS / FILE).write_text("\n".join(lines) + "\n", encoding="utf-8")
     for part in args.only:
-        if rows[part]:
-            show(part, rows[part])
-
-
-def show(part: str, rows: list[Row]) -> None:
-    """Prints the tables of a part and draws its picture."""
-    print(
-        f"## {part}: commit {rows[0]['commit']}, {rows[0]['part_seconds']} s\n\n{PARTS[part].tables(rows)}\n",
-        flush=True,
-    )
-    if part in PLOTS:
-        PLOTS[part](rows, IMAGES / f"stability_{part}.png")
+        if own := rows[part]:
+            head = f"## {part}: commit {own[0]['commit']}, {own[0]['part_seconds']} s"
+            print(f"{head}\n\n{PARTS[part].tables(own)}\n", flush=True)
+            if part in PLOTS:
+                PLOTS[part](own, IMAGES / f"stability_{part}.png")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,8 @@ from stability_stiffness import CONFIG, CONVERGED, LENGTHS, OPTIMIZERS, STEPS, c
 
 from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, QUIET, label_log, new_figure, save_figure, tidy
 
+LEGEND = {"loc": "outside lower center", "frameon": False, "fontsize": 8.5}
+
 
 def stiffness(rows: list[dict[str, Any]], path: Path) -> None:
     """Error by step size on the left, by seconds at the best step size on the right; dashes for linear sigma."""
@@ -29,9 +31,8 @@ def stiffness(rows: list[dict[str, Any]], path: Path) -> None:
             for y, text in ((start, "start"), (CONVERGED * start, "converged")):
                 axes.axhline(y, color=QUIET, linewidth=0.8, linestyle="--")
                 if not timed:
-                    axes.text(
-                        0.01, y * 0.97, text, transform=axes.get_yaxis_transform(), fontsize=8, color=QUIET, va="top"
-                    )
+                    there = axes.get_yaxis_transform()
+                    axes.text(0.01, y * 0.97, text, transform=there, fontsize=8, color=QUIET, va="top")
             axes.set_xscale("log")
             axes.set_yscale("log")
             tidy(axes)
@@ -46,9 +47,7 @@ def stiffness(rows: list[dict[str, Any]], path: Path) -> None:
         panels[1].set_xlabel(f"seconds of training, {LENGTHS[0]} to {LENGTHS[-1]} steps at the best step size")
         panels[0].plot([], [], color=INK, linestyle="-", marker="o", markersize=3.5, label="log sigma_d")
         panels[0].plot([], [], color=INK, linestyle=":", label="linear sigma_d")
-        figure.legend(
-            *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False, fontsize=8.5
-        )
+        figure.legend(*panels[0].get_legend_handles_labels(), **LEGEND, ncols=5)
         save_figure(figure, path)
 
 
@@ -87,7 +86,5 @@ def popping(rows: list[dict[str, Any]], path: Path) -> None:
         panels[1].text(1 / max(LENGTHS_OF_STEPS), 0.24, "scene, both cuts: no change", fontsize=8, color=BLUE)
         panels[1].set_xlabel("length of a step, share of the sweep")
         handles = {h.get_label(): h for axes in panels for h in axes.get_lines() if not h.get_label().startswith("_")}
-        figure.legend(
-            handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize=8.5
-        )
+        figure.legend(handles.values(), handles.keys(), **LEGEND, ncols=4)
         save_figure(figure, path)
