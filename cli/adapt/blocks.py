@@ -114,12 +114,13 @@ class Blocks:
     def run_job(self, inputs: Inputs) -> dict[str, Any]:
         """Does the job of ``--block``, the initialization or the next pass of one block; returns the report."""
         args, result, number = self.setup.args, None, 1
+        if args.block != "start" and not self.files.start.exists():
+            self._require_block(args.block, self.plan.blocks)
         divided = self.divided(inputs)
         division, files, block = divided.division, divided.files, args.block
         path = files.start
         if block != "start":
-            if int(block) > division.count:
-                raise ClodError(f"--block is {block}, and there are {division.count} blocks; give 1 to that")
+            self._require_block(block, division.count)
             block = int(block) - 1
             number = 1 if not files.block(block, 1).exists() else division.passes
             before = self.first_pass(inputs, divided) if number == 2 else None
@@ -135,6 +136,11 @@ class Blocks:
             "steps": result.learned.steps if result else 0, "memory": asdict(self.plan), "machine": machine(),
             "outputs": {"block": str(path)}, "exit_code": 1 if result and result.failed else 0,
         }  # fmt: skip
+
+    @staticmethod
+    def _require_block(block: str, count: int) -> None:
+        if int(block) > count:
+            raise ClodError(f"--block is {block}, and the number of blocks is {count}; give a number from 1 to {count}")
 
     def first_pass(self, inputs: Inputs, divided: Divided) -> Gaussians:
         """The merged result of the first pass."""

@@ -39,7 +39,9 @@ def finish(
     with stop.listening():  # a first Ctrl-C lets the writing finish
         report = write_result(setup, inputs, result, measured)
     written(not result.adapted.interrupted and not measured.interrupted)
-    if page and not measured.interrupted and stop.requests == before:  # after the report
+    if page and (measured.interrupted or stop.requests > before):
+        setup.console.say("interrupted: the page of --report was not written")
+    elif page:  # after the report
         report = add_page(setup, result, page, report)
     shown = table(measured.rows, inputs.base_rows, measured.plain) if measured.rows else ""
     print_summary(setup.outputs, shown, setup.args, setup.watch)

@@ -194,10 +194,14 @@ class Saver:
 
     @contextmanager
     def rescuing(self, how: str = "--resume") -> Iterator[None]:
-        """Calls ``rescue`` on an error within the block."""
+        """Calls ``rescue`` on an error within the block; after an abort only says what is saved already."""
         try:
             yield
         except Stopped:
+            raise
+        except KeyboardInterrupt:
+            if self.saved is not None:
+                _tell(f"{how} resumes from step {self.saved}, which is in {self.path}")
             raise
         except Exception:
             self.rescue(how)

@@ -13,6 +13,7 @@ from clod_adapter.progress import Progress
 
 from .console import Console
 from .interrupts import GracefulStop
+from .launch import launched
 
 DIALS = (1.0, 2.0, 3.0, 5.0)
 
@@ -36,7 +37,7 @@ def measure(
     metrics: Mapping[str, Metric] | None = None,
 ) -> tuple[list[Row], bool]:
     """The rows of the dial values, none without views, and whether Ctrl-C ended the measurement early."""
-    stop = GracefulStop()
+    stop = GracefulStop(aborts=launched().size == 1)  # launchers repeat signals
     if not views:
         return [], False
     with console.meter(label) as meter, stop.listening():

@@ -47,8 +47,8 @@ def adapt(
     ``AdaptConfig.paper`` gives CLoD-GS's own objective instead (section 3.3): one s a step and
     ``w_s (L_render + reg_weight L_reg)`` with ``L_reg = (s - 1)^2 relu(eta - s^-exponent)^2``, eta the share kept.
 
-    Training ends early, and returns the result so far with ``Adapted.interrupted``, in these cases. Except after a
-    Ctrl-C, ``progress`` is called once more, with ``Progress.error``.
+    Training ends early, and returns the result so far with ``Adapted.interrupted``, in these cases. After the
+    last one ``progress`` is called once more, with ``Progress.error``.
 
     - ``progress`` returns False. In a group of processes all of them end after the same step.
     - Ctrl-C, or another signal whose handler is Python's default one. The step under way is completed first, so the
@@ -134,7 +134,7 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
                     share, going = group.agree(share, going)
                 if share >= 1 or not going:
                     break
-                trainer.step(share)
+                _step(trainer, share, progress)
                 trainer.seconds = time.perf_counter() - began
                 interrupt.begin()  # from here on there is a result
                 going = _tell(trainer, progress) and not interrupt.received
@@ -147,10 +147,6 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
                 raise ClodError(f"{error}, so nothing can be learned; {more}") from error
             going, failed = False, str(error)
             _tell(trainer, progress, failed)
-        except Exception as error:
-            if trainer.done > 0:
-                _tell(trainer, progress, str(error) or type(error).__name__)
-            raise
         trainer.seconds = time.perf_counter() - began
         waiting, exchanging = (after - then for after, then in zip(_waits(group), before, strict=True))
         adapted = Adapted(
@@ -158,6 +154,18 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
             exchanging, failed, int(trainer.held.sum()),
         )  # fmt: skip
     return replace(adapted, interrupted=adapted.interrupted or interrupt.received, signalled=interrupt.received)
+
+
+def _step(trainer: Trainer, share: float, progress: Listener | None) -> None:
+    """One step; an error of it that nothing handles is told to the listener first, so that it can save the state."""
+    try:
+        trainer.step(share)
+    except (ProcessLost, LossNotFinite):
+        raise
+    except Exception as error:
+        if trainer.done > 0:
+            _tell(trainer, progress, str(error) or type(error).__name__)
+        raise
 
 
 def _progress(trainer: Trainer, seconds: float, error: str | None = None) -> Progress:
