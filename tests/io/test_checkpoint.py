@@ -79,61 +79,44 @@ def files(draw: st.DrawFn) -> tuple[np.ndarray, str, int]:
 
 
 @settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(files(), st.booleans())
-def test_any_layout_round_trips(tmp_path: Path, file: tuple[np.ndarray, str, int], twice: bool) -> None:
+@given(files(), st.integers(0, 1000))
+def test_any_layout_round_trips(tmp_path: Path, file: tuple[np.ndarray, str, int], seed: int) -> None:
+    """Every column is read and written bit for bit, but for the values that change; what training gives is saved."""
     vertex, kind, degree = file
-    source = write(tmp_path / "in.ply", vertex, kind, ("made by hand",))
+    source, out = write(tmp_path / "in.ply", vertex, kind, ("made by hand",)), tmp_path / "out.ply"
     before = source.read_bytes()
     base = load(source)
     g = base.gaussians
     assert g.sh_degree == degree and g.sigma_d is None and g.means.dtype == torch.float32 and base.notes == ()
     f32 = {name: vertex[name].astype(np.float32) for name in vertex.dtype.names}
-    np.testing.assert_array_equal(g.means[:, 1], f32["y"])
-    np.testing.assert_array_equal(g.quats[:, 0], f32["rot_0"])
-    np.testing.assert_array_equal(g.log_scales[:, 2], f32["scale_2"])
-    np.testing.assert_array_equal(g.opacity_logits, f32["opacity"])
-    np.testing.assert_array_equal(g.sh0[:, 0, 2], f32["f_dc_2"])
+    columns = {"y": g.means[:, 1], "rot_0": g.quats[:, 0], "scale_2": g.log_scales[:, 2], "f_dc_2": g.sh0[:, 0, 2]}
     bands = RESTS[degree] // 3
-    for k in range(bands):
-        for c in range(3):
-            np.testing.assert_array_equal(g.shN[:, k, c], f32[f"f_rest_{c * bands + k}"])
+    columns |= {f"f_rest_{c * bands + k}": g.shN[:, k, c] for k in range(bands) for c in range(3)}
+    for name, values in (columns | {"opacity": g.opacity_logits}).items():
+        np.testing.assert_array_equal(values, f32[name])
 
+    generator, changes = torch.Generator().manual_seed(seed), {}
+    for name, old in g.tensors().items():
+        touched = torch.rand(old.shape, generator=generator) < 0.3 * (seed % 2)
+        changes[name] = torch.where(touched, torch.randn(old.shape, generator=generator), old)
     sigma_d = torch.linspace(0.1, 3, len(g))
-    out = tmp_path / "out.ply"
-    save(out, g.replace(sigma_d=sigma_d, attenuation=CONFIG), base)
-    lines, rows = read_back(out)
+    tuned = g.replace(**changes, sigma_d=sigma_d, attenuation=CONFIG)
+    save(out, tuned.replace(means=changes["means"].requires_grad_(), sigma_d=sigma_d.double().requires_grad_()), base)
+    _, rows = read_back(out)
     constants = ("clod_eps", "clod_quantile", "sigma_d")  # of CONFIG, what is not the default, but for max_sv
     assert rows.dtype.names == (*vertex.dtype.names, *constants) and rows.dtype["sigma_d"] == "<f4"
     for name in vertex.dtype.names:
-        assert rows[name].tobytes() == vertex[name].astype(rows.dtype[name]).tobytes(), name
         assert rows.dtype[name] == vertex.dtype[name]
+        unchanged = rows[name].astype(np.float32) == f32[name] if seed % 2 else slice(None)
+        assert rows[name][unchanged].tobytes() == vertex[name].astype(rows.dtype[name])[unchanged].tobytes(), name
     assert source.read_bytes() == before
     again = load(out)
-    assert same(again.gaussians, g.replace(sigma_d=sigma_d, attenuation=CONFIG))
-    assert again.gaussians.attenuation == CONFIG and again.notes == ()
-    if twice:
-        save(tmp_path / "twice.ply", again.gaussians, again)
-        assert (tmp_path / "twice.ply").read_bytes() == out.read_bytes()
-
-
-@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(files(), st.integers(0, 1000))
-def test_only_changed_values_are_written(tmp_path: Path, file: tuple[np.ndarray, str, int], seed: int) -> None:
-    vertex, kind, _ = file
-    base = load(write(tmp_path / "in.ply", vertex, kind))
-    generator = torch.Generator().manual_seed(seed)
-    changes = {}
-    for name, old in base.gaussians.tensors().items():
-        touched = torch.rand(old.shape, generator=generator) < 0.3
-        changes[name] = torch.where(touched, torch.randn(old.shape, generator=generator), old)
-    tuned = base.gaussians.replace(**changes)
-    save(tmp_path / "out.ply", tuned, base)
-    _, rows = read_back(tmp_path / "out.ply")
-    assert rows.dtype.names == vertex.dtype.names
-    assert same(load(tmp_path / "out.ply").gaussians, tuned)
-    for name in vertex.dtype.names:
-        unchanged = rows[name].astype(np.float32) == vertex[name].astype(np.float32)
-        assert (rows[name] == vertex[name])[unchanged].all()
+    assert same(again.gaussians, tuned) and again.gaussians.attenuation == CONFIG and again.notes == ()
+    save(tmp_path / "twice.ply", again.gaussians, again)
+    assert (tmp_path / "twice.ply").read_bytes() == out.read_bytes()
+    if kind == "ascii":
+        source.write_bytes(before.replace(b"\n", b"\r\n"))
+        assert same(load(source).gaussians, g)
 
 
 def test_extended_header(tmp_path: Path) -> None:
@@ -154,22 +137,20 @@ def test_extended_header(tmp_path: Path) -> None:
     assert sum(name == "sigma_d" for name in rows.dtype.names) == 1
 
 
-@settings(deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(st.floats(-20, 20, width=32), min_size=1, max_size=12), st.integers(0, 99))
-def test_mask_gaussian_layout(tmp_path: Path, differences: list[float], seed: int) -> None:
+def test_mask_gaussian_layout(tmp_path: Path) -> None:
     names = needed(3)
     at = names.index("opacity") + 1
-    vertex = make(len(differences) + 1, [*names[:at], "masks_0", "masks_1", *names[at:]], seed)
-    vertex["masks_0"] = [*differences, 0.25]
-    vertex["masks_1"] = [0.0] * len(differences) + [0.25]  # probability exactly 0.5 stays
-    checkpoint = load(write(tmp_path / "in.ply", vertex))
-    expected = vertex["masks_0"] >= vertex["masks_1"]
-    np.testing.assert_array_equal(checkpoint.gaussians.means[:, 0], vertex["x"][expected])
-    assert checkpoint.vertex.tobytes() == vertex[expected].tobytes()
-    gone = int((~expected).sum())
-    assert (f"{gone} of {len(vertex)}" in checkpoint.notes[0]) if gone else checkpoint.notes == ()
-    save(tmp_path / "out.ply", checkpoint.gaussians, checkpoint)
-    assert load(tmp_path / "out.ply").notes == ()
+    for differences in ([-0.5, 2.0, 0.0, -20.0], [1.0]):
+        vertex = make(len(differences) + 1, [*names[:at], "masks_0", "masks_1", *names[at:]])
+        vertex["masks_0"] = [*differences, 0.25]
+        vertex["masks_1"] = [0.0] * len(differences) + [0.25]  # probability exactly 0.5 stays
+        checkpoint = load(write(tmp_path / "in.ply", vertex))
+        expected = vertex["masks_0"] >= vertex["masks_1"]
+        np.testing.assert_array_equal(checkpoint.gaussians.means[:, 0], vertex["x"][expected])
+        assert checkpoint.vertex.tobytes() == vertex[expected].tobytes()
+        assert ("2 of 5" in checkpoint.notes[0]) if len(vertex) == 5 else checkpoint.notes == ()
+        save(tmp_path / "out.ply", checkpoint.gaussians, checkpoint)
+        assert load(tmp_path / "out.ply").notes == ()
 
 
 def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
@@ -254,19 +235,9 @@ def test_refused_elements(tmp_path: Path) -> None:
             vertex[f"rot_{i}"] = fill
         with pytest.raises(ClodError, match="no usable Gaussian.*3 of 3"):
             load(write(path, vertex))
-
-
-@pytest.mark.parametrize("kind", ["<", ">", "ascii"])
-def test_no_rows(tmp_path: Path, kind: str) -> None:
-    with pytest.raises(ClodError, match="no usable Gaussian|damaged"):
-        load(write(tmp_path / "in.ply", make(0, needed(0)), kind))
-
-
-def test_line_ends_of_other_systems(tmp_path: Path) -> None:
-    text = write(tmp_path / "in.ply", make(2, needed(0)), "ascii").read_bytes()
-    expected = load(tmp_path / "in.ply").gaussians
-    (tmp_path / "crlf.ply").write_bytes(text.replace(b"\n", b"\r\n"))
-    assert same(load(tmp_path / "crlf.ply").gaussians, expected)
+    for kind in ("<", "ascii"):
+        with pytest.raises(ClodError, match="no usable Gaussian|damaged"):
+            load(write(path, make(0, needed(0)), kind))
 
 
 def test_refused_saves(tmp_path: Path) -> None:
@@ -298,14 +269,6 @@ def test_a_file_that_goes_away_is_named(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(checkpoint_file, "usable_rows", lambda *args: (path.unlink(), usable(*args))[1])
     with pytest.raises(ClodError, match="in.safetensors: cannot be read"):
         load(path)
-
-
-def test_saves_what_training_hands_over(tmp_path: Path) -> None:
-    base = load(write(tmp_path / "in.ply", make(3, needed(0))))
-    g = base.gaussians.replace(means=(base.gaussians.means + 1).requires_grad_())
-    sigma_d = torch.ones(3, dtype=torch.float64).requires_grad_()
-    save(tmp_path / "out.ply", g.replace(sigma_d=sigma_d, attenuation=CONFIG), base)
-    assert torch.equal(load(tmp_path / "out.ply").gaussians.means, g.means.detach())
 
 
 @pytest.mark.parametrize(

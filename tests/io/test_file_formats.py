@@ -218,19 +218,6 @@ def test_an_adapter_is_no_model(tmp_path: Path) -> None:
         read_model(tmp_path / "a.ply")
 
 
-def test_text_of_others_is_made_printable_ascii(tmp_path: Path) -> None:
-    write(tmp_path / "a.safetensors", model(0), ("caf\u00e9", "clod_adapter tau 0.5"))
-    found = load(tmp_path / "a.safetensors")
-    assert found.comments == ("caf?",) and found.gaussians.attenuation == ATTENUATION
-
-
-def test_opaque_gaussians_are_finite_in_a_ply(tmp_path: Path) -> None:
-    (note,) = write(tmp_path / "a.ply", model())
-    assert note == "1 opacities of +inf are written as 20, which is 1 too"
-    again = load(tmp_path / "a.ply").gaussians
-    assert torch.equal(again.opacities, model().opacities) and again.opacity_logits.isfinite().all()
-
-
 def test_unusable_rows_of_a_model_are_dropped(tmp_path: Path) -> None:
     """As those of a PLY are; an infinite opacity stays, also where the output is a PLY."""
     write(tmp_path / "a.pt", model(1), calibration=CALIBRATION)
@@ -275,3 +262,13 @@ def test_truncation_is_refused(tmp_path: Path, kind: str) -> None:
         path.write_bytes(whole[:size])
         with pytest.raises(ClodError, match=f"cut{kind}: "):
             load_adapter(path) if "adapter" in kind else load(path)
+
+
+def test_other_text_and_opaque_gaussians(tmp_path: Path) -> None:
+    write(tmp_path / "a.safetensors", model(0), ("caf\u00e9", "clod_adapter tau 0.5"))
+    found = load(tmp_path / "a.safetensors")
+    assert found.comments == ("caf?",) and found.gaussians.attenuation == ATTENUATION
+    (note,) = write(tmp_path / "a.ply", model())
+    assert note == "1 opacities of +inf are written as 20, which is 1 too"
+    again = load(tmp_path / "a.ply").gaussians
+    assert torch.equal(again.opacities, model().opacities) and again.opacity_logits.isfinite().all()
