@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import struct
 import subprocess
@@ -16,14 +17,11 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import strategies as st
-from safetensors import safe_open
-from safetensors.torch import save_file
+from plyfile import PlyData, PlyElement
 
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import load
-from clod_adapter.io.ply.header import stored_settings
 from scenes import gaussians
 
 ATTENUATION = AttenuationConfig(tau=0.02, cut="soft", reference_distance=3.217, max_sv=7.0)
@@ -93,69 +91,47 @@ def rows_by_place(means: np.ndarray, others: np.ndarray) -> np.ndarray:
     return rows
 
 
-def change_document(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
-    """Changes the settings that a file of any format or an adapter stores, in place; of a PLY its comments."""
-    suffix = path.suffix
-    if suffix == ".ply":
-        data = path.read_bytes()
-        head = [line for line in data.split(b"end_header\n")[0].decode().splitlines() if "clod_adapter" not in line]
-        values = stored_settings(load(path).comments)
-        if "screen_filter" in values:
-            words = values["screen_filter"].split()
-            values["screen_filter"] = dict(zip(("variance", "compensate"), words, strict=True))
-        change(values)
-        at = next(k for k, line in enumerate(head) if line.startswith("element vertex")) + 1
-        head[at:at] = [f"comment clod_adapter {line}" for line in _comments(values)]
-        path.write_bytes("\n".join([*head, "end_header\n"]).encode() + data.split(b"end_header\n", 1)[1])
-    elif suffix == ".pt":
+def change_setting(path: Path, name: str, old: str, new: str) -> Path:
+    """Changes a setting in a file of any format that stores it, or in an adapter: text of the same length."""
+    assert len(old) == len(new)
+    pattern = rf'({name}\\?"?:? ?){old}(?![.\d])'.encode()  # of JSON, of JSON in JSON, and of the comments of a PLY
+
+    def changed(whole: bytes) -> bytes:
+        found, count = re.subn(pattern, rb"\g<1>" + new.encode(), whole)
+        assert count, f"{name} is not in {path}"
+        return found
+
+    if path.suffix == ".pt":
         checkpoint = torch.load(path, weights_only=True)
-        checkpoint["clod_adapter"] = _changed(checkpoint["clod_adapter"], change)
+        checkpoint["clod_adapter"] = changed(checkpoint["clod_adapter"].encode()).decode()
         torch.save(checkpoint, path)
-    elif suffix == ".safetensors":
-        with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            text = file.metadata()["clod_adapter"]
-        save_file(tensors, path, {"clod_adapter": _changed(text, change)})
-    elif suffix == ".glb":
-        change_glb(path, lambda gltf: change(gltf["asset"]["extras"]["clod_adapter"]))
-    elif suffix == ".spz":
-        data = zlib.decompress(path.read_bytes(), wbits=31)
-        at = data.index(struct.pack("<I", 0x434C0001)) + 12
-        size, length = struct.unpack_from("<II", data, at - 8)
-        text, rest = data[at : at + length].decode(), data[at + length : at - 4 + size]
-        text = _changed(text, change)
-        record = struct.pack("<III", 0x434C0001, 4 + len(text) + len(rest), len(text)) + text.encode() + rest
+    elif path.suffix == ".spz":
         gzip = zlib.compressobj(wbits=31)
-        path.write_bytes(gzip.compress(data[: at - 12] + record) + gzip.flush())
+        path.write_bytes(gzip.compress(changed(zlib.decompress(path.read_bytes(), wbits=31))) + gzip.flush())
+    else:
+        path.write_bytes(changed(path.read_bytes()))
     return path
 
 
-def _changed(text: str, change: Callable[[dict[str, Any]], object]) -> str:
-    values = json.loads(text)
-    change(values)
-    return json.dumps(values)
-
-
-def _comments(values: dict[str, Any]) -> list[str]:
-    """Settings, also damaged ones, as the comments of a PLY."""
-    lines = [f"version {values['package_version']}"]
-    lines += [f"{name} {value}" for name, value in values.get("attenuation", {}).items()]
-    if "screen_filter" in values:
-        stored = values["screen_filter"]
-        lines.append(f"screen_filter {' '.join(map(str, stored.values())) if isinstance(stored, dict) else stored}")
-    if "calibration" in values:
-        table = values["calibration"]
-        extent = [table.get(name) for name in ("total", "views", "width", "height", "against")]
-        lines += [f"calibrated_on {table['machine']}", f"calibrated_with {' '.join(map(str, extent))}"]
-        lines += [f"calibrated {' '.join(map(str, row.values()))}" for row in table["rows"]]
-    return lines
+def without_comments(path: Path, **columns: float) -> Path:
+    """The file as another tool writes it: without its comments, some columns added or changed in every row."""
+    old = PlyData.read(str(path))["vertex"].data
+    added = [(name, "f4") for name in columns if name not in old.dtype.names]
+    rows = np.zeros(len(old), old.dtype.descr + added)
+    for name in rows.dtype.names or ():
+        rows[name] = columns[name] if name in columns else old[name]
+    found = path.with_name("rewritten.ply")
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(found))
+    return found
 
 
 def change_glb(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     """Changes the JSON of a glTF binary file, in place."""
     data = path.read_bytes()
     size = struct.unpack_from("<I", data, 12)[0]
-    text = _changed(data[20 : 20 + size].decode(), change).encode()
+    gltf = json.loads(data[20 : 20 + size])
+    change(gltf)
+    text = json.dumps(gltf).encode()
     text += b" " * (-len(text) % 4)
     rest = data[20 + size :]
     head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)

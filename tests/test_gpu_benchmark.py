@@ -22,7 +22,10 @@ def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def test_plush_and_city_small(script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     out = tmp_path / "gpu.jsonl"
-    words = f"gpu.py --device cpu --small --only plush city --count 1000 --results {out}".split(" ")
+    words = [
+        *["gpu.py", "--device", "cpu", "--small", "--only", "plush", "city", "--count", "1000", "--results"],
+        str(out),
+    ]
     monkeypatch.setattr(sys, "argv", words)
     script.main()
     rows = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import zipfile
 import zlib
 from importlib import import_module
 from pathlib import Path
@@ -13,12 +14,13 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from plyfile import PlyData
 
 from clod_adapter.adapter import detach, extract
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.inspection.report import inspect
-from clod_adapter.io.adapter_file import save_adapter
+from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import (
     FORMATS,
@@ -30,16 +32,36 @@ from clod_adapter.io.file_formats import (
     read_model,
     write,
 )
+from clod_adapter.io.formats.safetensors import load_safetensors
 from formats import ABOUT, ATTENUATION, CALIBRATION, ORIGIN, damaged, model, rows_by_place, turned
+from packing import write_packed
+from scenes import gaussians
 
 pytest.importorskip("pygltflib", reason="pygltflib is not installed")
 DIAL = tuple(suffix for suffix in WRITABLE if FORMATS[suffix].carries_sigma)
-BEGINNINGS = {".glb": b"glTF", ".spz": b"\x1f\x8b", ".pt": b"PK\x03\x04", ".ply": b"ply\n"}
+KINDS = (*WRITABLE, ".ascii.ply", ".big.ply", ".compressed.ply", ".adapter.safetensors")
 
 
 def of(suffix: str, degree: int = 1, count: int = 40) -> Gaussians:
     """A model that the format carries."""
     return model(degree, count) if suffix in DIAL else detach(model(degree, count))
+
+
+def any_file(folder: Path, kind: str) -> Path:
+    """A small file of a kind that is read."""
+    path, g = folder / f"a{kind}", of(kind, 0, 5) if kind in WRITABLE else model(0, 5)
+    if kind == ".compressed.ply":
+        return write_packed(path, gaussians(5, 1, 0))
+    if kind == ".adapter.safetensors":
+        save_adapter(path, extract(detach(g), g, fingerprint="ab", config={"steps": 3}))
+        return path
+    write(path, g, calibration=CALIBRATION if g.sigma_d is not None else None)
+    if kind in (".ascii.ply", ".big.ply"):
+        ply = PlyData.read(str(path), mmap=False)
+        PlyData(ply.elements, text=kind == ".ascii.ply", byte_order="=" if kind == ".ascii.ply" else ">").write(
+            str(path)
+        )
+    return path
 
 
 def same(suffix: str, g: Gaussians, again: Gaussians) -> None:
@@ -159,74 +181,41 @@ def test_colours_of_any_size(tmp_path: Path, suffix: str) -> None:
     assert len(again) == 40 and torch.equal(again.sh0.sign().unique(), torch.tensor([-1.0, 1.0]))
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_what_is_no_such_file_is_named(tmp_path: Path, suffix: str) -> None:
-    (tmp_path / f"folder{suffix}").mkdir()
-    os.mkfifo(tmp_path / f"pipe{suffix}")
-    (tmp_path / f"empty{suffix}").write_bytes(b"")
-    (tmp_path / f"pointer{suffix}").write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
-    (tmp_path / f"other{suffix}").write_bytes(b"what this is nobody knows")
-    expected = {
-        "missing": "cannot be read .No such file", "folder": "cannot be read", "pipe": "not a regular file",
-        "empty": "is empty", "pointer": "is a Git LFS pointer", "other": "",
-    }  # fmt: skip
-    for name, message in expected.items():
-        for read in (check_readable, load):
-            if name == "other" and read is check_readable and suffix in (".sog", ".ksplat"):
-                continue  # splat-transform tells
-            with pytest.raises(ClodError, match=f"{name}{suffix}: .*{message}"):
-                read(tmp_path / f"{name}{suffix}")
-
-
-@pytest.mark.parametrize("suffix", WRITABLE)
+@pytest.mark.parametrize("kind", KINDS)
 @settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data(), inside=st.booleans())
-def test_damage_is_never_another_exception(tmp_path: Path, suffix: str, data: st.DataObject, inside: bool) -> None:
-    """Of the file, or, of an SPZ, of its contents before compression."""
-    write(tmp_path / f"a{suffix}", of(suffix, 0, 5), calibration=CALIBRATION if suffix in DIAL else None)
-    whole, path = (tmp_path / f"a{suffix}").read_bytes(), tmp_path / f"damaged{suffix}"
-    if inside and suffix == ".spz":
+def test_damage_is_never_another_exception(tmp_path: Path, kind: str, data: st.DataObject, inside: bool) -> None:
+    """Of the file, or ``inside`` of the contents of an SPZ before compression, or of the pickle in a .pt."""
+    source = tmp_path / f"a{kind}"
+    whole = (source if source.exists() else any_file(tmp_path, kind)).read_bytes()
+    path = tmp_path / f"damaged{kind}"
+    if inside and kind == ".spz":
         gzip = zlib.compressobj(wbits=31)
         path.write_bytes(gzip.compress(damaged(zlib.decompress(whole, 31), data)) + gzip.flush())
+    elif inside and kind == ".pt":
+        with zipfile.ZipFile(source) as old, zipfile.ZipFile(path, "w") as new:
+            for name in old.namelist():
+                entry = old.read(name)
+                new.writestr(name, damaged(entry, data) if name.endswith("data.pkl") else entry)
     else:
         path.write_bytes(damaged(whole, data))
     try:
-        assert isinstance(load(path, activated="none").gaussians, Gaussians)
+        load_adapter(path) if "adapter" in kind else load(path, activated="none")
     except ClodError as error:
         assert str(error).isprintable() and str(path) in str(error)
 
 
-@pytest.mark.parametrize("suffix", WRITABLE)
-def test_truncation_is_refused(tmp_path: Path, suffix: str) -> None:
-    write(tmp_path / f"a{suffix}", of(suffix, 0, 5))
-    whole, path = (tmp_path / f"a{suffix}").read_bytes(), tmp_path / f"cut{suffix}"
-    for size in (1, len(whole) // 2, len(whole) - 1):
-        path.write_bytes(whole[:size])
-        with pytest.raises(ClodError, match=f"cut{suffix}: "):
-            load(path)
-
-
 def test_an_adapter_is_no_model(tmp_path: Path) -> None:
-    g = model(0)
-    save_adapter(tmp_path / "a.safetensors", extract(detach(g), g, fingerprint="ab", config={}))
+    path = any_file(tmp_path, ".adapter.safetensors")
     for read in (check_readable, load):
-        with pytest.raises(ClodError, match="a.safetensors: is an adapter, not a model; clod-adapt apply BASE.ply"):
-            read(tmp_path / "a.safetensors")
+        with pytest.raises(ClodError, match=f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply"):
+            read(path)
+    with pytest.raises(ClodError, match="is not a model but 'clod-adapter'; clod-adapt apply makes"):
+        load_safetensors(path)
+    with pytest.raises(ClodError, match="is a whole model, not an adapter"):
+        load_adapter(any_file(tmp_path, ".safetensors"))
     with pytest.raises(ClodError, match="a.ply: is read by clod_adapter.load"):
         read_model(tmp_path / "a.ply")
-
-
-def test_text_of_others_is_made_printable_ascii(tmp_path: Path) -> None:
-    write(tmp_path / "a.safetensors", model(0), ("caf\u00e9", "clod_adapter tau 0.5"))
-    found = load(tmp_path / "a.safetensors")
-    assert found.comments == ("caf?",) and found.gaussians.attenuation == ATTENUATION
-
-
-def test_opaque_gaussians_are_finite_in_a_ply(tmp_path: Path) -> None:
-    (note,) = write(tmp_path / "a.ply", model())
-    assert note == "1 opacities of +inf are written as 20, which is 1 too"
-    again = load(tmp_path / "a.ply").gaussians
-    assert torch.equal(again.opacities, model().opacities) and again.opacity_logits.isfinite().all()
 
 
 def test_unusable_rows_of_a_model_are_dropped(tmp_path: Path) -> None:
@@ -243,3 +232,43 @@ def test_unusable_rows_of_a_model_are_dropped(tmp_path: Path) -> None:
         assert any(part in note for note in found.notes)
     save(tmp_path / "b.ply", found.gaussians, found)
     assert torch.isposinf(load(tmp_path / "b.ply").gaussians.opacity_logits[0])
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_other_files_are_refused_by_name(tmp_path: Path, suffix: str) -> None:
+    (tmp_path / f"folder{suffix}").mkdir()
+    os.mkfifo(tmp_path / f"pipe{suffix}")
+    (tmp_path / f"empty{suffix}").write_bytes(b"")
+    (tmp_path / f"pointer{suffix}").write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
+    (tmp_path / f"other{suffix}").write_bytes(b"what this is nobody knows")
+    expected = {
+        "missing": "cannot be read .No such file", "folder": "cannot be read", "pipe": "not a regular file",
+        "empty": "is empty", "pointer": "is a Git LFS pointer", "other": "",
+    }  # fmt: skip
+    for name, message in expected.items():
+        for read in (check_readable, load, load_adapter)[: 3 if suffix == ".safetensors" else 2]:
+            if name == "other" and read is check_readable and suffix in (".sog", ".ksplat"):
+                continue  # splat-transform tells
+            with pytest.raises(ClodError, match=f"{name}{suffix}: .*{message}"):
+                read(tmp_path / f"{name}{suffix}")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_truncation_is_refused(tmp_path: Path, kind: str) -> None:
+    whole, path = any_file(tmp_path, kind).read_bytes(), tmp_path / f"cut{kind}"
+    # An ascii file that ends within its last number is a whole file with another number.
+    least = len(whole) - whole.rstrip().rfind(b" ") if kind == ".ascii.ply" else 1
+    for size in (1, len(whole) // 2, len(whole) - least):
+        path.write_bytes(whole[:size])
+        with pytest.raises(ClodError, match=f"cut{kind}: "):
+            load_adapter(path) if "adapter" in kind else load(path)
+
+
+def test_other_text_and_opaque_gaussians(tmp_path: Path) -> None:
+    write(tmp_path / "a.safetensors", model(0), ("caf\u00e9", "clod_adapter tau 0.5"))
+    found = load(tmp_path / "a.safetensors")
+    assert found.comments == ("caf?",) and found.gaussians.attenuation == ATTENUATION
+    (note,) = write(tmp_path / "a.ply", model())
+    assert note == "1 opacities of +inf are written as 20, which is 1 too"
+    again = load(tmp_path / "a.ply").gaussians
+    assert torch.equal(again.opacities, model().opacities) and again.opacity_logits.isfinite().all()

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,30 +13,6 @@ from clod_adapter.io.atomic import remove_leftovers
 from clod_adapter.io.lock import output_lock
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="locks are those of POSIX")
-
-
-def test_one_at_a_time(tmp_path: Path) -> None:
-    final = tmp_path / "out.ply"
-    with output_lock(final), output_lock(tmp_path / "other.ply"):
-        remove_leftovers(final)  # which a second run would do, had it not been refused
-        said = rf"out.ply: another run \(process {os.getpid()}\) is writing it; wait for that"
-        with pytest.raises(ClodError, match=said), output_lock(final):
-            raise AssertionError("the body must not run")
-        with pytest.raises(ClodError, match="^all: another run"), output_lock(final, of=Path("all"), shared=True):
-            raise AssertionError("the body must not run")
-    assert os.listdir(tmp_path) == []
-    with output_lock(final):
-        pass
-
-
-def test_jobs_share_it(tmp_path: Path) -> None:
-    final = tmp_path / "out.ply"
-    with output_lock(final, shared=True):
-        with output_lock(final, shared=True):
-            pass
-        with pytest.raises(ClodError, match="another run"), output_lock(final):
-            raise AssertionError("the body must not run")
-    assert os.listdir(tmp_path) == []
 
 
 def test_a_killed_holder_holds_nothing(tmp_path: Path) -> None:
@@ -82,3 +59,23 @@ def test_the_last_holder_may_remove_the_file_meanwhile(tmp_path: Path, monkeypat
     ):
         raise AssertionError("the body must not run")
     assert removed and os.listdir(tmp_path) == []
+
+
+def refused(path: Path, **how: Any) -> None:
+    said = rf"^{how.get('of', path)}: another run \(process {os.getpid()}\) is writing it; wait for that"
+    with pytest.raises(ClodError, match=said), output_lock(path, **how):
+        raise AssertionError("the body must not run")
+
+
+def test_one_run_holds_it_or_jobs_share_it(tmp_path: Path) -> None:
+    final = tmp_path / "out.ply"
+    with output_lock(final), output_lock(tmp_path / "other.ply"):
+        remove_leftovers(final)  # which a second run would do, had it not been refused
+        refused(final)
+        refused(final, of=Path("all"), shared=True)
+    assert os.listdir(tmp_path) == []
+    with output_lock(final, shared=True):
+        with output_lock(final, shared=True):
+            pass
+        refused(final)
+    assert os.listdir(tmp_path) == []

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import re
 import zlib
-from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
 import pytest
-from plyfile import PlyData, PlyElement
 
 from clod_adapter.adapter import detach
 from clod_adapter.config import CLASSIC, FILTERS, ScreenFilter
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write
-from clod_adapter.io.ply.constants import constant_settings, filter_constants
 from clod_adapter.io.screen_filter import implied_filter, is_antialiased, tagged
-from formats import model
+from formats import model, without_comments
 
 OTHER = ScreenFilter(variance=0.123456789, compensate=True)
 SUFFIXES = [".ply", ".glb", ".spz", ".safetensors", ".pt"]
@@ -32,18 +26,6 @@ def test_the_comments_of_other_programs_stay_true() -> None:
     for said in ("SplatRenderMode: mip", "antialiased 1"):
         assert tagged(["made by hand", said], FILTERS["on"]) == ["made by hand", said]
         assert tagged(["made by hand", said], CLASSIC) == ["made by hand"]
-
-
-def test_antialiased() -> None:
-    assert is_antialiased(["SplatRenderMode: mip"]) and is_antialiased(["x", "antialiased 1"])
-    assert not is_antialiased(["SplatRenderMode: default", "antialiased 0", "not antialiased 1"])
-
-
-def test_what_other_programs_state() -> None:
-    assert implied_filter((), ("x", "y")) == implied_filter(("antialiased 0",), ()) == CLASSIC
-    assert implied_filter((), ("x", "filter_3D")) == FILTERS["mip"]
-    assert implied_filter(("Exported from Brush", "SplatRenderMode: mip"), ()) == FILTERS["mip"]  # Brush's has 0.1 px^2
-    assert implied_filter(("SplatRenderMode: mip",), ()) == implied_filter(("antialiased 1",), ()) == FILTERS["on"]
 
 
 def test_the_flag_of_spz(tmp_path: Path) -> None:
@@ -66,24 +48,6 @@ def test_the_flag_of_spz(tmp_path: Path) -> None:
     assert is_antialiased(found.comments)
 
 
-def with_column(path: Path, g: Gaussians, column: str, value: float) -> None:
-    write(path, g)
-    old = PlyData.read(str(path))["vertex"].data
-    rows = np.zeros(len(old), [*old.dtype.descr, (column, "f4")])
-    for name in old.dtype.names or ():
-        rows[name] = old[name]
-    rows[column] = value
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
-
-
-def test_mip_splatting_is_drawn_with_its_filter(tmp_path: Path) -> None:
-    with_column(tmp_path / "a.ply", detach(model(1)), "filter_3D", 0.01)
-    found = load(tmp_path / "a.ply")
-    assert found.gaussians.screen_filter == FILTERS["mip"] and not found.filter_known
-    save(tmp_path / "b.ply", found.gaussians, found)  # without the column, which is fused
-    assert load(tmp_path / "b.ply").gaussians.screen_filter == FILTERS["mip"]
-
-
 def test_a_dial_was_tuned_with_what_its_file_says(tmp_path: Path) -> None:
     """Also where another program's comment, that its base had, says otherwise."""
     write(tmp_path / "a.ply", model(1))
@@ -95,21 +59,29 @@ def test_a_dial_was_tuned_with_what_its_file_says(tmp_path: Path) -> None:
     assert not is_antialiased(load(tmp_path / "b.ply").comments)
 
 
+def test_what_other_programs_state() -> None:
+    assert not is_antialiased(["SplatRenderMode: default", "antialiased 0", "not antialiased 1"])
+    assert implied_filter((), ("x", "y")) == implied_filter(("antialiased 0",), ()) == CLASSIC
+    assert implied_filter(("Exported from Brush", "SplatRenderMode: mip"), ()) == FILTERS["mip"]  # Brush's has 0.1 px^2
+    assert implied_filter(("SplatRenderMode: mip",), ()) == implied_filter(("x", "antialiased 1"), ()) == FILTERS["on"]
+
+
 @pytest.mark.parametrize("screen_filter", [*FILTERS.values(), ScreenFilter(variance=0.123, compensate=True)], ids=str)
 def test_columns_keep_it_where_comments_are_dropped(tmp_path: Path, screen_filter: ScreenFilter) -> None:
     """Of a file with a dial; a plain one has the columns of Inria's layout and no others."""
     write(tmp_path / "a.ply", model(1).replace(screen_filter=screen_filter))
-    data = re.sub(rb"(?m)^comment .*\n", b"", (tmp_path / "a.ply").read_bytes())
-    (tmp_path / "a.ply").write_bytes(data)
-    found = load(tmp_path / "a.ply")
+    found = load(without_comments(tmp_path / "a.ply"))
     assert found.gaussians.screen_filter == screen_filter and found.filter_known and found.comments == ()
-    stored = constant_settings(filter_constants(screen_filter)).get("screen_filter")
-    assert stored == (asdict(screen_filter) if screen_filter != CLASSIC else None)
     write(tmp_path / "b.ply", detach(found.gaussians))
     assert not any(name.startswith("clod_") for name in load(tmp_path / "b.ply").vertex.dtype.names or ())
 
 
-def test_a_damaged_column_is_named(tmp_path: Path) -> None:
-    with_column(tmp_path / "a.ply", model(1), "clod_screen_variance", -1.0)
-    with pytest.raises(ClodError, match=r"a.ply: its settings are damaged \(variance is -1.0"):
-        load(tmp_path / "a.ply")
+def test_columns_of_other_programs_and_damaged_ones(tmp_path: Path) -> None:
+    write(tmp_path / "a.ply", detach(model(1)))
+    found = load(without_comments(tmp_path / "a.ply", filter_3D=0.01))  # of Mip-Splatting
+    assert found.gaussians.screen_filter == FILTERS["mip"] and not found.filter_known
+    save(tmp_path / "b.ply", found.gaussians, found)  # without the column, which is fused
+    assert load(tmp_path / "b.ply").gaussians.screen_filter == FILTERS["mip"]
+    write(tmp_path / "a.ply", model(1))
+    with pytest.raises(ClodError, match=r"rewritten.ply: its settings are damaged \(variance is -1.0"):
+        load(without_comments(tmp_path / "a.ply", clod_screen_variance=-1.0))

@@ -13,8 +13,16 @@ from clod_adapter.render import render
 from scenes import camera, gaussians
 
 
-@pytest.mark.parametrize(("degree", "axis"), [(0, "x"), (1, "z"), (2, "x"), (3, "z"), (4, "x"), (4, "z")])
-def test_a_turned_scene_seen_by_a_turned_camera_is_the_same_picture(degree: int, axis: str) -> None:
+def test_activations() -> None:
+    logits = np.array([-80, -3, 0, 3, 12, np.inf], np.float32)
+    np.testing.assert_allclose(logit(sigmoid(logits)), logits, rtol=1e-9)
+    assert sigmoid(np.float32([-np.inf]))[0] == 0
+    levels = logits_of_bytes(np.arange(256))
+    assert np.isfinite(levels).all() and np.array_equal(np.round(255 * sigmoid(levels)), np.arange(256))
+
+
+@pytest.mark.parametrize(("degree", "axis"), [(4, "x"), (4, "z")])
+def test_a_turned_scene_seen_by_a_turned_camera_gives_the_same_image(degree: int, axis: str) -> None:
     """Positions, rotations and every harmonic turn alike; a wrong sign in one shows."""
     g = gaussians(400, degree, 3, size=0.15)
     arrays = {name: tensor.numpy() for name, tensor in g.tensors().items()}
@@ -25,14 +33,6 @@ def test_a_turned_scene_seen_by_a_turned_camera_is_the_same_picture(degree: int,
     torch.testing.assert_close(same, render(g, view).image, atol=2e-5, rtol=0)
     back = half_turn(half_turn(arrays, axis), axis)
     assert all(np.array_equal(back[name], array) for name, array in arrays.items())
-
-
-def test_activations() -> None:
-    logits = np.array([-80, -3, 0, 3, 12, np.inf], np.float32)
-    np.testing.assert_allclose(logit(sigmoid(logits)), logits, rtol=1e-9)
-    assert sigmoid(np.float32([-np.inf]))[0] == 0
-    levels = logits_of_bytes(np.arange(256))
-    assert np.isfinite(levels).all() and np.array_equal(np.round(255 * sigmoid(levels)), np.arange(256))
 
 
 def test_rotations_of_any_length() -> None:

@@ -10,37 +10,21 @@ import pytest
 import torch
 
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import load
 from clod_adapter.io.file_formats import write
-from clod_adapter.io.formats.spz_reader import QUANTISED, load_spz
-from formats import ATTENUATION, covariances, model, splat_transform, turned
+from clod_adapter.io.formats.spz_reader import load_spz
+from formats import ATTENUATION, model, splat_transform, turned
 
 
-def close(g: Gaussians, again: Gaussians, harmonics: float = 2.01 / 128) -> None:
-    """To the rounding of the format."""
-    assert (again.means - g.means).abs().max() <= 2.0**-20
-    assert (again.opacities - g.opacities).abs().max() <= 0.501 / 255
-    assert (again.sh0 - g.sh0).abs().max() <= 0.51 / (0.15 * 255)
-    assert (again.log_scales - g.log_scales).abs().max() <= 0.5001 / 16
-    bands = again.shN.shape[1]
-    assert bands == min(g.shN.shape[1], 15)
-    error = (again.shN - g.shN[:, :bands].clamp(-1, 127 / 128)).abs()
-    assert not bands or error.max() <= harmonics
-
-
-@pytest.mark.parametrize("typical", [250.0, 40_000.0])
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize(("typical", "known"), [(250.0, True), (40_000.0, False)])
 def test_a_dial_of_large_units_fits(tmp_path: Path, typical: float, known: bool) -> None:
-    generator = torch.Generator().manual_seed(0)
     g = model(0)
-    assert g.sigma_d is not None
     sigma = typical * torch.logspace(-1, 1.5, len(g))
-    means = typical * torch.nn.functional.normalize(torch.randn(len(g), 3, generator=generator))
+    direction = torch.randn(len(g), 3, generator=torch.Generator().manual_seed(0))
     config = replace(ATTENUATION, reference_distance=typical if known else 0.0)
+    means = typical * torch.nn.functional.normalize(direction)
     write(tmp_path / "a.spz", g.replace(sigma_d=sigma, means=means, attenuation=config))
-    again, card, _ = load_spz(tmp_path / "a.spz")[:3]
-    assert card.attenuation == again.attenuation is not None and again.attenuation.scene_distance == 1
+    again, metadata, _ = load_spz(tmp_path / "a.spz")[:3]
+    assert metadata.attenuation == again.attenuation is not None and again.attenuation.scene_distance == 1
     assert again.attenuation.eps == config.eps and (not known or again.attenuation.reference_distance == typical)
     torch.testing.assert_close(again.sigma_d, sigma, rtol=2.0**-11, atol=0)
 
@@ -60,7 +44,7 @@ def test_the_header_and_the_record(tmp_path: Path) -> None:
     assert plain == data[: end + 12]
 
 
-@pytest.mark.parametrize(("axes", "signs"), [(6, [1, 1, 1]), (4, [1, -1, -1]), (7, [-1, -1, 1])])
+@pytest.mark.parametrize(("axes", "signs"), [(4, [1, -1, -1]), (7, [-1, -1, 1])])
 def test_other_axes_are_turned(tmp_path: Path, axes: int, signs: list[int]) -> None:
     write(tmp_path / "a.spz", model(1))
     data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
@@ -74,72 +58,20 @@ def test_other_axes_are_turned(tmp_path: Path, axes: int, signs: list[int]) -> N
         load_spz(tmp_path / "b.spz")
 
 
-def test_an_independent_reader(tmp_path: Path) -> None:
-    gsply = pytest.importorskip("gsply.spz", reason="gsply is not installed")
-    g = model(3)
-    write(tmp_path / "a.spz", g)
-    found, ours = gsply.read_spz(tmp_path / "a.spz"), load_spz(tmp_path / "a.spz").gaussians
-    np.testing.assert_allclose(found.means, ours.means, atol=1e-6)
-    np.testing.assert_allclose(found.scales, ours.log_scales, atol=1e-6)
-    np.testing.assert_allclose(found.sh0, ours.sh0[:, 0], atol=1e-5)
-    assert turned(torch.from_numpy(found.quats), ours.quats) < 1e-3
-    np.testing.assert_allclose(found.shN, ours.shN, atol=1e-6)
-    opacities = 1 / (1 + np.exp(-found.opacities.ravel().astype(np.float64)))
-    np.testing.assert_allclose(opacities, ours.opacities, atol=1.1e-3)
-
-
-def test_splat_transform_reads_it(tmp_path: Path) -> None:
-    g = model(3)
-    write(tmp_path / "a.spz", g)
-    splat_transform(tmp_path / "a.spz", tmp_path / "b.ply")
-    ours, theirs = load_spz(tmp_path / "a.spz").gaussians, load(tmp_path / "b.ply").gaussians
-    torch.testing.assert_close(theirs.means, ours.means, atol=1e-5, rtol=0)
-    torch.testing.assert_close(covariances(theirs), covariances(ours), atol=1e-6, rtol=1e-3)
-    torch.testing.assert_close(theirs.opacities, ours.opacities, atol=1.1e-3, rtol=0)
-    torch.testing.assert_close(theirs.sh0, ours.sh0, atol=1e-5, rtol=0)
-    torch.testing.assert_close(theirs.shN, ours.shN, atol=1e-5, rtol=0)
-
-
 def test_what_splat_transform_writes(tmp_path: Path) -> None:
     g = model(3).select(torch.arange(4, 40))  # without the rotations of odd length, on which it fails
     write(tmp_path / "a.ply", g)
     splat_transform("--spz-version", "3", tmp_path / "a.ply", tmp_path / "b.spz")
-    again, card, notes = load_spz(tmp_path / "b.spz")[:3]
-    assert again.sigma_d is None and (card.version, notes) == ("", (QUANTISED,))
+    again, metadata, (note,) = load_spz(tmp_path / "b.spz")[:3]
+    assert again.sigma_d is None and metadata.version == "" and note.startswith("quantised: positions in 24 bits")
     assert (again.means - g.means).abs().max() <= 2.0**-13
-    close(g.replace(means=again.means), again, harmonics=8.6 / 128)
+    assert (again.opacities - g.opacities).abs().max() <= 0.501 / 255
+    assert (again.sh0 - g.sh0).abs().max() <= 0.51 / (0.15 * 255)
+    assert (again.log_scales - g.log_scales).abs().max() <= 0.5001 / 16
+    assert (again.shN - g.shN.clamp(-1, 127 / 128)).abs().max() <= 8.6 / 128
     assert turned(again.quats, g.quats) < 5e-3
     splat_transform(tmp_path / "a.ply", tmp_path / "c.spz")  # version 4
-    means = load_spz(tmp_path / "c.spz").gaussians.means
-    assert means.shape == g.means.shape
-
-
-def test_positions_use_the_bits_they_have(tmp_path: Path) -> None:
-    g = model(0)
-    for factor, step in ((1e-3, 2.0**-20), (1.0, 2.0**-20), (1e3, 2.0**-10), (5e5, 1.0)):
-        scaled = g.replace(means=g.means * factor)
-        write(tmp_path / "a.spz", scaled)
-        assert (load_spz(tmp_path / "a.spz").gaussians.means - scaled.means).abs().max() <= step
-    with pytest.raises(ClodError, match="within 4,000,000 of 0"):
-        write(tmp_path / "b.spz", g.replace(means=g.means * 1e7))
-    assert not (tmp_path / "b.spz").exists()
-
-
-def test_a_few_far_ones_do_not_cost_the_rest_their_digits(tmp_path: Path) -> None:
-    """They are moved, and look the same from 0: direction, size and fading."""
-    g = model(0, 400)
-    assert g.sigma_d is not None
-    means, scales = g.means.clone(), g.log_scales.clone()
-    means[9], scales[9] = torch.tensor([3e5, -1e5, 2e3]), 9.0
-    notes = write(tmp_path / "a.spz", g.replace(means=means, log_scales=scales))
-    again = load_spz(tmp_path / "a.spz").gaussians
-    assert again.sigma_d is not None and "the 1 farthest are moved to 64 from 0" in notes[0]
-    others = torch.arange(400) != 9
-    assert (again.means - means)[others].abs().max() <= 2.0**-17
-    factor = 64 / 3e5
-    torch.testing.assert_close(again.means[9], means[9] * factor, atol=1e-4, rtol=1e-4)
-    torch.testing.assert_close(again.log_scales[9], scales[9] + np.log(factor), atol=0.04, rtol=0)
-    torch.testing.assert_close(again.sigma_d[9], g.sigma_d[9] * factor, atol=0, rtol=1e-3)
+    assert load_spz(tmp_path / "c.spz").gaussians.means.shape == g.means.shape
 
 
 def test_version_2(tmp_path: Path) -> None:
@@ -152,19 +84,38 @@ def test_version_2(tmp_path: Path) -> None:
 
 
 def test_bombs_and_lies(tmp_path: Path) -> None:
-    path = tmp_path / "a.spz"
-    for text, message in (
+    def claiming(count: int) -> bytes:
+        return gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, count, 3, 12, 0, 0), mtime=0)
+
+    for data, message in (
         (gzip.compress(bytes(1 << 26), mtime=0), "unpacks to more"),
-        (gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 9_999_999, 3, 12, 0, 0), mtime=0), "truncated"),
-        (
-            gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 1 << 31, 3, 12, 0, 0), mtime=0),
-            "no SPZ file of version",
-        ),
-        (gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 0, 3, 12, 0, 0), mtime=0), "no Gaussians"),
-        (gzip.compress(b"short", mtime=0), "truncated"),
+        (claiming(9_999_999), "truncated"), (claiming(1 << 31), "no SPZ file of version"),
+        (claiming(0), "no Gaussians"), (gzip.compress(b"short", mtime=0), "truncated"),
         (b"NGSP" + bytes(40), "of version 4 is read through splat-transform|cannot be read"),
         (b"", "is no SPZ file"),
-    ):
-        path.write_bytes(text)
+    ):  # fmt: skip
+        (tmp_path / "a.spz").write_bytes(data)
         with pytest.raises(ClodError, match=message):
-            load_spz(path)
+            load_spz(tmp_path / "a.spz")
+
+
+def test_positions_use_the_available_bits(tmp_path: Path) -> None:
+    """A few far positions are moved closer, with the same direction, angular size and fading seen from 0."""
+    g = model(0, 400)
+    for factor, step in ((1e-3, 2.0**-20), (1e3, 2.0**-10), (5e5, 1.0)):
+        scaled = g.replace(means=g.means * factor)
+        write(tmp_path / "a.spz", scaled)
+        assert (load_spz(tmp_path / "a.spz").gaussians.means - scaled.means).abs().max() <= step
+    with pytest.raises(ClodError, match="within 4,000,000 of 0"):
+        write(tmp_path / "b.spz", g.replace(means=g.means * 1e7))
+    assert not (tmp_path / "b.spz").exists() and g.sigma_d is not None
+    means, scales = g.means.clone(), g.log_scales.clone()
+    means[9], scales[9] = torch.tensor([3e5, -1e5, 2e3]), 9.0
+    notes = write(tmp_path / "a.spz", g.replace(means=means, log_scales=scales))
+    again = load_spz(tmp_path / "a.spz").gaussians
+    assert again.sigma_d is not None and "the 1 farthest are moved to 64 from 0" in notes[0]
+    others, factor = torch.arange(400) != 9, 64 / 3e5
+    assert (again.means - means)[others].abs().max() <= 2.0**-17
+    torch.testing.assert_close(again.means[9], means[9] * factor, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(again.log_scales[9], scales[9] + np.log(factor), atol=0.04, rtol=0)
+    torch.testing.assert_close(again.sigma_d[9], g.sigma_d[9] * factor, atol=0, rtol=1e-3)

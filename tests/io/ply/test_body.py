@@ -18,8 +18,6 @@ from clod_adapter.io.ply.body import read_elements
 from clod_adapter.io.ply.columns import inria_dtype
 from clod_adapter.io.ply.header import parse_head, read_head
 
-FORMATS = ("binary_little_endian", "binary_big_endian", "ascii")
-
 
 def rows(count: int, seed: int = 0) -> np.ndarray:
     vertex = np.zeros(count, [*inria_dtype(0).descr, ("label", "u1"), ("time", "f8")])
@@ -34,8 +32,9 @@ def header(form: str, count: object, before: str = "", after: str = "") -> bytes
     return f"ply\nformat {form} 1.0\n{before}element vertex {count}\n{properties}{after}end_header\n".encode()
 
 
-@pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize("count", [1 << 31, 1 << 62, (1 << 64) - 1, 10])
+@pytest.mark.parametrize(
+    ("form", "count"), [("ascii", 1 << 31), ("binary_little_endian", (1 << 64) - 1), ("binary_big_endian", 10)]
+)
 def test_a_header_that_claims_too_much_allocates_nothing(tmp_path: Path, form: str, count: int) -> None:
     path = tmp_path / "in.ply"
     path.write_bytes(header(form, count) + b"0 " * 30)
@@ -50,17 +49,13 @@ def test_a_header_that_claims_too_much_allocates_nothing(tmp_path: Path, form: s
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("count", [-1, -(1 << 31), "nan", "0x10", "1_0", "9" * 21, "9" * 5000, "2.0", "+3", ""])
-def test_counts_that_are_none(tmp_path: Path, count: object) -> None:
-    (tmp_path / "in.ply").write_bytes(header("binary_little_endian", count) + bytes(300))
-    with pytest.raises(ClodError, match="header is damaged"):
-        load(tmp_path / "in.ply")
-
-
-@pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize(
-    "other", ["property uchar a\n", "", "property list uchar int a\n"], ids=["scalar", "nothing", "list"]
-)
+    ("form", "other"),
+    [
+        ("ascii", "property uchar a\n"), ("ascii", "property list uchar int a\n"), ("binary_little_endian", ""),
+        ("binary_big_endian", "property list uchar int a\n"),
+    ],
+)  # fmt: skip
 def test_other_elements_that_claim_too_much(tmp_path: Path, form: str, other: str) -> None:
     body = "".join("0 " * 17 + "\n").encode() if form == "ascii" else bytes(17 * 4)
     for before, after in ((f"element a {1 << 40}\n{other}", ""), ("", f"element a {1 << 40}\n{other}")):
@@ -69,25 +64,6 @@ def test_other_elements_that_claim_too_much(tmp_path: Path, form: str, other: st
         with pytest.raises(ClodError):
             load(tmp_path / "in.ply")
         assert time.perf_counter() - began < 1
-
-
-def test_a_header_without_an_end_is_not_searched_for_ever(tmp_path: Path) -> None:
-    (tmp_path / "in.ply").write_bytes(b"ply\nformat ascii 1.0\n" + b"comment x\n" * 200_000 + b"end_header\n")
-    with pytest.raises(ClodError, match="no end"):
-        load(tmp_path / "in.ply")
-
-
-def test_control_characters_do_not_reach_the_terminal(tmp_path: Path) -> None:
-    (tmp_path / "in.ply").write_bytes(header("ascii", 0).replace(b"element", b"comment \x1b[2J\nelement"))
-    with pytest.raises(ClodError, match="not printable ASCII"):
-        load(tmp_path / "in.ply")
-
-
-def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
-    for name in ("in.ply", "in.pt"):
-        os.mkfifo(tmp_path / name)
-        with pytest.raises(ClodError, match="not a regular file"):
-            load(tmp_path / name)
 
 
 @pytest.mark.parametrize("order", ["<", ">", "ascii"])
@@ -106,21 +82,6 @@ def test_rows_are_those_of_plyfile(tmp_path: Path, order: str) -> None:
         np.testing.assert_array_equal(found[name], expected[name])
 
 
-def test_lists_before_the_vertices_are_refused(tmp_path: Path) -> None:
-    before = "element face 1\nproperty list uchar int a\n"
-    (tmp_path / "in.ply").write_bytes(header("binary_little_endian", 1, before) + bytes(100))
-    with pytest.raises(ClodError, match="face has lists and stands before"):
-        load(tmp_path / "in.ply")
-
-
-@pytest.mark.parametrize("bad", ["1.0 " * 16, "1.0 " * 18, "1.0 " * 16 + "x", "1.0 " * 16 + "\u0661"])
-def test_ascii_rows_that_are_none(tmp_path: Path, bad: str) -> None:
-    good = "1.0 " * 17 + "\n"
-    (tmp_path / "in.ply").write_bytes(header("ascii", 3) + (good + bad + "\n" + good).encode())
-    with pytest.raises(ClodError, match="in.ply: damaged or truncated"):
-        load(tmp_path / "in.ply")
-
-
 @pytest.mark.parametrize("kind", ["f4", "f8"])
 def test_values_at_the_ends_warn_of_nothing(tmp_path: Path, kind: str) -> None:
     vertex = np.zeros(20, [(name, kind) for name in inria_dtype(0).names or ()])
@@ -135,20 +96,18 @@ def test_values_at_the_ends_warn_of_nothing(tmp_path: Path, kind: str) -> None:
     assert 0 < len(loaded.gaussians) < 20
 
 
-@pytest.mark.parametrize("order", ["<", ">", "ascii"])
-@pytest.mark.parametrize("limit", [1 << 20, 1500], ids=["whole", "pieces"])
+@pytest.mark.parametrize(("order", "limit"), [("<", 1 << 20), (">", 1500), ("ascii", 1 << 20), ("ascii", 1500)])
 def test_the_fingerprint_is_of_the_bytes_that_were_parsed(
     tmp_path: Path, order: str, limit: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever becomes of the file meanwhile: replaced, or overwritten in place; elements around the rows count too."""
     monkeypatch.setattr("clod_adapter.io.ply.header.HEADER_LIMIT", limit)
     path, text = tmp_path / "in.ply", order == "ascii"
-    data = {"text": text, "byte_order": "=" if text else order}
     around = [PlyElement.describe(np.arange(3).astype([("n", "i4")]), name) for name in ("before", "after")]
     files = []
     for seed in (0, 1):
         elements = [around[0], PlyElement.describe(rows(200, seed), "vertex"), around[1]]
-        PlyData(elements, **data).write(str(path))
+        PlyData(elements, text=text, byte_order="=" if text else order).write(str(path))
         files.append(path.read_bytes())
     old, new = files
     path.write_bytes(old)
@@ -186,3 +145,31 @@ def test_reading_takes_the_memory_of_the_rows_once(tmp_path: Path) -> None:
     finally:
         tracemalloc.stop()
     assert found.elements["vertex"].tobytes() == vertex.tobytes()
+
+
+GOOD = "1.0 " * 17 + "\n"
+
+
+COMMENTED = header("ascii", 0).replace(b"element", b"comment @\nelement")
+
+
+LIST = "element face 1\nproperty list uchar int a\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        *((header("binary_little_endian", count) + bytes(300), "header is damaged")
+          for count in (-1, "nan", "0x10", "1_0", "9" * 21, "9" * 5000, "2.0", "+3", "")),
+        *((header("ascii", 3) + f"{GOOD}{bad}\n{GOOD}".encode(), "in.ply: damaged or truncated")
+          for bad in ("1.0 " * 16, "1.0 " * 18, "1.0 " * 16 + "x", "1.0 " * 16 + "\u0661")),
+        (header("binary_little_endian", 1, LIST) + bytes(100), "face has lists and stands before"),
+        (COMMENTED.replace(b"@", b"\x1b[2J"), "not printable ASCII"),
+        (COMMENTED.replace(b"@", "\u00e9".encode()), "not printable ASCII"),
+        (b"ply\nformat ascii 1.0\n" + b"comment x\n" * 200_000 + b"end_header\n", "no end"),
+    ],
+)  # fmt: skip
+def test_malformed_files(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "in.ply").write_bytes(content)
+    with pytest.raises(ClodError, match=message):
+        load(tmp_path / "in.ply")

@@ -10,6 +10,7 @@ from plyfile import PlyData, PlyElement
 from clod_adapter.adapter import attach, extract
 from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.errors import ClodError
+from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.ply.columns import inria_dtype
 from clod_adapter.render import render
@@ -76,41 +77,6 @@ def test_usual_values_are_not_in_question(tmp_path: Path) -> None:
             assert loaded.notes == () and ":" not in loaded.fingerprint
 
 
-def test_opacities_at_the_ends(tmp_path: Path) -> None:
-    vertex = activate(inria(40), "opacity")
-    vertex["opacity"][:5] = 0, 1, 1.5, -0.05, np.nan  # Taming-3DGS activates by the absolute value
-    base = load(write(tmp_path / "in.ply", vertex), activated="opacity")
-    found = base.gaussians.opacities[:4]
-    assert len(base.gaussians) == 39 and base.gaussians.opacity_logits.isfinite().all()
-    torch.testing.assert_close(found, torch.tensor([0, 1, 1, 0.05]), atol=1e-7, rtol=1e-5)
-    assert "1 above 1 taken as 1" in base.notes[0]
-    with pytest.raises(ClodError, match="activated is 'yes'.*none, opacity, scales, both"):
-        load(tmp_path / "in.ply", activated="yes")  # type: ignore[arg-type]
-    vertex["opacity"] = 1
-    with pytest.raises(ClodError, match="opacity from 1 to 1"):
-        load(write(tmp_path / "in.ply", vertex))
-
-
-def test_what_this_package_wrote_is_not_in_question(tmp_path: Path) -> None:
-    """An opaque result, as every logit may be above 0 after tuning, and its adapter, bit for bit."""
-    path = write(tmp_path / "in.ply", activate(inria(40), "opacity", "scales"))
-    base = load(path, activated="both")
-    g = base.gaussians
-    tuned = attach(g.replace(opacity_logits=g.opacity_logits.abs()), torch.rand(40), AttenuationConfig())
-    adapter = extract(g, tuned, fingerprint=base.fingerprint, config={})
-    save(tmp_path / "out.ply", adapter.apply(g), base)
-    again = load(path, activated="both")
-    save(tmp_path / "again.ply", adapter.apply(again.gaussians, again.fingerprint), again)
-    assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "again.ply").read_bytes()
-    for activated in (None, "both"):
-        out = load(tmp_path / "out.ply", activated=activated)
-        torch.testing.assert_close(out.gaussians.opacity_logits, g.opacity_logits.abs(), atol=2e-2, rtol=1e-3)
-        assert out.comments[:2] == base.notes
-    with pytest.raises(ClodError, match="different base.*trained on both:"):
-        other = load(path, activated="none")
-        adapter.apply(other.gaussians, other.fingerprint)
-
-
 def mip(count: int = 40, kind: str = "f4") -> np.ndarray:
     vertex = inria(count, ("filter_3D",), kind)
     vertex["filter_3D"] = np.exp(np.random.default_rng(1).normal(size=count) - 2.5)
@@ -123,25 +89,6 @@ def fused(vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     wide = size**2 + vertex["filter_3D"].astype(np.float64)[:, None] ** 2
     opacity = 1 / (1 + np.exp(-vertex["opacity"].astype(np.float64)))
     return np.sqrt(wide), opacity * np.sqrt((size**2).prod(1) / wide.prod(1))
-
-
-@pytest.mark.parametrize("kind", ["f4", "f8"])
-def test_mip_splatting_is_fused(tmp_path: Path, kind: str) -> None:
-    vertex = mip(kind=kind)
-    base = load(write(tmp_path / "in.ply", vertex))
-    scales, opacities = fused(vertex)
-    np.testing.assert_allclose(base.gaussians.scales, scales, rtol=2e-6)
-    np.testing.assert_allclose(base.gaussians.opacities, opacities, rtol=2e-6)
-    assert base.comments == base.notes and "filter_3D is fused" in base.notes[0]
-    sigma_d = torch.rand(len(vertex))
-    save(tmp_path / "out.ply", attach(base.gaussians, sigma_d, AttenuationConfig()), base)
-    out = load(tmp_path / "out.ply")
-    assert "filter_3D" not in out.vertex.dtype.names and out.notes == () and base.notes[0] in out.comments
-    assert torch.equal(out.gaussians.log_scales, base.gaussians.log_scales)
-    assert torch.equal(out.gaussians.opacity_logits, base.gaussians.opacity_logits)
-    for name in inria_dtype(0).names or ():
-        if name not in (*SCALES, "opacity"):
-            np.testing.assert_array_equal(out.vertex[name], vertex[name])
 
 
 def test_mip_splatting_at_the_ends(tmp_path: Path) -> None:
@@ -181,3 +128,57 @@ def test_the_picture_is_that_of_the_filtered_gaussians(tmp_path: Path) -> None:
     expected = render(filtered, view).image
     torch.testing.assert_close(render(loaded, view).image, expected, atol=2e-5, rtol=0)
     assert (render(unfiltered, view).image - expected).abs().mean() > 0.02
+
+
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+def test_mip_splatting_is_fused(tmp_path: Path, kind: str) -> None:
+    vertex = mip(kind=kind)
+    base = load(write(tmp_path / "in.ply", vertex))
+    scales, opacities = fused(vertex)
+    np.testing.assert_allclose(base.gaussians.scales, scales, rtol=2e-6)
+    np.testing.assert_allclose(base.gaussians.opacities, opacities, rtol=2e-6)
+    assert base.comments == base.notes and "filter_3D is fused" in base.notes[0]
+    save(tmp_path / "out.ply", attach(base.gaussians, torch.rand(len(vertex)), AttenuationConfig()), base)
+    out = load(tmp_path / "out.ply")
+    assert "filter_3D" not in out.vertex.dtype.names and out.notes == () and base.notes[0] in out.comments
+    assert torch.equal(out.gaussians.log_scales, base.gaussians.log_scales)
+    assert torch.equal(out.gaussians.opacity_logits, base.gaussians.opacity_logits)
+    for name in set(inria_dtype(0).names or ()) - {*SCALES, "opacity"}:
+        np.testing.assert_array_equal(out.vertex[name], vertex[name])
+
+
+def test_opacities_at_the_ends(tmp_path: Path) -> None:
+    vertex = activate(inria(40), "opacity")
+    vertex["opacity"][:5] = 0, 1, 1.5, -0.05, np.nan  # Taming-3DGS activates by the absolute value
+    base = load(write(tmp_path / "in.ply", vertex), activated="opacity")
+    assert len(base.gaussians) == 39 and base.gaussians.opacity_logits.isfinite().all()
+    torch.testing.assert_close(base.gaussians.opacities[:4], torch.tensor([0, 1, 1, 0.05]), atol=1e-7, rtol=1e-5)
+    assert "1 above 1 taken as 1" in base.notes[0]
+    with pytest.raises(ClodError, match="activated is 'yes'.*none, opacity, scales, both"):
+        load(tmp_path / "in.ply", activated="yes")  # type: ignore[arg-type]
+    vertex["opacity"] = 1
+    with pytest.raises(ClodError, match="opacity from 1 to 1"):
+        load(write(tmp_path / "in.ply", vertex))
+
+
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+def test_outputs_of_this_package_and_adapters_are_not_in_question(tmp_path: Path, kind: str) -> None:
+    """An opaque result, as every logit may be above 0 after tuning, and its adapter, bit for bit."""
+    path = write(tmp_path / "in.ply", activate(inria(40, kind=kind), "opacity", "scales"))
+    base = load(path, activated="both")
+    g = base.gaussians
+    tuned = attach(g.replace(opacity_logits=g.opacity_logits.abs()), torch.rand(40), AttenuationConfig())
+    adapter = extract(g, tuned, fingerprint=base.fingerprint, config={})
+    save(tmp_path / "out.ply", adapter.apply(g), base)
+    save_adapter(tmp_path / "a.safetensors", adapter)
+    again = load(path, activated="both")
+    applied = load_adapter(tmp_path / "a.safetensors").apply(again.gaussians, again.fingerprint)
+    save(tmp_path / "again.ply", applied, again)
+    assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "again.ply").read_bytes()
+    for activated in (None, "both"):
+        out = load(tmp_path / "out.ply", activated=activated)
+        torch.testing.assert_close(out.gaussians.opacity_logits, g.opacity_logits.abs(), atol=2e-2, rtol=1e-3)
+        assert out.comments[:2] == base.notes
+    with pytest.raises(ClodError, match="different base.*trained on both:"):
+        other = load(path, activated="none")
+        adapter.apply(other.gaussians, other.fingerprint)
