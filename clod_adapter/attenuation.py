@@ -1,4 +1,4 @@
-"""The dial's equation, and the one function that turns Gaussians, a camera and a dial value into opacities to draw.
+"""The dial's equation, and the one function that turns Gaussians, a camera and a dial value into what is drawn.
 
 Source: "CLoD-GS: Continuous Level-of-Detail via 3D Gaussian Splatting", ICLR 2026: the attenuated opacity is its Eq. 2
 (section 3.2), the culling rule is the mask M_i of the same section. For activated opacity ``a``, decay ``sigma``,
@@ -41,35 +41,38 @@ from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, require
 from clod_adapter.distances import euclidean, normalized_distances, normalizing_distance
 from clod_adapter.errors import ClodError
+from clod_adapter.growth import growth_distance, growth_factors
 
 SIGMA_MAX = 1e9
 """Stands for an infinite sigma_d. The factor is exactly 1 for d s < 2e5 in float32, d s < 10 in float64."""
 
 Scale = TypeVar("Scale", float, Tensor)
-Fields = tuple[Tensor, Tensor, Tensor, Tensor]
+Fields = tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]
 
 
 class Attenuated(NamedTuple):
-    """The opacities at one dial value.
+    """The opacities at one dial value, and the growth of the scales.
 
     Attributes:
         opacities: ``[N]`` a'', in [0, 1].
         log_opacities: ``[N]`` log a'', in [-inf, 0]; meaningful where a'' underflows.
         keep: ``[N]`` bool, ``log a'' > log(tau s)``.
         drawn: ``[N]`` the rasterizer's input, in [0, 1]: a'' after the cut, above 0 exactly for kept Gaussians.
+        growth: ``[N]`` factor of the scales (``growth.growth_factors``); None without a ``growth_d``.
     """
 
     opacities: Tensor
     log_opacities: Tensor
     keep: Tensor
     drawn: Tensor
+    growth: Tensor | None = None
 
 
 def attenuate(
     opacities: Tensor, sigma_d: Tensor | None, seen_from: Tensor | tuple[Tensor, Camera], virtual_scale: float,
-    config: AttenuationConfig | None, *, activated: bool = False,
+    config: AttenuationConfig | None, *, activated: bool = False, growth_d: Tensor | None = None,
 ) -> Attenuated:  # fmt: skip
-    """The opacities of Gaussians at one dial value. Rendering, training, baking and renderers' hooks all call this.
+    """What is drawn of Gaussians at one dial value. Rendering, training, baking and renderers' hooks all call this.
 
     ``a'' = a exp(log_attenuation)``, then the cut, differentiable, once, in ``opacities`` and ``sigma_d``; distances
     are constants. Where the factor is exactly 1, a'' equals a bit for bit: with the hard cut a dial without effect
@@ -87,6 +90,7 @@ def attenuate(
         activated: ``opacities`` are a itself, in [0, 1], as rasterizers take them. The gradient is finite: at a = 1
             it is that of the factor and the cut, as anywhere; at a = 0 that of a'' is the factor, and those of
             ``log_opacities`` (-inf) and ``drawn`` are 0.
+        growth_d: ``[N]`` exponents of the growth of the scales; None for no growth.
 
     Raises:
         ClodError: the dial is below 1 or not finite, or the shapes differ.
@@ -98,6 +102,10 @@ def attenuate(
         return Attenuated(shown, opacities.log() if activated else F.logsigmoid(opacities), keep, shown)
     numbers = float(virtual_scale), log_threshold(config.tau, virtual_scale)
     named = {"opacities" if activated else "opacity_logits": opacities, "sigma_d": sigma_d}
+    more: Any = {"eps": config.eps, "cut": config.cut}
+    if growth_d is not None:
+        more["growth_d"] = conform(sigma_d=sigma_d, growth_d=growth_d)[1]
+        more["reach"] = growth_distance(config)
     if isinstance(seen_from, Tensor):
         d = seen_from
     elif activated or not _from_centres.compiles(seen_from[0]):
@@ -105,9 +113,9 @@ def attenuate(
     else:
         means, position, unit = _centres(*seen_from, config)
         rows = conform(**named, x=means[:, 0])[:2]
-        return Attenuated(*_from_centres(means, position, unit, *rows, *numbers, eps=config.eps, cut=config.cut))
+        return Attenuated(*_from_centres(means, position, unit, *rows, *numbers, **more))
     form = _from_opacities if activated else _from_logits
-    return Attenuated(*form(*conform(**named, d=d.detach()), *numbers, eps=config.eps, cut=config.cut))
+    return Attenuated(*form(*conform(**named, d=d.detach()), *numbers, **more))
 
 
 def log_attenuation(sigma_d: Tensor, d: Tensor, virtual_scale: float, eps: float) -> Tensor:
@@ -153,35 +161,44 @@ def _centres(means: Tensor, camera: Camera, config: AttenuationConfig) -> tuple[
 
 @Fused
 def _from_logits(
-    logits: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, threshold: Number, *, eps: float, cut: str
-) -> Fields:
+    logits: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, threshold: Number, *, eps: float, cut: str,
+    growth_d: Tensor | None = None, reach: float = 1.0,
+) -> Fields:  # fmt: skip
     opacities, log_opacities = _Attenuate.apply(logits, sigma, d, virtual_scale, eps)
-    return _cut(opacities, log_opacities, threshold, cut)
+    return *_cut(opacities, log_opacities, threshold, cut), _growth(growth_d, d, virtual_scale, reach)
 
 
 @Fused
 def _from_centres(
     means: Tensor, position: Tensor, unit: Number, logits: Tensor, sigma: Tensor, virtual_scale: Number,
-    threshold: Number, *, eps: float, cut: str,
+    threshold: Number, *, eps: float, cut: str, growth_d: Tensor | None = None, reach: float = 1.0,
 ) -> Fields:  # fmt: skip
     d = euclidean(means, position).div_(unit)
     opacities, log_opacities = _Attenuate.apply(logits, sigma, d, virtual_scale, eps)
-    return _cut(opacities, log_opacities, threshold, cut)
+    return *_cut(opacities, log_opacities, threshold, cut), _growth(growth_d, d, virtual_scale, reach)
 
 
 @Fused
 def _from_opacities(
-    opacities: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, threshold: Number, *, eps: float, cut: str
-) -> Fields:
+    opacities: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, threshold: Number, *, eps: float, cut: str,
+    growth_d: Tensor | None = None, reach: float = 1.0,
+) -> Fields:  # fmt: skip
     opaque = torch.full_like(opacities, math.inf)
     factor, log_factor = _Attenuate.apply(opaque, sigma, d, virtual_scale, eps)
     nothing = opacities <= 0
     logs = opacities.masked_fill(nothing, 1).log().masked_fill(nothing, -math.inf)  # no slope, rather than 1 / 0
-    return _cut(opacities * factor, logs + log_factor, threshold, cut)
+    drawn = _cut(opacities * factor, logs + log_factor, threshold, cut)
+    return *drawn, _growth(growth_d, d, virtual_scale, reach)
 
 
-def _cut(opacities: Tensor, log_opacities: Tensor, threshold: Number, cut: str) -> Fields:
-    """The fields of ``Attenuated`` from a'' and log a''."""
+def _growth(growth_d: Tensor | None, d: Tensor, virtual_scale: Number, reach: float) -> Tensor | None:
+    return None if growth_d is None else growth_factors(growth_d, d, virtual_scale, reach)
+
+
+def _cut(
+    opacities: Tensor, log_opacities: Tensor, threshold: Number, cut: str
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The opacities of ``Attenuated`` from a'' and log a''."""
     keep = log_opacities.detach() > threshold
     # The hard cut's product is five times as fast as where.
     drawn = opacities * keep.to(opacities) if cut == "hard" else _Fade.apply(opacities, log_opacities, threshold)

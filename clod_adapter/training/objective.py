@@ -106,7 +106,7 @@ class Objective:
     @property
     def stepped(self) -> tuple[str, ...]:
         """The names of all trained parameters."""
-        return (*self.tuned, "opacity_logits", self.decay)
+        return (*self.tuned, "opacity_logits", self.decay, *(["growth_d"] if self.config.growth == "on" else []))
 
     @property
     def has_target_count(self) -> bool:
@@ -165,15 +165,17 @@ class Objective:
         attributes: Any = {name: leaves[name] for name in ATTRIBUTES}
         shown = Gaussians(**attributes, screen_filter=self.screen_filter)
         logits, sigma = leaves["opacity_logits"][rows], self.sigma(leaves[self.decay][rows])
+        growth_d = leaves["growth_d"][rows] if "growth_d" in leaves else None
         distances = normalized_distances(leaves["means"], camera, self.attenuation)  # once for all dial values
         for s in dials:
-            dialled = attenuate(logits, sigma, distances[rows], s, self.attenuation)
-            drawn = dialled.drawn
+            dialled = attenuate(logits, sigma, distances[rows], s, self.attenuation, growth_d=growth_d)
+            drawn, growth = dialled.drawn, dialled.growth
             if self.part.full_context:
                 context = leaves["opacity_logits"].detach()[self.trained :]
                 drawn = torch.cat([drawn, attenuate(context, None, distances[self.trained :], s, None).drawn])
+                growth = None if growth is None else torch.cat([growth, torch.ones_like(context)])
             # Culled rows have opacity 0: the rasterizer skips them, and they get no gradient.
-            yield s, dialled, splat(shown, drawn, camera)[0]
+            yield s, dialled, splat(shown, drawn, camera, growth=growth)[0]
 
     def _count_gradient(self, dialled: Attenuated, logits: Tensor, view: View, s: float, loss: float) -> Tensor:
         """``[trained]`` the count term's gradient of log sigma_d at one dial value."""
@@ -181,7 +183,7 @@ class Objective:
             target = view.target_share(s)
         else:
             target = target_share(s, self.trained, self.config, self.part.total)
-        own = Attenuated(*(tensor[: self.trained] for tensor in dialled))
+        own = Attenuated(*(tensor[: self.trained] for tensor in dialled[:4]))
         return count_gradient(own, logits, s, self.attenuation.tau, loss, self.config, target)
 
     def _weight(self, s: float, *, alone: bool) -> float:
