@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -56,6 +58,17 @@ BACKENDS = {
     "cuda, gsplat in torch": Backend("cuda", dtype=torch.float64),
     "cuda": Backend("cuda", "cuda", repeats=False, looser=50.0),
 }
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Sets the number of torch's threads, and restores it at the end."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def fresh_copy(monkeypatch: pytest.MonkeyPatch, name: str, package: str, installed: ModuleType | None) -> ModuleType:

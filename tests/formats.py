@@ -113,16 +113,20 @@ def change_setting(path: Path, name: str, old: str, new: str) -> Path:
     return path
 
 
-def without_comments(path: Path, **columns: float) -> Path:
+def without_comments(path: Path, **columns: Any) -> Path:
     """The file as another tool writes it: without its comments, some columns added or changed in every row."""
-    old = PlyData.read(str(path))["vertex"].data
+    rows, found = with_columns(PlyData.read(str(path))["vertex"].data, **columns), path.with_name("rewritten.ply")
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(found))
+    return found
+
+
+def with_columns(old: np.ndarray, **columns: Any) -> np.ndarray:
+    """The rows of a PLY with float columns added or changed."""
     added = [(name, "f4") for name in columns if name not in old.dtype.names]
     rows = np.zeros(len(old), old.dtype.descr + added)
     for name in rows.dtype.names or ():
         rows[name] = columns[name] if name in columns else old[name]
-    found = path.with_name("rewritten.ply")
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(found))
-    return found
+    return rows
 
 
 def change_glb(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:

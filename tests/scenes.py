@@ -113,6 +113,13 @@ def capture(n: int = 300, views: int = 8, width: int = 48, height: int = 36, see
     return base, Scene(tuple(v for k, v in enumerate(seen) if k % 4), seen[::4])
 
 
+def assert_equal(a: Gaussians, b: Gaussians) -> None:
+    """Asserts that both have the same bits and the same attenuation settings."""
+    assert a.tensors().keys() == b.tensors().keys() and a.attenuation == b.attenuation
+    for name, value in a.tensors().items():
+        assert torch.equal(value, b.tensors()[name]), name
+
+
 def stripped(data: bytes) -> bytes:
     """A file without its calibration's times, the one thing in it that a seed does not settle."""
     if data.startswith(b"ply"):

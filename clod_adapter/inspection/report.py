@@ -236,13 +236,7 @@ def _anomalies(splat: Splat, questions: dict[str, tuple[float, float]]) -> list[
     wide = [name for name, kind in splat.columns if kind == "float64"]
     note("double_precision", len(wide), f"{{count}} properties are double: {_list(wide)}")
     if splat.screen_filter.compensate:
-        found.append(
-            Anomaly(
-                "antialiased",
-                0,
-                f"trained with antialiasing: {splat.screen_filter.description}",
-            )
-        )
+        found.append(Anomaly("antialiased", 0, f"trained with antialiasing: {splat.screen_filter.description}"))
     return found
 
 

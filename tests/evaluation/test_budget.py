@@ -104,20 +104,6 @@ def test_psnr_drop(psnr: list[float], drop: float, dial_value: float) -> None:
     assert drop < 3 or solved.note.startswith("only 1.75 dB are lost at s = 4")
 
 
-@settings(deadline=None, max_examples=100)
-@given(st.lists(st.floats(20, 40), min_size=1, max_size=9), st.floats(1e-3, 10))
-def test_the_drop_is_not_exceeded_before(psnr: list[float], drop: float) -> None:
-    """By the interpolation itself, written out once more, on a fine grid."""
-    s = dial_for(adapted(3, 0), psnr_drop=drop, calibration=table(psnr)).virtual_scale
-    assert 1 <= s <= 2.0 ** (len(psnr) - 1)
-    for k in range(50):
-        at = math.log2(s) * k / 49
-        left = min(int(at), len(psnr) - 2) if len(psnr) > 1 else 0
-        right = min(left + 1, len(psnr) - 1)
-        value = psnr[left] + (at - left) * (psnr[right] - psnr[left])
-        assert psnr[0] - value <= drop + 1e-6
-
-
 @pytest.mark.parametrize(
     ("times", "fps", "dial_value"),
     [

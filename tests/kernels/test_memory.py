@@ -18,9 +18,6 @@ from torch import Tensor
 
 from clod_adapter._kernels import memory
 from clod_adapter._kernels.memory import IDLE, aligned, recycled
-from clod_adapter.rasterizers import cpu
-from oracle import BACKGROUND, assert_same, differentiate, weights
-from scenes import camera, scene
 
 SHAPE = (120, 160, 3)
 
@@ -146,27 +143,6 @@ def test_held_memory_is_not_used_again(holder: str) -> None:
         gc.collect()
     assert recycled(SHAPE).data_ptr() == where[0]  # and then it is
     assert all((other == k).all() for k, other in enumerate(others))
-
-
-@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)], ids=str)
-def test_images_and_gradients_of_several_passes(order: tuple[int, ...]) -> None:
-    """Large ones, in recycled memory: gradients and saved tensors keep their values while others are drawn."""
-    cases = [(scene(6000, 1, seed, size=0.03), camera(150, 121 + 5 * seed)) for seed in range(3)]
-    alone = [differentiate(cpu.rasterize, some, view, weights(view)) for some, view in cases]
-    alone = [r._replace(gradients={name: g.clone() for name, g in r.gradients.items()}) for r in alone]
-    alive = []
-    for some, view in cases:
-        leaves = {name: value.clone().requires_grad_() for name, value in some.items()}
-        leaves["background"] = BACKGROUND.clone().requires_grad_()
-        alive.append((leaves, *cpu.rasterize(**leaves, camera=view)))
-        differentiate(cpu.rasterize, *cases[0], weights(cases[0][1]))  # dropped
-    for k in order:
-        leaves, image, alpha = alive[k]
-        v = weights(cases[k][1])
-        ((image * v[0]).sum() + (alpha * v[1]).sum()).backward()
-    for (leaves, image, alpha), want in zip(alive, alone, strict=True):
-        gradients = {name: leaf.grad for name, leaf in leaves.items()}
-        assert_same(want._replace(image=image.detach(), alpha=alpha.detach(), gradients=gradients), want)
 
 
 def test_few_stay_idle_and_the_oldest_are_freed(fresh: list[int]) -> None:

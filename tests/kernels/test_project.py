@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from backends import torch_threads
 from clod_adapter.rasterizers import cpu, reference
 from oracle import Parameters, assert_agrees, assert_same, differentiate, weights
 from scenes import camera, in_front, scene
@@ -16,12 +17,10 @@ from scenes import camera, in_front, scene
 VIEW = camera(45, 37)
 
 
-@pytest.fixture(params=[1, 3])
-def threads(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    torch.set_num_threads(before)
+@pytest.fixture(params=[1, 3], autouse=True)
+def threads(request: pytest.FixtureRequest) -> Iterator[None]:
+    with torch_threads(request.param):
+        yield
 
 
 def all_visible(n: int, degree: int = 3) -> Parameters:
@@ -46,7 +45,7 @@ def hide(some: Parameters, gone: Tensor, how: str) -> None:
 
 
 @pytest.mark.parametrize(("n", "degree"), [(0, 0), (1, 3), (15, 1), (16, 0), (16, 3), (17, 1), (33, 3)])
-def test_all_visible(threads: int, n: int, degree: int) -> None:
+def test_all_visible(n: int, degree: int) -> None:
     some = all_visible(n, degree)
     seen = differentiate(reference.rasterize, {k: v.double() for k, v in some.items()}, VIEW, weights(VIEW))
     assert (seen.gradients["opacities"] != 0).all()  # all are visible
@@ -72,7 +71,7 @@ PATTERNS = {
 
 
 @pytest.mark.parametrize(("pattern", "how"), [*zip(PATTERNS, ["behind", "faint", "beside"] * 5, strict=False)])
-def test_some_invisible(threads: int, pattern: str, how: str) -> None:
+def test_some_invisible(pattern: str, how: str) -> None:
     some, gone = all_visible(49), PATTERNS[pattern]
     hide(some, gone, how)
     assert_agrees(cpu.rasterize, some, VIEW, rows=~gone)
@@ -81,7 +80,7 @@ def test_some_invisible(threads: int, pattern: str, how: str) -> None:
 @pytest.mark.parametrize(
     ("pattern", "name"), [*zip(PATTERNS, ["sh0", "first of shN", "last of shN"] * 5, strict=False)]
 )
-def test_colors_that_are_not_finite(threads: int, pattern: str, name: str) -> None:
+def test_colors_that_are_not_finite(pattern: str, name: str) -> None:
     """Such rows are projected, packed, and removed again, beside others that are invisible."""
     some, gone = all_visible(49), PATTERNS[pattern]
     values = some[name.split()[-1]].view(49, -1)
@@ -90,13 +89,6 @@ def test_colors_that_are_not_finite(threads: int, pattern: str, name: str) -> No
     hidden = ROWS % 7 == 3
     hide(some, hidden, "behind")
     assert_agrees(cpu.rasterize, some, VIEW, rows=~gone & ~hidden)
-
-
-@pytest.mark.parametrize("n", [1, 16, 17])
-def test_no_color_is_finite(n: int) -> None:
-    some = all_visible(n)
-    some["sh0"][:] = math.nan
-    assert_agrees(cpu.rasterize, some, VIEW, rows=torch.zeros(n, dtype=torch.bool))
 
 
 def test_earlier_calls_do_not_change_the_result() -> None:

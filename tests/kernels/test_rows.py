@@ -8,7 +8,7 @@ import os
 
 import numpy as np
 import pytest
-from numba import int64, njit
+from numba import njit
 
 from clod_adapter._kernels.pointers import pointer, scratch
 from clod_adapter._kernels.rows import load_rows, store_rows
@@ -133,29 +133,3 @@ def test_any_bits_pass_and_no_columns_are_nothing() -> None:
     to_vectors(back, rows, 9, 0, 0, lanes, 0)
     np.testing.assert_array_equal(back.view(np.uint32), bits)
     assert (lanes[LANES:] == 1).all()
-
-
-@njit
-def all_rows(source, destination, width, first, count):
-    """Copies the columns of all rows, sixteen at a time, the last row again where there are fewer."""
-    vectors, rows = scratch(f32x16, LANES), scratch(int64, LANES)
-    for start in range(0, len(source) // width, LANES):
-        for lane in range(LANES):
-            rows[lane] = min(start + lane, len(source) // width - 1)
-        load_rows(pointer(source), rows, width, first, count, vectors, 0)
-        store_rows(pointer(destination), rows, width, first, count, vectors, 0)
-
-
-@pytest.mark.skipif(os.name != "posix", reason="needs mprotect")
-@pytest.mark.parametrize("width", WIDTHS)
-def test_memory_beyond_the_array_is_not_accessed(width: int) -> None:
-    for n, at_the_end in ((1, True), (15, False), (16, True), (16, False), (21, True)):
-        values = matrix(n, width)
-        source, destination = (island(n * width, at_the_end) for _ in range(2))
-        source[:] = values.ravel()
-        for _, first, count in (s for s in SPANS if s[0] == width):
-            destination[:] = 0
-            all_rows(source, destination, width, first, count)
-            want = np.zeros((n, width), np.float32)
-            want[:, first : first + count] = values[:, first : first + count]
-            np.testing.assert_array_equal(destination.reshape(n, width), want)

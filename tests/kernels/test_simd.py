@@ -10,7 +10,7 @@ from numba import float32, njit
 
 from clod_adapter._kernels.bits import bits_of, lowest, set_spans
 from clod_adapter._kernels.elementary import exp2, log2, vabs, vceil, vfloor, vsqrt
-from clod_adapter._kernels.pointers import fetch_add, pointer, prefetch
+from clod_adapter._kernels.pointers import fetch_add, pointer
 from clod_adapter._kernels.rows import store_sums
 from clod_adapter._kernels.simd import anywhere, both, but_not, eq, fma, ge, gt, load, select, splat, store, vmax, vmin
 
@@ -211,21 +211,6 @@ def test_bits_of_masks_and_lowest_bits() -> None:
     for k in range(64):
         for above in (0, 2**64 - 1, *rng.integers(0, 2**64, 5, dtype=np.uint64)):
             assert lowest_of(np.uint64(int(above) >> k << k | 1 << k)) == k
-
-
-@njit
-def prefetch_all(array):
-    p = pointer(array)
-    for i in range(len(array)):
-        prefetch(array, i)
-        prefetch(p, i)
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.uint64])
-def test_prefetch_changes_nothing(dtype: type) -> None:
-    array = np.arange(1000, dtype=dtype)
-    prefetch_all(array)
-    np.testing.assert_array_equal(array, np.arange(1000, dtype=dtype))
 
 
 @njit

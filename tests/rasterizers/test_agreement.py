@@ -96,17 +96,6 @@ def test_alpha_is_clamped(rasterize: Rasterizer) -> None:
     )
 
 
-@pytest.mark.parametrize("opacity", [0.3, 0.998])
-def test_one_that_covers_the_whole_image(rasterize: Rasterizer, opacity: float) -> None:
-    view = camera(70, 50)
-    one = scene(1, 2, 4)
-    one["means"] = in_front(view, torch.tensor([[0.3, 0.2, 2.0]]))
-    one["scales"] = torch.tensor([[3.0, 5.0, 4.0]])
-    one["opacities"][:] = opacity
-    one["sh0"][:] = 1.0  # clear of the colour's clamp at 0
-    assert_agrees(rasterize, one, view)
-
-
 @pytest.mark.parametrize(
     ("scales", "seed"),
     [((1.0, 1e-6, 1e-6), 0), ((0.3, 3e-7, 3e-7), 1), ((0.3, 0.3, 3e-7), 2)],

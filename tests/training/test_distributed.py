@@ -17,7 +17,7 @@ from clod_adapter.training import distributed
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost, joined
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.objective import GradientSum
-from scenes import capture
+from scenes import assert_equal, capture
 
 
 @pytest.fixture
@@ -41,8 +41,7 @@ def test_adapting_alone_changes_no_bit(peers: ProcessGroup) -> None:
     base, scene = capture(n=60, views=4)
     config = AdaptConfig(iters=3, batch=2)
     want, found = adapt(base, scene, config), adapt(base, scene, config, group=peers)
-    for name, tensor in want.gaussians.tensors().items():
-        assert torch.equal(found.gaussians.tensors()[name], tensor), name
+    assert_equal(found.gaussians, want.gaussians)
     assert found.waiting > 0 and want.waiting == want.exchanging == 0 and found.lost is None
     peers.size = 3
     with pytest.raises(ClodError, match="batch is 2, it must be at least 3, a view for each of the processes"):
@@ -57,8 +56,7 @@ def test_what_is_sent_arrives() -> None:
     pickled = distributed._without_tensors(sent, tensors)
     assert len(pickled) < 4000 and all(tensor.is_contiguous() for tensor in tensors)
     gaussians, views, more = distributed._with_tensors(pickled, [tensor.clone() for tensor in tensors])
-    for name, tensor in sent[0].tensors().items():
-        assert torch.equal(gaussians.tensors()[name], tensor), name
+    assert_equal(gaussians, sent[0])
     assert views.train[0].camera.name == scene.train[0].camera.name
     assert torch.equal(views.test[0].image, scene.test[0].image)
     assert torch.equal(more["a"], sent[2]["a"]) and more["b"].dtype == torch.bool

@@ -66,9 +66,7 @@ def interrupted(step: int, seconds: float) -> tuple[Adapted, list[Progress]]:
         timer.join()
 
 
-def test_the_result_is_of_the_last_whole_step(
-    undisturbed: tuple[dict[int, dict[str, torch.Tensor]], float],
-) -> None:
+def test_the_result_is_of_the_last_whole_step(undisturbed: tuple[dict[int, dict[str, torch.Tensor]], float]) -> None:
     after, seconds = undisturbed
     draw, early = random.Random(3), 0
     for _ in range(ROUNDS):

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from backends import torch_threads
 from clod_adapter.training.optimizer import RowAdam, add_to_mean
 
 SHAPES = {"means": (3,), "quats": (4,), "opacity_logits": (), "sh0": (1, 3), "shN": (8, 3)}
@@ -125,16 +126,13 @@ def test_a_first_step_is_as_long_as_the_rate(kind: type[RowAdam]) -> None:
 def test_rows_and_threads_do_not_matter_to_a_row(n: int = 100) -> None:
     """A row's value does not depend on which rows are stepped beside it, nor on who steps it."""
     gradient = gradients(n, 0)["shN"]
-    g, before = torch.Generator().manual_seed(0), torch.get_num_threads()
+    g = torch.Generator().manual_seed(0)
     results = []
     for count, some in [(1, everything(n)), (2, everything(n)), (3, torch.rand(n, generator=g) < 0.6)]:
-        torch.set_num_threads(count)
-        try:
-            optimizer = RowAdam(parameters(n))
-            for _ in range(3):
+        optimizer = RowAdam(parameters(n))
+        for _ in range(3):
+            with torch_threads(count):
                 optimizer.step({"shN": gradient}, some, {"shN": 0.01})
-        finally:
-            torch.set_num_threads(before)
         results.append(optimizer.parameters["shN"])
     assert torch.equal(results[0], results[1]) and torch.equal(results[0][some], results[2][some])
 

@@ -19,7 +19,7 @@ from clod_adapter.render import render
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.plan import NAMES, Override
 from clod_adapter.training.planner import make_plan
-from scenes import capture, with_unseen
+from scenes import assert_equal, capture, with_unseen
 
 CONFIG = AdaptConfig(iters=40, max_sv=4.0)
 ALL = frozenset(NAMES)
@@ -30,12 +30,6 @@ def captured() -> tuple[Gaussians, Scene]:
     """A capture without unseen Gaussians."""
     base, scene = capture()
     return base.select(removal_error(base, scene.train) > 0), scene
-
-
-def assert_equal(a: Gaussians, b: Gaussians) -> None:
-    assert a.tensors().keys() == b.tensors().keys() and a.attenuation == b.attenuation
-    for name, value in a.tensors().items():
-        assert torch.equal(value, b.tensors()[name]), name
 
 
 def test_training_is_the_same_if_nothing_is_left_out(captured: tuple[Gaussians, Scene]) -> None:
