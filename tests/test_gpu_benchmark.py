@@ -22,11 +22,8 @@ def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def test_plush_and_city_small(script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     out = tmp_path / "gpu.jsonl"
-    words = [
-        *["gpu.py", "--device", "cpu", "--small", "--only", "plush", "city", "--count", "1000", "--results"],
-        str(out),
-    ]
-    monkeypatch.setattr(sys, "argv", words)
+    words = "gpu.py --device cpu --small --only plush city --count 1000 --results"
+    monkeypatch.setattr(sys, "argv", [*words.split(), str(out)])
     script.main()
     rows = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
     plush, adapted, *frames = rows

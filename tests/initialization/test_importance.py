@@ -120,21 +120,6 @@ def test_shares_kept_follow_the_curve(share: float, exponent: float, n: int = 10
     assert empty.shape == (0,)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_sigma_grows_with_importance(seed: int, n: int = 200) -> None:
-    """All else equal; and whatever the opacity, those of small importance are culled first."""
-    importance = torch.rand(n, generator=torch.Generator().manual_seed(seed))
-    distances, order = torch.full((n,), 0.7), importance.argsort()
-    alike, some = gaussians(n, 0, 0).replace(opacity_logits=torch.full((n,), 1.0)), gaussians(n, 0, seed)
-    sigmas = [sigma_from_importance(g, importance, distances, CONFIG, share=0.7, exponent=1.5) for g in (alike, some)]
-    assert (sigmas[0][order].diff() > 0).all() and sigmas[0].isfinite().all(), f"seed {seed}"
-    culled_at = extinction_scale(some.opacity_logits, sigmas[1], distances, CONFIG)
-    # The others are kept for as long as their opacity allows.
-    lasting = (some.opacities * 255 * 0.99 > culled_at)[order]
-    assert lasting.sum() > n / 2
-    assert (culled_at[order][lasting].diff() >= -1e-4).all(), f"seed {seed}"
-
-
 def test_the_orders_of_the_initialization() -> None:
     """By removal error alone the most important is culled last; with neighbours it may be culled earlier."""
     some = gaussians(200, 0, 0)

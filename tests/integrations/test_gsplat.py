@@ -221,22 +221,6 @@ def test_faded_it_is_gsplat_camera_by_camera(tools: Tools, cameras: int, packed:
         torch.testing.assert_close(getattr(points[0], kind), want, rtol=1e-3, atol=1e-4)
 
 
-def test_the_gradient_of_sigma_d_matches_finite_differences(tools: Tools) -> None:
-    if tools.device == "cuda":
-        pytest.skip("gsplat's kernels are float32's")
-    given, views = arguments(12, 2, dtype=torch.float64)
-    given["opacities"] = given["opacities"].clamp(min=0.2)
-    weights = torch.rand(2, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1)).double()
-
-    def loss(sigma_d: Tensor) -> Tensor:
-        options = {"sh_degree": 1, "sigma_d": sigma_d, "virtual_scale": 1.5, "attenuation": SOFT}
-        return (tools.ours(**given, **views, **options)[0] * weights).sum()
-
-    sigma_d = (0.8 + reach(12, dtype=torch.float64)).requires_grad_()
-    # The rasterizer culls alphas below 1/255: a jump that finite differences may meet.
-    assert torch.autograd.gradcheck(loss, sigma_d, eps=1e-7, atol=1e-4, rtol=1e-4)
-
-
 def test_colours_and_backgrounds_of_each_camera(tools: Tools) -> None:
     given, views = arguments(N, 2, (2,), device=tools.device)
     given["colors"] = torch.rand(2, 2, N, 5, generator=torch.Generator().manual_seed(0)).to(tools.device)

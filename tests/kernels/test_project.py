@@ -35,13 +35,16 @@ def all_visible(n: int, degree: int = 3) -> Parameters:
 
 
 def hide(some: Parameters, gone: Tensor, how: str) -> None:
-    """Makes rows invisible: culled by the projection, or before it."""
-    if how == "behind":
-        some["means"][gone] = in_front(VIEW, torch.tensor([[0.1, 0.2, -3.0]])).expand(int(gone.sum()), 3)
-    elif how == "beside":
-        some["means"][gone] = in_front(VIEW, torch.tensor([[30.0, 0.2, 3.0]])).expand(int(gone.sum()), 3)
-    else:
+    """Makes rows invisible: culled by the projection, before it, or after it where their colour is not finite."""
+    if how in ("behind", "beside"):
+        place = [0.1, 0.2, -3.0] if how == "behind" else [30.0, 0.2, 3.0]
+        some["means"][gone] = in_front(VIEW, torch.tensor([place])).expand(int(gone.sum()), 3)
+    elif how == "faint":
         some["opacities"][gone] = 0.001
+    else:
+        values = some[how.split()[-1]].view(49, -1)
+        column = -1 if how.startswith("last") else 0
+        values[gone, column] = torch.tensor([math.nan, math.inf, -math.inf]).repeat(17)[:49][gone]
 
 
 @pytest.mark.parametrize(("n", "degree"), [(0, 0), (1, 3), (15, 1), (16, 0), (16, 3), (17, 1), (33, 3)])
@@ -70,25 +73,17 @@ PATTERNS = {
 }
 
 
-@pytest.mark.parametrize(("pattern", "how"), [*zip(PATTERNS, ["behind", "faint", "beside"] * 5, strict=False)])
-def test_some_invisible(pattern: str, how: str) -> None:
+HOW = [["behind", "faint", "beside"], ["sh0", "first of shN", "last of shN"]]
+
+
+@pytest.mark.parametrize(("pattern", "how"), [pair for some in HOW for pair in zip(PATTERNS, some * 5, strict=False)])
+def test_invisible_rows_are_not_packed(pattern: str, how: str) -> None:
+    """Rows whose colour is not finite are packed and removed again, beside others that the projection culls."""
     some, gone = all_visible(49), PATTERNS[pattern]
     hide(some, gone, how)
-    assert_agrees(cpu.rasterize, some, VIEW, rows=~gone)
-
-
-@pytest.mark.parametrize(
-    ("pattern", "name"), [*zip(PATTERNS, ["sh0", "first of shN", "last of shN"] * 5, strict=False)]
-)
-def test_colors_that_are_not_finite(pattern: str, name: str) -> None:
-    """Such rows are projected, packed, and removed again, beside others that are invisible."""
-    some, gone = all_visible(49), PATTERNS[pattern]
-    values = some[name.split()[-1]].view(49, -1)
-    column = -1 if name.startswith("last") else 0
-    values[gone, column] = torch.tensor([math.nan, math.inf, -math.inf]).repeat(17)[:49][gone]
-    hidden = ROWS % 7 == 3
-    hide(some, hidden, "behind")
-    assert_agrees(cpu.rasterize, some, VIEW, rows=~gone & ~hidden)
+    behind = (ROWS % 7 == 3) & torch.tensor(how in HOW[1])
+    hide(some, behind, "behind")
+    assert_agrees(cpu.rasterize, some, VIEW, rows=~gone & ~behind)
 
 
 def test_earlier_calls_do_not_change_the_result() -> None:

@@ -88,19 +88,16 @@ def test_the_dial_works_after_training(captured: Pair, trained: Trained) -> None
     sigma = adapted.sigma_d
     assert sigma.isfinite().all() and (sigma >= 0.9e-4).all()
     assert sigma.unique().numel() > len(sigma) / 2
+    initial = initialize(captured[0], captured[1].train, config_of()).sigma_d
+    assert ((sigma / initial).log().abs() > 0.02).float().mean() > 0.3
+    for name in ATTRIBUTES:
+        assert not torch.equal(getattr(adapted, name), getattr(captured[0], name)), name
     rows = evaluate(adapted, captured[1].train, SCALES)
     for more, less in zip(rows, rows[1:], strict=False):
         assert less.kept < 0.9 * more.kept and less.psnr < more.psnr
     assert rows[0].kept_share > 0.5 and 0 < rows[-1].kept_share < 0.2
     # What the count term is for: near the law, with Gaussians to spare at no dial value.
     assert all(row.kept_share < 1.5 * row.virtual_scale**-1.5 for row in rows)
-
-
-def test_sigma_is_learned(captured: Pair, trained: Trained) -> None:
-    old, new = initialize(captured[0], captured[1].train, config_of()).sigma_d, trained[0].gaussians.sigma_d
-    assert ((new / old).log().abs() > 0.02).float().mean() > 0.3
-    for name in ATTRIBUTES:
-        assert not torch.equal(getattr(trained[0].gaussians, name), getattr(captured[0], name)), name
 
 
 def test_progress_is_reported(captured: Pair, trained: Trained) -> None:
@@ -156,18 +153,6 @@ def test_no_steps_give_the_initialization(captured: Pair) -> None:
         assert row.kept_share == pytest.approx(1 / (s**1.5 + (1 / 0.7 - 1) * s**-1.5), rel=0.25)
 
 
-def test_continues_from_a_sigma(captured: Pair, trained: Trained) -> None:
-    """No importance pass, the same D, and from where the first run was."""
-    first, seen = trained[0].gaussians, []
-    config = config_of(iters=1, max_sv=3.0)
-    result = adapt(first, captured[1], config, seen.append)
-    assert [p.phase for p in seen] == [Phase.TRAINING]
-    moved = (result.gaussians.sigma_d / first.sigma_d).log().abs()
-    assert moved.max() <= 1.01e-2  # a step of log sigma
-    assert result.gaussians.attenuation == replace(first.attenuation, max_sv=3.0)
-    assert initialize(first, captured[1].train, config).sigma_d is first.sigma_d
-
-
 def test_the_result_is_in_world_units_and_read_back_as_it_was(captured: Pair, trained: Trained, tmp_path: Path) -> None:
     """What was evaluated is what is written: nothing is converted, and so rounded, on the way."""
     result = trained[0].gaussians
@@ -195,25 +180,30 @@ def test_rows_that_are_only_drawn_keep_their_units_when_resumed(captured: Pair, 
 
 
 @pytest.mark.parametrize("lost", [False, True], ids=["known", "lost"])
-def test_continuing_divides_by_the_typical_distance_again(captured: Pair, trained: Trained, lost: bool) -> None:
-    """The one in the file, or that of the views where another tool has dropped it: the steps are the same."""
-    first, states = trained[0].gaussians, list[float]()
+def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Trained, lost: bool) -> None:
+    """No importance pass; the unit is the file's typical distance, or the views' where another tool dropped it."""
+    first, phases, states = trained[0].gaussians, list[Phase](), list[float]()
     if lost:
         first = first.replace(attenuation=replace(first.attenuation, reference_distance=0.0))
 
     def follow(now: Progress) -> None:
+        phases.append(now.phase)
         if now.state:
             states.append(now.state().attenuation.scene_distance)
 
-    result = adapt(first, captured[1], config_of(iters=1), follow).gaussians
+    config = config_of(iters=1, max_sv=3.0)
+    result = adapt(first, captured[1], config, follow).gaussians
     want = scene_distance(first, captured[1].train, 0.95) if lost else first.attenuation.reference_distance
-    assert states == [pytest.approx(want)] and want > 2
-    assert result.attenuation.reference_distance == pytest.approx(want)
+    assert phases == [Phase.TRAINING] and states == [pytest.approx(want)] and want > 2
+    found = result.attenuation.reference_distance
+    assert found == pytest.approx(want)
+    assert result.attenuation == replace(first.attenuation, max_sv=3.0, reference_distance=found)
+    assert initialize(first, captured[1].train, config).sigma_d is first.sigma_d
     assert (result.sigma_d / first.sigma_d).log().abs().max() <= 1.01e-2  # a step of log sigma
     # A sigma_d learned under one tau and normalizer means something else under others: the file's are kept.
     own = AttenuationConfig(tau=0.02, eps=1e-6, normalizer="max", scene_distance=2.0, max_sv=4.0)
     dialled = attach(captured[0], torch.full((len(captured[0]),), 1.5), own)
-    result = adapt(dialled, captured[1], config_of(iters=1, max_sv=3.0)).gaussians
+    result = adapt(dialled, captured[1], config).gaussians
     assert result.attenuation == replace(own, max_sv=3.0, scene_distance=1.0, reference_distance=2.0)
 
 

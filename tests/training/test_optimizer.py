@@ -44,22 +44,6 @@ def everything(n: int) -> Tensor:
     return torch.ones(n, dtype=torch.bool)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_fused_is_plain(seed: int, n: int = 203) -> None:
-    """Different rows each step."""
-    fused, plain = RowAdam(parameters(n)), PlainRowAdam(parameters(n))
-    g = torch.Generator().manual_seed(seed)
-    for step in range(8):
-        rows = torch.rand(n, generator=g) < torch.rand((), generator=g)
-        for optimizer in (fused, plain):
-            optimizer.step(gradients(n, 100 * seed + step), rows, rates(0.01))
-    start = parameters(n)
-    for name in SHAPES:
-        moved = (fused.parameters[name] - start[name]).abs()
-        assert (moved > 0.01).any()
-        torch.testing.assert_close(fused.parameters[name], plain.parameters[name], rtol=1e-6, atol=1e-6)
-
-
 @pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
 @pytest.mark.parametrize(
     ("steps", "beta1", "beta2", "epsilon"),
