@@ -28,7 +28,7 @@ ZERO = mpmath.mpf(0)
 
 
 def grid(*axes: list[float]) -> list[Tensor]:
-    """Columns of the axes' product. Values are float32's, so both dtypes share one mpmath reference."""
+    """Columns of the axes' product. Values are exact in float32, so both dtypes share one mpmath reference."""
     return list(torch.tensor(list(itertools.product(*axes)), dtype=torch.float32).double().unbind(1))
 
 

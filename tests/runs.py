@@ -1,4 +1,4 @@
-"""What tests of the main job share: the names of its files, errors on demand, and processes without a slow start."""
+"""Shared by tests of training: file names, injected errors and signals, and processes that start quickly."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ for line in sys.stdin:
 
 
 class Server:
-    """Runs ``clod-adapt`` in real processes that need no seconds to start."""
+    """Runs ``clod-adapt`` in forked processes, which start quickly."""
 
     def __init__(self) -> None:
         self.process = subprocess.Popen(
@@ -81,7 +81,7 @@ class Server:
         )  # fmt: skip
 
     def wait(self, pid: int) -> int:
-        """The exit code; of a killed process the signal, negative."""
+        """The exit code; the negative signal of a killed process."""
         return self.ask(wait=pid)
 
     def run(self, folder: Path, *words: object) -> tuple[int, str]:
@@ -109,7 +109,7 @@ def fail(*_: Any, **__: Any) -> Any:
 
 
 def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[..., Any]:
-    """``real``, which these signals interrupt at the beginning of its ``at``-th call."""
+    """``real``, interrupted by these signals at the beginning of its ``at``-th call."""
     calls = count(1)
 
     def pressed(*given: Any, **rest: Any) -> Any:
@@ -123,7 +123,7 @@ def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[.
 def change_step(
     patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any], only: Callable[[Any], bool] = lambda config: True
 ) -> None:
-    """The gradients of the ``at``-th step from here, of runs that ``only`` names, are what ``change`` makes of them."""
+    """Applies ``change`` to the gradients of the ``at``-th step of runs whose config satisfies ``only``."""
     real, steps = Objective.gradient_sum, count(1)
 
     def changed(self: Objective, *given: Any) -> Any:

@@ -1,7 +1,6 @@
-"""Everything on the way from a checkpoint to its pictures and numbers works on another device than the CPU.
+"""Rendering, training and evaluation work on a device other than the CPU.
 
-On a GPU where there is one; else on a fake one, on which what would fail on a real one fails, with gsplat's Python and
-torch in place of its kernels.
+On a GPU, if there is one; otherwise on a simulated one (``fake_gpu``), with torch in place of gsplat's kernels.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ CONFIG = AdaptConfig(iters=2, max_sv=4.0)
 
 @dataclass(frozen=True)
 class Setup:
-    """The same Gaussians on both, and photographs, which are on the CPU."""
+    """The same Gaussians on both devices, and photographs, which are on the CPU."""
 
     device: torch.device
     own: Gaussians
@@ -108,8 +107,8 @@ def test_the_initialization(setup: Setup, kind: str) -> None:
     torch.testing.assert_close(mine.cpu().log(), want.log(), rtol=0.02, atol=0.02)
 
 
-def test_numbers(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows, counts, dial values, popping, alignment, orders: the CPU's, within what two rasterizers differ by."""
+def test_measurements_match_the_cpu(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows, counts, dial values, popping, alignment and orders, to the difference of two rasterizers."""
     cameras, test = setup.cameras, setup.scene.test
     rows, want = on_both(setup, lambda model: evaluate(model, test, [1.0, 3.0]))
     for mine, own in zip(rows, want, strict=True):
@@ -134,7 +133,7 @@ def test_numbers(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(taken > 0 for _, taken in frame_times(setup.there, cameras[:1]))
 
 
-def test_placed_cameras_are_those_of_the_cpu(setup: Setup) -> None:
+def test_placed_cameras_match_the_cpu(setup: Setup) -> None:
     placed = [place_cameras(model, views=1) for model in (setup.there, setup.own)]
     torch.testing.assert_close(placed[0][0].viewmat, placed[1][0].viewmat, rtol=1e-3, atol=1e-3)
     assert placed[0][0].viewmat.device.type == "cpu"
@@ -143,7 +142,7 @@ def test_placed_cameras_are_those_of_the_cpu(setup: Setup) -> None:
     assert all(view.image.device.type == "cpu" for view in pictures)
 
 
-def test_a_block(setup: Setup) -> None:
+def test_training_a_block(setup: Setup) -> None:
     views, config = setup.scene.train[:2], replace(CONFIG, iters=2)
     division = divide(setup.there.replace(sigma_d=None, attenuation=None), views, config, 2)
     aimed = target_image(division.initial, 25, views[0])
@@ -152,8 +151,8 @@ def test_a_block(setup: Setup) -> None:
     assert merged.means.device == setup.device and bool(merged.sigma_d.isfinite().all())
 
 
-def test_a_whole_training_after_its_plan(setup: Setup) -> None:
-    """What the plan leaves out is put back after training."""
+def test_plan_and_training(setup: Setup) -> None:
+    """Parts that the plan leaves out are restored after training."""
     plain, scene = setup.there.replace(sigma_d=None, attenuation=None), Scene(setup.scene.train[:2], ())
     config = AdaptConfig(iters=10, max_sv=4.0)
     plan = make_plan(plain, scene, config)
@@ -169,7 +168,7 @@ def test_a_whole_training_after_its_plan(setup: Setup) -> None:
 
 
 @pytest.mark.parametrize("changes", [{"batch": 2}, {"count_term": "paper"}], ids=str)
-def test_a_training_is_that_of_the_cpu(setup: Setup, changes: dict[str, Any]) -> None:
+def test_training_matches_the_cpu(setup: Setup, changes: dict[str, Any]) -> None:
     scene, config = Scene(setup.scene.train[:2], ()), replace(CONFIG, iters=1, **changes)
     mine, own = on_both(setup, lambda model: adapt(model, scene, config).gaussians)
     for name, value in own.tensors().items():
@@ -177,8 +176,8 @@ def test_a_training_is_that_of_the_cpu(setup: Setup, changes: dict[str, Any]) ->
         assert float((mine.tensors()[name].cpu() - value).abs().median()) <= 1e-4, name
 
 
-def test_what_is_frozen_takes_no_gradient(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor memory for one: harmonics are the largest part of a Gaussian."""
+def test_frozen_tensors_get_no_gradient(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No memory is allocated for one; harmonics are the largest part of a Gaussian."""
     if setup.there.means.is_cuda:
         monkeypatch.setattr(cuda, "unusable", lambda: None)
     made: list[torch.Size] = []
@@ -201,8 +200,8 @@ def test_rasterizing_under_a_debugger(setup: Setup) -> None:
         sys.settrace(before)
 
 
-def test_neither_the_dial_nor_adam_asks_the_device_for_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each answer would have the CPU wait until the GPU is done, every step."""
+def test_dial_and_adam_do_not_synchronize_with_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A synchronization would make the CPU wait for the GPU in every step."""
     from torch.utils._python_dispatch import TorchDispatchMode
 
     class Silent(TorchDispatchMode):

@@ -1,4 +1,4 @@
-"""The container: shapes are checked, nothing is shared by accident, copies are copies."""
+"""The container of Gaussians: shapes, activations, selection, and SH degrees."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_wrong_shapes_are_named(name: str, shape: tuple[int, ...]) -> None:
     assert f"Gaussians.{name}" in str(caught.value) and str(shape) in str(caught.value)
 
 
-def test_a_sigma_comes_with_its_reading() -> None:
+def test_sigma_d_requires_attenuation_settings() -> None:
     for changes in ({"sigma_d": torch.ones(5)}, {"attenuation": CONFIG}):
         with pytest.raises(ClodError, match="both sigma_d and attenuation"):
             gaussians(**changes)
@@ -73,7 +73,7 @@ def test_select_and_to() -> None:
 
 @pytest.mark.parametrize(("degree", "used"), [(0, 0), (1, 0), (1, 1), (2, 1), (3, 0), (3, 2), (3, 3), (4, 1), (4, 4)])
 def test_empty_sh_degrees_are_removed(degree: int, used: int) -> None:
-    """The highest ones that are 0 throughout; a single coefficient keeps its degree and all below."""
+    """The highest degrees that are 0 are removed; one coefficient keeps its degree and all below."""
     some = some_gaussians(7, degree, 0)
     assert some.sh_degree == degree and SH_COUNTS[degree] == (degree + 1) ** 2
     bands = (used + 1) ** 2 - 1

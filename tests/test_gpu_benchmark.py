@@ -1,4 +1,4 @@
-"""The script that does all checks on a GPU does them here, small; only its figures mean nothing."""
+"""The GPU benchmark script runs on the CPU at a small size."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_outcomes_of_tests_are_counted(script: ModuleType, monkeypatch: pytest.M
     assert [name.rpartition("::")[2] for name in row["failures"]] == ["test_bad"]
 
 
-def test_without_a_gpu_it_says_so(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_gpu_is_an_error(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(script.torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(sys, "argv", ["gpu.py"])
     with pytest.raises(SystemExit, match="--device cpu --small"):

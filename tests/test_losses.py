@@ -36,7 +36,7 @@ def value_and_gradient(function, image: Tensor, target: Tensor, weight: float) -
 @pytest.mark.parametrize(
     ("size", "weight"), [(size, (0.0, 0.2, 1.0)[k % 3]) for k, size in enumerate((*SIZES, (3, 7), (33, 50)))], ids=str
 )
-def test_fused_is_plain(size: tuple[int, int], weight: float) -> None:
+def test_fused_loss_matches_the_plain_loss(size: tuple[int, int], weight: float) -> None:
     """In float32, against float64: the value within 2e-6, the gradient within 1e-4 of its length."""
     image, target = pair(*size)
     loss, gradient = value_and_gradient(photometric_loss, image, target, weight)

@@ -33,7 +33,7 @@ def test_strip_shows_every_panel(tmp_path: Path) -> None:
 
 
 def test_labels_of_the_curve_do_not_overlap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the demo's own rows, with and without the base."""
+    """For the demo's own rows, with and without the base."""
     pytest.importorskip("matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.transforms import Bbox

@@ -1,4 +1,4 @@
-"""The folder in which a reader of the documentation is: a tiny capture, its checkpoints, and what was made of them."""
+"""The folder in which the documentation's commands run: a tiny capture, its checkpoints and results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from formats import without_comments
 @pytest.fixture(scope="session")
 def desk(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """``scene/``, ``pretrained.ply``, ``pretrained_mask.ply`` (MaskGaussian's old layout), ``pretrained_clod.*``, and
-    ``demo/`` with the names that the demo leaves."""
+    ``demo/`` with the demo's file names."""
     folder = tmp_path_factory.mktemp("desk")
     shutil.copytree(capture.scene, folder / "scene")
     shutil.copyfile(capture.ply, folder / "pretrained.ply")

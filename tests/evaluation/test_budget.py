@@ -1,4 +1,4 @@
-"""Budgets: the counts that solved dial values really keep, and what the table's interpolation makes of known curves."""
+"""Budgets: solved dial values keep the counts asked for, and interpolate known curves."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_SV = 6.0
 
 
 def adapted(n: int, seed: int, normalizer: str = "scene") -> Gaussians:
-    """With decays for which Gaussians are culled all over the dial's range, and below and above it."""
+    """Gaussians that are culled at dial values within, below and above the range."""
     generator = torch.Generator().manual_seed(seed)
     sigma = (torch.randn(n, generator=generator) * 0.8 + 0.4).exp()
     attenuation = AttenuationConfig(max_sv=MAX_SV, normalizer=normalizer, scene_distance=5.0)
@@ -124,7 +124,7 @@ def test_frame_rate(times: list[float], fps: float, dial_value: float) -> None:
 
 
 def test_frames_are_timed_where_nothing_is_stored(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The clock is the dial's: a frame at s takes 8/s ms."""
+    """The clock is simulated: a frame at s takes 8/s ms."""
     seen: list[tuple[str, float]] = []
     now = [0.0]
 
@@ -150,7 +150,7 @@ def test_frame_times_of_a_real_clock() -> None:
     assert len(frame_times(alone, ring(1, 48, 36))) == 1
 
 
-def test_bad_calls_are_named() -> None:
+def test_bad_arguments_are_refused() -> None:
     some, camera = adapted(5, 0), ring(1, 48, 36)
     for budgets in ({}, {"keep": 3, "fps": 3}):
         with pytest.raises(ClodError, match="exactly one of keep, psnr_drop and fps"):

@@ -37,7 +37,7 @@ ATTENUATION = AttenuationConfig(tau=0.01, max_sv=6.0, cut="soft", reference_dist
 
 
 def table(n: int = 300, degree: int = 1, seed: int = 0) -> np.ndarray:
-    """Rows in Inria's layout, unit quaternions, with something in every column that is used."""
+    """Rows in Inria's layout, with unit quaternions and nonzero values in every column."""
     g = scenes.gaussians(n, degree, seed)
     g = g.replace(quats=torch.nn.functional.normalize(g.quats))
     return rows_of({name: tensor.numpy() for name, tensor in g.tensors().items()})
@@ -126,7 +126,7 @@ def test_empty_sh_degrees_are_those_that_adapting_skips(tmp_path: Path, degree: 
 
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(0, 999))
-def test_the_same_rows_are_dropped_as_by_load(tmp_path: Path, seed: int) -> None:
+def test_dropped_rows_are_those_that_load_drops(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
     vertex = table(40, 1, seed)
     for name in rng.choice(vertex.dtype.names, 3):
@@ -169,7 +169,7 @@ def test_anomalies_are_counted(tmp_path: Path) -> None:
     assert v is not None and v.doubles == 599 and v.far == v.giant == 0
 
 
-def test_values_that_look_activated_are_taken_so(tmp_path: Path) -> None:
+def test_values_that_look_activated_are_read_as_activated(tmp_path: Path) -> None:
     plain, vertex = table(), table()
     vertex["opacity"] = 1 / (1 + np.exp(-vertex["opacity"]))
     for k in range(3):
@@ -269,7 +269,7 @@ def test_real_files(shared_data: Callable[[str], Path], name: str) -> None:
 
 
 def mutants(folder: Path) -> list[bytes]:
-    """A file of every kind that is inspected, in bytes, with its suffix before it."""
+    """The bytes of a file of every kind, each preceded by its suffix."""
     paths = [
         write(folder / "a.ply", table(6, 1)), write(folder / "b.ply", table(4, 0), order="ascii"),
         write_packed(folder / "c.ply", scenes.gaussians(6, 1, 0)), adapted(folder / "d.ply", 5),
@@ -283,7 +283,7 @@ def mutants(folder: Path) -> list[bytes]:
 
 
 def mutate(data: bytes, chance: random.Random) -> bytes:
-    """A few bytes or digits changed, mostly near the beginning, or a piece cut out."""
+    """Changes a few bytes or digits, mostly near the beginning, or removes some bytes."""
     changed = bytearray(data)
     for _ in range(chance.randint(1, 4)):
         near = int(chance.expovariate(1 / 600)) if chance.random() < 0.5 else chance.randrange(len(changed))

@@ -1,4 +1,4 @@
-"""Recycled memory: never used again while a tensor or an alias of it is alive."""
+"""Recycled memory is not reused while a tensor or an alias of it is alive."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def fresh(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def extent(x: Tensor) -> tuple[int, int]:
-    """First address and the one behind the last."""
+    """The first address, and the one after the last."""
     return x.data_ptr(), x.data_ptr() + x.numel() * x.element_size()
 
 
@@ -75,7 +75,7 @@ def test_shapes() -> None:
         tensor.fill_(1)
 
 
-def test_at_most_an_eighth_too_large(fresh: list[int]) -> None:
+def test_allocations_are_at_most_an_eighth_too_large(fresh: list[int]) -> None:
     sizes = [*range(16_384, 40_000, 777), *(2**k + d for k in range(15, 25) for d in (-1, 0, 1))]
     held = [recycled((size,)) for size in sizes]
     assert len(fresh) == len(held)
@@ -89,7 +89,7 @@ STEP = (SHAPE, SHAPE[:2], *((20_000, width) for width in (3, 4, 3, 1, 3, 45)))  
     ("rounds", "allocated"), [([[SHAPE]] * 10 * IDLE, 1), ([STEP] * 50, len(STEP)), ([[(100_000,)], [(100_100,)]], 1)]
 )
 def test_memory_is_used_again(fresh: list[int], rounds: list[list[tuple[int, ...]]], allocated: int) -> None:
-    """Of one tensor, of the tensors of a training step, held and released together, and of nearly equal sizes."""
+    """Memory of one tensor, of all tensors of a training step, and of similar sizes is reused."""
     for shapes in rounds:
         held = [recycled(shape) for shape in shapes]
         del held
@@ -145,7 +145,7 @@ def test_held_memory_is_not_used_again(holder: str) -> None:
     assert all((other == k).all() for k, other in enumerate(others))
 
 
-def test_few_stay_idle_and_the_oldest_are_freed(fresh: list[int]) -> None:
+def test_oldest_idle_memory_is_freed(fresh: list[int]) -> None:
     held = deque(recycled((size,)) for size in (20_000, 50_000, 100_000) for _ in range(3 * IDLE))
     held.clear()
     assert 0 < idle() <= IDLE
@@ -162,9 +162,9 @@ def test_few_stay_idle_and_the_oldest_are_freed(fresh: list[int]) -> None:
 
 
 def test_threads_never_get_the_same_memory(workers: int = 4, rounds: int = 500) -> None:
-    """Each fills its tensors with a number, which must be there until another thread releases them.
+    """Each thread fills its tensors with a number, which must be unchanged until another thread releases them.
 
-    The threads take turns as often as they can.
+    The interpreter switches threads as often as possible.
     """
     together, passed = threading.Barrier(workers), [deque[tuple[Tensor, float]]() for _ in range(workers)]
 

@@ -1,4 +1,4 @@
-"""The projection packs sixteen Gaussians at a time: counts and visibility patterns around sixteen."""
+"""The projection packs sixteen Gaussians at a time, tested with counts and visibility patterns around sixteen."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_invisible_rows_are_not_packed(pattern: str, how: str) -> None:
 
 
 def test_earlier_calls_do_not_change_the_result() -> None:
-    """Records and lists are in recycled memory: after a larger scene with NaN the result has the same bits."""
+    """Records and lists are in recycled memory; after a larger scene with NaN the result has the same bits."""
     some = all_visible(17)
     want = differentiate(cpu.rasterize, some, VIEW, weights(VIEW))
     for n in (33, 100, 400):

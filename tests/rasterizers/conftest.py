@@ -1,4 +1,4 @@
-"""The rasterizers under contract, one after the other, and how many threads they have."""
+"""Fixtures of every rasterizer, and of the number of threads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every backend draws and differentiates what the float64 reference does."""
+"""Every backend agrees with the float64 reference in images and gradients."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_random_scenes(rasterize: Rasterizer, degree: int) -> None:
 def test_cameras(rasterize: Rasterizer, view: dict[str, Any]) -> None:
     """Image sizes; narrow and wide lenses; the principal point outside the image.
 
-    Of the wide one, centres are far outside the image, where the Jacobian's ray is clamped.
+    With the wide lens, centres are far outside the image, where the Jacobian's ray is clamped.
     """
     cut = 0.05 if "width" in view else ON_A_CUT
     some = scene(120, 1, 7, size=0.3 if "width" in view else 0.2)
@@ -49,7 +49,7 @@ def test_cameras(rasterize: Rasterizer, view: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("near", [1e-6, 0.01, 3.0])
 def test_near_the_camera_plane(rasterize: Rasterizer, near: float) -> None:
-    """Centres just before, on and just beyond the near plane: those before it are not drawn."""
+    """Centres just before, on and just beyond the near plane; those before it are not drawn."""
     view, unit = camera(40, 30), near / 0.01
     some = scene(60, 2, 3)
     z = torch.cat([torch.linspace(-0.05, 0.0099, 30), torch.linspace(0.0101, 0.05, 30)])
@@ -73,7 +73,7 @@ def test_opacity_of_a_few(rasterize: Rasterizer, opacity: float) -> None:
 
 @pytest.mark.parametrize("saturated", [False, True])
 def test_opaque_layers(rasterize: Rasterizer, saturated: bool) -> None:
-    """Gaussians behind the end of a pixel play no part; at opacity 1 alpha is clamped, where it has no gradient."""
+    """Gaussians behind the end of a pixel are not drawn; at opacity 1 alpha is clamped and has no gradient."""
     some = scene(300 if saturated else 1500, 1, 0, size=1.0 if saturated else 0.3)
     some["opacities"] = torch.ones(300) if saturated else 0.9 + 0.1 * some["opacities"]
     assert_agrees(rasterize, some, camera(26, 19), cut=0.05 if saturated else ON_A_CUT)
@@ -117,7 +117,7 @@ def test_axis_ratio_of_a_million(rasterize: Rasterizer, scales: tuple[float, flo
 
 @pytest.mark.parametrize(("axes", "length"), [(1, 1e-8), (3, 0.0), (1, 1e2), (3, 1e3), (1, 1e4)])
 def test_extreme_scales(rasterize: Rasterizer, axes: int, length: float) -> None:
-    """And quaternions of any length."""
+    """With quaternions of any length."""
     if axes == 1 and length >= 100 and getattr(rasterize, "looser", 1.0) > 1:
         pytest.skip("gsplat takes the determinant in float32, where that of such a needle cancels")
     some = scene(100, 1, 5)
@@ -139,7 +139,7 @@ def test_far_away(rasterize: Rasterizer, distance: float) -> None:
 
 
 def test_thousands_in_one_tile(rasterize: Backend) -> None:
-    """20,000 faint ones before 5x4 pixels, of which some end early."""
+    """20,000 faint Gaussians before 5x4 pixels, some of which end early."""
     some = scene(20_000, 1, 2, size=0.02)
     some["means"] *= 0.5
     some["opacities"] = some["opacities"] * 0.02 + 1 / 255
@@ -160,9 +160,9 @@ def test_thousands_in_one_tile(rasterize: Backend) -> None:
     ids=str,
 )  # fmt: skip
 def test_screen_filters(rasterize: Rasterizer, scales: Any, screen_filter: ScreenFilter) -> None:
-    """Of sizes from a tenth of a pixel to several, the opacity compensated to nothing, by half, and hardly.
+    """Sizes from a tenth of a pixel to several pixels, where the compensation is strong, medium and weak.
 
-    A needle has no area and is not drawn; of a disc seen from its edge the compensation is steep.
+    A needle has no area and is not drawn; the compensation of a disc seen from its edge is steep.
     """
     view, image, cut = camera(70, 50), IMAGE, 0.04
     some = scene(200, 1, 11, size=scales if isinstance(scales, float) else 1.0)
@@ -174,7 +174,7 @@ def test_screen_filters(rasterize: Rasterizer, scales: Any, screen_filter: Scree
 
 @pytest.mark.parametrize("far", [1e4, 1e8])
 def test_an_ellipse_beyond_the_range_of_integers(rasterize: Rasterizer, far: float) -> None:
-    """Its centre up to 1e12 pixels away, its long axis through the image: all pixels are finite and in range."""
+    """The centre is up to 1e12 pixels away, the long axis crosses the image; all pixels are finite and in range."""
     view = Camera(torch.eye(4), torch.tensor([[100.0, 0, 64], [0, 100.0, 64], [0, 0, 1]]), 128, 128)
     some = scene(20, 0, 0)
     some["means"][:, 2] += 4

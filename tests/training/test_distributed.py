@@ -1,4 +1,4 @@
-"""What processes exchange. Here a group of one; tests/cli/test_processes.py has real ones, and their losses."""
+"""Communication of processes, with a group of one; tests/cli/adapt/test_processes.py has several processes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def peers() -> Iterator[ProcessGroup]:
         yield peers
 
 
-def test_one_alone_exchanges_with_itself(peers: ProcessGroup) -> None:
+def test_a_group_of_one_exchanges_with_itself(peers: ProcessGroup) -> None:
     pull = GradientSum({"means": torch.randn(5, 3), "sigma": torch.randn(5)}, torch.rand(5) < 0.5, 0.25)
     summed = peers.sum(replace(pull, gradients={name: g.clone() for name, g in pull.gradients.items()}))
     assert summed.loss == pull.loss and torch.equal(summed.kept, pull.kept)
@@ -37,7 +37,7 @@ def test_one_alone_exchanges_with_itself(peers: ProcessGroup) -> None:
     assert peers.waiting > 0 and peers.exchanging > 0
 
 
-def test_adapting_alone_changes_no_bit(peers: ProcessGroup) -> None:
+def test_a_group_of_one_changes_no_bit(peers: ProcessGroup) -> None:
     base, scene = capture(n=60, views=4)
     config = AdaptConfig(iters=3, batch=2)
     want, found = adapt(base, scene, config), adapt(base, scene, config, group=peers)
@@ -48,8 +48,8 @@ def test_adapting_alone_changes_no_bit(peers: ProcessGroup) -> None:
         adapt(base, scene, config, group=peers)
 
 
-def test_what_is_sent_arrives() -> None:
-    """Tensors of any kind, within anything that pickles; empty ones, as shN of degree 0, and views of others."""
+def test_objects_survive_being_sent() -> None:
+    """Tensors of any kind within picklable objects, including empty tensors and views."""
     base, scene = capture(n=10, views=2)
     sent = (base.replace(shN=base.shN[:, :0]), scene, {"a": torch.arange(6).view(2, 3).t(), "b": torch.tensor(True)})
     tensors: list[torch.Tensor] = []
@@ -62,7 +62,7 @@ def test_what_is_sent_arrives() -> None:
     assert torch.equal(more["a"], sent[2]["a"]) and more["b"].dtype == torch.bool
 
 
-def test_a_loss_is_told_from_other_errors() -> None:
+def test_a_lost_process_is_distinguished_from_other_errors() -> None:
     with (
         pytest.raises(ProcessLost, match=r"ended \(Connection closed by peer \[127.0.0.1\]:1\)$"),
         distributed._losses(),
@@ -73,7 +73,7 @@ def test_a_loss_is_told_from_other_errors() -> None:
 
 
 def test_connecting_prints_nothing(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    """Of some versions of torch gloo does, from C++, into what --json prints."""
+    """In some versions of torch, gloo prints from C++ to standard output, which --json uses."""
     connect = dist.init_process_group
 
     def noisy(*words: Any, **more: Any) -> None:

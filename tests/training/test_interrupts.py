@@ -1,4 +1,4 @@
-"""Ctrl-C at random moments of ``adapt`` itself, without the command around it."""
+"""Ctrl-C at random times within ``adapt``."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def interrupted(step: int, seconds: float) -> tuple[Adapted, list[Progress]]:
         timer.join()
 
 
-def test_the_result_is_of_the_last_whole_step(undisturbed: tuple[dict[int, dict[str, torch.Tensor]], float]) -> None:
+def test_interrupted_results_are_of_a_whole_step(undisturbed: tuple[dict[int, dict[str, torch.Tensor]], float]) -> None:
     after, seconds = undisturbed
     draw, early = random.Random(3), 0
     for _ in range(ROUNDS):
@@ -80,10 +80,10 @@ def test_the_result_is_of_the_last_whole_step(undisturbed: tuple[dict[int, dict[
 
 
 @pytest.mark.parametrize("where", ["spoilt_rows", "add_to_mean"])
-def test_an_interrupt_within_the_update(
+def test_an_interrupt_within_the_update_completes_the_step(
     undisturbed: tuple[dict[int, dict[str, torch.Tensor]], float], monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
-    """Before and after the parameters have moved: the step is completed, and the state resumes to the same bits."""
+    """Before and after the parameters change; the step is completed, and its state resumes to the same bits."""
     states: list[Any] = []
     monkeypatch.setattr(trainer, where, pressing(getattr(trainer, where), signal.SIGINT, at=5))
     found = adapt(*SCENE, CONFIG, lambda now: states.append(now.state) if now.state else None)
@@ -93,7 +93,7 @@ def test_an_interrupt_within_the_update(
     assert all(torch.equal(value, undisturbed[0][ITERS][n]) for n, value in whole.gaussians.tensors().items())
 
 
-def test_before_the_first_step_is_complete_it_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_before_the_first_step_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     def press(now: Progress) -> None:
         if now.phase == Phase.PRUNING_ORDER:
             signal.raise_signal(signal.SIGINT)
@@ -102,7 +102,7 @@ def test_before_the_first_step_is_complete_it_is_raised(monkeypatch: pytest.Monk
         adapt(*SCENE, CONFIG, press)
 
 
-def test_a_second_one_is_raised_at_once_and_handlers_return() -> None:
+def test_a_second_interrupt_is_raised_at_once() -> None:
     with pytest.raises(KeyboardInterrupt), DeferredInterrupt() as interrupt:
         interrupt.begin()
         signal.raise_signal(signal.SIGINT)
@@ -111,7 +111,7 @@ def test_a_second_one_is_raised_at_once_and_handlers_return() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_other_handlers_and_threads_are_left_alone() -> None:
+def test_other_handlers_and_threads_are_not_affected() -> None:
     heard: list[int] = []
     signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
     with DeferredInterrupt() as interrupt:
@@ -125,7 +125,7 @@ def test_other_handlers_and_threads_are_left_alone() -> None:
     assert found[0].steps == 2
 
 
-def test_an_error_of_the_listener_is_raised_and_not_told_to_it() -> None:
+def test_an_error_of_the_listener_is_not_reported_to_it() -> None:
     seen = []
 
     def listen(now: Progress) -> None:

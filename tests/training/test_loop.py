@@ -1,4 +1,4 @@
-"""Adapting a small generated scene: it gets better, the dial works, and runs end as they should."""
+"""Adapting a small generated scene: quality, dial, reproducibility, resuming, and errors."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SCALES = (1.0, 1.5, 2.0, 3.0, 5.0)
 
 
 def config_of(**changes: Any) -> AdaptConfig:
-    """Gentle settings of our own: what these tests find does not hang on the defaults of the day."""
+    """Fixed settings, so that the tests do not depend on the defaults."""
     settings = {
         "start_share": 0.6, "full_share": 0.5, "lr_sigma": 1e-2, "lr_means": 3e-5, "lr_quats": 4e-4,
         "lr_scales": 2e-3, "lr_opacities": 1e-2, "lr_sh0": 1e-3, "lr_shN": 5e-5,
@@ -61,7 +61,7 @@ def trained(captured: Pair) -> Trained:
     return adapt(*captured, config_of(iters=120), seen.append), seen
 
 
-def test_pictures_get_better(captured: Pair, trained: Trained) -> None:
+def test_training_improves_psnr(captured: Pair, trained: Trained) -> None:
     base, scene = captured
     before = initialize(base, scene.train, config_of())
     for views in (scene.train, scene.test):
@@ -72,7 +72,7 @@ def test_pictures_get_better(captured: Pair, trained: Trained) -> None:
     assert losses[-1] < 0.7 * losses[0]
 
 
-def test_the_defaults_do_that_too(captured: Pair) -> None:
+def test_default_settings_improve_psnr(captured: Pair) -> None:
     base, scene = captured
     config = AdaptConfig(iters=120)
     old, new = (
@@ -83,7 +83,7 @@ def test_the_defaults_do_that_too(captured: Pair) -> None:
     assert all(more.kept > less.kept for more, less in zip(new, new[1:], strict=False))
 
 
-def test_the_dial_works_after_training(captured: Pair, trained: Trained) -> None:
+def test_trained_dial_trades_quality_for_count(captured: Pair, trained: Trained) -> None:
     adapted = trained[0].gaussians
     sigma = adapted.sigma_d
     assert sigma.isfinite().all() and (sigma >= 0.9e-4).all()
@@ -117,13 +117,13 @@ def test_progress_is_reported(captured: Pair, trained: Trained) -> None:
 
 
 @pytest.mark.parametrize("config", [{}, {"normalizer": "quantile"}], ids=str)
-def test_a_seed_decides_everything(captured: Pair, config: dict[str, str]) -> None:
+def test_results_are_reproducible_from_the_seed(captured: Pair, config: dict[str, str]) -> None:
     runs = [adapt(*captured, config_of(iters=15, seed=seed, **config)).gaussians for seed in (7, 7, 8)]
     assert_equal(runs[0], runs[1])
     assert not torch.equal(runs[0].sigma_d, runs[2].sigma_d)
 
 
-def test_the_base_is_left_alone(captured: Pair) -> None:
+def test_base_is_not_modified(captured: Pair) -> None:
     base, scene = captured
     with_dial = initialize(base, scene.train, config_of())
     for some in (base, with_dial):
@@ -133,7 +133,7 @@ def test_the_base_is_left_alone(captured: Pair) -> None:
             assert torch.equal(value, before[name]) and not value.requires_grad, name
 
 
-def test_no_steps_give_the_initialization(captured: Pair) -> None:
+def test_zero_steps_return_the_initialization(captured: Pair) -> None:
     base, scene = captured
     result = adapt(base, scene, config_of(iters=0))
     want = initialize(base, scene.train, config_of())
@@ -153,8 +153,8 @@ def test_no_steps_give_the_initialization(captured: Pair) -> None:
         assert row.kept_share == pytest.approx(1 / (s**1.5 + (1 / 0.7 - 1) * s**-1.5), rel=0.25)
 
 
-def test_the_result_is_in_world_units_and_read_back_as_it_was(captured: Pair, trained: Trained, tmp_path: Path) -> None:
-    """What was evaluated is what is written: nothing is converted, and so rounded, on the way."""
+def test_result_is_in_world_units_and_survives_saving(captured: Pair, trained: Trained, tmp_path: Path) -> None:
+    """The saved file equals the evaluated result; no conversion rounds it."""
     result = trained[0].gaussians
     assert result.attenuation is not None and result.attenuation.scene_distance == 1
     assert result.attenuation.reference_distance == pytest.approx(scene_distance(captured[0], captured[1].train, 0.95))
@@ -166,8 +166,8 @@ def test_the_result_is_in_world_units_and_read_back_as_it_was(captured: Pair, tr
 
 
 @pytest.mark.parametrize("distance", [1.0, 4.0])
-def test_rows_that_are_only_drawn_keep_their_units_when_resumed(captured: Pair, distance: float) -> None:
-    """Their sigma_d is in no state: it is the base's, in whichever unit that has it."""
+def test_untrained_rows_keep_their_units_when_resumed(captured: Pair, distance: float) -> None:
+    """Their sigma_d is not in the state, but the base's, in its unit."""
     base, scene = captured
     settings = AttenuationConfig(scene_distance=distance, reference_distance=4.0)
     base = attach(base, torch.linspace(0.3, 3, len(base)) * 4 / distance, settings)
@@ -207,8 +207,8 @@ def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Trained, l
     assert result.attenuation == replace(own, max_sv=3.0, scene_distance=1.0, reference_distance=2.0)
 
 
-def test_every_sigma_of_the_start_feels_the_dial(captured: Pair) -> None:
-    """An opacity too low for its rank asks for an infinite sigma, which could never be learned away."""
+def test_every_initial_sigma_depends_on_the_dial(captured: Pair) -> None:
+    """An opacity too low for its rank would need an infinite sigma, which has no gradient."""
     base, scene = captured
     faint = base.replace(opacity_logits=torch.full_like(base.opacity_logits, -3.8))
     begun = initialize(faint, scene.train, config_of())
@@ -217,8 +217,8 @@ def test_every_sigma_of_the_start_feels_the_dial(captured: Pair) -> None:
     assert fades.min() > 1e-5
 
 
-def test_a_dead_sigma_is_revived(captured: Pair) -> None:
-    """A relu at 0 never recovers by itself, nor does a sigma so small that a'' is 0 at every dial value."""
+def test_a_zero_sigma_recovers(captured: Pair) -> None:
+    """A sigma of 0, or so small that a'' is 0 at every dial value, has no gradient of its own."""
     base, scene = captured
     config = config_of(iters=150, lr_sigma=0.3)
     settings = AttenuationConfig(tau=config.tau, cut="soft", scene_distance=4.0, max_sv=config.max_sv)
@@ -230,10 +230,10 @@ def test_a_dead_sigma_is_revived(captured: Pair) -> None:
 
 
 @pytest.mark.parametrize(("rate", "evaluated"), [(0.0, 0), (1e-3, 3)])
-def test_splatting_gets_the_filter_and_no_empty_harmonics(
+def test_screen_filter_is_used_and_empty_harmonics_are_skipped(
     captured: Pair, monkeypatch: pytest.MonkeyPatch, rate: float, evaluated: int
 ) -> None:
-    """Empty harmonics are evaluated where they are tuned; the result has them either way."""
+    """Empty harmonics are evaluated if they are trained; the result contains them in either case."""
     mip = FILTERS["mip"]
     base = captured[0].replace(shN=torch.zeros_like(captured[0].shN), screen_filter=mip)
     seen, shown = set(), set()
@@ -251,8 +251,8 @@ def test_splatting_gets_the_filter_and_no_empty_harmonics(
     assert found.shN.shape == base.shN.shape and found.shN.any() == (rate > 0)
 
 
-def test_one_step_by_hand(captured: Pair) -> None:
-    """At s = 1 on one view: the loss is the render's, kept rows move by their rates, dropped rows by nothing."""
+def test_one_step_moves_kept_rows_by_their_rates(captured: Pair) -> None:
+    """At s = 1 on one view, the loss is the render's, and culled rows do not move."""
     base, scene = captured
     alone = Scene(scene.train[:2], ())
     config = config_of(iters=1, sampling="log", full_share=1.0, reg_weight=0.0, seed=3)
@@ -276,8 +276,8 @@ def test_one_step_by_hand(captured: Pair) -> None:
     assert photometric_loss(render(after, view.camera).image, view.image) < seen[0].loss
 
 
-def test_a_batch_sums_what_its_views_ask(captured: Pair) -> None:
-    """And its first step is as long as the root of its size says."""
+def test_batch_gradient_is_the_sum_over_views(captured: Pair) -> None:
+    """The first step is longer by the square root of the batch size."""
     base, scene = captured
     begun, views = initialize(base, scene.train, config_of()), scene.train[:2]
     config = config_of(batch=2, sampling="pair")
@@ -295,7 +295,7 @@ def test_a_batch_sums_what_its_views_ask(captured: Pair) -> None:
 
 
 def test_only_the_first_rows_are_trained(captured: Pair) -> None:
-    """The others are in the pictures, and come out as they went in; what is trained goes on from a state, too."""
+    """Other rows are drawn and returned unchanged; resuming from a state gives the same bits."""
     base, scene = captured
     begun, few = initialize(base, scene.train, config_of()), len(base) // 3
     states: dict[int, TrainingState] = {}
@@ -315,8 +315,8 @@ def assert_uniform(values: torch.Tensor) -> None:
     assert (values - torch.linspace(0, 1, len(values))).abs().max() < 1.7 / len(values) ** 0.5  # Kolmogorov-Smirnov
 
 
-def test_dial_values_are_drawn_as_configured(captured: Pair) -> None:
-    """A pair: 1 and one log-uniform in [1, max_sv]. One: ``full_share`` of them 1, others log-uniform, or uniform."""
+def test_dial_values_follow_the_configured_distribution(captured: Pair) -> None:
+    """Pair: 1 and a log-uniform value in [1, max_sv]. Others: 1 with ``full_share``, or log-uniform, or uniform."""
 
     def drawn(**changes: Any) -> torch.Tensor:
         sampler = ViewSampler(captured[1].train, config_of(max_sv=4.0, **changes))
@@ -332,7 +332,7 @@ def test_dial_values_are_drawn_as_configured(captured: Pair) -> None:
 
 
 @pytest.mark.parametrize("sampling", ["pair", "log"])
-def test_steps_take_the_views_and_dial_values_that_are_drawn(
+def test_steps_use_the_sampled_views_and_dial_values(
     captured: Pair, monkeypatch: pytest.MonkeyPatch, sampling: str
 ) -> None:
     taken: list[Any] = []
@@ -346,8 +346,8 @@ def test_steps_take_the_views_and_dial_values_that_are_drawn(
 
 
 @pytest.mark.parametrize(("share", "steps"), [(1.0, [1, 2, 3, 4]), (0.5, [3, 4])])
-def test_the_result_is_the_mean_of_the_last_steps(captured: Pair, share: float, steps: list[int]) -> None:
-    """Of the parameters, so of log sigma_d; the steps themselves are as without."""
+def test_result_is_the_mean_of_the_last_steps(captured: Pair, share: float, steps: list[int]) -> None:
+    """The mean is over the parameters, so over log sigma_d; the steps do not change."""
     seen: list[Gaussians] = []
     adapt(
         *captured,
@@ -361,8 +361,8 @@ def test_the_result_is_the_mean_of_the_last_steps(captured: Pair, share: float, 
     torch.testing.assert_close(found.sigma_d.log(), torch.stack([g.sigma_d.log() for g in states]).mean(0))
 
 
-def test_a_time_budget_ends_it(captured: Pair) -> None:
-    """It counts what an earlier part of the run has spent."""
+def test_time_budget_ends_training(captured: Pair) -> None:
+    """The budget includes the time of an earlier part of the run."""
     config, states = config_of(iters=10_000_000, time_budget=0.3), dict[int, TrainingState]()
     result = adapt(*captured, config, states_of({3}, states))
     assert 0 < result.steps < 10_000 and 0.3 <= result.seconds < 5 and not result.interrupted
@@ -388,8 +388,8 @@ def test_a_listener_that_stops_returns_the_result_so_far(captured: Pair) -> None
         assert torch.equal(value, states[-1][name]) and value.isfinite().all() and not value.requires_grad, name
 
 
-def test_an_update_that_fails_leaves_no_state_to_save(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its parameters are of no whole step."""
+def test_a_failed_update_has_no_state(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The parameters of an incomplete step cannot be saved."""
     seen: list[Progress] = []
     monkeypatch.setattr("clod_adapter.training.trainer.add_to_mean", fail)
     with pytest.raises(ZeroDivisionError):
@@ -424,7 +424,7 @@ RESUMED = {
      ("sigma_d alone", "fresh")],
 )  # fmt: skip
 def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str, kind: str) -> None:
-    """From within a round of views and at its end, before, at the beginning of and within the averaging, at the end."""
+    """From states within and at the end of a round of views, and before, during and after averaging."""
     base, scene = captured
     if kind == "empty":
         base = base.replace(shN=torch.zeros_like(base.shN))
@@ -449,7 +449,7 @@ def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str, kind: 
     assert replace(later[11], **unlike) == replace(states[11], **unlike)
 
 
-def test_a_state_holds_what_changes_and_no_more(captured: Pair) -> None:
+def test_a_state_holds_trained_parameters_only(captured: Pair) -> None:
     base, states = captured[0], dict[int, TrainingState]()
     still = {"lr_shN": 0.0, "lr_means": 0.0, "average": 0.5}
     adapt(*captured, config_of(iters=4, **still), states_of({1, 3}, states))
@@ -460,7 +460,7 @@ def test_a_state_holds_what_changes_and_no_more(captured: Pair) -> None:
     assert "mean.quats" not in states[1].tensors and len(states[1].tensors["first.sh0"]) == len(base)
 
 
-def test_a_state_of_something_else_is_refused(captured: Pair) -> None:
+def test_a_state_of_another_run_is_refused(captured: Pair) -> None:
     base, scene = captured
     config, states = config_of(iters=2), dict[int, TrainingState]()
     adapt(base, scene, config, states_of({1}, states))
@@ -488,8 +488,8 @@ def test_a_state_of_something_else_is_refused(captured: Pair) -> None:
             adapt(base, scene, config, None, replace(state, random=broken))
 
 
-def test_scenes_at_the_edge(captured: Pair) -> None:
-    """One Gaussian, one that is never seen, and all cameras in one place."""
+def test_degenerate_scenes(captured: Pair) -> None:
+    """One Gaussian, one that is never seen, and coincident cameras."""
     views = photograph(gaussians(20, 0, 0), ring(2, 20, 16))
     for means in ([[0.0, 0.0, 0.0]], [[1e3, 0.0, 0.0]]):
         one = gaussians(1, 0, 0).replace(means=torch.tensor(means))
@@ -507,8 +507,8 @@ def test_scenes_at_the_edge(captured: Pair) -> None:
      (AdaptConfig.paper(iters=6), math.inf)],
     ids=["ours", "invisible", "paper"],
 )  # fmt: skip
-def test_infinite_opacities_stay(captured: Pair, config: AdaptConfig, logit: float) -> None:
-    """Fully opaque or invisible before and after; all else is finite, and what is finite is trained."""
+def test_infinite_opacities_are_kept(captured: Pair, config: AdaptConfig, logit: float) -> None:
+    """Infinite logits are unchanged; all other values are finite and trained."""
     base, scene = captured
     logits = base.opacity_logits.clone()
     logits[:9] = logit
@@ -518,7 +518,7 @@ def test_infinite_opacities_stay(captured: Pair, config: AdaptConfig, logit: flo
     assert all(value.isfinite().all() for name, value in found.tensors().items() if name != "opacity_logits")
 
 
-def test_inputs_that_cannot_be_adapted_are_refused(captured: Pair) -> None:
+def test_bad_inputs_are_refused(captured: Pair) -> None:
     base, scene = captured
     for run in (adapt, make_plan):
         with pytest.raises(ClodError, match="no training views"):
@@ -537,8 +537,8 @@ def test_inputs_that_cannot_be_adapted_are_refused(captured: Pair) -> None:
             adapt(base.replace(sh0=huge), Scene(scene.train[:1], ()), config_of(iters=1, start=how))
 
 
-def test_a_row_whose_gradient_is_not_finite_is_held(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By that step: the others move, and so does it in later ones."""
+def test_a_row_with_a_nonfinite_gradient_is_not_stepped(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only in that step: other rows move, and so does the row in later steps."""
 
     def spoil(found: Any) -> Any:
         found.gradients["means"][3, 1], found.gradients["log_sigma"][4] = math.nan, -math.inf
@@ -557,9 +557,7 @@ def test_a_row_whose_gradient_is_not_finite_is_held(captured: Pair, monkeypatch:
     assert (result.gaussians.sigma_d[3:5] != first.sigma_d[3:5]).all()
 
 
-def test_a_loss_that_is_not_finite_ends_training_before_its_step(
-    captured: Pair, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_nonfinite_loss_ends_training_before_its_step(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     config, told, states = config_of(iters=9, average=0.9), list[Progress](), dict[int, TrainingState]()
     whole = adapt(*captured, config).gaussians
 
@@ -577,8 +575,8 @@ def test_a_loss_that_is_not_finite_ends_training_before_its_step(
     assert_equal(adapt(*captured, config, None, states[4]).gaussians, whole)
 
 
-def test_an_error_is_told_with_the_state_before_it(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And is raised all the same; going on from that state gives the bits of an undisturbed run."""
+def test_an_error_is_reported_with_the_state_before_it(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error is raised; resuming from the state gives the bits of an undisturbed run."""
     config, states, lost = config_of(iters=8), dict[int, TrainingState](), list[str | None]()
     whole = adapt(*captured, config).gaussians
 
@@ -595,7 +593,7 @@ def test_an_error_is_told_with_the_state_before_it(captured: Pair, monkeypatch: 
     assert_equal(adapt(*captured, config, None, states[5]).gaussians, whole)
 
 
-def test_scene_units(captured: Pair) -> None:
+def test_scene_distance_is_the_mean_over_views(captured: Pair) -> None:
     base, scene = captured
     config = AttenuationConfig(normalizer="quantile", quantile=0.5)
     ratios = [

@@ -1,4 +1,4 @@
-"""A plan's training: the same as without one, except for the parts that are left out."""
+"""Training with a plan equals training without one, except for the parts left out."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_training_is_the_same_if_nothing_is_left_out(captured: tuple[Gaussians, 
     assert_equal(plan.adapt(scene).gaussians, planned)  # a plan can be used again
 
 
-def test_resuming(captured: tuple[Gaussians, Scene]) -> None:
+def test_a_resumed_plan_gives_the_same_bits(captured: tuple[Gaussians, Scene]) -> None:
     """A plan that is made again resumes to the same bits, with unseen Gaussians and frozen attributes."""
     base, scene = with_unseen(captured[0])[0], captured[1]
     states: list[Any] = []
@@ -80,7 +80,7 @@ def test_unseen_gaussians_are_unchanged(captured: tuple[Gaussians, Scene]) -> No
 
 
 def test_target_counts_are_shares_of_all_gaussians(captured: tuple[Gaussians, Scene]) -> None:
-    """With a third of the file unseen, a dial value keeps as many as if they were trained too."""
+    """With a third of the file unseen, a dial value keeps as many Gaussians as if all were trained."""
     base, scene = with_unseen(captured[0], 150)[0], captured[1]
     config = replace(CONFIG, iters=80)
     plan = make_plan(base, scene, config, Override(keep=ALL - {"unseen"}))

@@ -1,4 +1,4 @@
-"""Each decision of a plan, both ways."""
+"""Decisions of a plan, with both results."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def verdicts(plan: Plan) -> dict[str, str]:
     return {decision.what: decision.verdict for decision in plan.decisions}
 
 
-def test_the_same_plan_again(captured: tuple[Gaussians, Scene]) -> None:
+def test_plan_is_reproducible(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = with_unseen(captured[0])[0], captured[1]
     plans = [make_plan(base, scene, CONFIG) for _ in range(2)]
     assert plans[0].decisions == plans[1].decisions
@@ -43,7 +43,7 @@ def test_the_same_plan_again(captured: tuple[Gaussians, Scene]) -> None:
     assert json.loads(json.dumps(plans[0].as_dict()))["decisions"][1]["number"] >= 40
 
 
-def test_sh_degrees_both_ways(captured: tuple[Gaussians, Scene]) -> None:
+def test_sh_degrees_are_kept_or_left_out(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     plan = make_plan(base.replace(shN=1e-5 * base.shN), scene, CONFIG)
     assert verdicts(plan)["SH degree 1"] == "left out" and plan.sh_degree == 0
@@ -113,7 +113,7 @@ def test_an_invisible_checkpoint_is_kept(captured: tuple[Gaussians, Scene]) -> N
     assert plan.kept is None and verdicts(plan)["unseen Gaussians"] == "kept"
 
 
-def test_steps_that_reading_skipped_are_listed(captured: tuple[Gaussians, Scene]) -> None:
+def test_preparation_steps_that_were_skipped_are_listed(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     read = replace(scene, left_out=(("undistortion", "the cameras are pinholes"),))
     plan = make_plan(base, read, CONFIG, Override(keep=ALL))

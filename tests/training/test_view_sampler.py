@@ -1,4 +1,4 @@
-"""ViewSampler: each view once a round, by the seed alone, and again from a state."""
+"""ViewSampler draws each view once a round, reproducibly from a seed or a state."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def nine(draws: ViewSampler) -> list[tuple[str, list[float]]]:
 
 
 @pytest.mark.parametrize("sampling", ["pair", "log", "uniform"])
-def test_the_seed_and_a_state_decide_all(sampling: str) -> None:
+def test_draws_are_reproducible_from_a_seed_or_state(sampling: str) -> None:
     config = AdaptConfig(sampling=sampling, full_share=0.3, seed=3)
     one, two, other = (ViewSampler(VIEWS, each) for each in (config, config, replace(config, seed=4)))
     first = nine(one)
@@ -33,7 +33,7 @@ def test_the_seed_and_a_state_decide_all(sampling: str) -> None:
         assert sorted(names[start : start + len(VIEWS)]) == sorted(view.camera.name for view in VIEWS)
 
 
-def test_states_that_cannot_be_are_refused() -> None:
+def test_impossible_states_are_refused() -> None:
     draws = ViewSampler(VIEWS, AdaptConfig())
     random, order = draws.state()
     with pytest.raises(ClodError, match="of other Gaussians, views or settings"):
