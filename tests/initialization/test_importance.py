@@ -145,7 +145,7 @@ def test_tau_is_lowered_for_faint_checkpoints_only() -> None:
     assert fitting_tau(mixed, error, config) == config.tau
     faint = torch.full((1000,), 0.01)
     assert fitting_tau(faint, error, config) == pytest.approx(0.01 / 5 / 1.5, rel=1e-5)
-    # Nearly all opacities below tau, a few far above: the dial's end is served, the picture at s = 1 would not be.
+    # Nearly all opacities below tau, a few far above: tau follows them, unless they have no effect at s = 1.
     some = torch.where(torch.arange(1000) < 100, 0.9, 0.012)
     assert fitting_tau(some, torch.ones(1000), config) == pytest.approx(0.012 / 1.5)
     assert fitting_tau(some, (some > 0.1).float(), config) == config.tau  # unless the faint ones do nothing

@@ -70,7 +70,7 @@ def test_kept_rows_are_drawn_as_by_the_fork(name: str, monkeypatch: pytest.Monke
     ours = wrapper(monkeypatch, fork).GaussianRasterizer(raster_settings)
     got = ours(**given, sigma_d=sigma_d, virtual_scale=DIAL, attenuation=settings)
     for result, mine, theirs in zip(results, got, want, strict=True):
-        if result in ("radii", "touched"):  # of all rows, 0 for who is left out
+        if result in ("radii", "touched"):  # of all rows, 0 for culled ones
             assert torch.equal(mine[keep], theirs) and len(mine) == N and not mine[~keep].any()
         elif result != "features":
             torch.testing.assert_close(mine, theirs, rtol=1e-5, atol=1e-5)

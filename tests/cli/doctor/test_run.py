@@ -350,7 +350,7 @@ def test_a_cache_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_pat
 def test_the_reference_scene_detects_small_differences() -> None:
     """A difference of 1/255 in every pixel fails; rounding passes."""
     mini = ReferenceScene.make()
-    assert float((mini.image > 0.02).any(-1).float().mean()) > 0.3  # of the picture has something in it
+    assert float((mini.image > 0.02).any(-1).float().mean()) > 0.3  # of the image is not empty
     mini.compare(mini.image + 1e-5)
     with pytest.raises(CheckFailed, match="another image"):
         mini.compare(mini.image + 1 / 255)
