@@ -6,7 +6,6 @@ On a GPU, if there is one; otherwise on a simulated one (``fake_gpu``), with tor
 from __future__ import annotations
 
 import importlib
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -31,11 +30,13 @@ from clod_adapter.initialization.importance import initialize, usable_views
 from clod_adapter.losses import photometric_loss
 from clod_adapter.metrics import psnr_ssim
 from clod_adapter.rasterizers import cpu, cuda
+from clod_adapter.render import dial
 from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.planner import make_plan
 from clod_adapter.training.pseudo_views import render_pseudo_views
+from clod_adapter.training.target_count import count_gradient, paper_count
 from fake_gpu import fake_gpu
 from scenes import capture, gaussians, ring
 
@@ -167,9 +168,15 @@ def test_plan_and_training(setup: Setup) -> None:
     assert not torch.equal(adapted.means.cpu(), plan.lean.means.cpu()) and bool(adapted.means.isfinite().all())
 
 
-@pytest.mark.parametrize("changes", [{"batch": 2}, {"count_term": "paper"}], ids=str)
-def test_training_matches_the_cpu(setup: Setup, changes: dict[str, Any]) -> None:
-    scene, config = Scene(setup.scene.train[:2], ()), replace(CONFIG, iters=1, **changes)
+def test_count_terms_stay_on_the_device(setup: Setup) -> None:
+    model, tau = setup.there, setup.there.attenuation.tau
+    dialled = dial(model, setup.cameras[0], 2.0)
+    terms = count_gradient(dialled, model.opacity_logits, 2.0, tau, 0.1, CONFIG), paper_count(dialled, 2.0, tau, CONFIG)
+    assert all(term.device == setup.device for term in terms)
+
+
+def test_training_matches_the_cpu(setup: Setup) -> None:
+    scene, config = Scene(setup.scene.train[:2], ()), replace(CONFIG, batch=2, iters=1)
     mine, own = on_both(setup, lambda model: adapt(model, scene, config).gaussians)
     for name, value in own.tensors().items():
         # Adam's first steps are as long as their rate whichever way: where a slope is rounding, they may differ.
@@ -186,18 +193,6 @@ def test_frozen_tensors_get_no_gradient(setup: Setup, monkeypatch: pytest.Monkey
     sh0 = setup.there.sh0.clone().requires_grad_()
     render(setup.there.replace(sh0=sh0), setup.cameras[0]).image.sum().backward()
     assert sh0.grad is not None and setup.there.sh0.shape in made and setup.there.shN.shape not in made
-
-
-def test_rasterizing_under_a_debugger(setup: Setup) -> None:
-    def trace(frame: Any, *_: Any) -> Any:
-        return trace if frame.f_code.co_name == "rasterize" and frame.f_locals is not None else None
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        render(setup.there, setup.cameras[0])
-    finally:
-        sys.settrace(before)
 
 
 def test_dial_and_adam_do_not_synchronize_with_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,7 +212,6 @@ def test_dial_and_adam_do_not_synchronize_with_the_device(monkeypatch: pytest.Mo
     own = gaussians(30, 1, 0)
     model = own.replace(sigma_d=torch.ones(30), attenuation=CONFIG.attenuation(3.0))
     optimizer = RowAdam({"means": own.means.clone(), "sigma": torch.ones(30)})
-    dial = importlib.import_module("clod_adapter.render").dial
     camera = ring(1, 20, 14)[0]
     optimizer._step_plain({"means": own.means}, torch.ones(30, dtype=torch.bool), {"means": 0.1})  # its table is there
     with Silent():
