@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import signal
 import subprocess
@@ -14,7 +15,10 @@ from typing import Any
 
 import pytest
 
+from clod_adapter.config import AdaptConfig
+from clod_adapter.progress import Progress
 from clod_adapter.training.objective import Objective
+from clod_adapter.training.state import TrainingState
 
 OUTPUTS = ["dial.json", "dial.ply", "dial.safetensors"]
 STATE = "dial.resume.safetensors"
@@ -131,3 +135,22 @@ def change_step(
         return change(found) if only(self.config) and next(steps) == at else found
 
     patch.setattr(Objective, "gradient_sum", changed)
+
+
+def config_of(**changes: Any) -> AdaptConfig:
+    """Fixed settings, so that the tests do not depend on the defaults."""
+    settings = {
+        "start_share": 0.6, "full_share": 0.5, "lr_sigma": 1e-2, "lr_means": 3e-5, "lr_quats": 4e-4,
+        "lr_scales": 2e-3, "lr_opacities": 1e-2, "lr_sh0": 1e-3, "lr_shN": 5e-5,
+    }  # fmt: skip
+    return AdaptConfig(**(settings | changes))
+
+
+def states_of(steps: set[int], found: dict[int, TrainingState]) -> Callable[[Progress], None]:
+    """A progress callback that keeps the states after these steps."""
+
+    def keep(progress: Progress) -> None:
+        if progress.state and progress.done in steps:
+            found[progress.done] = copy.deepcopy(progress.state())
+
+    return keep

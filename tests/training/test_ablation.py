@@ -14,14 +14,9 @@ from clod_adapter.initialization.importance import removal_error
 from clod_adapter.render import render
 from clod_adapter.training import ablation
 from clod_adapter.training.ablation import largest_change, seen, sh_degree_losses
-from scenes import capture, gaussians, photograph, ring
+from scenes import gaussians, photograph, ring
 
 LIMIT = 0.02
-
-
-@pytest.fixture(scope="module")
-def captured() -> tuple[Gaussians, Scene]:
-    return capture()
 
 
 def with_bands(base: Gaussians, *sizes: float) -> Gaussians:

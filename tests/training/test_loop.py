@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,45 +13,24 @@ import pytest
 import torch
 
 from clod_adapter.adapter import ATTRIBUTES, attach
-from clod_adapter.attenuation import SIGMA_MAX, attenuate, log_attenuation
+from clod_adapter.attenuation import SIGMA_MAX, log_attenuation
 from clod_adapter.cameras import Scene, camera_extent
-from clod_adapter.config import FILTERS, AdaptConfig, AttenuationConfig
+from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization import importance
 from clod_adapter.initialization.importance import initialize, scene_distance
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.losses import photometric_loss
 from clod_adapter.progress import Phase, Progress, Stopped
-from clod_adapter.render import render, splat
-from clod_adapter.training import objective
 from clod_adapter.training.loop import Adapted, TrainingState, adapt
-from clod_adapter.training.objective import TrainableSubset
 from clod_adapter.training.planner import make_plan
-from clod_adapter.training.trainer import Trainer
-from clod_adapter.training.view_sampler import ViewSampler
-from runs import change_step, fail
-from scenes import assert_equal, capture, gaussians, photograph, ring
+from runs import change_step, config_of, fail, states_of
+from scenes import assert_equal, gaussians, photograph, ring
 
 Pair = tuple[Gaussians, Scene]
 Trained = tuple[Adapted, list[Progress]]
 SCALES = (1.0, 1.5, 2.0, 3.0, 5.0)
-
-
-def config_of(**changes: Any) -> AdaptConfig:
-    """Fixed settings, so that the tests do not depend on the defaults."""
-    settings = {
-        "start_share": 0.6, "full_share": 0.5, "lr_sigma": 1e-2, "lr_means": 3e-5, "lr_quats": 4e-4,
-        "lr_scales": 2e-3, "lr_opacities": 1e-2, "lr_sh0": 1e-3, "lr_shN": 5e-5,
-    }  # fmt: skip
-    return AdaptConfig(**(settings | changes))
-
-
-@pytest.fixture(scope="module")
-def captured() -> Pair:
-    return capture()
 
 
 @pytest.fixture(scope="module")
@@ -154,20 +132,6 @@ def test_result_is_in_world_units_and_survives_saving(captured: Pair, trained: T
     assert last.attenuation == result.attenuation
 
 
-@pytest.mark.parametrize("distance", [1.0, 4.0])
-def test_untrained_rows_keep_their_units_when_resumed(captured: Pair, distance: float) -> None:
-    """Their sigma_d is not in the state, but the base's, in its unit."""
-    base, scene = captured
-    settings = AttenuationConfig(scene_distance=distance, reference_distance=4.0)
-    base = attach(base, torch.linspace(0.3, 3, len(base)) * 4 / distance, settings)
-    part, states = TrainableSubset(len(base) // 2), dict[int, TrainingState]()
-    whole = adapt(base, scene, config_of(iters=4), states_of({2}, states), subset=part)
-    again = adapt(base, scene, config_of(iters=4), None, states[2], subset=part)
-    assert_equal(again.gaussians, whole.gaussians)
-    rest = slice(len(base) // 2, None)
-    torch.testing.assert_close(whole.gaussians.sigma_d[rest], base.sigma_d[rest] * distance)
-
-
 @pytest.mark.parametrize("lost", [False, True], ids=["known", "lost"])
 def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Trained, lost: bool) -> None:
     """No importance pass; the unit is the file's typical distance, or the views' where another tool dropped it."""
@@ -216,122 +180,6 @@ def test_a_zero_sigma_recovers(captured: Pair) -> None:
     result = adapt(dead, scene, config).gaussians
     assert (result.sigma_d > 1e-3).all() and result.sigma_d.isfinite().all()
     assert evaluate(result, scene.train, [1.0])[0].kept_share > 0.8 * config.start_share
-
-
-@pytest.mark.parametrize(("rate", "evaluated"), [(0.0, 0), (1e-3, 3)])
-def test_screen_filter_is_used_and_empty_harmonics_are_skipped(
-    captured: Pair, monkeypatch: pytest.MonkeyPatch, rate: float, evaluated: int
-) -> None:
-    """Empty harmonics are evaluated if they are trained; the result contains them in either case."""
-    mip = FILTERS["mip"]
-    base = captured[0].replace(shN=torch.zeros_like(captured[0].shN), screen_filter=mip)
-    seen, shown = set(), set()
-    for module in (objective, importance):
-        monkeypatch.setattr(
-            module, "splat", lambda g, *rest: seen.add((g.shN.shape[1], g.screen_filter)) or splat(g, *rest)
-        )
-
-    def look(now: Progress) -> None:
-        if now.gaussians:
-            shown.add(now.gaussians().screen_filter)
-
-    found = adapt(base, captured[1], config_of(iters=4, lr_shN=rate), look).gaussians
-    assert seen == {(evaluated, mip)} and shown == {found.screen_filter} == {mip}
-    assert found.shN.shape == base.shN.shape and found.shN.any() == (rate > 0)
-
-
-def test_one_step_moves_kept_rows_by_their_rates(captured: Pair) -> None:
-    """At s = 1 on one view, the loss is the render's, and culled rows do not move."""
-    base, scene = captured
-    alone = Scene(scene.train[:2], ())
-    config = config_of(iters=1, sampling="log", full_share=1.0, reg_weight=0.0, seed=3)
-    before, seen = initialize(base, alone.train, config), []
-    after = adapt(before, alone, config, seen.append).gaussians
-    losses = [photometric_loss(render(before, view.camera).image, view.image).item() for view in alone.train]
-    view = alone.train[min(range(2), key=lambda k: abs(losses[k] - seen[0].loss))]
-    assert seen[0].loss == pytest.approx(min(losses, key=lambda loss: abs(loss - seen[0].loss)), rel=1e-5)
-    kept = render(before, view.camera).kept
-    rates = {
-        "means": config.lr_means * camera_extent([view.camera for view in alone.train]), "quats": config.lr_quats,
-        "log_scales": config.lr_scales, "sh0": config.lr_sh0,
-    }  # fmt: skip
-    for name, rate in rates.items():
-        old, new = getattr(before, name), getattr(after, name)
-        assert torch.equal(old[~kept], new[~kept]), name
-        moved = (new - old)[kept].abs().flatten(1).amax(1)
-        assert (moved > 0).sum() > 20 and moved.max() == pytest.approx(rate, rel=1e-2), name
-    moved = (after.sigma_d / before.sigma_d).log().abs()
-    assert moved.max() == pytest.approx(config.lr_sigma, rel=1e-3) and (moved[~kept] < 1e-5).all()
-    assert photometric_loss(render(after, view.camera).image, view.image) < seen[0].loss
-
-
-def test_batch_gradient_is_the_sum_over_views(captured: Pair) -> None:
-    """The first step is longer by the square root of the batch size."""
-    base, scene = captured
-    begun, views = initialize(base, scene.train, config_of()), scene.train[:2]
-    config = config_of(batch=2, sampling="pair")
-    run = Trainer(begun, views, config)
-    draws = [(view, [1.0, 2.0]) for view in views]
-    one, two = (run.objective.gradient_sum(run.parameters, [draw]) for draw in draws)
-    both = run.objective.gradient_sum(run.parameters, draws)
-    assert both.loss == one.loss + two.loss and torch.equal(both.kept, one.kept | two.kept)
-    for name in run.stepped:
-        assert torch.equal(both.gradients[name], one.gradients[name] + two.gradients[name]), name
-    before = run.parameters["sh0"].clone()
-    run.step(0.0)
-    longest = (run.parameters["sh0"] - before).abs().max()
-    assert longest == pytest.approx(2**0.5 * config.lr_sh0, rel=1e-2) and run.sampler.order == []
-
-
-def test_only_the_first_rows_are_trained(captured: Pair) -> None:
-    """Other rows are drawn and returned unchanged; resuming from a state gives the same bits."""
-    base, scene = captured
-    begun, few = initialize(base, scene.train, config_of()), len(base) // 3
-    states: dict[int, TrainingState] = {}
-    config = config_of(iters=20, average=0.5)
-    found = adapt(begun, scene, config, states_of({5}, states), subset=TrainableSubset(few)).gaussians
-    for name, value in found.tensors().items():
-        rounding = 1e-6 if name == "sigma_d" else 0.0  # its logarithm is what training holds
-        torch.testing.assert_close(value[few:], begun.tensors()[name][few:], rtol=rounding, atol=0.0)
-        assert not torch.equal(value[:few], begun.tensors()[name][:few]), name
-    assert_equal(adapt(begun, scene, config, None, states[5], subset=TrainableSubset(few)).gaussians, found)
-    without = adapt(begun.select(torch.arange(few)), scene, config, subset=TrainableSubset(few)).gaussians
-    assert not torch.equal(without.sh0, found.sh0[:few])
-
-
-def assert_uniform(values: torch.Tensor) -> None:
-    values = values.sort().values.double()
-    assert (values - torch.linspace(0, 1, len(values))).abs().max() < 1.7 / len(values) ** 0.5  # Kolmogorov-Smirnov
-
-
-def test_dial_values_follow_the_configured_distribution(captured: Pair) -> None:
-    """Pair: 1 and a log-uniform value in [1, max_sv]. Others: 1 with ``full_share``, or log-uniform, or uniform."""
-
-    def drawn(**changes: Any) -> torch.Tensor:
-        sampler = ViewSampler(captured[1].train, config_of(max_sv=4.0, **changes))
-        return torch.tensor([sampler.draw()[1] for _ in range(480)])
-
-    pairs = drawn(sampling="pair")
-    assert (pairs[:, 0] == 1).all() and pairs.shape == (480, 2)
-    assert_uniform(pairs[:, 1].log() / math.log(4))
-    ones = drawn(sampling="log", full_share=0.25).log() / math.log(4)
-    assert 0.19 < (ones == 0).double().mean() < 0.31  # 3 standard deviations
-    assert_uniform(ones[ones > 0])
-    assert_uniform((drawn(sampling="uniform", full_share=0.0)[:, 0] - 1) / 3)
-
-
-@pytest.mark.parametrize("sampling", ["pair", "log"])
-def test_steps_use_the_sampled_views_and_dial_values(
-    captured: Pair, monkeypatch: pytest.MonkeyPatch, sampling: str
-) -> None:
-    taken: list[Any] = []
-    monkeypatch.setattr(objective, "attenuate", lambda *a: taken.append(a[3]) or attenuate(*a))
-    monkeypatch.setattr(objective, "photometric_loss", lambda *a: taken.append(id(a[1])) or photometric_loss(*a))
-    config = config_of(iters=14, max_sv=4.0, sampling=sampling)
-    adapt(attach(gaussians(5, 0, 0), torch.ones(5)), captured[1], config)
-    sampler = ViewSampler(captured[1].train, config)
-    draws = [sampler.draw() for _ in range(14)]
-    assert sorted(map(str, taken)) == sorted(str(x) for v, dials in draws for s in dials for x in (s, id(v.image)))
 
 
 @pytest.mark.parametrize(("share", "steps"), [(1.0, [1, 2, 3, 4]), (0.5, [3, 4])])
@@ -386,96 +234,6 @@ def test_a_failed_update_has_no_state(captured: Pair, monkeypatch: pytest.Monkey
         adapt(*captured, config_of(iters=6, average=0.5), seen.append)
     with pytest.raises(ClodError, match="failed while it updated the parameters"):
         seen[-1].state()
-
-
-def states_of(steps: set[int], found: dict[int, TrainingState]) -> Callable[[Progress], None]:
-    """A progress callback that keeps the states after these steps."""
-
-    def keep(progress: Progress) -> None:
-        if progress.state and progress.done in steps:
-            found[progress.done] = copy.deepcopy(progress.state())
-
-    return keep
-
-
-RATES = ("means", "quats", "scales", "opacities", "sh0", "shN")
-RESUMED = {
-    "ours": {},
-    "paper": vars(AdaptConfig.paper(iters=12, max_sv=4.0)),
-    "linear": {"parameter": "linear", "lr_shN": 0.0},
-    "mean of all": {"average": 1.0, "max_sv": 1.0},
-    "sigma_d alone": {f"lr_{name}": 0.0 for name in RATES} | {"average": 0.0},
-}
-
-
-@pytest.mark.parametrize(
-    ("form", "kind"),
-    [("ours", "fresh"), ("paper", "with a dial"), ("linear", "empty"), ("mean of all", "with a dial"),
-     ("sigma_d alone", "fresh")],
-)  # fmt: skip
-def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str, kind: str) -> None:
-    """From states within and at the end of a round of views, and before, during and after averaging."""
-    base, scene = captured
-    if kind == "empty":
-        base = base.replace(shN=torch.zeros_like(base.shN))
-    if kind == "with a dial":
-        base = attach(base, torch.full((len(base),), 1.5), AttenuationConfig(scene_distance=4.0, max_sv=3.0))
-    config, states = config_of(**{"iters": 12, **RESUMED[form]}), dict[int, TrainingState]()
-    whole = adapt(base, scene, config, states_of({1, 6, 10, 11, 12}, states))
-    if form == "sigma_d alone":
-        assert all(torch.equal(getattr(whole.gaussians, name), getattr(base, name)) for name in ATTRIBUTES)
-    assert ((whole.gaussians.sigma_d / initialize(base, scene.train, config).sigma_d - 1).abs() > 1e-3).any()
-    seen: list[Progress] = []
-    for steps, state in states.items():
-        again = adapt(base, scene, config, seen.append, copy.deepcopy(state))
-        assert_equal(again.gaussians, whole.gaussians)
-        assert (again.steps, again.interrupted, again.start_seconds) == (12, False, whole.start_seconds), steps
-        assert again.seconds > state.seconds
-    assert {p.phase for p in seen} == {Phase.TRAINING} and [p.done for p in seen[:11]] == list(range(2, 13))
-    later: dict[int, TrainingState] = {}
-    adapt(base, scene, config, states_of({11}, later), copy.deepcopy(states[6]))
-    assert all(later[11].tensors[name].equal(value) for name, value in states[11].tensors.items())
-    unlike = {"tensors": {}, "seconds": 0.0}
-    assert replace(later[11], **unlike) == replace(states[11], **unlike)
-
-
-def test_a_state_holds_trained_parameters_only(captured: Pair) -> None:
-    base, states = captured[0], dict[int, TrainingState]()
-    still = {"lr_shN": 0.0, "lr_means": 0.0, "average": 0.5}
-    adapt(*captured, config_of(iters=4, **still), states_of({1, 3}, states))
-    changing = {"quats", "log_scales", "opacity_logits", "sh0", "log_sigma"}
-    for step, kinds in ((1, {"parameter", "first", "second", "steps"}), (3, {"mean"})):
-        assert {name.split(".")[1] for name in states[step].tensors} == changing
-        assert kinds <= {name.split(".")[0] for name in states[step].tensors}
-    assert "mean.quats" not in states[1].tensors and len(states[1].tensors["first.sh0"]) == len(base)
-
-
-def test_a_state_of_another_run_is_refused(captured: Pair) -> None:
-    base, scene = captured
-    config, states = config_of(iters=2), dict[int, TrainingState]()
-    adapt(base, scene, config, states_of({1}, states))
-    state = states[1]
-    few, fewer = base.select(torch.arange(len(base)) < 9), Scene(scene.train[:1], ())
-    for other in ((few, scene, config), (base, fewer, config), (base, scene, config_of(iters=2, parameter="linear"))):
-        with pytest.raises(ClodError, match="of other Gaussians, views or settings"):
-            adapt(*other, None, state)
-    damaged = dict(state.tensors) | {"steps.sh0": state.tensors["steps.sh0"] - 2}
-    for impossible in (
-        {"tensors": damaged}, {"steps": 0}, {"averaged": -1}, {"averaged": 9}, {"seconds": math.nan}, {"seconds": -1.0},
-    ):  # fmt: skip
-        with pytest.raises(ClodError, match="impossible counts|impossible values of steps|of other Gaussians"):
-            adapt(base, scene, config, None, replace(state, **impossible))
-    for name, value in (
-        ("parameter.means", math.nan), ("parameter.opacity_logits", math.inf), ("first.sh0", math.inf),
-        ("second.sh0", -1.0), ("second.means", math.nan), ("parameter.log_sigma", 1e30),
-    ):  # fmt: skip
-        tensors = {n: t.clone() for n, t in state.tensors.items()}
-        tensors[name][7] = value
-        with pytest.raises(ClodError, match="the training state.*; start over"):
-            adapt(base, scene, config, None, replace(state, tensors=tensors))
-    for broken in ({}, {**state.random, "state": {"state": -1, "inc": "x"}}):
-        with pytest.raises(ClodError, match="random state is damaged"):
-            adapt(base, scene, config, None, replace(state, random=broken))
 
 
 def test_degenerate_scenes(captured: Pair) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
+import torch
 
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
@@ -40,3 +43,24 @@ def test_impossible_states_are_refused() -> None:
         draws.restore(random, (*order, len(VIEWS)))
     with pytest.raises(ClodError, match="random state is damaged"):
         draws.restore({"bit_generator": "MT19937"}, order)
+
+
+def assert_uniform(values: torch.Tensor) -> None:
+    values = values.sort().values.double()
+    assert (values - torch.linspace(0, 1, len(values))).abs().max() < 1.7 / len(values) ** 0.5  # Kolmogorov-Smirnov
+
+
+def test_dial_values_follow_the_configured_distribution() -> None:
+    """Pair: 1 and a log-uniform value in [1, max_sv]. Others: 1 with ``full_share``, or log-uniform, or uniform."""
+
+    def drawn(**changes: Any) -> torch.Tensor:
+        sampler = ViewSampler(VIEWS, AdaptConfig(max_sv=4.0, **changes))
+        return torch.tensor([sampler.draw()[1] for _ in range(480)])
+
+    pairs = drawn(sampling="pair")
+    assert (pairs[:, 0] == 1).all() and pairs.shape == (480, 2)
+    assert_uniform(pairs[:, 1].log() / math.log(4))
+    ones = drawn(sampling="log", full_share=0.25).log() / math.log(4)
+    assert 0.19 < (ones == 0).double().mean() < 0.31  # 3 standard deviations
+    assert_uniform(ones[ones > 0])
+    assert_uniform((drawn(sampling="uniform", full_share=0.0)[:, 0] - 1) / 3)
