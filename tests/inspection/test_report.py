@@ -16,7 +16,6 @@ from plyfile import PlyData, PlyElement
 
 import scenes
 from clod_adapter.adapter import attach, detach, extract
-from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.cli.inspect import lines_of
 from clod_adapter.cli.shared.report import jsonable
 from clod_adapter.config import AttenuationConfig
@@ -30,7 +29,7 @@ from clod_adapter.io.ply.columns import rows_of
 from clod_adapter.origin import NOWHERE
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.state_file import save_state
-from formats import with_columns
+from formats import CALIBRATION, with_columns
 from packing import write_packed
 
 ATTENUATION = AttenuationConfig(tau=0.01, max_sv=6.0, cut="soft", reference_distance=3.5)
@@ -53,13 +52,9 @@ def kinds(found: Inspection) -> dict[str, int]:
     return {anomaly.kind: anomaly.count for anomaly in found.anomalies}
 
 
-def adapted(path: Path, n: int = 40) -> Path:
+def adapted(path: Path) -> Path:
     """A file with a dial and its calibration."""
-    g = scenes.gaussians(n, 1, 0)
-    rows = tuple(CalibrationRow(s, n / s, 30.0 - s, 0.9, 5.0) for s in (1.0, 2.0, 6.0))
-    save(
-        path, attach(g, attenuation=ATTENUATION), blank(n, 1), calibration=Calibration(rows, n, 3, 64, 48, "a machine")
-    )
+    save(path, attach(scenes.gaussians(40, 1, 0), attenuation=ATTENUATION), blank(40, 1), calibration=CALIBRATION)
     return path
 
 
@@ -100,9 +95,8 @@ def test_a_plain_file(tmp_path: Path) -> None:
         assert [spread.low, spread.median, spread.high] == pytest.approx(np.quantile(vertex[axis], (0.01, 0.5, 0.99)))
     scales = np.sort(np.exp(np.stack([vertex[f"scale_{k}"] for k in range(3)])), 0)
     opacities = 1 / (1 + np.exp(-vertex["opacity"].astype(float)))
-    assert v.scale.median == pytest.approx(np.median(scales)) and v.largest_scale.greatest == pytest.approx(
-        scales.max()
-    )
+    largest = v.largest_scale.greatest
+    assert v.scale.median == pytest.approx(np.median(scales)) and largest == pytest.approx(scales.max())
     assert v.opacity_quartiles == pytest.approx(tuple(np.quantile(opacities, (0.25, 0.5, 0.75))))
     assert v.fainter_than_tau == (opacities < 0.02).mean() and splat.tau == 0.02
     assert v.fainter_than_visible == (opacities < 1 / 255).mean()
@@ -213,9 +207,8 @@ def test_parts_that_outputs_drop(tmp_path: Path, order: str) -> None:
 
 def test_a_dial_and_its_calibration(tmp_path: Path) -> None:
     found = inspect(adapted(tmp_path / "a.ply"))
-    assert found.splat is not None and found.splat.dial is not None and found.splat.dial.calibration is not None
+    assert found.splat is not None and found.splat.dial is not None and found.splat.dial.calibration == CALIBRATION
     assert found.splat.dial.attenuation == ATTENUATION and found.splat.tau == 0.01
-    assert [row.virtual_scale for row in found.splat.dial.calibration.rows] == [1, 2, 6]
     assert found.what == "an adapted splat, with sigma_d, PLY" and "clod-adapter" in (found.writer or "")
     assert found.splat.values.sigma is not None and found.splat.values.sigma.least > 0 and found.splat.comments == ()
 
@@ -272,7 +265,7 @@ def mutants(folder: Path) -> list[bytes]:
     """The bytes of a file of every kind, each preceded by its suffix."""
     paths = [
         write(folder / "a.ply", table(6, 1)), write(folder / "b.ply", table(4, 0), order="ascii"),
-        write_packed(folder / "c.ply", scenes.gaussians(6, 1, 0)), adapted(folder / "d.ply", 5),
+        write_packed(folder / "c.ply", scenes.gaussians(6, 1, 0)), adapted(folder / "d.ply"),
         adapter_of(folder / "e.safetensors", 5), state_of(folder / "f.safetensors"), gsplat_checkpoint(folder / "g.pt"),
     ]  # fmt: skip
     for suffix in (".glb", ".spz", ".safetensors", ".splat"):

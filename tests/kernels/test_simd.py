@@ -79,20 +79,6 @@ def test_operations_match_numpy() -> None:
 
 
 @njit
-def move(a, source, out, target):
-    store(out, target, load(a, source))
-
-
-def test_load_and_store_take_any_offset() -> None:
-    for source, target in ((0, 0), (1, 3), (7, 16), (21, 5)):
-        a, out = np.arange(40, dtype=np.float32), np.full(40, -1, np.float32)
-        move(a, source, out, target)
-        want = np.full(40, -1, np.float32)
-        want[target : target + LANES] = a[source : source + LANES]
-        np.testing.assert_array_equal(out, want)
-
-
-@njit
 def elementary(function, x, out):
     for at in range(0, len(x), LANES):
         store(out, at, exp2(load(x, at)) if function == 0 else log2(load(x, at)))

@@ -14,11 +14,6 @@ from clod_adapter.training.camera_placement import FIELD, HEIGHT, WIDTH, place_c
 from clod_adapter.training.pseudo_views import render_pseudo_views
 
 
-@pytest.fixture(scope="module")
-def blob() -> clod.Gaussians:
-    return scenes.gaussians(400, 1, 0, size=0.05)
-
-
 def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
     """An opaque sphere of small discs and a far floater, with SH degree 1 strong towards ``seen_from`` alone.
 

@@ -14,11 +14,6 @@ from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.training.pseudo_views import FEW, OWN, add_pseudo_views, render_pseudo_views
 
 
-@pytest.fixture(scope="module")
-def blob() -> clod.Gaussians:
-    return scenes.gaussians(400, 1, 0, size=0.05)
-
-
 @pytest.mark.parametrize("with_dial", [False, True])
 def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians, with_dial: bool) -> None:
     """Renders of a file with a dial are at s = 1."""
