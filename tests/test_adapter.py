@@ -38,11 +38,9 @@ def adapt(base: Gaussians, names: list[str], scale: float = 0.01, seed: int = 1)
 
 @settings(deadline=None)
 @given(
-    st.lists(st.sampled_from(ATTRIBUTES), unique=True),
-    st.sampled_from([1e-9, 1e-3, 1.0, 1e4, 1e6]),
-    st.integers(0, 1000),
-    st.sampled_from([0, 3, 15]),
-)
+    st.lists(st.sampled_from(ATTRIBUTES), unique=True), st.sampled_from([1e-9, 1e-3, 1.0, 1e4, 1e6]),
+    st.integers(0, 1000), st.sampled_from([0, 3, 15]),
+)  # fmt: skip
 def test_applying_an_adapter_gives_the_result(names: list[str], scale: float, seed: int, bands: int) -> None:
     base = gaussians(seed=seed, bands=bands)
     adapted = adapt(base, names, scale, seed + 1)

@@ -5,20 +5,17 @@ from __future__ import annotations
 import pytest
 import torch
 
+from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_COUNTS, Gaussians
 from scenes import gaussians as some_gaussians
 
 CONFIG = AttenuationConfig()
-SHAPES = {
-    "means": (5, 3), "quats": (5, 4), "log_scales": (5, 3), "opacity_logits": (5,), "sh0": (5, 1, 3), "shN": (5, 8, 3),
-}  # fmt: skip
 
 
 def gaussians(**changes: object) -> Gaussians:
-    g = torch.Generator().manual_seed(0)
-    return Gaussians(**({name: torch.randn(shape, generator=g) for name, shape in SHAPES.items()} | changes))
+    return some_gaussians(5, 2, 0).replace(**changes)
 
 
 def adapted() -> Gaussians:
@@ -54,7 +51,7 @@ def test_sigma_d_requires_attenuation_settings() -> None:
 
 def test_tensors_are_the_fields_and_replace_changes_one() -> None:
     some = adapted()
-    assert list(some.tensors()) == [*SHAPES, "sigma_d"] and list(gaussians().tensors()) == list(SHAPES)
+    assert list(some.tensors()) == [*ATTRIBUTES, "sigma_d"] and list(gaussians().tensors()) == list(ATTRIBUTES)
     assert all(value is getattr(some, name) for name, value in some.tensors().items())
     new = some.replace(means=torch.zeros(5, 3))
     assert (new.means == 0).all() and (some.means != 0).any()

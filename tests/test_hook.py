@@ -102,10 +102,10 @@ def test_mixed_and_strided_arrays_are_accepted() -> None:
 
 def test_gradients_reach_opacities_and_sigma_d_only() -> None:
     model, view = adapted(), camera()
-    a, sigma = model.opacities.double().requires_grad_(), model.sigma_d.double().requires_grad_()
-    means, viewmat = model.means.double().requires_grad_(), view.viewmat.double().requires_grad_()
-    keep = Hook(sigma, model.attenuation, 2.0)(means, a, viewmat)[1]
-    a, sigma, means = (tensor[keep].detach().requires_grad_() for tensor in (a, sigma, means))
+    given = (model.opacities, model.sigma_d, model.means)
+    keep = hook_of(model, 2.0)(model.means, model.opacities, view.viewmat)[1]
+    a, sigma, means = (tensor[keep].double().requires_grad_() for tensor in given)
+    viewmat = view.viewmat.double().requires_grad_()
 
     def drawn(a: torch.Tensor, sigma: torch.Tensor) -> torch.Tensor:
         return Hook(sigma, model.attenuation, 2.0)(means, a, viewmat)[0]

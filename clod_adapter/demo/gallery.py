@@ -192,14 +192,9 @@ def add_solids(scene: SceneBuilder) -> None:
 
 
 def write_gallery(
-    folder: str | Path,
-    *,
-    width: int = 320,
-    height: int = 240,
-    count: int = 64,
-    points: int = 20000,
+    folder: str | Path, *, width: int = 320, height: int = 240, count: int = 64, points: int = 20000,
     progress: Listener | None = None,
-) -> Gallery:
+) -> Gallery:  # fmt: skip
     """Renders the capture into a new `folder`: ``images/*.png`` and a COLMAP model with a point cloud.
 
     Args:

@@ -33,12 +33,9 @@ def own_teacher(report: Mapping[str, Any]) -> bool:
 
 
 def write_tradeoff_report(
-    path: str | Path,
-    report: Mapping[str, Any],
-    frames: Sequence[Picture],
-    others: Mapping[str, Picture],
+    path: str | Path, report: Mapping[str, Any], frames: Sequence[Picture], others: Mapping[str, Picture],
     training: Mapping[str, Any] | None = None,
-) -> dict[str, Path]:
+) -> dict[str, Path]:  # fmt: skip
     """Writes the page and its charts as PNGs in the same folder, atomically; returns the paths.
 
     Args:
