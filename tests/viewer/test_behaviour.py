@@ -1,4 +1,4 @@
-"""The page of one file: messages, names, sizes, and the self-contained file, in a browser."""
+"""The page in a browser: messages, file names, layout, and the self-contained page."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from shown import COUNTS, SIZE, Shown, serve
 
 
 def test_a_file_without_sigma_d_has_no_dial(show: Any, files: Any, plain: Gaussians) -> None:
-    """The page says why; it shows the file's name as text."""
+    """The page shows the reason, and the file's name as text."""
     name = "<img src=x onerror=clod=1><script>clod=1<!script>&amp;'\".ply"
     shown = show(files.save(plain, name))
     assert shown.text("#title") == name and shown.page.title() == name and shown.page.query_selector("img") is None
     assert shown.page.is_disabled("#dial") and shown.page.is_disabled("#target") and shown.page.is_disabled("#equation")
-    said = shown.text("#no-dial")
-    assert f"{name} has no sigma_d" in said and f"clod-adapt {name}" in said
+    reason = shown.text("#no-dial")
+    assert f"{name} has no sigma_d" in reason and f"clod-adapt {name}" in reason
     assert shown.counts() == {"total": 400, "kept": 400, "drawn": shown.counts()["drawn"]}
     assert shown.picture().max() > 50
     shown.page.keyboard.press("]")
     assert shown.counts()["kept"] == 400
-    shown.page.evaluate("location.hash = '#wipe=0.5&other=3&dial=3'")  # a link to a comparison that is not there
+    shown.page.evaluate("location.hash = '#wipe=0.5&other=3&dial=3'")  # a link with a comparison, which needs a dial
     shown.until("document.getElementById('compare').value === 'off'")
     assert shown.page.is_hidden("#wipe")
 
 
 def test_a_model_that_cannot_be_fetched_is_an_error(tab: Any, files: Any, gaussians: Gaussians) -> None:
-    """Keys then do nothing."""
+    """Keys have no effect then."""
     with serve(files.save(gaussians)) as url:
         tab.route("**/files/model", lambda route: route.fulfill(body=b"ply\nformat"))
         shown = Shown(tab)
@@ -63,9 +63,9 @@ def test_more_gaussians_than_16_bits_count(show: Any, files: Any) -> None:
 def test_one_file_needs_no_network(
     chromium: Any, show: Any, files: Any, gaussians: Gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its data, which may be larger than a text node, continues in further elements."""
-    monkeypatch.setattr(page, "LETTERS", 20_000)
-    monkeypatch.setattr(payload, "ROWS", 100)
+    """Large data are divided among several elements, because browsers limit the size of a text."""
+    monkeypatch.setattr(page, "MAX_CHARACTERS", 20_000)
+    monkeypatch.setattr(payload, "BLOCK_ROWS", 100)
     path = files.save(gaussians)
     served, model = show(path, "--sv", 2), clod_adapter.load(path)
     write_viewer_page(tmp_path / "page.html", model, base=model, cameras=scenes.ring(2, 320, 240), virtual_scale=2.0)
@@ -80,7 +80,7 @@ def test_one_file_needs_no_network(
         assert [url for url in alone.asked if not url.startswith(("file:", "blob:", "data:"))] == []
 
 
-def test_the_page_fits(show: Any, model: Path, files: Any, plain: Gaussians, artefacts: Path) -> None:
+def test_the_panel_fits_the_window(show: Any, model: Path, files: Any, plain: Gaussians, artefacts: Path) -> None:
     shown = show(model, "--base", files.save(plain, "base.ply"))
     shown.run("clod.setWipe(0.5, 'base')")
     for scheme, width in (("light", 360), ("dark", 1280)):
