@@ -70,7 +70,7 @@ def test_touch_moves_the_camera(chromium: Any, show: Any, model: Path) -> None:
 
 
 def test_cameras_of_the_scene(show: Any, model: Path, tmp_path: Path) -> None:
-    """By keys, and by name in the list, which shows none once the camera is moved."""
+    """Selected by keys and by name in the list; after the view moves, the list has no selection."""
     cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))]
     write_model(tmp_path, cameras, [camera.name for camera in cameras])
     shown = show(model, "--images", tmp_path, viewport=TALL)

@@ -21,8 +21,8 @@ from shown import Shown, assert_same, drop, message
 CAMERA = scenes.camera(320, 240)
 
 
-def fall(shown: Shown, path: Path, dial: float) -> None:
-    """Drops a file and waits until it is drawn."""
+def drop_file(shown: Shown, path: Path, dial: float) -> None:
+    """Drops a file, and waits until the page has drawn it."""
     drop(shown, path.name, path.read_bytes())
     shown.until(f"document.title === '{path.name}'")
     shown.camera(CAMERA)
@@ -33,7 +33,7 @@ def test_every_ply_layout_gives_the_same_picture(
     shown: Shown, files: Any, gaussians: Gaussians, artefacts: Path
 ) -> None:
     path = files.save(gaussians, "usual.ply")
-    fall(shown, path, 2.0)
+    drop_file(shown, path, 2.0)
     wanted = shown.picture()
     assert_same(shown, render(gaussians, CAMERA, 2.0), artefacts / "dropped.png")
     vertex = PlyData.read(str(path), mmap=False)["vertex"]
@@ -47,12 +47,12 @@ def test_every_ply_layout_gives_the_same_picture(
         rows = doubles if name == "doubles.ply" else vertex.data
         element = PlyElement.describe(rows, "vertex", comments=vertex.comments)
         PlyData([element], **options).write(str(files.folder / name))
-        fall(shown, files.folder / name, 2.0)
+        drop_file(shown, files.folder / name, 2.0)
         assert shown.page.is_enabled("#dial") and np.array_equal(shown.picture(), wanted), name
 
 
 def test_settings_are_read_without_comments(shown: Shown, files: Any, gaussians: Gaussians, artefacts: Path) -> None:
-    """Other tools remove comments: columns hold the settings too. A file of an earlier version has its defaults."""
+    """Other tools remove comments and keep the columns of settings. A file of an earlier version has its defaults."""
     paper = {"tau": 1 / 255, "cut": "hard", "normalizer": "max"}
     cases: dict[str, tuple[dict[str, Any], list[str]]] = {
         "default.ply": ({}, []), "paper.ply": (paper, []), "old.ply": ({}, ["clod_adapter max_sv 4.0"]),
@@ -62,7 +62,7 @@ def test_settings_are_read_without_comments(shown: Shown, files: Any, gaussians:
         rows = PlyData.read(str(files.save(model)), mmap=False)["vertex"].data
         path = files.folder / name
         PlyData([PlyElement.describe(rows, "vertex", comments=comments)], byte_order="<").write(str(path))
-        fall(shown, path, 1.5)
+        drop_file(shown, path, 1.5)
         wanted = render(clod_adapter.load(path).gaussians if comments else model, CAMERA, 1.5)
         assert 0 < int(wanted.kept.sum()) < 400
         assert_same(shown, wanted, artefacts / f"bare_{name}.png")
@@ -83,24 +83,24 @@ def test_the_screen_filter_of_the_file_is_used(
             path.write_bytes(re.sub(gone, b"", path.read_bytes()))
         found = clod_adapter.load(path).gaussians
         assert found.screen_filter == FILTERS[name]
-        fall(shown, path, 1.0)
+        drop_file(shown, path, 1.0)
         assert_same(shown, render(found, CAMERA), artefacts / f"filter_{form}.png")
 
 
-def test_a_damaged_file_is_an_error_and_leaves_the_picture(shown: Shown, model: Path) -> None:
+def test_a_damaged_file_is_an_error_and_the_picture_stays(shown: Shown, model: Path) -> None:
     data = model.read_bytes()
     damaged = (
         ("cut.ply", data[:-100], "truncated"),
         ("head.ply", data[:300], "truncated"),
-        ("words.ply", b"good morning", "no splat"),
+        ("words.ply", b"good morning", "not a splat"),
         ("empty.ply", b"", "empty"),
         ("mesh.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "mesh"),
-        ("cut.spz", gzip.compress(bytes(100), mtime=0)[:-9], "it is damaged, or too large"),
-        ("end.sog", b"PK\3\4" + bytes(60) + b"PK\5\6" + b"\xff" * 20, "it is damaged, or too large"),
+        ("cut.spz", gzip.compress(bytes(100), mtime=0)[:-9], "it is damaged or too large"),
+        ("end.sog", b"PK\3\4" + bytes(60) + b"PK\5\6" + b"\xff" * 20, "it is damaged or too large"),
         ("folder", b"", "cannot read it"),
     )
     before = shown.picture()
-    for name, content, said in damaged:
+    for name, content, error in damaged:
         drop(shown, name, content, fails=name == "folder")
-        assert said in message(shown, name) and shown.text("#title") == "model.ply"
+        assert error in message(shown, name) and shown.text("#title") == "model.ply"
     assert np.array_equal(shown.picture(), before)

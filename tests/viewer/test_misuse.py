@@ -1,4 +1,4 @@
-"""The page with quick or wrong input, and on devices that cannot show it."""
+"""The page with fast or invalid input, and on devices without the needed WebGL2."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shown import Shown, drop, fold, serve, take
 
 
 def target(shown: Shown, text: str | None = None) -> str:
-    """The page's note on a typed count, or on the same again."""
+    """The page's note after a count is entered; None enters the same again."""
     if text is not None:
         shown.page.fill("#target", text)
     shown.page.evaluate("document.getElementById('target-note').textContent = ''")
@@ -34,7 +34,7 @@ def test_the_last_of_two_dropped_files_is_shown(shown: Shown, files: Any, model:
 
 
 def test_keys(shown: Shown) -> None:
-    """Released with another Shift state (on many keyboards + is Shift and =); with the focus on a text or the dial."""
+    """A key released after Shift (on many keyboards + is Shift and =); keys with the focus on text or the dial."""
     fold(shown, True)
     shown.page.evaluate("""() => {
         const press = (kind, key) => new KeyboardEvent(kind, { key, code: "Equal", bubbles: true });
@@ -53,13 +53,13 @@ def test_keys(shown: Shown) -> None:
 
 
 def test_the_count_box_takes_counts_only(shown: Shown, gaussians: Gaussians) -> None:
-    """And sets the dial that ``dial_for`` finds for the count."""
+    """A valid count sets the dial value of ``dial_for``."""
     camera = scenes.camera(320, 240)
     wanted = clod_adapter.dial_for(gaussians, keep=150, cameras=[camera]).virtual_scale
     fold(shown, True)
     shown.camera(camera)
     for text in ("0", "-5", "1.5", "many"):
-        assert "A number of Gaussians" in target(shown, text) and shown.text("#dial-value") == "s = 1.00"
+        assert "Enter a number of Gaussians" in target(shown, text) and shown.text("#dial-value") == "s = 1.00"
     assert "keeps" in target(shown, "1,000,000")
     shown.run("clod.setEquation(false)")
     assert "keeps 150 in this view" in target(shown, "150")
@@ -69,14 +69,14 @@ def test_the_count_box_takes_counts_only(shown: Shown, gaussians: Gaussians) -> 
     assert target(shown) and shown.counts()["kept"] == 150
 
 
-def test_one_gaussian_is_shown_whole(shown: Shown, files: Any) -> None:
+def test_one_gaussian_fits_the_view(shown: Shown, files: Any) -> None:
     take(shown, files.save(scenes.gaussians(1, 0, 5).replace(opacity_logits=torch.tensor([5.0])), "one.ply"))
     picture = shown.picture().max(2)
     assert picture.max() > 20 and (picture[0].max(), picture[-1].max()) == (0, 0)
 
 
 def failed(tab: Any, path: Path, script: str) -> str:
-    """The message of the page of this file after a script that runs before the page's own."""
+    """The error message of the page of a file if ``script`` runs before the page's script."""
     with serve(path) as url:
         tab.add_init_script(script)
         shown = Shown(tab)
@@ -91,10 +91,10 @@ def test_a_model_beyond_the_device_limit_is_an_error_with_both_counts(tab: Any, 
         WebGL2RenderingContext.prototype.getParameter = function (name) {
             return name === this.MAX_TEXTURE_SIZE ? 2 : real.call(this, name);
         };"""
-    said = failed(tab, files.save(scenes.gaussians(1100, 3, 5)), small)
-    assert "1,100 Gaussians" in said and "takes 682" in said
+    error = failed(tab, files.save(scenes.gaussians(1100, 3, 5)), small)
+    assert "1,100 Gaussians" in error and "at most 682" in error
 
 
-def test_without_webgl_there_is_a_message_and_no_panel(tab: Any, model: Path) -> None:
+def test_without_webgl_the_page_shows_an_error_and_no_panel(tab: Any, model: Path) -> None:
     assert "WebGL2" in failed(tab, model, "HTMLCanvasElement.prototype.getContext = () => null")
     assert tab.is_hidden("#panel")

@@ -1,4 +1,4 @@
-"""The browser's picture equals ``clod_adapter.render`` at the same camera and dial."""
+"""The browser's picture equals ``clod_adapter.render`` at the same camera and dial value."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_at_dial_values_and_without_the_equation(shown: Shown, files: Any, artef
 def test_settings_and_screen_filters(
     show: Any, files: Any, artefacts: Path, settings: dict[str, Any], screen_filter: ScreenFilter
 ) -> None:
-    """For Gaussians of a pixel and less, where filters differ: the classic filter gives another picture."""
+    """With Gaussians of at most a pixel, for which filters differ: the classic filter gives a different picture."""
     classic = scenes.dialled(1500, 1, 7, **settings)
     classic = classic.replace(log_scales=classic.log_scales - 2.0)
     gaussians, camera = classic.replace(screen_filter=screen_filter), scenes.camera(320, 240)
