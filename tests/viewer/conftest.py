@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -64,20 +63,15 @@ def show(tabs: Any) -> Iterator[Callable[..., Shown]]:
             assert foreign == []
 
 
-@dataclass(frozen=True)
-class Files:
-    """Writes models into a test's folder."""
-
-    folder: Path
-
-    def save(self, gaussians: clod_adapter.Gaussians, name: str = "model.ply") -> Path:
-        clod_adapter.save(self.folder / name, gaussians)
-        return self.folder / name
-
-
 @pytest.fixture
-def files(tmp_path: Path) -> Files:
-    return Files(tmp_path)
+def save(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a model into the test's folder."""
+
+    def write(gaussians: Gaussians, name: str = "model.ply") -> Path:
+        clod_adapter.save(tmp_path / name, gaussians)
+        return tmp_path / name
+
+    return write
 
 
 @pytest.fixture(scope="session")
