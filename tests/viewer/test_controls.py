@@ -117,6 +117,18 @@ def test_touch_moves_the_camera(chromium: Any, show: Any, model: Path) -> None:
         assert differ(pictures[-1], pictures[-2])
 
 
+def test_a_link_opens_the_same_view(show: Any, model: Path) -> None:
+    shown = show(model)
+    fitted = shown.picture()
+    for key in ("ArrowRight", "-", "]"):
+        shown.page.keyboard.press(key)
+    shown.run("clod.setWipe(0.4, 3)")
+    shown.page.keyboard.press("l")
+    opened = show(model, address=shown.page.evaluate("location.hash"))
+    assert not differ(opened.picture(), shown.picture()) and differ(opened.picture(), fitted)
+    assert opened.counts() == shown.counts() and opened.text("#wipe-right") == shown.text("#wipe-right")
+
+
 def test_cameras_of_the_scene(show: Any, model: Path, tmp_path: Path) -> None:
     """Selected by keys and by name in the list; after the view moves, the list has no selection."""
     cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))]

@@ -65,7 +65,7 @@ export function createControls(canvas, camera, onMove) {
     onMove();
   }
 
-  /** One-character keys applyKeys unless the focus is on a text, a list or the dialog; other keys applyKeys on the canvas only. */
+  /** One-character keys act unless the focus is on a text, a list or the dialog; other keys act on the canvas only. */
   const accepts = (target, key) =>
     target === canvas || target === document.body || (key.length === 1 && !target.closest("input[type=text], select, dialog"));
 

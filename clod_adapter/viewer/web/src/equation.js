@@ -79,7 +79,7 @@ export function countAt(scales, dial) {
   return low;
 }
 
-/** The smallest dial value in [1, maxSv] that keeps at maxCount `target` Gaussians (budget.dial_for), and the number kept. */
+/** The smallest dial value in [1, maxSv] that keeps at most `target` Gaussians (budget.dial_for), and the number kept. */
 export function dialForCount(scales, target, maxSv) {
   const maxCount = countAt(scales, 1), minCount = countAt(scales, maxSv);
   if (target >= maxCount) return { dial: 1, kept: maxCount };

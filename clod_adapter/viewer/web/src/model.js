@@ -37,7 +37,7 @@ function upload(gl, gaussians) {
   if (gl.isContextLost()) throw new Error("the graphics device was lost; reload the page");
   const max = Math.floor(maxTexels(gl) / Math.max(texels, RECORD_TEXELS));
   if (gaussians.count > max) {
-    throw new Error(`it has ${integer(gaussians.count)} Gaussians of SH degree ${gaussians.degree}; this graphics device supports at most ${integer(max)}; export it at a larger dial value (--sv)`);
+    throw new Error(`it has ${integer(gaussians.count)} Gaussians of SH degree ${gaussians.degree}, and this graphics device supports at most ${integer(max)}; export it at a larger dial value (--sv)`);
   }
   const textures = {
     records: dataTexture(gl, RECORD_TEXELS * gaussians.count, Float32Array, (target) => fillRecords(target, gaussians)),
@@ -45,7 +45,7 @@ function upload(gl, gaussians) {
   };
   if (gl.getError() !== gl.OUT_OF_MEMORY) return textures;
   for (const each of Object.values(textures)) gl.deleteTexture(each);
-  throw new Error(`this graphics device has too little memory for ${integer(gaussians.count)} Gaussians`);
+  throw new Error(`this graphics device has too little memory for ${integer(gaussians.count)} Gaussians; export it at a larger dial value (--sv)`);
 }
 
 function fillRecords(target, { count, means, quats, logScales, opacityLogits, sh0, sigmaD }) {

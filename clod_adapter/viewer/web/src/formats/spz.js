@@ -10,7 +10,7 @@ export function readSpz(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset);
   if (bytes.length < HEADER || view.getUint32(0, true) !== MAGIC) throw new Error("it is gzip data but not .spz; open a .spz of version 2 or 3");
   const version = view.getUint32(4, true), count = view.getUint32(8, true), degree = bytes[12], unit = 2 ** -bytes[13];
-  if (version < 2 || version > 3 || degree > 3) throw new Error(`it is .spz of version ${version} and SH degree ${degree}; this page reads versions 2 and 3 and degrees 0 to 3`);
+  if (version < 2 || version > 3 || degree > 3) throw new Error(`it is .spz of version ${version} and SH degree ${degree}; export it as version 2 or 3 with degree 3 at most`);
   const quatSize = version === 3 ? 4 : 3, shSize = 3 * ((degree + 1) ** 2 - 1);
   const sizes = [9, 1, 3, 3, quatSize, shSize], starts = [HEADER];
   sizes.forEach((size) => starts.push(starts.at(-1) + size * count));
