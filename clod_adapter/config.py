@@ -185,7 +185,13 @@ class AdaptConfig:
         require(0 <= self.seed < 2**63, "seed", self.seed, "at least 0 and below 2^63")
         require(self.time_budget is None or self.time_budget > 0, "time_budget", self.time_budget, "positive seconds")
         require(0.5 < self.start_share <= 1, "start_share", self.start_share, "above 0.5 and at most 1")
-        choices = {"start": STARTS, "parameter": PARAMETERS, "sampling": SAMPLINGS, "count_term": COUNT_TERMS, "growth": GROWTHS}
+        choices = {
+            "start": STARTS,
+            "parameter": PARAMETERS,
+            "sampling": SAMPLINGS,
+            "count_term": COUNT_TERMS,
+            "growth": GROWTHS,
+        }
         for name, allowed in choices.items():
             require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
         require(0 <= self.full_share <= 1, "full_share", self.full_share, "between 0 and 1")
@@ -213,11 +219,16 @@ class AdaptConfig:
         """
         own: dict[str, Any] = {
             "tau": 1 / 255, "cut": "hard", "normalizer": "max", "start": "constant", "parameter": "linear",
-            "sampling": "uniform", "count_term": "paper", "reg_weight": 1.0, "growth": "off", "weight_slope": 0.5, "lr_sigma": 1e-2,
-            "temperature": 0.5, "average": 0.0, "lr_final": 0.05, "lr_means": 2.6e-4, "lr_quats": 8e-4,
+            "sampling": "uniform", "count_term": "paper", "reg_weight": 1.0, "weight_slope": 0.5, "lr_sigma": 1e-2,
+            "growth": "off", "temperature": 0.5, "average": 0.0, "lr_final": 0.05, "lr_means": 2.6e-4, "lr_quats": 8e-4,
             "lr_scales": 8e-3, "lr_opacities": 5e-2, "lr_sh0": 2e-3,
         }  # fmt: skip
         return cls(**{**own, **changes})
+
+    @property
+    def has_target_count(self) -> bool:
+        """Whether the target-count curve is part of the objective; with a single dial value it is not."""
+        return self.count_term == "law" and self.max_sv > 1
 
     def lighter(self, share: float) -> AdaptConfig:
         """A copy with the learning rates of all attributes but sigma_d multiplied by ``share``."""

@@ -37,7 +37,10 @@ def with_distance(gaussians: Gaussians, distance: float) -> Gaussians:
     config, sigma = gaussians.attenuation, gaussians.sigma_d
     if config is None or sigma is None or config.scene_distance == distance:
         return gaussians
-    changed = replace(config, scene_distance=distance, reference_distance=known_distance(config))
+    known = known_distance(config)
+    if gaussians.growth_d is not None:  # its unit, where none is known, is that of the distances so far
+        known = known or config.scene_distance
+    changed = replace(config, scene_distance=distance, reference_distance=known)
     if config.normalizer == "scene":
         ratio = config.scene_distance / distance
         if ratio < SMALL:

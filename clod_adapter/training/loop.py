@@ -79,7 +79,11 @@ def adapt(
     # Empty higher SH degrees that are not tuned stay empty, so they are not rendered.
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
     views = usable_views(base, scene.train)
-    begun = _initialized(lean, views, config, progress, group) if resume is None else _initialized_from(lean, resume)
+    begun = (
+        _initialized(lean, views, config, progress, group)
+        if resume is None
+        else _initialized_from(lean, resume, config)
+    )
     trainer = Trainer(begun, views, config, subset, group)
     trainer.empty_sh = None if lean is base else base.shN.clone()
     trainer.start_seconds = time.perf_counter() - began
@@ -109,16 +113,20 @@ def _initialized(
     """The Gaussians with the initial sigma_d, the same bits in all processes."""
     begun = for_training(initialize(lean, views, config, progress), views, config)
     if group:
-        own = {"sigma_d": begun.sigma_d, "attenuation": begun.attenuation}
+        own = {"sigma_d": begun.sigma_d, "growth_d": begun.growth_d, "attenuation": begun.attenuation}
         begun = begun.replace(**group.broadcast(own)).to(begun.means.device)
     return begun
 
 
-def _initialized_from(lean: Gaussians, resume: TrainingState) -> Gaussians:
+def _initialized_from(lean: Gaussians, resume: TrainingState, config: AdaptConfig) -> Gaussians:
     """The Gaussians with the sigma_d of rows that are rendered only; the state has that of the trained rows."""
     unset = torch.ones_like(lean.opacity_logits)
     dialled = with_distance(in_world_units(lean), resume.attenuation.scene_distance)  # rounded as in the first call
-    return lean.replace(sigma_d=unset if lean.sigma_d is None else dialled.sigma_d, attenuation=resume.attenuation)
+    growth = unset if lean.growth_d is None else lean.growth_d
+    return lean.replace(
+        sigma_d=unset if lean.sigma_d is None else dialled.sigma_d, attenuation=resume.attenuation,
+        growth_d=growth if config.growth == "on" else None,
+    )  # fmt: skip
 
 
 def _train(trainer: Trainer, progress: Listener | None) -> Adapted:

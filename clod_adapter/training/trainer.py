@@ -59,9 +59,9 @@ class Trainer:
             name: getattr(start, name).detach().to(**own, copy=name in self.stepped) for name in ATTRIBUTES
         }
         self.parameters[self.decay] = self.objective.parameter(start.sigma_d)
-        if config.growth == "on" or start.growth_d is not None:
-            begun = torch.zeros_like(start.opacity_logits) if start.growth_d is None else start.growth_d
-            self.parameters["growth_d"] = begun.detach().to(**own, copy=True).clamp_(*GROWTH_RANGE)
+        if config.growth == "on":
+            assert start.growth_d is not None
+            self.parameters["growth_d"] = start.growth_d.detach().float().clamp(*GROWTH_RANGE)
         self.optimizer = RowAdam(self._trained(), beta1=BETA1**config.batch, beta2=BETA2**config.batch)
         self.empty_sh: Tensor | None = None  # the whole shN of a base whose empty degrees were removed
         self.done, self.seconds, self.start_seconds, self.loss = 0, 0.0, 0.0, math.nan
@@ -89,7 +89,7 @@ class Trainer:
         for rows, names in ((found.kept & finite, set(self.stepped) - everywhere), (finite, everywhere)):
             self.optimizer.step({name: found.gradients[name] for name in self.stepped if name in names}, rows, rates)
         self.parameters[self.decay].clamp_(*self.decay_range)
-        if "growth_d" in self.stepped:
+        if self.config.growth == "on":
             self.parameters["growth_d"].clamp_(*GROWTH_RANGE)
         if share_done >= 1 - self.config.average:  # the optimizer continues from the parameters, not from the mean
             self.averaged += 1
@@ -108,7 +108,7 @@ class Trainer:
             found = self.objective.gradient_sum(self.parameters, self.group.share(samples) if self.group else samples)
             found = self.group.sum(found) if self.group else found
             if not math.isfinite(found.loss):
-                names = ", ".join(view.camera.name or "a view without a name" for view, _ in samples)
+                names = ", ".join(view.camera.name or "a view without a name" for view, *_ in samples)
                 raise LossNotFinite(f"the loss of step {self.done + 1} is not finite ({names})")
             return found
         except Exception:

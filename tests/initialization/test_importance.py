@@ -134,7 +134,7 @@ def test_initialization_culls_in_the_configured_order() -> None:
         return extinction_scale(dialled.opacity_logits, dialled.sigma_d, d, dialled.attenuation).argsort()
 
     assert torch.equal(culling_order(by_error)[100:180], error.argsort(stable=True)[100:180])
-    order = pruning_order(some, error.sqrt() * some.opacities)
+    order = pruning_order(some, error.sqrt() * some.opacities).position
     assert torch.equal(culling_order(by_default)[100:180], order.argsort()[100:180])
     assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
 
