@@ -27,6 +27,7 @@ from .shared.antialiasing import with_filter
 from .shared.budgets import solve_dials
 from .shared.console import Console
 from .shared.files import make_folder
+from .shared.interrupts import GracefulStop
 from .shared.kernels import prepare_kernels
 from .shared.measure import choose_dials
 from .shared.models import read_model_and_scene
@@ -83,18 +84,15 @@ def image_names(views: Sequence[View]) -> list[Path]:
 
 
 def write_all(images: Iterator[Written], total: int, out: Path, console: Console) -> tuple[list[Written], bool]:
-    """Writes the images with a progress bar; those written, and whether Ctrl-C ended it after the first."""
-    written = list[Written]()
-    try:
-        with output_lock(out / "pictures", of=out), console.meter("render") as meter:
-            for image in images:
-                written.append(image)
-                meter.update(len(written) / total, f"{len(written)}/{total}")
-    except KeyboardInterrupt:
-        if not written:
-            raise
-        return written, True
-    return written, False
+    """Writes the images with a progress bar; those written, and whether Ctrl-C ended it. A second one aborts."""
+    written, stop = list[Written](), GracefulStop()
+    with output_lock(out / "pictures", of=out), console.meter("render") as meter, stop.listening():
+        for image in images:
+            written.append(image)
+            meter.update(len(written) / total, f"{len(written)}/{total}")
+            if stop.requests:
+                break
+    return written, len(written) < total
 
 
 @torch.no_grad()

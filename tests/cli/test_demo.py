@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from clod_adapter.cli import demo
-from clod_adapter.cli.adapt import report, resume
+from clod_adapter.cli.adapt import report, resume, saver
 from clod_adapter.cli.adapt.result import Measurements
 from clod_adapter.cli.main import build_parser
 
@@ -97,7 +97,7 @@ def test_goes_on_with_what_was_interrupted(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(resume.Saver, "keep", stop)
+        patch.setattr(saver.Saver, "keep", stop)
         assert clod("demo").code == 130
     state = tmp_path / "demo" / "gallery.resume.safetensors"
     with monkeypatch.context() as patch:

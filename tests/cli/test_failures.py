@@ -14,9 +14,9 @@ import pytest
 import torch
 
 import clod_adapter
-from clod_adapter.cli.adapt import files, resume
 from clod_adapter.cli.adapt import report as reporting
-from clod_adapter.cli.adapt.progress import ProgressDisplay
+from clod_adapter.cli.adapt import saver
+from clod_adapter.cli.adapt.display import ProgressDisplay
 from clod_adapter.cli.shared import pages
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Phase, Progress
@@ -78,9 +78,9 @@ def after_step(patch: pytest.MonkeyPatch, step: int, action: Any) -> None:
         (lambda patch: change_step(patch, 6, fail, of_run), 1, 5),
         (lambda patch: after_step(patch, 7, fail), 1, 7),
         (lambda patch: patch.setattr(reporting, "measure_result", fail), 1, ITERS),
-        (lambda patch: patch.setattr(files, "save", raising(ClodError("dial.ply: cannot be written"))), 2, ITERS),
-        (lambda patch: patch.setattr(files, "save", raising(MemoryError())), 2, ITERS),
-        (lambda patch: patch.setattr(files, "save", fail), 1, ITERS),
+        (lambda patch: patch.setattr(reporting, "save", raising(ClodError("dial.ply: cannot be written"))), 2, ITERS),
+        (lambda patch: patch.setattr(reporting, "save", raising(MemoryError())), 2, ITERS),
+        (lambda patch: patch.setattr(reporting, "save", fail), 1, ITERS),
     ],
     ids=["step, quiet", "listener", "measuring", "full disk", "memory", "writing"],
 )
@@ -159,8 +159,8 @@ def test_a_folder_that_is_gone(clod: Any, outside: list[Any], whole: Any, tmp_pa
 def test_no_place_for_the_state(clod: Any, outside: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The one error is that of the output."""
     (tmp_path / "temporary").rmdir()
-    monkeypatch.setattr(reporting, "write", lambda *_: shutil.rmtree("out") or fail())
-    monkeypatch.setattr(resume, "save_state", raising(ClodError("full")))
+    monkeypatch.setattr(reporting, "write_files", lambda *_: shutil.rmtree("out") or fail())
+    monkeypatch.setattr(saver, "save_state", raising(ClodError("full")))
     done = clod(*outside)
     assert done.code == 1 and "ZeroDivisionError: of ours" in done.err and "resumes from" not in done.err, done
 

@@ -94,6 +94,8 @@ def test_bad_scenes() -> None:
         make_plan(base, Scene((), scene.test))
     with pytest.raises(ClodError, match="no Gaussians"):
         make_plan(base.select(torch.arange(0)), scene)
+    with pytest.raises(ClodError, match="not finite"):
+        make_plan(base.replace(sh0=base.sh0 * float("nan")), scene)
 
 
 def test_unseen_gaussians_of_a_base_with_a_dial_are_kept(captured: tuple[Gaussians, Scene]) -> None:

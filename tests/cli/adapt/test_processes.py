@@ -161,7 +161,7 @@ def test_the_launcher_s_signals_end_no_writing(server: Server, words: list[Any],
         "        return real(*arguments, **more)\n"
         "    return call\n"
         "result.explain = pressing(result.explain)\n"
-        "for name in ('write', 'print_summary'): setattr(report, name, pressing(getattr(report, name)))\n"
+        "for name in ('write_files', 'print_summary'): setattr(report, name, pressing(getattr(report, name)))\n"
         "main.json = argparse.Namespace(dumps=pressing(json.dumps))"
     )
     run = launch(server, tmp_path / "run", *words, *LONG, "--quiet", "--json", before={0: pressed}, wait=STATE)
