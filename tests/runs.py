@@ -120,14 +120,15 @@ def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[.
     return pressed
 
 
-def change_step(
-    patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any], only: Callable[[Any], bool] = lambda config: True
-) -> None:
-    """The gradients of the ``at``-th step from here, of runs that ``only`` names, are what ``change`` makes of them."""
+def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]) -> None:
+    """Replaces the gradients of the ``at``-th step from here by ``change`` of them, except in runs of one step.
+
+    Such a run prepares the kernels.
+    """
     real, steps = Objective.gradient_sum, count(1)
 
     def changed(self: Objective, *given: Any) -> Any:
         found = real(self, *given)
-        return change(found) if only(self.config) and next(steps) == at else found
+        return change(found) if self.config.iters > 1 and next(steps) == at else found
 
     patch.setattr(Objective, "gradient_sum", changed)

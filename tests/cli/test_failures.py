@@ -54,11 +54,6 @@ def raising(error: Exception) -> Any:
     return call
 
 
-def of_run(config: Any) -> bool:
-    """Not of the run that prepares the kernels."""
-    return bool(config.iters == ITERS)
-
-
 def after_step(patch: pytest.MonkeyPatch, step: int, action: Any) -> None:
     """``action`` follows a step, as the page and the check of the held-out views do."""
     call = ProgressDisplay.__call__
@@ -75,7 +70,7 @@ def after_step(patch: pytest.MonkeyPatch, step: int, action: Any) -> None:
 @pytest.mark.parametrize(
     ("broken", "code", "step"),
     [
-        (lambda patch: change_step(patch, 6, fail, of_run), 1, 5),
+        (lambda patch: change_step(patch, 6, fail), 1, 5),
         (lambda patch: after_step(patch, 7, fail), 1, 7),
         (lambda patch: patch.setattr(reporting, "measure_result", fail), 1, ITERS),
         (lambda patch: patch.setattr(reporting, "save", raising(ClodError("dial.ply: cannot be written"))), 2, ITERS),
@@ -99,7 +94,7 @@ def test_a_run_is_resumed_after_an_error(
 def test_a_loss_that_is_not_finite(clod: Any, words: list[Any], whole: Any, tmp_path: Path) -> None:
     """The result before that step is written, and the exit code is 1."""
     with pytest.MonkeyPatch.context() as patch:
-        change_step(patch, 6, lambda found: replace(found, loss=math.nan), of_run)
+        change_step(patch, 6, lambda found: replace(found, loss=math.nan))
         done = clod(*words, "--json")
     report = json.loads(done.out)
     assert done.code == 1 and names(tmp_path) == sorted([*OUTPUTS, STATE]), done
@@ -116,7 +111,7 @@ def test_gradients_that_are_not_finite(
         found.gradients["quats"][5] = math.nan
         return found
 
-    change_step(monkeypatch, 6, spoil, of_run)
+    change_step(monkeypatch, 6, spoil)
     done = clod(*words)
     assert done.code == 0 and "1 Gaussians were not moved by some steps: their gradients" in done.err, done
     found = clod_adapter.load(tmp_path / "dial.ply").gaussians
@@ -179,7 +174,7 @@ def test_infinite_opacities(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert clod("apply", "opaque.ply", "dial.safetensors", "-o", "again.ply").code == 0
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
     with pytest.MonkeyPatch.context() as patch:
-        change_step(patch, 12, fail, of_run)  # by then the state has a mean
+        change_step(patch, 12, fail)  # by then the state has a mean
         assert clod(*words, "next.ply").code == 1
     assert clod(*words, "next.ply", "--resume").code == 0
     assert stripped((tmp_path / "next.ply").read_bytes()) == stripped((tmp_path / "dial.ply").read_bytes())

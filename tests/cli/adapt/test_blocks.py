@@ -101,11 +101,6 @@ def test_jobs_write_the_files_of_one_process(
     assert not [path for path in tmp_path.iterdir() if "block" in path.name or "start" in path.name]
 
 
-def of_run(config: Any) -> bool:
-    """Whether it is the tested run, not the one that prepares the kernels."""
-    return bool(config.max_sv == 3)
-
-
 class Killed(BaseException):
     """Ends a run, and the run does not handle it."""
 
@@ -144,7 +139,7 @@ def interrupt(patch: pytest.MonkeyPatch) -> None:
     [
         (kill, None, "", "a.block2.pass1.resume.safetensors", 5),
         (interrupt, 130, "pass 1 of 2: stopped after step 3; the same command", "a.block2.pass1.resume.safetensors", 3),
-        (lambda patch: change_step(patch, 6, fail, of_run), 1, "the same command resumes from step 5, which is in "
+        (lambda patch: change_step(patch, 6, fail), 1, "the same command resumes from step 5, which is in "
          "a.block1.pass1.resume.safetensors\n", "a.block1.pass1.resume.safetensors", 5),
     ],
     ids=["killed", "ctrl-c", "error"],
@@ -258,7 +253,7 @@ def test_non_finite_loss_of_a_job_is_reported_by_the_merge(
 ) -> None:
     """That block ends early, and the exit code is 1, as without blocks; all that was learned is written."""
     with monkeypatch.context() as patch:
-        change_step(patch, 3, lambda found: replace(found, loss=float("nan")), of_run)
+        change_step(patch, 3, lambda found: replace(found, loss=float("nan")))
         done = adapt("a.ply", "--block", 1)
     assert done.code == 1 and "block 1 of 3, pass 1 of 2: ended after step 2: the loss of step 3" in done.err, done
     done = adapt("a.ply", "--json")

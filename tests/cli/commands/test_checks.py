@@ -122,6 +122,8 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("export DIALLED -o x.ply --fps 60", "dialled.ply: has no calibration .* --fps needs"),
         ("export DIALLED -o x.ply --sv 0.5", "--sv has 0.5, dial values must be"),
         ("export DIALLED -o x.ply --sv 2 --levels 1,2", "--levels gives the dial values; give no other"),
+        ("export DIALLED -o page.html --levels 1,2", "remove --levels, --camera and --order"),
+        ("export DIALLED -o page.html --order extinction", "remove --levels, --camera and --order"),
         ("export DIALLED -o x.ply --levels 1,4,2", "--levels: '1,4,2' must be ascending dial values of at least 1"),
         ("export DIALLED -o x.ply --levels nan,2", "--levels: 'nan,2' must be"),
         ("export DIALLED -o x.ply --levels 1,inf", "--levels: '1,inf' must be"),

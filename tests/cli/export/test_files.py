@@ -38,10 +38,3 @@ def test_a_page_has_the_cameras_of_the_scene(clod: Any, dialled: Path, capture: 
     (config,) = re.findall('id="clod-config">(.*?)</script>', (tmp_path / "page.html").read_text(encoding="utf-8"))
     names = [camera["name"] for camera in json.loads(config)["cameras"]]
     assert names == sorted(path.name for path in (capture.scene / "images").iterdir())
-
-
-@pytest.mark.parametrize("words", [("--levels", "1,2"), ("--order", "extinction")])
-def test_a_page_is_of_the_whole_dial(clod: Any, dialled: Path, tmp_path: Path, words: tuple[str, ...]) -> None:
-    done = clod("export", dialled, "-o", "page.html", *words)
-    assert done.code == 2 and "remove --levels, --camera and --order" in done.err
-    assert not list(tmp_path.glob("page*"))

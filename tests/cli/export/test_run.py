@@ -320,24 +320,6 @@ def test_baked_files_are_the_structs_that_sibr_reads(clod: Any, tmp_path: Path, 
         assert list(values[6 + harmonics :]) == torch.cat(rest).tolist()
 
 
-@pytest.mark.parametrize("degree", [0, 2])
-def test_a_foreign_reader_finds_the_same(clod: Any, tmp_path: Path, degree: int) -> None:
-    gsply = pytest.importorskip("gsply")
-    model = saved(tmp_path / "model.ply", degree)
-    rows = clod_adapter.order_by_extinction(model, load("model.ply").viewpoints)
-    assert clod("export", "model.ply", "--sv", 2, "-o", "baked.ply").code == 0
-    assert clod("export", "model.ply", "--order", "extinction", "-o", "ordered.ply").code == 0
-    for name, want in (("baked.ply", baked("model.ply", 2.0)), ("ordered.ply", model.select(rows))):
-        read = gsply.plyread(str(tmp_path / name))
-        pairs = [
-            (read.means, want.means), (read.scales, want.log_scales), (read.quats, want.quats),
-            (read.opacities.reshape(-1), want.opacity_logits), (read.sh0, want.sh0[:, 0]),
-        ]  # fmt: skip
-        pairs += [(read.shN, want.shN)] if degree else []
-        for theirs, ours in pairs:
-            assert np.array_equal(theirs, ours.numpy())
-
-
 def test_packing(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
     tool()
     for suffix in PACKED:
