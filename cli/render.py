@@ -16,7 +16,6 @@ from torch import Tensor
 from clod_adapter._support.text import file_name
 from clod_adapter._support.version import package_version
 from clod_adapter.cameras import View
-from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.lock import output_lock
@@ -111,10 +110,7 @@ def write_images(
 
 def write_png(path: Path, pixels: Tensor) -> None:
     """Writes ``[H, W, 3]`` uint8 pixels; makes the folder if it is missing."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ClodError(f"{path.parent}: cannot be made ({error.strerror or error}); choose another --out") from error
+    make_folder(path.parent)
     with atomic_path(path) as temporary:
         about = PngImagePlugin.PngInfo()
         about.add_text("Software", f"clod-adapter {package_version()}")  # check_ours looks for it

@@ -1,4 +1,4 @@
-"""What tests of the main job share: the names of its files, errors on demand, and processes without a slow start."""
+"""Shared by tests of the command: file names, injected errors and interrupts, processes that start fast."""
 
 from __future__ import annotations
 
@@ -91,6 +91,11 @@ class Server:
 
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
+
+
+def notes_of(report: Any) -> list[str]:
+    """Without the note on LPIPS and FLIP, which depends on installed packages."""
+    return [note for note in report["notes"] if not note.startswith("without ")]
 
 
 def log_of(folder: Path, rank: object = "") -> str:

@@ -43,6 +43,9 @@ def test_writes_three_files(clod: Any, capture: Any, dialled: Path, tmp_path: Pa
     assert (report["model"], report["scene"]) == (str(capture.ply), str(capture.scene))
     assert (report["base_count"], report["sh_degree"], report["steps"]) == (300, 1, 12)
     assert report["interrupted"] is False and report["notes"] == []
+    assert (report["alignment"]["guess"], report["alignment"]["explained"]) == (None, 1)
+    assert report["screen_filter"] == {"variance": 0.3, "compensate": False}
+    assert b"screen_filter" not in (tmp_path / "dial.ply").read_bytes()
     assert set(report["config"]) == set(AdaptConfig.__dataclass_fields__) and report["config"]["max_sv"] == 4
     assert report["attenuation"]["max_sv"] == 4
     assert set(report["machine"]) >= {"cpu", "cores", "python", "torch", "numba"}
@@ -105,19 +108,15 @@ def test_report_agrees_with_the_files(clod: Any, capture: Any, dialled: Path) ->
     assert stored.machine == machine_name() and report["ply_bytes"] == dialled.stat().st_size
 
 
-@pytest.mark.parametrize("device", ["auto", "cpu"])
-def test_device(clod: Any, capture: Any, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    moved = []
-    to = clod_adapter.Gaussians.to
+def test_default_output_name_and_device(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved, to = [], clod_adapter.Gaussians.to
     monkeypatch.setattr(clod_adapter.Gaussians, "to", lambda self, where: moved.append(where) or to(self, where))
-    done = clod(capture.ply, "--images", capture.scene, "--iters", 0, "--device", device, "--json")
-    assert set(moved) == {torch.device("cpu")} and json.loads(done.out)["device"] == "cpu"
-
-
-def test_default_output_name(clod: Any, capture: Any, tmp_path: Path) -> None:
-    done = clod(capture.ply, "--images", capture.scene, "--iters", 0, "--quiet")
+    done = clod(capture.ply, "--images", capture.scene, "--iters", 0, "--device", "cpu", "--quiet")
     assert done.code == 0 and names(tmp_path) == ["base_clod.json", "base_clod.ply", "base_clod.safetensors"]
-    assert done.err == "" and done.out.splitlines()[2].split()[0] == "base"
+    assert done.err == "" and done.out.splitlines()[2].split()[0] == "base" and set(moved) == {torch.device("cpu")}
+    assert json.loads((tmp_path / "base_clod.json").read_text())["device"] == "cpu"
 
 
 def test_training_continues_from_sigma_d(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:

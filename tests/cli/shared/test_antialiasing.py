@@ -53,12 +53,6 @@ def test_found_out_tuned_and_stored(clod: Any, trained: tuple[Path, Path], tmp_p
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
 
 
-def test_a_classic_checkpoint_stays_one_without_a_note(dialled: Path) -> None:
-    report = json.loads(dialled.with_suffix(".json").read_text())
-    assert report["notes"] == [] and report["screen_filter"] == {"variance": 0.3, "compensate": False}
-    assert b"screen_filter" not in dialled.read_bytes()
-
-
 def test_measured_and_rendered_with_what_is_found_out(clod: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
     ply, scene = trained
     for command in (("eval", ply, "--sv", 1), ("render", ply, "-o", tmp_path / "pictures")):
