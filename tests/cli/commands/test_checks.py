@@ -179,11 +179,11 @@ LINES = """
 PLY --images SCENE --max-sv 0 | PLY --images SCENE --out nowhere/dial.ply
 eval PLY --images SCENE --sv 0 | eval PLY --images SCENE --keep 10 | render PLY --images SCENE -o SCENE
 export PLY --sv 2 -o x.ply | export DIALLED --psnr-drop 2 -o x.ply | export DIALLED -o x.splat
-apply text.ply dial.safetensors -o dial.ply
+apply text.ply dial.safetensors -o dial.ply | inspect PLY
 """
 
 
-def test_help_and_errors_do_not_import_torch(bad: dict[str, Path], tmp_path: Path) -> None:
+def test_help_errors_and_inspect_do_not_import_torch(bad: dict[str, Path], tmp_path: Path) -> None:
     (tmp_path / "mesh.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
     lines = [line.split() for line in LINES.replace("\n", " | ").split(" | ") if line]
     script = (
@@ -198,6 +198,6 @@ def test_help_and_errors_do_not_import_torch(bad: dict[str, Path], tmp_path: Pat
     )
     words = json.dumps([[str(bad.get(word, word)) for word in line] for line in lines])
     done = subprocess.run([sys.executable, "-c", script, words], cwd=tmp_path, capture_output=True, text=True)
-    wanted = [0 if line[-1] in ("--help", "--version") else 2 for line in lines]
+    wanted = [0 if line[-1] in ("--help", "--version") or line[0] == "inspect" else 2 for line in lines]
     assert "Traceback" not in done.stderr and json.loads(done.stdout.splitlines()[-1]) == wanted, done
-    assert done.returncode == 2 and len(lines) == 18
+    assert done.returncode == 2 and len(lines) == 19
