@@ -83,7 +83,7 @@ class Saver:
 
     @contextmanager
     def rescuing(self, how: str = "--resume") -> Iterator[None]:
-        """Calls ``rescue`` on an error within the block; after an abort only says what is saved already.
+        """Calls ``rescue`` on an error within the block; after an abort only names the saved step.
 
         Raises:
             ClodError: the state to resume from was refused; names its file.

@@ -28,7 +28,7 @@ def signals_arrive() -> Iterator[None]:
 
 
 class Done:
-    """Exit code and what was printed."""
+    """Exit code, stdout and stderr."""
 
     def __init__(self, code: int, out: str, err: str) -> None:
         self.code, self.out, self.err = code, out, err

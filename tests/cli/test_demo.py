@@ -77,7 +77,7 @@ def test_folder_that_cannot_be_made(clod: Any, tmp_path: Path) -> None:
         assert done.code == 2 and said in done.err and done.err.count("\n") == 1, done
 
 
-def test_adapting_has_its_default_arguments() -> None:
+def test_arguments_for_adapting() -> None:
     flags = ["--quiet", "--json"]
     args = build_parser("demo").parse_args(["--out=-odd", *flags])
     files = [Path("-odd") / name for name in ("base.ply", "capture", "gallery.ply")]
