@@ -116,7 +116,7 @@ class Blocks:
             self._require_block(block, division.count)
             block = int(block) - 1
             number = 1 if not files.block(block, 1).exists() else division.passes
-            before = self.first_pass(inputs, divided) if number == 2 else None
+            before = self.first_pass(divided) if number == 2 else None
             result = self.train(inputs, divided, Pass(block, number, before))
             path = files.block(block, number)
         number = next((n for n in range(1, division.passes + 1) if files.missing(n)), 0)
@@ -135,15 +135,15 @@ class Blocks:
         if int(block) > count:
             raise ClodError(f"--block is {block}, and the number of blocks is {count}; give a number from 1 to {count}")
 
-    def first_pass(self, inputs: Inputs, divided: Divided) -> Gaussians:
-        """The merged result of the first pass."""
-        if missing := divided.files.missing(1):
+    def first_pass(self, divided: Divided) -> Gaussians:
+        """The merged result of the first pass, from its files."""
+        division, files = divided.division, divided.files
+        if missing := files.missing(1):
             raise ClodError(
                 f"block {self.setup.args.block} has its first pass, and the second needs the first of all: run --block "
                 f"{missing[0]} first ({len(missing)} are missing)"
             )
-        blocks = range(divided.division.count)
-        return merge(divided.division, [self.train(inputs, divided, Pass(block, 1)) for block in blocks])
+        return merge(division, [files.load_learned(division, block, 1) for block in range(division.count)])
 
     def divided(self, inputs: Inputs) -> Divided:
         """The division in the file, which is made if it does not exist.

@@ -60,7 +60,7 @@ def adapt_whole(setup: Setup, inputs: Inputs) -> dict[str, Any]:
             adapted = train(setup, inputs, plan, display, saver, page)
             result = make_result(setup, inputs, plan, adapted)
     with saver.rescuing():
-        return finish(setup, inputs, result, page, lambda complete: saver.close(complete))
+        return finish(setup, inputs, result, page, saver.close)
 
 
 def adapt_blocks(setup: Setup, inputs: Inputs, blocks: Blocks) -> dict[str, Any]:
@@ -75,11 +75,8 @@ def adapt_blocks(setup: Setup, inputs: Inputs, blocks: Blocks) -> dict[str, Any]
 
 
 def show_progress(setup: Setup, inputs: Inputs) -> ProgressDisplay:
-    base_row = inputs.base_rows[0] if inputs.base_rows else None
-    views = inputs.scene.test
-    return ProgressDisplay(
-        setup.console, setup.stop, inputs.base.gaussians, views, inputs.config.max_sv, base_row
-    )  # fmt: skip
+    base, row = inputs.base.gaussians, inputs.base_rows[0] if inputs.base_rows else None
+    return ProgressDisplay(setup.console, setup.stop, base, inputs.scene.test, inputs.config.max_sv, row)
 
 
 def make_page(setup: Setup, inputs: Inputs) -> AdaptPage | None:
