@@ -50,7 +50,7 @@ class Shown:
 
     def run(self, script: str, *arguments: object) -> Any:
         return self.page.evaluate(
-            f"async (given) => {{ const r = await {script}; await clod.settled(); return r }}", *arguments
+            f"async (given) => {{ const r = await {script}; await clod.whenDrawn(); return r }}", *arguments
         )
 
     def until(self, condition: str) -> None:
@@ -76,7 +76,7 @@ class Shown:
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
     def counts(self) -> dict[str, int]:
-        return dict(self.page.evaluate("clod.settled().then(clod.counts)"))
+        return dict(self.page.evaluate("clod.whenDrawn().then(clod.counts)"))
 
 
 def assert_alike(picture: np.ndarray, wanted: np.ndarray, keep: Path) -> None:
