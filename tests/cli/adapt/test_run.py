@@ -178,7 +178,7 @@ def test_interrupts_of_the_writing(
 def test_outputs_replace_earlier_ones_together(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Once, after the measurement."""
+    """Once, after the measurement, also without a calibration."""
     for name in OUTPUTS:
         (tmp_path / name).write_text(EARLIER)
     save, seen = reporting.save, []
@@ -187,11 +187,17 @@ def test_outputs_replace_earlier_ones_together(
         save(*args, **rest)
         seen.append({(tmp_path / name).read_text() for name in OUTPUTS})
 
+    def infinite(*_: Any) -> None:
+        raise ClodError("a PSNR is infinite")
+
     monkeypatch.setattr(reporting, "save", watched)
-    assert clod(capture.ply, "--images", capture.scene, *TINY).code == 0
+    monkeypatch.setattr(reporting, "calibrate", infinite)
+    done = clod(capture.ply, "--images", capture.scene, *TINY)
+    assert done.code == 0 and "the files have no calibration" in done.err, done
     report = json.loads((tmp_path / "dial.json").read_text())
     assert seen == [{EARLIER}] and names(tmp_path) == OUTPUTS and len(report["rows"]) == 7
-    assert report["ply_bytes"] == (tmp_path / "dial.ply").stat().st_size
+    assert report["ply_bytes"] == (tmp_path / "dial.ply").stat().st_size and report["calibration"] is None
+    assert clod_adapter.load_adapter(tmp_path / "dial.safetensors").calibration is None
 
 
 def test_unusable_config_is_refused_before_reading(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -257,20 +263,6 @@ def test_ci_banana(clod: Any, shared_data: Callable[[str], Path], tmp_path: Path
     assert report["rows"][-1]["kept_share"] < 0.3
     assert clod("apply", scene / "pretrained.ply", "dial.safetensors", "-o", "same.ply").code == 0
     assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
-
-
-def test_files_are_written_without_a_calibration(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def infinite(*_: Any) -> None:
-        raise ClodError("a PSNR is infinite")
-
-    monkeypatch.setattr(reporting, "calibrate", infinite)
-    done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
-    report = json.loads(done.out)
-    assert done.code == 0 and "the files have no calibration" in done.err and len(report["rows"]) == 7
-    assert report["calibration"] is None and names(tmp_path) == OUTPUTS
-    assert clod_adapter.load_adapter(tmp_path / "dial.safetensors").calibration is None
 
 
 def test_few_photographs_get_pseudo_views(clod: Any, capture: Any, tmp_path: Path) -> None:

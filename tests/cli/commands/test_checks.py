@@ -60,7 +60,7 @@ def test_folders_of_photographs_are_refused_as_output(scenes: Path, scene: str, 
 @pytest.fixture
 def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
     """Arguments of wrong commands."""
-    for name in ("text.ply", "broken.safetensors"):
+    for name in ("text.ply", "broken.safetensors", "a.hier", "a.lcc", "a.ckpt"):
         (tmp_path / name).write_text("hello")
     (tmp_path / "empty").mkdir()
     (tmp_path / "cut.ply").write_bytes(capture.ply.read_bytes()[:-100])
@@ -75,10 +75,12 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
     ("line", "said"),
     [
         ("", "arguments are required: PLY .*--help"),
-        ("PLY --images", "--images: expected one argument"),
         ("missing.ply --images SCENE", "missing.ply: .*No such file.*check the path"),
         ("text.ply --images SCENE --json", "text.ply: is not a PLY.*convert"),
         ("cut.ply --images SCENE", "cut.ply: .*truncated.*again"),
+        ("a.hier --out dial.ply", "Hierarchical-3DGS"),
+        ("a.lcc --out dial.ply", "splat-transform"),
+        ("a.ckpt --out dial.ply", "ns-export"),
         ("PLY --images nowhere", "nowhere: is not a folder; give"),
         ("PLY --images empty", "empty: no COLMAP model.*give the folder"),
         ("PLY --images SCENE --max-sv 0.5", "--max-sv is 0.5, it must be at least 1"),

@@ -75,15 +75,6 @@ def test_commands_that_read_a_checkpoint_have_the_option() -> None:
         assert ("--activated" in options) == (name not in ("demo", "inspect", "doctor")), name
 
 
-@pytest.mark.parametrize(
-    ("name", "message"), [("a.hier", "Hierarchical-3DGS"), ("a.lcc", "splat-transform"), ("a.ckpt", "ns-export")]
-)
-def test_unsupported_formats_are_refused_before_reading(clod: Any, tmp_path: Path, name: str, message: str) -> None:
-    (tmp_path / name).write_bytes(bytes(100))
-    done = clod(name, "--out", "dial.ply")
-    assert done.code == 2 and message in done.err and len(done.err.splitlines()) == 1, done
-
-
 @pytest.mark.parametrize("name", ["base.compressed.ply", "base.spz", "base.splat", "base.glb", "base.safetensors"])
 def test_other_formats_are_adapted(clod: Any, capture: Any, tmp_path: Path, name: str) -> None:
     (write_packed if name.endswith(".ply") else write)(tmp_path / name, capture.gaussians)
