@@ -22,9 +22,9 @@ from clod_adapter.io.scene.colmap import read_colmap
 from clod_adapter.io.scene.dataparser import trained_frame
 from clod_adapter.io.scene.folder import find_cameras, find_photographs
 from clod_adapter.io.scene.image_cache import ImageCache
-from clod_adapter.io.scene.images import LARGE, TRANSPARENT, Note, Photograph, Room, image_size, read_image
+from clod_adapter.io.scene.images import LARGE, Note, Photograph, Room, image_size, read_image
 from clod_adapter.io.scene.posed import HUGE, TEST_EVERY, PosedImage, held_out
-from clod_adapter.io.scene.transforms import MASKS, read_transforms
+from clod_adapter.io.scene.transforms import read_transforms
 from clod_adapter.origin import NOWHERE
 from clod_adapter.progress import Listener, Phase, tell
 
@@ -92,7 +92,7 @@ def load_scene(
     train = tuple(view for view in views if view.camera.name not in testing)
     test = tuple(view for view in views if view.camera.name in testing)
     pinhole = all(image.is_pinhole for image, _ in present)
-    spared = _left_out(views, sizes, done, pinhole, any(note.startswith(MASKS) for note in notes))
+    spared = _left_out(views, sizes, pinhole)
     return in_its_unit(Scene(train, test, (*notes, *_summary(done, len(views))), spared))
 
 
@@ -120,23 +120,15 @@ def _load(
     return views, sizes, notes
 
 
-def _left_out(
-    views: Sequence[View], sizes: Sequence[tuple[int, int]], notes: Sequence[Note], pinhole: bool, masked: bool
-) -> tuple[tuple[str, str], ...]:
-    """What of the reading these photographs do not need, and why: ``Scene.left_out``.
+def _left_out(views: Sequence[View], sizes: Sequence[tuple[int, int]], pinhole: bool) -> tuple[tuple[str, str], ...]:
+    """Steps of reading, or pixels, that are left out, and why: ``Scene.left_out``.
 
     Args:
         sizes: of the photographs in their files.
-        pinhole, masked: whether all cameras are pinholes, and whether the scene has masks.
+        pinhole: whether all cameras are pinholes.
     """
     whole, used = sum(3 * w * h for w, h in sizes), sum(3 * view.camera.width * view.camera.height for view in views)
-    found = [("exposure", "not modelled: photographs are used without exposure compensation")]
-    if pinhole:
-        found.append(("undistortion", f"all {len(views)} cameras are pinholes"))
-    if TRANSPARENT not in notes:
-        found.append(("alpha", f"none of {len(views)} photographs has transparency"))
-    if not masked:
-        found.append(("masks", "the scene has no masks"))
+    found = [("undistortion", f"all {len(views)} cameras are pinholes")] if pinhole else []
     if used < whole:
         kept = f"{used / 1e6:,.3g} MB of the {whole / 1e6:,.3g} MB in the files"
         found.append(("pixels", f"kept are {kept}: photographs are scaled as they are decoded"))

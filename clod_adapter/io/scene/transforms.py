@@ -20,7 +20,6 @@ from clod_adapter.io.scene.images import image_size
 from clod_adapter.io.scene.posed import PosedImage, check_posed
 
 DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in
-MASKS = "the masks"  # how the note on them begins
 MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 PERSPECTIVE = ("", "SIMPLE_PINHOLE", "PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -72,7 +71,7 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
     if "applied_transform" in content and not path.with_name(DATAPARSER).is_file():
         notes.append(f"{path.name} turned COLMAP's world (applied_transform): a checkpoint of the turned one is needed")
     if any("mask_path" in frame for frame in frames):
-        notes.append(f"{MASKS} of {path.name} are not used")
+        notes.append(f"the masks of {path.name} are not used")
     return images, notes
 
 

@@ -142,21 +142,17 @@ def test_split_and_single_image(tmp_path: Path) -> None:
         load_scene(tmp_path / "two")
 
 
-def test_what_the_scene_does_not_need(tmp_path: Path) -> None:
-    """Of each the reason, and none that the scene does need."""
+def test_left_out_names_skipped_steps_only(tmp_path: Path) -> None:
+    """Each with its reason; nothing that the scene does not have and no default would do."""
     (tmp_path / "plain").mkdir()
     write_scene(tmp_path / "plain", 3)
     spared = dict(load_scene(tmp_path / "plain").left_out)
-    assert set(spared) == {"undistortion", "alpha", "masks", "exposure", "scaling"}
+    assert set(spared) == {"undistortion", "scaling"}
     assert spared["undistortion"] == "all 3 cameras are pinholes"
-    assert spared["alpha"] == "none of 3 photographs has transparency"
     assert spared["scaling"] == "all 3 photographs are used at full resolution"
     scaled = dict(load_scene(tmp_path / "plain", max_width=20).left_out)
     assert "scaling" not in scaled
     assert scaled["pixels"].startswith("kept are 0.0027 MB of the 0.0108 MB in the files")  # 3 x 20x15 and 40x30, RGB
-    (see_through := Image.fromarray(pixels(0))).putalpha(99)
-    see_through.save(tmp_path / "plain" / "images" / "sub" / "002.png")
-    assert "alpha" not in dict(load_scene(tmp_path / "plain").left_out)
 
 
 def test_undistortion_is_not_even_imported_for_pinholes(tmp_path: Path) -> None:
