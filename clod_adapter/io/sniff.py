@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import sys
+from io import BufferedReader
 from pathlib import Path
 from typing import NoReturn
 
@@ -78,31 +77,18 @@ def read_start(path: Path, size: int = 64) -> bytes:
         raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
 
 
-def file_sha256(path: Path) -> str:
-    """SHA-256 of the file's bytes, hex.
+def handle_name(file: BufferedReader) -> str:
+    """A name of an open file, for libraries that open a file themselves and take names in UTF-8 only.
 
-    Raises:
-        ClodError: the file cannot be read.
+    It names the same file after another one has replaced it; on Windows nothing replaces an open file.
     """
-    try:
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    return str(file.name) if sys.platform == "win32" else f"/dev/fd/{file.fileno()}"
 
 
-@contextmanager
-def utf8_name(path: Path) -> Iterator[str]:
-    """A name for libraries that encode names as UTF-8: the file's own, or that of a handle where it is not UTF-8."""
-    try:
-        same = str(path).encode() == os.fsencode(path)
-    except UnicodeEncodeError:
-        same = False
-    if same:
-        yield str(path)
-    else:
-        with open(path, "rb") as held:
-            yield f"/dev/fd/{held.fileno()}"
+def file_sha256(file: BufferedReader) -> str:
+    """SHA-256 of an open file, hex."""
+    file.seek(0)
+    return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def refuse_known(path: Path, start: bytes) -> None:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -16,10 +18,10 @@ from clod_adapter.adapter import detach, trim
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io import checkpoint as checkpoint_file
 from clod_adapter.io.checkpoint import load, save, trimmed
 from clod_adapter.io.file_formats import write as save_as
 from clod_adapter.io.ply.columns import column_map
+from clod_adapter.io.sniff import handle_name
 from formats import model
 
 RESTS = (0, 9, 24, 45, 72)
@@ -261,14 +263,20 @@ def test_refused_saves(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [tmp_path / "in.ply"]
 
 
-def test_a_file_that_goes_away_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a format that a library reads; a PLY is read once (ply/test_body)."""
-    path = tmp_path / "in.safetensors"
+@pytest.mark.parametrize(("suffix", "module"), [(".safetensors", "tensor_file"), (".pt", "formats.pt")])
+def test_fingerprint_and_rows_are_of_one_file(
+    tmp_path: Path, suffix: str, module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file is replaced while it is open; for the PLY see ply/test_body."""
+    path, other = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
     save_as(path, detach(model(1)))
-    usable = checkpoint_file.usable_rows
-    monkeypatch.setattr(checkpoint_file, "usable_rows", lambda *args: (path.unlink(), usable(*args))[1])
-    with pytest.raises(ClodError, match="in.safetensors: cannot be read"):
-        load(path)
+    save_as(other, detach(model(0)))
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    monkeypatch.setattr("clod_adapter.io.file_formats.check_readable", lambda path: None)
+    name = f"clod_adapter.io.{module}.handle_name"
+    monkeypatch.setattr(name, lambda file: (os.replace(other, path), handle_name(file))[1])
+    found = load(path)
+    assert found.fingerprint == digest and found.gaussians.sh_degree == 1 and not other.exists()
 
 
 @pytest.mark.parametrize(

@@ -105,7 +105,7 @@ def test_files_of_others(tmp_path: Path) -> None:
     """Interleaved, in short integers, moved, without a description: sigma_d then has the default settings."""
     write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
     path = change_glb(tmp_path / "a.glb", lambda g: g["asset"].pop("extras"))
-    again, metadata, notes = load_glb(path)[:3]
+    again, metadata, _, notes, _ = load_glb(path)
     assert metadata.origin == ORIGIN and not notes and again.sigma_d is not None
     assert again.attenuation == AttenuationConfig()
     rows = np.zeros(5, [("position", "<f4", 3), ("rotation", "<i2", 4), ("opacity", "u1"), ("pad", "u1", 3)])

@@ -23,7 +23,7 @@ def test_a_dial_of_large_units_fits(tmp_path: Path, typical: float, known: bool)
     config = replace(ATTENUATION, reference_distance=typical if known else 0.0)
     means = typical * torch.nn.functional.normalize(direction)
     write(tmp_path / "a.spz", g.replace(sigma_d=sigma, means=means, attenuation=config))
-    again, metadata, _ = load_spz(tmp_path / "a.spz")[:3]
+    again, metadata = load_spz(tmp_path / "a.spz")[:2]
     assert metadata.attenuation == again.attenuation is not None and again.attenuation.scene_distance == 1
     assert again.attenuation.eps == config.eps and (not known or again.attenuation.reference_distance == typical)
     torch.testing.assert_close(again.sigma_d, sigma, rtol=2.0**-11, atol=0)
@@ -62,7 +62,7 @@ def test_what_splat_transform_writes(tmp_path: Path) -> None:
     g = model(3).select(torch.arange(4, 40))  # without the rotations of odd length, on which it fails
     write(tmp_path / "a.ply", g)
     splat_transform("--spz-version", "3", tmp_path / "a.ply", tmp_path / "b.spz")
-    again, metadata, (note,) = load_spz(tmp_path / "b.spz")[:3]
+    again, metadata, _, (note,), _ = load_spz(tmp_path / "b.spz")
     assert again.sigma_d is None and metadata.version == "" and note.startswith("quantised: positions in 24 bits")
     assert (again.means - g.means).abs().max() <= 2.0**-13
     assert (again.opacities - g.opacities).abs().max() <= 0.501 / 255
