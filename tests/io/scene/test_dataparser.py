@@ -97,9 +97,9 @@ def test_untouched_poses_stay(tmp_path: Path) -> None:
     [
         ("[1, 2]", "is no JSON object"),
         ("{", "is no JSON or damaged"),
-        ("{}", "transform is no 3x4 matrix"),
-        ('{"transform": "x"}', "transform is no 3x4 matrix"),
-        ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1e400]]}', "transform is no 3x4 matrix"),
+        ("{}", "transform is no 3x4 or 4x4 matrix"),
+        ('{"transform": "x"}', "transform is no 3x4 or 4x4 matrix"),
+        ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1e400]]}', "transform is no 3x4 or 4x4 matrix"),
         ('{"transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}', "transform is no rotation"),
         ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]]}', "transform is no rotation"),
         ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 0}', "scale is 0"),
