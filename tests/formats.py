@@ -63,13 +63,15 @@ def covariances(g: Gaussians) -> torch.Tensor:
 
 
 def damaged(whole: bytes, data: st.DataObject) -> bytes:
-    """A file cut short, or with a few bytes changed, its beginning more often than the rest."""
+    """A truncated file, or one with a few values overwritten, at its beginning more often than in the rest."""
     if data.draw(st.booleans()):
         return whole[: data.draw(st.integers(0, len(whole) - 1))]
     changed = bytearray(whole)
+    words = st.sampled_from([b"\xff" * 8, b"\xff" * 4, b"\0" * 8, b"\0\0\0\x80", b"nan", b" ", b"-1", b"\n", b"#"])
     for _ in range(data.draw(st.integers(1, 4))):
-        end = data.draw(st.sampled_from([16, 64, 1024, len(whole)]))
-        changed[data.draw(st.integers(0, min(end, len(whole)) - 1))] = data.draw(st.integers(0, 255))
+        end = min(data.draw(st.sampled_from([16, 64, 1024, len(whole)])), len(whole))
+        at, value = data.draw(st.integers(0, end - 1)), data.draw(st.binary(min_size=1, max_size=1) | words)
+        changed[at : at + len(value)] = value
     return bytes(changed)
 
 

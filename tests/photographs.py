@@ -13,6 +13,7 @@ from PIL import Image
 from clod_adapter.cameras import Camera
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.io.scene.colmap_library import pycolmap
+from formats import damaged
 
 SIZE = {"width": 160, "height": 120}
 LENSES = {
@@ -99,14 +100,6 @@ def psnr_of(picture: np.ndarray, other: np.ndarray) -> float:
 
 
 def damage(data: st.DataObject, files: list[Path]) -> None:
-    """Cuts one of the files, or overwrites some of its bytes, as hypothesis draws."""
+    """Truncates one of the files, or overwrites some of its bytes."""
     path = data.draw(st.sampled_from(files))
-    content = bytearray(path.read_bytes())
-    if data.draw(st.booleans()):
-        del content[data.draw(st.integers(0, len(content) - 1)) :]
-    else:
-        values = [b"\xff" * 8, b"\xff" * 4, b"\0" * 8, b"\0\0\0\x80", b"nan", b" ", b"-1", b"\n", b"#"]
-        for _ in range(data.draw(st.integers(1, 3))):
-            value, at = data.draw(st.sampled_from(values)), data.draw(st.integers(0, len(content) - 1))
-            content[at : at + len(value)] = value
-    path.write_bytes(content)
+    path.write_bytes(damaged(path.read_bytes(), data))

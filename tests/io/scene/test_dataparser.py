@@ -58,7 +58,7 @@ def require_poses(folder: Path, want: np.ndarray) -> None:
 
 @settings(deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(["today", "older", "none"]), st.integers(0, 50), st.sampled_from([1.0, 0.25]))
-def test_nerfstudio_data(tmp_path: Path, turn: str, seed: int, applied_scale: float) -> None:
+def test_cameras_of_nerfstudio_data(tmp_path: Path, turn: str, seed: int, applied_scale: float) -> None:
     applied = APPLIED.get(turn)
     given_poses = turned(in_colmap(9, seed), applied)
     up = given_poses[:, :3, 1].mean(0)
@@ -73,7 +73,7 @@ def test_nerfstudio_data(tmp_path: Path, turn: str, seed: int, applied_scale: fl
 
 
 @pytest.mark.parametrize("turn", ["today", "older"])
-def test_the_colmap_model_that_it_was_made_from(tmp_path: Path, turn: str) -> None:
+def test_cameras_of_the_colmap_model(tmp_path: Path, turn: str) -> None:
     """The colmap dataparser, or ns-process-data and its model: the world that is turned is COLMAP's."""
     want, written = trained(turned(in_colmap(9, 0), APPLIED[turn]), APPLIED[turn])
     write_model(tmp_path, [camera(i) for i in range(9)], [f"{i:03d}.png" for i in range(9)])
@@ -82,7 +82,7 @@ def test_the_colmap_model_that_it_was_made_from(tmp_path: Path, turn: str) -> No
     require_poses(tmp_path, want)
 
 
-def test_untouched_poses_stay(tmp_path: Path) -> None:
+def test_poses_that_nerfstudio_did_not_change(tmp_path: Path) -> None:
     """--orientation-method none --center-method none --auto-scale-poses False writes no more than applied_transform."""
     poses = turned(in_colmap(9, 3), APPLIED["today"])
     write_photographs(tmp_path, 9)
@@ -102,13 +102,11 @@ def test_untouched_poses_stay(tmp_path: Path) -> None:
         ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1e400]]}', "transform is no 3x4 or 4x4 matrix"),
         ('{"transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}', "transform is no rotation"),
         ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]]}', "transform is no rotation"),
-        ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 0}', "scale is 0"),
-        ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": NaN}', "scale is nan"),
-        ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": [1]}', "scale is "),
-        ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": true}', "scale is True"),
+        *((f'{{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": {scale}}}', f"scale is {message}")
+          for scale, message in (("0", "0"), ("NaN", "nan"), ("[1]", ""), ("true", "True"))),
     ],
-)
-def test_damage_is_named(tmp_path: Path, content: str, message: str) -> None:
+)  # fmt: skip
+def test_damaged_file_is_refused(tmp_path: Path, content: str, message: str) -> None:
     write_photographs(tmp_path, 3)
     write_transforms(tmp_path, in_colmap(3, 0))
     (tmp_path / "dataparser_transforms.json").write_text(content)
@@ -117,7 +115,7 @@ def test_damage_is_named(tmp_path: Path, content: str, message: str) -> None:
 
 
 @pytest.mark.parametrize("extra", [{"applied_transform": [[1]]}, {"applied_scale": -1}])
-def test_a_transforms_file_that_says_nonsense(tmp_path: Path, extra: dict[str, Any]) -> None:
+def test_invalid_applied_transform_is_refused(tmp_path: Path, extra: dict[str, Any]) -> None:
     write_photographs(tmp_path, 3)
     write_transforms(tmp_path, in_colmap(3, 0), **extra)
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps(trained(in_colmap(3, 0), None)[1]))

@@ -19,8 +19,8 @@ from clod_adapter.progress import Stopped
 from photographs import as_text, camera, model_of, pixels, write_scene
 
 
-def test_missing_images(tmp_path: Path) -> None:
-    """Named, and left out without a change to what is held out; too many are refused."""
+def test_missing_images_are_noted_or_refused(tmp_path: Path) -> None:
+    """The held-out images stay the same; more than half missing is an error."""
     names = sorted(write_scene(tmp_path, 18)[1])
     for name in names[2:11]:
         (tmp_path / "images" / name).unlink()
@@ -36,7 +36,7 @@ def test_missing_images(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_smaller_copies_where_there_are_no_images(tmp_path: Path) -> None:
+def test_smaller_copies_replace_missing_images(tmp_path: Path) -> None:
     write_scene(tmp_path, 3)
     (tmp_path / "images").rename(tmp_path / "images_2")
     for name in ("images_4", "input"):
@@ -61,7 +61,7 @@ def test_smaller_copies_where_there_are_no_images(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_several_cameras_and_sizes(tmp_path: Path) -> None:
+def test_several_cameras_and_image_sizes(tmp_path: Path) -> None:
     cameras = [camera(0), camera(1, 64, 48), camera(2, 30, 40)]
     write_model(tmp_path, cameras, ["a.png", "b.png", "c.png"])
     (tmp_path / "images").mkdir()
@@ -74,7 +74,7 @@ def test_several_cameras_and_sizes(tmp_path: Path) -> None:
     assert loaded.notes == ("3 of 3 images are 20x15 where the model says 40x30 (and 2 more): intrinsics scaled",)
 
 
-def test_two_images_of_one_name(tmp_path: Path) -> None:
+def test_duplicate_image_names_are_refused(tmp_path: Path) -> None:
     write_scene(tmp_path, 2)
     as_text(tmp_path)
     listed = tmp_path / "sparse" / "0" / "images.txt"
@@ -83,7 +83,7 @@ def test_two_images_of_one_name(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_an_interrupted_load_reads_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stopped_load_reads_no_more_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_scene(tmp_path, 40)
     read: list[Path] = []
 
@@ -112,7 +112,7 @@ def test_wide_images_are_scaled_with_their_intrinsics(tmp_path: Path) -> None:
     assert load_scene(tmp_path, max_width=40).notes == ()
 
 
-def test_images_of_another_size_than_the_camera(tmp_path: Path) -> None:
+def test_images_of_another_size_scale_the_intrinsics(tmp_path: Path) -> None:
     model_of(tmp_path, "PINHOLE", [330, 340, 200, 150], width=400, height=300)
     Image.fromarray(pixels(0)).save(tmp_path / "a.png")
     loaded = load_scene(tmp_path)
@@ -123,7 +123,7 @@ def test_images_of_another_size_than_the_camera(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_split_and_single_image(tmp_path: Path) -> None:
+def test_train_and_test_split(tmp_path: Path) -> None:
     (tmp_path / "ten").mkdir()
     (tmp_path / "one").mkdir()
     write_scene(tmp_path / "ten")
@@ -142,8 +142,8 @@ def test_split_and_single_image(tmp_path: Path) -> None:
         load_scene(tmp_path / "two")
 
 
-def test_what_the_scene_does_not_need(tmp_path: Path) -> None:
-    """Of each the reason, and none that the scene does need."""
+def test_steps_left_out_are_listed(tmp_path: Path) -> None:
+    """Each with its reason; a step that the scene needs is not listed."""
     (tmp_path / "plain").mkdir()
     write_scene(tmp_path / "plain", 3)
     spared = dict(load_scene(tmp_path / "plain").left_out)
@@ -159,7 +159,7 @@ def test_what_the_scene_does_not_need(tmp_path: Path) -> None:
     assert "alpha" not in dict(load_scene(tmp_path / "plain").left_out)
 
 
-def test_undistortion_is_not_even_imported_for_pinholes(tmp_path: Path) -> None:
+def test_undistortion_is_not_imported_for_pinholes(tmp_path: Path) -> None:
     (tmp_path / "pinhole").mkdir()
     write_scene(tmp_path / "pinhole", 2)
     model_of(tmp_path / "lens", "SIMPLE_RADIAL", [33, 20, 15, -0.1])
@@ -181,16 +181,16 @@ def test_undistortion_is_not_even_imported_for_pinholes(tmp_path: Path) -> None:
     assert done.stdout.split("\n")[:2] == ["pinhole False True False", "lens True False True"]
 
 
-def test_a_photograph_in_colour_is_in_memory_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Converting what is RGB already copies it, as large as it is in the file."""
+def test_rgb_image_is_not_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``Image.convert`` would copy it at full size."""
     Image.fromarray(pixels(0, 64, 48)).save(tmp_path / "a.jpg")
     monkeypatch.setattr(Image.Image, "convert", lambda *_, **__: pytest.fail("copies"))
     read, *_ = read_image(tmp_path / "a.jpg", 64, 48, 1600)
     assert read.mode == "RGB" and np.asarray(read).shape == (48, 64, 3)
 
 
-def test_only_so_many_photographs_are_decoded_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As many as torch has threads, at least two; what comes out does not depend on it."""
+def test_number_of_concurrent_decodes_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To the number of torch's threads, at least two; the result does not depend on it."""
     write_scene(tmp_path, 12)
     now, most = [0], [0]
 
