@@ -1,4 +1,4 @@
-"""What the tests of the file formats share: models with the odd cases, damage, and splat-transform where it is."""
+"""Helpers of the tests of file formats: models with extreme values, damaged files, splat-transform."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ import pytest
 import torch
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
+from scipy.spatial.transform import Rotation
 
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import AttenuationConfig
@@ -31,7 +32,7 @@ ORIGIN = (5.1e5, -4096.0, 0.25)
 
 
 def model(degree: int = 3, count: int = 40) -> Gaussians:
-    """With a dial, an opaque Gaussian, one that never decays, one that does not fade at all, and long rotations."""
+    """With a dial; opacity 1, very large, small and zero sigma_d, quaternions of length 1e-30 to 1e30."""
     g = gaussians(count, degree, seed=degree)
     sigma = torch.rand(count, generator=torch.Generator().manual_seed(1)) * 4
     sigma[:4] = torch.tensor([1e9, 0.0, 1e-3, 65504.0])
@@ -42,23 +43,18 @@ def model(degree: int = 3, count: int = 40) -> Gaussians:
     return g.replace(opacity_logits=logits, quats=quats, sigma_d=sigma, attenuation=ATTENUATION)
 
 
+def rotations(quats: torch.Tensor) -> Rotation:
+    return Rotation.from_quat(quats.double().roll(-1, 1).numpy())
+
+
 def turned(a: torch.Tensor, b: torch.Tensor) -> float:
     """The largest angle between rotations, radians."""
-    unit = [q.double() / q.double().abs().amax(1, keepdim=True) for q in (a, b)]
-    unit = [q / q.norm(dim=1, keepdim=True) for q in unit]
-    apart = torch.minimum((unit[0] - unit[1]).norm(dim=1), (unit[0] + unit[1]).norm(dim=1))
-    return float(4 * torch.asin(apart.clamp(max=2**0.5) / 2).max())
+    return float((rotations(a).inv() * rotations(b)).magnitude().max())
 
 
 def covariances(g: Gaussians) -> torch.Tensor:
-    """``[N, 3, 3]`` float64 of the ellipsoids, whichever of several rotations says so."""
-    w, x, y, z = (g.quats.double() / g.quats.double().norm(dim=1, keepdim=True)).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    axes = torch.stack(rows, 1).reshape(-1, 3, 3) * g.log_scales.double().exp()[:, None]
+    """``[N, 3, 3]`` float64, the same for every rotation that gives the same ellipsoid."""
+    axes = torch.from_numpy(rotations(g.quats).as_matrix()) * g.log_scales.double().exp()[:, None]
     return axes @ axes.mT
 
 
@@ -76,10 +72,10 @@ def damaged(whole: bytes, data: st.DataObject) -> bytes:
 
 
 def splat_transform(*arguments: str | Path) -> None:
-    """Runs splat-transform, or skips the test where it is not: on PATH, or at $CLOD_SPLAT_TRANSFORM."""
+    """Runs splat-transform, from PATH or $CLOD_SPLAT_TRANSFORM; skips the test if it is missing."""
     command = os.environ.get("CLOD_SPLAT_TRANSFORM") or shutil.which("splat-transform")
     if command is None:
-        pytest.skip("splat-transform is not on PATH, and CLOD_SPLAT_TRANSFORM does not say where it is")
+        pytest.skip("splat-transform is not on PATH, and CLOD_SPLAT_TRANSFORM is not set")
     done = subprocess.run(
         [*command.split(), "-q", "-w", *map(str, arguments)], capture_output=True, text=True, timeout=100
     )
@@ -87,7 +83,7 @@ def splat_transform(*arguments: str | Path) -> None:
 
 
 def rows_by_place(means: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """For each of ``means`` the row of ``others`` that is nearest to it; all different."""
+    """The row of ``others`` nearest to each of ``means``; all different."""
     rows = np.linalg.norm(means[:, None] - others[None], axis=2).argmin(1)
     assert len(set(rows)) == len(rows)
     return rows

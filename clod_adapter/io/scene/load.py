@@ -104,7 +104,11 @@ def _load(
     keep: ImageCache | None,
 ) -> tuple[list[View], list[tuple[int, int]], list[Note]]:
     """The views of the images, their sizes in the files, and notes. Each worker holds one of full size at a time."""
-    cache = None if all(image.is_pinhole for image, _ in present) else _cache_folder(folder)
+    cache = None
+    if not all(image.is_pinhole for image, _ in present):
+        from clod_adapter.io.scene.undistort import cache_folder
+
+        cache = cache_folder(folder)
     views, sizes, notes = list[View](), list[tuple[int, int]](), list[Note]()
     workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
     with warnings.catch_warnings():
@@ -143,12 +147,6 @@ def _left_out(
     else:
         found.append(("scaling", f"all {len(views)} photographs are used at full resolution"))
     return tuple(found)
-
-
-def _cache_folder(folder: Path) -> Path:
-    from clod_adapter.io.scene.undistort import cache_folder
-
-    return cache_folder(folder)
 
 
 def _again(load: Callable[[], tuple[View, tuple[int, int], list[Note]]]) -> torch.Tensor:

@@ -16,6 +16,7 @@ from photographs import as_text, camera, model_of, pixels, pose, write_scene
 
 
 @pytest.mark.parametrize("form", ["binary", "text", "before rigs"])
+@pytest.mark.usefixtures("library")
 def test_scene_round_trips(tmp_path: Path, form: str) -> None:
     cameras, names = write_scene(tmp_path)
     if form == "text":
