@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from PIL import Image
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import read_colmap
 from clod_adapter.io.scene.colmap_records import check_records
 from clod_adapter.io.scene.load import load_scene
-from photographs import damage
+from photographs import damage, write_images
 
 pycolmap = pytest.importorskip("pycolmap")  # which alone writes rigs, frames and text
 FORMS = ("binary", "text")
@@ -88,10 +87,7 @@ def test_long_names_and_control_characters_are_refused(tmp_path: Path, form: str
 def test_unusual_names_are_read(tmp_path: Path) -> None:
     names = ("$HOME.png", "a.b/c d.png", "sub\\of windows.png", "~/a.png", "äö ü/日本 (1).png")
     model(tmp_path, "binary", names)
-    for name in names:
-        path = tmp_path / "images" / name.replace("\\", "/")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(path)
+    write_images(tmp_path / "images", [name.replace("\\", "/") for name in names], width=8, height=6)
     scene = load_scene(tmp_path)
     assert [view.camera.name for view in (*scene.test, *scene.train)] == list(names)
 
@@ -100,8 +96,6 @@ def test_unusual_names_are_read(tmp_path: Path) -> None:
 def test_symbolic_links_to_images_are_followed(tmp_path: Path) -> None:
     """They are the user's; a name in a model cannot create one."""
     model(tmp_path / "scene", "binary")
-    (tmp_path / "elsewhere" / "sub").mkdir(parents=True)
-    for name in ("a.png", "sub/b.png"):
-        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "elsewhere" / name)
+    write_images(tmp_path / "elsewhere", ["a.png", "sub/b.png"], width=8, height=6)
     (tmp_path / "scene" / "images").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
     assert len(load_scene(tmp_path / "scene").train) == 1

@@ -49,6 +49,7 @@ def test_undistorted_image_is_that_of_the_pinhole_camera(tmp_path: Path, cache: 
     right = psnr_of(view.image.numpy(), ideal(view))
     shifted = [psnr_of(view.image.numpy(), ideal(view, *by)) for by in ((0.1, 0), (-0.1, 0), (0, 0.1), (0, -0.1))]
     assert right > 45 and right > max(shifted), (right, shifted)
+    assert "undistortion" not in dict(loaded.left_out)
     folder = next((cache / "clod-adapter" / "undistorted").iterdir())
     assert loaded.notes == (
         f"1 of 1 images undistorted from {kind} into {folder}, which may be deleted; the sources are untouched",
