@@ -9,7 +9,7 @@ import shutil
 import struct
 import subprocess
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +111,16 @@ def change_setting(path: Path, name: str, old: str, new: str) -> Path:
     return path
 
 
+def write_rows(path: Path, rows: np.ndarray, order: str = "<", comments: Iterable[str] = ()) -> Path:
+    """A PLY of these vertices, in the byte order "<" or ">", or "ascii"."""
+    return write_elements(path, [PlyElement.describe(rows, "vertex", comments=list(comments))], order)
+
+
+def write_elements(path: Path, elements: Sequence[PlyElement], order: str = "<") -> Path:
+    PlyData(elements, text=order == "ascii", byte_order="=" if order == "ascii" else order).write(str(path))
+    return path
+
+
 def without_comments(path: Path, **columns: float) -> Path:
     """The file as another tool writes it: without its comments, some columns added or changed in every row."""
     old = PlyData.read(str(path))["vertex"].data
@@ -118,9 +128,7 @@ def without_comments(path: Path, **columns: float) -> Path:
     rows = np.zeros(len(old), old.dtype.descr + added)
     for name in rows.dtype.names or ():
         rows[name] = columns[name] if name in columns else old[name]
-    found = path.with_name("rewritten.ply")
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(found))
-    return found
+    return write_rows(path.with_name("rewritten.ply"), rows)
 
 
 def change_glb(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:

@@ -24,7 +24,7 @@ from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, check_readable, file_has_dial, format_of, read_model, write
 from clod_adapter.io.formats.safetensors import load_safetensors
-from formats import ABOUT, ATTENUATION, CALIBRATION, ORIGIN, damaged, model, rows_by_place, turned
+from formats import ABOUT, ATTENUATION, CALIBRATION, ORIGIN, damaged, model, rows_by_place, turned, write_elements
 from packing import write_packed
 from scenes import gaussians
 
@@ -48,10 +48,7 @@ def any_file(folder: Path, kind: str) -> Path:
         return path
     write(path, g, calibration=CALIBRATION if g.sigma_d is not None else None)
     if kind in (".ascii.ply", ".big.ply"):
-        ply = PlyData.read(str(path), mmap=False)
-        PlyData(ply.elements, text=kind == ".ascii.ply", byte_order="=" if kind == ".ascii.ply" else ">").write(
-            str(path)
-        )
+        write_elements(path, PlyData.read(str(path), mmap=False).elements, "ascii" if kind == ".ascii.ply" else ">")
     return path
 
 
@@ -63,10 +60,9 @@ def same(suffix: str, g: Gaussians, again: Gaussians) -> None:
         scales = opacities = 0
     bands = again.shN.shape[1]
     assert bands == (g.shN.shape[1] if suffix in (".ply", ".pt", ".safetensors") else min(g.shN.shape[1], 15))
-    torch.testing.assert_close(again.means, g.means, rtol=0, atol=means)
-    torch.testing.assert_close(again.log_scales, g.log_scales, rtol=1e-6 if scales else 0, atol=scales)
-    torch.testing.assert_close(again.opacities, g.opacities, rtol=0, atol=opacities)
-    torch.testing.assert_close(again.sh0, g.sh0, rtol=0, atol=sh0)
+    for name, atol in (("means", means), ("log_scales", scales), ("opacities", opacities), ("sh0", sh0)):
+        rtol = 1e-6 if name == "log_scales" and scales else 0
+        torch.testing.assert_close(getattr(again, name), getattr(g, name), rtol=rtol, atol=atol)
     near = g.shN[:, :bands].clamp(-1, 127 / 128) if loss else g.shN[:, :bands]
     torch.testing.assert_close(again.shN, near, rtol=0, atol=shN)
     assert turned(again.quats, g.quats) <= angle

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from plyfile import PlyData, PlyElement
 
 from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.calibration import Calibration
@@ -21,7 +20,7 @@ from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.metadata import parse_metadata
 from clod_adapter.io.ply.columns import inria_dtype
 from clod_adapter.io.settings import EARLIER, read_metadata
-from formats import ATTENUATION, CALIBRATION, change_setting, model
+from formats import ATTENUATION, CALIBRATION, change_setting, model, write_rows
 
 pytest.importorskip("pygltflib", reason="pygltflib is not installed")
 KINDS = ["a.ply", "a.glb", "a.spz", "a.safetensors", "a.pt", "adapter.safetensors"]
@@ -155,7 +154,7 @@ def test_header_of_an_earlier_version(tmp_path: Path) -> None:
     for name in rows.dtype.names or ():
         rows[name] = rng.normal(size=50)
     lines = [f"clod_adapter {comment}" for comment in HEADER.split(", ")]
-    PlyData([PlyElement.describe(rows, "vertex", comments=lines)], byte_order="<").write(str(path))
+    write_rows(path, rows, comments=lines)
     checkpoint = load(path)
     want = AttenuationConfig(scene_distance=9.894437842071056, reference_distance=9.894437842071056)
     assert checkpoint.gaussians.attenuation == want and checkpoint.notes == ()

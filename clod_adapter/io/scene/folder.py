@@ -111,12 +111,12 @@ def name_parts(name: str, cameras: Path) -> tuple[str, ...]:
     if as_text(name) != name:
         raise ClodError(f"{cameras}: image name {as_text(name)[:80]!r} is not UTF-8; rename the photograph, there too")
     path = PureWindowsPath(name)
-    if any(sign < " " or "\x7f" <= sign <= "\x9f" for sign in name) or len(name) > LONGEST_NAME:
+    longest = max((len(part.encode()) for part in path.parts), default=0)
+    control = any(sign < " " or "\x7f" <= sign <= "\x9f" for sign in name)
+    if control or len(name) > LONGEST_NAME or longest > LONGEST_PART:
         raise ClodError(f"{cameras}: image name {name[:40]!r} ({len(name)} characters) is no file's name; rename it")
     if not path.parts or path.anchor or ".." in path.parts:
         raise ClodError(f"{cameras}: image name {name[:80]!r} leaves the images folder or is no name; rename it there")
-    if max(len(part.encode()) for part in path.parts) > LONGEST_PART:
-        raise ClodError(f"{cameras}: image name {name[:40]!r} ({len(name)} characters) is no file's name; rename it")
     return path.parts
 
 

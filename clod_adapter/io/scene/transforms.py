@@ -153,12 +153,8 @@ def _camera(where: str, photograph: Path, values: Mapping[str, Any]) -> pycolmap
     if model not in PERSPECTIVE or k4:  # of k4 some writers mean a power of the radius, some a divisor
         what = "k4 of a camera that is no fisheye" if k4 else f"camera_model {model[:40]!r}"
         raise ClodError(f"{where}: {what} is not known; give the COLMAP model that the file was made from")
-    return pycolmap.Camera(
-        model="FULL_OPENCV" if k3 else "OPENCV",
-        width=width,
-        height=height,
-        params=[*params, k1, k2, p1, p2, *([k3, 0, 0, 0] if k3 else [])],
-    )
+    params += [k1, k2, p1, p2, *([k3, 0, 0, 0] if k3 else [])]
+    return pycolmap.Camera(model="FULL_OPENCV" if k3 else "OPENCV", width=width, height=height, params=params)
 
 
 def _focal(pixels: int, angle: float) -> float:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 
 from clod_adapter.adapter import attach
 from clod_adapter.attenuation import attenuate
@@ -21,7 +21,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.inspection.report import inspect
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.ply.constants import simplest
-from formats import splat_transform, without_comments
+from formats import splat_transform, without_comments, write_rows
 from scenes import camera, gaussians
 
 USUAL = AttenuationConfig(reference_distance=3.0)
@@ -112,7 +112,7 @@ def test_invalid_column_values_are_refused(tmp_path: Path, rows: Any, value: flo
     save(tmp_path / "a.ply", model(EACH["tau"]))
     table = np.array(PlyData.read(str(tmp_path / "a.ply"))["vertex"].data)
     table["clod_tau"][rows] = value
-    PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(str(tmp_path / "b.ply"))
+    write_rows(tmp_path / "b.ply", table)
     for read in (load, inspect):
         with pytest.raises(ClodError, match=message):
             read(tmp_path / "b.ply")

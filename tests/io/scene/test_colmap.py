@@ -12,7 +12,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import load_points, read_colmap, write_model
 from clod_adapter.io.scene.colmap_library import pycolmap
 from clod_adapter.io.scene.load import load_scene
-from photographs import as_text, camera, model_of, pixels, pose, write_scene
+from photographs import as_text, camera, pixels, pose, write_scene
 
 
 @pytest.mark.parametrize("form", ["binary", "text", "before rigs"])
@@ -76,13 +76,6 @@ def test_written_model_is_read_by_pycolmap(tmp_path: Path) -> None:
     ):
         with pytest.raises(ClodError, match=message):
             write_model(folder, cameras[: len(names)], names)
-
-
-def test_simple_pinhole_intrinsics(tmp_path: Path) -> None:
-    model_of(tmp_path, "SIMPLE_PINHOLE", [33.0, 20.0, 15.0])
-    Image.fromarray(pixels(0)).save(tmp_path / "a.png")
-    K = load_scene(tmp_path).train[0].camera.K
-    assert K.tolist() == [[33, 0, 20], [0, 33, 15], [0, 0, 1]]
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin", "frames.bin", "rigs.bin"])

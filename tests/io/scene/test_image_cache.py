@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -68,8 +69,6 @@ def test_cached_scene_equals_the_scene(capture: Any) -> None:
 
 
 def test_photograph_that_changes_is_refused(capture: Any, tmp_path: Path) -> None:
-    import shutil
-
     shutil.copytree(capture.scene, tmp_path / "scene")
     stored = load_scene(tmp_path / "scene", cache=ImageCache(0))
     for path in (tmp_path / "scene" / "images").iterdir():

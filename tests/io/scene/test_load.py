@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from clod_adapter._support.workers import in_order
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.io.scene.images import read_image
@@ -172,26 +173,16 @@ def test_rgb_image_is_not_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert read.mode == "RGB" and np.asarray(read).shape == (48, 64, 3)
 
 
-def test_number_of_concurrent_decodes_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """To the number of torch's threads, at least two; the result does not depend on it."""
+@pytest.mark.parametrize(("threads", "workers"), [(1, 2), (5, 5), (99, 8)])
+def test_number_of_decoding_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int, workers: int
+) -> None:
+    """That of torch, within 2 to 8; the views do not depend on it."""
     write_scene(tmp_path, 12)
-    now, most = [0], [0]
-
-    def counted(path: Path, width: int, height: int, max_width: int) -> object:
-        now[0] += 1
-        most[0] = max(most[0], now[0])
-        time.sleep(0.01)
-        now[0] -= 1
-        return read_image(path, width, height, max_width)
-
-    monkeypatch.setattr("clod_adapter.io.scene.load.read_image", counted)
-    found = []
-    for threads, limit in ((1, 2), (5, 5), (99, 8)):
-        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
-        most[0] = 0
-        found.append(load_scene(tmp_path))
-        assert 1 <= most[0] <= limit
-    assert most[0] > 2
-    for other in found[1:]:
-        pairs = zip((*found[0].train, *found[0].test), (*other.train, *other.test), strict=True)
-        assert all(a.image.equal(b.image) and a.camera.name == b.camera.name for a, b in pairs)
+    before, used = load_scene(tmp_path), list[int]()
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    name = "clod_adapter.io.scene.load.in_order"
+    monkeypatch.setattr(name, lambda loads, count: used.append(count) or in_order(loads, count))
+    after = load_scene(tmp_path)
+    pairs = zip((*before.train, *before.test), (*after.train, *after.test), strict=True)
+    assert all(a.image.equal(b.image) and a.camera.name == b.camera.name for a, b in pairs) and used == [workers]

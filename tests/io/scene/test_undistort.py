@@ -56,12 +56,17 @@ def test_undistorted_image_is_that_of_the_pinhole_camera(tmp_path: Path, cache: 
     )
 
 
-def test_lens_without_distortion_is_a_pinhole(tmp_path: Path, cache: Path) -> None:
-    scene = capture(tmp_path / "scene", "OPENCV", [140, 142, 82, 58, 0, 0, 0, 0])
+@pytest.mark.parametrize(
+    ("kind", "params", "fy"), [("OPENCV", [140, 142, 82, 58, 0, 0, 0, 0], 142), ("SIMPLE_PINHOLE", [140, 82, 58], 140)]
+)
+def test_lens_without_distortion_is_a_pinhole(
+    tmp_path: Path, cache: Path, kind: str, params: list[float], fy: float
+) -> None:
+    scene = capture(tmp_path / "scene", kind, params)
     loaded = load_scene(scene)
     with Image.open(scene / "images" / "a.png") as image:
         np.testing.assert_array_equal(loaded.train[0].image, np.asarray(image))
-    assert loaded.train[0].camera.K.tolist() == [[140, 0, 82], [0, 142, 58], [0, 0, 1]]
+    assert loaded.train[0].camera.K.tolist() == [[140, 0, 82], [0, fy, 58], [0, 0, 1]]
     assert loaded.notes == () and not cache.exists()
 
 
