@@ -1,4 +1,4 @@
-"""First looks at a file: whether it can be read, and, where its name is wrong, what it is and what to do."""
+"""First checks of a file: whether it can be read, and its kind where the suffix is wrong."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _CONVERT = "convert it: splat-transform IN{suffix} OUT.ply; better still, adapt 
 
 _PAGE = "which clod-adapt export wrote to be opened in a browser, or a download went wrong"
 
-# First bytes (after white space) that determine what a file is whatever its name, what it is, and what to do.
+# First bytes (after white space) that determine the kind of a file, its name, and the remedy.
 CONTENTS = (
     (b"version https://git-lfs", "a Git LFS pointer, not the file it stands for", "fetch that: git lfs pull"),
     (b"<!doctype html", f"a web page, {_PAGE}", "download the file itself"),
@@ -108,10 +108,10 @@ def refuse_known(path: Path, start: bytes) -> None:
 def refuse(
     path: Path, start: bytes, otherwise: str = "is not a PLY file; convert it to a .ply in Inria's 3DGS layout first"
 ) -> NoReturn:
-    """Refuses a file by its first bytes, naming what it is.
+    """Refuses a file, with its kind by its first bytes.
 
     Args:
-        otherwise: the message for a file that none of the tables knows.
+        otherwise: the message for a file in none of the tables.
 
     Raises:
         ClodError: always.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors and the metadata of a file; raises OSError, or on damage whatever safetensors does."""
+    """The tensors and the metadata of a file; raises OSError, or for a damaged file any error of safetensors."""
     with open(path, "rb") as file:
         return _content(file)
 
@@ -58,5 +58,5 @@ def _one_line_errors(path: Path) -> Iterator[None]:
         raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
     except MemoryError:  # of a file that is whole
         raise
-    except Exception as error:  # SafetensorError, and whatever a crafted header provokes
+    except Exception as error:  # SafetensorError, and others for a crafted header
         raise ClodError(f"{path}: is not a safetensors file, or damaged ({error}); copy or export it again") from error

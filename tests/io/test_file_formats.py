@@ -211,7 +211,7 @@ def test_other_files_are_refused(tmp_path: Path, suffix: str) -> None:
     os.mkfifo(tmp_path / f"pipe{suffix}")
     (tmp_path / f"empty{suffix}").write_bytes(b"")
     (tmp_path / f"pointer{suffix}").write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
-    (tmp_path / f"other{suffix}").write_bytes(b"what this is nobody knows")
+    (tmp_path / f"other{suffix}").write_bytes(b"an unknown format")
     expected = {
         "missing": "cannot be read .No such file", "folder": "cannot be read", "pipe": "not a regular file",
         "empty": "is empty", "pointer": "is a Git LFS pointer", "other": "",

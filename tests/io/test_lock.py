@@ -58,8 +58,8 @@ def test_lock_file_removed_by_the_last_holder(tmp_path: Path, monkeypatch: pytes
 
 
 def refused(path: Path, **how: Any) -> None:
-    said = rf"^{how.get('of', path)}: another run \(process {os.getpid()}\) is writing it; wait for that"
-    with pytest.raises(ClodError, match=said), output_lock(path, **how):
+    message = rf"^{how.get('of', path)}: another run \(process {os.getpid()}\) is writing it; wait for that"
+    with pytest.raises(ClodError, match=message), output_lock(path, **how):
         raise AssertionError("the body must not run")
 
 

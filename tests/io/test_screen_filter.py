@@ -20,9 +20,9 @@ def test_comments_of_other_programs_are_corrected() -> None:
     mixed = ["made by hand", "SplatRenderMode: default", "antialiased 0"]
     assert tagged(mixed, CLASSIC) == mixed
     assert tagged(mixed, FILTERS["on"]) == ["made by hand", "SplatRenderMode: mip"]
-    for said in ("SplatRenderMode: mip", "antialiased 1"):
-        assert tagged(["made by hand", said], FILTERS["on"]) == ["made by hand", said]
-        assert tagged(["made by hand", said], CLASSIC) == ["made by hand"]
+    for comment in ("SplatRenderMode: mip", "antialiased 1"):
+        assert tagged(["made by hand", comment], FILTERS["on"]) == ["made by hand", comment]
+        assert tagged(["made by hand", comment], CLASSIC) == ["made by hand"]
 
 
 def test_spz_flag(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Models as checkpoints of gsplat's trainer; ``pt`` checks the pickle and reads its tensors."""
+"""Models as checkpoints of gsplat's trainer, read and written; ``pt`` checks the pickle and reads its tensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Posed photographs in, whichever way they come."""
+"""Reads posed photographs from a COLMAP model or a transforms file."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def load_scene(
         folder: usually the one with ``images/`` and ``sparse/0/``.
         test_every: one view in this many is held out; at least 2.
         max_width: wider images are scaled down to this many pixels, with Pillow's bicubic filter as
-            in Inria's code; the intrinsics follow, and a note says so.
+            in Inria's code; the intrinsics are scaled too, and a note states it.
         origin: ``[3]`` what the cameras' world is to be relative to, in its units: ``Checkpoint.origin``.
         progress: called in ``Phase.PHOTOGRAPHS`` after each image.
         cache: keeps the photographs, where not all are to be in memory; they are then read again when looked at.
@@ -187,7 +187,7 @@ def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
     with ROOM.of(width * height):
         photograph = _worked_on(image, path, max_width)
         if width * height > LARGE:
-            release()  # or this thread keeps for itself what the next one takes again
+            release()  # or this thread keeps memory that the next one allocates again
         return photograph
 
 
@@ -195,7 +195,7 @@ def _worked_on(image: PosedImage, path: Path, max_width: int) -> Photograph:
     camera = copy(image.camera)
     pixels, source, notes = read_image(path, camera.width, camera.height, max_width)
     if pixels.size != (camera.width, camera.height):
-        sizes = f"{pixels.width}x{pixels.height} where the model says {camera.width}x{camera.height}"
+        sizes = f"{pixels.width}x{pixels.height} where the model has {camera.width}x{camera.height}"
         notes.append(("are {}: intrinsics scaled", sizes))
         # With pixel centres at +0.5, in COLMAP as here, the principal point scales like the focal length.
         camera.rescale(*pixels.size)

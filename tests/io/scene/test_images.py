@@ -101,7 +101,7 @@ def test_exif_rotation_is_applied_if_the_camera_has_the_rotated_shape(tmp_path: 
     turned, notes = read(tmp_path / "a.png", 300, 400)
     a, b = {5: (0, 0), 6: (-1, 0), 7: (-1, -1), 8: (0, -1)}[orientation]  # what is at the top left once turned
     np.testing.assert_array_equal(turned[0, 0], pixels(0)[a, b])
-    assert turned.shape == (40, 30, 3) and notes == ["turned as their EXIF says, as the cameras have the turned shape"]
+    assert turned.shape == (40, 30, 3) and notes == ["rotated by their EXIF orientation, as the cameras are"]
 
 
 def test_damaged_exif_is_ignored_if_the_shape_fits(tmp_path: Path) -> None:
@@ -142,7 +142,7 @@ def reduced(path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int
     monkeypatch.setattr(images, "LARGE", 1000)
     image, size, notes = read_image(path, width, height, max_width)
     assert size in ((width, height), (height, width)) and len(notes) == len(set(notes))
-    assert sum("which takes long: brought down first" in what for what, _ in notes) == 1
+    assert sum("which takes long: reduced first" in what for what, _ in notes) == 1
     return np.asarray(image).astype(float)
 
 

@@ -32,8 +32,8 @@ def test_missing_images_are_noted_or_refused(tmp_path: Path) -> None:
     assert [view.camera.name for view in loaded.test] == [names[0], names[16]]  # the 8th is missing, the rest stay
     assert [view.camera.name for view in loaded.train] == [names[1], *names[11:16], names[17]]
     (tmp_path / "images" / names[0]).unlink()
-    said = r"10 of 18 images of the model are missing \(sub/001.png, sub/003.png, sub/004.png, \.\.\.\), more than half"
-    with pytest.raises(ClodError, match=said):
+    text = r"10 of 18 images of the model are missing \(sub/001.png, sub/003.png, sub/004.png, \.\.\.\), more than half"
+    with pytest.raises(ClodError, match=text):
         load_scene(tmp_path)
 
 
@@ -50,7 +50,7 @@ def test_smaller_copies_replace_missing_images(tmp_path: Path) -> None:
     loaded = load_scene(tmp_path)
     assert loaded.notes == (
         "the photographs are those in images_2, as there are more than in images",
-        "3 of 3 images are 20x15 where the model says 40x30: intrinsics scaled",
+        "3 of 3 images are 20x15 where the model has 40x30: intrinsics scaled",
     )
     torch.testing.assert_close(loaded.test[0].camera.K[:2] * 2, camera(2, focal=30.0).K[:2])
     for file in (tmp_path / "images_2" / "sub").iterdir():
@@ -74,7 +74,7 @@ def test_images_of_another_size_scale_the_intrinsics(tmp_path: Path) -> None:
     for view, was in zip(views, cameras, strict=True):
         torch.testing.assert_close(view.camera.K, was.K / torch.tensor([[2.0], [2.0], [1.0]]))
     assert [(view.camera.width, view.camera.height) for view in views] == [(20, 15), (32, 24), (15, 20)]
-    assert loaded.notes == ("3 of 3 images are 20x15 where the model says 40x30 (and 2 more): intrinsics scaled",)
+    assert loaded.notes == ("3 of 3 images are 20x15 where the model has 40x30 (and 2 more): intrinsics scaled",)
 
 
 def test_duplicate_image_names_are_refused(tmp_path: Path) -> None:

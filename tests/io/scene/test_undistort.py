@@ -79,7 +79,7 @@ def test_scaled_photographs_are_undistorted(tmp_path: Path) -> None:
     half.rescale(80, 60)
     Image.fromarray(seen(half)).save(scene / "images" / "a.png")
     loaded = load_scene(scene)
-    assert loaded.notes[0] == "1 of 1 images are 80x60 where the model says 160x120: intrinsics scaled"
+    assert loaded.notes[0] == "1 of 1 images are 80x60 where the model has 160x120: intrinsics scaled"
     assert psnr_of(loaded.train[0].image.numpy(), ideal(loaded.train[0])) > 40  # of twice the waves per pixel
 
 
@@ -167,7 +167,7 @@ def test_cache_folder_must_be_writable(tmp_path: Path, cache: Path, monkeypatch:
 
 
 @pytest.mark.parametrize(
-    ("kind", "params", "said"),
+    ("kind", "params", "message"),
     [
         ("EQUIRECTANGULAR", [160, 120], "EQUIRECTANGULAR, no perspective camera"),
         ("OPENCV", [140, 140, 80, 60, float("nan"), 0, 0, 0], "not usable"),
@@ -178,11 +178,11 @@ def test_cache_folder_must_be_writable(tmp_path: Path, cache: Path, monkeypatch:
         *(("OPENCV", [140, 140, 80, 60, k, 0, 0, 0], "") for k in (-5.0, 1e8, -1e8)),
     ],
 )
-def test_unusable_lenses_are_refused(tmp_path: Path, library: Any, kind: str, params: list[float], said: str) -> None:
+def test_bad_lenses_are_refused(tmp_path: Path, library: Any, kind: str, params: list[float], message: str) -> None:
     model_of(tmp_path, kind, params, **SIZE)
     Image.new("RGB", (160, 120)).save(tmp_path / "a.png")
-    if said:
-        with pytest.raises(ClodError, match=f"image 'a.png' has .*{said}"):
+    if message:
+        with pytest.raises(ClodError, match=f"image 'a.png' has .*{message}"):
             load_scene(tmp_path)
         return
     try:  # the lens folds
