@@ -121,14 +121,19 @@ def write_elements(path: Path, elements: Sequence[PlyElement], order: str = "<")
     return path
 
 
-def without_comments(path: Path, **columns: float) -> Path:
+def without_comments(path: Path, **columns: Any) -> Path:
     """The file as another tool writes it: without its comments, some columns added or changed in every row."""
-    old = PlyData.read(str(path))["vertex"].data
+    rows = with_columns(PlyData.read(str(path))["vertex"].data, **columns)
+    return write_rows(path.with_name("rewritten.ply"), rows)
+
+
+def with_columns(old: np.ndarray, **columns: Any) -> np.ndarray:
+    """The rows of a PLY with float columns added or changed."""
     added = [(name, "f4") for name in columns if name not in old.dtype.names]
     rows = np.zeros(len(old), old.dtype.descr + added)
     for name in rows.dtype.names or ():
         rows[name] = columns[name] if name in columns else old[name]
-    return write_rows(path.with_name("rewritten.ply"), rows)
+    return rows
 
 
 def change_glb(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:

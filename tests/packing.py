@@ -14,7 +14,7 @@ BLOCK = 256
 
 
 def write_packed(path: Path, gaussians: Gaussians, *, colours: bool = True) -> Path:
-    """Blocks in row order; without ``colours`` as older writers, whose colours are in [0, 1]."""
+    """Writes blocks in the order of the rows; without ``colours`` as in older files, with colours in [0, 1]."""
     count = len(gaussians)
     starts, block = np.arange(0, count, BLOCK), np.arange(count) // BLOCK
     rgb = 0.5 + SH_C0 * gaussians.sh0[:, 0].numpy()
