@@ -1,4 +1,4 @@
-"""Posed photographs in, whichever way they come."""
+"""Reads posed photographs from a COLMAP model or a transforms file."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def load_scene(
         folder: usually the one with ``images/`` and ``sparse/0/``.
         test_every: one view in this many is held out; at least 2.
         max_width: wider images are scaled down to this many pixels, with Pillow's bicubic filter as
-            in Inria's code; the intrinsics follow, and a note says so.
+            in Inria's code; the intrinsics are scaled too, and a note states it.
         origin: ``[3]`` what the cameras' world is to be relative to, in its units: ``Checkpoint.origin``.
         progress: called in ``Phase.PHOTOGRAPHS`` after each image.
         cache: keeps the photographs, where not all are to be in memory; they are then read again when looked at.
@@ -104,7 +104,11 @@ def _load(
     keep: ImageCache | None,
 ) -> tuple[list[View], list[tuple[int, int]], list[Note]]:
     """The views of the images, their sizes in the files, and notes. Each worker holds one of full size at a time."""
-    cache = None if all(image.is_pinhole for image, _ in present) else _cache_folder(folder)
+    cache = None
+    if not all(image.is_pinhole for image, _ in present):
+        from clod_adapter.io.scene.undistort import cache_folder
+
+        cache = cache_folder(folder)
     views, sizes, notes = list[View](), list[tuple[int, int]](), list[Note]()
     workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
     with warnings.catch_warnings():
@@ -135,12 +139,6 @@ def _left_out(views: Sequence[View], sizes: Sequence[tuple[int, int]], pinhole: 
     else:
         found.append(("scaling", f"all {len(views)} photographs are used at full resolution"))
     return tuple(found)
-
-
-def _cache_folder(folder: Path) -> Path:
-    from clod_adapter.io.scene.undistort import cache_folder
-
-    return cache_folder(folder)
 
 
 def _again(load: Callable[[], tuple[View, tuple[int, int], list[Note]]]) -> torch.Tensor:
@@ -181,7 +179,7 @@ def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
     with ROOM.of(width * height):
         photograph = _worked_on(image, path, max_width)
         if width * height > LARGE:
-            release()  # or this thread keeps for itself what the next one takes again
+            release()  # or this thread keeps memory that the next one allocates again
         return photograph
 
 
@@ -189,7 +187,7 @@ def _worked_on(image: PosedImage, path: Path, max_width: int) -> Photograph:
     camera = copy(image.camera)
     pixels, source, notes = read_image(path, camera.width, camera.height, max_width)
     if pixels.size != (camera.width, camera.height):
-        sizes = f"{pixels.width}x{pixels.height} where the model says {camera.width}x{camera.height}"
+        sizes = f"{pixels.width}x{pixels.height} where the model has {camera.width}x{camera.height}"
         notes.append(("are {}: intrinsics scaled", sizes))
         # With pixel centres at +0.5, in COLMAP as here, the principal point scales like the focal length.
         camera.rescale(*pixels.size)
