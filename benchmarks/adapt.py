@@ -19,10 +19,9 @@ from dataclasses import asdict
 from statistics import fmean
 from typing import Any
 
-from common import append, arguments, checkpoint, photographs, stored, table
-
 import clod_adapter as clod
 from clod_adapter.evaluation.popping import dial_popping, path_popping
+from common import append, arguments, checkpoint, photographs, stored, table
 
 FILE = "adapt.jsonl"
 DIALS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 14.0)

@@ -15,14 +15,14 @@ import time
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import torch
 import workloads
-from contenders import THREADS
-from torch import Tensor
-from workloads import Workload
-
 from clod_adapter.cameras import Camera
 from clod_adapter.rasterizers import cpu, reference
+from contenders import THREADS
+from workloads import Workload
+
+import torch
+from torch import Tensor
 
 IMAGE, GRADIENT = 2e-5, 5e-4
 CUT, DEPTH = 3e-4, 1e-6  # margins: of alphas and transmittances, of depths

@@ -14,17 +14,17 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numpy as np
-import pycolmap
-import torch
-from common import append, arguments, capture, checkpoint, photographs
-from torch import Tensor
-
 from clod_adapter.alignment.check import DOUBTFUL, check_alignment
 from clod_adapter.alignment.search import guess_frame
 from clod_adapter.cameras import View
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.scene.colmap import load_points
+from common import append, arguments, capture, checkpoint, photographs
+
+import numpy as np
+import pycolmap
+import torch
+from torch import Tensor
 
 SCENES = ("plush_half", "ci_banana", "bonsai146")
 EYE = torch.eye(3, dtype=torch.float64)

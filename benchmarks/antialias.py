@@ -15,15 +15,12 @@ import time
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-from common import append, arguments, capture, checkpoint, photographs
-from tuning import Tuning, tune
-
+import clod_adapter as clod
 from clod_adapter.alignment.screen_filter import compare_filters
 from clod_adapter.config import CLASSIC, FILTERS
 from clod_adapter.evaluation.evaluate import evaluate
+from common import append, arguments, capture, checkpoint, photographs
+from tuning import Tuning, tune
 
 FILE = "antialias.jsonl"
 CLASSIC_FILES = {

@@ -20,9 +20,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-from common import append, arguments, photographs, stored, table
-
 import clod_adapter as clod
 from clod_adapter.attenuation import attenuate
 from clod_adapter.calibration import Viewpoint
@@ -31,6 +28,9 @@ from clod_adapter.cli.shared.budgets import VIEWPOINTS
 from clod_adapter.distances import viewpoint_of
 from clod_adapter.extinction import extinction_scale
 from clod_adapter.initialization.importance import spread
+from common import append, arguments, photographs, stored, table
+
+import torch
 
 FILE = "bake.jsonl"
 DIALS = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)

@@ -19,10 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from city import write_city
-from common import COMMAND, Process, append, arguments, checkpoint, photographs
-
 from clod_adapter.blocks.divide import Division, divide
 from clod_adapter.blocks.targets import target_image
 from clod_adapter.blocks.train import adapt_block, merge
@@ -32,6 +29,9 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import usable_views
 from clod_adapter.render import render
 from clod_adapter.training.loop import adapt
+from common import COMMAND, Process, append, arguments, checkpoint, photographs
+
+import torch
 
 DIALS = (1.0, 3.0, 5.0)
 SOLE = 0.9

@@ -15,19 +15,19 @@ import math
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-import torch
 from city_points import FIELD, cover, facing, higher_degrees, shade, surround
 from city_surfaces import PITCH, blocks, build, extent, joined
-from common import arguments
-from PIL import Image
-
 from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import save
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import render
+from common import arguments
+
+import numpy as np
+import torch
+from PIL import Image
 
 Where = Literal["near", "far", "mixed"]
 FAR = (1500, 0.02, 30_000)  # Gaussians of fields and sky: at least, of all, at most

@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 
 import city_surfaces as surface
-import numpy as np
-import torch
 from city_surfaces import FIELD, PITCH, SKY, TREE, Surfaces, extent
-
 from clod_adapter.config import SH_COUNTS
 from clod_adapter.rasterizers.reference import sh_basis
+
+import numpy as np
+import torch
 
 # Gaussians per unit of area, relative to each other.
 DENSITY = {surface.ASPHALT: 0.5, surface.PAVING: 0.8, surface.GRASS: 0.6, surface.FACADE: 1.0, surface.ROOF: 0.6,

@@ -16,12 +16,10 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
-import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-import torch
-
+import clod_adapter as clod
 from clod_adapter.cli.shared.report import jsonable, machine
+
+import torch
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, CACHE = ROOT / "benchmarks" / "results", ROOT / "benchmarks" / "cache"

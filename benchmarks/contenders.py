@@ -14,12 +14,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import torch
 import workloads
-from torch import Tensor
+from clod_adapter.rasterizers import cpu
 from workloads import Workload
 
-from clod_adapter.rasterizers import cpu
+import torch
+from torch import Tensor
 
 THREADS = 2
 SHARES = (1.0, 0.5, 0.25, 0.1)

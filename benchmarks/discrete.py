@@ -14,17 +14,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from common import ROOT, append, arguments
-from torch import Tensor
-
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.evaluation import popping
 from clod_adapter.evaluation.popping import Popping
 from clod_adapter.metrics import psnr
 from clod_adapter.report.style import BLUE, ORANGE, QUIET, new_figure, save_figure, tidy
+from common import ROOT, append, arguments
+
+import numpy as np
+import torch
+from torch import Tensor
 
 PICTURE = ROOT / "docs" / "images" / "discrete_vs_continuous.png"
 STRIPS, FRAMES = 4, 120

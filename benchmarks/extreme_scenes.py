@@ -10,17 +10,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pycolmap
-import torch
-from common import capture
-from PIL import Image
-from plyfile import PlyData, PlyElement
-
 import clod_adapter as clod
 from clod_adapter.cameras import Camera, Scene, View, in_its_unit
 from clod_adapter.gaussians import SH_C0
 from clod_adapter.io.scene.colmap import write_model
+from common import capture
+
+import numpy as np
+import pycolmap
+import torch
+from PIL import Image
+from plyfile import PlyData, PlyElement
 
 CAPTURE = "ci_banana"
 RATIO = math.log(1e6)

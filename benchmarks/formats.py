@@ -20,12 +20,12 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
-import torch
-from common import append, arguments, checkpoint, photographs, stored, table
-
 import clod_adapter as clod
 from clod_adapter.initialization.importance import initialize, usable_views
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, read_model, write
+from common import append, arguments, checkpoint, photographs, stored, table
+
+import torch
 
 FILE = "formats.jsonl"
 DIALS = (1.0, 5.0)

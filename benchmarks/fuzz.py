@@ -27,18 +27,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-import torch
-from common import append, arguments
-from damage import mutate
-from mutants import MAKERS, Input, write, write_images
-
+import clod_adapter as clod
 from clod_adapter.cli.adapt.resume import find_state
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.errors import ClodError
 from clod_adapter.io.adapter_file import load_adapter
+from common import append, arguments
+from damage import mutate
+from mutants import MAKERS, Input, write, write_images
+
+import torch
 
 FILE = "fuzz.jsonl"
 LIMIT_S, LIMIT_MB = 10.0, 64

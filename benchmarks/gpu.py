@@ -27,18 +27,18 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
-import torch
-from city import city, city_cameras, perturb
-from common import ROOT, append, arguments, checkpoint, outcomes, photographs
-from torch import Tensor
-
 import clod_adapter as clod
+from city import city, city_cameras, perturb
 from clod_adapter.attenuation import attenuate
 from clod_adapter.cameras import Camera, Scene, View
 from clod_adapter.distances import normalized_distances
 from clod_adapter.metrics import psnr
 from clod_adapter.rasterizers import cuda, wait_for
 from clod_adapter.render import dial, splat
+from common import ROOT, append, arguments, checkpoint, outcomes, photographs
+
+import torch
+from torch import Tensor
 
 CHECKS = ("tests", "plush", "city")
 DIALS = (1.0, 3.0, 7.0)

@@ -8,11 +8,11 @@ from operator import itemgetter
 from typing import Any
 
 import growth_rows as fit
-import numpy as np
-from common import ROOT, Row
-from PIL import Image
-
 from clod_adapter.report.style import QUIET, SERIES, label_log, new_figure, save_figure, tidy
+from common import ROOT, Row
+
+import numpy as np
+from PIL import Image
 
 PICTURE, PAGE = ROOT / "docs" / "images" / "growth.png", ROOT / "docs" / "growth.md"
 # What is assumed of the city on paper, and of machines; the rest is fit.

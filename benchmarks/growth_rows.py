@@ -6,8 +6,9 @@ import math
 from collections.abc import Sequence
 from operator import itemgetter
 
-import numpy as np
 from common import Row, stored
+
+import numpy as np
 
 FILE = "growth.jsonl"
 COMMANDS = ("adapt", "eval", "export", "inspect", "view")

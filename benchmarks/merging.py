@@ -7,11 +7,11 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from common import CACHE
-from plyfile import PlyData, PlyElement
-
 import clod_adapter as clod
 from clod_adapter.io.formats.splat_transform import SplatTransform
+from common import CACHE
+
+from plyfile import PlyData, PlyElement
 
 TIMEOUT = 3600.0  # seconds
 

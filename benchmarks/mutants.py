@@ -16,13 +16,6 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-import pycolmap
-import torch
-from common import ROOT, SHARED
-from PIL import Image
-from plyfile import PlyData, PlyElement
-
 import clod_adapter as clod
 from clod_adapter._support.version import package_version
 from clod_adapter.io.adapter_file import save_adapter
@@ -33,6 +26,13 @@ from clod_adapter.io.ply.columns import inria_dtype
 from clod_adapter.io.ply.header import read_head
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.state_file import save_state
+from common import ROOT, SHARED
+
+import numpy as np
+import pycolmap
+import torch
+from PIL import Image
+from plyfile import PlyData, PlyElement
 
 sys.path.insert(0, str(ROOT / "tests"))
 from packing import write_packed  # noqa: E402

@@ -16,14 +16,14 @@ from __future__ import annotations
 import time
 from dataclasses import asdict
 
-import torch
+import clod_adapter as clod
 from adapt import at_shares
+from clod_adapter.training.camera_placement import place_cameras, typical_reach
+from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
 from common import append, arguments, checkpoint, stored, table
 from common import photographs as photographs_of
 
-import clod_adapter as clod
-from clod_adapter.training.camera_placement import place_cameras, typical_reach
-from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
+import torch
 
 FILE = "nophoto.jsonl"
 KINDS = ("photographs", "teacher", "placed", "complemented")

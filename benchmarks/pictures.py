@@ -16,11 +16,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from common import COMMAND, ROOT, arguments
-from PIL import Image
-
 import clod_adapter as clod
 from clod_adapter.io.atomic import atomic_path
+from common import COMMAND, ROOT, arguments
+
+from PIL import Image
 
 sys.path.insert(0, str(ROOT / "tests"))
 import browser  # noqa: E402

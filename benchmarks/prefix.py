@@ -20,11 +20,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from common import append, arguments, checkpoint, falling, head, photographs, stored, table
-
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.initialization.importance import removal_error
+from common import append, arguments, checkpoint, falling, head, photographs, stored, table
 
 FILE = "prefix.jsonl"
 DIALS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)

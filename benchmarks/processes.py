@@ -22,13 +22,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-import torch
+import clod_adapter as clod
+from clod_adapter.training.distributed import joined
 from common import append, arguments, checkpoint, photographs
 
-from clod_adapter.training.distributed import joined
+import torch
 
 FILE = "processes.jsonl"
 CORES = 2

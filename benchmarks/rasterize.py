@@ -19,15 +19,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
-import clod_adapter  # noqa: F401  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
 import agreement
 import contenders
-import torch
 import workloads
 from common import ROOT, Row, append, arguments
 from contenders import SHARES, THREADS, Worker
+
+import torch
 
 FILE = "rasterize.jsonl"
 YARDSTICK = Path(os.environ.get("CLOD_YARDSTICK", ROOT.parent / "shared" / "yardstick"))

@@ -21,17 +21,17 @@ from dataclasses import asdict
 from statistics import fmean
 from typing import Any
 
-import torch
-from common import append, arguments, checkpoint, falling, head, photographs, stored, table
-from merging import find_tool, merge
-from torch import Tensor
-from tuning import Tuning, tune
-
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.gaussians import SH_C0
 from clod_adapter.initialization.importance import removal_error
 from clod_adapter.render import splat
+from common import append, arguments, checkpoint, falling, head, photographs, stored, table
+from merging import find_tool, merge
+from tuning import Tuning, tune
+
+import torch
+from torch import Tensor
 
 FILE = "rivals.jsonl"
 RIVALS = ("merging", "specialist", "tuned", "prefix", "ranking")

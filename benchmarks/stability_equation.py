@@ -18,20 +18,20 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
-import mpmath
-import numpy as np
-import torch
-from common import table
-from equation_tally import Tallies
-from mpmath import mpf
-from torch import Tensor
-
 import exact
 from clod_adapter.attenuation import SIGMA_MAX, attenuate, log_attenuation
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.training.target_count import count_slope, soft_count
+from common import table
+from equation_tally import Tallies
 from exact import DTYPES, Array, Case, Wide, plain, tensor, wide
+
+import mpmath
+import numpy as np
+import torch
+from mpmath import mpf
+from torch import Tensor
 
 FADE = math.log(1.5)  # log(a'' / tau s) above which the soft cut changes nothing
 

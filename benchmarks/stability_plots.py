@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, QUIET, label_log, new_figure, save_figure, tidy
 from stability_popping import STEPS as LENGTHS_OF_STEPS
 from stability_popping import SWEEPS, TOGETHER
 from stability_stiffness import CONFIG, CONVERGED, LENGTHS, OPTIMIZERS, STEPS, curves
-
-from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, QUIET, label_log, new_figure, save_figure, tidy
 
 LEGEND = {"loc": "outside lower center", "frameon": False, "fontsize": 8.5}
 

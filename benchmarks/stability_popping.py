@@ -20,13 +20,6 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import clod_adapter  # noqa: F401  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-import torch
-from common import table
-from torch import Tensor
-
 from clod_adapter.adapter import attach
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CUTS, NORMALIZERS, AdaptConfig, AttenuationConfig
@@ -35,6 +28,10 @@ from clod_adapter.evaluation.popping import dial_popping, path, path_popping
 from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.render import splat
+from common import table
+
+import torch
+from torch import Tensor
 
 STEPS = (20, 40, 80, 160)
 SWEEPS = {"dial": "the dial from 1 to 5", "turn": "a camera that turns, s = 2", "path": "a camera that moves, s = 2"}

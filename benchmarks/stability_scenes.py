@@ -9,11 +9,10 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from common import checkpoint, photographs, table
-from extreme_scenes import CAPTURE, CASES, Case
-
 import clod_adapter as clod
 from clod_adapter.training.pseudo_views import add_pseudo_views
+from common import checkpoint, photographs, table
+from extreme_scenes import CAPTURE, CASES, Case
 
 STEPS, ALLOWED = 200, 0.3  # dB
 

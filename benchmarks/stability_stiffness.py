@@ -18,15 +18,6 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-import clod_adapter  # noqa: F401  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-import numpy as np
-import torch
-from common import table
-from stability_stuck import CONFIG, DIALS, STUCK_STEPS, TRAINING_STEPS, scene, stuck_rows, training_rows
-from torch import Tensor
-
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.attenuation import Attenuated, attenuate
 from clod_adapter.distances import normalized_distances
@@ -34,6 +25,12 @@ from clod_adapter.report.style import BLUE, GREEN, ORANGE, PURPLE, QUIET
 from clod_adapter.training.objective import SIGMA_RANGE
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.target_count import count_gradient
+from common import table
+from stability_stuck import CONFIG, DIALS, STUCK_STEPS, TRAINING_STEPS, scene, stuck_rows, training_rows
+
+import numpy as np
+import torch
+from torch import Tensor
 
 RATES = tuple(10 ** (k / 2) for k in range(-8, 1))  # 1e-4 to 1 in half decades
 WRONG = 4.0  # decades, each way

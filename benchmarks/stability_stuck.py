@@ -15,12 +15,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import clod_adapter  # noqa: F401  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-import torch
-from torch import Tensor
-
 from clod_adapter.adapter import attach
 from clod_adapter.attenuation import SIGMA_MAX, attenuate
 from clod_adapter.cameras import Camera, View
@@ -32,6 +26,9 @@ from clod_adapter.losses import photometric_loss
 from clod_adapter.render import render
 from clod_adapter.training.target_count import count_gradient, soft_count, target_curve
 from clod_adapter.training.trainer import Trainer
+
+import torch
+from torch import Tensor
 
 FROZEN = {f"lr_{name}": 0.0 for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
 CONFIG = AdaptConfig(**FROZEN)

@@ -15,17 +15,15 @@ from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
-import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-import torch
-from common import append, arguments, checkpoint, photographs
-
+import clod_adapter as clod
 from clod_adapter._kernels import threads
 from clod_adapter.initialization.importance import for_training, initialize
 from clod_adapter.rasterizers import cpu
 from clod_adapter.training import objective, optimizer
 from clod_adapter.training.trainer import Trainer
+from common import append, arguments, checkpoint, photographs
+
+import torch
 
 FILE = "step.jsonl"
 THREADS = 2

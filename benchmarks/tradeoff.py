@@ -15,16 +15,15 @@ import sys
 from collections.abc import Callable, Sequence
 from statistics import fmean
 
-from common import RESULTS, ROOT, Row, append, arguments, checkpoint, photographs
-from common import stored as stored_rows
-from merging import merge
-from tuning import Tuning, tune
-
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.report import page
 from clod_adapter.report.charts import draw_training, error, inline_svg, training_chart
 from clod_adapter.report.style import new_figure, save_figure
+from common import RESULTS, ROOT, Row, append, arguments, checkpoint, photographs
+from common import stored as stored_rows
+from merging import merge
+from tuning import Tuning, tune
 
 FILE = "tradeoff.jsonl"
 PAGE = ROOT / "docs" / "error_vs_time.html"

@@ -7,10 +7,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import numpy as np
-import torch
-from torch import Tensor
-
 import clod_adapter as clod
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES, detach
@@ -18,6 +14,10 @@ from clod_adapter.cameras import camera_extent
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import splat
 from clod_adapter.training.optimizer import RowAdam
+
+import numpy as np
+import torch
+from torch import Tensor
 
 # 3DGS's rates of training; means times the cameras' extent.
 RATES = {"means": 1.6e-4, "quats": 1e-3, "log_scales": 5e-3, "opacity_logits": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}

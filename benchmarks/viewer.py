@@ -16,12 +16,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from common import CACHE, COMMAND, ROOT, Process, Row, append, arguments, capture
-
 import clod_adapter as clod
 from clod_adapter.adapter import detach
+from common import CACHE, COMMAND, ROOT, Process, Row, append, arguments, capture
+
+import numpy as np
+import torch
 
 sys.path.insert(0, str(ROOT / "tests"))
 import browser  # noqa: E402
