@@ -24,7 +24,7 @@ from PIL import Image
 
 sys.path.insert(0, str(ROOT / "tests"))
 import browser  # noqa: E402
-from shown import RESTED, Shown, serve  # noqa: E402
+from shown import Shown, serve  # noqa: E402
 
 IMAGES = ROOT / "docs" / "images"
 SIZE, TALL = {"width": 1280, "height": 800}, {"width": 1100, "height": 1300}
@@ -53,7 +53,7 @@ def viewer(chromium: Any, folder: Path) -> bytes:
             shown.page.keyboard.press("n")
         shown.run("clod.setWipe(0.55, 'base')")
         shown.page.evaluate("document.getElementById('frame').style.visibility = 'hidden'")
-        shown.page.wait_for_timeout(RESTED)
+        shown.page.wait_for_timeout(250)  # longer than the page draws fewer pixels after a movement
         shown.run("clod.settled()")
         return bytes(shown.page.screenshot(timeout=120_000))
 

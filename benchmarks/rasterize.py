@@ -12,6 +12,7 @@ affects both alike. Times are medians in milliseconds: ``forward_ms`` and ``both
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import tempfile
@@ -42,14 +43,15 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(THREADS)
     if args.accuracy:
-        kind, table, rows = "accuracy", agreement.table, [agreement.compare(name) for name in workloads.SIZES]
+        kind, rows = "accuracy", [agreement.compare(name) for name in workloads.SIZES]
     elif args.extreme:
-        kind, table, rows = "extreme", extreme_table, extreme()
+        kind, rows = "extreme", extreme()
     else:
-        kind, table, rows = "speed", speed_table, speed()
-    print(table(rows), flush=True)
-    for row in rows if args.record else []:
-        append(FILE, {"benchmark": "rasterize", "kind": kind, **row})
+        kind, rows = "speed", speed()
+    for row in rows:
+        print(json.dumps(row, indent=1), flush=True)
+        if args.record:
+            append(FILE, {"benchmark": "rasterize", "kind": kind, **row})
 
 
 def speed() -> list[Row]:
@@ -107,24 +109,6 @@ def kept_rows(frames: Sequence[list[float]]) -> list[Row]:
     ]
 
 
-def speed_table(rows: list[Row]) -> str:
-    lines = []
-    for row in rows:
-        pairs = "" if row["pairs"] is None else f", {row['pairs'] / 1e6:.1f} M pairs of Gaussian and pixel"
-        lines += [f"{row['workload']}: {row['gaussians']:,} Gaussians, {row['width']}x{row['height']}{pairs}"]
-        lines += [f"  {'':10} {'forward ms':>10} {'best':>10} {'both ms':>10} {'best':>10} {'memory MB':>10}"]
-        for peer, prefix in (("ours", ""), ("yardstick", "yardstick_")):
-            fields = ("forward_ms", "forward_best_ms", "both_ms", "both_best_ms", "memory_mb")
-            cells = [row[prefix + field] for field in fields]
-            lines += [f"  {peer:10} " + " ".join(f"{'-' if cell is None else cell:>10}" for cell in cells)]
-        if row["both_ratio_yardstick"]:
-            ratios = (f"{what} {row[f'{what}_ratio_yardstick']}" for what in ("forward", "both"))
-            lines += [f"  ours takes {', '.join(ratios)} of the yardstick's"]
-        lines += [f"  a frame without gradients: {row['render_ms']} ms; of the most opaque Gaussians alone:"]
-        lines += [f"    {k['share']:5.0%} {k['way']:13} {k['ms']:8.2f} ms {k['fraction']:5.0%}" for k in row["kept"]]
-    return "\n".join(lines)
-
-
 def extreme() -> list[Row]:
     """A step of each extreme scene, ours, in turn with one of W1; and whether everything that comes out is finite."""
     w1, rows = workloads.make("W1"), []
@@ -146,19 +130,6 @@ def extreme() -> list[Row]:
             "ns_per_pair": round(both * 1e6 / pairs, 3) if pairs else None,
         })  # fmt: skip
     return rows
-
-
-def extreme_table(rows: list[Row]) -> str:
-    times = ("forward_ms", "both_ms", "times_w1", "ns_per_gaussian", "ns_per_pixel")
-    fields = ("gaussians", *times, "pairs", "ns_per_pair")
-    titles = [field.replace("_per_", "/").replace("_", " ") for field in fields]
-    lines = [f"{'scene':32}" + "".join(f"{title:>13}" for title in titles)]
-    for row in rows:
-        cells = ["-" if row[field] is None else f"{row[field]:,}" for field in fields]
-        lines.append(
-            f"{row['scene']:32}" + "".join(f"{cell:>13}" for cell in cells) + "  NOT FINITE" * (not row["finite"])
-        )
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

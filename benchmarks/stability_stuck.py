@@ -115,7 +115,7 @@ def trained(config: AdaptConfig, start: Tensor, steps: int, *, floor: bool = Tru
 @torch.no_grad()
 def objective(run: Trainer) -> float:
     """What training minimises, at dial values evenly spread, for sigma_d as it would be handed out."""
-    (view,), config, found, total = run.draws.views, run.config, run.gaussians(), 0.0
+    (view,), config, found, total = run.sampler.views, run.config, run.gaussians(), 0.0
     for s in DIALS:
         shown = render(found, view.camera, s)
         weight = (1 - config.weight_slope * s / config.max_sv) ** 2
@@ -130,7 +130,7 @@ def stuck(run: Trainer) -> int:
     A Gaussian that is culled at every dial value needs a negative gradient while none is kept; one that does not fade
     needs a positive gradient while all are kept.
     """
-    p, config, camera, reading = run.parameters, run.config, run.draws.views[0].camera, run.objective.attenuation
+    p, config, camera, reading = run.parameters, run.config, run.sampler.views[0].camera, run.objective.attenuation
     distances = normalized_distances(p["means"], camera, reading)
     seen = out = lifted = pressed = torch.zeros(len(distances), dtype=torch.bool)
     for s in DIALS:
