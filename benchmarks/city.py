@@ -1,7 +1,5 @@
 """A synthetic city of any number of Gaussians: streets, houses, trees, cars, fields and a sky.
 
-    python benchmarks/city.py OUT --count 1000000 --images 24 --size 800 500   # OUT/city.ply and a COLMAP scene
-
 It replaces captures that are too large for a repository. More Gaussians make a larger city at the same density of about
 5 per square metre of surface. Thin Gaussians cover the surfaces, a fifth of them as a coarser layer; colours vary from
 one Gaussian to the next, and all SH degrees are used.
@@ -23,7 +21,6 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import save
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import render
-from common import arguments
 
 import numpy as np
 import torch
@@ -157,18 +154,3 @@ def write_city(folder: str | Path, count: int, images: int, width: int, height: 
         colors = ((0.5 + SH_C0 * truth.sh0[some, 0].numpy()).clip(0, 1) * 255).astype(np.uint8)
         write_model(part, cameras, [camera.name for camera in cameras], truth.means[some].numpy(), colors)
         save(part / "city.ply", perturb(truth))
-
-
-def main() -> None:
-    parser = arguments(__doc__)
-    parser.add_argument("out", help="a folder that does not exist or is empty")
-    parser.add_argument("--count", type=int, default=100_000, help="Gaussians (default: %(default)s)")
-    parser.add_argument("--images", type=int, default=24, help="photographs (default: %(default)s)")
-    parser.add_argument("--size", type=int, nargs=2, default=(640, 400), metavar=("W", "H"), help="of a photograph")
-    parser.add_argument("--where", choices=("near", "far", "mixed"), default="mixed", help="cameras (default: mixed)")
-    args = parser.parse_args()
-    write_city(args.out, args.count, args.images, *args.size, where=args.where)
-
-
-if __name__ == "__main__":
-    main()

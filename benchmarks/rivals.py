@@ -27,8 +27,7 @@ from clod_adapter.gaussians import SH_C0
 from clod_adapter.initialization.importance import removal_error
 from clod_adapter.render import splat
 from common import append, arguments, checkpoint, falling, head, photographs, stored, table
-from merging import find_tool, merge
-from tuning import Tuning, tune
+from tuning import Tuning, find_tool, merge, tune
 
 import torch
 from torch import Tensor

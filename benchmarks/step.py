@@ -10,6 +10,7 @@ package: to measure another one, put it first on PYTHONPATH.
 
 from __future__ import annotations
 
+import json
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -65,7 +66,7 @@ def main() -> None:
     clock.wrap(optimizer.RowAdam, "step", "optimiser")
     for scene in args.scenes:
         row = {"benchmark": "step", "scene": scene, "threads": THREADS, **profile(scene, 120, clock)}
-        print(table(row), flush=True)
+        print(json.dumps(row, indent=1), flush=True)
         if args.record:
             append(FILE, row)
 
@@ -86,11 +87,6 @@ def profile(scene: str, steps: int, clock: Clock, warm: int = 5) -> dict[str, An
     sections = {name: round(seconds / steps * 1e3, 2) for name, seconds in clock.seconds.items()}
     splat = (clock.seconds["splat forward"] + clock.seconds["splat backward"]) / steps
     return {"steps": steps, "step_ms": round(total * 1e3, 2), "splat_share": round(splat / total, 3), "ms": sections}
-
-
-def table(row: dict[str, Any]) -> str:
-    lines = [f"{row['scene']}: {row['step_ms']} ms a step, {row['splat_share']:.0%} of it in the rasterizer"]
-    return "\n".join(lines + [f"  {name:26} {ms:7.2f}" for name, ms in row["ms"].items()])
 
 
 if __name__ == "__main__":

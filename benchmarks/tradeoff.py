@@ -22,8 +22,7 @@ from clod_adapter.report.charts import draw_training, error, inline_svg, trainin
 from clod_adapter.report.style import new_figure, save_figure
 from common import RESULTS, ROOT, Row, append, arguments, checkpoint, photographs
 from common import stored as stored_rows
-from merging import merge
-from tuning import Tuning, tune
+from tuning import Tuning, merge, tune
 
 FILE = "tradeoff.jsonl"
 PAGE = ROOT / "docs" / "error_vs_time.html"
