@@ -28,16 +28,17 @@ from clod_adapter.cli.shared.budgets import VIEWPOINTS
 from clod_adapter.distances import viewpoint_of
 from clod_adapter.extinction import extinction_scale
 from clod_adapter.initialization.importance import spread
-from common import append, arguments, photographs, stored, table
+from common import append, arguments, photographs, print_rows
 
 import torch
 
 FILE = "bake.jsonl"
+COLUMNS = ("scene", "label", "virtual_scale", "count", "psnr")
 DIALS = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=print_table)
+    parser = arguments(__doc__, table=lambda: print_rows(FILE, *COLUMNS))
     parser.add_argument("model", help="an adapted PLY")
     parser.add_argument("scene", help="its capture")
     parser.add_argument("--label", default="", help="how the model was adapted")
@@ -86,19 +87,6 @@ def at_one_distance(gaussians: clod.Gaussians, count: int) -> clod.Gaussians:
     at = attenuate(logits, sigma, ones, max(float(leaving[count]), 1.0), config)
     opacities = at.drawn.clamp(1e-9, 1 - 1e-7)
     return clod.detach(gaussians.replace(opacity_logits=opacities.logit())).select(at.keep)
-
-
-def print_table() -> None:
-    """PSNR on the held-out views: the dial's, and the difference of each file; with its count where that is another."""
-    for row in stored(FILE):
-        print(f"\n{row['scene']}, {row['gaussians']:,} Gaussians, {row['label']}")
-        names, lines = [name for name in row["rows"][0]["psnr"] if name != "dial"], []
-        for point in row["rows"]:
-            dial, counts = point["psnr"]["dial"], point["count"]
-            others = [f" @ {counts[name]:,}" if abs(counts[name] - counts["dial"]) > 1 else "" for name in names]
-            cells = [f"{point['psnr'][name] - dial:+.2f}{other}" for name, other in zip(names, others, strict=True)]
-            lines.append([f"{point['virtual_scale']:g}", f"{counts['dial']:,.0f}", f"{dial:.2f}", *cells])
-        print(table(["s", "count", "dial", *names], lines))
 
 
 if __name__ == "__main__":

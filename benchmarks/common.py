@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 import xml.etree.ElementTree as xml
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -101,6 +101,22 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[object]], numbers_from: 
     marks = ["---:" if numbers_from is not None and k >= numbers_from else "---" for k in range(len(heads))]
     lines = [f"| {' | '.join(map(str, cells))} |" for cells in (heads, *rows)]
     return "\n".join([lines[0], f"|{'|'.join(marks)}|", *lines[1:]])
+
+
+def flat(row: Row, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Numbers and texts of nested dictionaries, by dotted key."""
+    for key, value in row.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        elif not isinstance(value, list):
+            yield prefix + key, f"{value:.6g}" if isinstance(value, float) else "" if value is None else value
+
+
+def print_rows(file: str, *columns: str) -> None:
+    """Prints the stored rows as a Markdown table, a line for each of a row's ``rows``; columns: keys, or their parents."""
+    rows = [dict(flat({**row, **each})) for row in stored(file) for each in row.get("rows", [{}])]
+    found = {key: None for name in columns for row in rows for key in row if f"{key}.".startswith(f"{name}.")}
+    print(table(list(found), [[row.get(key, "") for key in found] for row in rows]))
 
 
 def falling(values: Any) -> Any:

@@ -22,7 +22,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
@@ -82,9 +83,8 @@ def main() -> None:
         if not torch.cuda.is_available():
             sys.exit("torch sees no GPU here: give --device cpu --small to try the script")
         cuda.require_gsplat()
-    size = SMALL if args.small else Size()
-    size = Size(**{**asdict(size), **({"count": args.count} if args.count else {})})
-    device = torch.device(args.device)
+    size, device = SMALL if args.small else Size(), torch.device(args.device)
+    size = replace(size, count=args.count or size.count)
     checks: dict[str, Callable[[], list[dict[str, Any]]]] = {
         "tests": lambda: [run_tests(args.small)],
         "plush": lambda: adapt_plush(device, size, args.small),
@@ -144,7 +144,7 @@ def measure_city(device: torch.device, size: Size) -> list[dict[str, Any]]:
     wait_for(device)
     rows: list[dict[str, Any]] = [{
         "what": "adapt", "config": asdict(config), "start_seconds": round(adapted.start_seconds, 2),
-        "train_seconds": round(adapted.seconds, 2), "peak_bytes": peak(device), "base_bytes": weight(base),
+        "train_seconds": round(adapted.seconds, 2), "peak_bytes": peak(device), "base_bytes": sum(x.nbytes for x in base.tensors().values()),
     }]  # fmt: skip
     del base
     model, truth = adapted.gaussians, city(size.count)
@@ -201,17 +201,14 @@ def plain_frames(model: clod.Gaussians) -> dict[str, Callable[[Camera], Tensor]]
 
     colors = torch.cat([model.sh0, model.shN], 1)
 
-    def draw(packed: bool) -> Callable[[Camera], Tensor]:
-        def picture(camera: Camera) -> Tensor:
-            return gsplat.rasterization(
-                model.means, model.quats, scales, opacities, colors, camera.viewmat.to(scales)[None],
-                camera.K.to(scales)[None], camera.width, camera.height, near_plane=camera.near,
-                sh_degree=model.sh_degree, packed=packed,
-            )[0][0]  # fmt: skip
+    def draw(camera: Camera, packed: bool) -> Tensor:
+        return gsplat.rasterization(
+            model.means, model.quats, scales, opacities, colors, camera.viewmat.to(scales)[None],
+            camera.K.to(scales)[None], camera.width, camera.height, near_plane=camera.near,
+            sh_degree=model.sh_degree, packed=packed,
+        )[0][0]  # fmt: skip
 
-        return picture
-
-    return {"plain packed": draw(True), "plain unpacked": draw(False)}
+    return {"plain packed": partial(draw, packed=True), "plain unpacked": partial(draw, packed=False)}
 
 
 def compaction(model: clod.Gaussians, s: float) -> Callable[[Camera], Any]:
@@ -251,11 +248,6 @@ def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, Scene]:
 def photograph(truth: clod.Gaussians, cameras: list[Camera], device: torch.device) -> list[View]:
     there = truth.to(device)
     return [View(camera, clod.render(there, camera).pixels.cpu()) for camera in cameras]
-
-
-def weight(gaussians: clod.Gaussians) -> int:
-    """Bytes of the tensors."""
-    return sum(x.numel() * x.element_size() for x in gaussians.tensors().values())
 
 
 def reset_peak(device: torch.device) -> None:

@@ -10,15 +10,15 @@ row to ``results/viewer.jsonl``.
 
 from __future__ import annotations
 
-import statistics
 import sys
 import time
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import clod_adapter as clod
 from clod_adapter.adapter import detach
-from common import CACHE, COMMAND, ROOT, Process, Row, append, arguments, capture
+from common import CACHE, COMMAND, ROOT, Process, Row, append, arguments, capture, table
 
 import numpy as np
 import torch
@@ -90,15 +90,14 @@ def adapted(name: str) -> Path:
 
 
 def summary(row: Row) -> str:
-    lines = [f"{row['capture']}: {row['gaussians']:,} Gaussians, first frame after {row['first_frame_seconds']:.1f} s"]
+    """PSNR and the largest difference of counts, at each dial value and with the equation off."""
+    lines = []
     for dial in (*DIALS, None):
         found = [each for each in row["rows"] if each["virtual_scale"] == dial]
         errors = [each["psnr"] for each in found]
         apart = max(abs(each["kept"] - each["kept_in_page"]) for each in found)
-        label = f"s = {dial:g}" if dial else "equation off"
-        lines.append(f"  {label}: {min(errors):.1f} to {max(errors):.1f} dB, mean {statistics.fmean(errors):.1f}, "
-                     f"counts differ by at most {apart}")  # fmt: skip
-    return "\n".join([*lines, f"  errors in the console: {len(row['errors'])}"])
+        lines.append([dial, *(f"{psnr:.1f}" for psnr in (min(errors), max(errors), fmean(errors))), apart])
+    return table(["s", "least dB", "most", "mean", "counts differ by"], lines)
 
 
 if __name__ == "__main__":
