@@ -113,7 +113,7 @@ def flat(row: Row, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def print_rows(file: str, *columns: str) -> None:
-    """Prints the stored rows as a Markdown table, a line for each of a row's ``rows``; columns: keys, or their parents."""
+    """Prints the stored rows as a Markdown table, a line for each of a row's ``rows``; columns are keys or parents."""
     rows = [dict(flat({**row, **each})) for row in stored(file) for each in row.get("rows", [{}])]
     found = {key: None for name in columns for row in rows for key in row if f"{key}.".startswith(f"{name}.")}
     print(table(list(found), [[row.get(key, "") for key in found] for row in rows]))

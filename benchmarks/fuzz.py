@@ -23,7 +23,6 @@ import sys
 import tempfile
 import time
 import warnings
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ from clod_adapter.cli.adapt.resume import find_state
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.errors import ClodError
 from clod_adapter.io.adapter_file import load_adapter
-from common import append, arguments
+from common import Row, append, arguments
 from damage import mutate
 from mutants import MAKERS, Input, write, write_images
 
@@ -46,19 +45,6 @@ SHARES = {"ply": 0.3, "safetensors": 0.15, "colmap": 0.2, "transforms": 0.1, "pt
 HARMFUL = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect", "ctypes.dlopen")
 # Fields of the shared memory of a worker and its parent.
 CASE, READ, REFUSED, SLOWEST_US, SLOWEST, EXTRA_KB = range(6)
-
-
-@dataclass
-class Tally:
-    """The result of a format."""
-
-    cases: int
-    read: int = 0
-    refused: int = 0
-    failures: dict[int, str] = field(default_factory=dict)
-    slowest_s: float = 0.0
-    slowest_case: int = 0
-    extra_mb: float = 0.0
 
 
 class Watch:
@@ -156,14 +142,14 @@ def work(kind: str, inputs: list[Input], seed: int, cases: range, folder: Path, 
                 out.write(json.dumps([number, result]) + "\n")
 
 
-def run(kind: str, seed: int, cases: int, folder: Path) -> Tally:
+def run(kind: str, seed: int, cases: int, folder: Path) -> Row:
     """All cases of a format, batch by batch; a process that dies or hangs loses its current case."""
-    tally, inputs = Tally(cases), MAKERS[kind](folder)
+    inputs, found, extra = MAKERS[kind](folder), dict[int, str](), 0
     write_images(folder / "case" / "images")
     failures, fork = folder / "failures.jsonl", multiprocessing.get_context("fork")
     shared = fork.Array("q", 6, lock=False)
     start = 0
-    while start < cases and len(tally.failures) < MANY:
+    while start < cases and len(found) < MANY:
         stop = min(start + BATCH, cases)
         arguments = (kind, inputs, seed, range(start, stop), folder / "case", shared, failures)
         shared[CASE] = start
@@ -171,18 +157,19 @@ def run(kind: str, seed: int, cases: int, folder: Path) -> Tally:
         process.start()
         died = wait(process, shared)
         if died:
-            tally.failures[shared[CASE]] = died
+            found[shared[CASE]] = died
         start = shared[CASE] + 1 if died else stop
-        tally.extra_mb = max(tally.extra_mb, shared[EXTRA_KB] / 1024)
+        extra = max(extra, shared[EXTRA_KB])
         shared[EXTRA_KB] = 0
         print(f"{kind}: {start} of {cases}", file=sys.stderr)
-    tally.read, tally.refused = shared[READ], shared[REFUSED]
-    tally.slowest_s, tally.slowest_case = shared[SLOWEST_US] / 1e6, shared[SLOWEST]
     for line in failures.read_text(encoding="utf-8").splitlines() if failures.exists() else []:
         number, result = json.loads(line)
-        tally.failures[number] = result
+        found[number] = result
     failures.unlink(missing_ok=True)
-    return tally
+    return {
+        "cases": cases, "read": shared[READ], "refused": shared[REFUSED], "failures": found,
+        "slowest_s": shared[SLOWEST_US] / 1e6, "slowest_case": shared[SLOWEST], "extra_mb": extra / 1024,
+    }  # fmt: skip
 
 
 def wait(process: Any, shared: Any) -> str:
@@ -228,12 +215,12 @@ def main() -> None:
         with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as folder:
             tallies[kind] = run(kind, args.seed, round(args.cases * share), Path(folder).resolve())
     row = {
-        "seed": args.seed, "cases": sum(tally.cases for tally in tallies.values()),
-        "failures": sum(len(tally.failures) for tally in tallies.values()),
-        "seconds": time.perf_counter() - began, "formats": {kind: vars(tally) for kind, tally in tallies.items()},
+        "seed": args.seed, "cases": sum(tally["cases"] for tally in tallies.values()),
+        "failures": sum(len(tally["failures"]) for tally in tallies.values()),
+        "seconds": time.perf_counter() - began, "formats": tallies,
     }  # fmt: skip
     for kind, tally in tallies.items():
-        for number, failure in tally.failures.items():
+        for number, failure in tally["failures"].items():
             print(f"{failure}\n  python benchmarks/fuzz.py --format {kind} --seed {args.seed} --case {number}")
     if args.record:
         append(FILE, row)

@@ -144,7 +144,8 @@ def measure_city(device: torch.device, size: Size) -> list[dict[str, Any]]:
     wait_for(device)
     rows: list[dict[str, Any]] = [{
         "what": "adapt", "config": asdict(config), "start_seconds": round(adapted.start_seconds, 2),
-        "train_seconds": round(adapted.seconds, 2), "peak_bytes": peak(device), "base_bytes": sum(x.nbytes for x in base.tensors().values()),
+        "train_seconds": round(adapted.seconds, 2), "peak_bytes": peak(device),
+        "base_bytes": sum(x.nbytes for x in base.tensors().values()),
     }]  # fmt: skip
     del base
     model, truth = adapted.gaussians, city(size.count)

@@ -60,12 +60,12 @@ def speed() -> list[Row]:
         library = contenders.build_yardstick(YARDSTICK, Path(folder))
         rows = []
         for name in workloads.SIZES:
-            peers = {"ours": Worker("ours", contenders.our_jobs, name)}
+            peers = {"ours": Worker(contenders.our_jobs, name)}
             if library:
-                peers["yardstick"] = Worker("yardstick", contenders.yardstick_jobs, name, YARDSTICK, library)
+                peers["yardstick"] = Worker(contenders.yardstick_jobs, name, YARDSTICK, library)
             rows.append(time_workload(name, peers))
             for worker in peers.values():
-                worker.close()
+                worker.pool.shutdown()
     return rows
 
 
