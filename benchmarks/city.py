@@ -67,9 +67,7 @@ def surrounding(count: int) -> int:
     return min(max(round(share * count), min(least, count // 5)), most)
 
 
-def city_cameras(
-    n: int, width: int, height: int, *, where: Where = "mixed", count: int, seed: int = 0
-) -> list[Camera]:  # fmt: skip
+def city_cameras(n: int, width: int, height: int, *, where: Where = "mixed", count: int, seed: int = 0) -> list[Camera]:
     """``n`` cameras in a city of ``count`` Gaussians, named ``view_0000.png`` on.
 
     Args:

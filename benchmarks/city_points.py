@@ -51,9 +51,7 @@ def cover(surfaces: Surfaces, count: int, random: np.random.Generator) -> Points
     position[tree] = surfaces.origin[row[tree]] + depth * normal[tree] * surfaces.u[row[tree]]
     color[tree] *= 0.55 + 0.45 * (depth - 0.65) / 0.35 + random.normal(0, 0.15, (len(tree), 1))
     kinds = kind.astype(np.int8)
-    return Points(
-        position.astype(np.float32), normal.astype(np.float32), spacing.astype(np.float32), kinds, color
-    )  # fmt: skip
+    return Points(position.astype(np.float32), normal.astype(np.float32), spacing.astype(np.float32), kinds, color)
 
 
 def on_sphere(spot: np.ndarray) -> np.ndarray:

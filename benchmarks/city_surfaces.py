@@ -124,9 +124,7 @@ def outward(surfaces: Surfaces, middle: np.ndarray) -> Surfaces:
     away[:, [0, 2]] -= middle
     away[:, 1] = -1e-3
     sign = np.where((away * surfaces.normal).sum(1, keepdims=True) < 0, -1.0, 1.0)
-    return Surfaces(
-        surfaces.origin, surfaces.u, surfaces.v, sign * surfaces.normal, surfaces.kind, surfaces.color
-    )  # fmt: skip
+    return Surfaces(surfaces.origin, surfaces.u, surfaces.v, sign * surfaces.normal, surfaces.kind, surfaces.color)
 
 
 def streets(corner: np.ndarray) -> list[Surfaces]:

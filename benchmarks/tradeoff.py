@@ -75,9 +75,7 @@ def dial(
 ) -> tuple[list[float], list[Row]]:
     """Seconds (of the one run that serves every dial value) and the row of each dial value."""
     config = (clod.AdaptConfig if method == "ours" else clod.AdaptConfig.paper)(max_sv=MAX_SV, iters=iters, seed=0)
-    done = clod.adapt(
-        base.gaussians, views, config, lambda p: follow(p.share if p.phase == "training" else 0.0)
-    )  # fmt: skip
+    done = clod.adapt(base.gaussians, views, config, lambda p: follow(p.share if p.phase == "training" else 0.0))
     rows = clod.evaluate(done.gaussians, views.test, DIALS)
     return [done.start_seconds + done.seconds] * len(rows), [row.as_dict() for row in rows]
 
