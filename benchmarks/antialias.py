@@ -18,7 +18,6 @@ from typing import Any
 import clod_adapter as clod
 from clod_adapter.alignment.screen_filter import compare_filters
 from clod_adapter.config import CLASSIC, FILTERS
-from clod_adapter.evaluation.evaluate import evaluate
 from common import append, arguments, capture, checkpoint, photographs
 from tuning import Tuning, tune
 
@@ -62,7 +61,7 @@ def substitute(name: str, scene: clod.Scene, trained: str) -> clod.Gaussians:
 def row(gaussians: clod.Gaussians, scene: clod.Scene) -> dict[str, Any]:
     """Held-out PSNR with each filter, and the choice of ``compare_filters`` with its CPU seconds."""
     psnr = {
-        name: round(evaluate(gaussians.replace(screen_filter=each), scene.test, [1.0])[0].psnr, 2)
+        name: round(clod.evaluate(gaussians.replace(screen_filter=each), scene.test, [1.0])[0].psnr, 2)
         for name, each in FILTERS.items()
     }
     began = time.process_time()
@@ -82,7 +81,7 @@ def adapted(gaussians: clod.Gaussians, scene: clod.Scene, drawn: str, teacher: s
     result = clod.adapt(start, own, clod.AdaptConfig(max_sv=5, iters=ADAPTED_STEPS))
     rows = [
         {"s": r.virtual_scale, "psnr": round(r.psnr, 2), "kept": round(r.kept)}
-        for r in evaluate(result.gaussians, scene.test, DIALS)
+        for r in clod.evaluate(result.gaussians, scene.test, DIALS)
     ]
     return {"adapted_with": drawn, "teacher": teacher, "iters": ADAPTED_STEPS, "max_sv": 5, "seed": 0, "rows": rows}
 

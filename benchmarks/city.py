@@ -13,14 +13,12 @@ import math
 from pathlib import Path
 from typing import Literal
 
+import clod_adapter as clod
 from city_points import FIELD, cover, facing, higher_degrees, shade, surround
 from city_surfaces import PITCH, blocks, build, extent, joined
-from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.checkpoint import save
 from clod_adapter.io.scene.colmap import write_model
-from clod_adapter.render import render
 
 import numpy as np
 import torch
@@ -67,7 +65,9 @@ def surrounding(count: int) -> int:
     return min(max(round(share * count), min(least, count // 5)), most)
 
 
-def city_cameras(n: int, width: int, height: int, *, where: Where = "mixed", count: int, seed: int = 0) -> list[Camera]:
+def city_cameras(
+    n: int, width: int, height: int, *, where: Where = "mixed", count: int, seed: int = 0
+) -> list[clod.Camera]:
     """``n`` cameras in a city of ``count`` Gaussians, named ``view_0000.png`` on.
 
     Args:
@@ -110,7 +110,7 @@ def in_air(count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndar
     return eye, np.array([aim[0], -5.0, aim[1]])
 
 
-def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: str) -> Camera:
+def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: str) -> clod.Camera:
     """An upright camera with a field of view of 65 degrees across the width."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross([0.0, 1.0, 0.0], forward)
@@ -120,7 +120,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: 
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
     focal = width / 2 / math.tan(math.radians(65) / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Camera(torch.from_numpy(viewmat).float(), torch.from_numpy(K).float(), width, height, name)
+    return clod.Camera(torch.from_numpy(viewmat).float(), torch.from_numpy(K).float(), width, height, name)
 
 
 def perturb(truth: Gaussians, seed: int = 0) -> Gaussians:
@@ -147,8 +147,8 @@ def write_city(folder: str | Path, count: int, images: int, width: int, height: 
         (part / "images").mkdir(parents=True)
         for camera in cameras:
             with torch.no_grad():
-                Image.fromarray(render(truth, camera).pixels.numpy()).save(part / "images" / camera.name)
+                Image.fromarray(clod.render(truth, camera).pixels.numpy()).save(part / "images" / camera.name)
         some = np.linspace(0, count - surrounding(count), 2000, endpoint=False).astype(np.int64)
         colors = ((0.5 + SH_C0 * truth.sh0[some, 0].numpy()).clip(0, 1) * 255).astype(np.uint8)
         write_model(part, cameras, [camera.name for camera in cameras], truth.means[some].numpy(), colors)
-        save(part / "city.ply", perturb(truth))
+        clod.save(part / "city.ply", perturb(truth))

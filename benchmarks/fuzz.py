@@ -29,8 +29,6 @@ from typing import Any
 import clod_adapter as clod
 from clod_adapter.cli.adapt.resume import find_state
 from clod_adapter.cli.shared.console import Console
-from clod_adapter.errors import ClodError
-from clod_adapter.io.adapter_file import load_adapter
 from common import Row, append, arguments
 from damage import mutate
 from mutants import MAKERS, Input, write, write_images
@@ -69,7 +67,7 @@ def read(kind: str, folder: Path, case: Input, number: int) -> None:
     if kind in ("colmap", "transforms"):
         clod.load_scene(folder)
     elif kind == "safetensors":
-        load_adapter(folder / next(iter(case)))
+        clod.load_adapter(folder / next(iter(case)))
     elif kind == "states":
         resumed = find_state(folder / next(iter(case)), True, clod.AdaptConfig(), Console(quiet=True))
         if resumed is None:
@@ -98,7 +96,7 @@ def result_of(kind: str, folder: Path, case: Input, number: int, watch: Watch) -
         with warnings.catch_warnings(action="error"):
             read(kind, folder, case, number)
         result = "read"
-    except ClodError as error:
+    except clod.ClodError as error:
         cause: BaseException | None = error
         while cause is not None and not isinstance(cause, MemoryError):
             cause = cause.__cause__ or cause.__context__

@@ -31,7 +31,6 @@ from typing import Any
 import clod_adapter as clod
 from city import city, city_cameras, perturb
 from clod_adapter.attenuation import attenuate
-from clod_adapter.cameras import Camera, Scene, View
 from clod_adapter.distances import normalized_distances
 from clod_adapter.metrics import psnr
 from clod_adapter.rasterizers import cuda, wait_for
@@ -119,7 +118,7 @@ def adapt_plush(device: torch.device, size: Size, small: bool) -> list[dict[str,
         own = base.to(place)
         warm = clod.AdaptConfig(iters=1)  # compiles and loads kernels before the clock starts; timed separately
         began = time.perf_counter()
-        clod.adapt(own, Scene(scene.train[:1], ()), warm)
+        clod.adapt(own, clod.Scene(scene.train[:1], ()), warm)
         warm_seconds = time.perf_counter() - began
         reset_peak(place)
         adapted = clod.adapt(own, scene, config)
@@ -157,10 +156,10 @@ def measure_city(device: torch.device, size: Size) -> list[dict[str, Any]]:
 
 
 @torch.no_grad()
-def frames(model: clod.Gaussians, views: list[View], where: str, s: float, repeats: int) -> dict[str, Any]:
+def frames(model: clod.Gaussians, views: list[clod.View], where: str, s: float, repeats: int) -> dict[str, Any]:
     """Medians in milliseconds, ours and plain in turn, over the views; and PSNR of the pictures."""
     device, plain = model.means.device, plain_frames(model)
-    jobs: dict[str, Callable[[Camera], Any]] = {
+    jobs: dict[str, Callable[[clod.Camera], Any]] = {
         "ours": lambda camera: clod.render(model, camera, s).image,
         **plain,
         "dial": lambda camera: dial(model, camera, s),
@@ -193,7 +192,7 @@ def frames(model: clod.Gaussians, views: list[View], where: str, s: float, repea
     }  # fmt: skip
 
 
-def plain_frames(model: clod.Gaussians) -> dict[str, Callable[[Camera], Tensor]]:
+def plain_frames(model: clod.Gaussians) -> dict[str, Callable[[clod.Camera], Tensor]]:
     """The file without its dial, activated beforehand, as a viewer that does not know the dial draws it."""
     scales, opacities = model.scales, model.opacities
     if model.means.device.type == "cpu":
@@ -202,7 +201,7 @@ def plain_frames(model: clod.Gaussians) -> dict[str, Callable[[Camera], Tensor]]
 
     colors = torch.cat([model.sh0, model.shN], 1)
 
-    def draw(camera: Camera, packed: bool) -> Tensor:
+    def draw(camera: clod.Camera, packed: bool) -> Tensor:
         return gsplat.rasterization(
             model.means, model.quats, scales, opacities, colors, camera.viewmat.to(scales)[None],
             camera.K.to(scales)[None], camera.width, camera.height, near_plane=camera.near,
@@ -212,12 +211,12 @@ def plain_frames(model: clod.Gaussians) -> dict[str, Callable[[Camera], Tensor]]
     return {"plain packed": partial(draw, packed=True), "plain unpacked": partial(draw, packed=False)}
 
 
-def compaction(model: clod.Gaussians, s: float) -> Callable[[Camera], Any]:
+def compaction(model: clod.Gaussians, s: float) -> Callable[[clod.Camera], Any]:
     """Removal of the culled rows, given the opacities."""
     scales = model.scales
     drawn: dict[str, Tensor] = {}
 
-    def run(camera: Camera) -> Any:
+    def run(camera: clod.Camera) -> Any:
         if camera.name not in drawn:
             drawn[camera.name] = dial(model, camera, s).drawn
         return cuda.compact(model.means, model.quats, scales, drawn[camera.name])
@@ -225,7 +224,7 @@ def compaction(model: clod.Gaussians, s: float) -> Callable[[Camera], Any]:
     return run
 
 
-def one_pass_differs(model: clod.Gaussians, camera: Camera, s: float) -> dict[str, float]:
+def one_pass_differs(model: clod.Gaussians, camera: clod.Camera, s: float) -> dict[str, float]:
     """Compiled formula and plain one: the largest difference of drawn opacities, and Gaussians that only one keeps."""
     assert model.sigma_d is not None and model.attenuation is not None
     fused = attenuate(model.opacity_logits, model.sigma_d, (model.means, camera), s, model.attenuation)
@@ -237,18 +236,18 @@ def one_pass_differs(model: clod.Gaussians, camera: Camera, s: float) -> dict[st
     return {"drawn": float(apart.max()), "kept_by_one": int((fused.keep.cpu() != plain.keep).sum())}
 
 
-def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, Scene]:
+def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, clod.Scene]:
     """A perturbed city, and photographs of the unperturbed one."""
     truth = city(size.count)
     cameras = city_cameras(2 * size.views, size.width, size.height, where="mixed", count=size.count)
     views = photograph(truth, cameras, device)
-    return perturb(truth), Scene(tuple(views[: size.views]), tuple(views[size.views :]))
+    return perturb(truth), clod.Scene(tuple(views[: size.views]), tuple(views[size.views :]))
 
 
 @torch.no_grad()
-def photograph(truth: clod.Gaussians, cameras: list[Camera], device: torch.device) -> list[View]:
+def photograph(truth: clod.Gaussians, cameras: list[clod.Camera], device: torch.device) -> list[clod.View]:
     there = truth.to(device)
-    return [View(camera, clod.render(there, camera).pixels.cpu()) for camera in cameras]
+    return [clod.View(camera, clod.render(there, camera).pixels.cpu()) for camera in cameras]
 
 
 def reset_peak(device: torch.device) -> None:

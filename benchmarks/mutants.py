@@ -18,7 +18,6 @@ from pathlib import Path
 
 import clod_adapter as clod
 from clod_adapter._support.version import package_version
-from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.file_formats import FORMATS as FILE_FORMATS
 from clod_adapter.io.file_formats import WRITABLE
 from clod_adapter.io.file_formats import write as write_model
@@ -104,7 +103,7 @@ def _adapters(folder: Path) -> list[Input]:
     tuned = gaussians.replace(**{name: value + 0.1 for name, value in gaussians.tensors().items()})
     for adapted in (gaussians, tuned):
         adapter = clod.extract(base.gaussians, adapted, fingerprint=base.fingerprint, config={"seed": 0, "row": row})
-        save_adapter(folder / "a.safetensors", adapter)
+        clod.save_adapter(folder / "a.safetensors", adapter)
         inputs.append({"a.safetensors": (folder / "a.safetensors").read_bytes()})
     return inputs
 

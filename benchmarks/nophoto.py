@@ -17,7 +17,6 @@ from dataclasses import asdict
 
 import clod_adapter as clod
 from adapt import at_shares
-from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
 from common import append, arguments, checkpoint, stored, table
 from common import photographs as photographs_of
@@ -52,7 +51,7 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
         # Of the views to train on alone; none is held out of them.
         views = clod.Scene(tuple(render_pseudo_views(base, [view.camera]).train[0] for view in photographs.train), ())
     if kind == "placed":
-        views = render_pseudo_views(base, place_cameras(base, seed=config.seed))
+        views = render_pseudo_views(base, clod.place_cameras(base, seed=config.seed))
     if kind == "complemented":
         views, config = add_pseudo_views(base, photographs, config)
     seconds = time.perf_counter() - began

@@ -20,9 +20,8 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from clod_adapter.adapter import attach
-from clod_adapter.cameras import Camera
-from clod_adapter.config import CUTS, NORMALIZERS, AdaptConfig, AttenuationConfig
+import clod_adapter as clod
+from clod_adapter.config import CUTS, NORMALIZERS, AttenuationConfig
 from clod_adapter.distances import normalized_distances
 from clod_adapter.evaluation.popping import dial_popping, path, path_popping
 from clod_adapter.extinction import sigma_for_extinction
@@ -55,7 +54,7 @@ def measure() -> list[dict[str, Any]]:
     return rows
 
 
-def scene(normalizer: str, cut: str) -> tuple[Gaussians, dict[str, list[Camera]]]:
+def scene(normalizer: str, cut: str) -> tuple[Gaussians, dict[str, list[clod.Camera]]]:
     """The Gaussians, and by name of the sweep the cameras it goes through."""
     draw = torch.Generator().manual_seed(0)
     n = OTHERS + TOGETHER + 1
@@ -69,7 +68,7 @@ def scene(normalizer: str, cut: str) -> tuple[Gaussians, dict[str, list[Camera]]
     logits[OTHERS:] = 3.0
     quats = torch.randn(n, 4, generator=draw)
     plain = Gaussians(means, quats, log_scales, logits, (colours - 0.5) / SH_C0, torch.empty(n, 0, 3))
-    config = AdaptConfig()
+    config = clod.AdaptConfig()
     settings = replace(config.attenuation(DISTANCE), normalizer=normalizer, cut=cut)
     eye = torch.tensor([0.0, 0.0, -DISTANCE])
     start = _looking(eye, torch.zeros(3))
@@ -82,20 +81,20 @@ def scene(normalizer: str, cut: str) -> tuple[Gaussians, dict[str, list[Camera]]
     leave[OTHERS:-1] = 2.2
     distances = normalized_distances(means, start, settings)
     sigma = sigma_for_extinction(logits, distances, leave, settings).clamp(max=100.0)
-    return attach(plain, sigma, settings), cameras
+    return clod.attach(plain, sigma, settings), cameras
 
 
-def _looking(eye: Tensor, at: Tensor, width: int = 48, height: int = 36) -> Camera:
+def _looking(eye: Tensor, at: Tensor, width: int = 48, height: int = 36) -> clod.Camera:
     forward = torch.nn.functional.normalize(at - eye, dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward), dim=0)
     viewmat = torch.eye(4)
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
     K = torch.tensor([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1.0]])
-    return Camera(viewmat, K, width, height)
+    return clod.Camera(viewmat, K, width, height)
 
 
-def _sweep(some: Gaussians, cameras: dict[str, list[Camera]], sweep: str, steps: int) -> Any:
+def _sweep(some: Gaussians, cameras: dict[str, list[clod.Camera]], sweep: str, steps: int) -> Any:
     assert some.attenuation is not None
     if sweep == "dial":
         return dial_popping(some, cameras[sweep][0], some.attenuation.max_sv, steps=steps)
@@ -109,7 +108,7 @@ def steepest(config: AttenuationConfig) -> float:
 
 
 @torch.no_grad()
-def bound(some: Gaussians, cameras: dict[str, list[Camera]], sweep: str, steps: int) -> float:
+def bound(some: Gaussians, cameras: dict[str, list[clod.Camera]], sweep: str, steps: int) -> float:
     """``W (255 L h + 1)``: the most that a pixel can change in a step of the default; 0 where no distance changes."""
     assert some.attenuation is not None
     if sweep == "turn":

@@ -17,7 +17,6 @@ from statistics import fmean
 from typing import Any
 
 import clod_adapter as clod
-from clod_adapter.adapter import detach
 from common import CACHE, COMMAND, ROOT, Process, Row, append, arguments, capture, table
 
 import numpy as np
@@ -70,7 +69,7 @@ def compare(shown: Shown, gaussians: clod.Gaussians, camera: clod.Camera) -> lis
         shown.run(f"clod.setEquation({str(dial is not None).lower()})")
         shown.run("clod.setDial(given)", dial or 1.0)
         with torch.no_grad():
-            wanted = clod.render(gaussians, camera, dial) if dial else clod.render(detach(gaussians), camera)
+            wanted = clod.render(gaussians, camera, dial) if dial else clod.render(clod.detach(gaussians), camera)
         error = float(((shown.picture().astype(np.float64) - wanted.pixels.numpy()) ** 2).mean())
         rows.append({
             "camera": camera.name, "virtual_scale": dial, "psnr": 10 * float(np.log10(255**2 / max(error, 1e-9))),
