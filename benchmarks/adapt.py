@@ -1,6 +1,5 @@
 """Quality, count and seconds of adapted checkpoints, by dial value.
 
-    python benchmarks/adapt.py plush_half bonsai146 ci_banana plush_half/pretrained_mask
     python benchmarks/adapt.py plush_half bonsai146 --set max_sv=14.0 --label "max_sv 14" --seeds 0 1 2
     python benchmarks/adapt.py plush_half --ablations      # one row for each choice in docs/method.md
     python benchmarks/adapt.py plush_half bonsai146 --leave-out    # the rows of docs/performance.md

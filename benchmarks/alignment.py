@@ -1,7 +1,5 @@
 """The alignment check before training: which inputs it stops, which frame it guesses, and its CPU seconds.
 
-    python benchmarks/alignment.py [SCENE ...]
-
 The inputs are checkpoints of the shared captures with their own photographs, with cameras transformed as other tools
 transform them, with another scene's checkpoint and with another exposure; and checkpoints in the normalised frames of
 gsplat's and nerfstudio's trainers. Each case adds a row to ``results/alignment.jsonl``.

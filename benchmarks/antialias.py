@@ -1,12 +1,9 @@
 """Quality of checkpoints drawn with the screen-space filter of their training and with others.
 
-    python benchmarks/antialias.py [SCENE ...]
-
-No capture has a checkpoint that was trained antialiased. Substitutes are each scene's checkpoint with its attributes
-tuned on the training photographs with gsplat's antialiasing ("on") and with Mip-Splatting's filter ("mip"). Each
-checkpoint adds a row with the held-out PSNR of each filter and the choice of ``compare_filters``. One substitute of
-each scene is also adapted with the right filter and with the classic one, to photographs and to its own renders. Rows
-go to ``results/antialias.jsonl``.
+No capture has a checkpoint that was trained antialiased. Substitutes are each scene's checkpoint, tuned on the training
+photographs with gsplat's antialiasing ("on") and with Mip-Splatting's filter ("mip"). Each checkpoint adds a row to
+``results/antialias.jsonl``: the held-out PSNR with each filter, and the choice of ``compare_filters``. One substitute
+of each scene is also adapted with the right filter and with the classic one, to photographs and to its own renders.
 """
 
 from __future__ import annotations

@@ -1,13 +1,11 @@
 """PSNR of baked plain files against the dial, at equal counts.
 
     clod-adapt ci_banana/pretrained.ply --images ci_banana --max-sv 5 --iters 400 -o clod.ply
-    python benchmarks/bake.py clod.ply ci_banana
-    python benchmarks/bake.py --table                      # the rows as a Markdown table
+    python benchmarks/bake.py clod.ply ci_banana           # --table: the rows as a Markdown table
 
-The model is an adapted file of the capture. The count at a dial value is the dial's mean over the held-out views. Files
-of that count, or of the nearest count that a dial value has, are baked for:
+The count at a dial value is the dial's mean over the held-out views. Files of the nearest count are baked for:
 
-- ``d' = 1``: one distance for all Gaussians, with the opacities of the dial value, as earlier versions baked;
+- ``d' = 1``: one distance for all Gaussians, with the opacities of the dial value;
 - ``images``: all training cameras, as ``clod-adapt export --images`` does;
 - ``stored``: the viewpoints that adapting stores in the file;
 - ``placed``: placed cameras.

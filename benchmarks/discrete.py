@@ -1,11 +1,10 @@
 """Two levels of detail with a hard switch against one file with its dial: a picture and the measured jump.
 
     clod-adapt demo                                      # makes demo/gallery.ply and demo/capture
-    python benchmarks/discrete.py
+    python benchmarks/discrete.py                        # docs/images/discrete_vs_continuous.png
 
-docs/images/discrete_vs_continuous.png shows a held-out view in four strips from least to most detail, for two levels
-and for one file; below it PSNR and the change from frame to frame over a sweep. The two levels are the file at both
-ends of its dial, so that they differ in the switch alone. Adds a row to ``results/discrete.jsonl``.
+The two levels are the file at both ends of its dial, so that only the switch differs. Adds a row to
+``results/discrete.jsonl``.
 """
 
 from __future__ import annotations

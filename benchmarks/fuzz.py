@@ -1,14 +1,12 @@
 """Damaged files of every input format: each must be read, or refused with ClodError, quickly and in little memory.
 
-    python benchmarks/fuzz.py                                # 200,000 cases over all formats, some minutes
     python benchmarks/fuzz.py --cases 20000 --format colmap --seed 3 --record
     python benchmarks/fuzz.py --format ply --seed 0 --case 4711 --keep /tmp/it    # one case, its files kept
 
 A case is an input (mutants.py) that is damaged (damage.py) at random from its seed and number. A failure is any other
 result: another exception, a process that dies (COLMAP is C++) or takes more than LIMIT_S, more than LIMIT_MB of memory
 beyond that of undamaged inputs, a refused allocation, a warning, a message of several lines or without the file's name,
-a file opened outside of the case's folder, a program started, a connection made. Each failure is printed with the
-command that repeats it.
+a file opened outside of the case's folder, a program started, a connection made.
 """
 
 from __future__ import annotations

@@ -2,13 +2,11 @@
 
     python benchmarks/gpu.py                         # needs torch with CUDA, gsplat 1.5.3 and the shared data
     python benchmarks/gpu.py --device cpu --small    # the same code, in seconds
-    python benchmarks/gpu.py --only city --count 2000000
 
-``tests``: the contract of every backend, the gsplat integration, the optimiser and the compiled formula.
+``tests``: the contract of every backend, the gsplat integration, the optimizer and the compiled formula.
 ``plush``: plush_half adapted on the GPU and on the CPU with the same settings: seconds, and held-out quality.
-``city``: a synthetic city adapted (peak memory), then near and far frames at s = 1, 3, 7 in turn with plain gsplat,
-packed and not, on the same file: times, the dial's share (attenuation, culling and compaction), PSNR against the full
-render and against the truth.
+``city``: a synthetic city adapted (peak memory), then near and far frames in turn with plain gsplat, packed and not, on
+the same file: times, the dial's share (attenuation, culling and compaction), PSNR.
 
 Each adds rows to ``results/gpu.jsonl``. Without a GPU, plain is this package's CPU rasterizer without the dial.
 """

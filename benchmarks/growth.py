@@ -1,13 +1,10 @@
 """Time and memory of the commands by the number of Gaussians, and of adapting by the photographs.
 
-    python benchmarks/growth.py                            # all of it: some 15 minutes, 12 GB of memory, 8 GB of disk
-    python benchmarks/growth.py --plot                     # runs nothing: the picture and the tables of the rows
+    python benchmarks/growth.py            # some 15 minutes, 12 GB of memory, 8 GB of disk; --plot runs nothing
 
-Runs each command in its own process on cities (``city.py``) that are made once and kept in benchmarks/cache. Measures
-wall and CPU seconds and resident memory, sampled every 20 ms, by phase. A city of 1000 Gaussians gives the start-up
-cost. Rows go to results/growth.jsonl; the last row of a kind counts. Writes docs/images/growth.png and the tables of
-docs/growth.md, with an estimate for a city of 100 million. Exponents are least squares in logarithms of the seconds
-above the start-up cost, from 100k Gaussians on.
+Runs each command in its own process on synthetic cities, which are kept in benchmarks/cache. Measures wall and CPU
+seconds and resident memory by phase. A city of 1000 Gaussians gives the start-up cost. Rows go to results/growth.jsonl;
+the last row of a kind counts. Writes docs/images/growth.png and the tables of docs/growth.md.
 """
 
 from __future__ import annotations

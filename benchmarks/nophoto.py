@@ -1,8 +1,6 @@
 """Quality after adapting with few photographs or none, on real held-out photographs.
 
-    python benchmarks/nophoto.py plush_half bonsai146 ci_banana
     python benchmarks/nophoto.py plush_half --iters 600 --kinds photographs placed
-    python benchmarks/nophoto.py plush_half --few 4 --iters 300 --max-sv 5 --kinds photographs complemented
     python benchmarks/nophoto.py --table                  # the rows as a Markdown table
 
 The kinds of views: ``photographs`` (real cameras and photographs), ``teacher`` (real cameras, renders of the

@@ -1,10 +1,7 @@
 """The pictures of the viewer and of a report for README, of the demo's scene, by a headless Chromium.
 
-    clod-adapt demo                  # makes demo/base.ply, demo/gallery.ply and demo/capture
-    python benchmarks/pictures.py    # docs/images/viewer.webp and docs/images/report.webp
-
-The viewer shows a held-out view with the wipe between the dial's end and the checkpoint, without its frame time, which
-would be that of WebGL in software. The report is the top of the page that ``clod-adapt eval --report`` writes.
+clod-adapt demo                  # makes demo/base.ply, demo/gallery.ply and demo/capture
+python benchmarks/pictures.py    # docs/images/viewer.webp and docs/images/report.webp
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """Savings and cost of the plan: the command with everything included, with the plan, and with --trim.
 
-    python benchmarks/plan.py                               # every scene of the shared data, one row per run
-    python benchmarks/plan.py ci_banana --iters 300
-    python benchmarks/plan.py --table                       # the last rows as Markdown, for docs/plan.md
+    python benchmarks/plan.py ci_banana --iters 300         # without a scene all of them; --table: the stored rows
 
 A scene is a folder of the shared data, followed by the name of the checkpoint where it is not ``pretrained``, or a file
 without photographs. Each run is a process of its own. Rows go to ``results/plan.jsonl``.

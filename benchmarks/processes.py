@@ -1,13 +1,11 @@
 """Adapting in several processes against one: equality, speed, and the quality of a larger batch.
 
-    python benchmarks/processes.py plush_half bonsai146             # 1,500 views each, then three times 60 steps
     python benchmarks/processes.py plush_half --views 300 --repeats 1
 
 Three adaptations with the same number of views: one view per step; two views per step in one process with two threads;
-two views per step in two processes with one thread each, started by torchrun and connected by gloo. ``quality`` has the
-held-out PSNR of each, ``largest_difference`` the difference between the last two, by attribute. ``speed`` has medians
-of the seconds of both over ``--speed-steps`` steps: importance, training, and of training the first process's seconds
-of waiting for the other and of moving and summing gradients.
+two views per step in two processes with one thread each (torchrun, gloo). ``quality`` has the held-out PSNR of each,
+``largest_difference`` the difference between the last two by attribute, ``speed`` median seconds of both over
+``--speed-steps`` steps: initialization, training, and of training the waiting and the exchange of gradients.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""Times of the CPU rasterizer and of a C++ baseline, and its agreement with a float64 reference.
-
-    python benchmarks/rasterize.py                     # times on W1 and W2, of fewer Gaussians too
-    python benchmarks/rasterize.py --accuracy          # image and gradients against float64 instead
-    python benchmarks/rasterize.py --extreme           # times of extreme scenes instead
+"""Times of the CPU rasterizer and of a C++ baseline; or its agreement with a float64 reference; or extreme scenes.
 
 The baseline is the yardstick, a hand-written C++ kernel outside the repository, built with g++; its fields are null
 where it is absent. Each runs in its own process with 2 threads, in turn step by step, so that drift of the machine

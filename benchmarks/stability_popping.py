@@ -1,17 +1,13 @@
-"""Popping: the largest change of any pixel per step, for every normaliser and cut, by the length of the steps.
+"""Popping: the largest change of any pixel per step, for every normalizer and threshold, by the length of the steps.
 
 The scene is made to pop: Gaussians in one place with one extinction scale, and one far away that enters the frustum
-while the camera turns, among others with different extinction scales. Three sweeps in steps of four lengths: the dial
-from 1 to max_sv, a camera that turns, a camera that moves and turns. A fade changes in proportion to the step's length
-(slope 1), a pop by the same amount at any length (slope 0).
-
-The default, one D for the scene and the soft cut, has a bound. For the opacities that are drawn (``attenuation``)::
+while the camera turns. A fade changes in proportion to the step's length (slope 1), a pop by the same amount (slope 0).
+The default, one D for the scene and the soft threshold, has a bound. For the drawn opacities (``attenuation``)::
 
     |change of opacity| <= L h    L = 2 x (1.5 - 4 ln x), x = min(1.5 tau max_sv, exp(-5/8)); at most 4.3
 
-``h`` is the change of ``log s``, or of the logarithm of the distance. Rasterizers drop an alpha below 1/255, one level
-of a pixel. With ``W`` the largest sum of the Gaussians' footprints over one pixel and colours within 0 and 1, no pixel
-changes by more than ``W (255 L h + 1)`` levels.
+``h`` is the change of ``log s``, or of the logarithm of the distance. With ``W`` the largest sum of the Gaussians'
+footprints over one pixel, no pixel changes by more than ``W (255 L h + 1)`` levels: rasterizers drop an alpha < 1/255.
 """
 
 from __future__ import annotations

@@ -1,13 +1,11 @@
 """Seconds from the command to the first training step, by phase.
 
-    python benchmarks/startup.py                         # everything, on plush_half; several minutes
-    python benchmarks/startup.py warm help               # two cases of it
-    python benchmarks/startup.py --record                # and a row in results/startup.jsonl
+    python benchmarks/startup.py --record                # on plush_half; several minutes
 
-Times the command ``clod-adapt PLY --images DIR --iters 1`` from outside, by its messages and the seconds in its report:
+Times the command ``clod-adapt PLY --images DIR --iters 1`` from outside, by its messages and its report:
 
 - ``help``: ``--help``, and the error for a checkpoint that does not exist;
-- ``warm``: with kernels cached by an earlier run, the median of three runs;
+- ``warm``: with cached kernels, the median of three runs;
 - ``first``: with an empty cache, where kernels are compiled.
 """
 

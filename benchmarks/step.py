@@ -1,11 +1,8 @@
 """Time of a training step by section and kernel, on real checkpoints.
 
-    python benchmarks/step.py                  # plush_half and bonsai146
-    python benchmarks/step.py plush_half --record
-
 Wall times are means over the steps after the first few, with the default settings at the start of training.
-``splat_share`` is the rasterizer's share of a step, forward and backward. A row names the commit of the imported
-package: to measure another one, put it first on PYTHONPATH.
+``splat_share`` is the rasterizer's share of a step. A row names the commit of the imported package: to measure another
+one, put it first on PYTHONPATH.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 """Held-out error against seconds of training: ours, the paper's form, and a specialist for each dial value.
 
-    python benchmarks/tradeoff.py plush_half                  # all methods at all budgets, an hour or so
     python benchmarks/tradeoff.py plush_half --iters 150 400 1200
-    python benchmarks/tradeoff.py plush_half --plot           # docs/error_vs_time.html and its PNG of the stored rows
+    python benchmarks/tradeoff.py plush_half --plot     # docs/error_vs_time.html and its PNG, from the stored rows
 
-A budget is a number of steps; each is a run of its own with its own schedule. A specialist is made for one count, which
-ours keeps at that dial value in its longest run: the base merged to it, then tuned for as many
-steps; at s = 1 the whole base, tuned. Each run adds a row to ``results/tradeoff.jsonl``.
+Each number of steps is a separate run with its own schedule. A specialist is the base merged to the count that ours
+keeps at that dial value, then tuned for as many steps; at s = 1 the whole base, tuned. Each run adds a row to
+``results/tradeoff.jsonl``.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
 """The page in a headless Chromium against clod_adapter.render: pictures and counts.
 
-    python benchmarks/viewer.py                      # plush_half and bonsai146
-
-Each capture's checkpoint is first adapted for 100 steps (kept in ``benchmarks/cache``), enough to compare pictures. At
-some held-out cameras and dial values, and with the equation off: PSNR between the browser's picture and
-``clod_adapter.render``, and the counts. The time to the first frame is that of WebGL in software. Each capture adds a
-row to ``results/viewer.jsonl``.
+Each capture's checkpoint is first adapted for 100 steps (kept in ``benchmarks/cache``). At some held-out cameras and
+dial values, and with the equation off: PSNR between the browser's picture and ``clod_adapter.render``, and the counts.
+The time to the first frame is that of WebGL in software. Each capture adds a row to ``results/viewer.jsonl``.
 """
 
 from __future__ import annotations
