@@ -42,8 +42,7 @@ class Drawn(NamedTuple):
     opacities: Tensor
     colors: Tensor
     depths: Tensor
-    reach: Tensor
-    """``[n, 2]``: how far from the centre alpha is 1/255, along x and y; a little more, for the margins."""
+    reach: Tensor  # [n, 2]: distance from the centre at which alpha is 1/255, along x and y, with a margin
 
 
 class Exact(NamedTuple):
@@ -159,21 +158,21 @@ def patches(drawn: Drawn, camera: Camera) -> Iterator[tuple[tuple[slice, slice],
 
 
 def alphas_of(pixels: Tensor, centres: Tensor, conics: Tensor, opacities: Tensor) -> Tensor:
-    """``[p, n]``, clamped, but not cut at 1/255."""
+    """``[p, n]``, clamped, but not 0 below 1/255."""
     x, y = (pixels[:, None] - centres).unbind(-1)
     power = -0.5 * (conics[:, 0, 0] * x * x + conics[:, 1, 1] * y * y) - conics[:, 0, 1] * x * y
     return (opacities * power.exp()).clamp(max=reference.ALPHA_MAX)
 
 
 def doubts(alphas: Tensor, weights: Tensor, depths: Tensor) -> Tensor:
-    """``[p, 3]``: pixels near a turn of an alpha's cut, of the pixel's end, of the order of two Gaussians."""
-    cut = torch.where(alphas >= reference.ALPHA_MIN, alphas, 0)
-    through = torch.cumprod(1 - cut, 1)
+    """``[p, 3]``: pixels near a decision: an alpha at 1/255, the pixel's end, the order of two Gaussians."""
+    seen = torch.where(alphas >= reference.ALPHA_MIN, alphas, 0)
+    through = torch.cumprod(1 - seen, 1)
     before = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], 1)
     at_cut = ((alphas / reference.ALPHA_MIN - 1).abs() < CUT) & (before > reference.T_MIN * (1 - CUT))
     at_end = (through / reference.T_MIN - 1).abs() < CUT
     close = depths.diff() < DEPTH * depths[1:]
-    swapped = (weights[:, :-1] > 0) & (cut[:, 1:] > 0) & close
+    swapped = (weights[:, :-1] > 0) & (seen[:, 1:] > 0) & close
     return torch.stack([at_cut.any(1), at_end.any(1), swapped.any(1)], 1)
 
 
@@ -185,9 +184,9 @@ def count_pairs(scene: Workload) -> int:
         light = torch.ones(len(pixels), 1, dtype=torch.float64)
         for some in rows.split(CHUNK) if len(rows) else ():
             alphas = alphas_of(pixels, *(field[some] for field in drawn[:3]))
-            cut = torch.where(alphas >= reference.ALPHA_MIN, alphas, 0)
-            through = light * torch.cumprod(1 - cut, 1)
-            pairs += int(((cut > 0) & (through > reference.T_MIN)).sum())
+            seen = torch.where(alphas >= reference.ALPHA_MIN, alphas, 0)
+            through = light * torch.cumprod(1 - seen, 1)
+            pairs += int(((seen > 0) & (through > reference.T_MIN)).sum())
             light = through[:, -1:]
             alive = light[:, 0] > reference.T_MIN
             pixels, light = pixels[alive], light[alive]

@@ -52,9 +52,6 @@ def main() -> None:
         "placed": clod.place_cameras(adapted, views=PLACED),
     }
 
-    def psnr(gaussians: clod.Gaussians) -> float:
-        return clod.evaluate(gaussians, views.test, [1.0])[0].psnr
-
     rows = []
     for s in [s for s in DIALS if s <= config.max_sv]:
         dial = clod.evaluate(adapted, views.test, [s])[0]
@@ -67,7 +64,7 @@ def main() -> None:
             files[name] = clod.bake(adapted, at, cameras=places)
         files["at s"] = clod.bake(adapted, s, cameras=training)
         for name, gaussians in files.items():
-            counts[name], found[name] = len(gaussians), psnr(gaussians)
+            counts[name], found[name] = len(gaussians), clod.evaluate(gaussians, views.test, [1.0])[0].psnr
         rows.append({"virtual_scale": s, "count": counts, "psnr": found})
     append(FILE, {
         "benchmark": "bake", "model": Path(args.model).name, "label": args.label, "scene": args.scene,
@@ -81,8 +78,8 @@ def at_one_distance(gaussians: clod.Gaussians, count: int) -> clod.Gaussians:
     assert gaussians.sigma_d is not None and gaussians.attenuation is not None
     logits, sigma, config = gaussians.opacity_logits, gaussians.sigma_d, gaussians.attenuation
     ones = torch.ones_like(logits)
-    leaving = extinction_scale(logits, sigma, ones, config).sort(descending=True).values
-    at = attenuate(logits, sigma, ones, max(float(leaving[count]), 1.0), config)
+    scales = extinction_scale(logits, sigma, ones, config).sort(descending=True).values
+    at = attenuate(logits, sigma, ones, max(float(scales[count]), 1.0), config)
     opacities = at.drawn.clamp(1e-9, 1 - 1e-7)
     return clod.detach(gaussians.replace(opacity_logits=opacities.logit())).select(at.keep)
 

@@ -132,8 +132,7 @@ def main() -> None:
     one.add_argument("--blocks", type=int, nargs="+", default=[4, 8])
     one.add_argument("--iters", type=int, default=clod.AdaptConfig().iters)
     one.set_defaults(run=seams)
-    other = commands.add_parser("memory")
-    other.set_defaults(run=memory)
+    commands.add_parser("memory").set_defaults(run=memory)
     args = parser.parse_args()
     args.run(args)
 

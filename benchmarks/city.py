@@ -31,12 +31,7 @@ BLUR = 0.1  # of a checkpoint: its Gaussians are larger than the truth by this, 
 
 
 def city(count: int, *, seed: int = 0, sh_degree: int = 3) -> Gaussians:
-    """``count`` Gaussians of a city, the same ones for the same arguments.
-
-    Args:
-        count: at least 1000.
-        sh_degree: 0 to 4.
-    """
+    """``count`` Gaussians of a city, at least 1000, with SH of degree 0 to 4; the same ones for the same arguments."""
     if count < 1000:
         raise SystemExit(f"a city needs at least 1000 Gaussians, not {count}")
     random = np.random.default_rng(seed)
@@ -138,8 +133,7 @@ def perturb(truth: Gaussians, seed: int = 0) -> Gaussians:
 def write_city(folder: str | Path, count: int, images: int, width: int, height: int, *, where: Where = "mixed") -> None:
     """Writes a perturbed checkpoint ``folder/city.ply`` and photographs of the truth as a COLMAP scene.
 
-    Args:
-        folder: does not exist or is empty; it appears when everything in it is complete.
+    The folder does not exist or is empty; it appears when everything in it is complete.
     """
     truth = city(count)
     cameras = city_cameras(images, width, height, where=where, count=count)

@@ -143,17 +143,17 @@ class Process:
 
     Attributes:
         out, lines: stdout; the lines of stderr.
-        moments, cpu: wall and CPU seconds up to the first line on stderr that matches each pattern of ``said``.
+        moments, cpu: wall and CPU seconds up to the first line on stderr that matches each pattern of ``messages``.
         memory: (seconds, resident bytes, CPU seconds) every 20 ms.
         seconds, cpu_seconds, peak_bytes: of the whole process, after ``finish``.
     """
 
     def __init__(
-        self, words: Iterable[object], said: Mapping[str, str] | None = None, *, until: str = "",
+        self, words: Iterable[object], messages: Mapping[str, str] | None = None, *, until: str = "",
         environment: Mapping[str, str] | None = None, code: int = 0,
     ) -> None:  # fmt: skip
         """Runs to the end, or with ``until`` to a line on stdout that has this text: ``line``. ``code``: exit code."""
-        self.words, self.said, self.code = [str(word) for word in words], said or {}, code
+        self.words, self.messages, self.code = [str(word) for word in words], messages or {}, code
         self.began = time.perf_counter()
         self.process = subprocess.Popen(
             self.words, text=True, cwd=tempfile.gettempdir(), stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -179,7 +179,7 @@ class Process:
         assert self.process.stderr is not None
         for line in self.process.stderr:
             self.lines.append(line.rstrip())
-            for name, pattern in self.said.items():
+            for name, pattern in self.messages.items():
                 if name not in self.moments and re.search(pattern, line):
                     self.moments[name], self.cpu[name] = self.now(), self._used()[1]
 

@@ -48,21 +48,15 @@ TESTS = (
 
 @dataclass(frozen=True)
 class Size:
-    """How large everything is.
+    """How large everything is."""
 
-    Attributes:
-        count: Gaussians of the city; width, height: of its pictures; views: to train on, as many again in each test.
-        steps: of the city's adaptation; plush_steps: of plush_half's, None for the default.
-        repeats: of each timed frame.
-    """
-
-    count: int = 6_000_000
-    width: int = 1600
+    count: int = 6_000_000  # Gaussians of the city
+    width: int = 1600  # of its pictures
     height: int = 1066
-    views: int = 24
-    steps: int = 300
-    plush_steps: int | None = None
-    repeats: int = 30
+    views: int = 24  # to train on, and as many to test
+    steps: int = 300  # of the city's adaptation
+    plush_steps: int | None = None  # of plush_half's; None: the default
+    repeats: int = 30  # of each timed frame
 
 
 SMALL = Size(count=3000, width=64, height=48, views=4, steps=3, plush_steps=3, repeats=2)

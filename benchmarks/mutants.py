@@ -170,7 +170,7 @@ def _transforms(folder: Path) -> list[Input]:
     blender = [{"camera_angle_x": 0.8, "frames": part} for part in (named[:2], named[2:])]
     documents = [
         {"transforms.json": {**size, "frames": frames}}, {"transforms.json": {**size, **lens, "frames": frames[:1]}},
-{"transforms_train.json": blender[0], "transforms_test.json": blender[1]},
+        {"transforms_train.json": blender[0], "transforms_test.json": blender[1]},
     ]  # fmt: skip
     return [{name: json.dumps(content).encode() for name, content in files.items()} for files in documents]
 

@@ -56,22 +56,22 @@ def speed() -> list[Row]:
         library = contenders.build_yardstick(YARDSTICK, Path(folder))
         rows = []
         for name in workloads.SIZES:
-            peers = {"ours": Worker(contenders.our_jobs, name)}
+            workers = {"ours": Worker(contenders.our_jobs, name)}
             if library:
-                peers["yardstick"] = Worker(contenders.yardstick_jobs, name, YARDSTICK, library)
-            rows.append(time_workload(name, peers))
-            for worker in peers.values():
+                workers["yardstick"] = Worker(contenders.yardstick_jobs, name, YARDSTICK, library)
+            rows.append(time_workload(name, workers))
+            for worker in workers.values():
                 worker.pool.shutdown()
     return rows
 
 
-def time_workload(name: str, peers: dict[str, Worker]) -> Row:
-    """Steps of all peers in turn, then our frames of fewer Gaussians."""
+def time_workload(name: str, workers: dict[str, Worker]) -> Row:
+    """Steps of all rasterizers in turn, then our frames of fewer Gaussians."""
     turns = range(REPEATS + WARM)
-    steps = [{peer: worker("step") for peer, worker in peers.items()} for _ in turns]
-    memory = {peer: worker("memory") for peer, worker in peers.items()}
-    pairs = peers["yardstick"]("pairs") if "yardstick" in peers else None
-    frames, kept = zip(*([peers["ours"](job) for job in ("frame", "kept")] for _ in turns), strict=True)
+    steps = [{peer: worker("step") for peer, worker in workers.items()} for _ in turns]
+    memory = {peer: worker("memory") for peer, worker in workers.items()}
+    pairs = workers["yardstick"]("pairs") if "yardstick" in workers else None
+    frames, kept = zip(*([workers["ours"](job) for job in ("frame", "kept")] for _ in turns), strict=True)
     if None in [*(step["ours"] for step in steps), *frames, *kept]:
         sys.exit(f"our own process ended early on {name}")
     count, width, height, _ = workloads.SIZES[name]

@@ -29,9 +29,7 @@ def stiffness(rows: list[dict[str, Any]], path: Path) -> None:
                 )  # fmt: skip
             for y, text in ((start, "start"), (CONVERGED * start, "converged")):
                 axes.axhline(y, color=QUIET, linewidth=0.8, linestyle="--")
-                if not timed:
-                    there = axes.get_yaxis_transform()
-                    axes.text(0.01, y * 0.97, text, transform=there, fontsize=8, color=QUIET, va="top")
+                axes.text(0.01, y * 0.97, text, transform=axes.get_yaxis_transform(), fontsize=8, color=QUIET, va="top")
             axes.set(xscale="log", yscale="log")
             tidy(axes)
         label_log(panels[0].yaxis, "{:g}")
@@ -49,7 +47,7 @@ def stiffness(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def popping(rows: list[dict[str, Any]], path: Path) -> None:
-    """Log-log, a panel a sweep: a colour a normaliser, dashes for the hard cut."""
+    """Log-log, a panel a sweep: a colour a normalizer, dashes for the hard threshold."""
     colours = {"scene": BLUE, "quantile": GREEN, "max": ORANGE}
     with new_figure((10.4, 3.9), layout="constrained") as figure:
         panels = figure.subplots(1, len(SWEEPS), sharey=True)
@@ -76,9 +74,7 @@ def popping(rows: list[dict[str, Any]], path: Path) -> None:
             label_log(axes.yaxis, "{:g}", subs=(1,))
             tidy(axes)
         panels[0].set_ylabel("largest change of a pixel in a step (of 255)")
-        note = {"fontsize": 8, "color": QUIET, "va": "top"}
-        panels[0].text(1 / max(LENGTHS_OF_STEPS), TOGETHER * 0.9, f"one level for each of the {TOGETHER}", **note)
-        panels[1].text(1 / max(LENGTHS_OF_STEPS), 0.24, "scene, both cuts: no change", fontsize=8, color=BLUE)
+        panels[0].text(1 / max(LENGTHS_OF_STEPS), TOGETHER, "one level for each", fontsize=8, color=QUIET, va="top")
         panels[1].set_xlabel("length of a step, share of the sweep")
         handles = {h.get_label(): h for axes in panels for h in axes.get_lines() if not h.get_label().startswith("_")}
         figure.legend(handles.values(), handles.keys(), **LEGEND, ncols=4)

@@ -98,7 +98,7 @@ def _sweep(some: Gaussians, cameras: dict[str, list[clod.Camera]], sweep: str, s
 
 
 def steepest(config: AttenuationConfig) -> float:
-    """L: by how much an opacity under the soft cut can change per unit of log s."""
+    """L: by how much an opacity under the soft threshold can change per unit of log s."""
     x = min(1.5 * config.tau * config.max_sv, math.exp(-0.625))
     return max(2 * x * (1.5 - 4 * math.log(x)), 2 / math.e)
 
@@ -135,5 +135,5 @@ def tables(rows: list[dict[str, Any]]) -> str:
         if default:
             lines.append(["its bound", "", *(f"{min(own[end]['bound'], 255):.0f}" for end in ends)])
     held = all(row["pixel"] <= row["bound"] + 0.05 for row in rows if "bound" in row)
-    found = table(["normaliser", "cut", *(f"{name}: 1/{steps}" for name, steps in ends)], lines)
+    found = table(["normalizer", "threshold", *(f"{name}: 1/{steps}" for name, steps in ends)], lines)
     return f"{found}\n\nThe bound {'holds' if held else 'IS BROKEN'}."

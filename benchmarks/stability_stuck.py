@@ -1,7 +1,6 @@
 """Extreme initial values of sigma_d: Gaussians that cannot recover, and the objective after training.
 
-Used by ``stability_stiffness.py``. Gaussians before a camera, whose right sigma_d spans eight decades, go through the
-training step itself, of sigma_d alone.
+Gaussians before a camera, whose right sigma_d spans eight decades, go through the training step, of sigma_d alone.
 
 - ``stuck``: sigma_d starts at 0, ten thousand times too small and too large, and at SIGMA_MAX, a quarter each. A
   Gaussian cannot recover if no picture at any dial value has a gradient for it, and the count term has none in the
@@ -35,7 +34,7 @@ DIALS = tuple(CONFIG.max_sv ** (k / 11) for k in range(12))
 METHODS: dict[str, tuple[clod.AdaptConfig, bool]] = {
     "paper: linear sigma under a relu": (PAPER, False),
     "the same with a floor of 1e-4": (PAPER, True),
-    "ours without the count law": (replace(CONFIG, reg_weight=0.0), True),
+    "ours without the count term": (replace(CONFIG, reg_weight=0.0), True),
     "ours, linear sigma": (replace(CONFIG, parameter="linear"), True),
     "ours": (CONFIG, True),
 }
@@ -128,7 +127,7 @@ def stuck(run: Trainer) -> int:
     """
     p, config, camera, reading = run.parameters, run.config, run.sampler.views[0].camera, run.objective.attenuation
     distances = normalized_distances(p["means"], camera, reading)
-    seen = out = lifted = pressed = torch.zeros(len(distances), dtype=torch.bool)
+    seen = out = raised = lowered = torch.zeros(len(distances), dtype=torch.bool)
     for s in DIALS:
         x = p[run.decay].detach().requires_grad_()
         now = attenuate(p["opacity_logits"], run.objective.sigma(x), distances, s, reading)
@@ -140,8 +139,8 @@ def stuck(run: Trainer) -> int:
                 count_gradient(now._replace(keep=kept), p["opacity_logits"], s, reading.tau, 1.0, config)
                 for kept in (torch.zeros_like(now.keep), torch.ones_like(now.keep))
             )
-            lifted, pressed = lifted | (none < 0), pressed | (all_ > 0)
+            raised, lowered = raised | (none < 0), lowered | (all_ > 0)
         else:  # the paper's term never lowers it
             count = soft_count(now.log_opacities, s, reading.tau, config.temperature)
-            pressed = pressed | (torch.autograd.grad(count, x)[0] != 0)
-    return int((~seen & ~torch.where(out, lifted, pressed)).sum())
+            lowered = lowered | (torch.autograd.grad(count, x)[0] != 0)
+    return int((~seen & ~torch.where(out, raised, lowered)).sum())

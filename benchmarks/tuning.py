@@ -32,19 +32,13 @@ RATES = {"means": 1.6e-4, "quats": 1e-3, "log_scales": 5e-3, "opacity_logits": 5
 
 @dataclass(frozen=True, kw_only=True)
 class Tuning:
-    """How a tuning is run.
+    """The settings of a tuning."""
 
-    Attributes:
-        iters: steps, over which the learning rates fall exponentially to ``final`` of RATES.
-        seed: of the order of the views, and of the prefixes' lengths.
-        draw: "log" draws a prefix's share of all log-uniformly from [shortest, 1]; None trains no prefixes.
-    """
-
-    iters: int
-    seed: int = 0
+    iters: int  # steps, over which the learning rates fall exponentially to ``final`` of RATES
+    seed: int = 0  # of the order of the views, and of the prefixes' lengths
     rates: dict[str, float] = field(default_factory=lambda: dict(RATES))
     final: float = 0.05
-    draw: str | None = None
+    draw: str | None = None  # "log": a prefix's share of all is log-uniform in [shortest, 1]; None: no prefixes
     shortest: float = 0.01
 
 
