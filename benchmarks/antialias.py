@@ -65,10 +65,8 @@ def row(gaussians: clod.Gaussians, scene: clod.Scene) -> dict[str, Any]:
     found = compare_filters(gaussians, [*scene.test, *scene.train])
     seconds = time.process_time() - began
     compared = {name: round(value, 2) for name, value in found.psnr.items()}
-    return {
-        "count": len(gaussians), "psnr": psnr, "chosen": found.chosen, "compared": compared,
-        "compare_cpu_s": round(seconds, 2),
-    }  # fmt: skip
+    chosen = {"chosen": found.chosen, "compared": compared, "compare_cpu_s": round(seconds, 2)}
+    return {"count": len(gaussians), "psnr": psnr, **chosen}
 
 
 def adapted(gaussians: clod.Gaussians, scene: clod.Scene, drawn: str, teacher: str) -> dict[str, Any]:

@@ -66,9 +66,8 @@ def compare(
             one, other = clod.render(some, view.camera, s), clod.render(whole, view.camera, s)
             a, b, photograph = one.image.clamp(0, 1), other.image.clamp(0, 1), view.image / 255
             errors = [(x - y).square().mean(2) for x, y in ((a, photograph), (b, photograph), (a, b))]
-            ours.append(db(float(errors[0].mean())))
-            theirs.append(db(float(errors[1].mean())))
-            between.append(db(float(errors[2].mean())))
+            for values, error in zip((ours, theirs, between), errors, strict=True):
+                values.append(db(float(error.mean())))
             kept.append((float(one.kept.float().mean()), float(other.kept.float().mean())))
             border += torch.tensor([*(float(e[mask].double().sum()) for e in errors), float(mask.sum())])
         difference = [a - b for a, b in zip(ours, theirs, strict=True)]

@@ -210,5 +210,5 @@ class Process:
             sys.exit("\n".join([f"exit code {self.process.returncode}: {' '.join(self.words)}", *self.lines]))
 
     def cost(self) -> Row:
-        seconds = {"seconds": round(self.seconds, 3), "cpu_seconds": round(self.cpu_seconds, 3)}
-        return {**seconds, "peak_bytes": self.peak_bytes}
+        times = {"seconds": round(self.seconds, 3), "cpu_seconds": round(self.cpu_seconds, 3)}
+        return times | {"peak_bytes": self.peak_bytes}

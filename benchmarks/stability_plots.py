@@ -10,6 +10,7 @@ from stability_popping import STEPS as LENGTHS_OF_STEPS
 from stability_popping import SWEEPS, TOGETHER
 from stability_stiffness import CONFIG, CONVERGED, LENGTHS, OPTIMIZERS, STEPS, curves
 
+NOTE = {"fontsize": 8, "color": QUIET, "va": "top"}
 LEGEND = {"loc": "outside lower center", "frameon": False, "fontsize": 8.5}
 
 
@@ -29,7 +30,8 @@ def stiffness(rows: list[dict[str, Any]], path: Path) -> None:
                 )  # fmt: skip
             for y, text in ((start, "start"), (CONVERGED * start, "converged")):
                 axes.axhline(y, color=QUIET, linewidth=0.8, linestyle="--")
-                axes.text(0.01, y * 0.97, text, transform=axes.get_yaxis_transform(), fontsize=8, color=QUIET, va="top")
+                if not timed:
+                    axes.text(0.01, y * 0.97, text, transform=axes.get_yaxis_transform(), **NOTE)
             axes.set(xscale="log", yscale="log")
             tidy(axes)
         label_log(panels[0].yaxis, "{:g}")
@@ -74,7 +76,8 @@ def popping(rows: list[dict[str, Any]], path: Path) -> None:
             label_log(axes.yaxis, "{:g}", subs=(1,))
             tidy(axes)
         panels[0].set_ylabel("largest change of a pixel in a step (of 255)")
-        panels[0].text(1 / max(LENGTHS_OF_STEPS), TOGETHER, "one level for each", fontsize=8, color=QUIET, va="top")
+        panels[0].text(1 / max(LENGTHS_OF_STEPS), TOGETHER * 0.9, f"one level for each of the {TOGETHER}", **NOTE)
+        panels[1].text(1 / max(LENGTHS_OF_STEPS), 0.3, "scene, both thresholds: no change", **NOTE)
         panels[1].set_xlabel("length of a step, share of the sweep")
         handles = {h.get_label(): h for axes in panels for h in axes.get_lines() if not h.get_label().startswith("_")}
         figure.legend(handles.values(), handles.keys(), **LEGEND, ncols=4)

@@ -19,8 +19,7 @@ from clod_adapter.cli.shared.console import Console
 from clod_adapter.report import page
 from clod_adapter.report.charts import draw_training, error, inline_svg, training_chart
 from clod_adapter.report.style import new_figure, save_figure
-from common import RESULTS, ROOT, Row, append, arguments, checkpoint, photographs
-from common import stored as stored_rows
+from common import RESULTS, ROOT, Row, append, arguments, checkpoint, photographs, stored
 from tuning import Tuning, merge, tune
 
 FILE = "tradeoff.jsonl"
@@ -95,17 +94,17 @@ def specialists(
 
 def counts(scene: str) -> list[int]:
     """Gaussians that ours keeps at each dial value in its longest run, of equal ones the last."""
-    longest = max((r for r in reversed(stored(scene)) if r["method"] == "ours"), key=lambda r: r["iters"])
+    longest = max((r for r in reversed(rows_of(scene)) if r["method"] == "ours"), key=lambda r: r["iters"])
     return [round(row["kept"]) for row in longest["rows"]]
 
 
-def stored(scene: str) -> list[Row]:
-    return [row for row in stored_rows(FILE) if (row["scene"], row["max_sv"]) == (scene, MAX_SV)]
+def rows_of(scene: str) -> list[Row]:
+    return [row for row in stored(FILE) if (row["scene"], row["max_sv"]) == (scene, MAX_SV)]
 
 
 def plot(scene: str) -> None:
     """A panel a dial value: error against seconds of training, the mean over seeds of the last row of each."""
-    rows = list({(r["method"], r["iters"], r["seed"]): r for r in stored(scene)}.values())  # the last of each
+    rows = list({(r["method"], r["iters"], r["seed"]): r for r in rows_of(scene)}.values())  # the last of each
     if not rows:
         sys.exit(f"there are no rows of {scene} in {RESULTS / FILE}")
     dials = [row["virtual_scale"] for row in rows[-1]["rows"]]

@@ -91,8 +91,8 @@ def summary(row: Row) -> str:
     for dial in (*DIALS, None):
         found = [each for each in row["rows"] if each["virtual_scale"] == dial]
         errors = [each["psnr"] for each in found]
-        apart = max(abs(each["kept"] - each["kept_in_page"]) for each in found)
-        lines.append([dial, *(f"{psnr:.1f}" for psnr in (min(errors), max(errors), fmean(errors))), apart])
+        psnr = [f"{value:.1f}" for value in (min(errors), max(errors), fmean(errors))]
+        lines.append([dial or "equation off", *psnr, max(abs(each["kept"] - each["kept_in_page"]) for each in found)])
     return table(["s", "least dB", "most", "mean", "counts differ by"], lines)
 
 
