@@ -51,7 +51,7 @@ def viewer(chromium: Any, folder: Path) -> bytes:
         shown.run("clod.setWipe(0.55, 'base')")
         shown.page.evaluate("document.getElementById('frame').style.visibility = 'hidden'")
         shown.page.wait_for_timeout(250)  # longer than the page draws fewer pixels after a movement
-        shown.run("clod.settled()")
+        shown.run("clod.whenDrawn()")
         return bytes(shown.page.screenshot(timeout=120_000))
 
 

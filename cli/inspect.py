@@ -9,7 +9,8 @@ from typing import Any
 
 from clod_adapter._support.version import package_version
 from clod_adapter.calibration import Calibration
-from clod_adapter.inspection.report import Inspection, Splat, inspect
+from clod_adapter.inspection.report import Inspection, inspect
+from clod_adapter.inspection.splat import Splat
 from clod_adapter.inspection.statistics import Spread
 from clod_adapter.io.settings import WARNING
 

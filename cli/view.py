@@ -12,7 +12,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.io.scene.poses import load_cameras
 from clod_adapter.viewer.page import policy, served_page
 from clod_adapter.viewer.payload import Payload, page_config
-from clod_adapter.viewer.server import Answer, Server
+from clod_adapter.viewer.server import Response, Server
 
 from .shared.antialiasing import with_filter, with_filter_of
 from .shared.browsers import open_browser
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> None:
             console.say("ended")
 
 
-def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Answer], dict[str, Any]]:
+def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Response], dict[str, Any]]:
     """The answers of the server by path, and the report."""
     model, base = with_filter(read_checkpoint(args.model, console, args.activated), args, console), None
     if args.base:
@@ -56,9 +56,9 @@ def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Ans
     payloads = {MODEL: Payload.of(model)} | ({BASE: Payload.of(base)} if base else {})
     entries = [payload.describe(href=path) for path, payload in payloads.items()]
     page = served_page(page_config(entries[0], entries[1] if base else None, cameras, opening))
-    answers = {"/": Answer("text/html; charset=utf-8", len(page), lambda: (page,), policy("'self'"))}
+    answers = {"/": Response("text/html; charset=utf-8", len(page), lambda: (page,), policy("'self'"))}
     for path, payload in payloads.items():
-        answers[path] = Answer("application/octet-stream", payload.size, payload.blocks)
+        answers[path] = Response("application/octet-stream", payload.size, payload.blocks)
     return answers, {
         "command": "view", "version": package_version(), "model": args.model, "base": args.base, "scene": args.images,
         "base_count": len(model.gaussians), "cameras": len(cameras), "notes": [*model.notes, *notes],

@@ -1,9 +1,11 @@
-"""The rasterizers under contract. A new backend is a line in BACKENDS."""
+"""The rasterizers that share one contract. A new backend is a line in BACKENDS."""
 
 from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -15,14 +17,14 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Backend:
-    """A rasterizer as the tests call it: with CPU tensors in and out, wherever and in whatever type it works.
+    """A rasterizer with CPU tensors in and out, whatever its device and type.
 
     Attributes:
-        module: below ``clod_adapter.rasterizers``.
-        device: that it works on.
-        dtype: what its inputs are brought to.
-        repeats: the same input gives the same bits; else the same but for the rounding of sums in no fixed order.
-        looser: how many times as far off as the CPU's it may be: 1 but for kernels in float32 with fast intrinsics.
+        module: name below ``clod_adapter.rasterizers``.
+        device: where it runs.
+        dtype: type of its inputs.
+        repeats: whether the same input gives the same bits; otherwise sums are rounded in no fixed order.
+        looser: factor on the tolerances; above 1 for float32 kernels with fast intrinsics.
     """
 
     module: str
@@ -41,12 +43,12 @@ class Backend:
 
     @property
     def stands_in(self) -> bool:
-        """Whether it is torch in place of kernels, whose pace and threads are not the backend's."""
+        """Whether torch replaces the kernels; its speed and threads are not the backend's."""
         return self.module == "cuda" and self.device == "cpu"
 
     @property
     def rounding(self) -> dict[str, float]:
-        """What the results of one input may differ by from run to run, for ``assert_same`` and ``assert_close``."""
+        """Tolerances between runs with one input, for ``assert_same`` and ``assert_close``."""
         return {"rtol": 0.0, "atol": 0.0} if self.repeats else {"rtol": 1e-3, "atol": 1e-3}
 
 
@@ -58,8 +60,19 @@ BACKENDS = {
 }
 
 
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Sets the number of torch's threads, and restores it at the end."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def fresh_copy(monkeypatch: pytest.MonkeyPatch, name: str, package: str, installed: ModuleType | None) -> ModuleType:
-    """A second copy of ``clod_adapter.integrations.NAME``, imported while ``package`` is this module, or absent."""
+    """A second copy of ``clod_adapter.integrations.NAME``, imported with ``package`` replaced or absent."""
     monkeypatch.setitem(sys.modules, package, installed)
     spec = importlib.util.find_spec(f"clod_adapter.integrations.{name}")
     assert spec is not None and spec.loader is not None

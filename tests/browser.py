@@ -4,7 +4,7 @@
         page = chromium.new_page()
 
 Needs Playwright's Python package (not its browsers) and a Chromium or Chrome on the PATH, or at CLOD_CHROMIUM. Where
-one is missing the test is skipped and says which; with CLOD_NEED_BROWSER=1 it fails instead.
+one is missing the test is skipped with a reason; with CLOD_NEED_BROWSER=1 it fails instead.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def find() -> str:
 
 @contextmanager
 def launch(*flags: str) -> Iterator[Any]:
-    """A Playwright browser with a profile of its own, closed at the end; skips where it cannot be had.
+    """A Playwright browser with its own profile, closed at the end; skips where there is none.
 
     Pages from ``file://`` and loopback are read as a user's browser reads them; ``flags`` are added to Chromium's.
     """
@@ -57,7 +57,7 @@ def launch(*flags: str) -> Iterator[Any]:
 
 
 def missing(what: str) -> NoReturn:
-    """Skips the test, or fails it where a browser was promised."""
+    """Skips the test; fails it if CLOD_NEED_BROWSER is 1."""
     if os.environ.get("CLOD_NEED_BROWSER") == "1":
         pytest.fail(f"{what} (CLOD_NEED_BROWSER=1)")
     pytest.skip(what)

@@ -1,4 +1,4 @@
-"""Fixtures for more than one folder: the shared data, and a tiny capture made here."""
+"""Fixtures of several folders: the shared data, a browser, and a tiny capture."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Capture:
 
 @pytest.fixture(scope="session")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """300 Gaussians in Inria's layout, seen from a circle around them."""
+    """300 Gaussians in Inria's layout, photographed from a circle around them."""
     folder = tmp_path_factory.mktemp("capture")
     scene = folder / "scene"
     (scene / "images").mkdir(parents=True)

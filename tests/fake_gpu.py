@@ -1,4 +1,4 @@
-"""A device that is none: its tensors are CPU tensors behind a wall, and what would fail on a GPU fails on it.
+"""A simulated device: it wraps CPU tensors, and operations that would fail on a GPU fail on it.
 
 Mixing its tensors with the CPU's in one operation, ``.numpy()``, and indexing the CPU's with its own are refused; 0-d
 CPU tensors mix, as on CUDA. It is torch's private backend under the name ``gpu``, which is neither "cpu" nor "cuda".
@@ -22,7 +22,7 @@ MOVES = ("aten._to_copy.default", "aten.copy_.default")  # what may see tensors 
 
 
 class Walled(Tensor):
-    """A tensor of the device; ``inner`` is where its numbers are."""
+    """A tensor of the device; ``inner`` is the CPU tensor."""
 
     inner: Tensor
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
@@ -70,7 +70,7 @@ class _Dispatch(TorchDispatchMode):
 
 
 class _Functions(TorchFunctionMode):
-    """What torch does below where it can be seen: ``torch.tensor`` moves its data, and ``tolist`` reads its own."""
+    """Handles calls that dispatch does not see: ``torch.tensor`` with a device, and ``tolist``."""
 
     def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
@@ -84,12 +84,12 @@ class _Functions(TorchFunctionMode):
 
 @lru_cache(maxsize=1)
 def register() -> bool:
-    """To be called before the process's first backward pass, when autograd makes a thread for each device there is.
+    """Registers the device; must precede the first backward pass, when autograd starts a thread per device.
 
-    Not where there is a GPU: autograd would take this one for the accelerator.
+    Does nothing with a real GPU, since autograd would use this one as the accelerator.
 
     Returns:
-        Whether torch can have devices that are written in Python. Older versions cannot.
+        Whether this version of torch supports devices written in Python.
     """
     if torch.cuda.is_available():
         return True
@@ -108,7 +108,7 @@ def register() -> bool:
 
 @contextmanager
 def fake_gpu() -> Iterator[torch.device]:
-    """While it lasts there is the device; skips where torch cannot have it."""
+    """The device, within the context; skips where torch does not support it."""
     if not register():
         pytest.skip("this torch has no devices that are written in Python")
     with _Dispatch(), _Functions():

@@ -1,4 +1,4 @@
-"""What the documentation says to type: fenced blocks, commands within sentences, and how they are run."""
+"""Commands of the documentation: fenced blocks and commands within sentences, parsed and run."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Block:
 
     Attributes:
         language: of the fence; ``sh`` for the README's, which have none.
-        reason: why it is not run, from ``<!-- not run: REASON -->`` above it; empty where it is.
+        reason: why it is not run, from ``<!-- not run: REASON -->`` above it; empty if it is run.
     """
 
     page: Path
@@ -67,7 +67,7 @@ def blocks(page: Path) -> list[Block]:
 
 
 def spoken(page: Path, program: str) -> list[str]:
-    """Commands of a program within sentences and in indented blocks, those with options and nothing left open."""
+    """Complete commands of a program with options, within sentences and in indented blocks."""
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", text)]
     lines = [line.strip() for line in text.splitlines() if line.startswith("    ")]
@@ -76,7 +76,7 @@ def spoken(page: Path, program: str) -> list[str]:
 
 
 def parse(words: list[str]) -> None:
-    """Raises the ClodError of ``clod-adapt`` options that there are not."""
+    """Raises ClodError for unknown options of ``clod-adapt``."""
     words = words[: words.index(">")] if ">" in words else words
     name = words[1] if len(words) > 1 and words[1] in COMMANDS else ""
     build_parser(name).parse_args(words[2:] if name else words[1:])
@@ -127,5 +127,5 @@ def _run_python(words: list[str]) -> None:
 
 
 def skipped(words: list[str]) -> str:
-    """Why a command is not run, wherever it stands; empty where it is."""
+    """The reason why a command is never run; empty if it is run."""
     return SKIPPED.get(words[0], "") or SKIPPED.get(" ".join(words[:2]), "")

@@ -1,4 +1,4 @@
-"""What the tests of the file formats share: models with the odd cases, damage, and splat-transform where it is."""
+"""Shared by the tests of file formats: models with edge cases, damaged files, and splat-transform."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ORIGIN = (5.1e5, -4096.0, 0.25)
 
 
 def model(degree: int = 3, count: int = 40) -> Gaussians:
-    """With a dial, an opaque Gaussian, one that never decays, one that does not fade at all, and long rotations."""
+    """Gaussians with a dial: an opaque one, extreme values of sigma_d, and rotations of any length."""
     g = gaussians(count, degree, seed=degree)
     sigma = torch.rand(count, generator=torch.Generator().manual_seed(1)) * 4
     sigma[:4] = torch.tensor([1e9, 0.0, 1e-3, 65504.0])
@@ -51,7 +51,7 @@ def turned(a: torch.Tensor, b: torch.Tensor) -> float:
 
 
 def covariances(g: Gaussians) -> torch.Tensor:
-    """``[N, 3, 3]`` float64 of the ellipsoids, whichever of several rotations says so."""
+    """``[N, 3, 3]`` float64 covariances, which do not depend on the choice among equivalent rotations."""
     w, x, y, z = (g.quats.double() / g.quats.double().norm(dim=1, keepdim=True)).unbind(1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -63,7 +63,7 @@ def covariances(g: Gaussians) -> torch.Tensor:
 
 
 def damaged(whole: bytes, data: st.DataObject) -> bytes:
-    """A file cut short, or with a few bytes changed, its beginning more often than the rest."""
+    """A truncated file, or one with a few bytes changed, mostly near its beginning."""
     if data.draw(st.booleans()):
         return whole[: data.draw(st.integers(0, len(whole) - 1))]
     changed = bytearray(whole)
@@ -74,7 +74,7 @@ def damaged(whole: bytes, data: st.DataObject) -> bytes:
 
 
 def splat_transform(*arguments: str | Path) -> None:
-    """Runs splat-transform, or skips the test where it is not: on PATH, or at $CLOD_SPLAT_TRANSFORM."""
+    """Runs splat-transform from PATH or $CLOD_SPLAT_TRANSFORM; skips the test where it is missing."""
     command = os.environ.get("CLOD_SPLAT_TRANSFORM") or shutil.which("splat-transform")
     if command is None:
         pytest.skip("splat-transform is not on PATH, and CLOD_SPLAT_TRANSFORM does not say where it is")
@@ -113,16 +113,20 @@ def change_setting(path: Path, name: str, old: str, new: str) -> Path:
     return path
 
 
-def without_comments(path: Path, **columns: float) -> Path:
+def without_comments(path: Path, **columns: Any) -> Path:
     """The file as another tool writes it: without its comments, some columns added or changed in every row."""
-    old = PlyData.read(str(path))["vertex"].data
+    rows, found = with_columns(PlyData.read(str(path))["vertex"].data, **columns), path.with_name("rewritten.ply")
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(found))
+    return found
+
+
+def with_columns(old: np.ndarray, **columns: Any) -> np.ndarray:
+    """The rows of a PLY with float columns added or changed."""
     added = [(name, "f4") for name in columns if name not in old.dtype.names]
     rows = np.zeros(len(old), old.dtype.descr + added)
     for name in rows.dtype.names or ():
         rows[name] = columns[name] if name in columns else old[name]
-    found = path.with_name("rewritten.ply")
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(found))
-    return found
+    return rows
 
 
 def change_glb(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:

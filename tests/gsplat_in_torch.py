@@ -1,6 +1,6 @@
 """gsplat 1.5.3's own ``rasterization`` without CUDA: its Python as it stands, torch in place of its five kernels.
 
-Slow, for a few dozen Gaussians on a few tiles. What the kernels do is in it: rows of an opacity below 1/255 are dropped
+Slow: for a few dozen Gaussians on a few tiles. It follows the kernels: rows of an opacity below 1/255 are dropped
 in the projection and narrow by their opacity, packed rows, tiles and keys are in the kernels' order, and what the
 packed kernels cannot do (a background, gsplat's issue 764) is refused.
 """
@@ -19,7 +19,7 @@ ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN = 1 / 255, 0.999, 1e-4
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Has gsplat, and who calls its kernels by themselves, find these where they look for them."""
+    """Replaces the kernels in gsplat and its rendering module."""
     import gsplat
     from gsplat import rendering
     from gsplat.cuda import _torch_impl

@@ -26,7 +26,7 @@ CALL = "means3D means2D opacities shs colors_precomp scales rotations cov3D_prec
 
 
 class Fork(NamedTuple):
-    """What is in the settings beside SETTINGS; the parameters of the call; the results."""
+    """Settings in addition to SETTINGS, parameters of the call, and results."""
 
     settings: str
     call: str
@@ -48,7 +48,7 @@ FORKS = {
 
 
 def module(name: str) -> Any:
-    """What ``import diff_gaussian_rasterization`` gives where this fork is installed."""
+    """The module ``diff_gaussian_rasterization`` of this fork."""
     fork = FORKS[name]
 
     class GaussianRasterizer(nn.Module):
@@ -87,14 +87,14 @@ def _depths(settings: Any, means: Tensor) -> Tensor:
 
 
 def _filter(settings: Any) -> ScreenFilter:
-    """Of the forks that have one in their settings; the others', and those told nothing, have the usual one."""
+    """The screen filter of the settings; the classic one where they name none."""
     if kernel := getattr(settings, "kernel_size", None):
         return ScreenFilter(variance=kernel, compensate=True)
     return ScreenFilter(compensate=bool(getattr(settings, "antialiasing", None)))
 
 
 def _draw(settings: Any, given: dict[str, Any]) -> dict[str, Tensor]:
-    """Every result that some fork has; ``radii`` and ``touched`` are of the Gaussians, not of what is drawn."""
+    """Every result of any fork; ``radii`` and ``touched`` have a row per Gaussian."""
     width, height = settings.image_width, settings.image_height
     fx, fy = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
     K = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""What nerfstudio does to cameras before it trains, as its source has it."""
+"""nerfstudio's transformation of cameras before training, from its source."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
 """Comparison of a rasterizer with the float64 reference, forward and backward.
 
-What agreement means here: away from pixels where a cut may fall either way (an alpha at 1/255 or at
-the clamp, a pixel's end at 1e-4) the image and alpha differ by at most IMAGE, the gradient of each input
-by at most GRADIENT of its length. Pixels on a cut are counted, must be few, and may be off by what one
-Gaussian at 1/255 can do.
+Image and alpha differ by at most IMAGE, and the gradient of each input by at most GRADIENT of its length. Pixels at a
+threshold (an alpha at 1/255 or at the clamp, a transmittance at 1e-4) are excluded: they must be few, and may differ
+by the effect of one Gaussian at 1/255.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ Parameters = dict[str, Tensor]
 
 
 class Result(NamedTuple):
-    """A picture and, by name, the gradients of a weighted sum of its pixels."""
+    """An image and, by name, the gradients of a weighted sum of its pixels."""
 
     image: Tensor
     alpha: Tensor
@@ -33,7 +32,7 @@ class Result(NamedTuple):
 
 
 def weights(camera: Camera, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Random weights of the image's and alpha's pixels."""
+    """Random weights of the pixels of image and alpha."""
     g = torch.Generator().manual_seed(seed)
     return (
         torch.randn(camera.height, camera.width, 3, generator=g),

@@ -14,7 +14,7 @@ BLOCK = 256
 
 
 def write_packed(path: Path, gaussians: Gaussians, *, colours: bool = True) -> Path:
-    """Blocks in the rows' own order; without ``colours`` as older files are, whose colours are in [0, 1]."""
+    """Writes blocks in the order of the rows; without ``colours`` as in older files, with colours in [0, 1]."""
     count = len(gaussians)
     means, scales = gaussians.means.numpy(), gaussians.log_scales.numpy()
     rgb = 0.5 + SH_C0 * gaussians.sh0[:, 0].numpy()

@@ -1,4 +1,4 @@
-"""Photographs and COLMAP models of them that the tests of readers share."""
+"""Photographs and their COLMAP models, shared by the tests of readers."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def as_text(folder: Path) -> None:
 
 
 def model_of(folder: Path, kind: str, params: list[float], name: str = "a.png", cameras: int = 1, **size: int) -> None:
-    """A model of one image, through pycolmap, or its stand-in, alone."""
+    """Writes a model of one image with pycolmap or its stand-in."""
     size = size or {"width": 40, "height": 30}
     reconstruction = pycolmap.Reconstruction()
     for i in range(1, cameras + 1):
@@ -87,7 +87,7 @@ def model_of(folder: Path, kind: str, params: list[float], name: str = "a.png", 
 
 
 def seen(camera: pycolmap.Camera) -> np.ndarray:
-    """``[H, W, 3]`` uint8: a smooth pattern on the plane z = 1, as a camera at the origin sees it, lens and all."""
+    """``[H, W, 3]`` uint8: a smooth pattern on the plane z = 1, seen through the lens of a camera at the origin."""
     across, down = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     u, v = camera.cam_from_img(np.stack([across.ravel(), down.ravel()], axis=1)).T
     waves = [np.sin(5 * u + v), np.sin(5 * v - 2 * u), np.sin(4 * (u + v) + 1)]

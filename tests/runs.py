@@ -1,7 +1,8 @@
-"""What tests of the main job share: the names of its files, errors on demand, and processes without a slow start."""
+"""Shared by tests of training: file names, injected errors and signals, and processes that start quickly."""
 
 from __future__ import annotations
 
+import copy
 import json
 import signal
 import subprocess
@@ -14,7 +15,10 @@ from typing import Any
 
 import pytest
 
+from clod_adapter.config import AdaptConfig
+from clod_adapter.progress import Progress
 from clod_adapter.training.objective import Objective
+from clod_adapter.training.state import TrainingState
 
 OUTPUTS = ["dial.json", "dial.ply", "dial.safetensors"]
 STATE = "dial.resume.safetensors"
@@ -61,7 +65,7 @@ for line in sys.stdin:
 
 
 class Server:
-    """Runs ``clod-adapt`` in real processes that need no seconds to start."""
+    """Runs ``clod-adapt`` in forked processes, which start quickly."""
 
     def __init__(self) -> None:
         self.process = subprocess.Popen(
@@ -81,7 +85,7 @@ class Server:
         )  # fmt: skip
 
     def wait(self, pid: int) -> int:
-        """The exit code; of a killed process the signal, negative."""
+        """The exit code; the negative signal of a killed process."""
         return self.ask(wait=pid)
 
     def run(self, folder: Path, *words: object) -> tuple[int, str]:
@@ -109,7 +113,7 @@ def fail(*_: Any, **__: Any) -> Any:
 
 
 def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[..., Any]:
-    """``real``, which these signals interrupt at the beginning of its ``at``-th call."""
+    """``real``, interrupted by these signals at the beginning of its ``at``-th call."""
     calls = count(1)
 
     def pressed(*given: Any, **rest: Any) -> Any:
@@ -123,7 +127,7 @@ def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[.
 def change_step(
     patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any], only: Callable[[Any], bool] = lambda config: True
 ) -> None:
-    """The gradients of the ``at``-th step from here, of runs that ``only`` names, are what ``change`` makes of them."""
+    """Applies ``change`` to the gradients of the ``at``-th step of runs whose config satisfies ``only``."""
     real, steps = Objective.gradient_sum, count(1)
 
     def changed(self: Objective, *given: Any) -> Any:
@@ -131,3 +135,22 @@ def change_step(
         return change(found) if only(self.config) and next(steps) == at else found
 
     patch.setattr(Objective, "gradient_sum", changed)
+
+
+def config_of(**changes: Any) -> AdaptConfig:
+    """Fixed settings, so that the tests do not depend on the defaults."""
+    settings = {
+        "start_share": 0.6, "full_share": 0.5, "lr_sigma": 1e-2, "lr_means": 3e-5, "lr_quats": 4e-4,
+        "lr_scales": 2e-3, "lr_opacities": 1e-2, "lr_sh0": 1e-3, "lr_shN": 5e-5,
+    }  # fmt: skip
+    return AdaptConfig(**(settings | changes))
+
+
+def states_of(steps: set[int], found: dict[int, TrainingState]) -> Callable[[Progress], None]:
+    """A progress callback that keeps the states after these steps."""
+
+    def keep(progress: Progress) -> None:
+        if progress.state and progress.done in steps:
+            found[progress.done] = copy.deepcopy(progress.state())
+
+    return keep

@@ -53,14 +53,14 @@ def scene(n: int, degree: int, seed: int, *, size: float = 0.08) -> dict[str, Te
 
 
 def gaussians(n: int, degree: int, seed: int, *, size: float = 0.08) -> Gaussians:
-    """The same as a checkpoint stores them."""
+    """The same Gaussians as a checkpoint stores them."""
     s = scene(n, degree, seed, size=size)
     logs, logits = s["scales"].log(), s["opacities"].logit()
     return Gaussians(s["means"], s["quats"], logs, logits, s["sh0"], s["shN"])
 
 
 def dialled(n: int, degree: int, seed: int, **settings: Any) -> Gaussians:
-    """With a sigma_d that is log-normal around e, 0 in every 50th row, and attenuation settings (soft culling)."""
+    """Gaussians with a sigma_d log-normal around e, 0 in every 50th row, and soft culling."""
     sigma_d = (torch.randn(n, generator=torch.Generator().manual_seed(seed + 1)) + 1).exp()
     sigma_d[::50] = 0.0
     attenuation = AttenuationConfig(**{"tau": 0.02, "cut": "soft", "scene_distance": 3.0} | settings)
@@ -93,12 +93,12 @@ def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Ca
 
 @torch.no_grad()
 def photograph(truth: Gaussians, cameras: list[Camera]) -> tuple[View, ...]:
-    """What the cameras see of ``truth``, in bytes."""
+    """Views of ``truth`` as uint8 images."""
     return tuple(View(c, (render(truth, c).image.clamp(0, 1) * 255).round().to(torch.uint8)) for c in cameras)
 
 
 def capture(n: int = 300, views: int = 8, width: int = 48, height: int = 36, seed: int = 0) -> tuple[Gaussians, Scene]:
-    """A slightly wrong checkpoint and the photographs of what it should be; every fourth one is held out."""
+    """A slightly perturbed checkpoint and photographs of the original; every fourth one is held out."""
     truth = gaussians(n, 1, seed, size=0.15)
     g = torch.Generator().manual_seed(seed + 1)
 
@@ -113,8 +113,15 @@ def capture(n: int = 300, views: int = 8, width: int = 48, height: int = 36, see
     return base, Scene(tuple(v for k, v in enumerate(seen) if k % 4), seen[::4])
 
 
+def assert_equal(a: Gaussians, b: Gaussians) -> None:
+    """Asserts that both have the same bits and the same attenuation settings."""
+    assert a.tensors().keys() == b.tensors().keys() and a.attenuation == b.attenuation
+    for name, value in a.tensors().items():
+        assert torch.equal(value, b.tensors()[name]), name
+
+
 def stripped(data: bytes) -> bytes:
-    """A file without its calibration's times, the one thing in it that a seed does not settle."""
+    """A file without its calibration's times, which are not reproducible."""
     if data.startswith(b"ply"):
         return re.sub(rb"(?m)^(comment clod_adapter calibrated .*) \S+$", rb"\1", data)
     text = re.sub(rb'\\"frame_ms\\": [0-9.e-]+', b"", data[8:])
@@ -122,7 +129,7 @@ def stripped(data: bytes) -> bytes:
 
 
 def with_unseen(base: Gaussians, count: int = 40) -> tuple[Gaussians, Tensor]:
-    """``base`` with ``count`` Gaussians outside every image in between, and ``[N]`` bool: the rows of ``base``."""
+    """``base`` mixed with ``count`` Gaussians outside every image, and ``[N]`` bool: the rows of ``base``."""
     far = base.select(torch.arange(count)).replace(means=base.means[:count] + torch.tensor([0.0, 90.0, 0.0]))
     order = torch.randperm(len(base) + count, generator=torch.Generator().manual_seed(4))
     values = {name: torch.cat([value, far.tensors()[name]])[order] for name, value in base.tensors().items()}

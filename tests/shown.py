@@ -32,7 +32,7 @@ SECONDS = 10  # until waiting ends
 
 @dataclass
 class Shown:
-    """The page in a tab; its methods wait until what they asked for is drawn."""
+    """The page in a tab; its methods wait until their change is drawn."""
 
     page: Any
     errors: list[str] = field(default_factory=list)
@@ -50,7 +50,7 @@ class Shown:
 
     def run(self, script: str, *arguments: object) -> Any:
         return self.page.evaluate(
-            f"async (given) => {{ const r = await {script}; await clod.settled(); return r }}", *arguments
+            f"async (given) => {{ const r = await {script}; await clod.whenDrawn(); return r }}", *arguments
         )
 
     def until(self, condition: str) -> None:
@@ -71,12 +71,12 @@ class Shown:
         self.run("clod.setCamera(given)", entry)
 
     def picture(self) -> np.ndarray:
-        """``[H, W, 3]`` uint8, of the splats alone, at full resolution, as when nothing moves."""
+        """``[H, W, 3]`` uint8 of the splats alone at full resolution."""
         data = self.run("clod.capture()").partition(",")[2]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
     def counts(self) -> dict[str, int]:
-        return dict(self.page.evaluate("clod.settled().then(clod.counts)"))
+        return dict(self.page.evaluate("clod.whenDrawn().then(clod.counts)"))
 
 
 def assert_alike(picture: np.ndarray, wanted: np.ndarray, keep: Path) -> None:
@@ -136,7 +136,7 @@ def take(shown: Shown, path: Path) -> None:
 
 @contextmanager
 def serve(*words: object) -> Iterator[str]:
-    """The address of what ``clod-adapt view`` serves for these words."""
+    """The address of a server of ``clod-adapt view`` with these arguments."""
     answers, _ = make_page(build_parser("view").parse_args([str(word) for word in words]), Console(quiet=True))
     with Server(answers) as server:
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()

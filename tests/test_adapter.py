@@ -1,4 +1,4 @@
-"""The adapter's contract: it is the result, it comes off without a trace, and it knows its base."""
+"""The adapter reproduces the result, can be removed exactly, and identifies its base."""
 
 from __future__ import annotations
 
@@ -38,12 +38,10 @@ def adapt(base: Gaussians, names: list[str], scale: float = 0.01, seed: int = 1)
 
 @settings(deadline=None)
 @given(
-    st.lists(st.sampled_from(ATTRIBUTES), unique=True),
-    st.sampled_from([1e-9, 1e-3, 1.0, 1e4, 1e6]),
-    st.integers(0, 1000),
-    st.sampled_from([0, 3, 15]),
-)
-def test_applying_is_the_result(names: list[str], scale: float, seed: int, bands: int) -> None:
+    st.lists(st.sampled_from(ATTRIBUTES), unique=True), st.sampled_from([1e-9, 1e-3, 1.0, 1e4, 1e6]),
+    st.integers(0, 1000), st.sampled_from([0, 3, 15]),
+)  # fmt: skip
+def test_applying_an_adapter_gives_the_result(names: list[str], scale: float, seed: int, bands: int) -> None:
     base = gaussians(seed=seed, bands=bands)
     adapted = adapt(base, names, scale, seed + 1)
     before = bits(base)
@@ -67,7 +65,7 @@ def test_applying_is_the_result(names: list[str], scale: float, seed: int, bands
     ids=["half the size", "overflow", "underflow"],
 )
 def test_the_type_of_a_difference(unit: float, step: float, dtype: torch.dtype) -> None:
-    """Half floats where they can hold it; new values where it overflows, or is below what float16 resolves."""
+    """Differences in float16; new values in float32 where a difference overflows or underflows float16."""
     base = gaussians(50)
     base = base.replace(means=unit * base.means)
     adapted = adapt(base, ["means"], step)
@@ -100,7 +98,7 @@ def test_unchanged_values_keep_their_bits() -> None:
 
 
 def test_attach_and_detach() -> None:
-    """Without sigma_d the dial does nothing and comes off without a trace; with it, it is the one that was given."""
+    """Without sigma_d the dial has no effect and can be removed exactly; with it, its tensor is used as it is."""
     base, sigma_d = gaussians(), torch.rand(6)
     on, chosen = attach(base), attach(base, sigma_d, CONFIG)
     assert on.attenuation == AttenuationConfig(tau=1 / 255, cut="hard") and bits(detach(on)) == bits(base)
@@ -134,7 +132,7 @@ def test_a_different_base_is_refused() -> None:
         adapter.apply(gaussians(bands=3))
 
 
-def test_extract_refuses_what_is_no_adaptation() -> None:
+def test_extract_refuses_other_results() -> None:
     base = gaussians()
     with pytest.raises(ClodError, match="no sigma_d"):
         extract(base, base, fingerprint="f", config={})

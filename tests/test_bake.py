@@ -1,4 +1,4 @@
-"""Baking: for one camera the plain Gaussians look as the dial shows them, and for several. And the dial's order."""
+"""Baking for one camera and for several, and the order of rows by extinction."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CUTS = pytest.mark.parametrize("cut", ["hard", "soft"])
 
 
 def at_one_place(some: Gaussians) -> Gaussians:
-    """All at d' = 1 from ``camera()`` with a ``scene_distance`` of 4, exactly."""
+    """All Gaussians exactly at d' = 1 from ``camera()`` with a ``scene_distance`` of 4."""
     return some.replace(means=camera().position.add(torch.tensor([0.0, 0.0, 4.0])).expand(len(some), 3))
 
 
@@ -44,7 +44,7 @@ def test_opacities_are_those_drawn(cut: str) -> None:
 
 
 @CUTS
-def test_a_gaussian_at_the_threshold_has_an_opacity_that_a_file_can_hold(cut: str) -> None:
+def test_opacities_at_the_threshold_have_finite_logits(cut: str) -> None:
     config = AttenuationConfig(tau=0.02, cut=cut, scene_distance=4.0)
     logits, ones = torch.linspace(-2, 6, 5000), torch.ones(5000)
     for s in (1.0, 1.7, 3.3):
@@ -54,7 +54,7 @@ def test_a_gaussian_at_the_threshold_has_an_opacity_that_a_file_can_hold(cut: st
         assert 0 < len(baked) < 5000 and baked.opacity_logits.isfinite().all()
 
 
-def test_a_dial_that_does_nothing_changes_nothing() -> None:
+def test_a_dial_without_effect_changes_nothing() -> None:
     some = gaussians(50, 0, 1)
     some.opacity_logits[:2] = torch.tensor([22.0, math.inf])  # more than opaque is left, no number is not
     baked = bake(attach(some), 1.0, cameras=[camera(), camera()])
@@ -64,7 +64,7 @@ def test_a_dial_that_does_nothing_changes_nothing() -> None:
 
 
 def spread(n: int = 300, normalizer: str = "scene", cut: str = "soft") -> Gaussians:
-    """At many distances from ``camera()``, with decays at which some stay and some go."""
+    """Gaussians at many distances from ``camera()``, some of which are culled."""
     sigma = torch.rand(n, generator=torch.Generator().manual_seed(2)) * 2 + 0.1
     return attach(gaussians(n, 1, 7), sigma, replace(CONFIG, cut=cut, normalizer=normalizer))
 
@@ -73,7 +73,7 @@ def spread(n: int = 300, normalizer: str = "scene", cut: str = "soft") -> Gaussi
     ("cut", "normalizer", "s"),
     [("soft", "scene", 1.0), ("hard", "quantile", 2.5), ("soft", "max", 2.5), ("hard", "scene", 4.5)],
 )
-def test_for_a_camera_it_is_the_same_image_from_there(cut: str, normalizer: str, s: float) -> None:
+def test_baked_image_matches_render_from_its_camera(cut: str, normalizer: str, s: float) -> None:
     some = spread(normalizer=normalizer, cut=cut)
     want, baked = render(some, camera(), s), bake(some, s, camera())
     assert baked.sigma_d is None and baked.attenuation is None and 0 < len(baked) < 300
@@ -84,7 +84,7 @@ def test_for_a_camera_it_is_the_same_image_from_there(cut: str, normalizer: str,
 
 
 @pytest.mark.parametrize("cameras", [[camera()], ring(3, 61, 45)], ids=["one", "several"])
-def test_prefixes_are_what_is_baked(cameras: list[Camera]) -> None:
+def test_prefixes_match_baked_rows(cameras: list[Camera]) -> None:
     some = spread()
     rows = order_by_extinction(some, cameras)
     assert torch.equal(rows.sort().values, torch.arange(300))
@@ -106,7 +106,7 @@ def test_rows_with_equal_extinction_stay_in_order() -> None:
     assert (scales.diff() <= 0).all() and scales[0] > scales[-1]
 
 
-def test_for_several_cameras_every_gaussian_has_one_distance() -> None:
+def test_several_cameras_share_one_distance_per_gaussian() -> None:
     some, cameras, s = spread(), ring(3, 61, 45), 3.0
     assert some.sigma_d is not None and some.attenuation is not None
     d = torch.stack([normalized_distances(some.means, each, CONFIG).log() for each in cameras]).mean(0).exp()
@@ -131,7 +131,7 @@ def test_a_solved_count_is_the_number_of_rows(several: bool) -> None:
         assert rows(dial_for(some, keep=wanted, cameras=cameras, baked=several).virtual_scale) == wanted
 
 
-def test_bad_calls_are_named() -> None:
+def test_bad_arguments_are_refused() -> None:
     some, plain = spread(), gaussians(3, 0, 0)
     for message, call in {
         "no sigma_d": lambda: bake(plain, 1.0),

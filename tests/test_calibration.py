@@ -1,4 +1,4 @@
-"""The calibration table: what it refuses, and that JSON, adapter and PLY give it back exactly."""
+"""The calibration table: its checks, and exact round trips through JSON, adapter and PLY."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ GOOD: dict[str, Any] = {"rows": (ROW,), "total": 10, "views": 1, "width": 8, "he
         ({"machine": "caf\u00e9"}, "machine"),
     ],
 )
-def test_refused(bad: dict[str, Any], said: str) -> None:
+def test_bad_tables_are_refused(bad: dict[str, Any], said: str) -> None:
     Calibration(**GOOD)
     with pytest.raises(ClodError, match=said):
         Calibration(**{**GOOD, **bad})
@@ -104,23 +104,21 @@ def edited(path: Path, old: bytes, new: bytes) -> Path:
         (b"calibrated 1.0", b"calibrated one", "unusable and ignored"),
         (b"calibrated 1.0", b"calibrated 3.0", "unusable and ignored.*ascend"),
         (b"calibrated_with 4 1 8 8", b"calibrated_with 4 1 8", "unusable and ignored"),
-        (b"calibrated_with", b"calibrated_what", "unusable and ignored"),
         (b"8 photographs", b"8 paintings", "unusable and ignored.*against 'paintings'"),
-        (b"8 photographs", b"8 photographs 9", "unusable and ignored"),
         (b"calibrated_with 4", b"calibrated_with 5", "of 5 Gaussians and ignored, these are 4"),
         (b"viewpoint 1.5", b"viewpoint nan", "unusable and ignored.*finite"),
         (b"viewpoint 1.5 2.5 3.5 4.5", b"viewpoint 1.5 2.5 3.5 0.0", "unusable and ignored.*unit.*positive"),
         (b"viewpoint 1.5 2.5 3.5 4.5", b"viewpoint 1.5 2.5 3.5", "unusable and ignored"),
     ],
 )
-def test_a_damaged_table_does_not_cost_the_file(tmp_path: Path, old: bytes, new: bytes, said: str) -> None:
+def test_a_damaged_table_is_ignored(tmp_path: Path, old: bytes, new: bytes, said: str) -> None:
     path = dialled(tmp_path / "a.ply", viewpoints=(Viewpoint(1.5, 2.5, 3.5, 4.5),))
     loaded = load(edited(path, old, new))
     assert loaded.calibration is None and loaded.gaussians.sigma_d is not None
     assert any(re.search(said, note) for note in loaded.notes), loaded.notes
 
 
-def test_a_table_without_its_kind_is_against_photographs_and_not_passed_on(tmp_path: Path) -> None:
+def test_a_table_without_its_kind_is_against_photographs(tmp_path: Path) -> None:
     about = Calibration(**GOOD).as_dict()
     assert about.pop("against") == "photographs" and Calibration.from_dict(about) == Calibration(**GOOD)
     base = load(edited(dialled(tmp_path / "a.ply"), b" 8 photographs", b" 8"))

@@ -1,4 +1,4 @@
-"""Cameras and views: conventions and what is refused."""
+"""Cameras and views: conventions, checks, extent and near plane."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scenes import camera, in_front, ring
 
 
 @pytest.mark.parametrize("view", [camera(), *ring(3, 20, 16)], ids=range(4))
-def test_conventions(view: Camera) -> None:
+def test_viewmat_conventions(view: Camera) -> None:
     """The position is the world point that ``viewmat`` takes to 0; a point ahead has a positive z."""
     at_itself = view.viewmat @ torch.cat([view.position, torch.ones(1)])
     torch.testing.assert_close(at_itself, torch.tensor([0.0, 0, 0, 1]), rtol=0, atol=1e-6)
@@ -45,7 +45,7 @@ def test_extent_of_cameras() -> None:
     assert camera_extent([*cameras[:1] * 5, *cameras[1:2]]) > 0
 
 
-def test_rounding_between_cameras_is_no_extent() -> None:
+def test_rounding_between_cameras_has_no_extent() -> None:
     place, right = torch.tensor([3.0, -2.0, 1.5]), torch.tensor([1.0, 0, 0])
 
     def at(position: torch.Tensor, each: Camera) -> Camera:

@@ -1,4 +1,4 @@
-"""Configs: every field explained, every impossible value named."""
+"""Settings: every field has a description, and impossible values are refused."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ EDGES = {
 }  # fmt: skip
 
 
-def test_values_at_the_edge_are_taken() -> None:
+def test_limits_are_accepted() -> None:
     for name, value in EDGES.items():
         assert getattr(AdaptConfig(**{name: value}), name) == value
     AttenuationConfig(tau=0.19, max_sv=5.0)  # something must pass the threshold at the end of the dial
@@ -64,7 +64,7 @@ def test_every_field_has_help_and_a_default(kind: type) -> None:
         kind(0.5)
 
 
-def test_what_travels_with_the_file() -> None:
+def test_attenuation_settings_of_a_training() -> None:
     chosen = AdaptConfig(tau=0.01, eps=1e-6, normalizer="quantile", quantile=0.7, max_sv=7.0)
     want = AttenuationConfig(
         tau=0.01, cut="soft", eps=1e-6, normalizer="quantile", quantile=0.7, scene_distance=2.5, max_sv=7.0

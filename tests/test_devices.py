@@ -1,13 +1,11 @@
-"""Everything on the way from a checkpoint to its pictures and numbers works on another device than the CPU.
+"""Rendering, training and evaluation work on a device other than the CPU.
 
-On a GPU where there is one; else on a fake one, on which what would fail on a real one fails, with gsplat's Python and
-torch in place of its kernels.
+On a GPU, if there is one; otherwise on a simulated one (``fake_gpu``), with torch in place of gsplat's kernels.
 """
 
 from __future__ import annotations
 
 import importlib
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -32,6 +30,7 @@ from clod_adapter.initialization.importance import initialize, usable_views
 from clod_adapter.losses import photometric_loss
 from clod_adapter.metrics import psnr_ssim
 from clod_adapter.rasterizers import cpu, cuda
+from clod_adapter.render import dial
 from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.optimizer import RowAdam
@@ -46,7 +45,7 @@ CONFIG = AdaptConfig(iters=2, max_sv=4.0)
 
 @dataclass(frozen=True)
 class Setup:
-    """The same Gaussians on both, and photographs, which are on the CPU."""
+    """The same Gaussians on both devices, and photographs, which are on the CPU."""
 
     device: torch.device
     own: Gaussians
@@ -109,8 +108,8 @@ def test_the_initialization(setup: Setup, kind: str) -> None:
     torch.testing.assert_close(mine.cpu().log(), want.log(), rtol=0.02, atol=0.02)
 
 
-def test_numbers(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows, counts, dial values, popping, alignment, orders: the CPU's, within what two rasterizers differ by."""
+def test_measurements_match_the_cpu(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows, counts, dial values, popping, alignment and orders, to the difference of two rasterizers."""
     cameras, test = setup.cameras, setup.scene.test
     rows, want = on_both(setup, lambda model: evaluate(model, test, [1.0, 3.0]))
     for mine, own in zip(rows, want, strict=True):
@@ -135,7 +134,7 @@ def test_numbers(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(taken > 0 for _, taken in frame_times(setup.there, cameras[:1]))
 
 
-def test_placed_cameras_are_those_of_the_cpu(setup: Setup) -> None:
+def test_placed_cameras_match_the_cpu(setup: Setup) -> None:
     placed = [place_cameras(model, views=1) for model in (setup.there, setup.own)]
     torch.testing.assert_close(placed[0][0].viewmat, placed[1][0].viewmat, rtol=1e-3, atol=1e-3)
     assert placed[0][0].viewmat.device.type == "cpu"
@@ -144,7 +143,7 @@ def test_placed_cameras_are_those_of_the_cpu(setup: Setup) -> None:
     assert all(view.image.device.type == "cpu" for view in pictures)
 
 
-def test_a_block(setup: Setup) -> None:
+def test_training_a_block(setup: Setup) -> None:
     views, config = setup.scene.train[:2], replace(CONFIG, iters=2)
     division = divide(setup.there.replace(sigma_d=None, attenuation=None), views, config, 2)
     aimed = target_image(division.initial, 25, views[0])
@@ -153,26 +152,8 @@ def test_a_block(setup: Setup) -> None:
     assert merged.means.device == setup.device and bool(merged.sigma_d.isfinite().all())
 
 
-def test_a_step_of_training(setup: Setup) -> None:
-    """Count terms and Adam, as the trainer uses them."""
-    results = []
-    for model in (setup.there, setup.own):
-        camera, sigma = setup.cameras[0], model.sigma_d.log()
-        dialled = importlib.import_module("clod_adapter.render").dial(model, camera, 2.0)
-        pull = count_gradient(dialled, model.opacity_logits, 2.0, model.attenuation.tau, 0.1, CONFIG)
-        paper = paper_count(dialled, 2.0, model.attenuation.tau, CONFIG)
-        assert paper.device == pull.device == model.means.device
-        parameters = {"sigma": sigma.clone(), "means": model.means.clone()}
-        optimizer = RowAdam(parameters)
-        for _ in range(2):
-            optimizer.step({"sigma": pull, "means": model.means}, dialled.keep, {"sigma": 0.1, "means": 0.01})
-        results.append({name: value.cpu() for name, value in parameters.items()})
-    for name, mine in results[0].items():
-        torch.testing.assert_close(mine, results[1][name], rtol=1e-5, atol=1e-5)
-
-
-def test_a_whole_training_after_its_plan(setup: Setup) -> None:
-    """What the plan leaves out is put back after training."""
+def test_plan_and_training(setup: Setup) -> None:
+    """Parts that the plan leaves out are restored after training."""
     plain, scene = setup.there.replace(sigma_d=None, attenuation=None), Scene(setup.scene.train[:2], ())
     config = AdaptConfig(iters=10, max_sv=4.0)
     plan = make_plan(plain, scene, config)
@@ -187,7 +168,14 @@ def test_a_whole_training_after_its_plan(setup: Setup) -> None:
     assert not torch.equal(adapted.means.cpu(), plan.lean.means.cpu()) and bool(adapted.means.isfinite().all())
 
 
-def test_a_training_is_that_of_the_cpu(setup: Setup) -> None:
+def test_count_terms_stay_on_the_device(setup: Setup) -> None:
+    model, tau = setup.there, setup.there.attenuation.tau
+    dialled = dial(model, setup.cameras[0], 2.0)
+    terms = count_gradient(dialled, model.opacity_logits, 2.0, tau, 0.1, CONFIG), paper_count(dialled, 2.0, tau, CONFIG)
+    assert all(term.device == setup.device for term in terms)
+
+
+def test_training_matches_the_cpu(setup: Setup) -> None:
     scene, config = Scene(setup.scene.train[:2], ()), replace(CONFIG, batch=2, iters=1)
     mine, own = on_both(setup, lambda model: adapt(model, scene, config).gaussians)
     for name, value in own.tensors().items():
@@ -195,8 +183,8 @@ def test_a_training_is_that_of_the_cpu(setup: Setup) -> None:
         assert float((mine.tensors()[name].cpu() - value).abs().median()) <= 1e-4, name
 
 
-def test_what_is_frozen_takes_no_gradient(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor memory for one: harmonics are the largest part of a Gaussian."""
+def test_frozen_tensors_get_no_gradient(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No memory is allocated for one; harmonics are the largest part of a Gaussian."""
     if setup.there.means.is_cuda:
         monkeypatch.setattr(cuda, "unusable", lambda: None)
     made: list[torch.Size] = []
@@ -207,28 +195,14 @@ def test_what_is_frozen_takes_no_gradient(setup: Setup, monkeypatch: pytest.Monk
     assert sh0.grad is not None and setup.there.sh0.shape in made and setup.there.shN.shape not in made
 
 
-def test_rasterizing_under_a_debugger(setup: Setup) -> None:
-    def trace(frame: Any, *_: Any) -> Any:
-        return trace if frame.f_code.co_name == "rasterize" and frame.f_locals is not None else None
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        render(setup.there, setup.cameras[0])
-    finally:
-        sys.settrace(before)
-
-
-def test_neither_the_dial_nor_adam_asks_the_device_for_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each answer would have the CPU wait until the GPU is done, every step."""
+def test_dial_and_adam_do_not_synchronize_with_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A synchronization would make the CPU wait for the GPU in every step."""
     from torch.utils._python_dispatch import TorchDispatchMode
 
     class Silent(TorchDispatchMode):
         def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
             name = str(function)
-            masked = "aten.index" in name and any(
-                isinstance(i, Tensor) and i.dtype == torch.bool for i in args[1] if "aten.index" in name
-            )
+            masked = "aten.index" in name and any(isinstance(i, Tensor) and i.dtype == torch.bool for i in args[1])
             if masked or any(part in name for part in ("_local_scalar_dense", "nonzero", "masked_select", "item")):
                 raise AssertionError(f"{function} waits for the device")
             return function(*args, **(kwargs or {}))
@@ -236,7 +210,6 @@ def test_neither_the_dial_nor_adam_asks_the_device_for_a_number(monkeypatch: pyt
     own = gaussians(30, 1, 0)
     model = own.replace(sigma_d=torch.ones(30), attenuation=CONFIG.attenuation(3.0))
     optimizer = RowAdam({"means": own.means.clone(), "sigma": torch.ones(30)})
-    dial = importlib.import_module("clod_adapter.render").dial
     camera = ring(1, 20, 14)[0]
     optimizer._step_plain({"means": own.means}, torch.ones(30, dtype=torch.bool), {"means": 0.1})  # its table is there
     with Silent():

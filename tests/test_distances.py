@@ -1,4 +1,4 @@
-"""Normalised distances of one camera, the typical distance over several, and viewpoints that a file stores."""
+"""Normalised distances of a camera, the typical distance over cameras, and stored viewpoints."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_the_typical_distance_is_a_geometric_mean() -> None:
 
 
 @pytest.mark.parametrize("normalizer", ["scene", "quantile", "max"])
-def test_a_viewpoint_stands_for_its_camera(normalizer: str) -> None:
+def test_a_viewpoint_is_equivalent_to_its_camera(normalizer: str) -> None:
     config = AttenuationConfig(scene_distance=4.0, normalizer=normalizer)
     means, cameras = gaussians(200, 0, 1).means, ring(3, 61, 45)
     places = [viewpoint_of(each, means, config) for each in cameras]

@@ -53,7 +53,7 @@ def test_training_and_rendering(run: Any, capture: Any, tmp_path: Path, monkeypa
     assert "of 300 Gaussians" in run(2, capture.ply, capture.scene)  # without held-out views
 
 
-def test_far_from_0_they_do_the_same(run: Any, capture: Any, tmp_path: Path) -> None:
+def test_results_are_independent_of_the_origin(run: Any, capture: Any, tmp_path: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")  # which alone moves models
     far, by = tmp_path / "far", np.array([437_123.0, -4_481_010.0, 1_000.0])
     shutil.copytree(capture.scene, far)
@@ -82,7 +82,7 @@ def test_budgets(run: Any, dialled: Path, capture: Any) -> None:
     assert "out of reach: at s = 4" in printed[2]  # a tenth is less than the far end keeps, and that is said
 
 
-def test_the_adapter_goes_on_and_off(run: Any, dialled: Path, capture: Any, tmp_path: Path) -> None:
+def test_adapter_is_applied_and_removed(run: Any, dialled: Path, capture: Any, tmp_path: Path) -> None:
     printed = run(6, capture.ply, dialled.with_suffix(".safetensors"), "again.ply")
     assert "changed: sigma_d, " in printed and f"{capture.ply}, bit for bit" in printed
     assert (tmp_path / "again.ply").read_bytes() == dialled.read_bytes()
@@ -92,7 +92,7 @@ def test_the_adapter_goes_on_and_off(run: Any, dialled: Path, capture: Any, tmp_
     assert not (tmp_path / "other_again.ply").exists()
 
 
-def test_misuse_is_explained(run: Any) -> None:
+def test_bad_arguments_are_refused(run: Any) -> None:
     for number in (1, 2, 5, 6):
         with pytest.raises(SystemExit, match=f"python examples/{EXAMPLES[number].name}"):
             run(number)
@@ -100,7 +100,7 @@ def test_misuse_is_explained(run: Any) -> None:
             run(number, "missing.ply", "nowhere")
 
 
-def test_the_list_names_them_all() -> None:
+def test_the_readme_lists_every_example() -> None:
     listed = re.findall(r"\]\((.+?)\)", (FOLDER / "README.md").read_text(encoding="utf-8"))
     assert listed == [path.name for path in EXAMPLES.values()]
     assert list(EXAMPLES) == list(range(1, len(EXAMPLES) + 1))

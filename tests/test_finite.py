@@ -1,4 +1,4 @@
-"""Rows that are not finite are found whatever else is there, and named."""
+"""Nonfinite rows are found and named."""
 
 from __future__ import annotations
 

@@ -1,34 +1,25 @@
-"""The container: shapes are checked, nothing is shared by accident, copies are copies."""
+"""The container of Gaussians: shapes, activations, selection, and SH degrees."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 
-from clod_adapter.cameras import Camera, Scene, View
-from clod_adapter.config import AdaptConfig, AttenuationConfig, ScreenFilter
+from clod_adapter.adapter import ATTRIBUTES
+from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_COUNTS, Gaussians
 from scenes import gaussians as some_gaussians
 
 CONFIG = AttenuationConfig()
-SHAPES = {
-    "means": (5, 3), "quats": (5, 4), "log_scales": (5, 3), "opacity_logits": (5,), "sh0": (5, 1, 3), "shN": (5, 8, 3),
-}  # fmt: skip
 
 
 def gaussians(**changes: object) -> Gaussians:
-    g = torch.Generator().manual_seed(0)
-    return Gaussians(**({name: torch.randn(shape, generator=g) for name, shape in SHAPES.items()} | changes))
+    return some_gaussians(5, 2, 0).replace(**changes)
 
 
 def adapted() -> Gaussians:
     return gaussians(sigma_d=torch.arange(5.0), attenuation=CONFIG)
-
-
-@pytest.mark.parametrize("kind", [Camera, View, Scene, Gaussians, AdaptConfig, AttenuationConfig, ScreenFilter])
-def test_value_classes_are_frozen(kind: type) -> None:
-    assert kind.__dataclass_params__.frozen
 
 
 def test_activations() -> None:
@@ -52,7 +43,7 @@ def test_wrong_shapes_are_named(name: str, shape: tuple[int, ...]) -> None:
     assert f"Gaussians.{name}" in str(caught.value) and str(shape) in str(caught.value)
 
 
-def test_a_sigma_comes_with_its_reading() -> None:
+def test_sigma_d_requires_attenuation_settings() -> None:
     for changes in ({"sigma_d": torch.ones(5)}, {"attenuation": CONFIG}):
         with pytest.raises(ClodError, match="both sigma_d and attenuation"):
             gaussians(**changes)
@@ -60,7 +51,7 @@ def test_a_sigma_comes_with_its_reading() -> None:
 
 def test_tensors_are_the_fields_and_replace_changes_one() -> None:
     some = adapted()
-    assert list(some.tensors()) == [*SHAPES, "sigma_d"] and list(gaussians().tensors()) == list(SHAPES)
+    assert list(some.tensors()) == [*ATTRIBUTES, "sigma_d"] and list(gaussians().tensors()) == list(ATTRIBUTES)
     assert all(value is getattr(some, name) for name, value in some.tensors().items())
     new = some.replace(means=torch.zeros(5, 3))
     assert (new.means == 0).all() and (some.means != 0).any()
@@ -79,7 +70,7 @@ def test_select_and_to() -> None:
 
 @pytest.mark.parametrize(("degree", "used"), [(0, 0), (1, 0), (1, 1), (2, 1), (3, 0), (3, 2), (3, 3), (4, 1), (4, 4)])
 def test_empty_sh_degrees_are_removed(degree: int, used: int) -> None:
-    """The highest ones that are 0 throughout; a single coefficient keeps its degree and all below."""
+    """The highest degrees that are 0 are removed; one coefficient keeps its degree and all below."""
     some = some_gaussians(7, degree, 0)
     assert some.sh_degree == degree and SH_COUNTS[degree] == (degree + 1) ** 2
     bands = (used + 1) ** 2 - 1

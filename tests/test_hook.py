@@ -1,4 +1,4 @@
-"""The hook gives the opacities that a rendering has, in numpy and in torch, or says what it needs."""
+"""The hook gives the opacities of a rendering in numpy and in torch."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ def test_shape_and_type_are_those_of_the_opacities() -> None:
     torch.testing.assert_close(column[:, 0].double(), double, rtol=1e-4, atol=1e-6)
 
 
-def test_float16_and_autocast_cost_no_distance() -> None:
-    """Farther away than float16 has squares for, and with products that autocast would round to bfloat16."""
+def test_float16_and_autocast_keep_distances() -> None:
+    """Squares of the distances overflow float16, and autocast would round products to bfloat16."""
     model, view = adapted(scene_distance=300.0, normalizer="quantile"), camera()
     viewmat = view.viewmat.clone()
     viewmat[:3, 3] = torch.tensor([100.0, 200.0, 300.0])
@@ -78,8 +78,8 @@ def test_float16_and_autocast_cost_no_distance() -> None:
     assert torch.equal(cast, drawn) and torch.equal(same, keep)
 
 
-def test_arrays_as_viewers_have_them() -> None:
-    """A camera of the other kind, or of whole numbers, arrays read backwards or in the other byte order, lists."""
+def test_mixed_and_strided_arrays_are_accepted() -> None:
+    """Mixed numpy and torch, integers, negative strides, the other byte order, and lists."""
     model, view = adapted(normalizer="max"), camera()
     means, a, viewmat = model.means.numpy(), model.opacities.numpy(), view.viewmat.numpy()
     hook, size = hook_of(model), (view.width, view.height)
@@ -100,12 +100,12 @@ def test_arrays_as_viewers_have_them() -> None:
     assert (of_whole == of_floats).all()
 
 
-def test_gradients_reach_opacities_and_sigma_d_and_nothing_else() -> None:
+def test_gradients_reach_opacities_and_sigma_d_only() -> None:
     model, view = adapted(), camera()
-    a, sigma = model.opacities.double().requires_grad_(), model.sigma_d.double().requires_grad_()
-    means, viewmat = model.means.double().requires_grad_(), view.viewmat.double().requires_grad_()
-    keep = Hook(sigma, model.attenuation, 2.0)(means, a, viewmat)[1]
-    a, sigma, means = (tensor[keep].detach().requires_grad_() for tensor in (a, sigma, means))
+    given = (model.opacities, model.sigma_d, model.means)
+    keep = hook_of(model, 2.0)(model.means, model.opacities, view.viewmat)[1]
+    a, sigma, means = (tensor[keep].double().requires_grad_() for tensor in given)
+    viewmat = view.viewmat.double().requires_grad_()
 
     def drawn(a: torch.Tensor, sigma: torch.Tensor) -> torch.Tensor:
         return Hook(sigma, model.attenuation, 2.0)(means, a, viewmat)[0]
@@ -114,7 +114,7 @@ def test_gradients_reach_opacities_and_sigma_d_and_nothing_else() -> None:
     assert torch.autograd.grad(drawn(a, sigma).sum(), [means, viewmat], allow_unused=True) == (None, None)
 
 
-def test_misuse_is_explained(tmp_path: Path) -> None:
+def test_bad_arguments_are_refused(tmp_path: Path) -> None:
     model, view = adapted(normalizer="max"), camera()
     with pytest.raises(ClodError, match="normalizer max needs K, width and height"):
         hook_of(model)(model.means, model.opacities, view.viewmat)

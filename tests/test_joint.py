@@ -216,4 +216,5 @@ def test_the_viewer_takes_the_settings_of_the_file() -> None:
     payload = Payload("model.ply", model)
     assert payload.describe()["attenuation"] == asdict(model.attenuation)  # type: ignore[arg-type]
     raised = Payload("model.ply", model.replace(attenuation=replace(model.attenuation, tau=RAISED)))  # type: ignore[type-var]
-    assert json.dumps(raised.describe()["attenuation"]["tau"]).encode() in raised.head and raised.head != payload.head
+    assert json.dumps(raised.describe()["attenuation"]["tau"]).encode() in raised.header
+    assert raised.header != payload.header

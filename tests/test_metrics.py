@@ -1,4 +1,4 @@
-"""PSNR and SSIM as reported, and the tie to those of training."""
+"""The reports' PSNR and SSIM agree with training's and with scikit-image's."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ TARGETS += [pytest.param(real_target(), id="photograph"), pytest.param(real_targ
 
 @pytest.mark.parametrize("sigma", [0.005, 0.1])
 @pytest.mark.parametrize("target", TARGETS)
-def test_training_and_reports_agree(target: Tensor, sigma: float) -> None:
+def test_training_and_report_metrics_agree(target: Tensor, sigma: float) -> None:
     image = noisy(target, sigma)
     shown, photo = image.clamp(0, 1), target / 255
     value, similarity = psnr_ssim(image.requires_grad_(), target)
@@ -52,8 +52,8 @@ def test_training_and_reports_agree(target: Tensor, sigma: float) -> None:
     assert exact == pytest.approx(losses.ssim_plain(shown.double(), target.double() / 255).item(), abs=1e-9)
 
 
-def test_scikit_image_without_the_border() -> None:
-    """PSNR is always scikit-image's; SSIM where the images agree near the border, which its mean leaves out."""
+def test_metrics_match_scikit_image() -> None:
+    """SSIM agrees where the images are equal near the border, which scikit-image's mean excludes."""
     target = real_target()
     image = target / 255
     inner = (slice(12, -12), slice(12, -12))

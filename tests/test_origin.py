@@ -1,4 +1,4 @@
-"""Scenes far from 0: nothing of them may be lost on the way in, and the way out leads back to where they were."""
+"""Scenes far from 0 are read relative to an origin and written back exactly."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def moved(path: Path, out: Path, kind: str) -> Path:
     return out
 
 
-def test_only_a_scene_far_from_0_has_an_origin() -> None:
+def test_only_distant_scenes_have_an_origin() -> None:
     near = np.random.default_rng(0).normal(size=(500, 3))
     assert origin_of(rows(near)) == origin_of(rows(near + 40)) == NOWHERE
     assert origin_of(rows(near[:1] + UTM)) == NOWHERE  # of one Gaussian there is no telling what is far
@@ -52,7 +52,7 @@ def test_only_a_scene_far_from_0_has_an_origin() -> None:
 
 
 @pytest.mark.parametrize("kind", ["f4", "f8"])
-def test_reading_loses_nothing_and_writing_leads_back(tmp_path: Path, kind: str) -> None:
+def test_round_trip_of_distant_scenes_is_exact(tmp_path: Path, kind: str) -> None:
     base = gaussians(200, 1, 0)
     clod.save(tmp_path / "near.ply", base)
     far = clod.load(moved(tmp_path / "near.ply", tmp_path / "far.ply", kind))
@@ -75,7 +75,7 @@ def test_reading_loses_nothing_and_writing_leads_back(tmp_path: Path, kind: str)
     assert again.gaussians.means.equal(tuned) and again.origin == far.origin
 
 
-def test_an_adapter_knows_the_origin(tmp_path: Path) -> None:
+def test_an_adapter_stores_the_origin(tmp_path: Path) -> None:
     clod.save(tmp_path / "near.ply", gaussians(200, 1, 0))
     far = clod.load(moved(tmp_path / "near.ply", tmp_path / "far.ply", "f4"))
     adapted = clod.attach(far.gaussians.replace(means=far.gaussians.means * 1e5))  # kept as values, not differences
@@ -86,8 +86,8 @@ def test_an_adapter_knows_the_origin(tmp_path: Path) -> None:
     assert adapter.apply(clod.load(tmp_path / "far.ply", origin=adapter.origin).gaussians).means.equal(adapted.means)
 
 
-def test_cameras_follow(tmp_path: Path) -> None:
-    """A georeferenced model, which COLMAP stores in float64, has the cameras it had near 0."""
+def test_cameras_are_read_relative_to_the_origin(tmp_path: Path) -> None:
+    """A georeferenced model, stored in float64, has the same cameras as near 0."""
     pycolmap = pytest.importorskip("pycolmap")  # which alone moves models
     for name in ("near", "far"):
         (tmp_path / name).mkdir()

@@ -1,4 +1,4 @@
-"""The joint: what the dial does to a picture, and what it leaves alone."""
+"""Rendering with and without a dial."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def adapted(n: int = 300, seed: int = 0, **config: object) -> Gaussians:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_disabled_adapter_is_the_base(seed: int) -> None:
-    """Bit for bit: detached and without sigma_d at any s, and with a dial attached without a sigma_d at s = 1."""
+    """Bit for bit: without a dial at any s, and with a dial without decay at s = 1."""
     base, view = gaussians(300, seed % 4, seed), camera()
     want = render(base, view)
     assert want.image.abs().sum() > 0 and want.kept.all()
@@ -48,8 +48,8 @@ def test_a_disabled_adapter_is_the_base(seed: int) -> None:
 
 
 @pytest.mark.parametrize("s", SCALES)
-def test_is_the_image_of_the_attenuated_opacities(s: float) -> None:
-    """Baked by hand: culled ones gone, the rest with the opacity of this view and dial value."""
+def test_image_matches_baked_opacities(s: float) -> None:
+    """Culled Gaussians are removed, and others have the opacity of this view and dial value."""
     some, view = adapted(), camera()
     found = render(some, view, s, background=torch.tensor([0.1, 0.5, 0.9]))
     distances = normalized_distances(some.means, view, some.attenuation)
@@ -65,7 +65,7 @@ def test_is_the_image_of_the_attenuated_opacities(s: float) -> None:
     torch.testing.assert_close(found.alpha, want.alpha, rtol=0, atol=1e-5)
 
 
-def test_the_rasterizer_sees_only_what_is_kept() -> None:
+def test_the_rasterizer_gets_kept_opacities_only() -> None:
     seen = []
 
     def spy(means, quats, scales, opacities, sh0, shN, camera, background, screen_filter):
@@ -80,7 +80,7 @@ def test_the_rasterizer_sees_only_what_is_kept() -> None:
     assert torch.equal(seen[0][rendering.kept], expected.opacities[expected.keep])
 
 
-def test_black_behind_by_default() -> None:
+def test_default_background_is_black() -> None:
     view = camera()
     far = gaussians(20, 0, 0).replace(means=torch.full((20, 3), 1e4))
     assert (render(far, view).image == 0).all()
@@ -91,7 +91,7 @@ def test_black_behind_by_default() -> None:
 
 @pytest.mark.parametrize("s", [1.0, 2.5])
 def test_gradients_reach_sigma_and_all_attributes(s: float) -> None:
-    """The chain through attenuation, cut and rasterizer, against central differences in float64."""
+    """Gradients through attenuation, culling and rasterizer match central differences in float64."""
     view = camera(20, 16)
     some = adapted(40, 3)
     doubles = {name: value.double() for name, value in some.replace(log_scales=some.log_scales + 1.5).tensors().items()}
@@ -120,7 +120,7 @@ def test_gradients_reach_sigma_and_all_attributes(s: float) -> None:
         assert (gradient - want).norm() <= 2e-3 * want.norm(), name
 
 
-def test_bad_calls_are_named() -> None:
+def test_bad_arguments_are_refused() -> None:
     base = gaussians(5, 0, 0)
     for value in (0.999, 0.0, -1.0, math.inf, math.nan):
         for some in (adapted(), base):
@@ -132,7 +132,7 @@ def test_bad_calls_are_named() -> None:
         splat(base, base.opacities[:3], camera())
 
 
-def test_of_no_gaussians() -> None:
+def test_rendering_no_gaussians() -> None:
     none = gaussians(0, 1, 0)
     for some in (none, attach(none), attach(none, attenuation=AttenuationConfig(normalizer="max"))):
         rendering = render(some, camera(), 2.0)

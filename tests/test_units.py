@@ -1,4 +1,4 @@
-"""The unit of sigma_d: the same dial whatever distances are divided by."""
+"""The unit of sigma_d: the dial does not depend on it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def dialled(n: int = 400, **config: float | str) -> Gaussians:
 
 @settings(deadline=None, max_examples=30)
 @given(st.floats(1e-3, 1e4), st.sampled_from([0.0, 1e-8, 0.3]), st.floats(1, 20))
-def test_another_distance_is_the_same_dial(distance: float, eps: float, s: float) -> None:
+def test_changing_the_unit_keeps_the_dial(distance: float, eps: float, s: float) -> None:
     some = dialled(eps=eps, max_sv=20.0)
     some = some.replace(sigma_d=some.sigma_d.double(), means=some.means.double())
     other = with_distance(some, distance)
@@ -43,7 +43,7 @@ def test_another_distance_is_the_same_dial(distance: float, eps: float, s: float
     torch.testing.assert_close(found[1][possible], found[0][possible], rtol=1e-6, atol=1e-9)
 
 
-def test_special_values_and_other_normalisers_keep_their_sigma() -> None:
+def test_special_values_and_other_normalizers_keep_sigma() -> None:
     sigma = torch.tensor([0.0, -1.0, SIGMA_MAX, 2.0])
     some = attach(gaussians(4, 0, 0), sigma, AttenuationConfig(scene_distance=8.0))
     there = in_world_units(some)
@@ -58,7 +58,7 @@ def test_special_values_and_other_normalisers_keep_their_sigma() -> None:
         assert (there.attenuation.scene_distance, there.attenuation.reference_distance) == (1.0, 3.7)
 
 
-def test_the_nominal_distance_is_the_one_of_the_training_views_where_that_is_known() -> None:
+def test_nominal_distance_is_that_of_the_training_views() -> None:
     means = gaussians(500, 0, 1).means
     config = AttenuationConfig()
     assert nominal_distance(means, config) == estimated_distance(means)
@@ -68,7 +68,7 @@ def test_the_nominal_distance_is_the_one_of_the_training_views_where_that_is_kno
     assert nominal_distance(means, replace(config, normalizer="max", reference_distance=2.5)) == 1.0
 
 
-def test_the_estimate_is_of_the_scene_and_not_of_its_farthest() -> None:
+def test_estimated_distance_ignores_outliers() -> None:
     means = gaussians(1000, 0, 1).means
     distance = estimated_distance(means)
     stray = means.clone()
@@ -79,7 +79,7 @@ def test_the_estimate_is_of_the_scene_and_not_of_its_farthest() -> None:
 
 
 @pytest.mark.parametrize("typical", [1e-4, 0.006, 3.0, 4.2e5])
-def test_eps_hides_no_sigma_and_is_the_same_after_each_training(typical: float) -> None:
+def test_eps_is_stable_over_repeated_training(typical: float) -> None:
     some = dialled(scene_distance=typical)
     there = in_world_units(some)
     torch.testing.assert_close(there.sigma_d, typical * some.sigma_d, rtol=1e-4, atol=1e-6 * typical)

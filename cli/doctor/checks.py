@@ -6,8 +6,7 @@ import io
 import warnings
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from clod_adapter._support.text import first_line
 
@@ -62,6 +61,3 @@ class Check:
         """``name  ok/off  found  -> fix``; the name takes ``width`` characters."""
         fix = f"  -> {self.fix}" if self.fix else ""
         return f"{self.name:<{width}}{'ok' if self.ok else 'off':<5}{self.found}{fix}"
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import asdict
 from typing import Any
 
 from clod_adapter._support.version import package_version
@@ -33,5 +34,5 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     print(f"rendering and training backends: {', '.join(draws)}" if draws else failed)
     return {
         "command": "doctor", "version": package_version(), "draws": draws, "exit_code": 0 if draws else 1,
-        "findings": [check.as_dict() for check in checks], "seconds": seconds,
+        "findings": [asdict(check) for check in checks], "seconds": seconds,
     }  # fmt: skip

@@ -121,15 +121,10 @@ def cores() -> str:
     allowed = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
     quota = _cgroup("cpu.max", lambda said: int(said.split()[0]) / int(said.split()[1]))
     usable = allowed if quota is None else min(allowed, max(1, round(quota)))
-    threads = _threads()
-    if threads is not None and threads > usable:
+    torch = sys.modules.get("torch")  # the check of torch reports its errors
+    if torch is not None and (threads := torch.get_num_threads()) > usable:
         raise CheckFailed(f"{threads} threads on {usable} cores", f"OMP_NUM_THREADS={usable} clod-adapt ...")
     return f"{usable} of {os.cpu_count()}"
-
-
-def _threads() -> int | None:
-    torch = sys.modules.get("torch")  # the check of torch reports its errors
-    return torch.get_num_threads() if torch is not None else None
 
 
 def memory() -> str:

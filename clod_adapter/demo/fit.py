@@ -16,12 +16,7 @@ from clod_adapter.training.loop import adapt
 
 
 def fit_base(
-    points: np.ndarray,
-    colors: np.ndarray,
-    scene: Scene,
-    *,
-    iters: int,
-    progress: Listener | None = None,
+    points: np.ndarray, colors: np.ndarray, scene: Scene, *, iters: int, progress: Listener | None = None
 ) -> Gaussians:
     """Trains one Gaussian per point at s = 1: ``adapt`` without fading and with 3DGS's learning rates.
 
@@ -44,20 +39,17 @@ def fit_base(
     return detach(adapted.gaussians)
 
 
-def from_points(points: np.ndarray, colors: np.ndarray, *, sh_degree: int = 3) -> Gaussians:
-    """3DGS's initialization: isotropic Gaussians scaled by the distance to neighbours, opacity 0.1, SH degree 0."""
+def from_points(points: np.ndarray, colors: np.ndarray) -> Gaussians:
+    """3DGS's initialization: isotropic Gaussians scaled by the distance to neighbours, opacity 0.1, SH degree 3."""
     means = torch.from_numpy(points).float()
     n = len(means)
     rgb = torch.from_numpy(colors).float() / 255
     spacing = neighbour_distance(means).clamp(min=1e-4)
     return Gaussians(
-        means=means,
-        quats=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
-        log_scales=spacing.log()[:, None].repeat(1, 3),
-        opacity_logits=torch.full((n,), 0.1).logit(),
-        sh0=((rgb - 0.5) / SH_C0)[:, None],
-        shN=torch.zeros(n, SH_COUNTS[sh_degree] - 1, 3),
-    )
+        means=means, quats=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1), log_scales=spacing.log()[:, None].repeat(1, 3),
+        opacity_logits=torch.full((n,), 0.1).logit(), sh0=((rgb - 0.5) / SH_C0)[:, None],
+        shN=torch.zeros(n, SH_COUNTS[3] - 1, 3),
+    )  # fmt: skip
 
 
 def neighbour_distance(means: Tensor) -> Tensor:

@@ -108,9 +108,9 @@ class Gallery:
         return seen, directions
 
 
-def make_gallery(samples: int = 3) -> Gallery:
+def make_gallery() -> Gallery:
     """Builds the room and bakes its light, which takes several seconds."""
-    return Gallery(bake_light(unlit_room()), samples)
+    return Gallery(bake_light(unlit_room()))
 
 
 def unlit_room() -> Tables:
@@ -131,9 +131,9 @@ def materials() -> dict[str, np.ndarray]:
         "blue": tx.plaster((84, 118, 132), 0.05, seed=2),
         "ceiling": tx.plain((236, 234, 228)),
         "bricks": tx.brickwork((124, 60, 44), (204, 158, 130)),
-        "gravel": tx.toned("gravel.png", (70, 66, 62), (196, 188, 176)),
-        "grass": tx.toned("grass.png", (28, 52, 20), (134, 166, 74)),
-        "terrazzo": tx.toned("gravel.png", (136, 112, 104), (242, 234, 222)),
+        "gravel": tx.toned(tx.photograph("gravel.png"), (70, 66, 62), (196, 188, 176)),
+        "grass": tx.toned(tx.photograph("grass.png"), (28, 52, 20), (134, 166, 74)),
+        "terrazzo": tx.toned(tx.photograph("gravel.png"), (136, 112, 104), (242, 234, 222)),
         "oak": tx.planks((120, 82, 48), (168, 122, 76), rows=5, seed=8),
         "chequers": tx.chequers(12, 6, (196, 62, 44), (240, 226, 196)),
         "coffee": tx.linear(tx.photograph("coffee.png").crop((100, 0, 500, 400))),
@@ -192,14 +192,9 @@ def add_solids(scene: SceneBuilder) -> None:
 
 
 def write_gallery(
-    folder: str | Path,
-    *,
-    width: int = 320,
-    height: int = 240,
-    count: int = 64,
-    points: int = 20000,
+    folder: str | Path, *, width: int = 320, height: int = 240, count: int = 64, points: int = 20000,
     progress: Listener | None = None,
-) -> Gallery:
+) -> Gallery:  # fmt: skip
     """Renders the capture into a new `folder`: ``images/*.png`` and a COLMAP model with a point cloud.
 
     Args:

@@ -20,6 +20,8 @@ from clod_adapter.demo.raytrace import MIRROR_HEIGHT, Tables, radiance, trace_ra
 
 LIFT = 1e-4  # world units from the surface to the origin of a ray
 GATHER_SPREAD = 0.2  # width of a gathering ray per unit of distance: coarse textures, less noise
+LAMP_RAYS, BOUNCE_RAYS = 5, 8  # strata per axis; a texel gets their squares in rays, per lamp and per bounce
+BOUNCES = 2  # reflections between surfaces
 BLOCK = 2048  # light map texels per task
 
 
@@ -77,28 +79,22 @@ def bounced_light(tables: Any, where: np.ndarray, uv: np.ndarray, jitter: np.nda
         out[k, 0], out[k, 1], out[k, 2] = r / (n * n), g / (n * n), b / (n * n)
 
 
-def bake_light(tables: Tables, lamp_rays: int = 5, bounce_rays: int = 8, bounces: int = 2) -> Tables:
-    """The scene, lit by its lamps.
-
-    Args:
-        tables: a closed scene (every ray hits something), its light maps at any value.
-        lamp_rays, bounce_rays: strata per axis; a texel gets their squares in rays (per lamp, per bounce).
-        bounces: number of reflections between surfaces.
-    """
+def bake_light(tables: Tables) -> Tables:
+    """The scene, lit by its lamps; a closed one (every ray hits something), its light maps at any value."""
     where, uv, jitter = light_texels(tables.surfaces)
     lamps = np.flatnonzero(tables.surfaces["glow"])
-    direct = in_blocks(len(where), lambda k, out: lamp_light(tables, lamps, where[k], uv[k], jitter[k], lamp_rays, out))
+    direct = in_blocks(len(where), lambda k, out: lamp_light(tables, lamps, where[k], uv[k], jitter[k], LAMP_RAYS, out))
     direct = smoothed(direct, tables.surfaces, 1)
     dark = tables.surfaces.copy()
     dark["glow"] = 0
 
     def bounced(light: np.ndarray) -> np.ndarray:
         scene = tables._replace(surfaces=dark, light=light)
-        found = in_blocks(len(where), lambda k, out: bounced_light(scene, where[k], uv[k], jitter[k], bounce_rays, out))
+        found = in_blocks(len(where), lambda k, out: bounced_light(scene, where[k], uv[k], jitter[k], BOUNCE_RAYS, out))
         return smoothed(found, tables.surfaces, 2)
 
     light = direct
-    for _ in range(bounces):
+    for _ in range(BOUNCES):
         light = direct + bounced(light)
     return with_mirrors(tables._replace(light=light))
 

@@ -53,12 +53,9 @@ def around_plinth(t: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 PATHS = (
-    CameraPath(around_room, 20),
-    CameraPath(walk_in, 9),
-    CameraPath(past_left_wall, 10),
-    CameraPath(past_right_wall, 11),
-    CameraPath(around_plinth, 14),
-)
+    CameraPath(around_room, 20), CameraPath(walk_in, 9), CameraPath(past_left_wall, 10),
+    CameraPath(past_right_wall, 11), CameraPath(around_plinth, 14),
+)  # fmt: skip
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: str) -> Camera:

@@ -30,9 +30,9 @@ def photograph(name: str) -> Image.Image:
         raise ClodError(f"the demo's photograph {name} is missing: pip install 'scikit-image>=0.22'") from error
 
 
-def linear(image: Image.Image, side: int = SIDE) -> np.ndarray:
+def linear(image: Image.Image) -> np.ndarray:
     """An image resized to a square texture."""
-    return decode_srgb(np.asarray(image.convert("RGB").resize((side, side), Image.Resampling.LANCZOS)))
+    return decode_srgb(np.asarray(image.convert("RGB").resize((SIDE, SIDE), Image.Resampling.LANCZOS)))
 
 
 def framed(name: str, size: tuple[float, float], frame: Colour, mat: float = 0.09, rim: float = 0.035) -> np.ndarray:
@@ -60,22 +60,16 @@ def shaded(colour: Colour, factor: float) -> Colour:
     return r, g, b
 
 
-def toned(name: str, dark: Colour, light: Colour) -> np.ndarray:
-    """A grey photograph as a material: its 2nd to 98th percentile maps to `dark` to `light`."""
-    return tone(photograph(name), dark, light)
-
-
 def brickwork(dark: Colour, light: Colour) -> np.ndarray:
     """The photograph of a brick wall, rotated and with its perspective corrected."""
     image = photograph("brick.png").rotate(90)
     rows_meet_left = (0, 62, 0, 454, 512, 512, 512, 0)
-    return tone(
-        image.transform((SIDE, SIDE), Image.Transform.QUAD, rows_meet_left, Image.Resampling.BICUBIC), dark, light
-    )
+    square = image.transform((SIDE, SIDE), Image.Transform.QUAD, rows_meet_left, Image.Resampling.BICUBIC)
+    return toned(square, dark, light)
 
 
-def tone(image: Image.Image, dark: Colour, light: Colour) -> np.ndarray:
-    """Maps the brightness of an image to a gradient between two colours, see `toned`."""
+def toned(image: Image.Image, dark: Colour, light: Colour) -> np.ndarray:
+    """A photograph's brightness as a material: its 2nd to 98th percentile maps to `dark` to `light`."""
     grey = np.asarray(image.convert("L").resize((SIDE, SIDE), Image.Resampling.LANCZOS), np.float32)
     low, high = np.percentile(grey, [2, 98])
     return mixed(dark, light, np.clip((grey - low) / (high - low), 0, 1))

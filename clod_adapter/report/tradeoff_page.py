@@ -33,12 +33,9 @@ def own_teacher(report: Mapping[str, Any]) -> bool:
 
 
 def write_tradeoff_report(
-    path: str | Path,
-    report: Mapping[str, Any],
-    frames: Sequence[Picture],
-    others: Mapping[str, Picture],
+    path: str | Path, report: Mapping[str, Any], frames: Sequence[Picture], others: Mapping[str, Picture],
     training: Mapping[str, Any] | None = None,
-) -> dict[str, Path]:
+) -> dict[str, Path]:  # fmt: skip
     """Writes the page and its charts as PNGs in the same folder, atomically; returns the paths.
 
     Args:
@@ -64,11 +61,8 @@ def write_tradeoff_report(
         svg = inline_svg(charts["rendering"], "error against milliseconds per frame")
         body.append(page.section("Error against frame time", page.chart(svg, _rendering_caption(drawn))))
     if training:
-        svg, caption = (
-            inline_svg(charts["adapting"], "error against seconds of adapting"),
-            _training_caption(training, own),
-        )
-        body.append(page.section("Error against adapting time", page.chart(svg, caption)))
+        svg = inline_svg(charts["adapting"], "error against seconds of adapting")
+        body.append(page.section("Error against adapting time", page.chart(svg, _training_caption(training, own))))
     reading = [text.format(truth=OWN_PICTURES if own else PHOTOGRAPHS) for text in READING]
     body += [_rows(series), page.section("How to read this", *map(page.paragraph, reading))]
     body += [_plan(report), _settings(report)]

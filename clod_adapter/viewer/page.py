@@ -19,12 +19,12 @@ from clod_adapter.cameras import Camera
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.formats.splat_transform import SplatTransform
-from clod_adapter.viewer.packed import Packed, pack
 from clod_adapter.viewer.payload import Payload, page_config
+from clod_adapter.viewer.sog import PackedSplat, pack_sog
 
 PAGE, STYLE, SCRIPT = "page.html", "viewer.css", "viewer.js"
-LETTERS = 1 << 26  # characters per script element; browsers limit strings to about 5e8
-PLACES = ("<!--CLOD-STYLE-->", "<!--CLOD-CONFIG-->", "<!--CLOD-DATA-->", "<!--CLOD-SCRIPT-->")  # in this order
+MAX_CHARACTERS = 1 << 26  # per script element; browsers limit strings to about 5e8
+PLACEHOLDERS = ("<!--CLOD-STYLE-->", "<!--CLOD-CONFIG-->", "<!--CLOD-DATA-->", "<!--CLOD-SCRIPT-->")  # in this order
 
 
 def served_page(config: Mapping[str, Any]) -> bytes:
@@ -49,7 +49,7 @@ def write_viewer_page(
         base: shown for comparison; relative to the same origin.
         cameras: selectable viewpoints, in the frame of the Gaussians (relative to the origin).
         virtual_scale: the initial dial value, >= 1.
-        tool: packs the splats to a fifth of their size, with rounded values (``packed.pack``, which calls
+        tool: packs the splats to a fifth of their size, with rounded values (``pack_sog``, which calls
             ``progress``); None stores them unpacked.
 
     Raises:
@@ -59,31 +59,32 @@ def write_viewer_page(
     for element, checkpoint in (("clod-model", model), ("clod-base", base)):
         if checkpoint is not None:
             payload = Payload.of(checkpoint)
-            entry, held = _held(
-                element, payload, pack(payload, tool, Path(path).absolute().parent, progress) if tool else None
-            )
+            packed = pack_sog(payload, tool, Path(path).absolute().parent, progress) if tool else None
+            entry, added = _embed(element, payload, packed)
             entries.append(entry)
-            data |= held
+            data |= added
     config = page_config(entries[0], entries[1] if base else None, cameras, virtual_scale)
     meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.writelines(_document(config, _elements(data), meta))
 
 
-def _held(element: str, payload: Payload, packed: Packed | None) -> tuple[dict[str, Any], dict[str, Iterable[bytes]]]:
+def _embed(
+    element: str, payload: Payload, packed: PackedSplat | None
+) -> tuple[dict[str, Any], dict[str, Iterable[bytes]]]:
     """A splat's entry in the configuration, and its bytes in the page by the id of their element."""
     if packed is None:
         return payload.describe(element=element), {element: payload.blocks()}
-    if packed.sigma is None:
+    if packed.sigma_d is None:
         return payload.describe(element=element, format="sog"), {element: (packed.sog,)}
-    beside = f"{element}-sigma"
-    entry = payload.describe(element=element, format="sog", sigma={"element": beside, "gzip": True})
-    return entry, {element: (packed.sog,), beside: (packed.sigma,)}
+    sigma_element = f"{element}-sigma"
+    entry = payload.describe(element=element, format="sog", sigma={"element": sigma_element, "gzip": True})
+    return entry, {element: (packed.sog,), sigma_element: (packed.sigma_d,)}
 
 
 def policy(connect: str = "") -> str:
     """The page's Content-Security-Policy; ``connect`` is a further source that it may fetch from."""
-    script, style = (f"'sha256-{_digest(_part(name))}'" for name in (SCRIPT, STYLE))
+    script, style = (f"'sha256-{_digest(_static_file(name))}'" for name in (SCRIPT, STYLE))
     return (
         f"default-src 'none'; script-src {script}; style-src {style}; img-src data: blob:; "
         f"connect-src {connect} data: blob:; worker-src blob:; base-uri 'none'; form-action 'none'"
@@ -92,21 +93,21 @@ def policy(connect: str = "") -> str:
 
 def _document(config: Mapping[str, Any], data: Iterable[bytes], meta: str) -> Iterator[bytes]:
     """The page in pieces, because data may be large; ``meta`` is added to its head."""
-    rest = _part(PAGE)
-    filled: dict[str, Iterable[bytes]] = {
-        PLACES[0]: (f"{meta}<style>{_part(STYLE)}</style>".encode(),),
-        PLACES[1]: (f'<script type="application/json" id="clod-config">{embedded(config)}</script>'.encode(),),
-        PLACES[2]: data,
-        PLACES[3]: (f'<script type="module">{_part(SCRIPT)}</script>'.encode(),),
+    rest = _static_file(PAGE)
+    content: dict[str, Iterable[bytes]] = {
+        PLACEHOLDERS[0]: (f"{meta}<style>{_static_file(STYLE)}</style>".encode(),),
+        PLACEHOLDERS[1]: (f'<script type="application/json" id="clod-config">{script_json(config)}</script>'.encode(),),
+        PLACEHOLDERS[2]: data,
+        PLACEHOLDERS[3]: (f'<script type="module">{_static_file(SCRIPT)}</script>'.encode(),),
     }
-    for place, pieces in filled.items():
-        before, _, rest = rest.partition(place)
+    for placeholder, pieces in content.items():
+        before, _, rest = rest.partition(placeholder)
         yield before.encode()
         yield from pieces
     yield rest.encode()
 
 
-def embedded(value: Any) -> str:
+def script_json(value: Any) -> str:
     """JSON without <, so that no text in it can end the script element."""
     return json.dumps(value, allow_nan=False, ensure_ascii=False).replace("<", "\\u003c")
 
@@ -116,28 +117,28 @@ def _elements(data: Mapping[str, Iterable[bytes]]) -> Iterator[bytes]:
     for element, blocks in data.items():
         begin, end = f'<script type="application/octet-stream" id="{element}">'.encode(), b"</script>\n"
         yield begin
-        held = 0
-        for letters in _base64(blocks):
-            if held > LETTERS:
+        length = 0
+        for characters in _base64(blocks):
+            if length > MAX_CHARACTERS:
                 yield end + begin
-                held = 0
-            yield letters
-            held += len(letters)
+                length = 0
+            yield characters
+            length += len(characters)
         yield end
 
 
 def _base64(blocks: Iterable[bytes]) -> Iterator[bytes]:
-    left = b""
+    rest = b""
     for block in blocks:
-        left += block
-        whole = len(left) - len(left) % 3  # encodes without padding
-        yield base64.b64encode(left[:whole])
-        left = left[whole:]
-    yield base64.b64encode(left)
+        rest += block
+        end = len(rest) - len(rest) % 3  # encodes without padding
+        yield base64.b64encode(rest[:end])
+        rest = rest[end:]
+    yield base64.b64encode(rest)
 
 
 @cache
-def _part(name: str) -> str:
+def _static_file(name: str) -> str:
     return (files("clod_adapter.viewer") / "static" / name).read_text(encoding="utf-8")
 
 

@@ -23,7 +23,7 @@ from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.ply.columns import SIGMA, column_map, inria_dtype
 from clod_adapter.io.ply.header import write_comments
 
-ROWS = 1 << 14  # per block
+BLOCK_ROWS = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Payload:
         return cls(as_text(checkpoint.path.name), checkpoint.gaussians.without_empty_bands(), checkpoint.calibration)
 
     @cached_property
-    def head(self) -> bytes:
+    def header(self) -> bytes:
         """The PLY's header, with attenuation settings and calibration as comments."""
         names = [name for name in inria_dtype(self.gaussians.sh_degree).names or () if name not in ("nx", "ny", "nz")]
         names += [SIGMA] if self.gaussians.sigma_d is not None else []
@@ -59,27 +59,27 @@ class Payload:
     def size(self) -> int:
         """Bytes of the PLY."""
         attributes = 4 * sum(map(len, column_map(self.gaussians.sh_degree).values()))
-        return len(self.head) + len(self.gaussians) * (attributes + 4 * (self.gaussians.sigma_d is not None))
+        return len(self.header) + len(self.gaussians) * (attributes + 4 * (self.gaussians.sigma_d is not None))
 
     def blocks(self) -> Iterator[bytes]:
         """The PLY in blocks of rows: little-endian float32, Inria's layout without normals, ``sigma_d`` last.
 
         A logit above 20 is written as 20, the same opacity in float32.
         """
-        yield self.head
-        for start in range(0, len(self.gaussians), ROWS):
-            yield _rows(self.gaussians, slice(start, start + ROWS)).astype("<f4", copy=False).tobytes()
+        yield self.header
+        for start in range(0, len(self.gaussians), BLOCK_ROWS):
+            yield _values(self.gaussians, slice(start, start + BLOCK_ROWS)).astype("<f4", copy=False).tobytes()
 
-    def describe(self, **where: Any) -> dict[str, Any]:
-        """The splat's entry in the page's configuration; ``where`` overrides the location of the data."""
+    def describe(self, **location: Any) -> dict[str, Any]:
+        """The splat's entry in the page's configuration; ``location`` overrides where the data are."""
         attenuation = self.gaussians.attenuation
         return {
             "name": self.name, "href": None, "element": None, "format": "ply", "sigma": None,
             "count": len(self.gaussians), "max_sv": attenuation.max_sv if attenuation else 1.0,
             "attenuation": asdict(attenuation) if attenuation else None,
             "screen_filter": asdict(self.gaussians.screen_filter),
-            "no_dial": None if attenuation else no_dial(self.name), "calibration": _rows_of(self.calibration),
-        } | where  # fmt: skip
+            "no_dial": None if attenuation else no_dial(self.name), "calibration": _calibration_rows(self.calibration),
+        } | location  # fmt: skip
 
 
 def page_config(
@@ -99,11 +99,11 @@ def page_config(
 
 
 def no_dial(name: str) -> str:
-    """Message for a file without a dial: the reason and the command that adds one."""
-    return f"{name} has no sigma_d, so there is no dial to turn; give it one: clod-adapt {name} --images SCENE"
+    """The message for a file without a dial: the reason, and the command that adds one."""
+    return f"{name} has no sigma_d, so it has no dial; add one: clod-adapt {name} --images SCENE"
 
 
-def _rows(gaussians: Gaussians, rows: slice) -> np.ndarray:
+def _values(gaussians: Gaussians, rows: slice) -> np.ndarray:
     """``[n, P]`` float32 values of these rows in the order of the header."""
     g = gaussians
     count = len(g.means[rows])
@@ -115,16 +115,16 @@ def _rows(gaussians: Gaussians, rows: slice) -> np.ndarray:
     return torch.cat(parts, 1).detach().float().cpu().numpy()
 
 
-def _rows_of(calibration: Calibration | None) -> list[dict[str, float]]:
+def _calibration_rows(calibration: Calibration | None) -> list[dict[str, float]]:
     rows = calibration.rows if calibration else ()
     return [{"virtual_scale": row.virtual_scale, "count": row.kept, "psnr": row.psnr} for row in rows]
 
 
 def _camera(camera: Camera) -> dict[str, Any]:
-    def short(matrix: torch.Tensor) -> list[list[float]]:
+    def nested_list(matrix: torch.Tensor) -> list[list[float]]:
         return [[float(f"{value:.9g}") for value in row] for row in matrix.tolist()]  # full float32 precision
 
     return {
-        "name": camera.name, "viewmat": short(camera.viewmat), "K": short(camera.K), "width": camera.width,
+        "name": camera.name, "viewmat": nested_list(camera.viewmat), "K": nested_list(camera.K), "width": camera.width,
         "height": camera.height, "near": camera.near,
     }  # fmt: skip

@@ -21,32 +21,32 @@ from typing import Any
 from clod_adapter.errors import ClodError
 
 HOST = "127.0.0.1"
-THIS_MACHINE = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?", re.ASCII)
-SECONDS = 30  # timeout of an idle connection
+LOOPBACK = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?", re.ASCII)
+IDLE_TIMEOUT = 30  # of a connection, seconds
 
 
 @dataclass(frozen=True)
-class Answer:
+class Response:
     """The response to a path.
 
     Attributes:
-        kind: media type.
+        media_type: of Content-Type.
         size: in bytes.
         blocks: returns the bytes in pieces, called for each request.
         policy: Content-Security-Policy.
     """
 
-    kind: str
+    media_type: str
     size: int
     blocks: Callable[[], Iterable[bytes]]
     policy: str = "default-src 'none'"
 
 
 class Server(ThreadingHTTPServer):
-    """Serves ``answers`` on loopback once ``serve_forever`` runs; a context manager that closes the port.
+    """Serves ``responses`` on loopback once ``serve_forever`` runs; a context manager that closes the port.
 
     Args:
-        answers: by path with its leading slash; a query (``?...``) is ignored.
+        responses: by path with its leading slash; a query (``?...``) is ignored.
         port: 0 selects a free one.
 
     Raises:
@@ -59,16 +59,16 @@ class Server(ThreadingHTTPServer):
     block_on_close = False
     allow_reuse_address = sys.platform != "win32"  # on Windows two servers would share a port
 
-    def __init__(self, answers: Mapping[str, Answer], port: int = 0) -> None:
-        self.answers = dict(answers)
-        self._requests: set[socket.socket] = set()
-        self._answering: list[threading.Thread] = []
+    def __init__(self, responses: Mapping[str, Response], port: int = 0) -> None:
+        self.responses = dict(responses)
+        self._sockets: set[socket.socket] = set()
+        self._threads_of_requests: list[threading.Thread] = []
         try:
             super().__init__((HOST, port), _Handler)
         except OSError as error:
             raise ClodError(
-                f"port {port} of {HOST} cannot be listened on ({error.strerror or error}); give another, or 0 for a "
-                "free one"
+                f"port {port} of {HOST} is not available ({error.strerror or error}); choose another, or 0 for a free "
+                "one"
             ) from error
 
     @property
@@ -85,26 +85,26 @@ class Server(ThreadingHTTPServer):
 
     def get_request(self) -> tuple[socket.socket, Any]:
         request, address = super().get_request()
-        self._requests.add(request)
+        self._sockets.add(request)
         return request, address
 
     def process_request(self, request: Any, client_address: Any) -> None:
         thread = threading.Thread(target=self.process_request_thread, args=(request, client_address))
-        self._answering = [*(each for each in self._answering if each.is_alive()), thread]
+        self._threads_of_requests = [*(each for each in self._threads_of_requests if each.is_alive()), thread]
         thread.start()
 
     def shutdown_request(self, request: Any) -> None:
-        self._requests.discard(request)
+        self._sockets.discard(request)
         super().shutdown_request(request)
 
     def server_close(self) -> None:
         """Closes open connections and waits for their threads."""
-        for request in list(self._requests):
+        for request in list(self._sockets):
             with suppress(OSError):
                 request.shutdown(socket.SHUT_RDWR)
         super().server_close()
-        for thread in self._answering:
-            if thread.is_alive():  # not one that never started
+        for thread in self._threads_of_requests:
+            if thread.is_alive():  # false for one that never started
                 thread.join()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -116,29 +116,29 @@ class Server(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "clod-adapt", ""
-    timeout = SECONDS
+    timeout = IDLE_TIMEOUT
     server: Server
 
     def do_GET(self) -> None:
-        self._answer(whole=True)
+        self._respond(body=True)
 
     def do_HEAD(self) -> None:
-        self._answer(whole=False)
+        self._respond(body=False)
 
-    def _answer(self, *, whole: bool) -> None:
-        if not is_here(self.headers.get_all("Host") or []):
+    def _respond(self, *, body: bool) -> None:
+        if not names_loopback(self.headers.get_all("Host") or []):
             self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
             return
-        answer = self.server.answers.get(self.path.partition("?")[0])
-        if answer is None:
+        response = self.server.responses.get(self.path.partition("?")[0])
+        if response is None:
             self.send_error(HTTPStatus.NOT_FOUND)
             return
         self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", answer.kind)
-        self.send_header("Content-Length", str(answer.size))
-        self.send_header("Content-Security-Policy", f"{answer.policy}; frame-ancestors 'none'")
+        self.send_header("Content-Type", response.media_type)
+        self.send_header("Content-Length", str(response.size))
+        self.send_header("Content-Security-Policy", f"{response.policy}; frame-ancestors 'none'")
         self.end_headers()
-        for block in answer.blocks() if whole else ():
+        for block in response.blocks() if body else ():
             self.wfile.write(block)
 
     def end_headers(self) -> None:
@@ -154,6 +154,6 @@ class _Handler(BaseHTTPRequestHandler):
         """Requests are not logged."""
 
 
-def is_here(hosts: list[str]) -> bool:
+def names_loopback(hosts: list[str]) -> bool:
     """Whether the Host headers name this machine, with any port (an ssh tunnel may have another)."""
-    return len(hosts) == 1 and THIS_MACHINE.fullmatch(hosts[0].lower()) is not None
+    return len(hosts) == 1 and LOOPBACK.fullmatch(hosts[0].lower()) is not None

@@ -1,4 +1,4 @@
-"""Compiled formulas equal the plain ones, in values and gradients, at all dial values from one compilation."""
+"""Compiled formulas match the plain ones in values and gradients; one compilation serves all dial values."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DIALS = (1.0, 2.5, 6.0)
 
 @pytest.fixture
 def everything_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the CPU too, for any number of rows, and again in each test."""
+    """Compiles on the CPU too, for any number of rows, and anew in each test."""
     monkeypatch.setattr(Fused, "compiles", lambda self, first: not self._failed)
     for name in ("_from_logits", "_from_centres", "_from_opacities"):
         monkeypatch.setattr(attenuation, name, Fused(getattr(attenuation, name).plain))
@@ -50,7 +50,7 @@ def inputs(n: int = 3001) -> dict[str, Tensor]:
 
 
 def results(given: dict[str, Tensor], view: Camera, config: AttenuationConfig, form: str) -> list[Tensor]:
-    """The four fields at each dial value, and the gradients of two of them."""
+    """The four fields at each dial value, and their gradients of logits and sigma."""
     logits, sigma = given["logits"].clone().requires_grad_(), given["sigma"].clone().requires_grad_()
     d = given["means"].norm(dim=1)
     found: list[Tensor] = []
@@ -70,7 +70,7 @@ def test_one_traced_graph_gives_the_same_results(
     monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     def donates() -> Any:
-        """A setting of the user's own compiled code too; torch 2.4 has none."""
+        """A global setting of torch, which must not change; torch 2.4 does not have it."""
         return getattr(torch._functorch.config, "donated_buffer", None)
 
     before = donates()
@@ -101,7 +101,7 @@ def test_compiled_results_are_the_same_to_rounding(request: pytest.FixtureReques
 
 
 def assert_same(found: list[Tensor], want: list[Tensor]) -> None:
-    """Within some roundings of float32: another torch fuses other operations."""
+    """Asserts equality to rounding: torch versions fuse different operations."""
     for mine, expected in zip(found, want, strict=True):
         torch.testing.assert_close(mine.float(), expected.float(), rtol=1e-5, atol=1e-6, equal_nan=True)
 

@@ -17,7 +17,7 @@ from clod_adapter._support.workers import Worker, in_order, some
 
 @pytest.fixture
 def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No workers yet, and a short timeout."""
+    """Starts without workers, with a short timeout."""
     monkeypatch.setattr(workers, "_workers", [])
     monkeypatch.setattr(workers, "LOOK_SECONDS", 0.02)
 
@@ -32,7 +32,7 @@ def test_results_come_in_order(fresh: None) -> None:
     assert list(in_order([], 3)) == []
 
 
-def test_an_error_is_raised_once_all_started_calls_are_done(fresh: None) -> None:
+def test_an_error_is_raised_after_started_calls_end(fresh: None) -> None:
     done, asked = [], []
 
     def call(number: int) -> None:
@@ -52,8 +52,8 @@ def test_an_error_is_raised_once_all_started_calls_are_done(fresh: None) -> None
 
 
 @pytest.mark.parametrize("refused", [True, False])
-def test_threads_that_do_not_start(fresh: None, monkeypatch: pytest.MonkeyPatch, refused: bool) -> None:
-    """The system refuses them, or starts them and they end at once, as without memory for their stack."""
+def test_unstarted_threads_raise_memory_error(fresh: None, monkeypatch: pytest.MonkeyPatch, refused: bool) -> None:
+    """The system refuses threads, or starts threads that end at once for lack of memory."""
     start = _thread.start_new_thread
 
     def start_none(*_: object) -> int:
@@ -67,7 +67,7 @@ def test_threads_that_do_not_start(fresh: None, monkeypatch: pytest.MonkeyPatch,
         some(1)
 
 
-def test_threads_that_end_before_their_work(fresh: None) -> None:
+def test_threads_that_end_early_are_replaced(fresh: None) -> None:
     def kernel(worker: int, count: int, out: torch.Tensor) -> None:
         out[worker] = count
 
@@ -86,7 +86,7 @@ def test_threads_that_end_before_their_work(fresh: None) -> None:
     assert out.tolist() == [2, 2]
 
 
-def test_a_worker_holds_no_reference_once_it_is_done(fresh: None) -> None:
+def test_a_finished_worker_holds_no_reference(fresh: None) -> None:
     """An idle thread that held a tensor while the interpreter ends would abort the process."""
 
     class Held:

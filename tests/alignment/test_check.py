@@ -1,4 +1,4 @@
-"""Does a checkpoint stand where the cameras look? What must pass, what must stop, and which frames are told."""
+"""The alignment of a checkpoint with its cameras: what fits, what does not, and which frame is suggested."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ def posed(view: View, viewmat: Tensor) -> View:
 
 
 def in_world(views: Sequence[View], scale: float, rotation: Tensor, offset: Tensor) -> list[View]:
-    """The views in a world where ``x' = scale rotation x + offset``: camera and file are no longer in one frame."""
+    """The views in the world ``x' = scale rotation x + offset``, which is not the file's."""
     viewmats = torch.stack([view.camera.viewmat.double() for view in views])
     moved = into_file(viewmats, rotation.T, 1 / scale, -rotation.T @ offset / scale)
     return [posed(view, viewmat) for view, viewmat in zip(views, moved, strict=True)]
 
 
-def test_a_file_in_its_place_fits_under_any_exposure(pair: tuple[Gaussians, list[View]]) -> None:
+def test_an_aligned_file_fits_under_any_exposure(pair: tuple[Gaussians, list[View]]) -> None:
     base, views = pair
     found = check_alignment(base, views)
     assert found.fits and not found.on_white and found.views == 8
@@ -60,7 +60,7 @@ def test_a_file_in_its_place_fits_under_any_exposure(pair: tuple[Gaussians, list
     assert check_alignment(base, darker).fits
 
 
-def test_numbers_are_those_of_their_equations(pair: tuple[Gaussians, list[View]]) -> None:
+def test_measures_match_their_definitions(pair: tuple[Gaussians, list[View]]) -> None:
     base, views = pair
     wrong = base.replace(means=base.means.roll(1, 1))
     found = check_alignment(wrong, views)
@@ -73,7 +73,7 @@ def test_numbers_are_those_of_their_equations(pair: tuple[Gaussians, list[View]]
     assert found.correlation == pytest.approx(float(torch.nn.functional.cosine_similarity(*both, dim=0)), abs=1e-4)
 
 
-def test_an_underfitted_base_fits(pair: tuple[Gaussians, list[View]]) -> None:
+def test_an_underfitted_checkpoint_fits(pair: tuple[Gaussians, list[View]]) -> None:
     base, views = pair
     poor = base.select(torch.arange(len(base)) % 5 > 0)
     poor = poor.replace(sh0=poor.sh0 * 0.7, shN=poor.shN[:, :0], log_scales=poor.log_scales + 0.15)
@@ -82,8 +82,8 @@ def test_an_underfitted_base_fits(pair: tuple[Gaussians, list[View]]) -> None:
     assert guess_frame(poor, views, found) is None
 
 
-def test_views_that_the_file_does_not_reach_do_not_stop_it(pair: tuple[Gaussians, list[View]]) -> None:
-    """Three of eight cameras look the other way, at something bright: the pooled error is the worse one."""
+def test_views_outside_the_scene_do_not_prevent_a_fit(pair: tuple[Gaussians, list[View]]) -> None:
+    """Three of eight cameras look away, at a bright scene, so the pooled error alone would reject the file."""
     base, views = pair
     away = torch.diag(torch.tensor([-1.0, 1, -1, 1]))
     bright = [View(view.camera, 255 - view.image // 4) for view in views[:3]]
@@ -117,7 +117,7 @@ def test_few_views_and_one_gaussian(pair: tuple[Gaussians, list[View]], count: i
     assert not lost.fits and guess_frame(stray, seen, lost) is None or count == 2
 
 
-def test_nothing_to_show_does_not_fit(pair: tuple[Gaussians, list[View]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_empty_render_does_not_fit(pair: tuple[Gaussians, list[View]], monkeypatch: pytest.MonkeyPatch) -> None:
     base, views = pair
     none = base.select(torch.zeros(len(base), dtype=torch.bool))
     found = check_alignment(none, views)
@@ -130,7 +130,7 @@ def test_nothing_to_show_does_not_fit(pair: tuple[Gaussians, list[View]], monkey
     assert math.isnan(found.psnr) and math.isnan(found.margin) and not found.fits
 
 
-def test_trained_on_white(pair: tuple[Gaussians, list[View]]) -> None:
+def test_a_white_background_is_recognised(pair: tuple[Gaussians, list[View]]) -> None:
     base, views = pair
     white = [View(view.camera, render(base, view.camera, background=torch.ones(3)).pixels) for view in views]
     found = check_alignment(base, white)
@@ -148,7 +148,7 @@ CASES = [
 
 
 def rounded(number: re.Match[str]) -> str:
-    """To two digits, as the search finds numbers to within a per cent or so."""
+    """The number to two digits; the search is accurate to about a per cent."""
     return f"{float(f'{float(number[0]):.2g}'):g}"
 
 
@@ -181,8 +181,8 @@ def test_other_poses_are_named(pair: tuple[Gaussians, list[View]], case: str) ->
     assert guess is not None and guess.description.endswith(case)
 
 
-def test_a_turn_is_told_from_all_others(pair: tuple[Gaussians, list[View]]) -> None:
-    """Each of the 48 ways to name the axes is undone by exactly one of those that are tried."""
+def test_every_axis_permutation_has_one_frame(pair: tuple[Gaussians, list[View]]) -> None:
+    """Each of the 48 signed permutations of the axes is undone by exactly one candidate frame."""
     _, views = pair
     viewmats = torch.stack([view.camera.viewmat.double() for view in views])
     for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)):
@@ -193,7 +193,7 @@ def test_a_turn_is_told_from_all_others(pair: tuple[Gaussians, list[View]]) -> N
         assert len(near) == (0 if rotation.equal(EYE) else 1)
 
 
-def test_another_scene_is_no_frame(pair: tuple[Gaussians, list[View]]) -> None:
+def test_another_scene_has_no_frame(pair: tuple[Gaussians, list[View]]) -> None:
     _, views = pair
     other = scenes.gaussians(250, 1, 99, size=0.15)
     found = check_alignment(other, views)

@@ -1,4 +1,4 @@
-"""Which filter a checkpoint was trained with, by the photographs."""
+"""The screen filter of a checkpoint is recognised by its photographs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from scenes import gaussians, photograph, ring
 def seen_with(name: str, views: int = 5) -> tuple[Gaussians, tuple[View, ...]]:
     """A checkpoint that does not name its filter, and photographs of it drawn with ``name``.
 
-    Its Gaussians are of a pixel and less in images 48 wide, where filters differ.
+    Its Gaussians are at most a pixel wide in images of 48 pixels, where filters differ.
     """
     fine = gaussians(1500, 0, 0, size=0.025)
     noisy = fine.sh0 + 0.1 * torch.randn(fine.sh0.shape, generator=torch.Generator().manual_seed(1))
@@ -33,8 +33,8 @@ def test_the_filter_of_the_photographs_is_found(name: str, expected: str) -> Non
     assert max(found.psnr, key=found.psnr.__getitem__) == name and found.psnr.keys() == FILTERS.keys()
 
 
-def test_where_nothing_is_clear_the_expected_one_stays() -> None:
-    """Gaussians so large that filters hardly change them."""
+def test_expected_filter_is_kept_without_a_clear_difference() -> None:
+    """The Gaussians are so large that filters hardly change them."""
     truth = gaussians(100, 0, 2, size=0.4)
     views = photograph(truth.replace(screen_filter=FILTERS["on"]), ring(4, 48, 36))
     base = truth.replace(sh0=truth.sh0 + 0.05)
@@ -43,15 +43,15 @@ def test_where_nothing_is_clear_the_expected_one_stays() -> None:
 
 
 def test_photographs_of_something_else_decide_nothing() -> None:
-    """Dark ones, so that the faintest picture is the nearest: less is not more where nothing is shown."""
+    """The photographs are dark, so the faintest render has the best PSNR."""
     base, views = seen_with("off")
     shuffled = [View(view.camera, view.image.flip(0, 1) // 6) for view in views]
     found = compare_filters(base, shuffled)
     assert found.psnr["on"] > found.psnr["off"] + 0.5 and found.chosen == "off"
 
 
-def test_a_better_mean_that_comes_of_few_views_is_not_enough() -> None:
-    """Two of five photographs of another filter: clearly better in the mean, in most of them not better at all."""
+def test_a_filter_must_be_better_in_most_views() -> None:
+    """Two of five photographs have another filter, which is better in the mean but not in most views."""
     base, classic = seen_with("off")
     _, other = seen_with("on")
     few = [*classic[:3], *(View(view.camera, view.image) for view in other[3:])]

@@ -1,4 +1,4 @@
-"""Plans of bytes, and sizes as people write them."""
+"""Memory plans, and the sizes that --memory accepts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_sizes() -> None:
             parse_size(text)
 
 
-def test_as_few_blocks_as_needed() -> None:
+def test_plan_uses_as_few_blocks_as_possible() -> None:
     plan = plan_for_limit(CITY, 8 * 10**9)
     assert plan.blocks == 1 and plan.peak <= 8 * 10**9 and plan.cache == CITY.images
     counts = [plan_for_limit(CITY, limit).blocks for limit in range(least(CITY), 5 * 10**9, 10**8)]
@@ -36,7 +36,7 @@ def test_as_few_blocks_as_needed() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 10**7), st.sampled_from([56, 236]), st.integers(0, 10**10), st.integers(1, 10**7))
-def test_the_least_is_enough_and_less_is_not(count: int, attributes: int, images: int, pixels: int) -> None:
+def test_least_memory_is_the_smallest_that_suffices(count: int, attributes: int, images: int, pixels: int) -> None:
     needs = MemoryEstimate(count, attributes, attributes + 12, images, pixels)
     limit = least(needs)
     plan = plan_for_limit(needs, limit)
@@ -46,8 +46,8 @@ def test_the_least_is_enough_and_less_is_not(count: int, attributes: int, images
             plan_for_limit(needs, limit - 10**8)
 
 
-def test_too_little_says_the_least() -> None:
-    """In words that are enough, also where three digits would say too little: 123.4 GB."""
+def test_too_little_memory_names_the_least() -> None:
+    """The least that the error names suffices; it has four digits where three would round down."""
     with pytest.raises(ClodError) as error:
         plan_for_limit(CITY, 10**9)
     assert f"--memory is 1 GB, and 2,000,000 Gaussians take at least {in_words(least(CITY))}" in str(error.value)
@@ -56,8 +56,8 @@ def test_too_little_says_the_least() -> None:
         assert plan_for_limit(needs, parse_size(in_words(least(needs)).replace(" ", ""))).blocks > 1
 
 
-def test_pictures_that_cannot_be_read_again_stay() -> None:
-    """They are in every phase but the first, beside a block's own of them."""
+def test_images_without_files_stay_in_memory() -> None:
+    """They are in memory in every phase but the first, in addition to a block's own images."""
     plan = plan_for_limit(CITY, 8 * 10**9)
     made = plan_for_limit(replace(CITY, images=0, pictures=CITY.images), 8 * 10**9)
     assert (made.cache, made.start, made.train) == (0, plan.start, plan.train)

@@ -1,4 +1,4 @@
-"""Adapting block by block: blocks, what each sees and draws, and that the whole is as one adapted undivided."""
+"""Adapting block by block: division, views, context, targets, and agreement with undivided training."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def learned(captured: tuple[Gaussians, Scene], divided: Division) -> list[Learne
 
 @pytest.fixture(scope="module")
 def whole(captured: tuple[Gaussians, Scene], divided: Division, learned: list[Learned]) -> Gaussians:
-    """After both passes."""
+    """The merged result after both passes."""
     first, views = merge(divided, learned), captured[1].train
     return merge(divided, [adapt_block(divided, views, CONFIG, block, after=first)[0] for block in range(BLOCKS)])
 
@@ -57,7 +57,7 @@ def whole(captured: tuple[Gaussians, Scene], divided: Division, learned: list[Le
 @given(
     st.integers(1, 400), st.integers(1, 40), st.integers(0, 2**31), st.sampled_from(["spread", "plane", "heaps", "far"])
 )
-def test_blocks_are_even_and_hold_everything(count: int, parts: int, seed: int, kind: str) -> None:
+def test_blocks_are_even_and_complete(count: int, parts: int, seed: int, kind: str) -> None:
     parts = min(parts, count)
     means = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
     if kind == "plane":
@@ -73,7 +73,7 @@ def test_blocks_are_even_and_hold_everything(count: int, parts: int, seed: int, 
 
 
 def test_blocks_are_boxes() -> None:
-    """Of an even spread each block is one piece of space: the boxes around them hardly overlap."""
+    """The bounding boxes of the blocks of an even distribution hardly overlap."""
     means = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([4.0, 1.0, 2.0])
     block = split(means, 8)
     sides = torch.stack([means[block == k].amax(0) - means[block == k].amin(0) for k in range(8)])
@@ -86,8 +86,8 @@ def test_blocks_are_boxes() -> None:
         split(torch.zeros(3, 3), 4)
 
 
-def test_coverage_is_what_a_picture_is_mixed_from(captured: tuple[Gaussians, Scene]) -> None:
-    """Adds up to the alpha, and is 0 for what no pixel shows."""
+def test_coverage_sums_to_alpha(captured: tuple[Gaussians, Scene]) -> None:
+    """Coverage is 0 for Gaussians that no pixel shows."""
     base, scene = captured
     camera = scene.train[0].camera
     shown = coverage(base, base.opacities, camera)
@@ -118,7 +118,7 @@ def test_a_block_has_the_views_that_see_it(divided: Division, captured: tuple[Ga
 
 
 def test_rows_left_out_of_the_context_are_not_needed(captured: tuple[Gaussians, Scene]) -> None:
-    """Of many small ones behind a wall: images without the rows left out of the context are nearly the same."""
+    """With many small Gaussians behind a wall, images hardly change without the rows left out."""
     base, scene = captured
     hidden = gaussians(400, 1, 3, size=0.02)
     hidden = hidden.replace(means=hidden.means * 0.2)  # within the cloud
@@ -134,7 +134,7 @@ def test_rows_left_out_of_the_context_are_not_needed(captured: tuple[Gaussians, 
 
 
 def test_target_shares_add_up_to_the_curve(divided: Division, captured: tuple[Gaussians, Scene]) -> None:
-    """And where each block has its part of the loss, each Gaussian is penalised as in an undivided run."""
+    """Weighted with its share of the loss, each Gaussian is penalised as in an undivided run."""
     views, count = captured[1].train, len(captured[0])
     for first in (True, False):
         shown = [with_target_shares(divided, block, views, CONFIG, first=first) for block in range(BLOCKS)]
@@ -149,8 +149,8 @@ def test_target_shares_add_up_to_the_curve(divided: Division, captured: tuple[Ga
                     assert loss * q.weight / len(divided.rows(block)) == pytest.approx(1 / (share * count))
 
 
-def test_targets_ask_for_the_whole_error_once(captured: tuple[Gaussians, Scene], divided: Division) -> None:
-    """What the blocks are asked to change adds up to what is between checkpoint and photograph."""
+def test_target_images_of_blocks_add_up_to_the_photograph(captured: tuple[Gaussians, Scene], divided: Division) -> None:
+    """The changes that the targets ask for add up to the error of the checkpoint."""
     base, scene = captured
     view, asked = scene.train[0], 0.0
     picture = render(base, view.camera).image
@@ -174,10 +174,10 @@ def test_merging_takes_each_row_from_its_block(divided: Division, learned: list[
         merge(divided, [*learned, learned[0]])
 
 
-def test_no_seams(
+def test_blocks_match_undivided_training(
     captured: tuple[Gaussians, Scene], divided: Division, learned: list[Learned], whole: Gaussians
 ) -> None:
-    """Every image here is across all borders, through a cloud that hides nothing: the hardest there is.
+    """Every image crosses all borders of a translucent cloud, which is the hardest case.
 
     benchmarks/blocks.py measures it on captures.
     """
@@ -216,8 +216,8 @@ def test_a_block_resumes_with_the_same_bits(
 
 
 @pytest.mark.parametrize("drawn", [True, False])
-def test_a_block_that_no_view_sees_stays(captured: tuple[Gaussians, Scene], drawn: bool) -> None:
-    """Also where nothing at all is drawn, and the block is behind the only camera."""
+def test_a_block_without_views_is_unchanged(captured: tuple[Gaussians, Scene], drawn: bool) -> None:
+    """The block is behind the only camera, which sees other blocks or nothing."""
     base, scene = captured
     view = scene.train[0]
     ahead, right = view.camera.viewmat[2, :3], view.camera.viewmat[0, :3]
@@ -231,7 +231,7 @@ def test_a_block_that_no_view_sees_stays(captured: tuple[Gaussians, Scene], draw
     assert torch.equal(part.values["sigma_d"], division.initial.sigma_d[division.rows(behind)])
 
 
-def test_what_needs_all_gaussians_at_once_is_refused(captured: tuple[Gaussians, Scene]) -> None:
+def test_settings_that_need_all_gaussians_are_refused(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     with pytest.raises(ClodError, match="the paper's form cannot be trained in blocks"):
         divide(base, scene.train, AdaptConfig.paper(), 2)

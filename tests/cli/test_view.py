@@ -76,7 +76,7 @@ def test_a_port_that_is_taken(clod: Any, capture: Any) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         done = clod("view", capture.ply, "--no-browser", "--port", taken.getsockname()[1])
     assert (done.code, done.out) == (2, ""), done
-    assert re.search(r"(?m)^clod-adapt: error: .*port \d+ of 127.0.0.1 cannot be listened on .*give another", done.err)
+    assert re.search(r"(?m)^clod-adapt: error: .*port \d+ of 127.0.0.1 is not available .*choose another", done.err)
 
 
 class Browser(webbrowser.BaseBrowser):

@@ -19,7 +19,7 @@ from clod_adapter.io.scene.colmap_library import pycolmap
 
 @pytest.fixture(scope="module")
 def gallery() -> Gallery:
-    """Without light, which takes seconds to bake and does not change the geometry."""
+    """The gallery without baked light, which takes seconds and does not change the geometry."""
     return Gallery(unlit_room(), samples=2)
 
 
@@ -77,7 +77,7 @@ def test_points_lie_on_visible_surfaces(gallery: Gallery) -> None:
         assert np.median(difference) < 12, camera.name
 
 
-def test_capture_is_written_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_capture_is_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "bake_light", lambda tables: tables)
     seen: list[tuple[int, int]] = []
     folder = tmp_path / "capture"

@@ -33,17 +33,15 @@ def test_strip_shows_every_panel(tmp_path: Path) -> None:
 
 
 def test_labels_of_the_curve_do_not_overlap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the demo's own rows, with and without the base."""
+    """For the demo's own rows, with and without the base."""
     pytest.importorskip("matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.transforms import Bbox
 
     kept = {1: 36067, 1.25: 30257, 1.5: 26078, 2: 20385, 2.5: 16961, 3: 14718, 4: 12408, 5: 11425}
     psnr, ssim = (29.26, 29.31, 29.28, 29.14, 28.98, 28.77, 28.27, 27.65), (920, 920, 920, 918, 916, 913, 906, 898)
-    rows = [
-        {"virtual_scale": s, "kept": n, "psnr": p, "ssim": q / 1000}
-        for (s, n), p, q in zip(kept.items(), psnr, ssim, strict=True)
-    ]
+    values = zip(kept, kept.values(), psnr, (q / 1000 for q in ssim), strict=True)
+    rows = [dict(zip(("virtual_scale", "kept", "psnr", "ssim"), row, strict=True)) for row in values]
     base = {"kept": 60000, "psnr": 27.52, "ssim": 0.8992}
     for given in (None, base):
         quality_curve(tmp_path / "curve.png", rows, given, "quality")

@@ -1,9 +1,8 @@
-"""The ray tracer and its light in configurations of known result."""
+"""The ray tracer and its light in configurations with a known result."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from numpy.typing import ArrayLike
 
@@ -34,8 +33,8 @@ def shoot(tables: Tables, origins: ArrayLike, directions: ArrayLike) -> np.ndarr
     return out
 
 
-def test_a_camera_facing_a_wall() -> None:
-    """It sees the texture upright and unmirrored; larger pixels are averages over their area."""
+def test_texture_is_upright_and_area_averaged() -> None:
+    """A camera facing a wall sees the texture unmirrored; larger pixels are averages over their area."""
     texture = np.random.default_rng(0).random((64, 64, 3), np.float32)
     scene = wall(texture).tables()
     np.testing.assert_allclose(render_linear(scene, camera(64, 640.0), samples=1), texture, atol=0.01)
@@ -44,19 +43,10 @@ def test_a_camera_facing_a_wall() -> None:
     assert np.abs(render_linear(scene, camera(16, 160.0), samples=4) - want).mean() < 0.03
 
 
-def test_fine_pattern_far_away_turns_grey_and_not_into_moire() -> None:
+def test_a_distant_fine_pattern_is_grey() -> None:
     board = np.kron(np.indices((32, 32)).sum(0) % 2, np.ones((2, 2)))[..., None].repeat(3, 2).astype(np.float32)
     seen = render_linear(wall(board, size=8.0, tile=1.0).tables(), camera(32, 41.0), samples=3)
     np.testing.assert_allclose(seen[2:-2, 2:-2], 0.5, atol=0.02)
-
-
-def test_edges_are_covered_by_area() -> None:
-    scene = SceneBuilder({"white": WHITE})
-    scene.ball((0, 0, 10), 1.0, Finish("white"))
-    coverage = render_linear(scene.tables(), camera(32, 100.0), samples=3)[..., 0]
-    radius = 100.0 / np.sqrt(10.0**2 - 1)  # of the outline, in pixels
-    assert coverage.sum() == pytest.approx(np.pi * radius**2, rel=0.01)
-    assert np.unique(coverage.round(3)).size > 5
 
 
 def test_distances_and_colours_are_exact() -> None:
@@ -75,7 +65,7 @@ def test_distances_and_colours_are_exact() -> None:
     np.testing.assert_array_equal(encode_srgb(decode_srgb(codes)), codes)
 
 
-def test_lamp_lights_the_floor_as_its_form_factor_says() -> None:
+def test_lamp_light_matches_its_form_factor() -> None:
     scene = SceneBuilder({"white": WHITE})
     scene.panel((0, 0, 0), (0, 1, 0), (2, 2), Finish("white"), down=(0, 0, 1))
     scene.panel((0, -1.5, 0), (0, -1, 0), (1.2, 0.8), Finish("white", glow=3.0), down=(0, 0, 1))
@@ -89,7 +79,7 @@ def test_lamp_lights_the_floor_as_its_form_factor_says() -> None:
     np.testing.assert_allclose(out, 3.0 * factor, rtol=1e-3)
 
 
-def test_light_that_fills_a_closed_box_comes_back_times_the_albedo() -> None:
+def test_bounced_light_of_a_closed_box_is_its_albedo() -> None:
     scene = SceneBuilder({"grey": WHITE * 0.6})
     for s in (-1, 1):
         for forward, down in (((s, 0, 0), (0, 1, 0)), ((0, s, 0), (0, 0, 1)), ((0, 0, s), (0, 1, 0))):
@@ -101,7 +91,7 @@ def test_light_that_fills_a_closed_box_comes_back_times_the_albedo() -> None:
     np.testing.assert_allclose(out, 0.6, rtol=1e-6)
 
 
-def test_only_a_glossy_surface_changes_with_the_point_of_view() -> None:
+def test_only_glossy_surfaces_depend_on_the_view() -> None:
     scene = SceneBuilder({"white": WHITE, "red": WHITE * [1, 0, 0]})
     scene.ball((0, 0, 5), 1.0, Finish("white", gloss=0.5))
     scene.ball((9, 0, 5), 1.0, Finish("white"))

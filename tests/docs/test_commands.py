@@ -20,7 +20,7 @@ IDS = [str(page.relative_to(ROOT)) for page in PAGES]
 @pytest.mark.usefixtures("without_splat_transform")
 @pytest.mark.parametrize("page", PAGES, ids=IDS)
 def test_blocks_run_in_the_order_of_the_page(page: Path, desk: Path, tmp_path: Path, monkeypatch: Any) -> None:
-    """Trainings are short."""
+    """Training is shortened."""
     shutil.copytree(desk, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(clod_adapter, "AdaptConfig", short)
@@ -48,7 +48,7 @@ def short(**settings: Any) -> AdaptConfig:
 
 @pytest.mark.parametrize("page", PAGES, ids=IDS)
 def test_named_options_exist(page: Path) -> None:
-    """Of all commands in a page, those that are not run among them; the reasons for not running are above a block."""
+    """Also of commands that are not run; each reason for not running a block stands above it."""
     written, text = blocks(page), page.read_text(encoding="utf-8")
     commands = [words for block in written if block.language in SHELL for words in block.commands()]
     for words in [*commands, *(command.split() for command in spoken(page, "clod-adapt"))]:

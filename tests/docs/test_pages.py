@@ -1,4 +1,4 @@
-"""The pages against what they are about: the report's fields, and the numbers in tables against their rows."""
+"""The pages agree with the code: the report's fields are explained, and tables match the results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DOCS, RESULTS = ROOT / "docs", ROOT / "benchmarks" / "results"
 
 
 def keys(value: Any) -> Iterator[str]:
-    """Of all objects in it, but those of the settings, which the Python page lists."""
+    """The keys of all objects in a value, except in ``config``, which the Python page lists."""
     if isinstance(value, dict):
         for name, entry in value.items():
             yield name
@@ -46,24 +46,17 @@ def test_every_field_of_the_reports_is_explained(desk: Path, capsys: pytest.Capt
 
 
 def tables(page: Path) -> list[list[list[str]]]:
-    """Of each table its rows, of each row its cells, without emphasis."""
+    """The tables of a page, as rows of cells without emphasis."""
     found = re.findall(r"(?:^\|.*\|\n)+", page.read_text(encoding="utf-8"), re.MULTILINE)
-    return [
-        [
-            [cell.strip(" *") for cell in line.strip("|\n").split("|")]
-            for line in table.splitlines()
-            if "---" not in line
-        ]
-        for table in found
-    ]
+    lines = [[line for line in table.splitlines() if "---" not in line] for table in found]
+    return [[[cell.strip(" *") for cell in line.strip("|").split("|")] for line in table] for table in lines]
 
 
-def test_the_ranges_are_those_that_were_measured() -> None:
+def test_tables_of_ranges_match_the_results() -> None:
     with (RESULTS / "robustness.csv").open(encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if row["max_sv"] != "base"]
-    cells = {
-        (row["checkpoint"], float(row["max_sv"]), f"s = {float(row['virtual_scale']):g}"): cell(row) for row in rows
-    }
+    places = ((row["checkpoint"], float(row["max_sv"]), f"s = {float(row['virtual_scale']):g}") for row in rows)
+    cells = dict(zip(places, map(cell, rows), strict=True))
     ranges = (1, 3, 5, 7)
     page = [table for table in tables(DOCS / "max_sv.md") if table[0] == ["dial", *(f"max_sv {m}" for m in ranges)]]
     for table, checkpoint in zip(page, ("pretrained", "pretrained_mask"), strict=True):
@@ -75,7 +68,7 @@ def cell(row: Mapping[str, Any]) -> str:
     return f"{float(row['psnr']):.2f} @ {100 * float(row['kept_share']):.0f} %"
 
 
-def test_the_long_dials_are_those_that_were_measured() -> None:
+def test_table_of_long_dials_matches_the_results() -> None:
     rows = [json.loads(line) for line in (RESULTS / "adapt.jsonl").read_text(encoding="utf-8").splitlines()]
     (page,) = [table for table in tables(DOCS / "max_sv.md") if table[0][1:2] == ["plush_half, 5"]]
     titles = page[0][1:]
@@ -91,17 +84,15 @@ def test_the_long_dials_are_those_that_were_measured() -> None:
         assert written == [column.get(name, "") for column in columns], name
 
 
-def test_the_target_counts_are_those_of_training() -> None:
+def test_target_counts_match_training() -> None:
     config = AdaptConfig()
     (dials, shares) = next(rows for rows in tables(DOCS / "equation.md") if rows[0][0] == "s")
     for s, share in zip(dials[1:], shares[1:], strict=True):
         assert share == f"{target_curve(float(s), config.start_share, config.exponent):.0%}".replace("%", " %")
 
 
-def test_the_keys_are_those_of_the_viewer() -> None:
+def test_keys_match_the_viewer() -> None:
     source = ROOT / "clod_adapter" / "viewer" / "web" / "src" / "page.html"
-    if not source.exists():
-        pytest.skip("there is no viewer yet")
     help = re.findall(r"<dt>(.+?)</dt><dd>(.+?)</dd>", source.read_text(encoding="utf-8"))
     (page,) = [table for table in tables(DOCS / "viewing.md") if len(table[1]) == 2]
     assert [tuple(row) for row in page[1:]] == [(unescape(keys), unescape(text)) for keys, text in help]

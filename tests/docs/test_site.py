@@ -1,4 +1,4 @@
-"""The site: links that lead somewhere, nothing fetched from elsewhere, and pages that say what the code says."""
+"""The site: its links exist, it fetches nothing from other hosts, and its pages agree with the code."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)|(?:href|src)=\"([^\"]+)\"")
 
 
 def anchors(page: Path) -> set[str]:
-    """Of the headings, as Markdown's toc extension makes them, and as GitHub does for these."""
+    """The anchors of a page's headings, as Markdown's toc extension and GitHub make them."""
     found = set()
     for title in re.findall(r"^#+ +(.+?) *$", FENCE.sub("", page.read_text(encoding="utf-8")), re.MULTILINE):
         plain = re.sub(r"[^\w\s-]", "", re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", title)).strip().lower()
@@ -30,7 +30,7 @@ def anchors(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_and_anchors_are_there(page: Path) -> None:
+def test_links_and_anchors_exist(page: Path) -> None:
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     for target in (one or other for one, other in LINK.findall(text)):
         if target.startswith(("https://", "http://")):
@@ -54,7 +54,7 @@ def test_the_picture_of_the_equation_is_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "equation.png").stat().st_size > 10_000 and made["PICTURE"].is_file()
 
 
-def test_the_python_page_has_every_name_where_it_lives() -> None:
+def test_the_python_page_lists_every_public_name() -> None:
     listed = re.findall(r"^::: (\S+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
     named = {f"clod_adapter.{clod_adapter._homes[name]}.{name}" for name in clod_adapter.__all__}
     # What needs another package, or few people need, its user imports from where it is.
@@ -63,7 +63,7 @@ def test_the_python_page_has_every_name_where_it_lives() -> None:
     assert len(listed) == len(set(listed)) and set(listed) == named | apart and len(apart) == 8
 
 
-def test_the_colours_are_those_of_the_reports() -> None:
+def test_colours_match_the_reports() -> None:
     ours, theirs = DOCS / "style.css", ROOT / "clod_adapter" / "report" / "style.css"
     pairs = [re.findall(r"(--[a-z0-9-]+): ([^;]+);", path.read_text(encoding="utf-8")) for path in (ours, theirs)]
     names = {name for name, _ in pairs[1]}
@@ -71,7 +71,7 @@ def test_the_colours_are_those_of_the_reports() -> None:
 
 
 class Fetched(HTMLParser):
-    """What a browser fetches by itself to show a page."""
+    """The URLs that a browser fetches to show a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -86,7 +86,7 @@ class Fetched(HTMLParser):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built as ``make docs`` does, where a link that leads nowhere or a page that is not in the list is an error."""
+    """The site built as by ``make docs``, where a broken link or an unlisted page is an error."""
     pytest.importorskip("mkdocs", reason="pip install '.[docs]'")
     out = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)]
@@ -97,7 +97,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_built_site(site: Path) -> None:
-    """It loads nothing from elsewhere, its search has all pages and docstrings, and it publishes pages only."""
+    """The site loads nothing from other hosts, its search covers all pages, and it publishes pages only."""
     pages = sorted(site.glob("*.html"))
     assert len(pages) > len(list(DOCS.glob("*.md")))
     for page in pages:

@@ -1,4 +1,4 @@
-"""Matching counts, and the base by rank."""
+"""The dial value of a count, and rankings of the base."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Budgets: the counts that solved dial values really keep, and what the table's interpolation makes of known curves."""
+"""Budgets: solved dial values keep the counts asked for, and interpolate known curves."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_SV = 6.0
 
 
 def adapted(n: int, seed: int, normalizer: str = "scene") -> Gaussians:
-    """With decays for which Gaussians are culled all over the dial's range, and below and above it."""
+    """Gaussians that are culled at dial values within, below and above the range."""
     generator = torch.Generator().manual_seed(seed)
     sigma = (torch.randn(n, generator=generator) * 0.8 + 0.4).exp()
     attenuation = AttenuationConfig(max_sv=MAX_SV, normalizer=normalizer, scene_distance=5.0)
@@ -104,20 +104,6 @@ def test_psnr_drop(psnr: list[float], drop: float, dial_value: float) -> None:
     assert drop < 3 or solved.note.startswith("only 1.75 dB are lost at s = 4")
 
 
-@settings(deadline=None, max_examples=100)
-@given(st.lists(st.floats(20, 40), min_size=1, max_size=9), st.floats(1e-3, 10))
-def test_the_drop_is_not_exceeded_before(psnr: list[float], drop: float) -> None:
-    """By the interpolation itself, written out once more, on a fine grid."""
-    s = dial_for(adapted(3, 0), psnr_drop=drop, calibration=table(psnr)).virtual_scale
-    assert 1 <= s <= 2.0 ** (len(psnr) - 1)
-    for k in range(50):
-        at = math.log2(s) * k / 49
-        left = min(int(at), len(psnr) - 2) if len(psnr) > 1 else 0
-        right = min(left + 1, len(psnr) - 1)
-        value = psnr[left] + (at - left) * (psnr[right] - psnr[left])
-        assert psnr[0] - value <= drop + 1e-6
-
-
 @pytest.mark.parametrize(
     ("times", "fps", "dial_value"),
     [
@@ -138,7 +124,7 @@ def test_frame_rate(times: list[float], fps: float, dial_value: float) -> None:
 
 
 def test_frames_are_timed_where_nothing_is_stored(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The clock is the dial's: a frame at s takes 8/s ms."""
+    """The clock is simulated: a frame at s takes 8/s ms."""
     seen: list[tuple[str, float]] = []
     now = [0.0]
 
@@ -164,7 +150,7 @@ def test_frame_times_of_a_real_clock() -> None:
     assert len(frame_times(alone, ring(1, 48, 36))) == 1
 
 
-def test_bad_calls_are_named() -> None:
+def test_bad_arguments_are_refused() -> None:
     some, camera = adapted(5, 0), ring(1, 48, 36)
     for budgets in ({}, {"keep": 3, "fps": 3}):
         with pytest.raises(ClodError, match="exactly one of keep, psnr_drop and fps"):

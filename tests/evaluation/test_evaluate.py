@@ -1,4 +1,4 @@
-"""Rows of an evaluation: values that can be worked out by hand, and what an unadapted file gives."""
+"""Rows of an evaluation: values computed by hand, and those of an unadapted file."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from scenes import camera, gaussians, in_front, photograph, ring
 
 
 def row_of_four() -> Gaussians:
-    """At camera depths 1, 2, 4 and 8 before ``camera()``, the last far outside the image; each 1 per sigma."""
+    """Four Gaussians at camera depths 1, 2, 4 and 8, the last far outside the image; sigma_d is 1."""
     means = in_front(camera(), torch.tensor([[0.0, 0, 1], [0, 0, 2], [0, 0, 4], [80, 0, 8]]))
     some = gaussians(4, 0, 0).replace(means=means, opacity_logits=torch.full((4,), 2.0))
     return attach(some, torch.ones(4), AttenuationConfig(tau=0.01, eps=0.0))
 
 
-def test_a_black_picture_by_hand() -> None:
-    """Nothing drawn: PSNR is that of the photograph against black; its mean is over views, in dB."""
+def test_metrics_of_a_black_image() -> None:
+    """Nothing is drawn: PSNR is that of the photograph against black, averaged over views in dB."""
     nothing = gaussians(5, 0, 0).replace(opacity_logits=torch.full((5,), -math.inf))
     views = [View(camera(20, 16), torch.full((16, 20, 3), value, dtype=torch.uint8)) for value in (51, 255)]
     (row,) = evaluate(nothing, views, [1.0])
@@ -40,7 +40,7 @@ def test_a_black_picture_by_hand() -> None:
     assert 0 < row.frame_ms < 1000
 
 
-def test_counts_by_hand() -> None:
+def test_counts_follow_the_culling_threshold() -> None:
     """Kept iff ``log a - (d s)^2 / 2 > log(tau s)`` with log a = -0.127: at s = 1 the two nearer than 3."""
     view = View(camera(), torch.zeros(45, 61, 3, dtype=torch.uint8))
     rows = evaluate(row_of_four(), [view, view], [1.0, 1.5, 3.0])
@@ -52,7 +52,7 @@ def test_counts_by_hand() -> None:
     assert rows[2].psnr == math.inf  # a black photograph of nothing
 
 
-def test_rows_are_the_renders() -> None:
+def test_rows_are_means_over_renders() -> None:
     sigma_d = torch.full((200,), 0.8, requires_grad=True)
     some = attach(gaussians(200, 1, 0), sigma_d, AttenuationConfig(scene_distance=4.0))
     views = photograph(gaussians(200, 1, 0), ring(3, 32, 24))
@@ -81,7 +81,7 @@ def test_an_unadapted_file_is_the_same_at_every_dial_value() -> None:
     assert rows[0].kept_share == 1
 
 
-def test_of_no_gaussians() -> None:
+def test_evaluating_no_gaussians() -> None:
     view = View(camera(20, 16), torch.zeros(16, 20, 3, dtype=torch.uint8))
     (row,) = evaluate(gaussians(0, 0, 0), [view], [2.0])
     assert (row.kept, row.kept_share, row.in_view, row.psnr) == (0, 0, 0, math.inf)

@@ -1,4 +1,4 @@
-"""LPIPS and FLIP: offline without their packages or weights, and what they give where these are there."""
+"""LPIPS and FLIP: notes without their packages or weights, values with them, no network access."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket, "create_connection", lambda *_, **__: pytest.fail("asked the network"))
 
 
-def test_without_the_packages_one_note_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_packages_give_one_note(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("lpips", "flip_evaluator"):
         monkeypatch.setitem(sys.modules, name, None)
     found, notes = available_metrics()
@@ -30,7 +30,7 @@ def test_without_the_packages_one_note_says_so(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_flip() -> None:
-    """0 for what is equal to the byte, about 1 for black against white, the mean over the views in a row."""
+    """FLIP is 0 for equal images and about 1 for black against white; a row has the mean over views."""
     pytest.importorskip("flip_evaluator")
     flip = available_metrics()[0]["flip"]
     photo = torch.randint(0, 256, (40, 60, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
@@ -47,7 +47,7 @@ def test_flip() -> None:
     assert "flip" in both.as_dict() and "lpips" not in both.as_dict()
 
 
-def test_a_torchvision_that_does_not_fit_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_incompatible_torchvision_gives_one_note(monkeypatch: pytest.MonkeyPatch) -> None:
     class Finder:
         def find_spec(self, name: str, *_: object) -> None:
             if name == "lpips":
@@ -60,7 +60,7 @@ def test_a_torchvision_that_does_not_fit_is_one_line(monkeypatch: pytest.MonkeyP
 
 
 def test_lpips_is_left_out_without_weights(tmp_path: Path) -> None:
-    """It would download them; with them (here random ones) it measures."""
+    """The weights are not downloaded; with weights (here random ones) LPIPS is measured."""
     pytest.importorskip("lpips", exc_type=(ImportError, RuntimeError))
     import torchvision
 
@@ -80,7 +80,7 @@ def test_lpips_is_left_out_without_weights(tmp_path: Path) -> None:
 
 
 def test_only_evaluating_loads_the_networks(capture: Any, tmp_path: Path) -> None:
-    """Packages of these names, which are there to be imported, are not by adapting and rendering."""
+    """Adapting and rendering do not import installed packages of these names."""
     for name in ("lpips", "torchvision", "flip_evaluator"):
         (tmp_path / f"{name}.py").write_text("evaluate = lambda *_, **__: (None, 0.5)\n")
     code = (

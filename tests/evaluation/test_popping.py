@@ -1,4 +1,4 @@
-"""The measure of popping: it must tell a jump from a fade, and count nothing that the camera's motion does."""
+"""The measure of popping separates a jump from a fade and excludes the camera's motion."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def dialled(tau: float = 1 / 255, n: int = 200, **settings: object) -> Gaussians
     return attach(gaussians(n, 1, 0, size=0.2), sigma, config)
 
 
-def test_an_even_fade_and_a_switch_by_hand() -> None:
+def test_popping_of_a_fade_and_of_a_switch() -> None:
     """Grey rising by 1/100 a step on one of two pixels; and black that becomes grey 1/2 in one step."""
     positions = [k / 10 for k in range(11)]
     fade = sweep(lambda _, j: torch.tensor([[[j / 100] * 3, [0.0] * 3]]), positions)
@@ -46,8 +46,8 @@ def test_an_even_fade_and_a_switch_by_hand() -> None:
     assert white.largest == white.pixel == 0 and math.isnan(white.ratio) and math.isnan(white.persistence)
 
 
-def test_a_switch_between_models_and_a_dial() -> None:
-    """The finer the steps, the larger a switch's ratio, while a dial's stays; what is left at half the step differs."""
+def test_popping_of_a_switch_exceeds_that_of_a_dial() -> None:
+    """With finer steps the ratio of a switch grows, and that of a dial does not; so does persistence differ."""
     some, (camera, *_) = dialled(), ring(3, 32, 24)
     coarse = some.select(torch.arange(0, 200, 4))
     for steps in (20, 80):
@@ -60,7 +60,7 @@ def test_a_switch_between_models_and_a_dial() -> None:
     assert turned.pixel < switch.pixel / 4
 
 
-def test_the_dial_sweep_is_its_renders() -> None:
+def test_dial_sweep_measures_its_renders() -> None:
     some, camera = dialled(), ring(3, 32, 24)[1]
     seen = []
     result = dial_popping(some, camera, 3.0, steps=4, progress=lambda now: seen.append((now.done, now.total)))
@@ -105,7 +105,7 @@ def test_path_of_a_camera_that_only_turns() -> None:
     assert all(torch.allclose(c.position, camera.position, atol=1e-5) for c in found)
 
 
-def test_bad_calls_are_named() -> None:
+def test_bad_arguments_are_refused() -> None:
     some, cameras = dialled(), ring(3, 32, 24)
     for message, call in {
         "max_sv is 1": lambda: dial_popping(some, cameras[0], 1.0),
@@ -118,7 +118,7 @@ def test_bad_calls_are_named() -> None:
 
 
 def adversary(normalizer: str, cut: str) -> tuple[Gaussians, list[Camera]]:
-    """Four opaque white Gaussians in one place that leave together at s = 2.2, with max_sv 5 and the default tau, two
+    """Four coincident opaque white Gaussians, culled together at s = 2.2 with max_sv 5 and the default tau, two
     black ones behind them, and one far away that a camera sees once it has turned."""
     camera = ring(1, 32, 24)[0]
     forward, right = camera.viewmat[2, :3], camera.viewmat[0, :3]
@@ -135,8 +135,8 @@ def adversary(normalizer: str, cut: str) -> tuple[Gaussians, list[Camera]]:
     return attach(some, sigma, config), [camera, dataclasses.replace(camera, viewmat=turn @ camera.viewmat)]
 
 
-def test_the_default_holds_a_bound_in_the_dial_and_the_hard_cut_does_not() -> None:
-    """What is drawn changes by at most 2.73 per unit of log s within max_sv 5; a rasterizer drops one level each."""
+def test_soft_culling_bounds_popping_and_hard_culling_does_not() -> None:
+    """Drawn opacity changes by at most 2.73 per unit of log s up to max_sv 5; the rasterizer adds one level each."""
     pixels = {}
     for cut in ("soft", "hard"):
         some, cameras = adversary("scene", cut)
@@ -148,8 +148,8 @@ def test_the_default_holds_a_bound_in_the_dial_and_the_hard_cut_does_not() -> No
     assert pixels["hard", 120] > 0.9 * pixels["hard", 60] > 30
 
 
-def test_the_default_does_not_change_as_a_camera_turns_and_the_maximum_does() -> None:
-    """One far Gaussian that enters the view sets the paper's maximum, and with it every opacity, at once."""
+def test_scene_normalizer_does_not_pop_as_a_camera_turns() -> None:
+    """A far Gaussian that enters the view changes the paper's maximum, and with it every opacity, at once."""
     for normalizer in ("scene", "quantile", "max"):
         some, cameras = adversary(normalizer, "soft")
         pixels = [path_popping(some, cameras, 2.0, steps=steps).pixel for steps in (10, 20)]

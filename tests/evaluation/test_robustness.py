@@ -1,4 +1,4 @@
-"""The robustness experiment's cells: what is measured, on what, and when it counts as the same."""
+"""Cells of the robustness experiment: measurements, baseline, distributions and fingerprints."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_a_range_is_adapted_and_measured_beyond_it() -> None:
 
 
 @pytest.mark.parametrize("phase", [Phase.IMPORTANCE, Phase.TRAINING, Phase.EVALUATION])
-def test_an_interrupted_adaptation_is_no_cell(phase: Phase) -> None:
+def test_an_interrupted_adaptation_gives_no_cell(phase: Phase) -> None:
     base, scene = capture()
     with pytest.raises(Stopped):
         adapt_at_range(
@@ -67,7 +67,7 @@ def test_distribution() -> None:
     assert (log_sigma["shares"][0], log_sigma["shares"][-1]) == (0.25, 0.25)
 
 
-def test_fingerprint_is_of_what_is_seen() -> None:
+def test_fingerprint_depends_on_images_and_split() -> None:
     _, scene = capture()
     _, same = capture()
     assert scene_fingerprint(scene) == scene_fingerprint(same)

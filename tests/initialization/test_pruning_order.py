@@ -1,4 +1,4 @@
-"""The leaving order against a plain twin, and what it is for."""
+"""The pruning order against a plain implementation, and its effect."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from scenes import gaussians
 
 
 def plainly(some: Gaussians, worth: Tensor) -> list[int]:
-    """Round by round, pair by pair."""
+    """The order computed round by round and pair by pair."""
     worths, left, order = worth.double().tolist(), list(range(len(some))), []
     centres, colours = some.means.double(), 0.5 + SH_C0 * some.sh0[:, 0].double()
     sizes = some.log_scales.double().exp().amax(1)
@@ -48,7 +48,7 @@ def plainly(some: Gaussians, worth: Tensor) -> list[int]:
 
 
 @pytest.mark.parametrize(("n", "seed"), [(0, 0), (1, 0), (2, 0), (3, 1), (9, 2), (10, 0), (60, 1), (60, 2)])
-def test_is_that_of_the_plain_twin(n: int, seed: int) -> None:
+def test_order_matches_the_plain_implementation(n: int, seed: int) -> None:
     some, seen = gaussians(n, 1, seed), []
     worth = torch.rand(n, generator=torch.Generator().manual_seed(seed))
     order = pruning_order(some, worth, lambda now: seen.append((now.done, now.total)))
@@ -56,8 +56,8 @@ def test_is_that_of_the_plain_twin(n: int, seed: int) -> None:
     assert n < 60 or (seen == sorted(seen) and 0 < seen[0][0] < 30 and seen[-1] == (60, 60))
 
 
-def test_one_of_two_alike_is_removed_before_a_single_less_important_one() -> None:
-    """And by worth alone both would stay: that is what the order is for."""
+def test_a_duplicate_is_pruned_before_a_less_important_single() -> None:
+    """By importance alone both duplicates would be kept."""
     three = gaussians(3, 0, 0)
     means = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [5.0, 0, 0]])
     three = three.replace(
@@ -67,14 +67,14 @@ def test_one_of_two_alike_is_removed_before_a_single_less_important_one() -> Non
     assert order.tolist() == [0, 2, 1]
 
 
-def test_does_not_depend_on_the_order_of_the_rows() -> None:
+def test_order_is_independent_of_row_order() -> None:
     some, worth = gaussians(80, 1, 4), torch.rand(80, generator=torch.Generator().manual_seed(4))
     rows = torch.randperm(80, generator=torch.Generator().manual_seed(5))
     assert torch.equal(pruning_order(some.select(rows), worth[rows]), pruning_order(some, worth)[rows])
 
 
-def test_many_in_one_place_are_moved_apart() -> None:
-    """A k-d tree cannot part them, and would compare each with all: hours for some hundred thousand."""
+def test_coincident_gaussians_are_moved_apart() -> None:
+    """A k-d tree cannot separate coincident points and would compare all pairs."""
     sizes = np.full(200, 0.1)
     sizes[3] = math.inf
     crowd = _without_crowds(np.full((200, 3), 0.3), sizes)
@@ -90,8 +90,8 @@ def test_many_in_one_place_are_moved_apart() -> None:
         assert order.sort().values.equal(torch.arange(2000)) and len(seen) < 300
 
 
-def test_what_is_not_finite() -> None:
-    """Colours and sizes are then unlike all others; centres are refused."""
+def test_nonfinite_values() -> None:
+    """Nonfinite colours and sizes match no neighbour; nonfinite means are refused."""
     some = gaussians(20, 0, 0)
     odd = some.replace(sh0=some.sh0.index_fill(0, torch.tensor([3, 4]), math.inf))
     odd = odd.replace(log_scales=some.log_scales.index_fill(0, torch.tensor([5]), math.nan))

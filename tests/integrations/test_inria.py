@@ -1,4 +1,4 @@
-"""The class against what the fork draws of the kept rows alone: stand-ins for five forks, the installed one on CUDA."""
+"""The wrapper against the fork with the kept rows alone: stand-ins for five forks, and the installed one on CUDA."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def wrapper(monkeypatch: pytest.MonkeyPatch, installed: ModuleType | None) -> Mo
 
 
 def arguments(*further: str, device: str = "cpu") -> dict[str, Any]:
-    """A fork's arguments by their names, of as many Gaussians behind the camera as before it, leaves of autograd."""
+    """A fork's arguments by name, which require gradients; half of the Gaussians are behind the camera."""
     s = scene(N, 1, 0, size=0.2)
     values = {
         "means3D": s["means"] * 3, "means2D": torch.zeros(N, 3), "opacities": s["opacities"][:, None],
@@ -56,7 +56,7 @@ def reach() -> Tensor:
 
 
 @pytest.mark.parametrize("name", inria_forks.FORKS)
-def test_it_draws_the_kept_rows_as_the_fork_does(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kept_rows_are_drawn_as_by_the_fork(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     further, results = inria_forks.FORKS[name].further, inria_forks.FORKS[name].results.split()
     fork, settings = inria_forks.module(name), config(normalizer="quantile" if name == "w-pose" else "scene")
     raster_settings = inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
@@ -70,7 +70,7 @@ def test_it_draws_the_kept_rows_as_the_fork_does(name: str, monkeypatch: pytest.
     ours = wrapper(monkeypatch, fork).GaussianRasterizer(raster_settings)
     got = ours(**given, sigma_d=sigma_d, virtual_scale=DIAL, attenuation=settings)
     for result, mine, theirs in zip(results, got, want, strict=True):
-        if result in ("radii", "touched"):  # of all rows, 0 for who is left out
+        if result in ("radii", "touched"):  # of all rows, 0 for culled ones
             assert torch.equal(mine[keep], theirs) and len(mine) == N and not mine[~keep].any()
         elif result != "features":
             torch.testing.assert_close(mine, theirs, rtol=1e-5, atol=1e-5)
@@ -88,10 +88,10 @@ def test_it_draws_the_kept_rows_as_the_fork_does(name: str, monkeypatch: pytest.
     ("fork", "settings", "name"),
     [("inria 2024", {"antialiasing": True}, "on"), ("mip-splatting", {"kernel_size": 0.1}, "mip")],
 )
-def test_it_matches_render_with_a_screen_filter(
+def test_images_match_render_with_a_screen_filter(
     fork: str, settings: dict[str, Any], name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From the fork's own settings; the compensation is applied after the dial, as in ``render``."""
+    """The fork's own settings choose the filter; the dial is applied before the compensation, as in ``render``."""
     module, given, sigma_d = inria_forks.module(fork), arguments(), reach()
     given["scales"] = 0.2 * given["scales"]
     black = inria_forks.settings_of(module.GaussianRasterizationSettings, VIEW, bg=torch.zeros(3), **settings)
@@ -107,7 +107,7 @@ def test_it_matches_render_with_a_screen_filter(
 
 
 @pytest.mark.parametrize("name", inria_forks.FORKS)
-def test_without_sigma_d_it_is_the_fork(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_sigma_d_results_are_those_of_the_fork(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     fork, given = inria_forks.module(name), arguments(*inria_forks.FORKS[name].further)
     ours = wrapper(monkeypatch, fork)
     assert ours.GaussianRasterizationSettings is fork.GaussianRasterizationSettings
@@ -122,7 +122,7 @@ def test_without_sigma_d_it_is_the_fork(name: str, monkeypatch: pytest.MonkeyPat
 
 
 def test_culled_rows_are_invisible_to_a_fork_that_culls_at_zero(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From many positions: by rounding, a point at the camera's centre is in front of it or behind it."""
+    """From many positions, since rounding moves a point at the camera's centre in front of it or behind it."""
     monkeypatch.setattr(inria_forks, "NEAREST", 0.0)
     fork, given, sigma_d = inria_forks.module("inria 2024"), arguments(), torch.full((N,), 1e-3)
     for view in ring(31, 48, 36):
@@ -131,7 +131,7 @@ def test_culled_rows_are_invisible_to_a_fork_that_culls_at_zero(monkeypatch: pyt
         assert not rasterizer(**given, sigma_d=sigma_d, virtual_scale=DIAL, attenuation=config())[1].any()
 
 
-def test_by_position(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_positional_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
     fork = inria_forks.module("w-pose")
     settings = inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
     ours = wrapper(monkeypatch, fork).GaussianRasterizer(settings)
@@ -141,7 +141,7 @@ def test_by_position(monkeypatch: pytest.MonkeyPatch) -> None:
     assert torch.equal(by_position[0], ours(**g, theta=theta, rho=theta, **more)[0])
 
 
-def test_misuse_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_arguments_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     fork = inria_forks.module("inria 2024")
     ours = wrapper(monkeypatch, fork).GaussianRasterizer
     kind, given = fork.GaussianRasterizationSettings, arguments()
@@ -157,7 +157,7 @@ def test_misuse_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_the_installed_fork() -> None:
-    """On CUDA, whichever it is, called as Inria's own renderer calls it."""
+    """On CUDA, called as by Inria's renderer."""
     fork = pytest.importorskip("diff_gaussian_rasterization")
     from clod_adapter.integrations.inria import GaussianRasterizer
 

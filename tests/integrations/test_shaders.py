@@ -1,4 +1,4 @@
-"""The shader functions give the golden values, in a real WebGL 2 and a real WebGPU; so does the equation itself."""
+"""The shader functions match the golden values in WebGL 2 and WebGPU, and so does the equation."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ WEBGPU = """async ([source, rows]) => {
 
 
 def run(chromium: Any, script: str, shader: str) -> list[float]:
-    """What the shader draws of every golden row."""
+    """The shader's result for every golden row."""
     source = SHADERS.joinpath(shader).read_text(encoding="utf-8")
     rows = [[float(value) for value in row] for row in INPUTS]
     with closing(chromium.new_page()) as page:
@@ -106,7 +106,7 @@ def run(chromium: Any, script: str, shader: str) -> list[float]:
 
 
 @pytest.mark.parametrize(("script", "shader"), [(WEBGL, "attenuation.glsl"), (WEBGPU, "attenuation.wgsl")])
-def test_a_browser_draws_the_golden_values(chromium: Any, script: str, shader: str) -> None:
+def test_shaders_match_the_golden_values(chromium: Any, script: str, shader: str) -> None:
     drawn = run(chromium, script, shader)
     assert len(drawn) == len(STORED["rows"])
     for got, row in zip(drawn, STORED["rows"], strict=True):
@@ -114,16 +114,16 @@ def test_a_browser_draws_the_golden_values(chromium: Any, script: str, shader: s
         assert abs(got - want) <= STORED["tolerance"] * faded and (want > 0 or got == 0), (row, got)
 
 
-def test_the_stored_values_are_those_of_the_equation() -> None:
-    """To rounding: exp differs between processors."""
+def test_golden_values_match_the_equation() -> None:
+    """Equal to rounding, since exp differs between processors."""
     made = golden.golden()
     assert (list(made["columns"]), made["tolerance"]) == (STORED["columns"], STORED["tolerance"])
     for row, want in zip(made["rows"], STORED["rows"], strict=True):
         assert row[:7] == want[:7] and row[7:] == pytest.approx(want[7:], rel=1e-12, abs=1e-300)
 
 
-def test_the_rows_reach_every_branch() -> None:
-    """Some fade and some do not, some are kept whole; at the camera, without a reach, on both sides of both cuts."""
+def test_golden_rows_cover_every_branch() -> None:
+    """Attenuated, culled and unchanged rows; distance 0, sigma 0, and both sides of the soft and hard thresholds."""
     rows = [dict(zip(STORED["columns"], row, strict=True)) for row in STORED["rows"]]
     assert 200 <= len(rows) <= 400
     for soft in (False, True):

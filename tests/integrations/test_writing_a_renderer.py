@@ -1,4 +1,4 @@
-"""The code and the defaults of docs/writing_a_renderer.md, and its two examples."""
+"""The code and the defaults in docs/writing_a_renderer.md, and its two examples."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DIALS = (1, 2, 3, 5)
 def my_opacity(
     opacity: float, sigma: float, distance: float, scale: float, eps: float, tau: float, soft: bool
 ) -> float:
-    """The package's, in float32."""
+    """The package's opacity, in float32."""
     config = AttenuationConfig(eps=eps, tau=tau, cut="soft" if soft else "hard", max_sv=1)
     values = (torch.tensor([value], dtype=torch.float32) for value in (opacity, sigma, distance))
     return float(attenuate(*values, scale, config, activated=True).drawn)
@@ -37,7 +37,7 @@ def my_opacity(
 
 @pytest.fixture
 def adapted(capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> clod_adapter.Gaussians:
-    """Written as adapted.ply in the test's folder."""
+    """Gaussians with a dial, saved as adapted.ply in the test's folder."""
     monkeypatch.chdir(tmp_path)
     sigma_d = 2.5 + 15 * torch.rand(len(capture.gaussians), generator=torch.Generator().manual_seed(0))
     attenuation = AttenuationConfig(tau=0.02, cut="soft", reference_distance=5.0)
@@ -47,18 +47,18 @@ def adapted(capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> cl
 
 
 def block(word: str) -> str:
-    """The page's Python block with this word."""
+    """The page's Python block that contains a word."""
     (found,) = (text for text in re.findall(r"```python\n(.*?)```", PAGE, re.S) if word in text)
     return str(found)
 
 
-def test_its_golden_loop_runs() -> None:
+def test_golden_loop_of_the_page_runs() -> None:
     exec(block("golden"), {"my_opacity": my_opacity})
     with pytest.raises(AssertionError):
         exec(block("golden"), {"my_opacity": lambda *row: my_opacity(*row) * 1.001})
 
 
-def test_its_hook_runs(adapted: clod_adapter.Gaussians) -> None:
+def test_hook_code_of_the_page_runs(adapted: clod_adapter.Gaussians) -> None:
     names: dict[str, Any] = {"means": adapted.means, "opacities": adapted.opacities, "viewmat": torch.eye(4)}
     Path("adapted.ply").rename("model.ply")
     exec(block(".hook("), names | {"clod_adapter": clod_adapter, "K": torch.eye(3), "width": 2, "height": 2}, names)
@@ -66,7 +66,7 @@ def test_its_hook_runs(adapted: clod_adapter.Gaussians) -> None:
     assert torch.equal(names["opacities"], want[0]) and torch.equal(names["keep"], want[1])
 
 
-def test_its_defaults_are_those_of_the_reader() -> None:
+def test_defaults_of_the_page_match_the_reader() -> None:
     told = dict(re.findall(r"`(\w+)`\s+\(`?(?:default )?([\w./-]+)`?\)", PAGE.split("2. **Activate**")[0]))
     assert set(told) == {field.name for field in fields(AttenuationConfig)}
     for name, value in told.items():
@@ -93,7 +93,7 @@ def test_the_hook_example(
 def test_the_gsplat_example(
     adapted: clod_adapter.Gaussians, capture: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its pictures are the package's own."""
+    """The example's images match the package's."""
     pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
     device = "cuda" if torch.cuda.is_available() else "cpu"
     if device == "cpu":

@@ -1,4 +1,4 @@
-"""Compiled kernels: cached where that is possible, and correct where it is not."""
+"""The cache of compiled kernels, and its failures."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_kernels_are_cached() -> None:
     assert done.stdout.strip() == "_Cache", done.stderr
 
 
-def test_compiling_is_disabled(capture: Any, tmp_path: Path) -> None:
+def test_disabled_compilation_is_an_error(capture: Any, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "clod_adapter", str(capture.ply), "--out", str(tmp_path / "dial.ply")]
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -32,7 +32,7 @@ def test_compiling_is_disabled(capture: Any, tmp_path: Path) -> None:
 def number(tmp_path: Path) -> Start:
     """Starts a process that prints the result of a one-line kernel for ``[1.0]``: 1 + ``version``.
 
-    The versions differ in the kernels' stamp, as they do where a part of the kernel in another file changed.
+    The versions differ in the kernels' stamp, as after a change of an inlined function.
     """
     (tmp_path / "sums.py").write_text(
         "from clod_adapter._kernels import compiling\n"
@@ -63,8 +63,8 @@ def said(process: subprocess.Popen[str]) -> str:
     return out.strip()
 
 
-def test_a_process_that_dies_while_it_writes_does_no_harm(number: Start) -> None:
-    """In particular, the code of the version before is not used."""
+def test_cache_survives_a_process_killed_while_writing(number: Start) -> None:
+    """The code of the previous version is not used."""
     assert said(number(1)) == "2.0"
     for written, version in ((0, 5), (1, 7)):
         dies = f"left = [os.replace] * {written}\nos.replace = lambda *a: left.pop()(*a) if left else os._exit(9)"
@@ -72,9 +72,7 @@ def test_a_process_that_dies_while_it_writes_does_no_harm(number: Start) -> None
         assert said(number(version)) == f"{version + 1}.0"
 
 
-def test_without_a_writable_folder_or_disk_space_only_the_cache_is_lost(
-    number: Start, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_kernels_run_without_a_writable_cache(number: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     full = "def full(*_): raise OSError(28, 'No space left on device')\nos.replace = full"
     assert said(number(1, full)) == "2.0" and said(number(1)) == "2.0"
     monkeypatch.setenv("NUMBA_CACHE_LOCATOR_CLASSES", "UserProvidedCacheLocator")
@@ -93,8 +91,8 @@ def test_a_damaged_file_is_compiled_again(number: Start, tmp_path: Path) -> None
         assert whole and all(len(path.read_bytes()) == len(data) for path, data in whole.items())
 
 
-def test_several_processes_at_once(number: Start) -> None:
-    """Of different variants, on an empty cache; the cache then serves all of them."""
+def test_several_processes_share_the_cache(number: Start) -> None:
+    """Processes with different variants start on an empty cache, which then serves all of them."""
     kinds = ("float32", "float64", "float32")
     assert [said(process) for process in [number(1, kind=kind) for kind in kinds]] == ["2.0"] * 3
     hits = "import atexit; atexit.register(lambda: print(sum(sums.f.stats.cache_hits.values())))"

@@ -1,7 +1,7 @@
 """Kernels compiled for another processor agree with the reference.
 
-LLVM compiles them differently for each: NAME has vectors of 4 lanes and no fused multiplication and addition. This
-processor, whose vectors are usually wider and which fuses, is that of all other tests.
+NAME has vectors of 4 lanes and no fused multiply-add. All other tests use this processor, whose vectors are usually
+wider and which has fused multiply-add.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ NAME, NEEDS = "nehalem", "sse4.2"  # LLVM's name, and the feature that runs its 
 
 
 @pytest.mark.timeout(600)  # all kernels are compiled anew
-def test_agreement_with_the_reference() -> None:
+def test_kernels_for_another_processor_agree_with_the_reference() -> None:
     if not llvm.get_host_cpu_features().get(NEEDS, False):
         pytest.skip(f"needs {NEEDS}")
     path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])

@@ -1,4 +1,4 @@
-"""The projection packs sixteen Gaussians at a time: counts and visibility patterns around sixteen."""
+"""The projection packs sixteen Gaussians at a time, tested with counts and visibility patterns around sixteen."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from backends import torch_threads
 from clod_adapter.rasterizers import cpu, reference
 from oracle import Parameters, assert_agrees, assert_same, differentiate, weights
 from scenes import camera, in_front, scene
@@ -16,12 +17,10 @@ from scenes import camera, in_front, scene
 VIEW = camera(45, 37)
 
 
-@pytest.fixture(params=[1, 3])
-def threads(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    torch.set_num_threads(before)
+@pytest.fixture(params=[1, 3], autouse=True)
+def threads(request: pytest.FixtureRequest) -> Iterator[None]:
+    with torch_threads(request.param):
+        yield
 
 
 def all_visible(n: int, degree: int = 3) -> Parameters:
@@ -36,17 +35,20 @@ def all_visible(n: int, degree: int = 3) -> Parameters:
 
 
 def hide(some: Parameters, gone: Tensor, how: str) -> None:
-    """Makes rows invisible: culled by the projection, or before it."""
-    if how == "behind":
-        some["means"][gone] = in_front(VIEW, torch.tensor([[0.1, 0.2, -3.0]])).expand(int(gone.sum()), 3)
-    elif how == "beside":
-        some["means"][gone] = in_front(VIEW, torch.tensor([[30.0, 0.2, 3.0]])).expand(int(gone.sum()), 3)
-    else:
+    """Makes rows invisible: culled by the projection, before it, or after it where their colour is not finite."""
+    if how in ("behind", "beside"):
+        place = [0.1, 0.2, -3.0] if how == "behind" else [30.0, 0.2, 3.0]
+        some["means"][gone] = in_front(VIEW, torch.tensor([place])).expand(int(gone.sum()), 3)
+    elif how == "faint":
         some["opacities"][gone] = 0.001
+    else:
+        values = some[how.split()[-1]].view(49, -1)
+        column = -1 if how.startswith("last") else 0
+        values[gone, column] = torch.tensor([math.nan, math.inf, -math.inf]).repeat(17)[:49][gone]
 
 
 @pytest.mark.parametrize(("n", "degree"), [(0, 0), (1, 3), (15, 1), (16, 0), (16, 3), (17, 1), (33, 3)])
-def test_all_visible(threads: int, n: int, degree: int) -> None:
+def test_all_visible(n: int, degree: int) -> None:
     some = all_visible(n, degree)
     seen = differentiate(reference.rasterize, {k: v.double() for k, v in some.items()}, VIEW, weights(VIEW))
     assert (seen.gradients["opacities"] != 0).all()  # all are visible
@@ -71,36 +73,21 @@ PATTERNS = {
 }
 
 
-@pytest.mark.parametrize(("pattern", "how"), [*zip(PATTERNS, ["behind", "faint", "beside"] * 5, strict=False)])
-def test_some_invisible(threads: int, pattern: str, how: str) -> None:
+HOW = [["behind", "faint", "beside"], ["sh0", "first of shN", "last of shN"]]
+
+
+@pytest.mark.parametrize(("pattern", "how"), [pair for some in HOW for pair in zip(PATTERNS, some * 5, strict=False)])
+def test_invisible_rows_are_not_packed(pattern: str, how: str) -> None:
+    """Rows whose colour is not finite are packed and removed again, beside others that the projection culls."""
     some, gone = all_visible(49), PATTERNS[pattern]
     hide(some, gone, how)
-    assert_agrees(cpu.rasterize, some, VIEW, rows=~gone)
-
-
-@pytest.mark.parametrize(
-    ("pattern", "name"), [*zip(PATTERNS, ["sh0", "first of shN", "last of shN"] * 5, strict=False)]
-)
-def test_colors_that_are_not_finite(threads: int, pattern: str, name: str) -> None:
-    """Such rows are projected, packed, and removed again, beside others that are invisible."""
-    some, gone = all_visible(49), PATTERNS[pattern]
-    values = some[name.split()[-1]].view(49, -1)
-    column = -1 if name.startswith("last") else 0
-    values[gone, column] = torch.tensor([math.nan, math.inf, -math.inf]).repeat(17)[:49][gone]
-    hidden = ROWS % 7 == 3
-    hide(some, hidden, "behind")
-    assert_agrees(cpu.rasterize, some, VIEW, rows=~gone & ~hidden)
-
-
-@pytest.mark.parametrize("n", [1, 16, 17])
-def test_no_color_is_finite(n: int) -> None:
-    some = all_visible(n)
-    some["sh0"][:] = math.nan
-    assert_agrees(cpu.rasterize, some, VIEW, rows=torch.zeros(n, dtype=torch.bool))
+    behind = (ROWS % 7 == 3) & torch.tensor(how in HOW[1])
+    hide(some, behind, "behind")
+    assert_agrees(cpu.rasterize, some, VIEW, rows=~gone & ~behind)
 
 
 def test_earlier_calls_do_not_change_the_result() -> None:
-    """Records and lists are in recycled memory: after a larger scene with NaN the result has the same bits."""
+    """Records and lists are in recycled memory; after a larger scene with NaN the result has the same bits."""
     some = all_visible(17)
     want = differentiate(cpu.rasterize, some, VIEW, weights(VIEW))
     for n in (33, 100, 400):

@@ -1,4 +1,4 @@
-"""Sixteen rows of a matrix as vectors, a lane a row, and back."""
+"""Transposes of sixteen rows of a matrix to vectors with one lane per row, and back."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import os
 
 import numpy as np
 import pytest
-from numba import int64, njit
+from numba import njit
 
 from clod_adapter._kernels.pointers import pointer, scratch
 from clod_adapter._kernels.rows import load_rows, store_rows
@@ -29,7 +29,7 @@ CONSTANTS = [(1, 0, 1), (3, 0, 3), (4, 0, 4), (16, 0, 16), (16, 6, 3), (9, 1, 8)
 
 @njit
 def to_vectors(source, rows, width, first, count, lanes, at):
-    """``lanes [VECTORS, 16]`` go through the vectors, so that those which are not written are seen."""
+    """Initialises the vectors from ``lanes [VECTORS, 16]``, so that unwritten vectors are visible."""
     vectors = scratch(f32x16, VECTORS)
     for k in range(VECTORS):
         vectors[k] = load(lanes[k], 0)
@@ -72,7 +72,7 @@ ORDERS = {
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_load_and_store_rows(width: int) -> None:
-    """Other vectors and columns are not written; of a row that is named twice the last lane is stored."""
+    """Other vectors and columns are not written; the last lane of a repeated row is stored."""
     source, stored = matrix(50, width), -matrix(VECTORS, LANES)
     for rows in (order.astype(np.int64) for order in ORDERS.values()):
         for turn, (_, first, count) in enumerate(s for s in SPANS if s[0] == width):
@@ -91,7 +91,7 @@ def test_load_and_store_rows(width: int) -> None:
 @pytest.mark.skipif(os.name != "posix", reason="needs mprotect")
 @pytest.mark.parametrize(("width", "first", "count"), CONSTANTS)
 def test_constant_columns(width: int, first: int, count: int) -> None:
-    """Compiled for these numbers, as the kernels have them, and without an access beyond the array."""
+    """Compiled for constant columns, as in the kernels, and without access beyond the array."""
 
     @njit
     def load_constant(source, rows, lanes):
@@ -120,8 +120,8 @@ def test_constant_columns(width: int, first: int, count: int) -> None:
             np.testing.assert_array_equal(array.reshape(50, width), want)
 
 
-def test_any_bits_pass_and_no_columns_are_nothing() -> None:
-    """NaN with its payload, infinities, -0 and subnormal numbers; a count of 0, as of the SH rows of degree 0."""
+def test_all_bit_patterns_pass_and_zero_columns_do_nothing() -> None:
+    """NaN payloads, infinities, -0 and subnormal numbers are kept; a count of 0 is that of SH degree 0."""
     bits = np.random.default_rng(0).integers(0, 2**32, (LANES, 9), dtype=np.uint32)
     bits[:, :5] = np.array([0x7FC12345, 0xFF800000, 0x80000000, 1, 0x7F800001], np.uint32)
     source, back = bits.view(np.float32), np.zeros((LANES, 9), np.float32)
@@ -133,29 +133,3 @@ def test_any_bits_pass_and_no_columns_are_nothing() -> None:
     to_vectors(back, rows, 9, 0, 0, lanes, 0)
     np.testing.assert_array_equal(back.view(np.uint32), bits)
     assert (lanes[LANES:] == 1).all()
-
-
-@njit
-def all_rows(source, destination, width, first, count):
-    """Copies the columns of all rows, sixteen at a time, the last row again where there are fewer."""
-    vectors, rows = scratch(f32x16, LANES), scratch(int64, LANES)
-    for start in range(0, len(source) // width, LANES):
-        for lane in range(LANES):
-            rows[lane] = min(start + lane, len(source) // width - 1)
-        load_rows(pointer(source), rows, width, first, count, vectors, 0)
-        store_rows(pointer(destination), rows, width, first, count, vectors, 0)
-
-
-@pytest.mark.skipif(os.name != "posix", reason="needs mprotect")
-@pytest.mark.parametrize("width", WIDTHS)
-def test_memory_beyond_the_array_is_not_accessed(width: int) -> None:
-    for n, at_the_end in ((1, True), (15, False), (16, True), (16, False), (21, True)):
-        values = matrix(n, width)
-        source, destination = (island(n * width, at_the_end) for _ in range(2))
-        source[:] = values.ravel()
-        for _, first, count in (s for s in SPANS if s[0] == width):
-            destination[:] = 0
-            all_rows(source, destination, width, first, count)
-            want = np.zeros((n, width), np.float32)
-            want[:, first : first + count] = values[:, first : first + count]
-            np.testing.assert_array_equal(destination.reshape(n, width), want)

@@ -10,7 +10,7 @@ from numba import float32, njit
 
 from clod_adapter._kernels.bits import bits_of, lowest, set_spans
 from clod_adapter._kernels.elementary import exp2, log2, vabs, vceil, vfloor, vsqrt
-from clod_adapter._kernels.pointers import fetch_add, pointer, prefetch
+from clod_adapter._kernels.pointers import fetch_add, pointer
 from clod_adapter._kernels.rows import store_sums
 from clod_adapter._kernels.simd import anywhere, both, but_not, eq, fma, ge, gt, load, select, splat, store, vmax, vmin
 
@@ -79,20 +79,6 @@ def test_operations_match_numpy() -> None:
 
 
 @njit
-def move(a, source, out, target):
-    store(out, target, load(a, source))
-
-
-def test_load_and_store_take_any_offset() -> None:
-    for source, target in ((0, 0), (1, 3), (7, 16), (21, 5)):
-        a, out = np.arange(40, dtype=np.float32), np.full(40, -1, np.float32)
-        move(a, source, out, target)
-        want = np.full(40, -1, np.float32)
-        want[target : target + LANES] = a[source : source + LANES]
-        np.testing.assert_array_equal(out, want)
-
-
-@njit
 def elementary(function, x, out):
     for at in range(0, len(x), LANES):
         store(out, at, exp2(load(x, at)) if function == 0 else log2(load(x, at)))
@@ -121,7 +107,7 @@ def test_exp2_has_a_relative_error_below_3e_7() -> None:
         assert (np.abs(exp2_of(x) - want) / want).max() < 3e-7
 
 
-def test_exp2_is_exact_at_whole_numbers_and_monotonic() -> None:
+def test_exp2_is_exact_at_integers_and_monotonic() -> None:
     """It is clamped to the smallest normal number, and rises with its argument up to its last digits."""
     whole = np.arange(-126, 128, dtype=np.float32)
     np.testing.assert_array_equal(exp2_of(whole), np.ldexp(np.float32(1), whole.astype(int)))
@@ -132,7 +118,7 @@ def test_exp2_is_exact_at_whole_numbers_and_monotonic() -> None:
 
 
 def test_log2_has_an_absolute_error_below_1e_7() -> None:
-    """Beside the rounding of the result: every mantissa of the octaves around 1, and all normal numbers."""
+    """In addition to the rounding of the result; for every mantissa of two octaves, and all normal exponents."""
     octaves = np.float32(0.5).view(np.uint32) + np.arange(1 << 24, dtype=np.uint32)
     every = np.arange(0x00800000, np.float32(3.4e38).view(np.uint32), 997, dtype=np.uint32)
     ends = np.array([2.0**-126, 3e38, np.finfo(np.float32).max], np.float32)
@@ -142,7 +128,7 @@ def test_log2_has_an_absolute_error_below_1e_7() -> None:
         assert (np.abs(found - want) - rounding).max() < 1e-7
 
 
-def test_log2_is_exact_at_powers_of_two_and_relatively_exact_near_1() -> None:
+def test_log2_is_exact_at_powers_of_two_and_accurate_near_1() -> None:
     whole = np.arange(-126, 128)
     found, _ = log2_of(np.ldexp(np.float32(1), whole))
     np.testing.assert_array_equal(found[: len(whole)], whole)
@@ -175,7 +161,7 @@ def assert_spans(low: np.ndarray, high: np.ndarray, rows: int, index: int = 0) -
 
 @pytest.mark.parametrize("rows", [8, 16])
 def test_spans(rows: int) -> None:
-    """Every span in every row, empty ones (high < low) and ones right of the tile among them; then mixed rows."""
+    """Every span in every row, including empty ones (high < low) and ones right of the tile; then mixed rows."""
     for low in range(rows):
         for high in range(-1, rows):
             assert_spans(np.full(LANES, low), np.full(LANES, high), rows)
@@ -214,21 +200,6 @@ def test_bits_of_masks_and_lowest_bits() -> None:
 
 
 @njit
-def prefetch_all(array):
-    p = pointer(array)
-    for i in range(len(array)):
-        prefetch(array, i)
-        prefetch(p, i)
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.uint64])
-def test_prefetch_changes_nothing(dtype: type) -> None:
-    array = np.arange(1000, dtype=dtype)
-    prefetch_all(array)
-    np.testing.assert_array_equal(array, np.arange(1000, dtype=dtype))
-
-
-@njit
 def sums(v, out, index):
     store_sums(
         out, index, load(v[0], 0), load(v[1], 0), load(v[2], 0), load(v[3], 0), load(v[4], 0), load(v[5], 0),
@@ -237,7 +208,7 @@ def sums(v, out, index):
 
 
 def test_store_sums() -> None:
-    """Nine sums in the order given, nothing beside them, added pairwise: four roundings on the way, not fifteen."""
+    """Nine sums in order, added pairwise with four roundings each; no other element is written."""
     rng = np.random.default_rng(0)
     for index in (0, 9, 11):
         vectors = rng.integers(-1000, 1000, (9, LANES)).astype(np.float32)  # whole numbers: exact in any order
@@ -259,7 +230,7 @@ def take_numbers(counter, amount, out):
 
 @pytest.mark.parametrize("amount", [1, 3])
 def test_fetch_add_gives_each_number_once(amount: int, count: int = 200_000) -> None:
-    """Under two threads that run at the same time."""
+    """With two concurrent threads."""
     counter, taken, together = np.zeros(1, np.int64), np.full((2, count), -1, np.int64), threading.Barrier(2)
     take_numbers(counter, amount, np.empty(0, np.int64))  # compiled
 

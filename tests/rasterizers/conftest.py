@@ -1,4 +1,4 @@
-"""The rasterizers under contract, one after the other, and how many threads they have."""
+"""Fixtures of every rasterizer, and of the number of threads."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import gsplat_in_torch
-from backends import BACKENDS, Backend
+from backends import BACKENDS, Backend, torch_threads
 
 
 @pytest.fixture(params=BACKENDS)
@@ -24,8 +24,6 @@ def rasterize(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.fixture(params=[1, 2])
-def torch_threads(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    torch.set_num_threads(before)
+def one_or_two_threads(request: pytest.FixtureRequest) -> Iterator[None]:
+    with torch_threads(request.param):
+        yield

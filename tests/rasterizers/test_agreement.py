@@ -1,18 +1,20 @@
-"""Every backend draws and differentiates what the float64 reference does."""
+"""Every backend agrees with the float64 reference in images and gradients."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from typing import Any
 
 import pytest
 import torch
 
+from backends import Backend
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, ScreenFilter
 from clod_adapter.rasterizers import Rasterizer
-from oracle import BACKGROUND, IMAGE, ON_A_CUT, assert_agrees
+from oracle import BACKGROUND, IMAGE, ON_A_CUT, assert_agrees, differentiate, weights
 from scenes import camera, in_front, scene
 
 # Neither multiples of 4 nor of a tile, but one; principal points on either side.
@@ -38,7 +40,7 @@ def test_random_scenes(rasterize: Rasterizer, degree: int) -> None:
 def test_cameras(rasterize: Rasterizer, view: dict[str, Any]) -> None:
     """Image sizes; narrow and wide lenses; the principal point outside the image.
 
-    Of the wide one, centres are far outside the image, where the Jacobian's ray is clamped.
+    With the wide lens, centres are far outside the image, where the Jacobian's ray is clamped.
     """
     cut = 0.05 if "width" in view else ON_A_CUT
     some = scene(120, 1, 7, size=0.3 if "width" in view else 0.2)
@@ -47,7 +49,7 @@ def test_cameras(rasterize: Rasterizer, view: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("near", [1e-6, 0.01, 3.0])
 def test_near_the_camera_plane(rasterize: Rasterizer, near: float) -> None:
-    """Centres just before, on and just beyond the near plane: those before it are not drawn."""
+    """Centres just before, on and just beyond the near plane; those before it are not drawn."""
     view, unit = camera(40, 30), near / 0.01
     some = scene(60, 2, 3)
     z = torch.cat([torch.linspace(-0.05, 0.0099, 30), torch.linspace(0.0101, 0.05, 30)])
@@ -71,7 +73,7 @@ def test_opacity_of_a_few(rasterize: Rasterizer, opacity: float) -> None:
 
 @pytest.mark.parametrize("saturated", [False, True])
 def test_opaque_layers(rasterize: Rasterizer, saturated: bool) -> None:
-    """Gaussians behind the end of a pixel play no part; at opacity 1 alpha is clamped, where it has no gradient."""
+    """Gaussians behind the end of a pixel are not drawn; at opacity 1 alpha is clamped and has no gradient."""
     some = scene(300 if saturated else 1500, 1, 0, size=1.0 if saturated else 0.3)
     some["opacities"] = torch.ones(300) if saturated else 0.9 + 0.1 * some["opacities"]
     assert_agrees(rasterize, some, camera(26, 19), cut=0.05 if saturated else ON_A_CUT)
@@ -96,17 +98,6 @@ def test_alpha_is_clamped(rasterize: Rasterizer) -> None:
     )
 
 
-@pytest.mark.parametrize("opacity", [0.3, 0.998])
-def test_one_that_covers_the_whole_image(rasterize: Rasterizer, opacity: float) -> None:
-    view = camera(70, 50)
-    one = scene(1, 2, 4)
-    one["means"] = in_front(view, torch.tensor([[0.3, 0.2, 2.0]]))
-    one["scales"] = torch.tensor([[3.0, 5.0, 4.0]])
-    one["opacities"][:] = opacity
-    one["sh0"][:] = 1.0  # clear of the colour's clamp at 0
-    assert_agrees(rasterize, one, view)
-
-
 @pytest.mark.parametrize(
     ("scales", "seed"),
     [((1.0, 1e-6, 1e-6), 0), ((0.3, 3e-7, 3e-7), 1), ((0.3, 0.3, 3e-7), 2)],
@@ -126,7 +117,7 @@ def test_axis_ratio_of_a_million(rasterize: Rasterizer, scales: tuple[float, flo
 
 @pytest.mark.parametrize(("axes", "length"), [(1, 1e-8), (3, 0.0), (1, 1e2), (3, 1e3), (1, 1e4)])
 def test_extreme_scales(rasterize: Rasterizer, axes: int, length: float) -> None:
-    """And quaternions of any length."""
+    """With quaternions of any length."""
     if axes == 1 and length >= 100 and getattr(rasterize, "looser", 1.0) > 1:
         pytest.skip("gsplat takes the determinant in float32, where that of such a needle cancels")
     some = scene(100, 1, 5)
@@ -147,13 +138,17 @@ def test_far_away(rasterize: Rasterizer, distance: float) -> None:
     assert_agrees(rasterize, some, view, image=1e-3 if distance > 1e5 else IMAGE, gradient=math.inf)
 
 
-def test_thousands_in_one_tile(rasterize: Rasterizer) -> None:
-    """20,000 faint ones before 5x4 pixels, of which some end early."""
+def test_thousands_in_one_tile(rasterize: Backend) -> None:
+    """20,000 faint Gaussians before 5x4 pixels, some of which end early."""
     some = scene(20_000, 1, 2, size=0.02)
     some["means"] *= 0.5
     some["opacities"] = some["opacities"] * 0.02 + 1 / 255
     # So many alphas per pixel that a cut is nearby in most: look closer.
     assert_agrees(rasterize, some, camera(5, 4), cut=0.1, nudge=1e-5)
+    if not rasterize.stands_in:  # for the kernels, whose pace torch does not have
+        began, view = time.perf_counter(), camera(30, 28)
+        differentiate(rasterize, some, view, weights(view))
+        assert time.perf_counter() - began < 5  # measured: 0.03 s
 
 
 @pytest.mark.parametrize(
@@ -165,9 +160,9 @@ def test_thousands_in_one_tile(rasterize: Rasterizer) -> None:
     ids=str,
 )  # fmt: skip
 def test_screen_filters(rasterize: Rasterizer, scales: Any, screen_filter: ScreenFilter) -> None:
-    """Of sizes from a tenth of a pixel to several, the opacity compensated to nothing, by half, and hardly.
+    """Sizes from a tenth of a pixel to several pixels, where the compensation is strong, medium and weak.
 
-    A needle has no area and is not drawn; of a disc seen from its edge the compensation is steep.
+    A needle has no area and is not drawn; the compensation of a disc seen from its edge is steep.
     """
     view, image, cut = camera(70, 50), IMAGE, 0.04
     some = scene(200, 1, 11, size=scales if isinstance(scales, float) else 1.0)
@@ -179,7 +174,7 @@ def test_screen_filters(rasterize: Rasterizer, scales: Any, screen_filter: Scree
 
 @pytest.mark.parametrize("far", [1e4, 1e8])
 def test_an_ellipse_beyond_the_range_of_integers(rasterize: Rasterizer, far: float) -> None:
-    """Its centre up to 1e12 pixels away, its long axis through the image: all pixels are finite and in range."""
+    """The centre is up to 1e12 pixels away, the long axis crosses the image; all pixels are finite and in range."""
     view = Camera(torch.eye(4), torch.tensor([[100.0, 0, 64], [0, 100.0, 64], [0, 0, 1]]), 128, 128)
     some = scene(20, 0, 0)
     some["means"][:, 2] += 4

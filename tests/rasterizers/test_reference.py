@@ -1,4 +1,4 @@
-"""The oracle itself, against closed forms, plain loops and numerical derivatives."""
+"""The float64 reference against closed forms, plain loops and numerical derivatives."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def one(view: Camera, **changes: Tensor) -> dict[str, Tensor]:
     return {name: value.double() for name, value in (values | changes).items()}
 
 
-def test_a_gaussian_has_its_closed_form() -> None:
+def test_one_gaussian_matches_its_closed_form() -> None:
     """On the optical axis: variance (f s / z)^2 + 0.3 along x and y, peak at the projected centre, grey 0.5."""
     view = camera(41, 31)
     focal = view.K.double().diagonal()[:2]
@@ -50,7 +50,7 @@ def test_a_gaussian_has_its_closed_form() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_projection_is_first_order(seed: int) -> None:
+def test_projection_matches_finite_differences(seed: int) -> None:
     """``J W Sigma W^T J^T + variance``, J from finite differences of the pinhole, Sigma from a rotation matrix."""
     g = torch.Generator().manual_seed(seed)
     view = camera(80, 60)
@@ -75,7 +75,7 @@ def test_projection_is_first_order(seed: int) -> None:
 
 @pytest.mark.parametrize(("name", "size"), [("on", 0.5), ("mip", 1.0), ("on", 4.0)])
 def test_a_compensated_gaussian_keeps_its_integral(name: str, size: float) -> None:
-    """Of ``size`` pixels: the sum over pixels is ``2 pi`` opacity ``size^2``, whatever the filter widens it to."""
+    """The sum over pixels of a Gaussian of ``size`` pixels is ``2 pi`` opacity ``size^2`` under any filter."""
     view = Camera(torch.eye(4), torch.tensor([[100.0, 0, 40], [0, 100.0, 40], [0, 0, 1]]), 80, 80)
     some = one(view, means=torch.tensor([[0.0, 0.0, 2.0]]), scales=torch.full((1, 3), size / 50))
     _, alpha = reference.rasterize(**some, camera=view, background=BLACK, screen_filter=FILTERS[name])
@@ -84,7 +84,7 @@ def test_a_compensated_gaussian_keeps_its_integral(name: str, size: float) -> No
     torch.testing.assert_close(float(alpha.sum()), 2 * math.pi * (0.8 * size**2 - lost), rtol=0.03, atol=0)
 
 
-def test_a_compensated_opacity_below_the_cut_is_dropped() -> None:
+def test_a_compensated_opacity_below_the_minimum_is_dropped() -> None:
     """At 0.1 pixels the classic filter draws 0.8 at the centre, antialiasing 0.8 * 0.01 / 0.31; at 0.035 nothing."""
     view = Camera(torch.eye(4), torch.tensor([[100.0, 0, 40.5], [0, 100.0, 40.5], [0, 0, 1]]), 81, 81)
     for size, want in ((0.1, 0.8 * 0.01 / 0.31), (0.035, 0.0)):
@@ -98,7 +98,7 @@ def test_a_compensated_opacity_below_the_cut_is_dropped() -> None:
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_the_ray_is_clamped_beyond_the_image(axis: int) -> None:
-    """From 0.15 of the image's size beyond its edge on, the Jacobian's ray stays; the centre does not."""
+    """The Jacobian's ray is clamped from 0.15 of the image's size beyond its edge; the centre is not."""
     view = camera(80, 60)
     K, size = view.K.double(), torch.tensor([80.0, 60.0]).double()
     edge = ((1.15 * size - K[:2, 2]) / K.diagonal()[:2])[axis]
@@ -114,7 +114,7 @@ def test_the_ray_is_clamped_beyond_the_image(axis: int) -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_blending_is_front_to_back(seed: int) -> None:
-    """A loop over each pixel's list, as every rasterizer's shader has it."""
+    """Compared with a loop over the list of each pixel."""
     g = torch.Generator().manual_seed(seed)
     alphas = torch.rand(40, 30, generator=g).double() ** 2
     alphas[torch.rand(40, 30, generator=g) < 0.3] = 0
@@ -133,7 +133,7 @@ def test_blending_is_front_to_back(seed: int) -> None:
     assert (through < 1e-3).any() and (through > 1e-2).any()
 
 
-def test_harmonics_are_real() -> None:
+def test_harmonics_match_mpmath() -> None:
     """sqrt(2) Im Y_lm for m < 0 and Re for m > 0, with the Condon-Shortley phase, in the order of l, then m."""
     g = torch.Generator().manual_seed(0)
     directions = torch.randn(50, 3, generator=g).double()
@@ -160,8 +160,8 @@ def test_colours_are_clamped_at_black() -> None:
 
 
 @pytest.mark.parametrize(("degree", "name"), [(0, "off"), (2, "off"), (0, "on"), (1, "mip")])
-def test_gradients_numerically(degree: int, name: str) -> None:
-    """Autograd of the oracle passes through its cuts as through constants, so the scene stays clear of them."""
+def test_gradients_match_finite_differences(degree: int, name: str) -> None:
+    """Autograd treats thresholds as constants, so the scene has no value near one."""
     view = camera(6, 5)
     some = {name: value.double() for name, value in scene(3, degree, 1).items()}
     some["means"] = in_front(view, torch.tensor([[0.1, 0, 2.0], [-0.1, 0.1, 3.0], [0.0, -0.2, 4.0]])).double()

@@ -1,4 +1,4 @@
-"""The charts are drawn, on log axes with PSNR beside the error, and take a page's colours."""
+"""The charts have log axes with PSNR beside the error, and use a page's colours."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def axes_of(draw: Any) -> list[Any]:
         return list(figure.axes)
 
 
-def test_rendering() -> None:
+def test_rendering_chart() -> None:
     pytest.importorskip("matplotlib")
     left, right = axes_of(rendering_chart([DIAL, BASE]))
     assert (left.get_xscale(), left.get_yscale(), right.get_yscale()) == ("log", "log", "log")
@@ -42,7 +42,7 @@ def test_rendering() -> None:
     assert len(right.get_yticks()) >= 3
 
 
-def test_training() -> None:
+def test_training_chart() -> None:
     pytest.importorskip("matplotlib")
     left, _ = axes_of(training_chart(CURVES, 29.0))
     curve, base = left.get_lines()
@@ -50,7 +50,7 @@ def test_training() -> None:
     assert len(axes_of(training_chart(CURVES, None))[0].get_lines()) == 1
 
 
-def test_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chart_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
     write_chart(tmp_path / "chart.png", rendering_chart([DIAL, BASE]))
     pixels = np.asarray(Image.open(tmp_path / "chart.png").convert("RGB"))

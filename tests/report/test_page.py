@@ -1,4 +1,4 @@
-"""The page holds everything itself, whatever the texts in it."""
+"""The page is self-contained and escapes its texts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ VOID = {"meta", "img", "input", "link", "br"}
 
 
 class Outline(HTMLParser):
-    """Elements with their attributes; fails where one is not closed in order."""
+    """The elements of a page with their attributes; fails where one is not closed in order."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -43,7 +43,7 @@ def picture(level: float, title: str = NASTY) -> Picture:
     return Picture(np.full((6, 8, 3), level, np.float32), title, NASTY)
 
 
-def test_a_page(tmp_path: Path) -> None:
+def test_page_is_self_contained_and_escaped(tmp_path: Path) -> None:
     body = [
         page.section(NASTY, page.paragraph(NASTY), page.tiles([(NASTY, "1", NASTY)]), page.facts({NASTY: NASTY})),
         page.dial_figure([picture(0.0), picture(0.5), picture(1.0)], {"photograph": picture(0.2)}),
@@ -71,8 +71,8 @@ def test_a_page(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
-def test_images_in_a_page(kind: type) -> None:
-    """They keep their pixels; wide ones are scaled down."""
+def test_images_are_embedded(kind: type) -> None:
+    """Embedded images keep their pixels; wide ones are scaled down."""
     ramp = np.linspace(0, 255, 32 * 24 * 3).reshape(24, 32, 3)
     image = ramp.astype(np.uint8) if kind is np.uint8 else (ramp / 255).astype(np.float32)
     urls = [page.data_url(each) for each in (image, np.zeros((300, 2000, 3), kind))]

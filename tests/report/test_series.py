@@ -1,4 +1,4 @@
-"""Which lines a chart gets from which report."""
+"""The series of a chart from each kind of report."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ def row(s: float, psnr: float | None = 20.0) -> dict[str, Any]:
     return {"virtual_scale": s, "psnr": psnr, "ssim": 0.9, "kept": 10, "kept_share": 0.5, "in_view": 9, "frame_ms": 3.0}
 
 
-def test_an_adaptation() -> None:
+def test_series_of_an_adaptation() -> None:
     report = {"rows": [row(1), row(5)], "base_rows": [row(1, 21)], "detached_row": row(1, 19)}
     dial, base, plain = series_of(report)
     assert (dial.label, dial.dial, dial.rows) == ("dial, one file", True, report["rows"])
@@ -19,7 +19,7 @@ def test_an_adaptation() -> None:
     assert (plain.label, plain.rows) == ("plain viewer, no dial", [report["detached_row"]])
 
 
-def test_an_evaluation_with_comparisons() -> None:
+def test_series_of_an_evaluation_with_comparisons() -> None:
     report = {
         "rows": [row(1), row(3)],
         "base_row": row(1, 22),
@@ -37,7 +37,7 @@ def test_an_evaluation_with_comparisons() -> None:
     }  # fmt: skip
 
 
-def test_a_plain_model_and_missing_measurements() -> None:
+def test_series_of_a_plain_model_and_of_missing_measurements() -> None:
     (plain,) = series_of({"rows": [row(1), row(2)], "attenuation": None})
     (dial,) = series_of({"rows": [row(1), row(2)], "attenuation": {"tau": 0.02}})
     assert (plain.label, plain.dial, dial.label, dial.dial) == ("the file, no dial", False, "dial, one file", True)

@@ -1,4 +1,4 @@
-"""What a scene needs, on scenes where it is known."""
+"""Measurements of a plan, on scenes with known results."""
 
 from __future__ import annotations
 
@@ -14,24 +14,19 @@ from clod_adapter.initialization.importance import removal_error
 from clod_adapter.render import render
 from clod_adapter.training import ablation
 from clod_adapter.training.ablation import largest_change, seen, sh_degree_losses
-from scenes import capture, gaussians, photograph, ring
+from scenes import gaussians, photograph, ring
 
 LIMIT = 0.02
 
 
-@pytest.fixture(scope="module")
-def captured() -> tuple[Gaussians, Scene]:
-    return capture()
-
-
 def with_bands(base: Gaussians, *sizes: float) -> Gaussians:
-    """Degree 3, its bands of these sizes."""
+    """``base`` with harmonics of degree 3, each degree of the given size."""
     random = torch.Generator().manual_seed(5)
     bands = [size * torch.randn(len(base), 2 * d + 1, 3, generator=random) for d, size in enumerate(sizes, 1)]
     return base.replace(shN=torch.cat(bands, 1))
 
 
-def test_sh_degrees_that_matter_and_that_do_not() -> None:
+def test_sh_degree_losses_separate_used_from_unused_degrees() -> None:
     truth, cameras = with_bands(gaussians(200, 0, 3), 0.3, 1e-4, 1e-5), ring(4, 48, 36)
     views = photograph(truth, cameras)
     found = list(sh_degree_losses(truth, views, LIMIT))
@@ -49,7 +44,7 @@ def test_sh_degrees_that_matter_and_that_do_not() -> None:
     assert change == pytest.approx(sum(of_each) / 4) and min(of_each) > 1
 
 
-def test_empty_sh_degrees_are_worth_nothing(captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_empty_sh_degrees_lose_nothing(captured: tuple[Gaussians, Scene], monkeypatch: pytest.MonkeyPatch) -> None:
     base, scene = captured
     assert dict(sh_degree_losses(with_bands(base, 0.3, 0, 0), scene.train, LIMIT)).keys() == {1, 2, 3}
     monkeypatch.setattr(ablation, "render", lambda *_: pytest.fail("rendered for nothing"))
@@ -58,9 +53,9 @@ def test_empty_sh_degrees_are_worth_nothing(captured: tuple[Gaussians, Scene], m
 
 
 def hidden() -> tuple[Gaussians, Scene, torch.Tensor]:
-    """An opaque shell, Gaussians in it, some out of every image, some too faint to be drawn, and others around.
+    """An opaque shell with Gaussians inside, some outside every image, some too faint, and others around it.
 
-    And which of them change an image when they are removed alone.
+    Also ``[N]`` bool: the Gaussians whose removal alone changes an image.
     """
     base = gaussians(70, 1, 2, size=0.1)
     means, logs, logits = base.means, base.log_scales, base.opacity_logits
@@ -79,8 +74,8 @@ def hidden() -> tuple[Gaussians, Scene, torch.Tensor]:
 
 
 @pytest.mark.parametrize("most_views", [64, 2])
-def test_seen_is_what_changes_a_pixel_when_it_is_removed(monkeypatch: pytest.MonkeyPatch, most_views: int) -> None:
-    """Whichever views the initialization renders; those are not rendered again."""
+def test_seen_gaussians_change_a_pixel_when_removed(monkeypatch: pytest.MonkeyPatch, most_views: int) -> None:
+    """The result does not depend on the views of the initialization, which are not rendered again."""
     base, scene, matters = hidden()
     monkeypatch.setattr(ablation, "MOST_VIEWS", most_views)
     told: list[tuple[int, int]] = []
@@ -99,7 +94,7 @@ def test_seen_is_what_changes_a_pixel_when_it_is_removed(monkeypatch: pytest.Mon
     assert seen(base, views, error, seed=0)[0]
 
 
-def test_the_largest_change(captured: tuple[Gaussians, Scene]) -> None:
+def test_largest_change(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     assert largest_change(base, base, scene.train) == (0.0, 0.0)
     less = base.select(torch.arange(len(base)) % 2 == 0)

@@ -1,4 +1,4 @@
-"""Cameras placed from the Gaussians alone."""
+"""Cameras placed without photographs."""
 
 from __future__ import annotations
 
@@ -14,15 +14,10 @@ from clod_adapter.training.camera_placement import FIELD, HEIGHT, WIDTH, place_c
 from clod_adapter.training.pseudo_views import render_pseudo_views
 
 
-@pytest.fixture(scope="module")
-def blob() -> clod.Gaussians:
-    return scenes.gaussians(400, 1, 0, size=0.05)
-
-
 def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
     """An opaque sphere of small discs and a far floater, with SH degree 1 strong towards ``seen_from`` alone.
 
-    So training leaves them. Degree 1 is odd in the direction: on the half that is not seen it is 0.
+    As after training. Degree 1 is odd in the direction: it is 0 on the half that is not seen.
     """
     k = torch.arange(n) + 0.5
     z, turn = 1 - 2 * k / n, math.pi * (1 + 5**0.5) * k
@@ -36,7 +31,7 @@ def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
     return clod.Gaussians(means, quats, logs, torch.full((n + 1,), 3.0), sh0, shN.repeat(1, 1, 3))
 
 
-def test_cameras_are_proper_and_see_the_scene(blob: clod.Gaussians) -> None:
+def test_placed_cameras_are_valid_and_see_the_scene(blob: clod.Gaussians) -> None:
     told: list[tuple[int, int]] = []
     cameras = place_cameras(blob, views=12, progress=lambda now: told.append((now.done, now.total)))
     assert told[-1][0] == told[-1][1] == len(told)
@@ -56,7 +51,7 @@ def test_cameras_are_proper_and_see_the_scene(blob: clod.Gaussians) -> None:
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_cameras_stand_outside_where_higher_sh_degrees_were_trained(axis: int) -> None:
+def test_cameras_face_the_side_where_sh_was_trained(axis: int) -> None:
     side = torch.eye(3)[axis]
     truth = ball(1500, side)
     positions = torch.stack([c.position for c in place_cameras(truth, views=12)])
@@ -75,7 +70,7 @@ def test_gaussians_that_are_not_finite_or_not_visible_are_ignored(blob: clod.Gau
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1e4])
-def test_cameras_are_placed_in_any_unit(blob: clod.Gaussians, unit: float) -> None:
+def test_placement_is_independent_of_the_unit(blob: clod.Gaussians, unit: float) -> None:
     other = blob.replace(means=blob.means * unit, log_scales=blob.log_scales + math.log(unit))
     assert typical_reach(other) == pytest.approx(unit * typical_reach(blob), rel=1e-4)
     here, there = (render_pseudo_views(g, place_cameras(g, views=8)) for g in (blob, other))

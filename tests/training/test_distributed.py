@@ -1,4 +1,4 @@
-"""What processes exchange. Here a group of one; tests/cli/test_processes.py has real ones, and their losses."""
+"""Communication of processes, with a group of one; tests/cli/adapt/test_processes.py has several processes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from clod_adapter.training import distributed
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost, joined
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.objective import GradientSum
-from scenes import capture
+from scenes import assert_equal, capture
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def peers() -> Iterator[ProcessGroup]:
         yield peers
 
 
-def test_one_alone_exchanges_with_itself(peers: ProcessGroup) -> None:
+def test_a_group_of_one_exchanges_with_itself(peers: ProcessGroup) -> None:
     pull = GradientSum({"means": torch.randn(5, 3), "sigma": torch.randn(5)}, torch.rand(5) < 0.5, 0.25)
     summed = peers.sum(replace(pull, gradients={name: g.clone() for name, g in pull.gradients.items()}))
     assert summed.loss == pull.loss and torch.equal(summed.kept, pull.kept)
@@ -37,34 +37,32 @@ def test_one_alone_exchanges_with_itself(peers: ProcessGroup) -> None:
     assert peers.waiting > 0 and peers.exchanging > 0
 
 
-def test_adapting_alone_changes_no_bit(peers: ProcessGroup) -> None:
+def test_a_group_of_one_changes_no_bit(peers: ProcessGroup) -> None:
     base, scene = capture(n=60, views=4)
     config = AdaptConfig(iters=3, batch=2)
     want, found = adapt(base, scene, config), adapt(base, scene, config, group=peers)
-    for name, tensor in want.gaussians.tensors().items():
-        assert torch.equal(found.gaussians.tensors()[name], tensor), name
+    assert_equal(found.gaussians, want.gaussians)
     assert found.waiting > 0 and want.waiting == want.exchanging == 0 and found.lost is None
     peers.size = 3
     with pytest.raises(ClodError, match="batch is 2, it must be at least 3, a view for each of the processes"):
         adapt(base, scene, config, group=peers)
 
 
-def test_what_is_sent_arrives() -> None:
-    """Tensors of any kind, within anything that pickles; empty ones, as shN of degree 0, and views of others."""
+def test_objects_survive_being_sent() -> None:
+    """Tensors of any kind within picklable objects, including empty tensors and views."""
     base, scene = capture(n=10, views=2)
     sent = (base.replace(shN=base.shN[:, :0]), scene, {"a": torch.arange(6).view(2, 3).t(), "b": torch.tensor(True)})
     tensors: list[torch.Tensor] = []
     pickled = distributed._without_tensors(sent, tensors)
     assert len(pickled) < 4000 and all(tensor.is_contiguous() for tensor in tensors)
     gaussians, views, more = distributed._with_tensors(pickled, [tensor.clone() for tensor in tensors])
-    for name, tensor in sent[0].tensors().items():
-        assert torch.equal(gaussians.tensors()[name], tensor), name
+    assert_equal(gaussians, sent[0])
     assert views.train[0].camera.name == scene.train[0].camera.name
     assert torch.equal(views.test[0].image, scene.test[0].image)
     assert torch.equal(more["a"], sent[2]["a"]) and more["b"].dtype == torch.bool
 
 
-def test_a_loss_is_told_from_other_errors() -> None:
+def test_a_lost_process_is_distinguished_from_other_errors() -> None:
     with (
         pytest.raises(ProcessLost, match=r"ended \(Connection closed by peer \[127.0.0.1\]:1\)$"),
         distributed._losses(),
@@ -75,7 +73,7 @@ def test_a_loss_is_told_from_other_errors() -> None:
 
 
 def test_connecting_prints_nothing(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    """Of some versions of torch gloo does, from C++, into what --json prints."""
+    """In some versions of torch, gloo prints from C++ to standard output, which --json uses."""
     connect = dist.init_process_group
 
     def noisy(*words: Any, **more: Any) -> None:

@@ -1,7 +1,8 @@
-"""Ctrl-C at random moments of ``adapt`` itself, without the command around it."""
+"""Ctrl-C at random times within ``adapt``."""
 
 from __future__ import annotations
 
+import copy
 import random
 import signal
 import threading
@@ -9,7 +10,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-import torch
 
 from clod_adapter import adapt
 from clod_adapter.config import AdaptConfig
@@ -19,8 +19,9 @@ from clod_adapter.training import trainer
 from clod_adapter.training.interrupts import DeferredInterrupt
 from clod_adapter.training.loop import Adapted
 from runs import pressing
-from scenes import capture
+from scenes import assert_equal, capture
 
+Undisturbed = tuple[dict[int, Gaussians], float]
 ITERS, ROUNDS = 60, 8
 CONFIG = AdaptConfig(iters=ITERS, max_sv=3.0, average=0.5)
 SCENE = capture(60, views=4, width=16, height=12)
@@ -33,18 +34,14 @@ def default_handler() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
-def snapshot(gaussians: Gaussians) -> dict[str, torch.Tensor]:
-    return {name: value.clone() for name, value in gaussians.tensors().items()}
-
-
 @pytest.fixture(scope="module")
-def undisturbed() -> tuple[dict[int, dict[str, torch.Tensor]], float]:
+def undisturbed() -> Undisturbed:
     """The result after each step, and the seconds of training."""
-    after: dict[int, dict[str, torch.Tensor]] = {}
+    after: dict[int, Gaussians] = {}
 
     def keep(now: Progress) -> None:
         if now.gaussians:
-            after[now.done] = snapshot(now.gaussians())
+            after[now.done] = copy.deepcopy(now.gaussians())
 
     return after, adapt(*SCENE, CONFIG, keep).seconds
 
@@ -66,36 +63,32 @@ def interrupted(step: int, seconds: float) -> tuple[Adapted, list[Progress]]:
         timer.join()
 
 
-def test_the_result_is_of_the_last_whole_step(
-    undisturbed: tuple[dict[int, dict[str, torch.Tensor]], float],
-) -> None:
+def test_interrupted_results_are_of_a_whole_step(undisturbed: Undisturbed) -> None:
     after, seconds = undisturbed
     draw, early = random.Random(3), 0
     for _ in range(ROUNDS):
         adapted, seen = interrupted(draw.randint(1, ITERS // 2), draw.uniform(0, 2 * seconds / ITERS))
         assert adapted.interrupted and adapted.signalled and adapted.steps == len(seen)
-        for name, value in adapted.gaussians.tensors().items():
-            assert torch.equal(value, after[adapted.steps][name]), (adapted.steps, name)
+        assert_equal(adapted.gaussians, after[adapted.steps])
         early += adapted.steps < ITERS
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert early > ROUNDS / 2
 
 
 @pytest.mark.parametrize("where", ["spoilt_rows", "add_to_mean"])
-def test_an_interrupt_within_the_update(
-    undisturbed: tuple[dict[int, dict[str, torch.Tensor]], float], monkeypatch: pytest.MonkeyPatch, where: str
+def test_an_interrupt_within_the_update_completes_the_step(
+    undisturbed: Undisturbed, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
-    """Before and after the parameters have moved: the step is completed, and the state resumes to the same bits."""
+    """Before and after the parameters change; the step is completed, and its state resumes to the same bits."""
     states: list[Any] = []
     monkeypatch.setattr(trainer, where, pressing(getattr(trainer, where), signal.SIGINT, at=5))
     found = adapt(*SCENE, CONFIG, lambda now: states.append(now.state) if now.state else None)
     assert found.interrupted and found.signalled
-    assert all(torch.equal(value, undisturbed[0][found.steps][n]) for n, value in found.gaussians.tensors().items())
-    whole = adapt(*SCENE, CONFIG, resume=states[-1]())
-    assert all(torch.equal(value, undisturbed[0][ITERS][n]) for n, value in whole.gaussians.tensors().items())
+    assert_equal(found.gaussians, undisturbed[0][found.steps])
+    assert_equal(adapt(*SCENE, CONFIG, resume=states[-1]()).gaussians, undisturbed[0][ITERS])
 
 
-def test_before_the_first_step_is_complete_it_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_before_the_first_step_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     def press(now: Progress) -> None:
         if now.phase == Phase.PRUNING_ORDER:
             signal.raise_signal(signal.SIGINT)
@@ -104,7 +97,7 @@ def test_before_the_first_step_is_complete_it_is_raised(monkeypatch: pytest.Monk
         adapt(*SCENE, CONFIG, press)
 
 
-def test_a_second_one_is_raised_at_once_and_handlers_return() -> None:
+def test_a_second_interrupt_is_raised_at_once() -> None:
     with pytest.raises(KeyboardInterrupt), DeferredInterrupt() as interrupt:
         interrupt.begin()
         signal.raise_signal(signal.SIGINT)
@@ -113,7 +106,7 @@ def test_a_second_one_is_raised_at_once_and_handlers_return() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_other_handlers_and_threads_are_left_alone() -> None:
+def test_other_handlers_and_threads_are_not_affected() -> None:
     heard: list[int] = []
     signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
     with DeferredInterrupt() as interrupt:
@@ -127,7 +120,7 @@ def test_other_handlers_and_threads_are_left_alone() -> None:
     assert found[0].steps == 2
 
 
-def test_an_error_of_the_listener_is_raised_and_not_told_to_it() -> None:
+def test_an_error_of_the_listener_is_not_reported_to_it() -> None:
     seen = []
 
     def listen(now: Progress) -> None:

@@ -1,4 +1,4 @@
-"""A plan's training: the same as without one, except for the parts that are left out."""
+"""Training with a plan equals training without one, except for the parts left out."""
 
 from __future__ import annotations
 
@@ -13,33 +13,20 @@ from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import initialize, removal_error
+from clod_adapter.initialization.importance import initialize
 from clod_adapter.progress import Progress
 from clod_adapter.render import render
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.plan import NAMES, Override
 from clod_adapter.training.planner import make_plan
-from scenes import capture, with_unseen
+from scenes import assert_equal, with_unseen
 
 CONFIG = AdaptConfig(iters=40, max_sv=4.0)
 ALL = frozenset(NAMES)
 
 
-@pytest.fixture(scope="module")
-def captured() -> tuple[Gaussians, Scene]:
-    """A capture without unseen Gaussians."""
-    base, scene = capture()
-    return base.select(removal_error(base, scene.train) > 0), scene
-
-
-def assert_equal(a: Gaussians, b: Gaussians) -> None:
-    assert a.tensors().keys() == b.tensors().keys() and a.attenuation == b.attenuation
-    for name, value in a.tensors().items():
-        assert torch.equal(value, b.tensors()[name]), name
-
-
-def test_training_is_the_same_if_nothing_is_left_out(captured: tuple[Gaussians, Scene]) -> None:
-    base, scene = captured
+def test_training_is_the_same_if_nothing_is_left_out(visible: tuple[Gaussians, Scene]) -> None:
+    base, scene = visible
     plan = make_plan(base, scene, CONFIG)
     assert plan.kept is None and plan.config == CONFIG and not plan.trims(base)
     planned = plan.adapt(scene).gaussians
@@ -47,9 +34,9 @@ def test_training_is_the_same_if_nothing_is_left_out(captured: tuple[Gaussians, 
     assert_equal(plan.adapt(scene).gaussians, planned)  # a plan can be used again
 
 
-def test_resuming(captured: tuple[Gaussians, Scene]) -> None:
+def test_a_resumed_plan_gives_the_same_bits(visible: tuple[Gaussians, Scene]) -> None:
     """A plan that is made again resumes to the same bits, with unseen Gaussians and frozen attributes."""
-    base, scene = with_unseen(captured[0])[0], captured[1]
+    base, scene = with_unseen(visible[0])[0], visible[1]
     states: list[Any] = []
 
     def stop(now: Progress) -> bool:
@@ -68,9 +55,9 @@ def test_resuming(captured: tuple[Gaussians, Scene]) -> None:
     assert not torch.equal(found.quats, base.quats)
 
 
-def test_unseen_gaussians_are_unchanged(captured: tuple[Gaussians, Scene]) -> None:
-    base, before = with_unseen(captured[0])
-    scene = captured[1]
+def test_unseen_gaussians_are_unchanged(visible: tuple[Gaussians, Scene]) -> None:
+    base, before = with_unseen(visible[0])
+    scene = visible[1]
     plan = make_plan(base, scene, CONFIG)
     assert plan.kept is not None and not plan.kept[~before].any()
     lean = plan.adapt(scene).gaussians
@@ -85,9 +72,9 @@ def test_unseen_gaussians_are_unchanged(captured: tuple[Gaussians, Scene]) -> No
     assert not torch.equal(lean.means, base.means[plan.kept])  # seen ones are trained
 
 
-def test_target_counts_are_shares_of_all_gaussians(captured: tuple[Gaussians, Scene]) -> None:
-    """With a third of the file unseen, a dial value keeps as many as if they were trained too."""
-    base, scene = with_unseen(captured[0], 150)[0], captured[1]
+def test_target_counts_are_shares_of_all_gaussians(visible: tuple[Gaussians, Scene]) -> None:
+    """With a third of the file unseen, a dial value keeps as many Gaussians as if all were trained."""
+    base, scene = with_unseen(visible[0], 150)[0], visible[1]
     config = replace(CONFIG, iters=80)
     plan = make_plan(base, scene, config, Override(keep=ALL - {"unseen"}))
     left_out = plan.whole(base, plan.adapt(scene).gaussians)
@@ -97,8 +84,8 @@ def test_target_counts_are_shares_of_all_gaussians(captured: tuple[Gaussians, Sc
         assert kept[0] == pytest.approx(kept[1], rel=0.15)
 
 
-def test_tuned_sh_degrees_return_to_their_place(captured: tuple[Gaussians, Scene]) -> None:
-    base, scene = captured
+def test_tuned_sh_degrees_return_to_their_place(visible: tuple[Gaussians, Scene]) -> None:
+    base, scene = visible
     base = base.replace(shN=torch.cat([base.shN, 1e-6 * torch.ones(len(base), 5, 3)], 1))
     plan = make_plan(base, scene, replace(CONFIG, lr_shN=1e-2))
     assert plan.sh_degree == 1
@@ -106,8 +93,8 @@ def test_tuned_sh_degrees_return_to_their_place(captured: tuple[Gaussians, Scene
     assert torch.equal(whole.shN[:, 3:], base.shN[:, 3:]) and not torch.equal(whole.shN[:, :3], base.shN[:, :3])
 
 
-def test_sh_degrees_that_are_left_out_are_unchanged(captured: tuple[Gaussians, Scene]) -> None:
-    base, scene = captured
+def test_sh_degrees_that_are_left_out_are_unchanged(visible: tuple[Gaussians, Scene]) -> None:
+    base, scene = visible
     faint = base.replace(shN=1e-5 * base.shN)
     plan = make_plan(faint, scene, CONFIG)
     lean = plan.adapt(scene).gaussians

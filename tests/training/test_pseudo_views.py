@@ -1,4 +1,4 @@
-"""Cameras placed from the Gaussians alone, and the checkpoint's own pictures."""
+"""Pseudo views: renders of the checkpoint as target images."""
 
 from __future__ import annotations
 
@@ -14,14 +14,9 @@ from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.training.pseudo_views import FEW, OWN, add_pseudo_views, render_pseudo_views
 
 
-@pytest.fixture(scope="module")
-def blob() -> clod.Gaussians:
-    return scenes.gaussians(400, 1, 0, size=0.05)
-
-
 @pytest.mark.parametrize("with_dial", [False, True])
-def test_the_images_are_the_checkpoints_own(blob: clod.Gaussians, with_dial: bool) -> None:
-    """Those of a file with a dial are at its full quality, s = 1."""
+def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians, with_dial: bool) -> None:
+    """Renders of a file with a dial are at s = 1."""
     own, cameras, told = blob, scenes.ring(9, 40, 30), []
     if with_dial:
         own = clod.attach(blob, torch.full((len(blob),), 0.3), clod.AttenuationConfig(scene_distance=4.0))
@@ -33,8 +28,8 @@ def test_the_images_are_the_checkpoints_own(blob: clod.Gaussians, with_dial: boo
     assert render_pseudo_views(own, cameras[:1]).test == ()
 
 
-def test_a_dial_learned_from_placed_views_serves_views_it_never_saw() -> None:
-    """End to end: at the same count it beats the untrained start on other cameras."""
+def test_training_on_pseudo_views_improves_held_out_views() -> None:
+    """At the same count, PSNR on other cameras exceeds that of the initialization."""
     base, scene = scenes.capture(300, views=8, seed=2)
     placed = render_pseudo_views(base, place_cameras(base, views=8))
     config = clod.AdaptConfig(max_sv=4, iters=0)

@@ -1,4 +1,4 @@
-"""Training states on disk: the same bits come back, and what is something else is named."""
+"""Training states on disk: exact round trips, and other files are refused."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def state() -> TrainingState:
     )  # fmt: skip
 
 
-def test_the_same_bits_come_back(tmp_path: Path, state: TrainingState) -> None:
+def test_round_trip_keeps_every_bit(tmp_path: Path, state: TrainingState) -> None:
     save_state(tmp_path / "state", state, BELONGS)
     found, belongs = load_state(tmp_path / "state")
     assert belongs == BELONGS and found.tensors.keys() == state.tensors.keys()
@@ -57,7 +57,7 @@ CHANGES: list[dict[str, Any]] = [
 ]  # fmt: skip
 
 
-def test_files_that_are_no_state_are_refused(tmp_path: Path, state: TrainingState) -> None:
+def test_other_files_are_refused(tmp_path: Path, state: TrainingState) -> None:
     good, bad = tmp_path / "good", tmp_path / "bad"
     save_state(good, state, BELONGS)
     tensors = load_file(good)

@@ -1,4 +1,4 @@
-"""The target-count curve: its values, the gradient of its square, and that following this reaches the target."""
+"""The target-count curve: its values, its gradients, and convergence of the counts."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def gradient(logits: Tensor, log_sigma: Tensor, d: Tensor, s: float, **changes: 
     return count_gradient(dialled, logits, s, ATTENUATION.tau, 0.1, dataclasses.replace(CONFIG, **changes))
 
 
-def test_the_gradient_penalises_too_many_and_brings_back_too_few() -> None:
-    """That of the square of the excess; 0 for the last Gaussian, of which the curve would keep a tenth."""
+def test_count_gradient_penalises_excess_and_deficit() -> None:
+    """The gradient is that of the squared excess; it is 0 for a single remaining Gaussian."""
     logits, log_sigma, d = some()
     many, few = log_sigma + 3, log_sigma - 2
     for s in (1.5, 6.0):
@@ -75,8 +75,8 @@ def test_the_gradient_penalises_too_many_and_brings_back_too_few() -> None:
 
 
 @pytest.mark.parametrize("start", [-1.0, 0.7, None])
-def test_without_an_image_the_counts_reach_the_curve(start: float | None) -> None:
-    """In the optimiser's steps, from too few, from too many, and from none: every sigma at training's floor.
+def test_counts_reach_the_curve_without_an_image_loss(start: float | None) -> None:
+    """With the optimiser's steps, from too few, from too many, and from none (every sigma at its minimum).
 
     Steps of constant size end up to a quarter from the curve, so they shrink, as in training.
     Ten orders of the dial values then end within 0.07 of it.
@@ -107,7 +107,7 @@ def test_without_an_image_the_counts_reach_the_curve(start: float | None) -> Non
 
 
 def test_count_slope_is_that_of_the_soft_count() -> None:
-    """Where 2 u > 1; below that it is as if 2 u were 1, so that Gaussians without attenuation yet can get some."""
+    """Where 2 u > 1; below, 2 u counts as 1, so that Gaussians without attenuation have a gradient."""
     tau, s, temperature = 0.02, 2.0, 0.5
     logits = torch.linspace(-5, 5, 200, dtype=torch.float64)
     d, log_sigma = torch.linspace(0.1, 1, 200, dtype=torch.float64), torch.linspace(-1, 2, 200, dtype=torch.float64)
@@ -127,8 +127,8 @@ def test_count_slope_is_that_of_the_soft_count() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("temperature", [0.02, 0.15, 1.0])
-def test_the_slope_of_the_soft_count_matches_mpmath(dtype: torch.dtype, temperature: float) -> None:
-    """On both sides of the threshold alike: q (1 - q) is not formed as a difference."""
+def test_soft_count_gradient_matches_mpmath(dtype: torch.dtype, temperature: float) -> None:
+    """On both sides of the threshold; q (1 - q) is computed without cancellation."""
     tau, s, eps = 0.02, 3.0, torch.finfo(dtype).eps
     threshold = mpmath.log(mpmath.mpf(tau) * s)
     logs = torch.tensor([-8.0, -4.5, -2.9, -2.8125, -2.5, -2.0, -1.0, -0.5, 0.0], dtype=dtype, requires_grad=True)
@@ -145,8 +145,8 @@ def test_the_slope_of_the_soft_count_matches_mpmath(dtype: torch.dtype, temperat
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-def test_counts_at_the_edges(dtype: torch.dtype) -> None:
-    """Never NaN, 0 where log a'' is -inf; a half's slope is float32's."""
+def test_count_gradients_of_extreme_opacities_are_finite(dtype: torch.dtype) -> None:
+    """Gradients are never NaN, and 0 where log a'' is -inf; those of float16 are computed in float32."""
     tau, s = 0.5, 2.0  # log(tau s) is 0: a log a'' stands exactly on the threshold
     logs = torch.tensor([-math.inf, -math.inf, -math.inf, 0.0, -0.0, -200.0, -1e4], dtype=dtype, requires_grad=True)
     logits = torch.tensor([-math.inf, 0.0, math.inf, math.inf, 200.0, -200.0, 1.0], dtype=dtype)
@@ -161,8 +161,8 @@ def test_counts_at_the_edges(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize(("form", "s"), [("law", 1.0), ("law", 3.0), ("paper", 3.0)])
-def test_shares_of_more_than_are_here(form: str, s: float) -> None:
-    """Gaussians that are left out because they are never drawn count as if they were here and culled."""
+def test_shares_count_gaussians_that_are_left_out(form: str, s: float) -> None:
+    """Gaussians left out because they are never drawn count as culled."""
     config = AdaptConfig(count_term=form)
     random = torch.Generator().manual_seed(1)
     logits = torch.cat([torch.randn(40, generator=random), torch.full((25,), -40.0)])

@@ -1,10 +1,13 @@
-"""ViewSampler: each view once a round, by the seed alone, and again from a state."""
+"""ViewSampler draws each view once a round, reproducibly from a seed or a state."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
+import torch
 
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
@@ -19,7 +22,7 @@ def nine(draws: ViewSampler) -> list[tuple[str, list[float]]]:
 
 
 @pytest.mark.parametrize("sampling", ["pair", "log", "uniform"])
-def test_the_seed_and_a_state_decide_all(sampling: str) -> None:
+def test_draws_are_reproducible_from_a_seed_or_state(sampling: str) -> None:
     config = AdaptConfig(sampling=sampling, full_share=0.3, seed=3)
     one, two, other = (ViewSampler(VIEWS, each) for each in (config, config, replace(config, seed=4)))
     first = nine(one)
@@ -33,10 +36,31 @@ def test_the_seed_and_a_state_decide_all(sampling: str) -> None:
         assert sorted(names[start : start + len(VIEWS)]) == sorted(view.camera.name for view in VIEWS)
 
 
-def test_states_that_cannot_be_are_refused() -> None:
+def test_impossible_states_are_refused() -> None:
     draws = ViewSampler(VIEWS, AdaptConfig())
     random, order = draws.state()
     with pytest.raises(ClodError, match="of other Gaussians, views or settings"):
         draws.restore(random, (*order, len(VIEWS)))
     with pytest.raises(ClodError, match="random state is damaged"):
         draws.restore({"bit_generator": "MT19937"}, order)
+
+
+def assert_uniform(values: torch.Tensor) -> None:
+    values = values.sort().values.double()
+    assert (values - torch.linspace(0, 1, len(values))).abs().max() < 1.7 / len(values) ** 0.5  # Kolmogorov-Smirnov
+
+
+def test_dial_values_follow_the_configured_distribution() -> None:
+    """Pair: 1 and a log-uniform value in [1, max_sv]. Others: 1 with ``full_share``, or log-uniform, or uniform."""
+
+    def drawn(**changes: Any) -> torch.Tensor:
+        sampler = ViewSampler(VIEWS, AdaptConfig(max_sv=4.0, **changes))
+        return torch.tensor([sampler.draw()[1] for _ in range(480)])
+
+    pairs = drawn(sampling="pair")
+    assert (pairs[:, 0] == 1).all() and pairs.shape == (480, 2)
+    assert_uniform(pairs[:, 1].log() / math.log(4))
+    ones = drawn(sampling="log", full_share=0.25).log() / math.log(4)
+    assert 0.19 < (ones == 0).double().mean() < 0.31  # 3 standard deviations
+    assert_uniform(ones[ones > 0])
+    assert_uniform((drawn(sampling="uniform", full_share=0.0)[:, 0] - 1) / 3)

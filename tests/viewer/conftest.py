@@ -1,11 +1,10 @@
-"""The page in a browser: one context for all tests, and a server for each file that is shown."""
+"""Fixtures for the page in a browser: one browser context for all tests, and one server per shown file."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from shown import SIZE, Shown, fold, serve, take
 
 @pytest.fixture
 def artefacts(tmp_path: Path) -> Path:
-    """The folder for screenshots: CLOD_ARTIFACTS, or the test's own folder."""
+    """The folder for screenshots: CLOD_ARTIFACTS or a temporary folder."""
     folder = Path(os.environ.get("CLOD_ARTIFACTS", tmp_path))
     folder.mkdir(parents=True, exist_ok=True)
     return folder
@@ -28,7 +27,7 @@ def artefacts(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def tabs(chromium: Any) -> Iterator[Any]:
-    """The browser context that tests open tabs in: a context for each test doubles the time until the first frame."""
+    """The browser context of all tabs; a context per test would double the time to the first frame."""
     with chromium.new_context() as context:
         context.set_default_timeout(10_000)
         yield context
@@ -60,24 +59,19 @@ def show(tabs: Any) -> Iterator[Callable[..., Shown]]:
         yield start
         for shown, url in opened:
             assert shown.errors == []
-            elsewhere = [each for each in shown.asked if not each.startswith((url, "data:", f"blob:{url}"))]
-            assert elsewhere == []
-
-
-@dataclass(frozen=True)
-class Files:
-    """Writes models into the folder of a test."""
-
-    folder: Path
-
-    def save(self, gaussians: clod_adapter.Gaussians, name: str = "model.ply") -> Path:
-        clod_adapter.save(self.folder / name, gaussians)
-        return self.folder / name
+            foreign = [each for each in shown.asked if not each.startswith((url, "data:", f"blob:{url}"))]
+            assert foreign == []
 
 
 @pytest.fixture
-def files(tmp_path: Path) -> Files:
-    return Files(tmp_path)
+def save(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a model into the test's folder."""
+
+    def write(gaussians: Gaussians, name: str = "model.ply") -> Path:
+        clod_adapter.save(tmp_path / name, gaussians)
+        return tmp_path / name
+
+    return write
 
 
 @pytest.fixture(scope="session")
@@ -102,7 +96,7 @@ def model(gaussians: Gaussians, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 @pytest.fixture(scope="session")
 def tab_of_model(tabs: Any, model: Path) -> Iterator[Shown]:
-    """A tab with that file, for ``shown``."""
+    """A tab with the file ``model``."""
     with serve(model) as url:
         shown = Shown(tabs.new_page())
         shown.page.set_viewport_size(SIZE)
@@ -112,7 +106,7 @@ def tab_of_model(tabs: Any, model: Path) -> Iterator[Shown]:
 
 @pytest.fixture
 def shown(tab_of_model: Shown, model: Path) -> Iterator[Shown]:
-    """One tab for all tests that need no server of their own: reset to ``model``, as opening one takes a second."""
+    """The tab of ``tab_of_model``, reset to that file: opening a tab for each test would take a second."""
     fold(tab_of_model, False)
     tab_of_model.page.evaluate("document.activeElement.blur(), document.getElementById('target').value = ''")
     take(tab_of_model, model)

@@ -1,4 +1,4 @@
-"""The page of one file: messages, names, sizes, and the self-contained file, in a browser."""
+"""The page in a browser: messages, file names, layout, and the self-contained page."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import clod_adapter
 import scenes
@@ -14,29 +15,29 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import dial
 from clod_adapter.viewer import page, payload
 from clod_adapter.viewer.page import write_viewer_page
-from shown import COUNTS, SIZE, Shown, serve
+from shown import COUNTS, SIZE, Shown, serve, take
 
 
-def test_a_file_without_sigma_d_has_no_dial(show: Any, files: Any, plain: Gaussians) -> None:
-    """The page says why; it shows the file's name as text."""
+def test_a_file_without_sigma_d_has_no_dial(show: Any, save: Any, plain: Gaussians) -> None:
+    """The page shows the reason, and the file's name as text."""
     name = "<img src=x onerror=clod=1><script>clod=1<!script>&amp;'\".ply"
-    shown = show(files.save(plain, name))
+    shown = show(save(plain, name))
     assert shown.text("#title") == name and shown.page.title() == name and shown.page.query_selector("img") is None
     assert shown.page.is_disabled("#dial") and shown.page.is_disabled("#target") and shown.page.is_disabled("#equation")
-    said = shown.text("#no-dial")
-    assert f"{name} has no sigma_d" in said and f"clod-adapt {name}" in said
+    reason = shown.text("#no-dial")
+    assert f"{name} has no sigma_d" in reason and f"clod-adapt {name}" in reason
     assert shown.counts() == {"total": 400, "kept": 400, "drawn": shown.counts()["drawn"]}
     assert shown.picture().max() > 50
     shown.page.keyboard.press("]")
     assert shown.counts()["kept"] == 400
-    shown.page.evaluate("location.hash = '#wipe=0.5&other=3&dial=3'")  # a link to a comparison that is not there
+    shown.page.evaluate("location.hash = '#wipe=0.5&other=3&dial=3'")  # a link with a comparison, which needs a dial
     shown.until("document.getElementById('compare').value === 'off'")
     assert shown.page.is_hidden("#wipe")
 
 
-def test_a_model_that_cannot_be_fetched_is_an_error(tab: Any, files: Any, gaussians: Gaussians) -> None:
-    """Keys then do nothing."""
-    with serve(files.save(gaussians)) as url:
+def test_a_model_that_cannot_be_fetched_is_an_error(tab: Any, save: Any, gaussians: Gaussians) -> None:
+    """Keys have no effect then."""
+    with serve(save(gaussians)) as url:
         tab.route("**/files/model", lambda route: route.fulfill(body=b"ply\nformat"))
         shown = Shown(tab)
         tab.goto(url)
@@ -49,11 +50,42 @@ def test_a_model_that_cannot_be_fetched_is_an_error(tab: Any, files: Any, gaussi
         assert shown.errors == [] and shown.text("#target-note") == ""
 
 
-def test_more_gaussians_than_16_bits_count(show: Any, files: Any) -> None:
+def failed(tab: Any, path: Path, script: str) -> str:
+    """The error message of the page of a file if ``script`` runs before the page's script."""
+    with serve(path) as url:
+        tab.add_init_script(script)
+        shown = Shown(tab)
+        tab.goto(url)
+        shown.until("!document.getElementById('message').hidden")
+        assert shown.errors == []
+        return shown.text("#message")
+
+
+def test_a_model_beyond_the_device_limit_is_an_error_with_both_counts(tab: Any, save: Any) -> None:
+    small = """const real = WebGL2RenderingContext.prototype.getParameter;
+        WebGL2RenderingContext.prototype.getParameter = function (name) {
+            return name === this.MAX_TEXTURE_SIZE ? 2 : real.call(this, name);
+        };"""
+    error = failed(tab, save(scenes.gaussians(1100, 3, 5)), small)
+    assert "1,100 Gaussians" in error and "at most 682" in error
+
+
+def test_without_webgl_the_page_shows_an_error_and_no_panel(tab: Any, model: Path) -> None:
+    assert "WebGL2" in failed(tab, model, "HTMLCanvasElement.prototype.getContext = () => null")
+    assert tab.is_hidden("#panel")
+
+
+def test_one_gaussian_fits_the_view(shown: Shown, save: Any) -> None:
+    take(shown, save(scenes.gaussians(1, 0, 5).replace(opacity_logits=torch.tensor([5.0])), "one.ply"))
+    picture = shown.picture().max(2)
+    assert picture.max() > 20 and (picture[0].max(), picture[-1].max()) == (0, 0)
+
+
+def test_more_gaussians_than_16_bits_count(show: Any, save: Any) -> None:
     count = 100_000
     many = scenes.dialled(count, 0, 6)
     many = many.replace(log_scales=many.log_scales - 3.3)
-    shown, camera = show(files.save(many), "--sv", 3), scenes.camera(320, 240)
+    shown, camera = show(save(many), "--sv", 3), scenes.camera(320, 240)
     shown.camera(camera)
     kept = int(dial(many, camera, 3.0).keep.sum())
     assert shown.counts()["total"] == count and abs(shown.counts()["kept"] - kept) <= COUNTS * kept
@@ -61,12 +93,12 @@ def test_more_gaussians_than_16_bits_count(show: Any, files: Any) -> None:
 
 
 def test_one_file_needs_no_network(
-    chromium: Any, show: Any, files: Any, gaussians: Gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    chromium: Any, show: Any, save: Any, gaussians: Gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its data, which may be larger than a text node, continues in further elements."""
-    monkeypatch.setattr(page, "LETTERS", 20_000)
-    monkeypatch.setattr(payload, "ROWS", 100)
-    path = files.save(gaussians)
+    """Large data are divided among several elements, because browsers limit the size of a text."""
+    monkeypatch.setattr(page, "MAX_CHARACTERS", 20_000)
+    monkeypatch.setattr(payload, "BLOCK_ROWS", 100)
+    path = save(gaussians)
     served, model = show(path, "--sv", 2), clod_adapter.load(path)
     write_viewer_page(tmp_path / "page.html", model, base=model, cameras=scenes.ring(2, 320, 240), virtual_scale=2.0)
     assert (tmp_path / "page.html").read_text(encoding="utf-8").count('id="clod-model"') > 2
@@ -80,8 +112,8 @@ def test_one_file_needs_no_network(
         assert [url for url in alone.asked if not url.startswith(("file:", "blob:", "data:"))] == []
 
 
-def test_the_page_fits(show: Any, model: Path, files: Any, plain: Gaussians, artefacts: Path) -> None:
-    shown = show(model, "--base", files.save(plain, "base.ply"))
+def test_the_panel_fits_the_window(show: Any, model: Path, save: Any, plain: Gaussians, artefacts: Path) -> None:
+    shown = show(model, "--base", save(plain, "base.ply"))
     shown.run("clod.setWipe(0.5, 'base')")
     for scheme, width in (("light", 360), ("dark", 1280)):
         shown.page.set_viewport_size({"width": width, "height": 640})

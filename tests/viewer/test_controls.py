@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+import clod_adapter
 import scenes
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.scene.colmap import write_model
-from shown import TALL, Shown
+from shown import TALL, Shown, fold
 
 
 def test_keys_move_the_dial(shown: Shown) -> None:
@@ -30,6 +32,52 @@ def test_keys_move_the_dial(shown: Shown) -> None:
     assert shown.counts()["kept"] == full
     shown.page.keyboard.press("e")
     assert shown.counts()["kept"] == 400 and not shown.page.is_checked("#equation")
+
+
+def test_keys_by_modifier_and_focus(shown: Shown) -> None:
+    """A key released after Shift (on many keyboards + is Shift and =); keys with the focus on text or the dial."""
+    fold(shown, True)
+    shown.page.evaluate("""() => {
+        const press = (kind, key) => new KeyboardEvent(kind, { key, code: "Equal", bubbles: true });
+        const canvas = document.getElementById("canvas");
+        for (const event of [press("keydown", "+"), press("keyup", "=")]) canvas.dispatchEvent(event);
+    }""")
+    shown.page.wait_for_timeout(100)
+    before = shown.picture()
+    assert np.array_equal(shown.picture(), before)
+    shown.page.focus("#target")
+    shown.page.keyboard.type("wasdech0")
+    assert shown.page.input_value("#target") == "wasdech0" and np.array_equal(shown.picture(), before)
+    shown.page.focus("#dial")
+    shown.page.keyboard.press("w")
+    assert not np.array_equal(shown.picture(), before)
+
+
+def target(shown: Shown, text: str | None = None) -> str:
+    """The page's note after a count is entered; None enters the same again."""
+    if text is not None:
+        shown.page.fill("#target", text)
+    shown.page.evaluate("document.getElementById('target-note').textContent = ''")
+    shown.page.keyboard.press("Enter")
+    shown.until("document.getElementById('target-note').textContent !== ''")
+    return shown.text("#target-note")
+
+
+def test_the_count_box_takes_counts_only(shown: Shown, gaussians: Gaussians) -> None:
+    """A valid count sets the dial value of ``dial_for``."""
+    camera = scenes.camera(320, 240)
+    wanted = clod_adapter.dial_for(gaussians, keep=150, cameras=[camera]).virtual_scale
+    fold(shown, True)
+    shown.camera(camera)
+    for text in ("0", "-5", "1.5", "many"):
+        assert "Enter a number of Gaussians" in target(shown, text) and shown.text("#dial-value") == "s = 1.00"
+    assert "keeps" in target(shown, "1,000,000")
+    shown.run("clod.setEquation(false)")
+    assert "keeps 150 in this view" in target(shown, "150")
+    assert shown.counts()["kept"] == 150 and shown.page.is_checked("#equation")
+    assert shown.text("#dial-value") == f"s = {wanted:.2f}"
+    shown.run("clod.setDial(1)")
+    assert target(shown) and shown.counts()["kept"] == 150
 
 
 def differ(one: np.ndarray, other: np.ndarray) -> bool:
@@ -69,8 +117,20 @@ def test_touch_moves_the_camera(chromium: Any, show: Any, model: Path) -> None:
         assert differ(pictures[-1], pictures[-2])
 
 
+def test_a_link_opens_the_same_view(show: Any, model: Path) -> None:
+    shown = show(model)
+    fitted = shown.picture()
+    for key in ("ArrowRight", "-", "]"):
+        shown.page.keyboard.press(key)
+    shown.run("clod.setWipe(0.4, 3)")
+    shown.page.keyboard.press("l")
+    opened = show(model, address=shown.page.evaluate("location.hash"))
+    assert not differ(opened.picture(), shown.picture()) and differ(opened.picture(), fitted)
+    assert opened.counts() == shown.counts() and opened.text("#wipe-right") == shown.text("#wipe-right")
+
+
 def test_cameras_of_the_scene(show: Any, model: Path, tmp_path: Path) -> None:
-    """By keys, and by name in the list, which shows none once the camera is moved."""
+    """Selected by keys and by name in the list; after the view moves, the list has no selection."""
     cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))]
     write_model(tmp_path, cameras, [camera.name for camera in cameras])
     shown = show(model, "--images", tmp_path, viewport=TALL)

@@ -21,8 +21,8 @@ from shown import Shown, assert_same, drop, message
 CAMERA = scenes.camera(320, 240)
 
 
-def fall(shown: Shown, path: Path, dial: float) -> None:
-    """Drops a file and waits until it is drawn."""
+def drop_file(shown: Shown, path: Path, dial: float) -> None:
+    """Drops a file, and waits until the page has drawn it."""
     drop(shown, path.name, path.read_bytes())
     shown.until(f"document.title === '{path.name}'")
     shown.camera(CAMERA)
@@ -30,10 +30,10 @@ def fall(shown: Shown, path: Path, dial: float) -> None:
 
 
 def test_every_ply_layout_gives_the_same_picture(
-    shown: Shown, files: Any, gaussians: Gaussians, artefacts: Path
+    shown: Shown, save: Any, gaussians: Gaussians, artefacts: Path, tmp_path: Path
 ) -> None:
-    path = files.save(gaussians, "usual.ply")
-    fall(shown, path, 2.0)
+    path = save(gaussians, "usual.ply")
+    drop_file(shown, path, 2.0)
     wanted = shown.picture()
     assert_same(shown, render(gaussians, CAMERA, 2.0), artefacts / "dropped.png")
     vertex = PlyData.read(str(path), mmap=False)["vertex"]
@@ -46,61 +46,72 @@ def test_every_ply_layout_gives_the_same_picture(
     for name, options in layouts.items():
         rows = doubles if name == "doubles.ply" else vertex.data
         element = PlyElement.describe(rows, "vertex", comments=vertex.comments)
-        PlyData([element], **options).write(str(files.folder / name))
-        fall(shown, files.folder / name, 2.0)
+        PlyData([element], **options).write(str(tmp_path / name))
+        drop_file(shown, tmp_path / name, 2.0)
         assert shown.page.is_enabled("#dial") and np.array_equal(shown.picture(), wanted), name
 
 
-def test_settings_are_read_without_comments(shown: Shown, files: Any, gaussians: Gaussians, artefacts: Path) -> None:
-    """Other tools remove comments: columns hold the settings too. A file of an earlier version has its defaults."""
+def test_settings_are_read_without_comments(
+    shown: Shown, save: Any, gaussians: Gaussians, artefacts: Path, tmp_path: Path
+) -> None:
+    """Other tools remove comments and keep the columns of settings. A file of an earlier version has its defaults."""
     paper = {"tau": 1 / 255, "cut": "hard", "normalizer": "max"}
     cases: dict[str, tuple[dict[str, Any], list[str]]] = {
         "default.ply": ({}, []), "paper.ply": (paper, []), "old.ply": ({}, ["clod_adapter max_sv 4.0"]),
     }  # fmt: skip
     for name, (settings, comments) in cases.items():
         model = gaussians.replace(attenuation=AttenuationConfig(**settings))
-        rows = PlyData.read(str(files.save(model)), mmap=False)["vertex"].data
-        path = files.folder / name
+        rows = PlyData.read(str(save(model)), mmap=False)["vertex"].data
+        path = tmp_path / name
         PlyData([PlyElement.describe(rows, "vertex", comments=comments)], byte_order="<").write(str(path))
-        fall(shown, path, 1.5)
+        drop_file(shown, path, 1.5)
         wanted = render(clod_adapter.load(path).gaussians if comments else model, CAMERA, 1.5)
         assert 0 < int(wanted.kept.sum()) < 400
         assert_same(shown, wanted, artefacts / f"bare_{name}.png")
 
 
 def test_the_screen_filter_of_the_file_is_used(
-    shown: Shown, files: Any, gaussians: Gaussians, plain: Gaussians, artefacts: Path
+    shown: Shown, save: Any, gaussians: Gaussians, plain: Gaussians, artefacts: Path, tmp_path: Path
 ) -> None:
     """From our comments, from columns without them, from an SPZ, and from another program's comment."""
     small = gaussians.log_scales - 2.0  # where filters differ most
     for form, suffix in (("comments", "ply"), ("columns", "ply"), ("spz", "spz"), ("tag", "ply")):
         name = "on" if form == "tag" else "mip"
         base = plain if form == "tag" else gaussians
-        path = files.folder / f"{form}.{suffix}"
+        path = tmp_path / f"{form}.{suffix}"
         write(path, base.replace(log_scales=small, screen_filter=FILTERS[name]))
         if form in ("columns", "tag"):
             gone = rb"(?m)^comment .*\n" if form == "columns" else rb"(?m)^comment clod_adapter .*\n"
             path.write_bytes(re.sub(gone, b"", path.read_bytes()))
         found = clod_adapter.load(path).gaussians
         assert found.screen_filter == FILTERS[name]
-        fall(shown, path, 1.0)
+        drop_file(shown, path, 1.0)
         assert_same(shown, render(found, CAMERA), artefacts / f"filter_{form}.png")
 
 
-def test_a_damaged_file_is_an_error_and_leaves_the_picture(shown: Shown, model: Path) -> None:
+def test_a_damaged_file_is_an_error_and_the_picture_stays(shown: Shown, model: Path) -> None:
     data = model.read_bytes()
     damaged = (
         ("cut.ply", data[:-100], "truncated"),
         ("head.ply", data[:300], "truncated"),
-        ("words.ply", b"good morning", "no splat"),
+        ("words.ply", b"good morning", "not a splat"),
         ("empty.ply", b"", "empty"),
         ("mesh.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "mesh"),
-        ("cut.spz", gzip.compress(bytes(100), mtime=0)[:-9], "it is damaged, or too large"),
-        ("end.sog", b"PK\3\4" + bytes(60) + b"PK\5\6" + b"\xff" * 20, "it is damaged, or too large"),
+        ("cut.spz", gzip.compress(bytes(100), mtime=0)[:-9], "it is damaged or too large"),
+        ("end.sog", b"PK\3\4" + bytes(60) + b"PK\5\6" + b"\xff" * 20, "it is damaged or too large"),
         ("folder", b"", "cannot read it"),
     )
     before = shown.picture()
-    for name, content, said in damaged:
+    for name, content, error in damaged:
         drop(shown, name, content, fails=name == "folder")
-        assert said in message(shown, name) and shown.text("#title") == "model.ply"
+        assert error in message(shown, name) and shown.text("#title") == "model.ply"
     assert np.array_equal(shown.picture(), before)
+
+
+def test_the_last_of_two_dropped_files_is_shown(shown: Shown, save: Any, model: Path) -> None:
+    one = save(scenes.gaussians(9, 0, 1), "nine.ply")
+    drop(shown, "slow.ply", model.read_bytes(), wait=200)
+    drop(shown, "nine.ply", one.read_bytes())
+    shown.until("document.title === 'nine.ply'")
+    shown.page.wait_for_timeout(400)
+    assert shown.text("#title") == "nine.ply" and shown.counts()["total"] == 9

@@ -1,4 +1,4 @@
-"""The data of the page: one layout, whatever the source of the Gaussians."""
+"""The data of the page: one PLY layout for Gaussians from any file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import scenes
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.viewer.payload import ROWS, Payload, page_config
+from clod_adapter.viewer.payload import BLOCK_ROWS, Payload, page_config
 
 
 def dialled(n: int = 40, degree: int = 1) -> Gaussians:
@@ -24,7 +24,7 @@ def dialled(n: int = 40, degree: int = 1) -> Gaussians:
 
 
 def read_back(payload: Payload, folder: Path) -> Any:
-    """The payload as our own reader reads it."""
+    """The payload as our reader reads it."""
     path = folder / "payload.ply"
     path.write_bytes(b"".join(payload.blocks()))
     assert path.stat().st_size == payload.size
@@ -40,7 +40,7 @@ def assert_same(one: Gaussians, other: Gaussians) -> None:
 
 @pytest.mark.parametrize("degree", [0, 4])
 def test_bytes_are_a_plain_ply(degree: int, tmp_path: Path) -> None:
-    gaussians = dialled(ROWS + 3, degree)  # more than one block
+    gaussians = dialled(BLOCK_ROWS + 3, degree)  # more than one block
     calibration = Calibration((CalibrationRow(1.0, 30.5, 29.25, 0.9, 4.0),), len(gaussians), 2, 8, 6, "a machine")
     read = read_back(Payload("a.ply", gaussians, calibration), tmp_path)
     assert_same(read.gaussians, gaussians)
@@ -70,7 +70,7 @@ def test_empty_sh_degrees_and_dropped_rows_are_left_out(capture: Any, tmp_path: 
     capture.write(tmp_path / "a.ply", gaussians.replace(means=means, sigma_d=None, attenuation=None))
     checkpoint = dataclasses.replace(clod_adapter.load(tmp_path / "a.ply"), path=Path("b\udcff.ply"))
     payload = Payload.of(checkpoint)
-    assert b"f_rest" not in payload.head and len(payload.gaussians) == payload.describe()["count"] == 39
+    assert b"f_rest" not in payload.header and len(payload.gaussians) == payload.describe()["count"] == 39
     assert payload.name == "b\\xff.ply"
 
 

@@ -1,4 +1,4 @@
-"""The browser's picture equals ``clod_adapter.render`` at the same camera and dial."""
+"""The browser's picture equals ``clod_adapter.render`` at the same camera and dial value."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from shown import Shown, assert_alike, assert_same, take
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_at_dial_values_and_without_the_equation(shown: Shown, files: Any, artefacts: Path, degree: int) -> None:
+def test_at_dial_values_and_without_the_equation(shown: Shown, save: Any, artefacts: Path, degree: int) -> None:
     gaussians, camera = scenes.dialled(1500, degree, 7), scenes.camera(320, 240)
-    take(shown, files.save(gaussians))
+    take(shown, save(gaussians))
     shown.camera(camera)
     for s in (1.0, 3.0):
         shown.run("clod.setDial(given)", s)
@@ -39,13 +39,13 @@ def test_at_dial_values_and_without_the_equation(shown: Shown, files: Any, artef
     ids=["hard, on", "quantile, mip", "eps, blur"],
 )
 def test_settings_and_screen_filters(
-    show: Any, files: Any, artefacts: Path, settings: dict[str, Any], screen_filter: ScreenFilter
+    show: Any, save: Any, artefacts: Path, settings: dict[str, Any], screen_filter: ScreenFilter
 ) -> None:
-    """For Gaussians of a pixel and less, where filters differ: the classic filter gives another picture."""
+    """With Gaussians of at most a pixel, for which filters differ: the classic filter gives a different picture."""
     classic = scenes.dialled(1500, 1, 7, **settings)
     classic = classic.replace(log_scales=classic.log_scales - 2.0)
     gaussians, camera = classic.replace(screen_filter=screen_filter), scenes.camera(320, 240)
-    shown = show(files.save(gaussians), "--sv", 2)
+    shown = show(save(gaussians), "--sv", 2)
     shown.camera(camera)
     wanted = render(gaussians, camera, 2.0)
     assert 0.05 < wanted.kept.float().mean() < 0.95
@@ -54,10 +54,10 @@ def test_settings_and_screen_filters(
         assert_alike(shown.picture(), render(classic, camera, 2.0).pixels.numpy(), artefacts / "classic.png")
 
 
-def test_through_cameras_of_other_shapes(shown: Shown, files: Any, artefacts: Path) -> None:
+def test_through_cameras_of_other_shapes(shown: Shown, save: Any, artefacts: Path) -> None:
     """Portrait format, the principal point in a corner, and a small unit of length with a nearer near plane."""
     gaussians = scenes.dialled(1500, 0, 7)
-    take(shown, files.save(gaussians))
+    take(shown, save(gaussians))
     for k, camera in enumerate([scenes.camera(180, 240, fov=100), scenes.camera(320, 240, off_centre=(0.1, 0.9))]):
         shown.camera(camera)
         assert_same(shown, render(gaussians, camera), artefacts / f"shape{k}.png")
@@ -69,15 +69,15 @@ def test_through_cameras_of_other_shapes(shown: Shown, files: Any, artefacts: Pa
     viewmat = scenes.camera().viewmat.clone()
     viewmat[:3, 3] *= size
     near = Camera(viewmat, scenes.camera(320, 240).K, 320, 240, near=0.01 * size)
-    take(shown, files.save(small, "small.ply"))
+    take(shown, save(small, "small.ply"))
     shown.camera(near)
     assert_same(shown, render(small, near), artefacts / "small.png")
 
 
-def test_wipe_shows_both_sides(show: Any, files: Any, artefacts: Path) -> None:
+def test_wipe_shows_both_sides(show: Any, save: Any, artefacts: Path) -> None:
     gaussians, camera = scenes.dialled(1500, 0, 7), scenes.camera(320, 240)
     plain = gaussians.replace(sigma_d=None, attenuation=None, sh0=-gaussians.sh0)
-    shown = show(files.save(gaussians), "--base", files.save(plain, "base.ply"), "--sv", 3)
+    shown = show(save(gaussians), "--base", save(plain, "base.ply"), "--sv", 3)
     shown.camera(camera)
     sides = {"base": render(plain, camera), 1.5: render(gaussians, camera, 1.5)}
     for other, right in sides.items():

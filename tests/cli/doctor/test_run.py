@@ -1,4 +1,4 @@
-"""``clod-adapt doctor``: here, and on the machines that it is for."""
+"""``clod-adapt doctor`` on this machine, and on simulated machines with defects."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ def program(folder: Path, name: str, script: str) -> None:
 
 @pytest.fixture
 def gpu(monkeypatch: pytest.MonkeyPatch) -> torch.device:
-    """A processor that stands for a GPU."""
+    """The CPU in place of a GPU."""
     device = torch.device("cpu")
     monkeypatch.setattr(doctor_gpu, "cuda_device", lambda: device)
     return device
 
 
-def test_here(clod: Any) -> None:
+def test_all_checks_run_here(clod: Any) -> None:
     done = clod("doctor")
     *lines, last = done.out.splitlines()
     assert done.code == 0 and [line.split()[0] for line in lines] == NAMES
@@ -60,7 +60,7 @@ def test_here(clod: Any) -> None:
 
 
 def test_json_without_torch() -> None:
-    """As torchrun starts it, as a module of the interpreter; all other checks are made, and the exit code is 1."""
+    """Run as a module, as by torchrun: all other checks run, and the exit code is 1."""
     code = "import sys, runpy; sys.modules['torch'] = None; sys.argv = ['clod-adapt', 'doctor', '--json']\n"
     code += "runpy.run_module('clod_adapter', run_name='__main__')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -77,7 +77,7 @@ def test_json_without_torch() -> None:
 
 
 def broken(change: Callable[[torch.Tensor], torch.Tensor]) -> Any:
-    """A rasterizer whose image is ``change`` of the reference's."""
+    """A rasterizer that applies ``change`` to the reference's image."""
 
     def rasterize(**given: Any) -> tuple[torch.Tensor, torch.Tensor]:
         image, alpha = reference.rasterize(**given)
@@ -89,14 +89,14 @@ def broken(change: Callable[[torch.Tensor], torch.Tensor]) -> Any:
 wrong = broken(lambda image: image.roll(1, dims=1))
 
 
-def test_a_broken_image(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_image_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     for rasterize in (wrong, broken(lambda image: image * float("nan")), broken(lambda image: image.transpose(0, 1))):
         monkeypatch.setattr(rasterizers, "for_device", lambda device, rasterize=rasterize: rasterize)
         found = find("cpu")
         assert not found.ok and found.found.startswith("renders another image than the reference") and found.fix
 
 
-def test_nothing_draws(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_working_backend_is_an_error(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rasterizers, "for_device", lambda device: wrong)
     monkeypatch.setattr(run, "PROBES", {name: run.PROBES[name] for name in ("torch", "cpu", "gpu")})
     done = clod("doctor")
@@ -129,7 +129,7 @@ def test_any_error_is_a_result() -> None:
         ("sleep 5", True, False, "does not answer", "restart"),
     ],
 )
-def test_driver(
+def test_driver_check(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str | None, bus: bool, ok: bool, said: str, fix: str
 ) -> None:
     (tmp_path / "bus" / "0000:01").mkdir(parents=True)
@@ -187,10 +187,10 @@ def test_no_gsplat_and_an_old_one(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("toolkit", [None, "/usr/local/cuda"])
-def test_gsplat_is_not_compiled(
+def test_uncompiled_gsplat_is_reported(
     monkeypatch: pytest.MonkeyPatch, gpu: torch.device, tmp_path: Path, toolkit: str | None
 ) -> None:
-    """And the doctor does not begin to, which takes minutes."""
+    """The doctor does not start the compilation, which takes minutes."""
     pytest.importorskip("gsplat")
     from torch.utils import cpp_extension
 
@@ -205,8 +205,8 @@ def test_gsplat_is_not_compiled(
         assert "no nvcc found" in found.found and found.fix.startswith("install the CUDA toolkit")
 
 
-def test_gsplat_draws(monkeypatch: pytest.MonkeyPatch, gpu: torch.device, tmp_path: Path) -> None:
-    """Its Python with kernels of torch; and with one that is broken."""
+def test_gsplat_check_compares_the_image(monkeypatch: pytest.MonkeyPatch, gpu: torch.device, tmp_path: Path) -> None:
+    """With kernels replaced by torch: correct ones, and a wrong one."""
     pytest.importorskip("gsplat")
     monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
     (tmp_path / "gsplat_cuda").mkdir()
@@ -221,7 +221,7 @@ def test_gsplat_draws(monkeypatch: pytest.MonkeyPatch, gpu: torch.device, tmp_pa
     assert "another image" in find("gsplat").found
 
 
-def test_gpu_rasterizer(monkeypatch: pytest.MonkeyPatch, gpu: torch.device) -> None:
+def test_gpu_rasterizer_check(monkeypatch: pytest.MonkeyPatch, gpu: torch.device) -> None:
     def none(device: torch.device) -> Any:
         raise ClodError("no rasterizer for device cuda: move the Gaussians")
 
@@ -234,7 +234,7 @@ def test_gpu_rasterizer(monkeypatch: pytest.MonkeyPatch, gpu: torch.device) -> N
     assert "another image" in find("gpu").found
 
 
-def test_forks_of_inrias(monkeypatch: pytest.MonkeyPatch, gpu: torch.device) -> None:
+def test_inria_check(monkeypatch: pytest.MonkeyPatch, gpu: torch.device) -> None:
     for fork in ("inria 2023", "inria 2024", None):
         installed = inria_forks.module(fork) if fork else None
         if installed:
@@ -251,7 +251,7 @@ def test_forks_of_inrias(monkeypatch: pytest.MonkeyPatch, gpu: torch.device) -> 
             assert found.fix.startswith("pip install --no-build-isolation git+https://github.com/graphdeco-inria/")
 
 
-def test_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_check(monkeypatch: pytest.MonkeyPatch) -> None:
     assert find("processes").ok and not torch.distributed.is_initialized()
 
     def unreachable(*_: Any) -> None:
@@ -276,7 +276,7 @@ def test_extras_that_are_not_installed(monkeypatch: pytest.MonkeyPatch, name: st
     assert not found.ok and found.fix == f"pip install 'clod-adapter[{extra}]'", found
 
 
-def test_splat_transform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_splat_transform_check(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CLOD_SPLAT_TRANSFORM", raising=False)
     found = find("splat-transform")
@@ -292,7 +292,7 @@ def test_splat_transform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Non
     assert found.ok and found.found.startswith("3.7.1, without a GPU")
 
 
-def test_weights_that_are_missing_have_their_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_weights_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     from clod_adapter.evaluation import perceptual
 
     def none() -> Any:
@@ -304,7 +304,7 @@ def test_weights_that_are_missing_have_their_line(monkeypatch: pytest.MonkeyPatc
     assert "measures 0 for equal images and 0 for others" in find("lpips").found
 
 
-def test_browser(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_browser_check(monkeypatch: pytest.MonkeyPatch) -> None:
     def none() -> None:
         raise webbrowser.Error("could not locate runnable browser")
 
@@ -347,10 +347,10 @@ def test_a_cache_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_pat
     assert find("cache").fix.startswith("set NUMBA_CACHE_DIR")
 
 
-def test_the_reference_scene_tells_small_differences() -> None:
-    """A level of 255 in every pixel is another picture; rounding is none."""
+def test_the_reference_scene_detects_small_differences() -> None:
+    """A difference of 1/255 in every pixel fails; rounding passes."""
     mini = ReferenceScene.make()
-    assert float((mini.image > 0.02).any(-1).float().mean()) > 0.3  # of the picture has something in it
+    assert float((mini.image > 0.02).any(-1).float().mean()) > 0.3  # of the image is not empty
     mini.compare(mini.image + 1e-5)
     with pytest.raises(CheckFailed, match="another image"):
         mini.compare(mini.image + 1 / 255)

@@ -1,17 +1,17 @@
-// Pointer, wheel, touch and keys on the canvas: orbit or fly.
+// Pointer, wheel, touch and keys on the canvas, which orbit or fly the camera.
 
-const TURN = 0.005; // radians a pixel
-const TAP = 1 / 30; // seconds that the shortest press counts for
+const ROTATION = 0.005; // radians per pixel
+const MIN_PRESS = 1 / 30; // seconds that a key press counts for at least
 const KEYS = { // right, down, forward
   w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], pageup: [0, -1, 0], pagedown: [0, 1, 0],
 };
 const ZOOMS = { "+": -1, "=": -1, "-": 1 };
 const ARROWS = { arrowleft: [-1, 0], arrowright: [1, 0], arrowup: [0, -1], arrowdown: [0, 1] };
 
-/** `moved()` is called after every change of the camera. Returns {flying, reset}. */
-export function createControls(canvas, camera, moved) {
+/** Calls `onMove()` after every change of the camera. Returns the mode, {flying}. */
+export function createControls(canvas, camera, onMove) {
   const mode = { flying: false };
-  const pointers = new Map(), held = new Map(); // keys by where they are: Shift changes what they say
+  const pointers = new Map(), pressed = new Map(); // keys by code, because Shift changes event.key
   let last = 0, fast = false;
 
   function drag(event) {
@@ -20,53 +20,53 @@ export function createControls(canvas, camera, moved) {
     const now = { x: event.clientX, y: event.clientY, button: before.button };
     const dx = now.x - before.x, dy = now.y - before.y;
     if (pointers.size === 2) pinch(event.pointerId, before, now);
-    else if (before.button === 0 && !event.shiftKey) turn(dx, dy);
+    else if (before.button === 0 && !event.shiftKey) rotate(dx, dy);
     else pan(dx, dy);
     pointers.set(event.pointerId, now);
-    moved();
+    onMove();
   }
 
-  // Orbiting drags the scene along, flying turns the head: the same angles, about another point.
-  const turn = (dx, dy) => camera.turn(-dx * TURN, -dy * TURN, !mode.flying);
+  // The same angles in both modes: orbiting rotates about the pivot, flying about the eye.
+  const rotate = (dx, dy) => camera.rotate(-dx * ROTATION, -dy * ROTATION, !mode.flying);
 
   function pan(dx, dy) {
-    const pixel = (2 * camera.reach * Math.tan(camera.field / 2)) / Math.min(canvas.clientWidth, canvas.clientHeight);
+    const pixel = (2 * camera.distance * Math.tan(camera.fov / 2)) / Math.min(canvas.clientWidth, canvas.clientHeight);
     camera.move(-dx * pixel, -dy * pixel, 0);
   }
 
-  /** Two fingers: what lies under them stays under them. */
+  /** Two fingers: pans with their centre and zooms with their distance. */
   function pinch(id, before, now) {
     const other = [...pointers].find(([key]) => key !== id)[1];
     const gap = (point) => Math.max(Math.hypot(point.x - other.x, point.y - other.y), 1);
     pan((now.x - before.x) / 2, (now.y - before.y) / 2);
-    nearer(gap(before) / gap(now));
+    dolly(gap(before) / gap(now));
   }
 
-  function nearer(factor) {
-    if (mode.flying) camera.move(0, 0, camera.reach * (1 - factor));
+  function dolly(factor) {
+    if (mode.flying) camera.move(0, 0, camera.distance * (1 - factor));
     else camera.zoom(factor);
   }
 
   function step(time) {
-    if (!held.size) return;
-    act(Math.min((time - last) / 1000, 0.1));
+    if (!pressed.size) return;
+    applyKeys(Math.min((time - last) / 1000, 0.1));
     last = time;
     requestAnimationFrame(step);
   }
 
-  /** What the held keys do in so many seconds. */
-  function act(seconds) {
-    const speed = camera.reach * seconds * (fast ? 3 : 0.8);
-    for (const key of held.values()) {
+  /** Applies the pressed keys for a number of seconds. */
+  function applyKeys(seconds) {
+    const speed = camera.distance * seconds * (fast ? 3 : 0.8);
+    for (const key of pressed.values()) {
       if (KEYS[key]) camera.move(...KEYS[key].map((k) => k * speed));
-      else if (ZOOMS[key]) nearer(Math.exp(ZOOMS[key] * seconds));
-      else turn(...ARROWS[key].map((k) => (mode.flying ? 1 : -1) * k * 260 * seconds));
+      else if (ZOOMS[key]) dolly(Math.exp(ZOOMS[key] * seconds));
+      else rotate(...ARROWS[key].map((k) => (mode.flying ? 1 : -1) * k * 260 * seconds));
     }
-    moved();
+    onMove();
   }
 
-  /** Letters move wherever the focus is but in a text; arrows and pages are a slider's own. */
-  const listens = (target, key) =>
+  /** One-character keys act unless the focus is on a text, a list or the dialog; other keys act on the canvas only. */
+  const accepts = (target, key) =>
     target === canvas || target === document.body || (key.length === 1 && !target.closest("input[type=text], select, dialog"));
 
   canvas.addEventListener("pointerdown", (event) => {
@@ -79,24 +79,24 @@ export function createControls(canvas, camera, moved) {
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault();
-    nearer(Math.exp(Math.max(-60, Math.min(60, event.deltaY * (event.deltaMode ? 20 : 1))) * 0.002));
-    moved();
+    dolly(Math.exp(Math.max(-60, Math.min(60, event.deltaY * (event.deltaMode ? 20 : 1))) * 0.002));
+    onMove();
   }, { passive: false });
   document.addEventListener("keydown", (event) => {
-    const key = event.key.toLowerCase(), ours = KEYS[key] || ARROWS[key] || ZOOMS[key];
-    if (event.metaKey) held.clear(); // macOS does not say that they are let go
-    if (!ours || !listens(event.target, key) || event.ctrlKey || event.metaKey || event.altKey) return;
+    const key = event.key.toLowerCase(), known = KEYS[key] || ARROWS[key] || ZOOMS[key];
+    if (event.metaKey) pressed.clear(); // macOS sends no keyup for keys released under Command
+    if (!known || !accepts(event.target, key) || event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();
     fast = event.shiftKey;
-    if (held.has(event.code)) return;
-    if (!held.size) {
+    if (pressed.has(event.code)) return;
+    if (!pressed.size) {
       last = performance.now();
       requestAnimationFrame(step);
     }
-    held.set(event.code, key);
-    act(TAP);
+    pressed.set(event.code, key);
+    applyKeys(MIN_PRESS);
   });
-  document.addEventListener("keyup", (event) => held.delete(event.code));
-  for (const target of [canvas, window]) target.addEventListener("blur", () => held.clear());
+  document.addEventListener("keyup", (event) => pressed.delete(event.code));
+  for (const target of [canvas, window]) target.addEventListener("blur", () => pressed.clear());
   return mode;
 }

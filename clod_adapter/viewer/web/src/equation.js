@@ -1,38 +1,38 @@
-// The dial's equation in float64, as clod_adapter/attenuation.py and extinction.py have it: who is kept, and when a
-// Gaussian leaves. A Gaussian is kept iff  log a - (d s)^2 / (2 v) > log(tau s),  d = |mean - eye| / D,
-// 2 v = 2 relu(sigma)^2 + eps. Runs in the worker (order.js).
+// The dial's equation in float64, as in clod_adapter/attenuation.py and extinction.py. A Gaussian is kept iff
+// log a - (d s)^2 / (2 v) > log(tau s),  d = |mean - eye| / D,  2 v = 2 relu(sigma_d)^2 + eps,  a the opacity. Runs in the
+// worker (worker.js).
 
-const HUGE = 1e300; // stands for 1/0: 0 * HUGE is 0, as d = 0 keeps a Gaussian whatever its sigma is
+const HUGE = 1e300; // replaces 1/0: 0 * HUGE is 0, as at d = 0 a Gaussian is not attenuated for any sigma_d
 
-/** Per Gaussian log a and 1 / (2 v), which no camera changes. */
-export function prepare(opacityLogits, sigma, eps) {
+/** log a and 1 / (2 v) of each Gaussian, which do not depend on the camera. */
+export function prepare(opacityLogits, sigmaD, eps) {
   const count = opacityLogits.length;
   const logA = new Float64Array(count), inverse = new Float64Array(count);
   for (let i = 0; i < count; i++) {
-    const l = opacityLogits[i], reach = Math.max(sigma[i], 0);
+    const l = opacityLogits[i], sigma = Math.max(sigmaD[i], 0);
     logA[i] = l >= 0 ? -Math.log1p(Math.exp(-l)) : l - Math.log1p(Math.exp(l));
-    inverse[i] = Math.min(1 / (2 * reach * reach + eps), HUGE);
+    inverse[i] = Math.min(1 / (2 * sigma * sigma + eps), HUGE);
   }
   return { logA, inverse };
 }
 
-/** D, what distances are divided by, world units (attenuation.normalizing_distance). */
+/** D, the unit of the distances, in world units (attenuation.normalizing_distance). */
 export function normalizingDistance(means, view, attenuation) {
   if (attenuation.normalizer === "scene") return attenuation.scene_distance;
   const [x, y, z] = view.eye, count = means.length / 3;
-  const inside = new Float64Array(count);
-  let found = 0;
-  for (const everywhere of [false, true]) {
+  const buffer = new Float64Array(count);
+  let size = 0;
+  for (const ignoreFrustum of [false, true]) {
     for (let i = 0; i < count; i++) {
       const px = means[3 * i], py = means[3 * i + 1], pz = means[3 * i + 2];
-      if (everywhere || inFrustum(px, py, pz, view)) inside[found++] = Math.hypot(px - x, py - y, pz - z);
+      if (ignoreFrustum || inFrustum(px, py, pz, view)) buffer[size++] = Math.hypot(px - x, py - y, pz - z);
     }
-    if (found) break;
+    if (size) break;
   }
-  if (!found) return 1;
-  const distances = inside.subarray(0, found);
+  if (!size) return 1;
+  const distances = buffer.subarray(0, size);
   if (attenuation.normalizer === "max") return Math.max(distances.reduce((a, b) => Math.max(a, b)), 2 ** -126);
-  const rank = Math.min(Math.max(Math.ceil(attenuation.quantile * found), 1), found);
+  const rank = Math.min(Math.max(Math.ceil(attenuation.quantile * size), 1), size);
   return Math.max(distances.sort()[rank - 1], 2 ** -126);
 }
 
@@ -45,14 +45,14 @@ function inFrustum(px, py, pz, { rotation: r, eye, fx, fy, cx, cy, width, height
   return u >= 0 && u < width * depth && v >= 0 && v < height * depth;
 }
 
-/** The dial values s* at which the Gaussians leave, descending; kept iff s < s*. Closed form by Lambert's W. */
+/** Extinction scales s*, descending: a Gaussian is kept iff s < s*. In closed form by Lambert's W. */
 export function extinctionScales(means, { logA, inverse }, eye, distance, tau) {
   const scales = new Float64Array(logA.length);
   for (let i = 0; i < logA.length; i++) {
     const d = Math.hypot(means[3 * i] - eye[0], means[3 * i + 1] - eye[1], means[3 * i + 2] - eye[2]) / distance;
     const ratio = d * Math.sqrt(2 * inverse[i]); // d / sqrt(v)
     const w = lambertOfExp(2 * (logA[i] - Math.log(tau) + Math.log(ratio)));
-    scales[i] = w < 1 ? Math.exp(logA[i] - 0.5 * w) / tau : Math.sqrt(w) / ratio; // the same twice, each where exact
+    scales[i] = w < 1 ? Math.exp(logA[i] - 0.5 * w) / tau : Math.sqrt(w) / ratio; // equal; each is used where it is exact
   }
   return scales.sort().reverse();
 }
@@ -68,7 +68,7 @@ function lambertOfExp(x) {
   return w;
 }
 
-/** How many are kept at one dial value, from descending s*. */
+/** The number of Gaussians kept at a dial value, from descending s*. */
 export function countAt(scales, dial) {
   let low = 0, high = scales.length;
   while (low < high) {
@@ -79,11 +79,11 @@ export function countAt(scales, dial) {
   return low;
 }
 
-/** The smallest dial in [1, maxSv] that keeps at most `wanted` (budget.dial_for), and how many it keeps. */
-export function dialForCount(scales, wanted, maxSv) {
-  const most = countAt(scales, 1), fewest = countAt(scales, maxSv);
-  if (wanted >= most) return { dial: 1, kept: most };
-  if (wanted <= fewest) return { dial: maxSv, kept: fewest };
-  const dial = Math.min(Math.sqrt(scales[wanted - 1] * scales[wanted]), maxSv);
+/** The smallest dial value in [1, maxSv] that keeps at most `target` Gaussians (budget.dial_for), and the number kept. */
+export function dialForCount(scales, target, maxSv) {
+  const maxCount = countAt(scales, 1), minCount = countAt(scales, maxSv);
+  if (target >= maxCount) return { dial: 1, kept: maxCount };
+  if (target <= minCount) return { dial: maxSv, kept: minCount };
+  const dial = Math.min(Math.sqrt(scales[target - 1] * scales[target]), maxSv);
   return { dial, kept: countAt(scales, dial) };
 }

@@ -1,11 +1,13 @@
-// The view in the address: #eye=..&turn=..&field=..&dial=..&equation=off&wipe=..&other=.. A link opens what is seen.
+// The view as the fragment of a link: #eye=..&axes=..&fov=..&distance=..&dial=..&equation=off&wipe=..&other=..
+// eye: position, world units. axes: right and down, unit vectors. fov: radians across the shorter side. distance: to the
+// pivot, world units. wipe: share of the width. other: a dial value or "base".
 
 const digits = (values) => values.map((value) => Number(value.toPrecision(7))).join(",");
 
 export function writeLink(camera, state) {
   const [right, down] = [camera.rotation.slice(0, 3), camera.rotation.slice(3, 6)];
   const parts = {
-    eye: digits(camera.eye), turn: digits([...right, ...down]), field: digits([camera.field]), reach: digits([camera.reach]),
+    eye: digits(camera.eye), axes: digits([...right, ...down]), fov: digits([camera.fov]), distance: digits([camera.distance]),
     dial: digits([state.dial]),
   };
   if (!state.equation) parts.equation = "off";
@@ -18,28 +20,29 @@ export function writeLink(camera, state) {
   return url.href;
 }
 
-/** What a link says, null where it says nothing usable: {eye, rotation, field, reach, dial, equation, wipe, other}. */
+/** {eye, rotation, fov, distance, dial, equation, wipe, other} of a link; a value that is missing or invalid is null. */
 export function readLink(hash) {
   const parts = new URLSearchParams(hash.replace(/^#/, ""));
   const numbers = (name, count) => {
     const values = (parts.get(name) ?? "").split(",").map(Number);
     return parts.has(name) && values.length === count && values.every(Number.isFinite) ? values : null;
   };
-  const turn = numbers("turn", 6);
-  const [field] = numbers("field", 1) ?? [null], [reach] = numbers("reach", 1) ?? [null];
+  const axes = numbers("axes", 6);
+  const [fov] = numbers("fov", 1) ?? [null], [distance] = numbers("distance", 1) ?? [null];
   return {
-    eye: numbers("eye", 3), rotation: turn && orthonormal(turn.slice(0, 3), turn.slice(3)),
-    field: field > 0.01 && field < 3 ? field : null, reach: reach > 0 ? reach : null,
+    eye: numbers("eye", 3), rotation: axes && orthonormal(axes.slice(0, 3), axes.slice(3)),
+    fov: fov > 0.01 && fov < 3 ? fov : null, distance: distance > 0 ? distance : null,
     dial: numbers("dial", 1)?.[0] ?? null, equation: parts.get("equation") !== "off",
     wipe: numbers("wipe", 1)?.[0] ?? null, other: numbers("other", 1)?.[0] ?? "base",
   };
 }
 
+/** Right, down and forward by Gram-Schmidt; null where right and down are parallel or 0. */
 function orthonormal(right, down) {
-  const long = Math.hypot(...right), x = right.map((v) => v / long);
+  const rightLength = Math.hypot(...right), x = right.map((v) => v / rightLength);
   const along = x.reduce((sum, v, k) => sum + v * down[k], 0);
-  const rest = down.map((v, k) => v - along * x[k]), tall = Math.hypot(...rest);
-  if (!(long > 0 && tall > 0)) return null;
-  const y = rest.map((v) => v / tall);
+  const rest = down.map((v, k) => v - along * x[k]), downLength = Math.hypot(...rest);
+  if (!(rightLength > 0 && downLength > 0)) return null;
+  const y = rest.map((v) => v / downLength);
   return [...x, ...y, x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]];
 }

@@ -1,4 +1,4 @@
-// Puts the page together, and hands `window.clod` to tests and scripts.
+// Assembles the page, and defines `window.clod` for tests and scripts.
 import { createCamera } from "./camera.js";
 import { createControls } from "./controls.js";
 import { readFile } from "./formats/index.js";
@@ -18,174 +18,174 @@ async function start() {
   const stage = createStage(renderer, elements.canvas, camera);
   const controls = createControls(elements.canvas, camera, () => {
     stage.change({ moving: true });
-    viewer.ui.at(null);
+    viewer.ui.selectCamera(null);
   });
   const wipe = createWipe(elements, stage);
   viewer = { renderer, camera, stage, controls, wipe, cameraNumber: 0, cameras: config.cameras };
   viewer.ui = createUi(elements, stage, actions);
-  stage.listeners.frame = viewer.ui.frame;
-  stage.listeners.error = (error) => viewer.ui.say(error.message);
+  stage.listeners.frame = viewer.ui.updateFrame;
+  stage.listeners.error = (error) => viewer.ui.showMessage(error.message);
   new ResizeObserver(() => stage.change()).observe(elements.canvas);
-  elements.canvas.addEventListener("webglcontextlost", () => viewer.ui.say("The graphics device went away; reload the page."));
+  elements.canvas.addEventListener("webglcontextlost", () => viewer.ui.showMessage("The graphics device was lost; reload the page."));
   listenForFiles();
   document.title = elements.title.textContent = config.title || "clod-adapter";
-  viewer.ui.show();
-  if (!config.model) return viewer.ui.busy("Drop a splat here, or open one");
+  viewer.ui.update();
+  if (!config.model) return viewer.ui.showProgress("Drop a splat here, or open one");
   const [model, base] = await Promise.all([config.model, config.base].map((entry) => entry && fetchNamed(entry)));
-  if (loads) return; // another file was dropped meanwhile
+  if (loadCount) return; // another file was dropped meanwhile
   show(model, base, config.cameras, config.virtual_scale);
   applyLink(readLink(location.hash));
   window.addEventListener("hashchange", () => applyLink(readLink(location.hash)));
-  await stage.settled();
+  await stage.whenDrawn();
 }
 
-const fetchNamed = (entry) => fetchModel(entry, (part) => viewer.ui.busy(`Loading ${entry.name}: ${Math.floor(100 * part)} %`)).catch((error) => { throw new Error(`${entry.name}: ${error.message}`); });
+const fetchNamed = (entry) => fetchModel(entry, (fraction) => viewer.ui.showProgress(`Loading ${entry.name}: ${Math.floor(100 * fraction)} %`)).catch((error) => { throw new Error(`${entry.name}: ${error.message}`); });
 
 function show(model, base, cameras, dial) {
   const { renderer, stage, camera, ui } = viewer;
-  const make = ({ gaussians, about }) => createModel(renderer.gl, gaussians, about);
-  const [made, madeBase] = [make(model), base && make(base)];
+  const upload = ({ gaussians, metadata }) => createModel(renderer.gl, gaussians, metadata);
+  const [uploaded, uploadedBase] = [upload(model), base && upload(base)];
   Object.assign(stage.state, { dial: 1, equation: true, wipe: null, other: "base" });
-  stage.show(made, madeBase);
+  stage.show(uploaded, uploadedBase);
   viewer.cameras = cameras;
-  ui.list(cameras);
+  ui.listCameras(cameras);
   actions.reset();
   stage.state.dial = clampDial(dial);
-  ui.busy(null);
-  ui.note("");
-  changed();
+  ui.showProgress(null);
+  ui.showNote("");
+  update();
 }
 
 const clampDial = (dial) => Math.min(Math.max(dial, 1), viewer.stage.model.max_sv);
 
-function changed() {
+function update() {
   viewer.stage.change();
-  viewer.ui.show();
-  viewer.ui.frame();
-  viewer.wipe.show();
+  viewer.ui.update();
+  viewer.ui.updateFrame();
+  viewer.wipe.update();
 }
 
-function applyLink({ eye, rotation, field, reach, dial, equation, wipe, other }) {
+function applyLink({ eye, rotation, fov, distance, dial, equation, wipe, other }) {
   const { camera, stage } = viewer;
   if (eye && rotation) {
-    Object.assign(camera, { eye, rotation, exact: null });
-    viewer.ui.at(null);
+    Object.assign(camera, { eye, rotation, intrinsics: null });
+    viewer.ui.selectCamera(null);
   }
-  camera.field = field ?? camera.field;
-  camera.reach = reach ?? camera.reach;
+  camera.fov = fov ?? camera.fov;
+  camera.distance = distance ?? camera.distance;
   const { attenuation } = stage.model, comparable = wipe !== null && (attenuation || stage.base);
   Object.assign(stage.state, {
     dial: clampDial(dial ?? stage.state.dial), equation, wipe: comparable ? Math.min(Math.max(wipe, 0), 1) : null,
     other: other === "base" || !attenuation ? "base" : clampDial(other),
   });
-  changed();
+  update();
 }
 
 const actions = {
-  flying: () => viewer.controls.flying,
+  isFlying: () => viewer.controls.flying,
   setDial(dial) {
-    if (!(dial >= 1)) throw new Error(`the dial is ${dial}, it must be at least 1`);
+    if (!(dial >= 1)) throw new Error(`the dial value is ${dial}; it must be at least 1`);
     viewer.stage.state.dial = dial;
-    viewer.ui.note("");
-    changed();
+    viewer.ui.showNote("");
+    update();
   },
   setEquation(on) {
     viewer.stage.state.equation = Boolean(on);
-    changed();
+    update();
   },
   setWipe(position, other = viewer.stage.state.other) {
     Object.assign(viewer.stage.state, { wipe: position, other });
-    changed();
+    update();
   },
-  compare(kind) {
+  compare(mode) {
     const { state } = viewer.stage, position = state.wipe ?? 0.5;
-    if (kind === "off") actions.setWipe(null);
-    else actions.setWipe(position, kind === "base" ? "base" : state.other === "base" ? viewer.stage.model.max_sv : state.other);
+    if (mode === "off") actions.setWipe(null);
+    else actions.setWipe(position, mode === "base" ? "base" : state.other === "base" ? viewer.stage.model.max_sv : state.other);
   },
   async setTarget(text) {
-    const wanted = Number(text.replaceAll(/[\s,_.'](?=\d{3}(?!\d))/g, ""));
-    if (!text.trim()) return viewer.ui.note("");
-    if (!(Number.isInteger(wanted) && wanted > 0)) return viewer.ui.note("A number of Gaussians, such as 20000");
+    const target = Number(text.replaceAll(/[\s,_.'](?=\d{3}(?!\d))/g, ""));
+    if (!text.trim()) return viewer.ui.showNote("");
+    if (!(Number.isInteger(target) && target > 0)) return viewer.ui.showNote("Enter a number of Gaussians, such as 20000");
     const { stage } = viewer;
-    const { dial, kept } = await stage.model.dialFor(stage.view(), wanted);
+    const { dial, kept } = await stage.model.dialFor(stage.view(), target);
     stage.state.equation = true;
     actions.setDial(dial);
-    const most = stage.model.max_sv;
-    if (kept > wanted) viewer.ui.note(`At s = ${most}, the largest trained, ${kept.toLocaleString("en")} are kept here`);
-    else if (dial === 1) viewer.ui.note(`s = 1 keeps ${kept.toLocaleString("en")} already`);
-    else viewer.ui.note(`s = ${dial.toFixed(3)} keeps ${kept.toLocaleString("en")} in this view`);
+    const max = stage.model.max_sv, count = kept.toLocaleString("en");
+    if (kept > target) viewer.ui.showNote(`s = ${max}, the largest trained value, keeps ${count} in this view`);
+    else if (dial === 1) viewer.ui.showNote(`s = 1 already keeps no more than ${count} in this view`);
+    else viewer.ui.showNote(`s = ${dial.toFixed(3)} keeps ${count} in this view`);
   },
   toggleFlying() {
     viewer.controls.flying = !viewer.controls.flying;
-    viewer.ui.show();
+    viewer.ui.update();
   },
   reset() {
     viewer.camera.fit(viewer.stage.model.extent, viewer.cameras);
-    viewer.camera.exact = null;
+    viewer.camera.intrinsics = null; // fills the window
     viewer.cameraNumber = 0;
-    viewer.ui.at(0);
-    changed();
+    viewer.ui.selectCamera(0);
+    update();
   },
-  nextCamera(by) {
+  nextCamera(step) {
     const { length } = viewer.cameras;
-    if (length) actions.goTo((viewer.cameraNumber + by + length) % length);
+    if (length) actions.goTo((viewer.cameraNumber + step + length) % length);
   },
   goTo(number) {
     viewer.camera.set(viewer.cameras[number]);
-    viewer.camera.exact = null;
+    viewer.camera.intrinsics = null;
     viewer.cameraNumber = number;
-    viewer.ui.at(number);
-    changed();
+    viewer.ui.selectCamera(number);
+    update();
   },
   async copyLink() {
     const link = writeLink(viewer.camera, viewer.stage.state);
     history.replaceState(null, "", link);
     try {
       await navigator.clipboard.writeText(link);
-      viewer.ui.note(viewer.dropped ? "Link copied: to this view, not to the file" : "Link copied");
+      viewer.ui.showNote(viewer.dropped ? "Link copied; it contains the view, not the file" : "Link copied");
     } catch {
-      viewer.ui.note("The link is in the address bar"); // file:// pages may not write to the clipboard
+      viewer.ui.showNote("The link is in the address bar"); // file:// pages may not write to the clipboard
     }
   },
   fullScreen: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.()),
   openFile(file) {
-    const unread = () => { throw new Error("the browser cannot read it: it is a folder, or too large"); };
-    return load(file.arrayBuffer().catch(unread), file.name).catch(() => {});
+    const refuse = () => { throw new Error("the browser cannot read it: it is a folder or too large"); };
+    return load(file.arrayBuffer().catch(refuse), file.name).catch(() => {});
   },
 };
 
-let loads = 0;
+let loadCount = 0;
 
-/** Shows another file, out of a buffer or a promise of one; of several the last. Where it cannot be read what was shown
- *  stays, and the message says why. */
+/** Shows another file, from a buffer or a promise of one; of concurrent calls, the last. If reading fails, the page shows
+ *  an error and keeps the previous file. */
 async function load(buffer, name) {
-  const { ui, stage } = viewer, turn = ++loads;
-  ui.busy(`Reading ${name}`);
+  const { ui, stage } = viewer, number = ++loadCount;
+  ui.showProgress(`Reading ${name}`);
   try {
     const read = await readFile(await buffer, name);
-    if (turn !== loads) return;
+    if (number !== loadCount) return;
     show(read, null, [], 1);
     viewer.dropped = true;
-    ui.note(read.about.notes.join("; "));
+    ui.showNote(read.metadata.notes.join("; "));
     document.title = elements.title.textContent = name;
-    ui.say(null);
-    await stage.settled();
+    ui.showMessage(null);
+    await stage.whenDrawn();
   } catch (error) {
     const message = `${name}: ${error.message}`;
-    if (turn === loads) ui.say(message);
+    if (number === loadCount) ui.showMessage(message);
     throw new Error(message);
   } finally {
-    if (turn === loads) ui.busy(null);
+    if (number === loadCount) ui.showProgress(null);
   }
 }
 
 function listenForFiles() {
-  const over = (on) => { elements.drop.hidden = !on; };
-  window.addEventListener("dragover", (event) => { event.preventDefault(); over(true); });
-  window.addEventListener("dragleave", (event) => { if (!event.relatedTarget) over(false); });
+  const showTarget = (on) => { elements.drop.hidden = !on; };
+  window.addEventListener("dragover", (event) => { event.preventDefault(); showTarget(true); });
+  window.addEventListener("dragleave", (event) => { if (!event.relatedTarget) showTarget(false); });
   window.addEventListener("drop", (event) => {
     event.preventDefault();
-    over(false);
+    showTarget(false);
     const [file] = event.dataTransfer.files;
     if (file) actions.openFile(file);
   });
@@ -193,12 +193,12 @@ function listenForFiles() {
 
 const ready = start().catch((error) => {
   elements.busy.hidden = true;
-  elements.panel.hidden = !viewer?.ui; // it works nothing without
+  elements.panel.hidden = !viewer?.ui; // without it, no control works
   elements.message.hidden = false;
   elements.message.firstElementChild.textContent = error.message;
   throw error;
 });
-ready.catch(() => {}); // shown on the page; who awaits `ready` sees it too
+ready.catch(() => {}); // shown on the page; awaiting `ready` throws it too
 
 window.clod = {
   ready, load,
@@ -207,11 +207,11 @@ window.clod = {
     viewer.camera.set(camera);
     viewer.stage.change();
   },
-  settled: () => viewer.stage.settled(),
+  whenDrawn: () => viewer.stage.whenDrawn(),
   counts: () => viewer.stage.counts(),
   async capture() {
-    viewer.stage.still();
-    await viewer.stage.settled();
+    viewer.stage.endMotion();
+    await viewer.stage.whenDrawn();
     viewer.stage.redraw();
     return elements.canvas.toDataURL("image/png");
   },

@@ -1,54 +1,54 @@
-// One splat on the GPU, and its worker, which knows who is kept at a dial value and in which order they are drawn.
-import { WIDTH, dataTexture, heightOf, mostTexels } from "./gpu.js";
+// A splat on the GPU, and its worker, which culls and sorts the Gaussians.
+import { WIDTH, dataTexture, heightOf, maxTexels } from "./gpu.js";
 import { half } from "./half.js";
-import { BAND_TEXELS } from "./shaders.js";
+import { SH_TEXELS } from "./shaders.js";
 import workerSource from "worker:./worker.js";
 
 const SH_C0 = 0.28209479177387814;
 const RECORD_TEXELS = 4;
 
-/** `about`: name, attenuation or null, screen_filter, no_dial, max_sv, calibration. `gaussians`: as the readers in formats/ make them. */
-export function createModel(gl, gaussians, about) {
-  const { count, degree, means, opacityLogits } = gaussians, { records, higher } = upload(gl, gaussians);
-  const attenuation = gaussians.sigma ? about.attenuation : null, extent = extentOf(gaussians), worker = startWorker();
-  worker.ask("model", { means, opacityLogits, sigma: attenuation && gaussians.sigma, attenuation }, [means.buffer]);
-  const spare = []; // buffers for orders, which go to the worker and back
+/** `metadata`: name, attenuation or null, screen_filter, no_dial, max_sv, calibration. `gaussians`: from a reader in formats/. */
+export function createModel(gl, gaussians, metadata) {
+  const { count, degree, means, opacityLogits } = gaussians, { records, sh } = upload(gl, gaussians);
+  const attenuation = gaussians.sigmaD ? metadata.attenuation : null, extent = extentOf(gaussians), worker = startWorker();
+  worker.request("model", { means, opacityLogits, sigmaD: attenuation && gaussians.sigmaD, attenuation }, [means.buffer]);
+  const spare = []; // buffers for orders, which are transferred to the worker and back
   return {
-    ...about, attenuation, count, degree, records, higher, extent,
-    /** Has the worker find the rows to draw, and calls `use({rows, drawn, kept, distance})` with them. */
-    async order(request, use) {
+    ...metadata, attenuation, count, degree, records, sh, extent,
+    /** Requests the rows to draw from the worker, and calls `use({rows, drawn, kept, distance})`. */
+    async order(state, use) {
       const buffer = spare.pop() ?? new ArrayBuffer(4 * WIDTH * heightOf(count));
-      const answer = await worker.ask("order", { ...request, rows: buffer }, [buffer]);
-      use({ ...answer, rows: new Uint32Array(answer.rows) });
-      spare.push(answer.rows);
+      const result = await worker.request("order", { ...state, rows: buffer }, [buffer]);
+      use({ ...result, rows: new Uint32Array(result.rows) });
+      spare.push(result.rows);
     },
-    dialFor: (view, wanted) => worker.ask("dialFor", { view, wanted, maxSv: about.max_sv }),
+    dialFor: (view, target) => worker.request("dialFor", { view, target, maxSv: metadata.max_sv }),
     destroy() {
       worker.stop();
       gl.deleteTexture(records);
-      gl.deleteTexture(higher);
+      gl.deleteTexture(sh);
     },
   };
 }
 
-/** Apart, so that nothing that lives on holds the values after they are on the GPU. */
+/** A separate function, so that no closure of the model keeps the values in memory after the upload. */
 function upload(gl, gaussians) {
-  const texels = BAND_TEXELS[gaussians.degree], integer = new Intl.NumberFormat("en").format;
-  if (gl.isContextLost()) throw new Error("the graphics device went away; reload the page");
-  const most = Math.floor(mostTexels(gl) / Math.max(texels, RECORD_TEXELS));
-  if (gaussians.count > most) {
-    throw new Error(`it has ${integer(gaussians.count)} Gaussians; this graphics device takes ${integer(most)} of its SH degree`);
+  const texels = SH_TEXELS[gaussians.degree], integer = new Intl.NumberFormat("en").format;
+  if (gl.isContextLost()) throw new Error("the graphics device was lost; reload the page");
+  const max = Math.floor(maxTexels(gl) / Math.max(texels, RECORD_TEXELS));
+  if (gaussians.count > max) {
+    throw new Error(`it has ${integer(gaussians.count)} Gaussians of SH degree ${gaussians.degree}, and this graphics device supports at most ${integer(max)}; export it at a larger dial value (--sv)`);
   }
-  const made = {
+  const textures = {
     records: dataTexture(gl, RECORD_TEXELS * gaussians.count, Float32Array, (target) => fillRecords(target, gaussians)),
-    higher: dataTexture(gl, texels * gaussians.count, Uint32Array, (target) => fillBands(target, gaussians, texels)),
+    sh: dataTexture(gl, texels * gaussians.count, Uint32Array, (target) => fillSh(target, gaussians, texels)),
   };
-  if (gl.getError() !== gl.OUT_OF_MEMORY) return made;
-  for (const each of Object.values(made)) gl.deleteTexture(each);
-  throw new Error(`this graphics device has too little memory for its ${integer(gaussians.count)} Gaussians`);
+  if (gl.getError() !== gl.OUT_OF_MEMORY) return textures;
+  for (const each of Object.values(textures)) gl.deleteTexture(each);
+  throw new Error(`this graphics device has too little memory for ${integer(gaussians.count)} Gaussians; export it at a larger dial value (--sv)`);
 }
 
-function fillRecords(target, { count, means, quats, logScales, opacityLogits, sh0, sigma }) {
+function fillRecords(target, { count, means, quats, logScales, opacityLogits, sh0, sigmaD }) {
   for (let i = 0, at = 0; i < count; i++, at += 16) {
     for (let k = 0; k < 3; k++) {
       target[at + k] = means[3 * i + k];
@@ -58,20 +58,20 @@ function fillRecords(target, { count, means, quats, logScales, opacityLogits, sh
     target[at + 3] = 1 / (1 + Math.exp(-opacityLogits[i]));
     const norm = Math.hypot(quats[4 * i], quats[4 * i + 1], quats[4 * i + 2], quats[4 * i + 3]);
     for (let k = 0; k < 4; k++) target[at + 4 + k] = quats[4 * i + k] / norm;
-    target[at + 11] = sigma ? sigma[i] : 0;
+    target[at + 11] = sigmaD ? sigmaD[i] : 0;
   }
 }
 
-/** Coefficient by coefficient, red, green and blue of each, as halves. */
-function fillBands(target, { count, degree, shN }, texels) {
+/** SH of degrees 1 and up as float16: red, green and blue of each coefficient. */
+function fillSh(target, { count, degree, shN }, texels) {
   const values = 3 * ((degree + 1) ** 2 - 1), halves = new Uint16Array(target.buffer);
   for (let i = 0; i < count; i++) {
     for (let k = 0; k < values; k++) halves[8 * texels * i + k] = half(shN[values * i + k]);
   }
 }
 
-/** Where the bulk of the Gaussians is: the median, and the distance that holds 80 % of a sample of them; of few large
- *  ones three times their size. */
+/** {centre, radius} of the bulk of the Gaussians: the median of their means; the distance from it that contains 80 % of
+ *  a sample, and at least three times the median size. */
 function extentOf({ means, logScales }) {
   const step = Math.max(Math.floor(means.length / 3 / 20000), 1), axes = [[], [], []];
   for (let i = 0; i < means.length / 3; i += step) for (let k = 0; k < 3; k++) axes[k].push(means[3 * i + k]);
@@ -94,10 +94,10 @@ function startWorker() {
     else resolve(data);
   };
   return {
-    ask: (job, message, moved = []) =>
+    request: (job, message, transferred = []) =>
       new Promise((resolve, reject) => {
         waiting.set(++next, { resolve, reject });
-        worker.postMessage({ id: next, job, ...message }, moved);
+        worker.postMessage({ id: next, job, ...message }, transferred);
       }),
     stop: () => worker.terminate(),
   };

@@ -1,44 +1,44 @@
-// The page's configuration and the files in it or beside it.
+// The page's configuration, and the splats that it names: in the page or on its server.
 import { readFile } from "./formats/index.js";
-import { unpacked } from "./formats/zip.js";
+import { inflate } from "./formats/zip.js";
 
-/** The configuration that the page was written with; an empty page (a viewer for dropped files) has none. */
+/** The page's configuration; a page without one starts empty, as a viewer for dropped files. */
 export function readConfig() {
   const element = document.getElementById("clod-config");
   return { title: "", model: null, base: null, cameras: [], virtual_scale: 1, ...(element ? JSON.parse(element.textContent) : {}) };
 }
 
-/** {gaussians, about} of the configuration's `model` or `base`; `arrived(part)` is told how much of it is here. */
-export async function fetchModel(entry, arrived) {
-  const { gaussians, about } = await readFile(await bytesOf(entry, arrived), entry.name);
-  if (entry.sigma) gaussians.sigma = new Float32Array(await bytesOf(entry.sigma));
-  if (gaussians.sigma && gaussians.sigma.length !== gaussians.count) {
-    throw new Error(`it has ${gaussians.count} Gaussians and ${gaussians.sigma.length} values of sigma_d`);
+/** {gaussians, metadata} of the configuration's `model` or `base`; calls `onProgress(fraction)` during the transfer. */
+export async function fetchModel(entry, onProgress) {
+  const { gaussians, metadata } = await readFile(await bytesOf(entry, onProgress), entry.name);
+  if (entry.sigma) gaussians.sigmaD = new Float32Array(await bytesOf(entry.sigma));
+  if (gaussians.sigmaD && gaussians.sigmaD.length !== gaussians.count) {
+    throw new Error(`it has ${gaussians.count} Gaussians and ${gaussians.sigmaD.length} values of sigma_d; export the page again`);
   }
-  const attenuation = gaussians.sigma ? entry.attenuation ?? null : null;
+  const attenuation = gaussians.sigmaD ? entry.attenuation ?? null : null;
   return {
     gaussians,
-    about: {
-      ...about, name: entry.name, attenuation, screen_filter: entry.screen_filter, max_sv: entry.max_sv ?? about.max_sv,
-      no_dial: attenuation ? null : entry.no_dial ?? about.no_dial, calibration: entry.calibration ?? [],
+    metadata: {
+      ...metadata, name: entry.name, attenuation, screen_filter: entry.screen_filter, max_sv: entry.max_sv ?? metadata.max_sv,
+      no_dial: attenuation ? null : entry.no_dial ?? metadata.no_dial, calibration: entry.calibration ?? [],
     },
   };
 }
 
-/** Bytes from the same origin (`href`), or base64 out of the page's elements of an id, which it then leaves. */
-async function bytesOf({ href, element, gzip }, arrived) {
+/** Bytes from the same origin (`href`), or from base64 in the elements with the id `element`, which are then removed. */
+async function bytesOf({ href, element, gzip }, onProgress) {
   if (href) {
     const response = await fetch(href);
     if (!response.ok) throw new Error(`the server answered ${response.status} ${response.statusText}`);
-    return received(response, arrived);
+    return readBody(response, onProgress);
   }
-  const holders = [...document.querySelectorAll(`[id="${element}"]`)];
-  if (!holders.length) throw new Error("the page does not hold it; write the page again");
-  const held = new Blob(holders.map(decoded));
-  return gzip ? (await unpacked(held, "gzip")).buffer : held.arrayBuffer();
+  const elements = [...document.querySelectorAll(`[id="${element}"]`)];
+  if (!elements.length) throw new Error("the page does not contain its data; export the page again");
+  const data = new Blob(elements.map(takeBytes));
+  return gzip ? (await inflate(data, "gzip")).buffer : data.arrayBuffer();
 }
 
-async function received(response, arrived) {
+async function readBody(response, onProgress) {
   const size = Number(response.headers.get("Content-Length"));
   if (!size || response.headers.has("Content-Encoding")) return response.arrayBuffer();
   const bytes = new Uint8Array(size), reader = response.body.getReader();
@@ -46,14 +46,15 @@ async function received(response, arrived) {
   for (let { done, value } = await reader.read(); !done; { done, value } = await reader.read()) {
     bytes.set(value, at);
     at += value.length;
-    arrived(at / size);
+    onProgress(at / size);
   }
   return bytes.buffer;
 }
 
-function decoded(holder) {
-  const letters = atob(holder.textContent.trim()), bytes = new Uint8Array(letters.length);
-  holder.remove();
-  for (let i = 0; i < bytes.length; i++) bytes[i] = letters.charCodeAt(i);
+/** Removes the element, for its memory, and decodes its text. */
+function takeBytes(element) {
+  const characters = atob(element.textContent.trim()), bytes = new Uint8Array(characters.length);
+  element.remove();
+  for (let i = 0; i < bytes.length; i++) bytes[i] = characters.charCodeAt(i);
   return bytes;
 }

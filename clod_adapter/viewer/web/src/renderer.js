@@ -1,30 +1,31 @@
-// Draws models: each Gaussian is projected once, a pixel each, then drawn as one quad, the farthest first, into a
-// half-float picture, so that hundreds of blended layers are not rounded to 8 bits each.
+// Draws models. A first pass projects each Gaussian to one texel; a second one draws a quad each, farthest first, into a
+// half-float image, so that blending hundreds of layers does not round to 8 bits.
 import { WIDTH, bindTextures, framebuffer, heightOf, program, quads, texture } from "./gpu.js";
 import { copyVertex, copyFragment, projectFragment, splatFragment, splatVertex } from "./shaders.js";
 
 export function createRenderer(canvas) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
   if (!gl) throw new Error("this browser has no WebGL2; try a current Chrome, Edge, Firefox or Safari");
-  const precise = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
+  const halfFloat = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
   const projectors = new Map(), splat = program(gl, splatVertex, splatFragment), copy = program(gl, copyVertex, copyFragment);
-  const corners = quads(gl), empty = gl.createVertexArray();
-  const projected = { textures: [], target: null, height: 0 }, picture = { texture: null, target: null };
+  const quadArray = quads(gl), empty = gl.createVertexArray();
+  const projected = { textures: [], target: null, height: 0 }, image = { texture: null, target: null };
   let width = 0, height = 0;
 
   function resize(view) {
     if (view.width === width && view.height === height) return;
     ({ width, height } = view);
     [canvas.width, canvas.height] = [width, height];
-    gl.deleteTexture(picture.texture);
-    gl.deleteFramebuffer(picture.target);
-    picture.texture = precise
+    gl.deleteTexture(image.texture);
+    gl.deleteFramebuffer(image.target);
+    image.texture = halfFloat
       ? texture(gl, gl.RGBA16F, width, height, gl.RGBA, gl.HALF_FLOAT)
       : texture(gl, gl.RGBA8, width, height, gl.RGBA, gl.UNSIGNED_BYTE);
-    picture.target = framebuffer(gl, [picture.texture]);
+    image.target = framebuffer(gl, [image.texture]);
   }
 
-  function makeRoom(rows) {
+  /** Enlarges the textures of projected Gaussians to at least so many rows of texels. */
+  function resizeProjected(rows) {
     if (rows <= projected.height) return;
     projected.textures.forEach((old) => gl.deleteTexture(old));
     gl.deleteFramebuffer(projected.target);
@@ -39,12 +40,12 @@ export function createRenderer(canvas) {
   }
 
   function project(side, view) {
-    const { model } = side, { made, uniforms: u } = projector(model.degree);
-    makeRoom(heightOf(model.count));
+    const { model } = side, { handle, uniforms: u } = projector(model.degree);
+    resizeProjected(heightOf(model.count));
     gl.bindFramebuffer(gl.FRAMEBUFFER, projected.target);
     gl.viewport(0, 0, WIDTH, heightOf(side.drawn));
-    gl.useProgram(made);
-    bindTextures(gl, u, { order: side.order, records: model.records, higher: model.higher });
+    gl.useProgram(handle);
+    bindTextures(gl, u, { order: side.order, records: model.records, sh: model.sh });
     gl.uniform1i(u.drawn, side.drawn);
     gl.uniformMatrix3fv(u.view, true, view.rotation);
     gl.uniform3fv(u.eye, view.eye);
@@ -52,8 +53,8 @@ export function createRenderer(canvas) {
     gl.uniform3f(u.size, view.width, view.height, view.near);
     gl.uniform1f(u.blur, model.screen_filter.variance);
     gl.uniform1i(u.compensate, model.screen_filter.compensate);
-    gl.uniform1i(u.dialled, side.dialled);
-    if (side.dialled) {
+    gl.uniform1i(u.attenuated, side.attenuated);
+    if (side.attenuated) {
       gl.uniform1f(u.dial, side.dial);
       gl.uniform1f(u.distance_unit, side.distance);
       gl.uniform1f(u.eps, model.attenuation.eps);
@@ -64,19 +65,19 @@ export function createRenderer(canvas) {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  function paint(side, view) {
-    gl.bindFramebuffer(gl.FRAMEBUFFER, picture.target);
+  function blend(side, view) {
+    gl.bindFramebuffer(gl.FRAMEBUFFER, image.target);
     gl.viewport(0, 0, width, height);
-    gl.useProgram(splat.made);
-    const [first, second, third] = projected.textures;
-    bindTextures(gl, splat.uniforms, { first, second, third });
+    gl.useProgram(splat.handle);
+    const [footprint, conic, color] = projected.textures;
+    bindTextures(gl, splat.uniforms, { footprint, conic, color });
     gl.uniform3f(splat.uniforms.size, view.width, view.height, view.near);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.enable(gl.SCISSOR_TEST);
     const from = Math.round(side.from * width), to = Math.round(side.to * width);
     gl.scissor(from, 0, to - from, height);
-    gl.bindVertexArray(corners);
+    gl.bindVertexArray(quadArray);
     gl.drawElementsInstanced(gl.TRIANGLES, 6 * WIDTH, gl.UNSIGNED_SHORT, 0, heightOf(side.drawn));
     gl.disable(gl.SCISSOR_TEST);
     gl.disable(gl.BLEND);
@@ -84,7 +85,7 @@ export function createRenderer(canvas) {
 
   return {
     gl,
-    /** New rows for a side, `drawn` of them, in whole lines of WIDTH. */
+    /** Uploads the order of a side: its first `drawn` rows, rounded up to a multiple of WIDTH. */
     upload(side, rows, drawn) {
       const lines = heightOf(side.model.count);
       side.order ??= texture(gl, gl.R32UI, WIDTH, lines, gl.RED_INTEGER, gl.UNSIGNED_INT);
@@ -96,36 +97,36 @@ export function createRenderer(canvas) {
       gl.deleteTexture(side.order);
       side.order = null;
     },
-    /** Draws the sides, each in its share [from, to] of the picture's width, and shows it. */
+    /** Draws each side in its range [from, to] of the image's width, in [0, 1], and shows the image. */
     draw(sides, view) {
       resize(view);
-      gl.bindFramebuffer(gl.FRAMEBUFFER, picture.target);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, image.target);
       gl.clearColor(0, 0, 0, 0);
       gl.clear(gl.COLOR_BUFFER_BIT);
       for (const side of sides) {
         if (!side.drawn) continue;
         project(side, view);
-        paint(side, view);
+        blend(side, view);
       }
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
       gl.viewport(0, 0, width, height);
-      gl.useProgram(copy.made);
-      bindTextures(gl, copy.uniforms, { picture: picture.texture });
+      gl.useProgram(copy.handle);
+      bindTextures(gl, copy.uniforms, { image: image.texture });
       gl.bindVertexArray(empty);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     },
-    /** Resolves with the milliseconds since `began` once the GPU has finished what it was given. */
-    finished(began) {
+    /** Resolves with the milliseconds since `start` once the GPU has executed all commands so far. */
+    whenFinished(start) {
       const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
       gl.flush();
       return new Promise((resolve) => {
-        const look = () => {
+        const poll = () => {
           const state = gl.clientWaitSync(fence, 0, 0);
-          if (state === gl.TIMEOUT_EXPIRED) return setTimeout(look, 1);
+          if (state === gl.TIMEOUT_EXPIRED) return setTimeout(poll, 1);
           gl.deleteSync(fence);
-          resolve(performance.now() - began);
+          resolve(performance.now() - start);
         };
-        setTimeout(look, 0);
+        setTimeout(poll, 0);
       });
     },
   };

@@ -1,86 +1,87 @@
-// The panel: what is said on it, and what its controls do. Everything is a native control, so keys and readers work.
+// The panel: its texts and its controls. All controls are native, so that keys and screen readers work.
 
-const TICKS = 1000; // of the sliders, even steps of log s
+const TICKS = 1000; // of a slider, in equal steps of log s
 const integer = new Intl.NumberFormat("en").format;
 
 export const elementsOf = (document) =>
   new Proxy({}, { get: (_, name) => document.getElementById(name.replace(/[A-Z]/g, (c) => `-${c.toLowerCase()}`)) });
 
-const toDial = (tick, most) => (most > 1 ? most ** (tick / TICKS) : 1);
-const toTick = (dial, most) => (most > 1 ? Math.round((TICKS * Math.log(dial)) / Math.log(most)) : 0);
+const toDial = (tick, maxDial) => (maxDial > 1 ? maxDial ** (tick / TICKS) : 1);
+const toTick = (dial, maxDial) => (maxDial > 1 ? Math.round((TICKS * Math.log(dial)) / Math.log(maxDial)) : 0);
 
-/** PSNR at a dial value, linear in log s between the calibration's rows; null outside of them. */
-function calibrated(rows, dial) {
+/** PSNR at a dial value, interpolated linearly in log s between the calibration's rows; null outside their range. */
+function interpolatePsnr(rows, dial) {
   const next = rows.findIndex((row) => row.virtual_scale >= dial);
   if (next < 0) return null;
   if (rows[next].virtual_scale === dial || next === 0) return rows[next].virtual_scale === dial ? rows[next].psnr : null;
   const [a, b] = [rows[next - 1], rows[next]];
-  const part = Math.log(dial / a.virtual_scale) / Math.log(b.virtual_scale / a.virtual_scale);
-  return a.psnr + part * (b.psnr - a.psnr);
+  const fraction = Math.log(dial / a.virtual_scale) / Math.log(b.virtual_scale / a.virtual_scale);
+  return a.psnr + fraction * (b.psnr - a.psnr);
 }
 
-/** `actions`: what the panel asks for; see main.js. */
+/** `actions`: the functions that the controls call (main.js). */
 export function createUi(elements, stage, actions) {
   const { state } = stage;
-  const most = () => stage.model?.max_sv ?? 1;
+  const maxDial = () => stage.model?.max_sv ?? 1;
 
-  function show() {
-    const { model } = stage, dialled = Boolean(model?.attenuation), kind = comparison();
-    for (const control of [elements.dial, elements.target, elements.equation]) control.disabled = !dialled;
+  /** Shows the present state on the controls. */
+  function update() {
+    const { model } = stage, hasDial = Boolean(model?.attenuation), mode = comparison();
+    for (const control of [elements.dial, elements.target, elements.equation]) control.disabled = !hasDial;
     for (const control of [elements.reset, elements.link, elements.move]) control.disabled = !model;
-    elements.compare.disabled = !dialled && !stage.base;
+    elements.compare.disabled = !hasDial && !stage.base;
     elements.compare.options[1].textContent = stage.base ? "with the base" : "without the equation";
-    elements.noDial.hidden = !model || dialled;
+    elements.noDial.hidden = !model || hasDial;
     elements.noDial.textContent = model?.no_dial ?? "";
-    slide(elements.dial, elements.dialValue, dialled ? state.dial : null);
-    elements.equation.checked = state.equation && dialled;
-    elements.compare.value = kind;
-    for (const option of elements.compare.options) option.disabled = option.value === "dial" && !dialled;
-    elements.otherRow.hidden = kind !== "dial";
-    if (kind === "dial") slide(elements.other, elements.otherValue, state.other);
-    elements.move.textContent = actions.flying() ? "Fly" : "Orbit";
-    elements.canvas.classList.toggle("flying", actions.flying());
+    setSlider(elements.dial, elements.dialValue, hasDial ? state.dial : null);
+    elements.equation.checked = state.equation && hasDial;
+    elements.compare.value = mode;
+    for (const option of elements.compare.options) option.disabled = option.value === "dial" && !hasDial;
+    elements.otherRow.hidden = mode !== "dial";
+    if (mode === "dial") setSlider(elements.other, elements.otherValue, state.other);
+    elements.move.textContent = actions.isFlying() ? "Fly" : "Orbit";
+    elements.canvas.classList.toggle("flying", actions.isFlying());
   }
 
-  function slide(slider, output, dial) {
-    slider.value = toTick(dial ?? 1, most());
-    output.textContent = dial === null ? "" : said(dial);
-    slider.setAttribute("aria-valuetext", dial === null ? "none" : said(dial));
+  function setSlider(slider, output, dial) {
+    slider.value = toTick(dial ?? 1, maxDial());
+    output.textContent = dial === null ? "" : formatDial(dial);
+    slider.setAttribute("aria-valuetext", dial === null ? "none" : formatDial(dial));
   }
 
-  /** What has changed with the last frame. */
-  function frame() {
+  /** Shows count, frame time and PSNR of the last frame. */
+  function updateFrame() {
     const { model } = stage, { total, kept } = stage.counts(), other = stage.otherCounts();
-    elements.counts.textContent = total ? `${integer(kept)} of ${integer(total)} kept (${share(kept, total)})` : "";
-    elements.frame.textContent = stage.frameMs === null ? "" : `${stage.frameMs.toFixed(stage.frameMs < 10 ? 1 : 0)} ms a frame`;
-    const psnr = model?.attenuation && state.equation ? calibrated(model.calibration, state.dial) : null;
+    elements.counts.textContent = total ? `${integer(kept)} of ${integer(total)} kept (${percent(kept, total)})` : "";
+    elements.frame.textContent = stage.frameMs === null ? "" : `${stage.frameMs.toFixed(stage.frameMs < 10 ? 1 : 0)} ms per frame`;
+    const psnr = model?.attenuation && state.equation ? interpolatePsnr(model.calibration, state.dial) : null;
     elements.quality.textContent = psnr === null ? "" : `${psnr.toFixed(1)} dB`;
     if (!other) return;
-    const left = !model.attenuation ? model.name : state.equation ? said(state.dial) : "equation off";
-    const right = state.other === "base" ? (stage.base ? "base" : "equation off") : state.equation ? said(state.other) : "equation off";
+    const left = !model.attenuation ? model.name : state.equation ? formatDial(state.dial) : "equation off";
+    const right = state.other === "base" ? (stage.base ? "base" : "equation off") : state.equation ? formatDial(state.other) : "equation off";
     elements.wipeLeft.textContent = `${left} · ${integer(kept)}`;
     elements.wipeRight.textContent = `${right} · ${integer(other.kept)}`;
   }
 
   const comparison = () => (state.wipe === null ? "off" : state.other === "base" ? "base" : "dial");
-  const said = (dial) => `s = ${dial.toFixed(2)}`;
-  const share = (kept, total) => `${((100 * kept) / total).toFixed(kept === total ? 0 : 1)} %`;
+  const formatDial = (dial) => `s = ${dial.toFixed(2)}`;
+  const percent = (kept, total) => `${((100 * kept) / total).toFixed(kept === total ? 0 : 1)} %`;
 
-  elements.dial.addEventListener("input", () => actions.setDial(toDial(elements.dial.value, most())));
-  elements.other.addEventListener("input", () => actions.setWipe(state.wipe ?? 0.5, toDial(elements.other.value, most())));
+  elements.dial.addEventListener("input", () => actions.setDial(toDial(elements.dial.value, maxDial())));
+  elements.other.addEventListener("input", () => actions.setWipe(state.wipe ?? 0.5, toDial(elements.other.value, maxDial())));
   elements.equation.addEventListener("change", () => actions.setEquation(elements.equation.checked));
   elements.compare.addEventListener("change", () => actions.compare(elements.compare.value));
   elements.target.addEventListener("change", () => actions.setTarget(elements.target.value));
-  elements.target.addEventListener("keydown", (event) => event.key === "Enter" && actions.setTarget(elements.target.value)); // also the same again
+  elements.target.addEventListener("keydown", (event) => event.key === "Enter" && actions.setTarget(elements.target.value)); // change does not fire for the same text
   elements.camera.addEventListener("change", () => actions.goTo(elements.camera.selectedIndex));
   elements.move.addEventListener("click", actions.toggleFlying);
   elements.reset.addEventListener("click", actions.reset);
   elements.link.addEventListener("click", actions.copyLink);
   elements.open.addEventListener("click", () => elements.file.click());
-  elements.full.hidden = !document.fullscreenEnabled; // iPhones have none
+  elements.full.hidden = !document.fullscreenEnabled; // false on iPhones
   elements.full.addEventListener("click", actions.fullScreen);
   elements.helpOpen.addEventListener("click", () => elements.help.showModal());
-  elements.fold.addEventListener("click", fold);
+  elements.fold.addEventListener("click", toggleControls);
   elements.dismiss.addEventListener("click", () => { elements.message.hidden = true; });
   elements.file.addEventListener("change", () => {
     const [file] = elements.file.files;
@@ -88,22 +89,22 @@ export function createUi(elements, stage, actions) {
     if (file) actions.openFile(file);
   });
 
-  function fold() {
+  function toggleControls() {
     elements.more.hidden = !elements.more.hidden;
     elements.fold.setAttribute("aria-expanded", !elements.more.hidden);
   }
-  if (window.matchMedia("(max-width: 34rem), (max-height: 28rem)").matches) fold();
+  if (window.matchMedia("(max-width: 34rem), (max-height: 28rem)").matches) toggleControls();
 
   const keys = {
     e: () => elements.equation.disabled || actions.setEquation(!state.equation),
     c: () => elements.compare.disabled || actions.compare({ off: "base", base: stage.model?.attenuation ? "dial" : "off", dial: "off" }[comparison()]),
-    v: () => elements.move.disabled || actions.toggleFlying(), l: () => elements.link.disabled || actions.copyLink(), f: actions.fullScreen, m: fold, 0: () => elements.reset.disabled || actions.reset(),
+    v: () => elements.move.disabled || actions.toggleFlying(), l: () => elements.link.disabled || actions.copyLink(), f: actions.fullScreen, m: toggleControls, 0: () => elements.reset.disabled || actions.reset(),
     o: () => elements.file.click(), n: () => actions.nextCamera(1), p: () => actions.nextCamera(-1),
-    "[": () => nudge(-20), "]": () => nudge(20), "?": () => elements.help.showModal(),
+    "[": () => stepDial(-20), "]": () => stepDial(20), "?": () => elements.help.showModal(),
     h: () => { elements.panel.hidden = !elements.panel.hidden; },
   };
-  const nudge = (ticks) => {
-    if (stage.model?.attenuation) actions.setDial(toDial(Math.min(Math.max(toTick(state.dial, most()) + ticks, 0), TICKS), most()));
+  const stepDial = (ticks) => {
+    if (stage.model?.attenuation) actions.setDial(toDial(Math.min(Math.max(toTick(state.dial, maxDial()) + ticks, 0), TICKS), maxDial()));
   };
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || elements.help.open) return;
@@ -116,20 +117,22 @@ export function createUi(elements, stage, actions) {
   });
 
   return {
-    show, frame,
-    say(text) {
+    update, updateFrame,
+    /** Shows an error message; null hides it. */
+    showMessage(text) {
       elements.message.hidden = !text;
       elements.message.firstElementChild.textContent = text ?? "";
     },
-    /** The cameras to go to, by their names. */
-    list(cameras) {
+    /** Lists the cameras by name. */
+    listCameras(cameras) {
       elements.cameraRow.hidden = !cameras.length;
       elements.camera.replaceChildren(...cameras.map(({ name }) => new Option(name)));
     },
-    /** The camera that the view is of; null where it is of none. */
-    at(number) { elements.camera.selectedIndex = number ?? -1; },
-    note(text) { elements.targetNote.textContent = text; },
-    busy(text) {
+    /** Selects the camera of the present view in the list; null for none. */
+    selectCamera(number) { elements.camera.selectedIndex = number ?? -1; },
+    showNote(text) { elements.targetNote.textContent = text; },
+    /** Shows progress over the canvas; null hides it. */
+    showProgress(text) {
       elements.busy.hidden = !text;
       elements.busy.textContent = text ?? "";
     },

@@ -1,4 +1,4 @@
-// The handle between the two sides: dragged, or moved with the arrow keys.
+// The handle between the two compared images, moved by dragging or by the arrow keys.
 
 export function createWipe(elements, stage) {
   const { wipe, wipeLeft, wipeRight } = elements;
@@ -6,10 +6,10 @@ export function createWipe(elements, stage) {
   function set(position) {
     stage.state.wipe = Math.min(Math.max(position, 0), 1);
     stage.change({ moving: true });
-    show();
+    update();
   }
 
-  function show() {
+  function update() {
     const { wipe: position } = stage.state;
     wipe.hidden = wipeLeft.hidden = wipeRight.hidden = position === null;
     if (position === null) return;
@@ -33,5 +33,5 @@ export function createWipe(elements, stage) {
     event.preventDefault();
     set(stage.state.wipe + step);
   });
-  return { show };
+  return { update };
 }

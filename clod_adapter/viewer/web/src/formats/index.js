@@ -1,35 +1,35 @@
-// Which reader a file needs, by its first bytes, and what the page is told about it.
+// Selects the reader of a file by its first bytes, and collects its metadata.
 import { isCompressed, readCompressed } from "./compressed.js";
-import { usable } from "./gaussians.js";
+import { removeInvalid } from "./gaussians.js";
 import { readHeader, readPly } from "./ply.js";
 import { readCalibration, readScreenFilter, readSettings } from "./settings.js";
 import { readSog } from "./sog.js";
 import { readSplat } from "./splat.js";
 import { readSpz } from "./spz.js";
-import { unpacked } from "./zip.js";
+import { inflate } from "./zip.js";
 
-const noDial = (name) => `${name} has no sigma_d, so there is no dial to turn; give it one: clod-adapt ${name} --images SCENE`;
+const noDial = (name) => `${name} has no sigma_d, so it has no dial; add one: clod-adapt ${name} --images SCENE`;
 
-/** {gaussians, about}: what a dropped file holds, and its settings as the page's configuration would give them. */
+/** {gaussians, metadata} of a file, with the metadata that the page's configuration has for a served one. */
 export async function readFile(buffer, name) {
-  const gaussians = usable(await readGaussians(new Uint8Array(buffer), name).catch(said));
-  const dialled = gaussians.sigma !== null;
-  const settings = dialled ? gaussians.settings ?? readSettings(gaussians.comments, gaussians.constants) : null;
+  const gaussians = removeInvalid(await readGaussians(new Uint8Array(buffer), name).catch(rethrow));
+  const hasDial = gaussians.sigmaD !== null;
+  const settings = hasDial ? gaussians.settings ?? readSettings(gaussians.comments, gaussians.constants) : null;
   return {
     gaussians,
-    about: {
-      name, attenuation: settings, screen_filter: gaussians.screenFilter ?? readScreenFilter(gaussians.comments, dialled, gaussians.constants),
+    metadata: {
+      name, attenuation: settings, screen_filter: gaussians.screenFilter ?? readScreenFilter(gaussians.comments, hasDial, gaussians.constants),
       max_sv: settings?.max_sv ?? 1, notes: gaussians.notes,
-      no_dial: dialled ? null : noDial(name),
+      no_dial: hasDial ? null : noDial(name),
       calibration: readCalibration(gaussians.comments, gaussians.count),
     },
   };
 }
 
-/** The readers' own words; what the browser says of bytes that lead nowhere is of no use. */
-function said(error) {
+/** Keeps the readers' errors, and replaces the browser's, such as a RangeError for damaged bytes. */
+function rethrow(error) {
   if (error.constructor === Error) throw error;
-  throw new Error("it is damaged, or too large for this browser; copy or export it again", { cause: error });
+  throw new Error("it is damaged or too large for this browser; copy or export it again", { cause: error });
 }
 
 async function readGaussians(bytes, name) {
@@ -39,9 +39,9 @@ async function readGaussians(bytes, name) {
     const header = readHeader(bytes);
     return isCompressed(header) ? readCompressed(bytes, header) : readPly(bytes, header);
   }
-  if (magic.startsWith("\x1f\x8b")) return readSpz(await unpacked(bytes, "gzip"));
-  if (magic === "NGSP") throw new Error("it is .spz of version 4, which this page does not read; write version 3, or a .ply");
+  if (magic.startsWith("\x1f\x8b")) return readSpz(await inflate(bytes, "gzip"));
+  if (magic === "NGSP") throw new Error("it is .spz of version 4, which this page does not read; export it as version 3 or as .ply");
   if (magic.startsWith("PK")) return readSog(bytes);
-  if (/\.splat$/i.test(name) && bytes.length % 32 === 0) return readSplat(bytes); // which has no mark of its own
-  throw new Error("it is no splat that this page reads (.ply, .compressed.ply, .sog, .spz, .splat)");
+  if (/\.splat$/i.test(name) && bytes.length % 32 === 0) return readSplat(bytes); // .splat has no magic number
+  throw new Error("it is not a splat in a format that this page reads; open a .ply, .compressed.ply, .sog, .spz or .splat file");
 }

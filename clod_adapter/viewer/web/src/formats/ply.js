@@ -1,21 +1,21 @@
-// PLY: the header, and files of plain Gaussians in any order and type of columns, ascii or binary (io/ply.py).
-import { blank } from "./gaussians.js";
+// PLY: the header, and plain Gaussians with columns of any order and type, ascii or binary (io/ply).
+import { allocate } from "./gaussians.js";
 
 const TYPES = {
   char: ["Int8", 1], int8: ["Int8", 1], uchar: ["Uint8", 1], uint8: ["Uint8", 1], short: ["Int16", 2], int16: ["Int16", 2],
   ushort: ["Uint16", 2], uint16: ["Uint16", 2], int: ["Int32", 4], int32: ["Int32", 4], uint: ["Uint32", 4],
   uint32: ["Uint32", 4], float: ["Float32", 4], float32: ["Float32", 4], double: ["Float64", 8], float64: ["Float64", 8],
 };
-const FOREIGN = [
-  [/^f_(offset|anchor_feat)_\d+$/, "this is a Scaffold-GS or Octree-GS file, which holds anchors and no plain Gaussians"],
+const UNSUPPORTED = [
+  [/^f_(offset|anchor_feat)_\d+$/, "this is a Scaffold-GS or Octree-GS file, which stores anchors, not Gaussians; export Gaussians from that program"],
 ];
 const HEADER_LIMIT = 1 << 20;
 
-/** {elements: [{name, count, properties: [{name, type, size, offset}], size}], format, comments, length}. */
+/** The header: {elements: [{name, count, properties: [{name, type, size, offset}], size}], format, comments, length}. */
 export function readHeader(bytes) {
   const text = new TextDecoder("latin1").decode(bytes.subarray(0, HEADER_LIMIT));
   const end = /[\r\n]end_header(\r\n|\n|\r)/.exec(text);
-  if (!end) throw new Error("the PLY header has no end, so the file is truncated; copy or export it again");
+  if (!end) throw new Error("the PLY header has no end_header line, so the file is truncated; copy or export it again");
   const header = { elements: [], comments: [], format: "", length: end.index + end[0].length };
   for (const line of text.slice(0, end.index).split(/\r\n|\n|\r/).slice(1)) {
     const words = line.trim().split(/\s+/), last = header.elements.at(-1);
@@ -37,37 +37,37 @@ export function readHeader(bytes) {
   return header;
 }
 
-/** Plain or extended Gaussians. */
+/** Gaussians with or without sigma_d. */
 export function readPly(bytes, header) {
   const vertex = header.elements.find((element) => element.name === "vertex");
-  if (!vertex) throw new Error("it has no vertex element; give a splat in Inria's 3DGS layout");
+  if (!vertex) throw new Error("it has no vertex element; open a splat in Inria's 3DGS layout");
   const degree = degreeOf(vertex);
   const columns = header.format === "ascii" ? asciiColumns(bytes, header, vertex) : binaryColumns(bytes, header, vertex);
-  const gaussians = { ...blank(vertex.count, degree), comments: header.comments };
-  const put = (target, stride, at, name) => columns(name, (i, value) => { target[stride * i + at] = value; });
-  ["x", "y", "z"].forEach((name, k) => put(gaussians.means, 3, k, name));
-  for (let k = 0; k < 4; k++) put(gaussians.quats, 4, k, `rot_${k}`);
-  for (let k = 0; k < 3; k++) put(gaussians.logScales, 3, k, `scale_${k}`);
-  for (let k = 0; k < 3; k++) put(gaussians.sh0, 3, k, `f_dc_${k}`);
-  put(gaussians.opacityLogits, 1, 0, "opacity");
-  const bands = gaussians.coefficients;
-  for (let k = 0; k < bands; k++) for (let c = 0; c < 3; c++) put(gaussians.shN, 3 * bands, 3 * k + c, `f_rest_${c * bands + k}`);
+  const gaussians = { ...allocate(vertex.count, degree), comments: header.comments };
+  const read = (target, stride, offset, name) => columns(name, (i, value) => { target[stride * i + offset] = value; });
+  ["x", "y", "z"].forEach((name, k) => read(gaussians.means, 3, k, name));
+  for (let k = 0; k < 4; k++) read(gaussians.quats, 4, k, `rot_${k}`);
+  for (let k = 0; k < 3; k++) read(gaussians.logScales, 3, k, `scale_${k}`);
+  for (let k = 0; k < 3; k++) read(gaussians.sh0, 3, k, `f_dc_${k}`);
+  read(gaussians.opacityLogits, 1, 0, "opacity");
+  const terms = gaussians.coefficients; // of a channel
+  for (let k = 0; k < terms; k++) for (let c = 0; c < 3; c++) read(gaussians.shN, 3 * terms, 3 * k + c, `f_rest_${c * terms + k}`);
   if (vertex.properties.some((property) => property.name === "sigma_d")) {
-    gaussians.sigma = new Float32Array(vertex.count);
-    put(gaussians.sigma, 1, 0, "sigma_d");
+    gaussians.sigmaD = new Float32Array(vertex.count);
+    read(gaussians.sigmaD, 1, 0, "sigma_d");
     gaussians.constants = constantsOf(vertex, columns);
   }
   return gaussians;
 }
 
-/** The value of each clod_* column, which is one for all rows (io/ply_constants.py). */
+/** The value of each clod_* column, which is the same in all rows (io/ply/constants.py). */
 function constantsOf({ properties }, columns) {
   const found = {};
   for (const { name } of properties.filter((property) => property.name.startsWith("clod_"))) {
     columns(name, (i, value) => {
-      const narrow = Math.fround(value);
-      if (i && narrow !== found[name]) throw new Error(`property ${name} must be one value for all rows and has several`);
-      found[name] = narrow;
+      const rounded = Math.fround(value);
+      if (i && rounded !== found[name]) throw new Error(`property ${name} must have the same value in all rows; export the file again`);
+      found[name] = rounded;
     });
   }
   return found;
@@ -75,14 +75,14 @@ function constantsOf({ properties }, columns) {
 
 function degreeOf({ properties }) {
   const names = new Set(properties.map((property) => property.name));
-  for (const [pattern, what] of FOREIGN) if ([...names].some((name) => pattern.test(name))) throw new Error(what);
+  for (const [pattern, what] of UNSUPPORTED) if ([...names].some((name) => pattern.test(name))) throw new Error(what);
   if (!names.has("f_dc_0") && !names.has("scale_0")) {
-    throw new Error("f_dc_0 and scale_0 are missing, so this is a mesh or a point cloud; give a trained splat");
+    throw new Error("f_dc_0 and scale_0 are missing, so this is a mesh or a point cloud; open a trained splat");
   }
-  if (names.has("scale_0") && !names.has("scale_2")) throw new Error("scale_2 is missing: this is a 2DGS file of flat disks");
+  if (names.has("scale_0") && !names.has("scale_2")) throw new Error("scale_2 is missing, so this is a 2DGS file of flat disks; open a 3DGS file");
   const rest = [...names].filter((name) => /^f_rest_\d+$/.test(name)).length;
   const degree = [0, 9, 24, 45, 72].indexOf(rest);
-  if (degree < 0) throw new Error(`${rest} f_rest_* properties fit no SH degree; export the file again`);
+  if (degree < 0) throw new Error(`${rest} f_rest_* properties match no SH degree; export the file again`);
   for (const name of ["x", "y", "z", "opacity", "rot_0", "rot_1", "rot_2", "rot_3", "scale_1", "f_dc_1", "f_dc_2"]) {
     if (!names.has(name)) throw new Error(`property ${name} is missing; export the file again in Inria's 3DGS layout`);
   }
@@ -95,10 +95,10 @@ function binaryColumns(bytes, header, vertex) {
     if (element === vertex) break;
     start += element.count * element.size;
   }
-  if (Number.isNaN(start + vertex.size)) throw new Error("it has lists, which splats have not; export the file again");
-  const least = start + vertex.count * vertex.size;
-  if (bytes.length < least) {
-    throw new Error(`it is truncated: its header claims ${least} bytes, and it has ${bytes.length}; copy or export it again`);
+  if (Number.isNaN(start + vertex.size)) throw new Error("it has a list property, which splats do not have; export the file again");
+  const size = start + vertex.count * vertex.size;
+  if (bytes.length < size) {
+    throw new Error(`it is truncated: its header describes ${size} bytes and it has ${bytes.length}; copy or export it again`);
   }
   const little = header.format === "binary_little_endian", view = new DataView(bytes.buffer, bytes.byteOffset + start);
   return (name, each) => {

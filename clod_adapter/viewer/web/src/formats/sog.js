@@ -1,22 +1,22 @@
-// PlayCanvas's .sog: a ZIP of WebP pictures, a pixel a Gaussian, and meta.json. Its rows keep the order they were
-// written in, so sigma_d may come beside it.
-import { blank, logit, smallestThree } from "./gaussians.js";
+// PlayCanvas's .sog: a ZIP of WebP images, one pixel per Gaussian, and meta.json. Reading keeps the order of rows, so
+// that sigma_d can be stored separately.
+import { allocate, logit, smallestThree } from "./gaussians.js";
 import { unzip } from "./zip.js";
 
 export async function readSog(bytes) {
   const files = await unzip(bytes), text = files.get("meta.json");
-  if (!text) throw new Error("it is a ZIP archive without meta.json, so no .sog");
+  if (!text) throw new Error("it is a ZIP archive without meta.json, so it is not a .sog; open a .sog of version 2");
   const meta = JSON.parse(new TextDecoder().decode(text));
-  if (meta.version !== 2) throw new Error("it is a .sog of version 1; this page reads version 2: write it again with splat-transform");
-  const read = picturesReader(files);
+  if (meta.version !== 2) throw new Error("it is a .sog of version 1; this page reads version 2; convert it with splat-transform");
+  const read = imageReader(files);
   const [low, high] = [await read(meta.means.files[0]), await read(meta.means.files[1])];
   const [scales, quats, colors] = [await read(meta.scales.files[0]), await read(meta.quats.files[0]), await read(meta.sh0.files[0])];
-  const degree = meta.shN?.bands ?? 0, gaussians = blank(meta.count, degree);
-  if (low.data.length < 4 * meta.count) throw new Error("its pictures hold fewer Gaussians than meta.json says");
+  const degree = meta.shN?.bands ?? 0, gaussians = allocate(meta.count, degree);
+  if (low.data.length < 4 * meta.count) throw new Error("its images have fewer pixels than meta.json has Gaussians; export it again");
   for (let i = 0; i < meta.count; i++) {
     for (let k = 0; k < 3; k++) {
-      const part = (low.data[4 * i + k] + 256 * high.data[4 * i + k]) / 65535;
-      const value = meta.means.mins[k] * (1 - part) + meta.means.maxs[k] * part;
+      const fraction = (low.data[4 * i + k] + 256 * high.data[4 * i + k]) / 65535;
+      const value = meta.means.mins[k] * (1 - fraction) + meta.means.maxs[k] * fraction;
       gaussians.means[3 * i + k] = Math.sign(value) * Math.expm1(Math.abs(value));
       gaussians.logScales[3 * i + k] = meta.scales.codebook[scales.data[4 * i + k]];
       gaussians.sh0[3 * i + k] = meta.sh0.codebook[colors.data[4 * i + k]];
@@ -25,13 +25,13 @@ export async function readSog(bytes) {
     const three = [0, 1, 2].map((k) => (quats.data[4 * i + k] / 255 - 0.5) * Math.SQRT2);
     gaussians.quats.set(smallestThree(quats.data[4 * i + 3] - 252, three), 4 * i);
   }
-  if (degree) readBands(gaussians, meta.shN, await read(meta.shN.files[0]), await read(meta.shN.files[1]));
-  read.done();
+  if (degree) readSh(gaussians, meta.shN, await read(meta.shN.files[0]), await read(meta.shN.files[1]));
+  read.close();
   return gaussians;
 }
 
-/** Bands come from a palette, 64 entries a row of its picture. */
-function readBands({ count, coefficients, shN }, { codebook }, palette, labels) {
+/** SH of degrees 1 and up, from a palette of 64 entries per image row. */
+function readSh({ count, coefficients, shN }, { codebook }, palette, labels) {
   for (let i = 0; i < count; i++) {
     const label = labels.data[4 * i] + 256 * labels.data[4 * i + 1];
     const start = 4 * ((label >> 6) * palette.width + (label & 63) * coefficients);
@@ -41,24 +41,24 @@ function readBands({ count, coefficients, shN }, { codebook }, palette, labels) 
   }
 }
 
-/** Pixels as stored. Through WebGL, as a 2D canvas would multiply the colours by alpha and round them. */
-function picturesReader(files) {
+/** Reads pixels as stored, by WebGL: a 2D canvas would multiply the colours by alpha and round them. */
+function imageReader(files) {
   const gl = document.createElement("canvas").getContext("webgl2");
   gl.bindFramebuffer(gl.FRAMEBUFFER, gl.createFramebuffer());
   const read = async (name) => {
-    if (!files.has(name)) throw new Error(`${name} is missing in it; copy or export it again`);
-    const picture = await createImageBitmap(new Blob([files.get(name)], { type: "image/webp" }), {
+    if (!files.has(name)) throw new Error(`${name} is missing from it; copy or export it again`);
+    const image = await createImageBitmap(new Blob([files.get(name)], { type: "image/webp" }), {
       premultiplyAlpha: "none", colorSpaceConversion: "none",
     });
-    const { width, height } = picture, data = new Uint8Array(4 * width * height), texture = gl.createTexture();
+    const { width, height } = image, data = new Uint8Array(4 * width * height), texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, picture);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, image);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, data);
     gl.deleteTexture(texture);
-    picture.close();
+    image.close();
     return { width, data };
   };
-  read.done = () => gl.getExtension("WEBGL_lose_context")?.loseContext();
+  read.close = () => gl.getExtension("WEBGL_lose_context")?.loseContext();
   return read;
 }

@@ -1,10 +1,10 @@
-// .splat: 32 bytes a Gaussian, without higher bands (antimatter15's viewer).
-import { SH_C0, blank, logit } from "./gaussians.js";
+// .splat, of antimatter15's viewer: 32 bytes per Gaussian, SH degree 0.
+import { SH_C0, allocate, logit } from "./gaussians.js";
 
 const ROW = 32;
 
 export function readSplat(bytes) {
-  const count = bytes.length / ROW, gaussians = blank(count, 0);
+  const count = bytes.length / ROW, gaussians = allocate(count, 0);
   const view = new DataView(bytes.buffer, bytes.byteOffset);
   for (let i = 0, at = 0; i < count; i++, at += ROW) {
     for (let k = 0; k < 3; k++) {

@@ -1,21 +1,21 @@
-// Niantic's .spz, versions 2 and 3: gzip, then attribute by attribute, then records of vendors, ours with sigma_d
-// among them (io/spz.py). Axes are taken as they are: converters leave those of the PLY.
-import { blank, logit, smallestThree } from "./gaussians.js";
+// Niantic's .spz, versions 2 and 3: gzip of one block per attribute and then vendor records, of which ours has sigma_d
+// (io/formats/spz.py). Axes are not converted: converters keep those of the PLY.
+import { allocate, logit, smallestThree } from "./gaussians.js";
 
 const MAGIC = 0x5053474e, HEADER = 16;
 const COLOR = 0.15; // colours are stored as 0.15 f_dc + 0.5
-const ANTIALIASED = 1, EXTENDED = 2, RECORD = 0x434c0001; // flags: opacities compensated, records; the type of ours
+const ANTIALIASED = 1, EXTENDED = 2, RECORD = 0x434c0001; // flags: compensated opacities, vendor records; type of our record
 
 export function readSpz(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset);
-  if (bytes.length < HEADER || view.getUint32(0, true) !== MAGIC) throw new Error("it is gzip, and no .spz inside");
+  if (bytes.length < HEADER || view.getUint32(0, true) !== MAGIC) throw new Error("it is gzip data but not .spz; open a .spz of version 2 or 3");
   const version = view.getUint32(4, true), count = view.getUint32(8, true), degree = bytes[12], unit = 2 ** -bytes[13];
-  if (version < 2 || version > 3 || degree > 3) throw new Error(`it is .spz of version ${version} and degree ${degree}; this page reads versions 2 and 3, degrees 0 to 3`);
-  const turn = version === 3 ? 4 : 3, bands = 3 * ((degree + 1) ** 2 - 1);
-  const sizes = [9, 1, 3, 3, turn, bands], starts = [HEADER];
+  if (version < 2 || version > 3 || degree > 3) throw new Error(`it is .spz of version ${version} and SH degree ${degree}; export it as version 2 or 3 with degree 3 at most`);
+  const quatSize = version === 3 ? 4 : 3, shSize = 3 * ((degree + 1) ** 2 - 1);
+  const sizes = [9, 1, 3, 3, quatSize, shSize], starts = [HEADER];
   sizes.forEach((size) => starts.push(starts.at(-1) + size * count));
   if (bytes.length < starts[6]) throw new Error("it is truncated; copy or export it again");
-  const gaussians = { ...blank(count, degree), screenFilter: { variance: 0.3, compensate: (bytes[14] & ANTIALIASED) > 0 } };
+  const gaussians = { ...allocate(count, degree), screenFilter: { variance: 0.3, compensate: (bytes[14] & ANTIALIASED) > 0 } };
   for (let i = 0; i < count; i++) {
     for (let k = 0; k < 3; k++) {
       const p = starts[0] + 9 * i + 3 * k, raw = bytes[p] | (bytes[p + 1] << 8) | (bytes[p + 2] << 16);
@@ -24,44 +24,44 @@ export function readSpz(bytes) {
       gaussians.logScales[3 * i + k] = bytes[starts[3] + 3 * i + k] / 16 - 10;
     }
     gaussians.opacityLogits[i] = logit(bytes[starts[1] + i] / 255);
-    const [w, x, y, z] = version === 3 ? packed(view.getUint32(starts[4] + 4 * i, true)) : bytewise(bytes, starts[4] + 3 * i);
+    const [w, x, y, z] = version === 3 ? quatOfBits(view.getUint32(starts[4] + 4 * i, true)) : quatOfBytes(bytes, starts[4] + 3 * i);
     gaussians.quats.set([w, x, y, z], 4 * i);
-    for (let k = 0; k < bands; k++) {
-      gaussians.shN[bands * i + k] = (bytes[starts[5] + bands * i + k] - 128) / 128;
+    for (let k = 0; k < shSize; k++) {
+      gaussians.shN[shSize * i + k] = (bytes[starts[5] + shSize * i + k] - 128) / 128;
     }
   }
-  return bytes[14] & EXTENDED ? withRecord(gaussians, bytes, view, starts[6]) : gaussians;
+  return bytes[14] & EXTENDED ? readRecord(gaussians, bytes, view, starts[6]) : gaussians;
 }
 
-/** Our record: the length of a description in JSON, the description, sigma_d as halves. */
-function withRecord(gaussians, bytes, view, at) {
+/** Adds the data of our record: the length of a JSON text, the text, sigma_d as float16. */
+function readRecord(gaussians, bytes, view, at) {
   while (at + 8 <= bytes.length) {
     const type = view.getUint32(at, true), length = view.getUint32(at + 4, true), start = at + 12;
     at += 8 + length;
     if (type !== RECORD || at > bytes.length) continue;
     const end = start + view.getUint32(start - 4, true);
-    const card = JSON.parse(new TextDecoder().decode(bytes.subarray(start, end)));
-    if (card.screen_filter) gaussians.screenFilter = card.screen_filter;
-    if (at - end !== 2 * gaussians.count || !card.attenuation) continue;
-    const sigma = Float32Array.from({ length: gaussians.count }, (_, i) => whole(view.getUint16(end + 2 * i, true)));
-    return { ...gaussians, sigma, settings: card.attenuation };
+    const metadata = JSON.parse(new TextDecoder().decode(bytes.subarray(start, end)));
+    if (metadata.screen_filter) gaussians.screenFilter = metadata.screen_filter;
+    if (at - end !== 2 * gaussians.count || !metadata.attenuation) continue;
+    const sigmaD = Float32Array.from({ length: gaussians.count }, (_, i) => floatOfHalf(view.getUint16(end + 2 * i, true)));
+    return { ...gaussians, sigmaD, settings: metadata.attenuation };
   }
   return gaussians;
 }
 
-/** A finite half as a number. */
-function whole(bits) {
-  const power = (bits >> 10) & 31, part = (bits & 1023) / 1024;
-  return (bits & 0x8000 ? -1 : 1) * (power ? 2 ** (power - 15) * (1 + part) : 2 ** -14 * part);
+/** The value of a finite float16. */
+function floatOfHalf(bits) {
+  const exponent = (bits >> 10) & 31, fraction = (bits & 1023) / 1024;
+  return (bits & 0x8000 ? -1 : 1) * (exponent ? 2 ** (exponent - 15) * (1 + fraction) : 2 ** -14 * fraction);
 }
 
-function bytewise(bytes, at) {
+function quatOfBytes(bytes, at) {
   const [x, y, z] = [0, 1, 2].map((k) => bytes[at + k] / 127.5 - 1);
   return [Math.sqrt(Math.max(0, 1 - x * x - y * y - z * z)), x, y, z];
 }
 
-/** Sign and nine bits each for the three smaller of x, y, z, w; two bits say which is not there. */
-function packed(bits) {
+/** Two bits for the index of the largest of x, y, z, w; a sign and nine bits for each of the others. */
+function quatOfBits(bits) {
   const three = [20, 10, 0].map((shift) => {
     const value = bits >>> shift, size = ((value & 511) / 511) * Math.SQRT1_2;
     return (value >>> 9) & 1 ? -size : size;

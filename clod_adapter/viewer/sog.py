@@ -1,4 +1,4 @@
-"""Packs a splat for a standalone page by splat-transform: SOG, a fifth of the PLY's size, and sigma_d separately."""
+"""Packs a splat for a standalone page with splat-transform: SOG, a fifth of the PLY's size, and sigma_d separately."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ BITS = 11  # stored fraction bits of sigma_d; its relative error is at most 2^-1
 
 
 @dataclass(frozen=True)
-class Packed:
+class PackedSplat:
     """A packed splat.
 
     Attributes:
         sog: the .sog file.
-        sigma: gzip of ``[N]`` little-endian float32 sigma_d in the row order of ``sog``; None without a dial.
+        sigma_d: gzip of ``[N]`` little-endian float32 sigma_d in the row order of ``sog``; None without a dial.
     """
 
     sog: bytes
-    sigma: bytes | None
+    sigma_d: bytes | None
 
 
-def pack(
+def pack_sog(
     payload: Payload, tool: SplatTransform, folder: Path, progress: Callable[[float], None] | None = None
-) -> Packed:
+) -> PackedSplat:
     """Packs a splat.
 
     SOG has no field for sigma_d and sorts the rows in Morton order. So a PLY, which keeps all columns, is sorted first;
@@ -48,17 +48,19 @@ def pack(
     """
     count = len(payload.gaussians)
     timeout = time_limit(count)
-    with TemporaryDirectory(dir=folder, prefix=".tmp-") as made:
-        rows, ordered, sog = (Path(made) / name for name in ("rows.ply", "ordered.ply", "packed.sog"))
+    with TemporaryDirectory(dir=folder, prefix=".tmp-") as temporary:
+        rows, ordered, sog = (Path(temporary) / name for name in ("rows.ply", "ordered.ply", "packed.sog"))
         with open(rows, "wb") as file:
             file.writelines(payload.blocks())
         tool.run(rows, ordered, "-m", timeout=timeout, progress=progress)
         tool.run(ordered, sog, timeout=timeout, progress=progress)
         found = load(ordered, activated="none").gaussians
         if len(found) != count:
-            raise ClodError(f"splat-transform {tool.version} has kept {len(found)} of {count} Gaussians")
-        sigma = None if found.sigma_d is None else gzip.compress(_rounded(found.sigma_d.numpy()).tobytes())
-        return Packed(sog.read_bytes(), sigma)
+            raise ClodError(
+                f"splat-transform {tool.version} has written {len(found)} of {count} Gaussians; try another version"
+            )
+        sigma_d = None if found.sigma_d is None else gzip.compress(_rounded(found.sigma_d.numpy()).tobytes())
+        return PackedSplat(sog.read_bytes(), sigma_d)
 
 
 def _rounded(values: np.ndarray) -> np.ndarray:

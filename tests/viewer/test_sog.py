@@ -1,4 +1,4 @@
-"""SOG and sigma_d row by row: with a stand-in for splat-transform, and with it where it is installed."""
+"""The order of sigma_d in a packed splat, and packed pages; the latter need splat-transform."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.splat_transform import SplatTransform
 from clod_adapter.render import render
-from clod_adapter.viewer.packed import pack
 from clod_adapter.viewer.page import write_viewer_page
 from clod_adapter.viewer.payload import Payload
+from clod_adapter.viewer.sog import pack_sog
 from shown import SIZE, Shown, assert_same
 
 
 def dialled(degree: int) -> Gaussians:
-    """Some Gaussians are too transparent for the 8 bits that SOG has for an opacity."""
+    """1000 Gaussians, some too transparent for the 8 bits of an opacity in SOG."""
     model = scenes.dialled(1000, degree, 4, scene_distance=1.0, reference_distance=3.0)
     logits, sigma_d = model.opacity_logits.clone(), model.sigma_d.clone()
     logits[::20] = -12.0
@@ -34,7 +34,7 @@ def dialled(degree: int) -> Gaussians:
 
 
 class Reversing:
-    """Stands in for splat-transform: its Morton order is the rows from last to first."""
+    """A stub of splat-transform that reverses the rows, and removes the last ``lost``."""
 
     version = "0"
 
@@ -53,20 +53,20 @@ class Reversing:
 
 def test_sigma_d_follows_the_rows(tmp_path: Path) -> None:
     gaussians = dialled(0)
-    packed = pack(Payload("a.ply", gaussians), Reversing(), tmp_path)  # type: ignore[arg-type]
-    sigma = np.frombuffer(gzip.decompress(packed.sigma or b""), "<f4")
+    packed = pack_sog(Payload("a.ply", gaussians), Reversing(), tmp_path)  # type: ignore[arg-type]
+    sigma = np.frombuffer(gzip.decompress(packed.sigma_d or b""), "<f4")
     wanted = gaussians.sigma_d.numpy()[::-1]
     assert packed.sog == b"packed" and list(tmp_path.iterdir()) == []
     assert (np.abs(sigma - wanted) <= 2.0**-12 * np.abs(wanted)).all()
-    with pytest.raises(ClodError, match="has kept 998 of 1000 Gaussians"):
-        pack(Payload("a.ply", gaussians), Reversing(2), tmp_path)  # type: ignore[arg-type]
+    with pytest.raises(ClodError, match="has written 998 of 1000 Gaussians"):
+        pack_sog(Payload("a.ply", gaussians), Reversing(2), tmp_path)  # type: ignore[arg-type]
     plain = gaussians.replace(sigma_d=None, attenuation=None)
-    assert pack(Payload("a.ply", plain), Reversing(), tmp_path).sigma is None  # type: ignore[arg-type]
+    assert pack_sog(Payload("a.ply", plain), Reversing(), tmp_path).sigma_d is None  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("degree", [0, 1])
 def test_a_packed_page_shows_its_contents(chromium: Any, tmp_path: Path, degree: int) -> None:
-    """Against our render of what splat-transform itself reads from the page's .sog."""
+    """Against our rendering of the page's .sog as splat-transform reads it."""
     try:
         tool = SplatTransform.find()
     except ClodError as error:
@@ -74,29 +74,29 @@ def test_a_packed_page_shows_its_contents(chromium: Any, tmp_path: Path, degree:
     gaussians, camera = dialled(degree), scenes.camera(320, 240)
     clod_adapter.save(tmp_path / "model.ply", gaussians)
     write_viewer_page(tmp_path / "page.html", clod_adapter.load(tmp_path / "model.ply"), tool=tool)
-    held = unpacked(tmp_path / "page.html", tool)
-    assert len(held) == 1000
+    packed = unpacked(tmp_path / "page.html", tool)
+    assert len(packed) == 1000
     with chromium.new_context(viewport=SIZE, offline=True) as context:
         shown = Shown(context.new_page()).ready((tmp_path / "page.html").as_uri())
         shown.camera(camera)
         for s in (1.0, 3.0):
             shown.run("clod.setDial(given)", s)
-            assert_same(shown, render(held, camera, s), tmp_path / "shown.png")
+            assert_same(shown, render(packed, camera, s), tmp_path / "shown.png")
             kept = int(render(gaussians, camera, s).kept.sum())
             assert abs(shown.counts()["kept"] - kept) <= 10  # opacities have 8 bits
         assert shown.errors == []
 
 
 def unpacked(page: Path, tool: SplatTransform) -> Gaussians:
-    """What a packed page holds."""
+    """The Gaussians of a packed page."""
 
-    def held(name: str) -> bytes:
+    def data(name: str) -> bytes:
         (text,) = re.findall(rf'id="{name}">([^<]*)<', page.read_text(encoding="utf-8"))
         return base64.b64decode(text, validate=True)
 
-    sog, ply = page.with_name("held.sog"), page.with_name("held.ply")
-    sog.write_bytes(held("clod-model"))
+    sog, ply = page.with_name("packed.sog"), page.with_name("packed.ply")
+    sog.write_bytes(data("clod-model"))
     tool.run(sog, ply, timeout=60)
-    sigma_d = torch.from_numpy(np.frombuffer(gzip.decompress(held("clod-model-sigma")), "<f4").copy())
+    sigma_d = torch.from_numpy(np.frombuffer(gzip.decompress(data("clod-model-sigma")), "<f4").copy())
     found = clod_adapter.load(ply, activated="none").gaussians
     return found.replace(sigma_d=sigma_d, attenuation=dialled(0).attenuation)

@@ -1,0 +1,123 @@
+"""The gradients of a step: views, dial values, trained rows, screen filter and batch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from clod_adapter.adapter import attach
+from clod_adapter.attenuation import attenuate
+from clod_adapter.cameras import Scene, camera_extent
+from clod_adapter.config import FILTERS
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization import importance
+from clod_adapter.initialization.importance import initialize
+from clod_adapter.losses import photometric_loss
+from clod_adapter.progress import Progress
+from clod_adapter.render import render, splat
+from clod_adapter.training import objective
+from clod_adapter.training.loop import TrainingState, adapt
+from clod_adapter.training.objective import TrainableSubset
+from clod_adapter.training.trainer import Trainer
+from clod_adapter.training.view_sampler import ViewSampler
+from runs import config_of, states_of
+from scenes import assert_equal, gaussians
+
+Pair = tuple[Gaussians, Scene]
+
+
+@pytest.mark.parametrize(("rate", "evaluated"), [(0.0, 0), (1e-3, 3)])
+def test_screen_filter_is_used_and_empty_harmonics_are_skipped(
+    captured: Pair, monkeypatch: pytest.MonkeyPatch, rate: float, evaluated: int
+) -> None:
+    """Empty harmonics are evaluated if they are trained; the result contains them in either case."""
+    mip = FILTERS["mip"]
+    base = captured[0].replace(shN=torch.zeros_like(captured[0].shN), screen_filter=mip)
+    seen, shown = set(), set()
+    for module in (objective, importance):
+        monkeypatch.setattr(
+            module, "splat", lambda g, *rest: seen.add((g.shN.shape[1], g.screen_filter)) or splat(g, *rest)
+        )
+
+    def look(now: Progress) -> None:
+        if now.gaussians:
+            shown.add(now.gaussians().screen_filter)
+
+    found = adapt(base, captured[1], config_of(iters=4, lr_shN=rate), look).gaussians
+    assert seen == {(evaluated, mip)} and shown == {found.screen_filter} == {mip}
+    assert found.shN.shape == base.shN.shape and found.shN.any() == (rate > 0)
+
+
+def test_one_step_moves_kept_rows_by_their_rates(captured: Pair) -> None:
+    """At s = 1 on one view, the loss is the render's, and culled rows do not move."""
+    base, scene = captured
+    alone = Scene(scene.train[:2], ())
+    config = config_of(iters=1, sampling="log", full_share=1.0, reg_weight=0.0, seed=3)
+    before, seen = initialize(base, alone.train, config), []
+    after = adapt(before, alone, config, seen.append).gaussians
+    losses = [photometric_loss(render(before, view.camera).image, view.image).item() for view in alone.train]
+    view = alone.train[min(range(2), key=lambda k: abs(losses[k] - seen[0].loss))]
+    assert seen[0].loss == pytest.approx(min(losses, key=lambda loss: abs(loss - seen[0].loss)), rel=1e-5)
+    kept = render(before, view.camera).kept
+    rates = {
+        "means": config.lr_means * camera_extent([view.camera for view in alone.train]), "quats": config.lr_quats,
+        "log_scales": config.lr_scales, "sh0": config.lr_sh0,
+    }  # fmt: skip
+    for name, rate in rates.items():
+        old, new = getattr(before, name), getattr(after, name)
+        assert torch.equal(old[~kept], new[~kept]), name
+        moved = (new - old)[kept].abs().flatten(1).amax(1)
+        assert (moved > 0).sum() > 20 and moved.max() == pytest.approx(rate, rel=1e-2), name
+    moved = (after.sigma_d / before.sigma_d).log().abs()
+    assert moved.max() == pytest.approx(config.lr_sigma, rel=1e-3) and (moved[~kept] < 1e-5).all()
+    assert photometric_loss(render(after, view.camera).image, view.image) < seen[0].loss
+
+
+def test_batch_gradient_is_the_sum_over_views(captured: Pair) -> None:
+    """The first step is longer by the square root of the batch size."""
+    base, scene = captured
+    begun, views = initialize(base, scene.train, config_of()), scene.train[:2]
+    config = config_of(batch=2, sampling="pair")
+    run = Trainer(begun, views, config)
+    draws = [(view, [1.0, 2.0]) for view in views]
+    one, two = (run.objective.gradient_sum(run.parameters, [draw]) for draw in draws)
+    both = run.objective.gradient_sum(run.parameters, draws)
+    assert both.loss == one.loss + two.loss and torch.equal(both.kept, one.kept | two.kept)
+    for name in run.stepped:
+        assert torch.equal(both.gradients[name], one.gradients[name] + two.gradients[name]), name
+    before = run.parameters["sh0"].clone()
+    run.step(0.0)
+    longest = (run.parameters["sh0"] - before).abs().max()
+    assert longest == pytest.approx(2**0.5 * config.lr_sh0, rel=1e-2) and run.sampler.order == []
+
+
+def test_only_the_first_rows_are_trained(captured: Pair) -> None:
+    """Other rows are drawn and returned unchanged; resuming from a state gives the same bits."""
+    base, scene = captured
+    begun, few = initialize(base, scene.train, config_of()), len(base) // 3
+    states: dict[int, TrainingState] = {}
+    config = config_of(iters=20, average=0.5)
+    found = adapt(begun, scene, config, states_of({5}, states), subset=TrainableSubset(few)).gaussians
+    for name, value in found.tensors().items():
+        rounding = 1e-6 if name == "sigma_d" else 0.0  # its logarithm is what training holds
+        torch.testing.assert_close(value[few:], begun.tensors()[name][few:], rtol=rounding, atol=0.0)
+        assert not torch.equal(value[:few], begun.tensors()[name][:few]), name
+    assert_equal(adapt(begun, scene, config, None, states[5], subset=TrainableSubset(few)).gaussians, found)
+    without = adapt(begun.select(torch.arange(few)), scene, config, subset=TrainableSubset(few)).gaussians
+    assert not torch.equal(without.sh0, found.sh0[:few])
+
+
+@pytest.mark.parametrize("sampling", ["pair", "log"])
+def test_steps_use_the_sampled_views_and_dial_values(
+    captured: Pair, monkeypatch: pytest.MonkeyPatch, sampling: str
+) -> None:
+    taken: list[Any] = []
+    monkeypatch.setattr(objective, "attenuate", lambda *a: taken.append(a[3]) or attenuate(*a))
+    monkeypatch.setattr(objective, "photometric_loss", lambda *a: taken.append(id(a[1])) or photometric_loss(*a))
+    config = config_of(iters=14, max_sv=4.0, sampling=sampling)
+    adapt(attach(gaussians(5, 0, 0), torch.ones(5)), captured[1], config)
+    sampler = ViewSampler(captured[1].train, config)
+    draws = [sampler.draw() for _ in range(14)]
+    assert sorted(map(str, taken)) == sorted(str(x) for v, dials in draws for s in dials for x in (s, id(v.image)))

@@ -1,0 +1,118 @@
+"""States of training: resumed runs end with the same bits, and other states are refused."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from clod_adapter.adapter import ATTRIBUTES, attach
+from clod_adapter.cameras import Scene
+from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.importance import initialize
+from clod_adapter.progress import Phase, Progress
+from clod_adapter.training.loop import TrainingState, adapt
+from clod_adapter.training.objective import TrainableSubset
+from runs import config_of, states_of
+from scenes import assert_equal
+
+Pair = tuple[Gaussians, Scene]
+
+
+RATES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+RESUMED = {
+    "ours": {},
+    "paper": vars(AdaptConfig.paper(iters=12, max_sv=4.0)),
+    "linear": {"parameter": "linear", "lr_shN": 0.0},
+    "mean of all": {"average": 1.0, "max_sv": 1.0},
+    "sigma_d alone": {f"lr_{name}": 0.0 for name in RATES} | {"average": 0.0},
+}
+
+
+@pytest.mark.parametrize(
+    ("form", "kind"),
+    [("ours", "fresh"), ("paper", "with a dial"), ("linear", "empty"), ("mean of all", "with a dial"),
+     ("sigma_d alone", "fresh")],
+)  # fmt: skip
+def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str, kind: str) -> None:
+    """From states within and at the end of a round of views, and before, during and after averaging."""
+    base, scene = captured
+    if kind == "empty":
+        base = base.replace(shN=torch.zeros_like(base.shN))
+    if kind == "with a dial":
+        base = attach(base, torch.full((len(base),), 1.5), AttenuationConfig(scene_distance=4.0, max_sv=3.0))
+    config, states = config_of(**{"iters": 12, **RESUMED[form]}), dict[int, TrainingState]()
+    whole = adapt(base, scene, config, states_of({1, 6, 10, 11, 12}, states))
+    if form == "sigma_d alone":
+        assert all(torch.equal(getattr(whole.gaussians, name), getattr(base, name)) for name in ATTRIBUTES)
+    assert ((whole.gaussians.sigma_d / initialize(base, scene.train, config).sigma_d - 1).abs() > 1e-3).any()
+    seen: list[Progress] = []
+    for steps, state in states.items():
+        again = adapt(base, scene, config, seen.append, copy.deepcopy(state))
+        assert_equal(again.gaussians, whole.gaussians)
+        assert (again.steps, again.interrupted, again.start_seconds) == (12, False, whole.start_seconds), steps
+        assert again.seconds > state.seconds
+    assert {p.phase for p in seen} == {Phase.TRAINING} and [p.done for p in seen[:11]] == list(range(2, 13))
+    later: dict[int, TrainingState] = {}
+    adapt(base, scene, config, states_of({11}, later), copy.deepcopy(states[6]))
+    assert all(later[11].tensors[name].equal(value) for name, value in states[11].tensors.items())
+    unlike = {"tensors": {}, "seconds": 0.0}
+    assert replace(later[11], **unlike) == replace(states[11], **unlike)
+
+
+@pytest.mark.parametrize("distance", [1.0, 4.0])
+def test_untrained_rows_keep_their_units_when_resumed(captured: Pair, distance: float) -> None:
+    """Their sigma_d is not in the state, but the base's, in its unit."""
+    base, scene = captured
+    settings = AttenuationConfig(scene_distance=distance, reference_distance=4.0)
+    base = attach(base, torch.linspace(0.3, 3, len(base)) * 4 / distance, settings)
+    part, states = TrainableSubset(len(base) // 2), dict[int, TrainingState]()
+    whole = adapt(base, scene, config_of(iters=4), states_of({2}, states), subset=part)
+    again = adapt(base, scene, config_of(iters=4), None, states[2], subset=part)
+    assert_equal(again.gaussians, whole.gaussians)
+    rest = slice(len(base) // 2, None)
+    torch.testing.assert_close(whole.gaussians.sigma_d[rest], base.sigma_d[rest] * distance)
+
+
+def test_a_state_holds_trained_parameters_only(captured: Pair) -> None:
+    base, states = captured[0], dict[int, TrainingState]()
+    still = {"lr_shN": 0.0, "lr_means": 0.0, "average": 0.5}
+    adapt(*captured, config_of(iters=4, **still), states_of({1, 3}, states))
+    changing = {"quats", "log_scales", "opacity_logits", "sh0", "log_sigma"}
+    for step, kinds in ((1, {"parameter", "first", "second", "steps"}), (3, {"mean"})):
+        assert {name.split(".")[1] for name in states[step].tensors} == changing
+        assert kinds <= {name.split(".")[0] for name in states[step].tensors}
+    assert "mean.quats" not in states[1].tensors and len(states[1].tensors["first.sh0"]) == len(base)
+
+
+def test_a_state_of_another_run_is_refused(captured: Pair) -> None:
+    base, scene = captured
+    config, states = config_of(iters=2), dict[int, TrainingState]()
+    adapt(base, scene, config, states_of({1}, states))
+    state = states[1]
+    few, fewer = base.select(torch.arange(len(base)) < 9), Scene(scene.train[:1], ())
+    for other in ((few, scene, config), (base, fewer, config), (base, scene, config_of(iters=2, parameter="linear"))):
+        with pytest.raises(ClodError, match="of other Gaussians, views or settings"):
+            adapt(*other, None, state)
+    damaged = dict(state.tensors) | {"steps.sh0": state.tensors["steps.sh0"] - 2}
+    for impossible in (
+        {"tensors": damaged}, {"steps": 0}, {"averaged": -1}, {"averaged": 9}, {"seconds": math.nan}, {"seconds": -1.0},
+    ):  # fmt: skip
+        with pytest.raises(ClodError, match="impossible counts|impossible values of steps|of other Gaussians"):
+            adapt(base, scene, config, None, replace(state, **impossible))
+    for name, value in (
+        ("parameter.means", math.nan), ("parameter.opacity_logits", math.inf), ("first.sh0", math.inf),
+        ("second.sh0", -1.0), ("second.means", math.nan), ("parameter.log_sigma", 1e30),
+    ):  # fmt: skip
+        tensors = {n: t.clone() for n, t in state.tensors.items()}
+        tensors[name][7] = value
+        with pytest.raises(ClodError, match="the training state.*; start over"):
+            adapt(base, scene, config, None, replace(state, tensors=tensors))
+    for broken in ({}, {**state.random, "state": {"state": -1, "inc": "x"}}):
+        with pytest.raises(ClodError, match="random state is damaged"):
+            adapt(base, scene, config, None, replace(state, random=broken))
