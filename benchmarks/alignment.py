@@ -1,7 +1,5 @@
 """The alignment check before training: which inputs it stops, which frame it guesses, and its CPU seconds.
 
-    python benchmarks/alignment.py [SCENE ...]
-
 The inputs are checkpoints of the shared captures with their own photographs, with cameras transformed as other tools
 transform them, with another scene's checkpoint and with another exposure; and checkpoints in the normalised frames of
 gsplat's and nerfstudio's trainers. Each case adds a row to ``results/alignment.jsonl``.
@@ -14,22 +12,21 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 
+import clod_adapter as clod
+from clod_adapter.alignment.check import DOUBTFUL, check_alignment
+from clod_adapter.alignment.search import guess_frame
+from clod_adapter.io.scene.colmap import load_points
+from common import append, arguments, capture, checkpoint, photographs
+
 import numpy as np
 import pycolmap
 import torch
-from common import append, arguments, capture, checkpoint, photographs
 from torch import Tensor
-
-from clod_adapter.alignment.check import DOUBTFUL, check_alignment
-from clod_adapter.alignment.search import guess_frame
-from clod_adapter.cameras import View
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.scene.colmap import load_points
 
 SCENES = ("plush_half", "ci_banana", "bonsai146")
 EYE = torch.eye(3, dtype=torch.float64)
 BACKWARD = torch.diag(torch.tensor([1.0, -1, -1, 1]))
-Case = tuple[str, Gaussians, list[View]]
+Case = tuple[str, clod.Gaussians, list[clod.View]]
 
 
 def main() -> None:
@@ -46,7 +43,7 @@ def main() -> None:
             append("alignment.jsonl", {"scene": name, "case": case, **row(gaussians, seen, points)})
 
 
-def row(gaussians: Gaussians, views: list[View], points: Tensor) -> dict[str, object]:
+def row(gaussians: clod.Gaussians, views: list[clod.View], points: Tensor) -> dict[str, object]:
     """CPU seconds of all threads, which other work on the machine affects less."""
     began = time.process_time()
     found = check_alignment(gaussians, views)
@@ -61,7 +58,7 @@ def row(gaussians: Gaussians, views: list[View], points: Tensor) -> dict[str, ob
     }  # fmt: skip
 
 
-def cases(base: Gaussians, views: list[View], points: Tensor) -> Iterator[Case]:
+def cases(base: clod.Gaussians, views: list[clod.View], points: Tensor) -> Iterator[Case]:
     yield "as it is", base, views
     yield "darker by a stop", base, [exposed(view, 0.5) for view in views]
     sparse = base.select(torch.arange(0, len(base), 2))
@@ -91,15 +88,15 @@ def cases(base: Gaussians, views: list[View], points: Tensor) -> Iterator[Case]:
     yield "turned by 60 degrees", moved(base, tilt), views
 
 
-def exposed(view: View, gain: float) -> View:
-    return View(view.camera, (view.image * gain).round().to(torch.uint8))
+def exposed(view: clod.View, gain: float) -> clod.View:
+    return clod.View(view.camera, (view.image * gain).round().to(torch.uint8))
 
 
-def posed(view: View, viewmat: Tensor) -> View:
-    return View(replace(view.camera, viewmat=viewmat.to(view.camera.viewmat)), view.image)
+def posed(view: clod.View, viewmat: Tensor) -> clod.View:
+    return clod.View(replace(view.camera, viewmat=viewmat.to(view.camera.viewmat)), view.image)
 
 
-def in_world(view: View, scale: float, rotation: Tensor, offset: Tensor) -> View:
+def in_world(view: clod.View, scale: float, rotation: Tensor, offset: Tensor) -> clod.View:
     """The view in a world where ``x' = scale rotation x + offset``."""
     viewmat = view.camera.viewmat.double()
     turned = viewmat[:3, :3] @ rotation.T
@@ -108,7 +105,7 @@ def in_world(view: View, scale: float, rotation: Tensor, offset: Tensor) -> View
     return posed(view, out)
 
 
-def moved(base: Gaussians, transform: np.ndarray) -> Gaussians:
+def moved(base: clod.Gaussians, transform: np.ndarray) -> clod.Gaussians:
     """The Gaussians after a similarity, without harmonics, which would have to be turned too."""
     scale = np.linalg.det(transform[:3, :3]) ** (1 / 3)
     x, y, z, w = pycolmap.Rotation3d(transform[:3, :3] / scale).quat

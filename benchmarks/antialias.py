@@ -1,12 +1,9 @@
 """Quality of checkpoints drawn with the screen-space filter of their training and with others.
 
-    python benchmarks/antialias.py [SCENE ...]
-
-No capture has a checkpoint that was trained antialiased. Substitutes are each scene's checkpoint with its attributes
-tuned on the training photographs with gsplat's antialiasing ("on") and with Mip-Splatting's filter ("mip"). Each
-checkpoint adds a row with the held-out PSNR of each filter and the choice of ``compare_filters``. One substitute of
-each scene is also adapted with the right filter and with the classic one, to photographs and to its own renders. Rows
-go to ``results/antialias.jsonl``.
+No capture has a checkpoint that was trained antialiased. Substitutes are each scene's checkpoint, tuned on the training
+photographs with gsplat's antialiasing ("on") and with Mip-Splatting's filter ("mip"). Each checkpoint adds a row to
+``results/antialias.jsonl``: the held-out PSNR with each filter, and the choice of ``compare_filters``. One substitute
+of each scene is also adapted with the right filter and with the classic one, to photographs and to its own renders.
 """
 
 from __future__ import annotations
@@ -15,15 +12,11 @@ import time
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-from common import append, arguments, capture, checkpoint, photographs
-from tuning import Tuning, tune
-
+import clod_adapter as clod
 from clod_adapter.alignment.screen_filter import compare_filters
 from clod_adapter.config import CLASSIC, FILTERS
-from clod_adapter.evaluation.evaluate import evaluate
+from common import append, arguments, capture, checkpoint, photographs
+from tuning import Tuning, tune
 
 FILE = "antialias.jsonl"
 CLASSIC_FILES = {
@@ -65,17 +58,15 @@ def substitute(name: str, scene: clod.Scene, trained: str) -> clod.Gaussians:
 def row(gaussians: clod.Gaussians, scene: clod.Scene) -> dict[str, Any]:
     """Held-out PSNR with each filter, and the choice of ``compare_filters`` with its CPU seconds."""
     psnr = {
-        name: round(evaluate(gaussians.replace(screen_filter=each), scene.test, [1.0])[0].psnr, 2)
+        name: round(clod.evaluate(gaussians.replace(screen_filter=each), scene.test, [1.0])[0].psnr, 2)
         for name, each in FILTERS.items()
     }
     began = time.process_time()
     found = compare_filters(gaussians, [*scene.test, *scene.train])
     seconds = time.process_time() - began
     compared = {name: round(value, 2) for name, value in found.psnr.items()}
-    return {
-        "count": len(gaussians), "psnr": psnr, "chosen": found.chosen, "compared": compared,
-        "compare_cpu_s": round(seconds, 2),
-    }  # fmt: skip
+    chosen = {"chosen": found.chosen, "compared": compared, "compare_cpu_s": round(seconds, 2)}
+    return {"count": len(gaussians), "psnr": psnr, **chosen}
 
 
 def adapted(gaussians: clod.Gaussians, scene: clod.Scene, drawn: str, teacher: str) -> dict[str, Any]:
@@ -85,7 +76,7 @@ def adapted(gaussians: clod.Gaussians, scene: clod.Scene, drawn: str, teacher: s
     result = clod.adapt(start, own, clod.AdaptConfig(max_sv=5, iters=ADAPTED_STEPS))
     rows = [
         {"s": r.virtual_scale, "psnr": round(r.psnr, 2), "kept": round(r.kept)}
-        for r in evaluate(result.gaussians, scene.test, DIALS)
+        for r in clod.evaluate(result.gaussians, scene.test, DIALS)
     ]
     return {"adapted_with": drawn, "teacher": teacher, "iters": ADAPTED_STEPS, "max_sv": 5, "seed": 0, "rows": rows}
 

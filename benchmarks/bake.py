@@ -1,13 +1,11 @@
 """PSNR of baked plain files against the dial, at equal counts.
 
     clod-adapt ci_banana/pretrained.ply --images ci_banana --max-sv 5 --iters 400 -o clod.ply
-    python benchmarks/bake.py clod.ply ci_banana
-    python benchmarks/bake.py --table                      # the rows as a Markdown table
+    python benchmarks/bake.py clod.ply ci_banana           # --table: the rows as a Markdown table
 
-The model is an adapted file of the capture. The count at a dial value is the dial's mean over the held-out views. Files
-of that count, or of the nearest count that a dial value has, are baked for:
+The count at a dial value is the dial's mean over the held-out views. Files of the nearest count are baked for:
 
-- ``d' = 1``: one distance for all Gaussians, with the opacities of the dial value, as earlier versions baked;
+- ``d' = 1``: one distance for all Gaussians, with the opacities of the dial value;
 - ``images``: all training cameras, as ``clod-adapt export --images`` does;
 - ``stored``: the viewpoints that adapting stores in the file;
 - ``placed``: placed cameras.
@@ -20,9 +18,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-from common import append, arguments, photographs, stored, table
-
 import clod_adapter as clod
 from clod_adapter.attenuation import attenuate
 from clod_adapter.calibration import Viewpoint
@@ -31,13 +26,17 @@ from clod_adapter.cli.shared.budgets import VIEWPOINTS
 from clod_adapter.distances import viewpoint_of
 from clod_adapter.extinction import extinction_scale
 from clod_adapter.initialization.importance import spread
+from common import append, arguments, photographs, print_rows
+
+import torch
 
 FILE = "bake.jsonl"
+COLUMNS = ("scene", "label", "virtual_scale", "count", "psnr")
 DIALS = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=print_table)
+    parser = arguments(__doc__, table=lambda: print_rows(FILE, *COLUMNS))
     parser.add_argument("model", help="an adapted PLY")
     parser.add_argument("scene", help="its capture")
     parser.add_argument("--label", default="", help="how the model was adapted")
@@ -53,9 +52,6 @@ def main() -> None:
         "placed": clod.place_cameras(adapted, views=PLACED),
     }
 
-    def psnr(gaussians: clod.Gaussians) -> float:
-        return clod.evaluate(gaussians, views.test, [1.0])[0].psnr
-
     rows = []
     for s in [s for s in DIALS if s <= config.max_sv]:
         dial = clod.evaluate(adapted, views.test, [s])[0]
@@ -68,7 +64,7 @@ def main() -> None:
             files[name] = clod.bake(adapted, at, cameras=places)
         files["at s"] = clod.bake(adapted, s, cameras=training)
         for name, gaussians in files.items():
-            counts[name], found[name] = len(gaussians), psnr(gaussians)
+            counts[name], found[name] = len(gaussians), clod.evaluate(gaussians, views.test, [1.0])[0].psnr
         rows.append({"virtual_scale": s, "count": counts, "psnr": found})
     append(FILE, {
         "benchmark": "bake", "model": Path(args.model).name, "label": args.label, "scene": args.scene,
@@ -82,23 +78,10 @@ def at_one_distance(gaussians: clod.Gaussians, count: int) -> clod.Gaussians:
     assert gaussians.sigma_d is not None and gaussians.attenuation is not None
     logits, sigma, config = gaussians.opacity_logits, gaussians.sigma_d, gaussians.attenuation
     ones = torch.ones_like(logits)
-    leaving = extinction_scale(logits, sigma, ones, config).sort(descending=True).values
-    at = attenuate(logits, sigma, ones, max(float(leaving[count]), 1.0), config)
+    scales = extinction_scale(logits, sigma, ones, config).sort(descending=True).values
+    at = attenuate(logits, sigma, ones, max(float(scales[count]), 1.0), config)
     opacities = at.drawn.clamp(1e-9, 1 - 1e-7)
     return clod.detach(gaussians.replace(opacity_logits=opacities.logit())).select(at.keep)
-
-
-def print_table() -> None:
-    """PSNR on the held-out views: the dial's, and the difference of each file; with its count where that is another."""
-    for row in stored(FILE):
-        print(f"\n{row['scene']}, {row['gaussians']:,} Gaussians, {row['label']}")
-        names, lines = [name for name in row["rows"][0]["psnr"] if name != "dial"], []
-        for point in row["rows"]:
-            dial, counts = point["psnr"]["dial"], point["count"]
-            others = [f" @ {counts[name]:,}" if abs(counts[name] - counts["dial"]) > 1 else "" for name in names]
-            cells = [f"{point['psnr'][name] - dial:+.2f}{other}" for name, other in zip(names, others, strict=True)]
-            lines.append([f"{point['virtual_scale']:g}", f"{counts['dial']:,.0f}", f"{dial:.2f}", *cells])
-        print(table(["s", "count", "dial", *names], lines))
 
 
 if __name__ == "__main__":

@@ -19,19 +19,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
+import clod_adapter as clod
 from city import write_city
-from common import COMMAND, Process, append, arguments, checkpoint, photographs
-
 from clod_adapter.blocks.divide import Division, divide
 from clod_adapter.blocks.targets import target_image
 from clod_adapter.blocks.train import adapt_block, merge
-from clod_adapter.cameras import View
-from clod_adapter.config import AdaptConfig
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import usable_views
-from clod_adapter.render import render
-from clod_adapter.training.loop import adapt
+from common import COMMAND, Process, append, arguments, checkpoint, photographs
+
+import torch
 
 DIALS = (1.0, 3.0, 5.0)
 SOLE = 0.9
@@ -43,12 +39,12 @@ def db(error: float) -> float:
 
 
 @torch.no_grad()
-def borders(division: Division, views: tuple[View, ...]) -> list[torch.Tensor]:
+def borders(division: Division, views: tuple[clod.View, ...]) -> list[torch.Tensor]:
     """For each view ``[H, W]`` bool: no block has SOLE of the pixel. By ``target`` of a white photograph on black."""
     black = division.initial.replace(sh0=torch.full_like(division.initial.sh0, -10), shN=division.initial.shN[:, :0])
     found = []
     for view in views:
-        white, largest = View(view.camera, torch.full_like(view.image, 255)), torch.zeros(view.image.shape[:2])
+        white, largest = clod.View(view.camera, torch.full_like(view.image, 255)), torch.zeros(view.image.shape[:2])
         for block in range(division.count):
             rows = division.rows(block)
             ordered = black.select(torch.cat([rows, (division.block != block).nonzero()[:, 0]]))
@@ -59,7 +55,7 @@ def borders(division: Division, views: tuple[View, ...]) -> list[torch.Tensor]:
 
 @torch.no_grad()
 def compare(
-    some: Gaussians, whole: Gaussians, views: tuple[View, ...], masks: list[torch.Tensor]
+    some: clod.Gaussians, whole: clod.Gaussians, views: tuple[clod.View, ...], masks: list[torch.Tensor]
 ) -> list[dict[str, Any]]:
     """A row a dial value; PSNR as the mean over views, of border pixels over all of them together."""
     rows = []
@@ -67,12 +63,11 @@ def compare(
         ours, theirs, between, kept = [], [], [], []
         border = torch.zeros(4, dtype=torch.float64)
         for view, mask in zip(views, masks, strict=True):
-            one, other = render(some, view.camera, s), render(whole, view.camera, s)
+            one, other = clod.render(some, view.camera, s), clod.render(whole, view.camera, s)
             a, b, photograph = one.image.clamp(0, 1), other.image.clamp(0, 1), view.image / 255
             errors = [(x - y).square().mean(2) for x, y in ((a, photograph), (b, photograph), (a, b))]
-            ours.append(db(float(errors[0].mean())))
-            theirs.append(db(float(errors[1].mean())))
-            between.append(db(float(errors[2].mean())))
+            for values, error in zip((ours, theirs, between), errors, strict=True):
+                values.append(db(float(error.mean())))
             kept.append((float(one.kept.float().mean()), float(other.kept.float().mean())))
             border += torch.tensor([*(float(e[mask].double().sum()) for e in errors), float(mask.sum())])
         difference = [a - b for a, b in zip(ours, theirs, strict=True)]
@@ -90,11 +85,11 @@ def compare(
 def seams(args: Namespace) -> None:
     for name in args.scenes:
         base, scene = checkpoint(name), photographs(name)
-        config, views = AdaptConfig(iters=args.iters), usable_views(base.gaussians, scene.train)
+        config, views = clod.AdaptConfig(iters=args.iters), usable_views(base.gaussians, scene.train)
         began = time.perf_counter()
-        whole = adapt(base.gaussians, scene, config).gaussians
+        whole = clod.adapt(base.gaussians, scene, config).gaussians
         seconds = time.perf_counter() - began
-        again = adapt(base.gaussians, scene, replace(config, seed=1)).gaussians
+        again = clod.adapt(base.gaussians, scene, replace(config, seed=1)).gaussians
         for count in args.blocks:
             division = divide(base.gaussians, views, config, count)
             masks = borders(division, scene.test)
@@ -134,10 +129,9 @@ def main() -> None:
     one = commands.add_parser("seams")
     one.add_argument("--scenes", nargs="+", default=["plush_half", "bonsai146"])
     one.add_argument("--blocks", type=int, nargs="+", default=[4, 8])
-    one.add_argument("--iters", type=int, default=AdaptConfig().iters)
+    one.add_argument("--iters", type=int, default=clod.AdaptConfig().iters)
     one.set_defaults(run=seams)
-    other = commands.add_parser("memory")
-    other.set_defaults(run=memory)
+    commands.add_parser("memory").set_defaults(run=memory)
     args = parser.parse_args()
     args.run(args)
 

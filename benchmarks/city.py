@@ -1,7 +1,5 @@
 """A synthetic city of any number of Gaussians: streets, houses, trees, cars, fields and a sky.
 
-    python benchmarks/city.py OUT --count 1000000 --images 24 --size 800 500   # OUT/city.ply and a COLMAP scene
-
 It replaces captures that are too large for a repository. More Gaussians make a larger city at the same density of about
 5 per square metre of surface. Thin Gaussians cover the surfaces, a fifth of them as a coarser layer; colours vary from
 one Gaussian to the next, and all SH degrees are used.
@@ -15,19 +13,16 @@ import math
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-import torch
+import clod_adapter as clod
 from city_points import FIELD, cover, facing, higher_degrees, shade, surround
 from city_surfaces import PITCH, blocks, build, extent, joined
-from common import arguments
-from PIL import Image
-
-from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.checkpoint import save
 from clod_adapter.io.scene.colmap import write_model
-from clod_adapter.render import render
+
+import numpy as np
+import torch
+from PIL import Image
 
 Where = Literal["near", "far", "mixed"]
 FAR = (1500, 0.02, 30_000)  # Gaussians of fields and sky: at least, of all, at most
@@ -36,12 +31,7 @@ BLUR = 0.1  # of a checkpoint: its Gaussians are larger than the truth by this, 
 
 
 def city(count: int, *, seed: int = 0, sh_degree: int = 3) -> Gaussians:
-    """``count`` Gaussians of a city, the same ones for the same arguments.
-
-    Args:
-        count: at least 1000.
-        sh_degree: 0 to 4.
-    """
+    """``count`` Gaussians of a city, at least 1000, with SH of degree 0 to 4; the same ones for the same arguments."""
     if count < 1000:
         raise SystemExit(f"a city needs at least 1000 Gaussians, not {count}")
     random = np.random.default_rng(seed)
@@ -72,7 +62,7 @@ def surrounding(count: int) -> int:
 
 def city_cameras(
     n: int, width: int, height: int, *, where: Where = "mixed", count: int, seed: int = 0
-) -> list[Camera]:  # fmt: skip
+) -> list[clod.Camera]:
     """``n`` cameras in a city of ``count`` Gaussians, named ``view_0000.png`` on.
 
     Args:
@@ -115,7 +105,7 @@ def in_air(count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndar
     return eye, np.array([aim[0], -5.0, aim[1]])
 
 
-def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: str) -> Camera:
+def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: str) -> clod.Camera:
     """An upright camera with a field of view of 65 degrees across the width."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross([0.0, 1.0, 0.0], forward)
@@ -125,7 +115,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: 
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
     focal = width / 2 / math.tan(math.radians(65) / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Camera(torch.from_numpy(viewmat).float(), torch.from_numpy(K).float(), width, height, name)
+    return clod.Camera(torch.from_numpy(viewmat).float(), torch.from_numpy(K).float(), width, height, name)
 
 
 def perturb(truth: Gaussians, seed: int = 0) -> Gaussians:
@@ -143,8 +133,7 @@ def perturb(truth: Gaussians, seed: int = 0) -> Gaussians:
 def write_city(folder: str | Path, count: int, images: int, width: int, height: int, *, where: Where = "mixed") -> None:
     """Writes a perturbed checkpoint ``folder/city.ply`` and photographs of the truth as a COLMAP scene.
 
-    Args:
-        folder: does not exist or is empty; it appears when everything in it is complete.
+    The folder does not exist or is empty; it appears when everything in it is complete.
     """
     truth = city(count)
     cameras = city_cameras(images, width, height, where=where, count=count)
@@ -152,23 +141,8 @@ def write_city(folder: str | Path, count: int, images: int, width: int, height: 
         (part / "images").mkdir(parents=True)
         for camera in cameras:
             with torch.no_grad():
-                Image.fromarray(render(truth, camera).pixels.numpy()).save(part / "images" / camera.name)
+                Image.fromarray(clod.render(truth, camera).pixels.numpy()).save(part / "images" / camera.name)
         some = np.linspace(0, count - surrounding(count), 2000, endpoint=False).astype(np.int64)
         colors = ((0.5 + SH_C0 * truth.sh0[some, 0].numpy()).clip(0, 1) * 255).astype(np.uint8)
         write_model(part, cameras, [camera.name for camera in cameras], truth.means[some].numpy(), colors)
-        save(part / "city.ply", perturb(truth))
-
-
-def main() -> None:
-    parser = arguments(__doc__)
-    parser.add_argument("out", help="a folder that does not exist or is empty")
-    parser.add_argument("--count", type=int, default=100_000, help="Gaussians (default: %(default)s)")
-    parser.add_argument("--images", type=int, default=24, help="photographs (default: %(default)s)")
-    parser.add_argument("--size", type=int, nargs=2, default=(640, 400), metavar=("W", "H"), help="of a photograph")
-    parser.add_argument("--where", choices=("near", "far", "mixed"), default="mixed", help="cameras (default: mixed)")
-    args = parser.parse_args()
-    write_city(args.out, args.count, args.images, *args.size, where=args.where)
-
-
-if __name__ == "__main__":
-    main()
+        clod.save(part / "city.ply", perturb(truth))

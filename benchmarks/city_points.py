@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 
 import city_surfaces as surface
-import numpy as np
-import torch
 from city_surfaces import FIELD, PITCH, SKY, TREE, Surfaces, extent
-
 from clod_adapter.config import SH_COUNTS
 from clod_adapter.rasterizers.reference import sh_basis
+
+import numpy as np
+import torch
 
 # Gaussians per unit of area, relative to each other.
 DENSITY = {surface.ASPHALT: 0.5, surface.PAVING: 0.8, surface.GRASS: 0.6, surface.FACADE: 1.0, surface.ROOF: 0.6,
@@ -51,9 +51,7 @@ def cover(surfaces: Surfaces, count: int, random: np.random.Generator) -> Points
     position[tree] = surfaces.origin[row[tree]] + depth * normal[tree] * surfaces.u[row[tree]]
     color[tree] *= 0.55 + 0.45 * (depth - 0.65) / 0.35 + random.normal(0, 0.15, (len(tree), 1))
     kinds = kind.astype(np.int8)
-    return Points(
-        position.astype(np.float32), normal.astype(np.float32), spacing.astype(np.float32), kinds, color
-    )  # fmt: skip
+    return Points(position.astype(np.float32), normal.astype(np.float32), spacing.astype(np.float32), kinds, color)
 
 
 def on_sphere(spot: np.ndarray) -> np.ndarray:

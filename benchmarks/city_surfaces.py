@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -22,21 +22,14 @@ PAINTS = np.array([[0.75, 0.1, 0.1], [0.9, 0.9, 0.9], [0.12, 0.13, 0.15], [0.15,
 
 @dataclass(frozen=True)
 class Surfaces:
-    """R rectangles, or ellipsoids where the kind is TREE.
+    """R rectangles, or ellipsoids where the kind is TREE."""
 
-    Attributes:
-        origin, u, v: ``[R, 3]`` a corner and its two edges; of a tree the centre and, in u, the radii.
-        normal: ``[R, 3]`` outward, unit length.
-        kind: ``[R]`` ASPHALT to TREE.
-        color: ``[R, 3]`` sRGB in [0, 1].
-    """
-
-    origin: np.ndarray
-    u: np.ndarray
-    v: np.ndarray
-    normal: np.ndarray
-    kind: np.ndarray
-    color: np.ndarray
+    origin: np.ndarray  # [R, 3] a corner; of a tree the centre
+    u: np.ndarray  # [R, 3] an edge; of a tree the radii
+    v: np.ndarray  # [R, 3] the other edge
+    normal: np.ndarray  # [R, 3] outward, unit length
+    kind: np.ndarray  # [R] ASPHALT to TREE
+    color: np.ndarray  # [R, 3] sRGB in [0, 1]
 
     def areas(self) -> np.ndarray:
         """``[R]`` square metres; of a tree about that of its crown."""
@@ -124,9 +117,7 @@ def outward(surfaces: Surfaces, middle: np.ndarray) -> Surfaces:
     away[:, [0, 2]] -= middle
     away[:, 1] = -1e-3
     sign = np.where((away * surfaces.normal).sum(1, keepdims=True) < 0, -1.0, 1.0)
-    return Surfaces(
-        surfaces.origin, surfaces.u, surfaces.v, sign * surfaces.normal, surfaces.kind, surfaces.color
-    )  # fmt: skip
+    return replace(surfaces, normal=sign * surfaces.normal)
 
 
 def streets(corner: np.ndarray) -> list[Surfaces]:
@@ -164,10 +155,9 @@ def build_houses(
     zero = np.zeros(count)
     parts = box(low, house, zero, tall, (FACADE, ROOF), color, above)
     # Stair heads and plant rooms on the roofs, and a narrower storey or two on the tall ones.
-    size = house * np.where(tall > 22, 0.7, 0.25)[:, None]
+    size, top = house * np.where(tall > 22, 0.7, 0.25)[:, None], tall + np.where(tall > 22, 7, 2.5)
     on = low + (house - size) * random.random((count, 2))
-    kinds = (FACADE, ROOF)
-    return (low, house), parts + box(on, size, tall, tall + np.where(tall > 22, 7, 2.5), kinds, 0.9 * color, above)
+    return (low, house), parts + box(on, size, tall, top, (FACADE, ROOF), 0.9 * color, above)
 
 
 def park_cars(corner: np.ndarray, random: np.random.Generator) -> list[Surfaces]:

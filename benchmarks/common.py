@@ -11,17 +11,15 @@ import sys
 import tempfile
 import time
 import xml.etree.ElementTree as xml
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from threading import Thread
 from typing import Any
 
-import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-import torch
-
+import clod_adapter as clod
 from clod_adapter.cli.shared.report import jsonable, machine
+
+import torch
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, CACHE = ROOT / "benchmarks" / "results", ROOT / "benchmarks" / "cache"
@@ -105,6 +103,22 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[object]], numbers_from: 
     return "\n".join([lines[0], f"|{'|'.join(marks)}|", *lines[1:]])
 
 
+def flat(row: Row, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Numbers and texts of nested dictionaries, by dotted key."""
+    for key, value in row.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        elif not isinstance(value, list):
+            yield prefix + key, f"{value:.6g}" if isinstance(value, float) else "" if value is None else value
+
+
+def print_rows(file: str, *columns: str) -> None:
+    """Prints the stored rows as a Markdown table, a line for each of a row's ``rows``; columns are keys or parents."""
+    rows = [dict(flat({**row, **each})) for row in stored(file) for each in row.get("rows", [{}])]
+    found = {key: None for name in columns for row in rows for key in row if f"{key}.".startswith(f"{name}.")}
+    print(table(list(found), [[row.get(key, "") for key in found] for row in rows]))
+
+
 def falling(values: Any) -> Any:
     """``[N]`` rows by falling value, equal ones in their order."""
     return values.argsort(descending=True, stable=True)
@@ -129,17 +143,17 @@ class Process:
 
     Attributes:
         out, lines: stdout; the lines of stderr.
-        moments, cpu: wall and CPU seconds up to the first line on stderr that matches each pattern of ``said``.
+        moments, cpu: wall and CPU seconds up to the first line on stderr that matches each pattern of ``messages``.
         memory: (seconds, resident bytes, CPU seconds) every 20 ms.
         seconds, cpu_seconds, peak_bytes: of the whole process, after ``finish``.
     """
 
     def __init__(
-        self, words: Iterable[object], said: Mapping[str, str] | None = None, *, until: str = "",
+        self, words: Iterable[object], messages: Mapping[str, str] | None = None, *, until: str = "",
         environment: Mapping[str, str] | None = None, code: int = 0,
     ) -> None:  # fmt: skip
         """Runs to the end, or with ``until`` to a line on stdout that has this text: ``line``. ``code``: exit code."""
-        self.words, self.said, self.code = [str(word) for word in words], said or {}, code
+        self.words, self.messages, self.code = [str(word) for word in words], messages or {}, code
         self.began = time.perf_counter()
         self.process = subprocess.Popen(
             self.words, text=True, cwd=tempfile.gettempdir(), stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -165,7 +179,7 @@ class Process:
         assert self.process.stderr is not None
         for line in self.process.stderr:
             self.lines.append(line.rstrip())
-            for name, pattern in self.said.items():
+            for name, pattern in self.messages.items():
                 if name not in self.moments and re.search(pattern, line):
                     self.moments[name], self.cpu[name] = self.now(), self._used()[1]
 
@@ -196,5 +210,5 @@ class Process:
             sys.exit("\n".join([f"exit code {self.process.returncode}: {' '.join(self.words)}", *self.lines]))
 
     def cost(self) -> Row:
-        seconds = {"seconds": round(self.seconds, 3), "cpu_seconds": round(self.cpu_seconds, 3)}
-        return {**seconds, "peak_bytes": self.peak_bytes}
+        times = {"seconds": round(self.seconds, 3), "cpu_seconds": round(self.cpu_seconds, 3)}
+        return times | {"peak_bytes": self.peak_bytes}

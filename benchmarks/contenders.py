@@ -11,20 +11,23 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
-import torch
 import workloads
-from torch import Tensor
+from clod_adapter.rasterizers import cpu
 from workloads import Workload
 
-from clod_adapter.rasterizers import cpu
+import torch
+from torch import Tensor
 
 THREADS = 2
 SHARES = (1.0, 0.5, 0.25, 0.1)
 FEW = slice(100)  # rows that libraries are loaded and warmed with
 Jobs = dict[str, Callable[[], Any]]
+JOBS: Jobs = {}  # of a worker's process
 
 
 class Worker:
@@ -33,41 +36,30 @@ class Worker:
     The yardstick's library, for example, makes its process flush denormal numbers. A dead worker returns None.
     """
 
-    def __init__(self, title: str, make: Callable[..., Jobs], *arguments: Any) -> None:
+    def __init__(self, make: Callable[..., Jobs], *arguments: Any) -> None:
         spawn = multiprocessing.get_context("spawn")
-        self.title = title
-        self._pipe, theirs = spawn.Pipe()
-        self._process = spawn.Process(target=_serve, args=(theirs, make, arguments), daemon=True)
-        self._process.start()
-        theirs.close()
+        self.pool = ProcessPoolExecutor(1, mp_context=spawn, initializer=_start, initargs=(make, *arguments))
 
     def __call__(self, job: str) -> Any:
         try:
-            self._pipe.send(job)
-            return self._pipe.recv()
-        except (EOFError, OSError):
+            return self.pool.submit(_run, job).result()
+        except BrokenProcessPool:
             return None
 
-    def close(self) -> None:
-        with contextlib.suppress(OSError):
-            self._pipe.send(None)
-        self._process.join()
-        if self._process.exitcode:
-            print(f"{self.title} ended with exit code {self._process.exitcode}", file=sys.stderr)
 
-
-def _serve(pipe: Any, make: Callable[..., Jobs], arguments: tuple[Any, ...]) -> None:
-    """A worker's process: runs jobs by name until there is none."""
+def _start(make: Callable[..., Jobs], *arguments: Any) -> None:
     torch.set_num_threads(THREADS)
-    jobs = make(*arguments)
+    JOBS.update(make(*arguments))
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)  # memory that is free already must not hide that of the steps
     before = _memory("VmRSS")
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak starts anew
-    jobs["memory"] = lambda: before and round(_memory("VmHWM") - before)
-    while (job := pipe.recv()) is not None:
-        pipe.send(jobs[job]())
+    JOBS["memory"] = lambda: before and round(_memory("VmHWM") - before)
+
+
+def _run(job: str) -> Any:
+    return JOBS[job]()
 
 
 def _memory(field: str) -> float:

@@ -1,11 +1,10 @@
 """Two levels of detail with a hard switch against one file with its dial: a picture and the measured jump.
 
     clod-adapt demo                                      # makes demo/gallery.ply and demo/capture
-    python benchmarks/discrete.py
+    python benchmarks/discrete.py                        # docs/images/discrete_vs_continuous.png
 
-docs/images/discrete_vs_continuous.png shows a held-out view in four strips from least to most detail, for two levels
-and for one file; below it PSNR and the change from frame to frame over a sweep. The two levels are the file at both
-ends of its dial, so that they differ in the switch alone. Adds a row to ``results/discrete.jsonl``.
+The two levels are the file at both ends of its dial, so that only the switch differs. Adds a row to
+``results/discrete.jsonl``.
 """
 
 from __future__ import annotations
@@ -14,17 +13,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from common import ROOT, append, arguments
-from torch import Tensor
-
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.evaluation import popping
 from clod_adapter.evaluation.popping import Popping
 from clod_adapter.metrics import psnr
 from clod_adapter.report.style import BLUE, ORANGE, QUIET, new_figure, save_figure, tidy
+from common import ROOT, append, arguments
+
+import numpy as np
+import torch
+from torch import Tensor
 
 PICTURE = ROOT / "docs" / "images" / "discrete_vs_continuous.png"
 STRIPS, FRAMES = 4, 120

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-import numpy as np
-import torch
-
 import exact
 from exact import DTYPES, Array
+
+import numpy as np
+import torch
 
 NAIVE = 1e3  # units of eps from which on the paper's formula has failed
 REASONS = ("nan", "infinite", "zero", "inaccurate")

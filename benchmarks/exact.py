@@ -11,14 +11,14 @@ import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+from clod_adapter.attenuation import SIGMA_MAX
+
 import mpmath
 import numpy as np
 import torch
 from mpmath import mpf
 from scipy.special import lambertw
 from torch import Tensor
-
-from clod_adapter.attenuation import SIGMA_MAX
 
 mpmath.mp.dps = 50
 Wide = np.longdouble

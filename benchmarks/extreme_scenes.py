@@ -7,23 +7,23 @@ import math
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import clod_adapter as clod
+from clod_adapter.cameras import Scene, View, in_its_unit
+from clod_adapter.gaussians import SH_C0
+from clod_adapter.io.scene.colmap import write_model
+from common import capture
 
 import numpy as np
 import pycolmap
 import torch
-from common import capture
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
-import clod_adapter as clod
-from clod_adapter.cameras import Camera, Scene, View, in_its_unit
-from clod_adapter.gaussians import SH_C0
-from clod_adapter.io.scene.colmap import write_model
-
 CAPTURE = "ci_banana"
-RATIO = math.log(1e6)
 
 
 @dataclass(frozen=True)
@@ -38,24 +38,22 @@ class Case:
 Change = Callable[[clod.Gaussians, Scene], Case]
 
 
-def similar(scale: float) -> Change:
+def similar(base: clod.Gaussians, scene: Scene, scale: float) -> Case:
     """The same scene in other units."""
 
-    def change(base: clod.Gaussians, scene: Scene) -> Case:
-        larger = base.replace(means=base.means * scale, log_scales=base.log_scales + math.log(scale))
-        return Case(larger, of_cameras(scene, lambda camera: moved(camera, camera.position * scale)))
+    def resized(view: View) -> View:
+        viewmat = view.camera.viewmat.clone()
+        viewmat[:3, 3] = -viewmat[:3, :3] @ (view.camera.position * scale)
+        return View(dataclasses.replace(view.camera, viewmat=viewmat), view.image)
 
-    return change
+    larger = base.replace(means=base.means * scale, log_scales=base.log_scales + math.log(scale))
+    return Case(larger, in_its_unit(of_views(scene, resized)))
 
 
-def one_view_in(scale: float) -> Change:
-    """A single training image, and the same in other units: one camera does not define the size of a scene."""
-
-    def change(base: clod.Gaussians, scene: Scene) -> Case:
-        case = similar(scale)(base, scene)
-        return dataclasses.replace(case, scene=Scene(case.scene.train[:1], case.scene.test))
-
-    return change
+def one_view(base: clod.Gaussians, scene: Scene, scale: float) -> Case:
+    """A single training image, in other units: one camera does not define the size of a scene."""
+    case = similar(base, scene, scale)
+    return dataclasses.replace(case, scene=Scene(case.scene.train[:1], case.scene.test))
 
 
 def floater(base: clod.Gaussians, scene: Scene) -> Case:
@@ -76,10 +74,6 @@ def only_one(base: clod.Gaussians, scene: Scene) -> Case:
         ),
         scene,
     )  # fmt: skip
-
-
-def all_in_one_place(base: clod.Gaussians, scene: Scene) -> Case:
-    return Case(base.replace(means=base.means.median(0).values.expand(len(base), 3).clone()), scene)
 
 
 def behind(base: clod.Gaussians, scene: Scene) -> Case:
@@ -105,60 +99,39 @@ def inside(base: clod.Gaussians, scene: Scene) -> Case:
     return Case(base.replace(means=means, log_scales=scales, opacity_logits=logits), scene)
 
 
-def opacity(value: float) -> Change:
-    logit = math.log(value / (1 - value))
-    return lambda base, scene: Case(base.replace(opacity_logits=torch.full_like(base.opacity_logits, logit)), scene)
+def opacity(base: clod.Gaussians, scene: Scene, value: float) -> Case:
+    return Case(base.replace(opacity_logits=torch.full_like(base.opacity_logits, math.log(value / (1 - value)))), scene)
 
 
-def flat(axes: int) -> Change:
+def flat(base: clod.Gaussians, scene: Scene, axes: int) -> Case:
     """The smallest ``axes`` axes a millionth of the largest: 1 for discs, 2 for needles."""
-
-    def change(base: clod.Gaussians, scene: Scene) -> Case:
-        order = base.log_scales.argsort(1)[:, :axes]
-        shrunk = base.log_scales.amax(1, keepdim=True) - RATIO
-        return Case(base.replace(log_scales=base.log_scales.scatter(1, order, shrunk.expand(-1, axes))), scene)
-
-    return change
+    order = base.log_scales.argsort(1)[:, :axes]
+    shrunk = base.log_scales.amax(1, keepdim=True) - math.log(1e6)
+    return Case(base.replace(log_scales=base.log_scales.scatter(1, order, shrunk.expand(-1, axes))), scene)
 
 
 def black(base: clod.Gaussians, scene: Scene) -> Case:
-    def dark(views: tuple[View, ...]) -> tuple[View, ...]:
-        return tuple(View(view.camera, torch.zeros_like(view.image)) for view in views)
-
-    return Case(base, Scene(dark(scene.train), dark(scene.test)))
+    return Case(base, of_views(scene, lambda view: View(view.camera, torch.zeros_like(view.image))))
 
 
-def twice(base: clod.Gaussians, scene: Scene) -> Case:
-    return Case(base, Scene((*scene.train, scene.train[0]), scene.test))
-
-
-def with_(**settings: Any) -> Change:
-    return lambda base, scene: Case(base, scene, settings)
-
-
-def georeferenced(kind: str) -> Change:
+def georeferenced(base: clod.Gaussians, scene: Scene, kind: str) -> Case:
     """Coordinates a million units off, as file of ``kind`` f4 or f8 and COLMAP model; read back by our readers."""
-
-    def change(base: clod.Gaussians, scene: Scene) -> Case:
-        offset = np.array([437_000.0, 4_481_000.0, 1_000_000.0])
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            model = pycolmap.Reconstruction(str(capture(CAPTURE) / "sparse" / "0"))
-            model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), offset))
-            (folder / "sparse" / "0").mkdir(parents=True)
-            model.write_binary(str(folder / "sparse" / "0"))
-            (folder / "images").symlink_to((capture(CAPTURE) / "images").resolve())
-            clod.save(folder / "plain.ply", base)
-            rows = PlyData.read(str(folder / "plain.ply"))["vertex"].data
-            types = [(n, kind if n in ("x", "y", "z") else rows.dtype[n]) for n in rows.dtype.names]
-            shifted = rows.astype(types)
-            for axis, by in zip("xyz", offset, strict=True):
-                shifted[axis] = rows[axis].astype("f8") + by
-            PlyData([PlyElement.describe(shifted, "vertex")]).write(str(folder / "utm.ply"))
-            checkpoint = clod.load(folder / "utm.ply")
-            return Case(checkpoint.gaussians, clod.load_scene(folder, origin=checkpoint.origin))
-
-    return change
+    offset = np.array([437_000.0, 4_481_000.0, 1_000_000.0])
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        model = pycolmap.Reconstruction(str(capture(CAPTURE) / "sparse" / "0"))
+        model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), offset))
+        (folder / "sparse" / "0").mkdir(parents=True)
+        model.write_binary(str(folder / "sparse" / "0"))
+        (folder / "images").symlink_to((capture(CAPTURE) / "images").resolve())
+        clod.save(folder / "plain.ply", base)
+        rows = PlyData.read(str(folder / "plain.ply"))["vertex"].data
+        shifted = rows.astype([(n, kind if n in ("x", "y", "z") else rows.dtype[n]) for n in rows.dtype.names])
+        for axis, by in zip("xyz", offset, strict=True):
+            shifted[axis] = rows[axis].astype("f8") + by
+        PlyData([PlyElement.describe(shifted, "vertex")]).write(str(folder / "utm.ply"))
+        checkpoint = clod.load(folder / "utm.ply")
+        return Case(checkpoint.gaussians, clod.load_scene(folder, origin=checkpoint.origin))
 
 
 def with_alpha(base: clod.Gaussians, scene: Scene) -> Case:
@@ -166,26 +139,19 @@ def with_alpha(base: clod.Gaussians, scene: Scene) -> Case:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "images").mkdir()
-        for view in (*scene.train, *scene.test):
+        views = sorted((*scene.train, *scene.test), key=lambda view: view.camera.name)
+        for view in views:
             y, x = np.mgrid[-1 : 1 : view.camera.height * 1j, -1 : 1 : view.camera.width * 1j]
             alpha = np.clip(4 * (1 - np.hypot(x, y)), 0, 1) * 255
             rgba = np.dstack([view.image.numpy(), alpha.astype(np.uint8)])
             Image.fromarray(rgba).save(folder / "images" / f"{view.camera.name}.png")
-        views = sorted((*scene.train, *scene.test), key=lambda view: view.camera.name)
         cameras = [view.camera for view in views]
         write_model(folder, cameras, [f"{camera.name}.png" for camera in cameras])
         return Case(base, clod.load_scene(folder))
 
 
-def of_cameras(scene: Scene, change: Callable[[Camera], Camera]) -> Scene:
-    train, test = (tuple(View(change(v.camera), v.image) for v in views) for views in (scene.train, scene.test))
-    return in_its_unit(Scene(train, test))
-
-
-def moved(camera: Camera, position: torch.Tensor) -> Camera:
-    viewmat = camera.viewmat.clone()
-    viewmat[:3, 3] = -viewmat[:3, :3] @ position
-    return dataclasses.replace(camera, viewmat=viewmat)
+def of_views(scene: Scene, change: Callable[[View], View]) -> Scene:
+    return Scene(tuple(map(change, scene.train)), tuple(map(change, scene.test)))
 
 
 def size_of(base: clod.Gaussians) -> float:
@@ -195,27 +161,29 @@ def size_of(base: clod.Gaussians) -> float:
 
 
 CASES: dict[str, Change] = {
-    "as it is": with_(),
-    "offset by 1e6, stored as double": georeferenced("f8"),
-    "offset by 1e6, stored as float": georeferenced("f4"),
-    "scaled by 1e-4": similar(1e-4),
-    "scaled by 1e4": similar(1e4),
+    "as it is": Case,
+    "offset by 1e6, stored as double": partial(georeferenced, kind="f8"),
+    "offset by 1e6, stored as float": partial(georeferenced, kind="f4"),
+    "scaled by 1e-4": partial(similar, scale=1e-4),
+    "scaled by 1e4": partial(similar, scale=1e4),
     "one floater at 1e6 times the size": floater,
     "one Gaussian in all": only_one,
-    "all Gaussians in one place": all_in_one_place,
+    "all Gaussians in one place": lambda base, scene: Case(
+        base.replace(means=base.means.median(0).values.repeat(len(base), 1)), scene
+    ),
     "all behind a third of the cameras": behind,
     "cameras inside Gaussians": inside,
-    "opacities all 0.99": opacity(0.99),
-    "opacities all 0.01": opacity(0.01),
-    "discs, axes 1e6 : 1": flat(1),
-    "needles, axes 1e6 : 1": flat(2),
-    "a single training image": one_view_in(1.0),
-    "a single training image, scaled by 1e-4": one_view_in(1e-4),
-    "a single training image, scaled by 1e4": one_view_in(1e4),
+    "opacities all 0.99": partial(opacity, value=0.99),
+    "opacities all 0.01": partial(opacity, value=0.01),
+    "discs, axes 1e6 : 1": partial(flat, axes=1),
+    "needles, axes 1e6 : 1": partial(flat, axes=2),
+    "a single training image": partial(one_view, scale=1.0),
+    "a single training image, scaled by 1e-4": partial(one_view, scale=1e-4),
+    "a single training image, scaled by 1e4": partial(one_view, scale=1e4),
     "black images": black,
     "images with alpha": with_alpha,
-    "two cameras at one place": twice,
-    "max_sv 1": with_(max_sv=1.0),
-    "max_sv 100, tau 0.004": with_(max_sv=100.0, tau=0.004),
-    "max_sv 100, tau 0.004, 1,500 steps": with_(max_sv=100.0, tau=0.004, iters=1500),
+    "two cameras at one place": lambda base, scene: Case(base, Scene((*scene.train, scene.train[0]), scene.test)),
+    "max_sv 1": partial(Case, settings={"max_sv": 1.0}),
+    "max_sv 100, tau 0.004": partial(Case, settings={"max_sv": 100.0, "tau": 0.004}),
+    "max_sv 100, tau 0.004, 1,500 steps": partial(Case, settings={"max_sv": 100.0, "tau": 0.004, "iters": 1500}),
 }

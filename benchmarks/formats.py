@@ -20,20 +20,31 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
-import torch
-from common import append, arguments, checkpoint, photographs, stored, table
-
 import clod_adapter as clod
 from clod_adapter.initialization.importance import initialize, usable_views
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, read_model, write
+from common import append, arguments, checkpoint, photographs, print_rows
+
+import torch
 
 FILE = "formats.jsonl"
+COLUMNS = (
+    "scene",
+    "suffix",
+    "bytes_per_gaussian",
+    "write_seconds",
+    "read_seconds",
+    "sigma_error",
+    "decay_error",
+    "s1.psnr",
+    "s5.psnr",
+)
 DIALS = (1.0, 5.0)
 REPEATS = 5
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=print_table)
+    parser = arguments(__doc__, table=lambda: print_rows(FILE, *COLUMNS))
     parser.add_argument("scenes", nargs="*")
     for scene in parser.parse_args().scenes:
         run(scene, clod.AdaptConfig(max_sv=max(DIALS)))
@@ -114,19 +125,6 @@ def pictures(
         "psnr": round(fmean(decibels), 2) if len(decibels) == len(errors) else None,
         "kept": [round(fmean(share), 5) for share in zip(*kept, strict=True)],
     }  # fmt: skip
-
-
-def print_table() -> None:
-    lines = []
-    for row in stored(FILE):
-        psnr = [row[f"s{s:g}"]["psnr"] for s in DIALS]
-        error = "no sigma_d" if row["sigma_error"] is None else f"{row['sigma_error']:.1g}, {row['decay_error']:.1g}"
-        lines.append([
-            row["scene"], row["suffix"], f"{row['bytes_per_gaussian']:.1f}", f"{row['write_seconds']:.2f} s",
-            f"{row['read_seconds']:.2f} s", error, *("equal" if p is None else f"{p:.1f} dB" for p in psnr),
-        ])  # fmt: skip
-    heads = ["scene", "format", "bytes", "write", "read", "sigma_d, decay error", "PSNR s = 1", "s = 5"]
-    print(table(heads, lines))
 
 
 if __name__ == "__main__":

@@ -1,14 +1,12 @@
 """Damaged files of every input format: each must be read, or refused with ClodError, quickly and in little memory.
 
-    python benchmarks/fuzz.py                                # 200,000 cases over all formats, some minutes
     python benchmarks/fuzz.py --cases 20000 --format colmap --seed 3 --record
     python benchmarks/fuzz.py --format ply --seed 0 --case 4711 --keep /tmp/it    # one case, its files kept
 
 A case is an input (mutants.py) that is damaged (damage.py) at random from its seed and number. A failure is any other
 result: another exception, a process that dies (COLMAP is C++) or takes more than LIMIT_S, more than LIMIT_MB of memory
 beyond that of undamaged inputs, a refused allocation, a warning, a message of several lines or without the file's name,
-a file opened outside of the case's folder, a program started, a connection made. Each failure is printed with the
-command that repeats it.
+a file opened outside of the case's folder, a program started, a connection made.
 """
 
 from __future__ import annotations
@@ -23,22 +21,17 @@ import sys
 import tempfile
 import time
 import warnings
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-import torch
-from common import append, arguments
+import clod_adapter as clod
+from clod_adapter.cli.adapt.resume import find_state
+from clod_adapter.cli.shared.console import Console
+from common import Row, append, arguments
 from damage import mutate
 from mutants import MAKERS, Input, write, write_images
 
-from clod_adapter.cli.adapt.resume import find_state
-from clod_adapter.cli.shared.console import Console
-from clod_adapter.errors import ClodError
-from clod_adapter.io.adapter_file import load_adapter
+import torch
 
 FILE = "fuzz.jsonl"
 LIMIT_S, LIMIT_MB = 10.0, 64
@@ -48,19 +41,6 @@ SHARES = {"ply": 0.3, "safetensors": 0.15, "colmap": 0.2, "transforms": 0.1, "pt
 HARMFUL = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect", "ctypes.dlopen")
 # Fields of the shared memory of a worker and its parent.
 CASE, READ, REFUSED, SLOWEST_US, SLOWEST, EXTRA_KB = range(6)
-
-
-@dataclass
-class Tally:
-    """The result of a format."""
-
-    cases: int
-    read: int = 0
-    refused: int = 0
-    failures: dict[int, str] = field(default_factory=dict)
-    slowest_s: float = 0.0
-    slowest_case: int = 0
-    extra_mb: float = 0.0
 
 
 class Watch:
@@ -85,7 +65,7 @@ def read(kind: str, folder: Path, case: Input, number: int) -> None:
     if kind in ("colmap", "transforms"):
         clod.load_scene(folder)
     elif kind == "safetensors":
-        load_adapter(folder / next(iter(case)))
+        clod.load_adapter(folder / next(iter(case)))
     elif kind == "states":
         resumed = find_state(folder / next(iter(case)), True, clod.AdaptConfig(), Console(quiet=True))
         if resumed is None:
@@ -114,7 +94,7 @@ def result_of(kind: str, folder: Path, case: Input, number: int, watch: Watch) -
         with warnings.catch_warnings(action="error"):
             read(kind, folder, case, number)
         result = "read"
-    except ClodError as error:
+    except clod.ClodError as error:
         cause: BaseException | None = error
         while cause is not None and not isinstance(cause, MemoryError):
             cause = cause.__cause__ or cause.__context__
@@ -158,14 +138,14 @@ def work(kind: str, inputs: list[Input], seed: int, cases: range, folder: Path, 
                 out.write(json.dumps([number, result]) + "\n")
 
 
-def run(kind: str, seed: int, cases: int, folder: Path) -> Tally:
+def run(kind: str, seed: int, cases: int, folder: Path) -> Row:
     """All cases of a format, batch by batch; a process that dies or hangs loses its current case."""
-    tally, inputs = Tally(cases), MAKERS[kind](folder)
+    inputs, found, extra = MAKERS[kind](folder), dict[int, str](), 0
     write_images(folder / "case" / "images")
     failures, fork = folder / "failures.jsonl", multiprocessing.get_context("fork")
     shared = fork.Array("q", 6, lock=False)
     start = 0
-    while start < cases and len(tally.failures) < MANY:
+    while start < cases and len(found) < MANY:
         stop = min(start + BATCH, cases)
         arguments = (kind, inputs, seed, range(start, stop), folder / "case", shared, failures)
         shared[CASE] = start
@@ -173,18 +153,19 @@ def run(kind: str, seed: int, cases: int, folder: Path) -> Tally:
         process.start()
         died = wait(process, shared)
         if died:
-            tally.failures[shared[CASE]] = died
+            found[shared[CASE]] = died
         start = shared[CASE] + 1 if died else stop
-        tally.extra_mb = max(tally.extra_mb, shared[EXTRA_KB] / 1024)
+        extra = max(extra, shared[EXTRA_KB])
         shared[EXTRA_KB] = 0
         print(f"{kind}: {start} of {cases}", file=sys.stderr)
-    tally.read, tally.refused = shared[READ], shared[REFUSED]
-    tally.slowest_s, tally.slowest_case = shared[SLOWEST_US] / 1e6, shared[SLOWEST]
     for line in failures.read_text(encoding="utf-8").splitlines() if failures.exists() else []:
         number, result = json.loads(line)
-        tally.failures[number] = result
+        found[number] = result
     failures.unlink(missing_ok=True)
-    return tally
+    return {
+        "cases": cases, "read": shared[READ], "refused": shared[REFUSED], "failures": found,
+        "slowest_s": shared[SLOWEST_US] / 1e6, "slowest_case": shared[SLOWEST], "extra_mb": extra / 1024,
+    }  # fmt: skip
 
 
 def wait(process: Any, shared: Any) -> str:
@@ -230,12 +211,12 @@ def main() -> None:
         with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as folder:
             tallies[kind] = run(kind, args.seed, round(args.cases * share), Path(folder).resolve())
     row = {
-        "seed": args.seed, "cases": sum(tally.cases for tally in tallies.values()),
-        "failures": sum(len(tally.failures) for tally in tallies.values()),
-        "seconds": time.perf_counter() - began, "formats": {kind: vars(tally) for kind, tally in tallies.items()},
+        "seed": args.seed, "cases": sum(tally["cases"] for tally in tallies.values()),
+        "failures": sum(len(tally["failures"]) for tally in tallies.values()),
+        "seconds": time.perf_counter() - began, "formats": tallies,
     }  # fmt: skip
     for kind, tally in tallies.items():
-        for number, failure in tally.failures.items():
+        for number, failure in tally["failures"].items():
             print(f"{failure}\n  python benchmarks/fuzz.py --format {kind} --seed {args.seed} --case {number}")
     if args.record:
         append(FILE, row)

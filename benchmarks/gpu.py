@@ -2,13 +2,11 @@
 
     python benchmarks/gpu.py                         # needs torch with CUDA, gsplat 1.5.3 and the shared data
     python benchmarks/gpu.py --device cpu --small    # the same code, in seconds
-    python benchmarks/gpu.py --only city --count 2000000
 
-``tests``: the contract of every backend, the gsplat integration, the optimiser and the compiled formula.
+``tests``: the contract of every backend, the gsplat integration, the optimizer and the compiled formula.
 ``plush``: plush_half adapted on the GPU and on the CPU with the same settings: seconds, and held-out quality.
-``city``: a synthetic city adapted (peak memory), then near and far frames at s = 1, 3, 7 in turn with plain gsplat,
-packed and not, on the same file: times, the dial's share (attenuation, culling and compaction), PSNR against the full
-render and against the truth.
+``city``: a synthetic city adapted (peak memory), then near and far frames in turn with plain gsplat, packed and not, on
+the same file: times, the dial's share (attenuation, culling and compaction), PSNR.
 
 Each adds rows to ``results/gpu.jsonl``. Without a GPU, plain is this package's CPU rasterizer without the dial.
 """
@@ -22,23 +20,23 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
-import torch
-from city import city, city_cameras, perturb
-from common import ROOT, append, arguments, checkpoint, outcomes, photographs
-from torch import Tensor
-
 import clod_adapter as clod
+from city import city, city_cameras, perturb
 from clod_adapter.attenuation import attenuate
-from clod_adapter.cameras import Camera, Scene, View
 from clod_adapter.distances import normalized_distances
 from clod_adapter.metrics import psnr
 from clod_adapter.rasterizers import cuda, wait_for
 from clod_adapter.render import dial, splat
+from common import ROOT, append, arguments, checkpoint, outcomes, photographs
+
+import torch
+from torch import Tensor
 
 CHECKS = ("tests", "plush", "city")
 DIALS = (1.0, 3.0, 7.0)
@@ -50,21 +48,15 @@ TESTS = (
 
 @dataclass(frozen=True)
 class Size:
-    """How large everything is.
+    """How large everything is."""
 
-    Attributes:
-        count: Gaussians of the city; width, height: of its pictures; views: to train on, as many again in each test.
-        steps: of the city's adaptation; plush_steps: of plush_half's, None for the default.
-        repeats: of each timed frame.
-    """
-
-    count: int = 6_000_000
-    width: int = 1600
+    count: int = 6_000_000  # Gaussians of the city
+    width: int = 1600  # of its pictures
     height: int = 1066
-    views: int = 24
-    steps: int = 300
-    plush_steps: int | None = None
-    repeats: int = 30
+    views: int = 24  # to train on, and as many to test
+    steps: int = 300  # of the city's adaptation
+    plush_steps: int | None = None  # of plush_half's; None: the default
+    repeats: int = 30  # of each timed frame
 
 
 SMALL = Size(count=3000, width=64, height=48, views=4, steps=3, plush_steps=3, repeats=2)
@@ -82,9 +74,8 @@ def main() -> None:
         if not torch.cuda.is_available():
             sys.exit("torch sees no GPU here: give --device cpu --small to try the script")
         cuda.require_gsplat()
-    size = SMALL if args.small else Size()
-    size = Size(**{**asdict(size), **({"count": args.count} if args.count else {})})
-    device = torch.device(args.device)
+    size, device = SMALL if args.small else Size(), torch.device(args.device)
+    size = replace(size, count=args.count or size.count)
     checks: dict[str, Callable[[], list[dict[str, Any]]]] = {
         "tests": lambda: [run_tests(args.small)],
         "plush": lambda: adapt_plush(device, size, args.small),
@@ -119,7 +110,7 @@ def adapt_plush(device: torch.device, size: Size, small: bool) -> list[dict[str,
         own = base.to(place)
         warm = clod.AdaptConfig(iters=1)  # compiles and loads kernels before the clock starts; timed separately
         began = time.perf_counter()
-        clod.adapt(own, Scene(scene.train[:1], ()), warm)
+        clod.adapt(own, clod.Scene(scene.train[:1], ()), warm)
         warm_seconds = time.perf_counter() - began
         reset_peak(place)
         adapted = clod.adapt(own, scene, config)
@@ -144,7 +135,8 @@ def measure_city(device: torch.device, size: Size) -> list[dict[str, Any]]:
     wait_for(device)
     rows: list[dict[str, Any]] = [{
         "what": "adapt", "config": asdict(config), "start_seconds": round(adapted.start_seconds, 2),
-        "train_seconds": round(adapted.seconds, 2), "peak_bytes": peak(device), "base_bytes": weight(base),
+        "train_seconds": round(adapted.seconds, 2), "peak_bytes": peak(device),
+        "base_bytes": sum(x.nbytes for x in base.tensors().values()),
     }]  # fmt: skip
     del base
     model, truth = adapted.gaussians, city(size.count)
@@ -156,10 +148,10 @@ def measure_city(device: torch.device, size: Size) -> list[dict[str, Any]]:
 
 
 @torch.no_grad()
-def frames(model: clod.Gaussians, views: list[View], where: str, s: float, repeats: int) -> dict[str, Any]:
+def frames(model: clod.Gaussians, views: list[clod.View], where: str, s: float, repeats: int) -> dict[str, Any]:
     """Medians in milliseconds, ours and plain in turn, over the views; and PSNR of the pictures."""
     device, plain = model.means.device, plain_frames(model)
-    jobs: dict[str, Callable[[Camera], Any]] = {
+    jobs: dict[str, Callable[[clod.Camera], Any]] = {
         "ours": lambda camera: clod.render(model, camera, s).image,
         **plain,
         "dial": lambda camera: dial(model, camera, s),
@@ -192,7 +184,7 @@ def frames(model: clod.Gaussians, views: list[View], where: str, s: float, repea
     }  # fmt: skip
 
 
-def plain_frames(model: clod.Gaussians) -> dict[str, Callable[[Camera], Tensor]]:
+def plain_frames(model: clod.Gaussians) -> dict[str, Callable[[clod.Camera], Tensor]]:
     """The file without its dial, activated beforehand, as a viewer that does not know the dial draws it."""
     scales, opacities = model.scales, model.opacities
     if model.means.device.type == "cpu":
@@ -201,25 +193,22 @@ def plain_frames(model: clod.Gaussians) -> dict[str, Callable[[Camera], Tensor]]
 
     colors = torch.cat([model.sh0, model.shN], 1)
 
-    def draw(packed: bool) -> Callable[[Camera], Tensor]:
-        def picture(camera: Camera) -> Tensor:
-            return gsplat.rasterization(
-                model.means, model.quats, scales, opacities, colors, camera.viewmat.to(scales)[None],
-                camera.K.to(scales)[None], camera.width, camera.height, near_plane=camera.near,
-                sh_degree=model.sh_degree, packed=packed,
-            )[0][0]  # fmt: skip
+    def draw(camera: clod.Camera, packed: bool) -> Tensor:
+        return gsplat.rasterization(
+            model.means, model.quats, scales, opacities, colors, camera.viewmat.to(scales)[None],
+            camera.K.to(scales)[None], camera.width, camera.height, near_plane=camera.near,
+            sh_degree=model.sh_degree, packed=packed,
+        )[0][0]  # fmt: skip
 
-        return picture
-
-    return {"plain packed": draw(True), "plain unpacked": draw(False)}
+    return {"plain packed": partial(draw, packed=True), "plain unpacked": partial(draw, packed=False)}
 
 
-def compaction(model: clod.Gaussians, s: float) -> Callable[[Camera], Any]:
+def compaction(model: clod.Gaussians, s: float) -> Callable[[clod.Camera], Any]:
     """Removal of the culled rows, given the opacities."""
     scales = model.scales
     drawn: dict[str, Tensor] = {}
 
-    def run(camera: Camera) -> Any:
+    def run(camera: clod.Camera) -> Any:
         if camera.name not in drawn:
             drawn[camera.name] = dial(model, camera, s).drawn
         return cuda.compact(model.means, model.quats, scales, drawn[camera.name])
@@ -227,7 +216,7 @@ def compaction(model: clod.Gaussians, s: float) -> Callable[[Camera], Any]:
     return run
 
 
-def one_pass_differs(model: clod.Gaussians, camera: Camera, s: float) -> dict[str, float]:
+def one_pass_differs(model: clod.Gaussians, camera: clod.Camera, s: float) -> dict[str, float]:
     """Compiled formula and plain one: the largest difference of drawn opacities, and Gaussians that only one keeps."""
     assert model.sigma_d is not None and model.attenuation is not None
     fused = attenuate(model.opacity_logits, model.sigma_d, (model.means, camera), s, model.attenuation)
@@ -239,23 +228,18 @@ def one_pass_differs(model: clod.Gaussians, camera: Camera, s: float) -> dict[st
     return {"drawn": float(apart.max()), "kept_by_one": int((fused.keep.cpu() != plain.keep).sum())}
 
 
-def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, Scene]:
+def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, clod.Scene]:
     """A perturbed city, and photographs of the unperturbed one."""
     truth = city(size.count)
     cameras = city_cameras(2 * size.views, size.width, size.height, where="mixed", count=size.count)
     views = photograph(truth, cameras, device)
-    return perturb(truth), Scene(tuple(views[: size.views]), tuple(views[size.views :]))
+    return perturb(truth), clod.Scene(tuple(views[: size.views]), tuple(views[size.views :]))
 
 
 @torch.no_grad()
-def photograph(truth: clod.Gaussians, cameras: list[Camera], device: torch.device) -> list[View]:
+def photograph(truth: clod.Gaussians, cameras: list[clod.Camera], device: torch.device) -> list[clod.View]:
     there = truth.to(device)
-    return [View(camera, clod.render(there, camera).pixels.cpu()) for camera in cameras]
-
-
-def weight(gaussians: clod.Gaussians) -> int:
-    """Bytes of the tensors."""
-    return sum(x.numel() * x.element_size() for x in gaussians.tensors().values())
+    return [clod.View(camera, clod.render(there, camera).pixels.cpu()) for camera in cameras]
 
 
 def reset_peak(device: torch.device) -> None:

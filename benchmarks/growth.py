@@ -1,28 +1,27 @@
 """Time and memory of the commands by the number of Gaussians, and of adapting by the photographs.
 
-    python benchmarks/growth.py                            # all of it: some 15 minutes, 12 GB of memory, 8 GB of disk
-    python benchmarks/growth.py --plot                     # runs nothing: the picture and the tables of the rows
+    python benchmarks/growth.py            # some 15 minutes, 12 GB of memory, 8 GB of disk; --plot runs nothing
 
-Runs each command in its own process on cities (``city.py``) that are made once and kept in benchmarks/cache. Measures
-wall and CPU seconds and resident memory, sampled every 20 ms, by phase. A city of 1000 Gaussians gives the start-up
-cost. Rows go to results/growth.jsonl; the last row of a kind counts. Writes docs/images/growth.png and the tables of
-docs/growth.md, with an estimate for a city of 100 million. Exponents are least squares in logarithms of the seconds
-above the start-up cost, from 100k Gaussians on.
+Runs each command in its own process on synthetic cities, which are kept in benchmarks/cache. Measures wall and CPU
+seconds and resident memory by phase. A city of 1000 Gaussians gives the start-up cost. Rows go to results/growth.jsonl;
+the last row of a kind counts. Writes docs/images/growth.png and the tables of docs/growth.md.
 """
 
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 import urllib.request
 from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import growth_page
+from city import write_city
 from common import CACHE, COMMAND, Process, Row, append, arguments
 from growth_rows import FEW, FILE, FLOOR, SERIES_COUNT, SIZES, latest, tables
 
@@ -80,8 +79,8 @@ def scene(count: int, images: int, width: int, height: int) -> Path:
     folder = CITIES / f"city-{count}-{images}-{width}x{height}"
     if not folder.exists():
         # In a process of its own, so that its memory is given back.
-        words = [sys.executable, Path(__file__).parent / "city.py", folder, "--count", count, "--images", images]
-        subprocess.run([*map(str, words), "--size", str(width), str(height)], check=True)
+        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+            pool.submit(write_city, folder, count, images, width, height).result()
     return folder
 
 
@@ -136,17 +135,9 @@ def order_seconds(folder: Path) -> Row:
     return {"order_seconds": wall, "order_cpu": cpu}
 
 
-def run_eval(folder: Path) -> Row:
-    return Process([*COMMAND, "eval", dial_of(folder), "--images", folder, "--sv", 1, MAX_SV]).cost()
-
-
 def run_export(folder: Path) -> Row:
     with tempfile.TemporaryDirectory(dir=CITIES) as out:
         return Process([*COMMAND, "export", dial_of(folder), "-o", Path(out) / "plain.ply", "--sv", 1.5]).cost()
-
-
-def run_inspect(folder: Path) -> Row:
-    return Process([*COMMAND, "inspect", dial_of(folder)]).cost()
 
 
 def run_view(folder: Path) -> Row:
@@ -164,9 +155,9 @@ def run_view(folder: Path) -> Row:
 
 RUNS = {
     "adapt": lambda folder: run_adapt(folder) | order_seconds(folder),
-    "eval": run_eval,
+    "eval": lambda folder: Process([*COMMAND, "eval", dial_of(folder), "--images", folder, "--sv", 1, MAX_SV]).cost(),
     "export": run_export,
-    "inspect": run_inspect,
+    "inspect": lambda folder: Process([*COMMAND, "inspect", dial_of(folder)]).cost(),
     "view": run_view,
 }
 

@@ -8,11 +8,11 @@ from operator import itemgetter
 from typing import Any
 
 import growth_rows as fit
-import numpy as np
-from common import ROOT, Row
-from PIL import Image
-
 from clod_adapter.report.style import QUIET, SERIES, label_log, new_figure, save_figure, tidy
+from common import ROOT, Row, table
+
+import numpy as np
+from PIL import Image
 
 PICTURE, PAGE = ROOT / "docs" / "images" / "growth.png", ROOT / "docs" / "growth.md"
 # What is assumed of the city on paper, and of machines; the rest is fit.
@@ -28,19 +28,18 @@ MEMORIES = (8, 16, 32, 64)  # GB for a job
 def on_paper(rows: Sequence[Row]) -> str:
     """The city in blocks for jobs of a given memory: number of blocks, hours, price. Markdown."""
     each, rest = fit.bytes_a_gaussian(rows, "adapt")
-    lines = ["| a job's memory, GB | Gaussians in a block | blocks | hours a block, of them training | core-hours | "
-             "hours on 64 cores | dollars | on one assumed GPU: hours | dollars |", "|---" * 9 + "|"]  # fmt: skip
+    lines = []
     for memory in MEMORIES:
         room = int(((1 - FOR_IMAGES) * memory * 1e9 - rest) / each)
         blocks = math.ceil(CITY * (1 + BORDER) / room)
         training, other = block_seconds(rows, room)
         hours = (training + other) / 3600
-        core_hours, gpu_hours = blocks * hours * CORES_OF_A_JOB, blocks * hours / GPU_TIMES
-        lines.append(
-            f"| {memory} | {room / 1e6:.1f} million | {blocks} | {hours:.2f}, {training / 3600:.2f} | {core_hours:.0f} "
-            f"| {core_hours / 64:.1f} | {core_hours * CORE_HOUR:.1f} | {gpu_hours:.1f} | {gpu_hours * GPU_HOUR:.1f} |"
-        )
-    return "\n".join(lines)
+        cores, gpu = blocks * hours * CORES_OF_A_JOB, blocks * hours / GPU_TIMES
+        money = [f"{cores / 64:.1f}", f"{cores * CORE_HOUR:.1f}", f"{gpu:.1f}", f"{gpu * GPU_HOUR:.1f}"]
+        spent = [f"{hours:.2f}, {training / 3600:.2f}", f"{cores:.0f}", *money]
+        lines.append([memory, f"{room / 1e6:.1f} million", blocks, *spent])
+    heads = ["a job's memory, GB", "Gaussians in a block", "blocks", "hours a block, of them training", "core-hours"]
+    return table([*heads, "hours on 64 cores", "dollars", "on one assumed GPU: hours", "dollars"], lines)
 
 
 def block_seconds(rows: Sequence[Row], count: int) -> tuple[float, float]:
@@ -62,11 +61,11 @@ def block_seconds(rows: Sequence[Row], count: int) -> tuple[float, float]:
 
     trained, held_out = split(row["images"])
     larger = SIZE - fit.megapixels(row)
-    step = fit.phase_of(row, "step") * share + larger * a_megapixel("step", 1)
-    importance = fit.phase_of(row, "importance") / trained * share + larger * a_megapixel("start", split(fit.FEW)[0])
-    evaluate = fit.phase_of(row, "evaluate") / held_out * share + larger * a_megapixel("evaluate", split(fit.FEW)[1])
-    order = fit.phase_of(row, "order") * share * math.log(count) / math.log(n)
-    fixed = (fit.phase_of(row, "load") + 2 * fit.phase_of(row, "write")) * share
+    step = fit.wall(row, "step") * share + larger * a_megapixel("step", 1)
+    importance = fit.wall(row, "importance") / trained * share + larger * a_megapixel("start", split(fit.FEW)[0])
+    evaluate = fit.wall(row, "evaluate") / held_out * share + larger * a_megapixel("evaluate", split(fit.FEW)[1])
+    order = fit.wall(row, "order") * share * math.log(count) / math.log(n)
+    fixed = (fit.wall(row, "load") + 2 * fit.wall(row, "write")) * share
     return BLOCK_STEPS * step, LOOKED_AT * importance + HELD_OUT * evaluate + order + fixed
 
 
@@ -81,12 +80,12 @@ def draw(rows: Sequence[Row]) -> None:
     with new_figure((9.6, 7.2), layout="constrained") as figure:
         (a, b), (c, d) = figure.subplots(2, 2)
         for command, colour in zip(fit.COMMANDS, SERIES, strict=True):
-            points = fit.seconds_of(rows, command)
+            points = fit.times_of(rows, command)
             line(a, points, colour, f"{command}  {fit.growth(points)[0]:.2f}")
             memory = [(row["gaussians"], row["peak_bytes"] / 1e9) for row in fit.over_count(rows, command)]
             line(b, memory, colour, f"{command}  {fit.bytes_a_gaussian(rows, command)[0]:,.0f} B")
         for phase, colour in zip(fit.PHASES, (*SERIES, "#b8860b"), strict=True):
-            points = fit.seconds_of(rows, "adapt", phase)
+            points = fit.times_of(rows, "adapt", phase)
             line(c, points, colour, f"{phase}  {fit.growth(points)[0]:.2f}")
         guide(c, rows)
         for series, x, colour in (("images", itemgetter("images"), SERIES[0]), ("shapes", fit.megapixels, SERIES[1])):
@@ -113,7 +112,7 @@ def line(axes: Any, points: Sequence[tuple[float, float]], colour: str, label: s
 
 def guide(axes: Any, rows: Sequence[Row]) -> None:
     """What n log n would be, through the last point of the pruning order."""
-    points = fit.seconds_of(rows, "adapt", "order")
+    points = fit.times_of(rows, "adapt", "order")
     if points:
         n, seconds = points[-1]
         x = np.array([size for size, _ in points if size != fit.FLOOR], float)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from operator import itemgetter
 
+from common import Row, stored, table
+
 import numpy as np
-from common import Row, stored
 
 FILE = "growth.jsonl"
 COMMANDS = ("adapt", "eval", "export", "inspect", "view")
@@ -15,7 +16,7 @@ FLOOR, SIZES = 1000, (10_000, 100_000, 1_000_000, 5_000_000)
 FROM = 100_000  # Gaussians from which exponents are fitted: below, start-up dominates
 SERIES_COUNT = 100_000  # Gaussians of the series over photographs
 FEW = 16  # photographs of the series over their size
-BUSY = 3.0  # load of the machine above which other work disturbed the times
+Points = Sequence[tuple[float, float]]
 
 
 def latest() -> list[Row]:
@@ -25,7 +26,7 @@ def latest() -> list[Row]:
     return [found[key] for key in sorted(found)]
 
 
-def exponent(points: Sequence[tuple[float, float]]) -> float:
+def exponent(points: Points) -> float:
     """Of the power of x that y follows, by least squares in logarithms; NaN of fewer than two points."""
     usable = [point for point in points if point[1] > 0]
     return float(np.polyfit(*np.log(usable).T, 1)[0]) if len(usable) > 1 else math.nan
@@ -35,32 +36,19 @@ def over_count(rows: Sequence[Row], command: str) -> list[Row]:
     return [row for row in rows if row["series"] == "count" and row["command"] == command]
 
 
-def seconds_of(rows: Sequence[Row], command: str, phase: str = "") -> list[tuple[float, float]]:
-    """(Gaussians, seconds) of a command, or of a phase of adapting."""
-    return [(row["gaussians"], phase_of(row, phase)) for row in over_count(rows, command)]
-
-
-def phase_of(row: Row, phase: str) -> float:
-    if not phase:
-        return row["seconds"]
-    if phase == "importance":
-        return row["phases"]["start"] - row["order_seconds"]
-    return row["order_seconds"] if phase == "order" else row["phases"][phase]
-
-
 PHASES = ("load", "importance", "order", "step", "evaluate", "write")
 
 
-def cpu_of(rows: Sequence[Row], command: str, phase: str = "") -> list[tuple[float, float]]:
-    """(Gaussians, CPU seconds) of a command, or of a phase of adapting: less affected by other work on the machine."""
-    return [
-        (row["gaussians"], phase_cpu(row, phase))
-        for row in over_count(rows, command)
-        if "phase_cpu" in row or not phase
-    ]
+def wall(row: Row, phase: str) -> float:
+    """Seconds of a command, or of a phase of adapting."""
+    phases = row.get("phases", {})
+    if phase == "importance":
+        return phases["start"] - row["order_seconds"]
+    return row["order_seconds"] if phase == "order" else phases[phase] if phase else row["seconds"]
 
 
-def phase_cpu(row: Row, phase: str) -> float:
+def cpu(row: Row, phase: str) -> float:
+    """The same in CPU seconds: less affected by other work on the machine."""
     if not phase or phase == "order":
         return row["order_cpu"] if phase else row["cpu_seconds"]
     of = row["phase_cpu"]
@@ -70,7 +58,12 @@ def phase_cpu(row: Row, phase: str) -> float:
     }[phase]  # fmt: skip
 
 
-def growth(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
+def times_of(rows: Sequence[Row], command: str, phase: str = "", clock: Callable[[Row, str], float] = wall) -> Points:
+    """(Gaussians, seconds) of a command, or of a phase of adapting."""
+    return [(row["gaussians"], clock(row, phase)) for row in over_count(rows, command)]
+
+
+def growth(points: Points) -> tuple[float, float]:
     """The exponent above the floor from FROM on, and that of the last two sizes with the floor in it."""
     floor = dict(points).get(FLOOR, 0.0)
     fitted = exponent([(x, y - floor) for x, y in points if x >= FROM])
@@ -93,35 +86,42 @@ def megapixels(row: Row) -> float:
 
 def tables(rows: Sequence[Row]) -> str:
     """Markdown for docs/growth.md."""
-    sizes = sorted({row["gaussians"] for row in rows if row["series"] == "count"})
-    head = "| | " + " | ".join(f"{size:,}" for size in sizes) + " | exponent | last two | exponent of CPU |"
-    busy = max(row["busy"] for row in rows)
-    lines = [f"**Preliminary**: the machine's load was up to {busy:.0f} while these rows were taken, so wall times are "
-             "several times too long; CPU times and memory are not affected.", ""] if busy > BUSY else []  # fmt: skip
-    lines += [head, "|---" * (len(sizes) + 4) + "|"]
-    cases = [(command, "") for command in COMMANDS] + [("adapt", phase) for phase in PHASES]
-    for command, phase in cases:
-        points = seconds_of(rows, command, phase)
-        fitted, last = growth(points)
+    return "\n\n".join([times_table(rows), *memory_tables(rows), *(series_table(rows, *each) for each in X)])
+
+
+def times_table(rows: Sequence[Row]) -> str:
+    sizes, lines = sorted({row["gaussians"] for row in rows if row["series"] == "count"}), []
+    for command, phase in [(command, "") for command in COMMANDS] + [("adapt", phase) for phase in PHASES]:
+        points = times_of(rows, command, phase)
         cells = [f"{dict(points)[size]:.3g}" if size in dict(points) else "" for size in sizes]
-        powers = " | ".join(f"{power:.2f}" for power in (fitted, last, growth(cpu_of(rows, command, phase))[0]))
-        lines.append(f"| {phase or command} | {' | '.join(cells)} | {powers} |")
-    lines += ["", "| | peak, GB | | bytes per Gaussian | fixed, MB |", "|---|---|---|---|---|"]
+        powers = [*growth(points), growth(times_of(rows, command, phase, cpu))[0]]
+        lines.append([phase or command, *cells, *(f"{power:.2f}" for power in powers)])
+    return table(["", *(f"{size:,}" for size in sizes), "exponent", "last two", "exponent of CPU"], lines)
+
+
+def memory_tables(rows: Sequence[Row]) -> list[str]:
+    """Peaks of the commands, and of the phases of adapting the largest city."""
+    lines = []
     for command in COMMANDS:
         each, rest = bytes_a_gaussian(rows, command)
         peaks = [f"{row['gaussians']:,}: {row['peak_bytes'] / 1e9:.2f}" for row in over_count(rows, command)[-2:]]
-        lines.append(f"| {command} | {' | '.join(peaks or ['', ''])} | {each:,.0f} | {rest / 1e6:,.0f} |")
+        lines.append([command, *(peaks or ["", ""]), f"{each:,.0f}", f"{rest / 1e6:,.0f}"])
+    found = [table(["", "peak, GB", "", "bytes per Gaussian", "fixed, MB"], lines)]
     for row in over_count(rows, "adapt")[-1:]:
-        peaks = row["phase_peaks"]
-        lines += ["", f"| adapt, {row['gaussians']:,}: up to | {' | '.join(peaks)} |", "|---" * (len(peaks) + 1) + "|"]
-        per = " | ".join(f"{peak / row['gaussians']:,.0f}" for peak in peaks.values())
-        lines.append(f"| resident bytes per Gaussian | {per} |")
-    for series, name, x in (("images", "photographs", itemgetter("images")), ("shapes", "megapixels", megapixels)):
-        chosen = sorted((row for row in rows if row["series"] == series), key=x)
-        lines += ["", f"| adapt over {name} | seconds | start | step | evaluate | load | peak, GB |", "|---" * 7 + "|"]
-        for row in chosen:
-            times = " | ".join(f"{row['phases'][key]:.3g}" for key in ("start", "step", "evaluate", "load"))
-            lines.append(f"| {x(row):.3g} | {row['seconds']:.3g} | {times} | {row['peak_bytes'] / 1e9:.2f} |")
-        powers = [exponent([(x(row), row["phases"][key]) for row in chosen]) for key in ("start", "step", "evaluate")]
-        lines.append(f"| exponent | | {' | '.join(f'{power:.2f}' for power in powers)} | | |")
-    return "\n".join(lines)
+        each = [f"{peak / row['gaussians']:,.0f}" for peak in row["phase_peaks"].values()]
+        heads = [f"adapt, {row['gaussians']:,}: up to", *row["phase_peaks"]]
+        found.append(table(heads, [["resident bytes per Gaussian", *each]]))
+    return found
+
+
+X = (("images", "photographs", itemgetter("images")), ("shapes", "megapixels", megapixels))
+
+
+def series_table(rows: Sequence[Row], series: str, name: str, x: Callable[[Row], float]) -> str:
+    chosen, lines = sorted((row for row in rows if row["series"] == series), key=x), []
+    for row in chosen:
+        times = [f"{row['phases'][key]:.3g}" for key in ("start", "step", "evaluate", "load")]
+        lines.append([f"{x(row):.3g}", f"{row['seconds']:.3g}", *times, f"{row['peak_bytes'] / 1e9:.2f}"])
+    powers = [exponent([(x(row), row["phases"][key]) for row in chosen]) for key in ("start", "step", "evaluate")]
+    lines.append(["exponent", "", *(f"{power:.2f}" for power in powers), "", ""])
+    return table([f"adapt over {name}", "seconds", "start", "step", "evaluate", "load", "peak, GB"], lines)

@@ -16,16 +16,8 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-import pycolmap
-import torch
-from common import ROOT, SHARED
-from PIL import Image
-from plyfile import PlyData, PlyElement
-
 import clod_adapter as clod
 from clod_adapter._support.version import package_version
-from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.file_formats import FORMATS as FILE_FORMATS
 from clod_adapter.io.file_formats import WRITABLE
 from clod_adapter.io.file_formats import write as write_model
@@ -33,6 +25,13 @@ from clod_adapter.io.ply.columns import inria_dtype
 from clod_adapter.io.ply.header import read_head
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.state_file import save_state
+from common import ROOT, SHARED
+
+import numpy as np
+import pycolmap
+import torch
+from PIL import Image
+from plyfile import PlyData, PlyElement
 
 sys.path.insert(0, str(ROOT / "tests"))
 from packing import write_packed  # noqa: E402
@@ -104,7 +103,7 @@ def _adapters(folder: Path) -> list[Input]:
     tuned = gaussians.replace(**{name: value + 0.1 for name, value in gaussians.tensors().items()})
     for adapted in (gaussians, tuned):
         adapter = clod.extract(base.gaussians, adapted, fingerprint=base.fingerprint, config={"seed": 0, "row": row})
-        save_adapter(folder / "a.safetensors", adapter)
+        clod.save_adapter(folder / "a.safetensors", adapter)
         inputs.append({"a.safetensors": (folder / "a.safetensors").read_bytes()})
     return inputs
 
@@ -171,7 +170,7 @@ def _transforms(folder: Path) -> list[Input]:
     blender = [{"camera_angle_x": 0.8, "frames": part} for part in (named[:2], named[2:])]
     documents = [
         {"transforms.json": {**size, "frames": frames}}, {"transforms.json": {**size, **lens, "frames": frames[:1]}},
-{"transforms_train.json": blender[0], "transforms_test.json": blender[1]},
+        {"transforms_train.json": blender[0], "transforms_test.json": blender[1]},
     ]  # fmt: skip
     return [{name: json.dumps(content).encode() for name, content in files.items()} for files in documents]
 

@@ -1,14 +1,11 @@
 """Quality after adapting with few photographs or none, on real held-out photographs.
 
-    python benchmarks/nophoto.py plush_half bonsai146 ci_banana
     python benchmarks/nophoto.py plush_half --iters 600 --kinds photographs placed
-    python benchmarks/nophoto.py plush_half --few 4 --iters 300 --max-sv 5 --kinds photographs complemented
     python benchmarks/nophoto.py --table                  # the rows as a Markdown table
 
 The kinds of views: ``photographs`` (real cameras and photographs), ``teacher`` (real cameras, renders of the
 checkpoint), ``placed`` (placed cameras, renders of the checkpoint) and ``complemented`` (few photographs and pseudo
-views, as clod-adapt combines them). Each run adds one row to ``results/nophoto.jsonl``, with the distances between
-placed and real cameras.
+views, as clod-adapt combines them). Each run adds one row to ``results/nophoto.jsonl``.
 """
 
 from __future__ import annotations
@@ -16,14 +13,11 @@ from __future__ import annotations
 import time
 from dataclasses import asdict
 
-import torch
+import clod_adapter as clod
 from adapt import at_shares
+from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
 from common import append, arguments, checkpoint, stored, table
 from common import photographs as photographs_of
-
-import clod_adapter as clod
-from clod_adapter.training.camera_placement import place_cameras, typical_reach
-from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
 
 FILE = "nophoto.jsonl"
 KINDS = ("photographs", "teacher", "placed", "complemented")
@@ -50,14 +44,12 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
         photographs = clod.Scene(train, photographs.test)
     base_row = clod.evaluate(base, photographs.test, [1.0])[0]
     began = time.perf_counter()
-    views, placement = photographs, None
+    views = photographs
     if kind == "teacher":
         # Of the views to train on alone; none is held out of them.
         views = clod.Scene(tuple(render_pseudo_views(base, [view.camera]).train[0] for view in photographs.train), ())
     if kind == "placed":
-        cameras = place_cameras(base, seed=config.seed)
-        views = render_pseudo_views(base, cameras)
-        placement = distances(cameras, [view.camera for view in photographs.train], typical_reach(base))
+        views = render_pseudo_views(base, clod.place_cameras(base, seed=config.seed))
     if kind == "complemented":
         views, config = add_pseudo_views(base, photographs, config)
     seconds = time.perf_counter() - began
@@ -65,29 +57,11 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
     rows = clod.evaluate(adapted.gaussians, photographs.test, [s for s in DIALS if s <= config.max_sv])
     append(FILE, {
         "benchmark": "nophoto", "scene": scene, "kind": kind, "config": asdict(config), "views": len(views.train),
-        "photographs": len(photographs.train),
-        "placement": placement, "base": base_row.as_dict(), "rows": [row.as_dict() for row in rows],
-        "at_shares": at_shares(adapted.gaussians, photographs.test),
-        "steps": adapted.steps, "views_seconds": round(seconds, 2), "start_seconds": round(adapted.start_seconds, 2),
+        "photographs": len(photographs.train), "base": base_row.as_dict(), "rows": [row.as_dict() for row in rows],
+        "at_shares": at_shares(adapted.gaussians, photographs.test), "steps": adapted.steps,
+        "views_seconds": round(seconds, 2), "start_seconds": round(adapted.start_seconds, 2),
         "train_seconds": round(adapted.seconds, 2),
     })  # fmt: skip
-
-
-def distances(placed: list[clod.Camera], real: list[clod.Camera], reach: float) -> dict[str, list[float]]:
-    """10, 50 and 90 % quantiles, to the nearest of the others: in units of ``reach``, an angle of 30 degrees
-    counting as one."""
-
-    def parts(cameras: list[clod.Camera]) -> tuple[torch.Tensor, torch.Tensor]:
-        return torch.stack([c.position for c in cameras]), torch.stack([c.viewmat[2, :3] for c in cameras])
-
-    (at, forward), (at_real, forward_real) = parts(placed), parts(real)
-    angles = torch.rad2deg((forward @ forward_real.T).clamp(-1, 1).acos())
-    apart = ((torch.cdist(at, at_real) / reach).square() + (angles / 30).square()).sqrt()
-    shares = torch.tensor([0.1, 0.5, 0.9])
-    return {
-        "placed_to_real": apart.amin(1).quantile(shares).tolist(),
-        "real_to_placed": apart.amin(0).quantile(shares).tolist(),
-    }
 
 
 def print_table() -> None:

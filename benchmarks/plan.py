@@ -1,8 +1,6 @@
 """Savings and cost of the plan: the command with everything included, with the plan, and with --trim.
 
-    python benchmarks/plan.py                               # every scene of the shared data, one row per run
-    python benchmarks/plan.py ci_banana --iters 300
-    python benchmarks/plan.py --table                       # the last rows as Markdown, for docs/plan.md
+    python benchmarks/plan.py ci_banana --iters 300         # without a scene all of them; --table: the stored rows
 
 A scene is a folder of the shared data, followed by the name of the checkpoint where it is not ``pretrained``, or a file
 without photographs. Each run is a process of its own. Rows go to ``results/plan.jsonl``.
@@ -15,9 +13,22 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from common import COMMAND, Process, append, arguments, capture, stored, table
+from common import COMMAND, Process, append, arguments, capture, print_rows
 
 FILE = "plan.jsonl"
+COLUMNS = (
+    "scene",
+    "steps",
+    "way",
+    "seconds.start",
+    "seconds.train",
+    "ply_mb",
+    "adapter_mb",
+    "peak_mb",
+    "virtual_scale",
+    "psnr",
+    "kept",
+)
 SCENES = (
     "plush_half", "plush_half/pretrained_mask", "bonsai146", "ci_banana", "splats/lod_tiles/lod1_tile_0_0.5x.ply",
     "splats/playbot_lod4_from_sog.ply",
@@ -27,7 +38,7 @@ WAYS = {"everything": ["--with", "bands", "unseen"], "plan": [], "plan, trimmed"
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=print_table)
+    parser = arguments(__doc__, table=lambda: print_rows(FILE, *COLUMNS))
     parser.add_argument("scenes", nargs="*", default=SCENES)
     parser.add_argument("--iters", type=int, default=1500)
     args = parser.parse_args()
@@ -56,27 +67,6 @@ def run(scene: str, options: list[str]) -> dict[str, Any]:
         "base_psnr": report["base_rows"][0]["psnr"] if report["base_rows"] else None,
         "rows": [row for row in report["rows"] if row["virtual_scale"] in DIALS],
     }  # fmt: skip
-
-
-def print_table() -> None:
-    """The last row of each scene, way and number of steps."""
-    last: dict[tuple[str, int, str], dict[str, Any]] = {}
-    for row in stored(FILE):
-        if row["label"] == "default":
-            last[row["scene"], row["steps"], row["way"]] = row
-    lines, decisions = [], []
-    for (scene, steps, way), row in last.items():
-        # Rows from before attributes were only frozen by hand also have a time, and decisions, of attributes.
-        plan = sum(row["plan"]["seconds"].get(part, 0.0) for part in ("bands", "unseen", "trim"))
-        times = [f"{seconds:.1f}" for seconds in (plan, row["seconds"]["start"], row["seconds"]["train"])]
-        sizes = [f"{row['ply_mb']:.1f}", f"{row['adapter_mb']:.2f}", f"{row['peak_mb']:.0f}"]
-        lines.append([scene, steps, way, *times, *sizes, *(f"{r['psnr']:.2f} ({r['kept']:,.0f})" for r in row["rows"])])
-        for made in row["plan"]["decisions"] if way == "plan, trimmed" else ():
-            if made["verdict"] != "trained":
-                decisions.append([scene, made["what"], made["verdict"], f"{made['measured']} {made['why']}"])
-    heads = ["scene", "steps", "run", "plan s", "start s", "train s", "PLY MB", "adapter MB", "peak MB"]
-    print(table([*heads, *(f"dB at {s:g} (kept)" for s in DIALS)], lines, 3), end="\n\n")
-    print(table(["scene", "item", "decision", "number"], decisions))
 
 
 if __name__ == "__main__":

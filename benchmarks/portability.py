@@ -38,12 +38,8 @@ from common import ROOT, SHARED, append, arguments, outcomes
 
 FILE = "portability.jsonl"
 SPACED = os.fsdecode("a folder, spàced".encode())  # under an ASCII locale too
-PARALLEL = [
-    "--numprocesses=auto",
-    "--maxprocesses=4",
-    "--dist=loadfile",
-    "--no-loadscope-reorder",
-]  # as in the Makefile
+# As in the Makefile.
+PARALLEL = ["--numprocesses=auto", "--maxprocesses=4", "--dist=loadfile", "--no-loadscope-reorder"]
 
 
 @dataclass(frozen=True)

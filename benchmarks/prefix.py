@@ -8,30 +8,29 @@ each count: ``dial``; ``baked``, a file baked for the training cameras; and pref
 opacities in the file:
 
 - ``extinction``: by falling s* for the training cameras, as ``clod-adapt export --order extinction --images`` writes;
-- ``extinction, s = 1 baked``: the same with ``--sv 1``, slightly faded and shorter;
+- ``extinction, s = 1 baked``: the same with ``--sv 1``;
 - ``own``, ``opacity``, ``removal error``: the adapted file as it is, by falling opacity, by falling removal error;
 - ``base, ...``: the untouched checkpoint in the adapted one's order of extinction, by opacity, by removal error.
 
-Each run adds a row to ``results/prefix.jsonl``; those of commit c0ce1ea have ``extinction`` and ``baked`` at the one
-distance d' = 1, and as ``extinction, views`` the order by the mean of log s* over the training cameras.
+Each run adds a row to ``results/prefix.jsonl``; those of commit c0ce1ea use the one distance d' = 1.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from common import append, arguments, checkpoint, falling, head, photographs, stored, table
-
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.initialization.importance import removal_error
+from common import append, arguments, checkpoint, falling, head, photographs, print_rows
 
 FILE = "prefix.jsonl"
+COLUMNS = ("scene", "model", "count", "psnr")
 DIALS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=print_table)
+    parser = arguments(__doc__, table=lambda: print_rows(FILE, *COLUMNS))
     parser.add_argument("model", help="an adapted PLY")
     parser.add_argument("scene", help="its capture")
     parser.add_argument("--base", default="pretrained", help="the capture's checkpoint that was adapted")
@@ -76,16 +75,6 @@ def orders(adapted: clod.Gaussians, base: clod.Gaussians, views: tuple[clod.View
         "base, opacity": base.select(falling(base.opacity_logits)),
         "base, removal error": base.select(falling(removal_error(base, views, seed=0))),
     }
-
-
-def print_table() -> None:
-    """PSNR on the held-out views, a line for an order and a column for a count."""
-    for row in stored(FILE):
-        print(f"\n{row['scene']}, {row['model']}: all {row['gaussians']:,} unfaded {row['all']['adapted']:.2f} dB")
-        points = row["rows"]
-        lines = [[name, *("-" if (value := point["psnr"][name]) is None else f"{value:.2f}" for point in points)]
-                 for name in points[0]["psnr"]]  # fmt: skip
-        print(table(["drawn", *(f"{point['count']:,}" for point in points)], lines))
 
 
 if __name__ == "__main__":

@@ -1,13 +1,11 @@
 """Adapting in several processes against one: equality, speed, and the quality of a larger batch.
 
-    python benchmarks/processes.py plush_half bonsai146             # 1,500 views each, then three times 60 steps
     python benchmarks/processes.py plush_half --views 300 --repeats 1
 
 Three adaptations with the same number of views: one view per step; two views per step in one process with two threads;
-two views per step in two processes with one thread each, started by torchrun and connected by gloo. ``quality`` has the
-held-out PSNR of each, ``largest_difference`` the difference between the last two, by attribute. ``speed`` has medians
-of the seconds of both over ``--speed-steps`` steps: importance, training, and of training the first process's seconds
-of waiting for the other and of moving and summing gradients.
+two views per step in two processes with one thread each (torchrun, gloo). ``quality`` has the held-out PSNR of each,
+``largest_difference`` the difference between the last two by attribute, ``speed`` median seconds of both over
+``--speed-steps`` steps: initialization, training, and of training the waiting and the exchange of gradients.
 """
 
 from __future__ import annotations
@@ -22,13 +20,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-import torch
+import clod_adapter as clod
+from clod_adapter.training.distributed import joined
 from common import append, arguments, checkpoint, photographs
 
-from clod_adapter.training.distributed import joined
+import torch
 
 FILE = "processes.jsonl"
 CORES = 2
@@ -63,7 +59,11 @@ def measure(scene: str, args: Namespace) -> None:
     test = photographs(scene).test
     for label, (processes, config) in runs.items():
         results[label], spent = run(scene, processes, config)
-        quality[label] = {"steps": config["iters"], **spent, "rows": rows_of(results[label], test)}
+        rows = [
+            {"s": r.virtual_scale, "psnr": round(r.psnr, 4), "kept_share": round(r.kept_share, 4)}
+            for r in clod.evaluate(results[label], test, DIALS)
+        ]
+        quality[label] = {"steps": config["iters"], **spent, "rows": rows}
     one, two = results["batch 2"].tensors(), results["batch 2, two processes"].tensors()
     append(FILE, {
         "benchmark": "processes", "scene": scene, "views": args.views, "seed": 0,
@@ -86,11 +86,6 @@ def speed(scene: str, config: dict[str, Any], repeats: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def rows_of(gaussians: clod.Gaussians, test: Any) -> list[dict[str, float]]:
-    rows = clod.evaluate(gaussians, test, DIALS)
-    return [{"s": r.virtual_scale, "psnr": round(r.psnr, 4), "kept_share": round(r.kept_share, 4)} for r in rows]
-
-
 def run(scene: str, processes: int, config: dict[str, Any]) -> tuple[clod.Gaussians, dict[str, float]]:
     """The result of an adaptation in processes that share the cores, and its seconds."""
     launcher = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)]
@@ -108,10 +103,10 @@ def take_part(scene: str, config: clod.AdaptConfig, file: Path) -> None:
     if "RANK" in os.environ:
         from torch.distributed.rendezvous import rendezvous
 
-        with joined(*next(iter(rendezvous("env://")))) as peers:
-            peers.agree(0.0, True)  # both have read and compiled before a clock runs
-            adapted = clod.adapt(base, views, config, group=peers)
-        if peers.rank > 0:
+        with joined(*next(iter(rendezvous("env://")))) as group:
+            group.agree(0.0, True)  # both have read and compiled before a clock runs
+            adapted = clod.adapt(base, views, config, group=group)
+        if group.rank > 0:
             return
     else:
         adapted = clod.adapt(base, views, config)

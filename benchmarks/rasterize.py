@@ -1,8 +1,4 @@
-"""Times of the CPU rasterizer and of a C++ baseline, and its agreement with a float64 reference.
-
-    python benchmarks/rasterize.py                     # times on W1 and W2, of fewer Gaussians too
-    python benchmarks/rasterize.py --accuracy          # image and gradients against float64 instead
-    python benchmarks/rasterize.py --extreme           # times of extreme scenes instead
+"""Times of the CPU rasterizer and of a C++ baseline; or its agreement with a float64 reference; or extreme scenes.
 
 The baseline is the yardstick, a hand-written C++ kernel outside the repository, built with g++; its fields are null
 where it is absent. Each runs in its own process with 2 threads, in turn step by step, so that drift of the machine
@@ -12,6 +8,7 @@ affects both alike. Times are medians in milliseconds: ``forward_ms`` and ``both
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import tempfile
@@ -19,15 +16,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
-import clod_adapter  # noqa: F401  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
 import agreement
 import contenders
-import torch
 import workloads
 from common import ROOT, Row, append, arguments
 from contenders import SHARES, THREADS, Worker
+
+import torch
 
 FILE = "rasterize.jsonl"
 YARDSTICK = Path(os.environ.get("CLOD_YARDSTICK", ROOT.parent / "shared" / "yardstick"))
@@ -44,14 +39,15 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(THREADS)
     if args.accuracy:
-        kind, table, rows = "accuracy", agreement.table, [agreement.compare(name) for name in workloads.SIZES]
+        kind, rows = "accuracy", [agreement.compare(name) for name in workloads.SIZES]
     elif args.extreme:
-        kind, table, rows = "extreme", extreme_table, extreme()
+        kind, rows = "extreme", extreme()
     else:
-        kind, table, rows = "speed", speed_table, speed()
-    print(table(rows), flush=True)
-    for row in rows if args.record else []:
-        append(FILE, {"benchmark": "rasterize", "kind": kind, **row})
+        kind, rows = "speed", speed()
+    for row in rows:
+        print(json.dumps(row, indent=1), flush=True)
+        if args.record:
+            append(FILE, {"benchmark": "rasterize", "kind": kind, **row})
 
 
 def speed() -> list[Row]:
@@ -60,22 +56,22 @@ def speed() -> list[Row]:
         library = contenders.build_yardstick(YARDSTICK, Path(folder))
         rows = []
         for name in workloads.SIZES:
-            peers = {"ours": Worker("ours", contenders.our_jobs, name)}
+            workers = {"ours": Worker(contenders.our_jobs, name)}
             if library:
-                peers["yardstick"] = Worker("yardstick", contenders.yardstick_jobs, name, YARDSTICK, library)
-            rows.append(time_workload(name, peers))
-            for worker in peers.values():
-                worker.close()
+                workers["yardstick"] = Worker(contenders.yardstick_jobs, name, YARDSTICK, library)
+            rows.append(time_workload(name, workers))
+            for worker in workers.values():
+                worker.pool.shutdown()
     return rows
 
 
-def time_workload(name: str, peers: dict[str, Worker]) -> Row:
-    """Steps of all peers in turn, then our frames of fewer Gaussians."""
+def time_workload(name: str, workers: dict[str, Worker]) -> Row:
+    """Steps of all rasterizers in turn, then our frames of fewer Gaussians."""
     turns = range(REPEATS + WARM)
-    steps = [{peer: worker("step") for peer, worker in peers.items()} for _ in turns]
-    memory = {peer: worker("memory") for peer, worker in peers.items()}
-    pairs = peers["yardstick"]("pairs") if "yardstick" in peers else None
-    frames, kept = zip(*([peers["ours"](job) for job in ("frame", "kept")] for _ in turns), strict=True)
+    steps = [{peer: worker("step") for peer, worker in workers.items()} for _ in turns]
+    memory = {peer: worker("memory") for peer, worker in workers.items()}
+    pairs = workers["yardstick"]("pairs") if "yardstick" in workers else None
+    frames, kept = zip(*([workers["ours"](job) for job in ("frame", "kept")] for _ in turns), strict=True)
     if None in [*(step["ours"] for step in steps), *frames, *kept]:
         sys.exit(f"our own process ended early on {name}")
     count, width, height, _ = workloads.SIZES[name]
@@ -109,24 +105,6 @@ def kept_rows(frames: Sequence[list[float]]) -> list[Row]:
     ]
 
 
-def speed_table(rows: list[Row]) -> str:
-    lines = []
-    for row in rows:
-        pairs = "" if row["pairs"] is None else f", {row['pairs'] / 1e6:.1f} M pairs of Gaussian and pixel"
-        lines += [f"{row['workload']}: {row['gaussians']:,} Gaussians, {row['width']}x{row['height']}{pairs}"]
-        lines += [f"  {'':10} {'forward ms':>10} {'best':>10} {'both ms':>10} {'best':>10} {'memory MB':>10}"]
-        for peer, prefix in (("ours", ""), ("yardstick", "yardstick_")):
-            fields = ("forward_ms", "forward_best_ms", "both_ms", "both_best_ms", "memory_mb")
-            cells = [row[prefix + field] for field in fields]
-            lines += [f"  {peer:10} " + " ".join(f"{'-' if cell is None else cell:>10}" for cell in cells)]
-        if row["both_ratio_yardstick"]:
-            ratios = (f"{what} {row[f'{what}_ratio_yardstick']}" for what in ("forward", "both"))
-            lines += [f"  ours takes {', '.join(ratios)} of the yardstick's"]
-        lines += [f"  a frame without gradients: {row['render_ms']} ms; of the most opaque Gaussians alone:"]
-        lines += [f"    {k['share']:5.0%} {k['way']:13} {k['ms']:8.2f} ms {k['fraction']:5.0%}" for k in row["kept"]]
-    return "\n".join(lines)
-
-
 def extreme() -> list[Row]:
     """A step of each extreme scene, ours, in turn with one of W1; and whether everything that comes out is finite."""
     w1, rows = workloads.make("W1"), []
@@ -148,19 +126,6 @@ def extreme() -> list[Row]:
             "ns_per_pair": round(both * 1e6 / pairs, 3) if pairs else None,
         })  # fmt: skip
     return rows
-
-
-def extreme_table(rows: list[Row]) -> str:
-    times = ("forward_ms", "both_ms", "times_w1", "ns_per_gaussian", "ns_per_pixel")
-    fields = ("gaussians", *times, "pairs", "ns_per_pair")
-    titles = [field.replace("_per_", "/").replace("_", " ") for field in fields]
-    lines = [f"{'scene':32}" + "".join(f"{title:>13}" for title in titles)]
-    for row in rows:
-        cells = ["-" if row[field] is None else f"{row[field]:,}" for field in fields]
-        lines.append(
-            f"{row['scene']:32}" + "".join(f"{cell:>13}" for cell in cells) + "  NOT FINITE" * (not row["finite"])
-        )
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

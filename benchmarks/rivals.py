@@ -1,13 +1,12 @@
 """Other methods on the same checkpoint and photographs, at fixed shares of the base's Gaussians.
 
     python benchmarks/rivals.py plush_half bonsai146 --iters 1500
-    python benchmarks/rivals.py plush_half bonsai146 --only specialist --shares 0.12
     python benchmarks/rivals.py --table                    # the rows as a Markdown table
 
 - ``merging``: ``splat-transform --decimate``, without training, one file per count;
-- ``specialist``: the merged file, tuned for that count alone, one file per count;
+- ``specialist``: the merged file, tuned for that count alone;
 - ``tuned``: the whole base, tuned for as many steps;
-- ``prefix``: one file whose prefixes are the counts, tuned with random prefixes (tuning.tune);
+- ``prefix``: one file whose prefixes are the counts, tuned with random prefixes (``tuning.tune``);
 - ``ranking``: prefixes without tuning, ordered by opacity, by contribution and by removal error.
 
 A scene is named as for adapt.py. Each run adds a row to ``results/rivals.jsonl``.
@@ -21,17 +20,16 @@ from dataclasses import asdict
 from statistics import fmean
 from typing import Any
 
-import torch
-from common import append, arguments, checkpoint, falling, head, photographs, stored, table
-from merging import find_tool, merge
-from torch import Tensor
-from tuning import Tuning, tune
-
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.gaussians import SH_C0
 from clod_adapter.initialization.importance import removal_error
 from clod_adapter.render import splat
+from common import append, arguments, checkpoint, falling, head, photographs, stored, table
+from tuning import Tuning, find_tool, merge, tune
+
+import torch
+from torch import Tensor
 
 FILE = "rivals.jsonl"
 RIVALS = ("merging", "specialist", "tuned", "prefix", "ranking")

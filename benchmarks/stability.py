@@ -18,9 +18,8 @@ import stability_plots
 import stability_popping
 import stability_scenes
 import stability_stiffness
-from common import RESULTS, ROOT, about, arguments, stored
-
 from clod_adapter.cli.shared.report import jsonable
+from common import RESULTS, ROOT, about, arguments, stored
 
 FILE, IMAGES = "stability.jsonl", ROOT / "docs" / "images"
 PARTS = {

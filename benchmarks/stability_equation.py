@@ -18,22 +18,23 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
-import mpmath
-import numpy as np
-import torch
-from common import table
-from equation_tally import Tallies
-from mpmath import mpf
-from torch import Tensor
-
 import exact
 from clod_adapter.attenuation import SIGMA_MAX, attenuate, log_attenuation
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.training.target_count import count_slope, soft_count
+from common import table
+from equation_tally import Tallies
 from exact import DTYPES, Array, Case, Wide, plain, tensor, wide
 
-FADE = math.log(1.5)  # log(a'' / tau s) above which the soft cut changes nothing
+import mpmath
+import numpy as np
+import torch
+from mpmath import mpf
+from torch import Tensor
+
+COUNT_BOUND = "4 + (abs(log tau s) + 1) / 2T + 1.5 z"
+FADE = math.log(1.5)  # log(a'' / tau s) above which the soft threshold changes nothing
 
 
 def gradients(value: Tensor, *leaves: Tensor) -> list[Array]:
@@ -63,23 +64,23 @@ def check_opacities(tallies: Tallies, case: Case) -> None:
     opacities = np.exp(case.log_a) * case.factor
     steep = np.where(opacities == 0, 0, opacities) * case.slope
     # exp makes u's error a relative one; where the results are float32's u is float64's until after it.
-    soft, said = (4 + 3 * np.minimum(case.u, 1e9), "4 + 3u") if tallies.wide else (4.0, "4")
+    soft, amplified = (4 + 3 * np.minimum(case.u, 1e9), "4 + 3u") if tallies.wide else (4.0, "4")
     where = {"logit": case.logits, "sigma_d": case.sigma, "d": case.d, "s": s, "eps": eps}
     # A gradient by sigma_d is a'' times a slope, which may be steep: as accurate as an a'' that is a normal number.
     normal = opacities >= tallies.info.tiny
     for name, bound, got, want, allowed, other, sure in [
         ("log opacity", "4", plain(out.log_opacities), case.log_a - case.u, 4, plain(naive.log()), True),
-        ("opacity", said, plain(out.opacities), opacities, soft, plain(naive), True),
+        ("opacity", amplified, plain(out.opacities), opacities, soft, plain(naive), True),
         ("gradient of log opacity by sigma_d", "4", log_by_sigma, case.slope, 4, naive_log_by_sigma, True),
         ("gradient of log opacity by logit", "4", log_by_logit, case.faint, 4, naive_log_by_logit, True),
-        ("gradient of opacity by sigma_d", said, by_sigma, steep, soft, naive_by_sigma, normal),
-        ("gradient of opacity by logit", said, by_logit, opacities * case.faint, soft, naive_by_logit, True),
+        ("gradient of opacity by sigma_d", amplified, by_sigma, steep, soft, naive_by_sigma, normal),
+        ("gradient of opacity by logit", amplified, by_logit, opacities * case.faint, soft, naive_by_logit, True),
     ]:
         tallies.of(name, bound, "gradient" in name).add(got, want, allowed, where, other, sure)
 
 
 def check_drawn(tallies: Tallies, case: Case, place: str) -> None:
-    """What either cut draws, and the soft one's gradient by sigma_d.
+    """The drawn opacities of either threshold, and the soft one's gradient by sigma_d.
 
     By ``x = log(a'' / tau s)``, a difference of logarithms. Points within rounding of the threshold are not compared.
     """
@@ -184,16 +185,13 @@ def check_counts(tallies: Tallies) -> None:
             allowed = 4 + np.expm1(info.eps * np.minimum((abs(level) + 1) / (2 * t) + 1.5 * z, 1e9)) / info.eps
             touched = np.where(np.isfinite(logs), np.maximum(2 * u, 1), 1)
         sure = (np.abs(logs - level) >= info.eps * (2 * np.abs(level) + 1)) & ((z < -math.log(info.tiny)) | (z > 1e4))
-        where, bound = (
-            {"log_opacity": logs, "s": s, "tau": tau, "temperature": t},
-            "4 + (abs(log tau s) + 1) / 2T + 1.5 z",
-        )
+        where = {"log_opacity": logs, "s": s, "tau": tau, "temperature": t}
         got, other = gradients(soft_count(leaf, s, tau, t), leaf)[0], gradients(soft.mean(), leaf)[0]
-        tallies.of("gradient of soft_count", bound, True).add(got, want, allowed, where, other, sure)
+        tallies.of("gradient of soft_count", COUNT_BOUND, True).add(got, want, allowed, where, other, sure)
         got = plain(count_slope(tensor(logit, dtype), leaf, s, tau, t))
         other = plain(exact.naive_slope(tensor(logit, dtype), leaf, soft, t))
         allowed = allowed + 2 + 2 * np.abs(log_a) / np.maximum(u, 0.5)
-        row = tallies.of("count_slope", bound + " + 2 + 2 abs(log a) / max(u, 1/2)")
+        row = tallies.of("count_slope", COUNT_BOUND + " + 2 + 2 abs(log a) / max(u, 1/2)")
         row.add(got, want * touched, allowed, {"logit": logit, **where}, other, sure)
 
 

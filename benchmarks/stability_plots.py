@@ -5,17 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, QUIET, label_log, new_figure, save_figure, tidy
 from stability_popping import STEPS as LENGTHS_OF_STEPS
 from stability_popping import SWEEPS, TOGETHER
 from stability_stiffness import CONFIG, CONVERGED, LENGTHS, OPTIMIZERS, STEPS, curves
 
-from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, QUIET, label_log, new_figure, save_figure, tidy
-
+NOTE = {"fontsize": 8, "color": QUIET, "va": "top"}
 LEGEND = {"loc": "outside lower center", "frameon": False, "fontsize": 8.5}
 
 
 def stiffness(rows: list[dict[str, Any]], path: Path) -> None:
-    """Error by step size on the left, by seconds at the best step size on the right; dashes for linear sigma."""
+    """Error by learning rate on the left, by seconds at the best one on the right; dots for linear sigma."""
     (start,) = (row["error"] for row in rows if row["what"] == "start")
     with new_figure((10.4, 4.6), layout="constrained") as figure:
         panels = figure.subplots(1, 2, sharey=True)
@@ -31,20 +31,17 @@ def stiffness(rows: list[dict[str, Any]], path: Path) -> None:
             for y, text in ((start, "start"), (CONVERGED * start, "converged")):
                 axes.axhline(y, color=QUIET, linewidth=0.8, linestyle="--")
                 if not timed:
-                    there = axes.get_yaxis_transform()
-                    axes.text(0.01, y * 0.97, text, transform=there, fontsize=8, color=QUIET, va="top")
-            axes.set_xscale("log")
-            axes.set_yscale("log")
+                    axes.text(0.01, y * 0.97, text, transform=axes.get_yaxis_transform(), **NOTE)
+            axes.set(xscale="log", yscale="log")
             tidy(axes)
         label_log(panels[0].yaxis, "{:g}")
         label_log(panels[0].xaxis, "{:g}", subs=(1,))
         label_log(panels[1].xaxis, "{:g}", subs=(1, 3))
         panels[0].axvline(CONFIG.lr_sigma, color=BLUE, linewidth=0.8)
-        panels[0].text(CONFIG.lr_sigma * 0.9, 0.0125, "default\nstep size", fontsize=8, color=BLUE, ha="right")
-        panels[0].set_ylim(0.012, 0.6)
-        panels[0].set_ylabel("RMS error of the opacity that is drawn")
-        panels[0].set_xlabel(f"step size, {STEPS} steps")
-        panels[1].set_xlabel(f"seconds of training, {LENGTHS[0]} to {LENGTHS[-1]} steps at the best step size")
+        panels[0].text(CONFIG.lr_sigma * 0.9, 0.0125, "default\nlearning rate", fontsize=8, color=BLUE, ha="right")
+        panels[0].set(ylim=(0.012, 0.6), ylabel="RMS error of the opacity that is drawn")
+        panels[0].set_xlabel(f"learning rate, {STEPS} steps")
+        panels[1].set_xlabel(f"seconds of training, {LENGTHS[0]} to {LENGTHS[-1]} steps at the best learning rate")
         panels[0].plot([], [], color=INK, linestyle="-", marker="o", markersize=3.5, label="log sigma_d")
         panels[0].plot([], [], color=INK, linestyle=":", label="linear sigma_d")
         figure.legend(*panels[0].get_legend_handles_labels(), **LEGEND, ncols=5)
@@ -52,7 +49,7 @@ def stiffness(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def popping(rows: list[dict[str, Any]], path: Path) -> None:
-    """Log-log, a panel a sweep: a colour a normaliser, dashes for the hard cut."""
+    """Log-log, a panel a sweep: a colour a normalizer, dashes for the hard threshold."""
     colours = {"scene": BLUE, "quantile": GREEN, "max": ORANGE}
     with new_figure((10.4, 3.9), layout="constrained") as figure:
         panels = figure.subplots(1, len(SWEEPS), sharey=True)
@@ -73,17 +70,14 @@ def popping(rows: list[dict[str, Any]], path: Path) -> None:
                           linestyle=":", label="bound of the default")  # fmt: skip
             axes.axhline(TOGETHER, color=QUIET, linewidth=0.8)
             axes.set_title(title, loc="left", fontsize=9.5)
-            axes.set_xscale("log")
-            axes.set_yscale("log")
+            axes.set(xscale="log", yscale="log", ylim=(0.15, 500))
             axes.set_xticks([1 / steps for steps in LENGTHS_OF_STEPS], [f"1/{steps}" for steps in LENGTHS_OF_STEPS])
             axes.set_xticks([], minor=True)
-            axes.set_ylim(0.15, 500)
             label_log(axes.yaxis, "{:g}", subs=(1,))
             tidy(axes)
         panels[0].set_ylabel("largest change of a pixel in a step (of 255)")
-        note = {"fontsize": 8, "color": QUIET, "va": "top"}
-        panels[0].text(1 / max(LENGTHS_OF_STEPS), TOGETHER * 0.9, f"one level for each of the {TOGETHER}", **note)
-        panels[1].text(1 / max(LENGTHS_OF_STEPS), 0.24, "scene, both cuts: no change", fontsize=8, color=BLUE)
+        panels[0].text(1 / max(LENGTHS_OF_STEPS), TOGETHER * 0.9, f"one level for each of the {TOGETHER}", **NOTE)
+        panels[1].text(1 / max(LENGTHS_OF_STEPS), 0.3, "scene, both thresholds: no change", **NOTE)
         panels[1].set_xlabel("length of a step, share of the sweep")
         handles = {h.get_label(): h for axes in panels for h in axes.get_lines() if not h.get_label().startswith("_")}
         figure.legend(handles.values(), handles.keys(), **LEGEND, ncols=4)

@@ -1,17 +1,13 @@
-"""Popping: the largest change of any pixel per step, for every normaliser and cut, by the length of the steps.
+"""Popping: the largest change of any pixel per step, for every normalizer and threshold, by the length of the steps.
 
 The scene is made to pop: Gaussians in one place with one extinction scale, and one far away that enters the frustum
-while the camera turns, among others with different extinction scales. Three sweeps in steps of four lengths: the dial
-from 1 to max_sv, a camera that turns, a camera that moves and turns. A fade changes in proportion to the step's length
-(slope 1), a pop by the same amount at any length (slope 0).
-
-The default, one D for the scene and the soft cut, has a bound. For the opacities that are drawn (``attenuation``)::
+while the camera turns. A fade changes in proportion to the step's length (slope 1), a pop by the same amount (slope 0).
+The default, one D for the scene and the soft threshold, has a bound. For the drawn opacities (``attenuation``)::
 
     |change of opacity| <= L h    L = 2 x (1.5 - 4 ln x), x = min(1.5 tau max_sv, exp(-5/8)); at most 4.3
 
-``h`` is the change of ``log s``, or of the logarithm of the distance. Rasterizers drop an alpha below 1/255, one level
-of a pixel. With ``W`` the largest sum of the Gaussians' footprints over one pixel and colours within 0 and 1, no pixel
-changes by more than ``W (255 L h + 1)`` levels.
+``h`` is the change of ``log s``, or of the logarithm of the distance. With ``W`` the largest sum of the Gaussians'
+footprints over one pixel, no pixel changes by more than ``W (255 L h + 1)`` levels: rasterizers drop an alpha < 1/255.
 """
 
 from __future__ import annotations
@@ -20,21 +16,17 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import clod_adapter  # noqa: F401  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-import torch
-from common import table
-from torch import Tensor
-
-from clod_adapter.adapter import attach
-from clod_adapter.cameras import Camera
-from clod_adapter.config import CUTS, NORMALIZERS, AdaptConfig, AttenuationConfig
+import clod_adapter as clod
+from clod_adapter.config import CUTS, NORMALIZERS, AttenuationConfig
 from clod_adapter.distances import normalized_distances
 from clod_adapter.evaluation.popping import dial_popping, path, path_popping
 from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.render import splat
+from common import table
+
+import torch
+from torch import Tensor
 
 STEPS = (20, 40, 80, 160)
 SWEEPS = {"dial": "the dial from 1 to 5", "turn": "a camera that turns, s = 2", "path": "a camera that moves, s = 2"}
@@ -58,7 +50,7 @@ def measure() -> list[dict[str, Any]]:
     return rows
 
 
-def scene(normalizer: str, cut: str) -> tuple[Gaussians, dict[str, list[Camera]]]:
+def scene(normalizer: str, cut: str) -> tuple[Gaussians, dict[str, list[clod.Camera]]]:
     """The Gaussians, and by name of the sweep the cameras it goes through."""
     draw = torch.Generator().manual_seed(0)
     n = OTHERS + TOGETHER + 1
@@ -72,7 +64,7 @@ def scene(normalizer: str, cut: str) -> tuple[Gaussians, dict[str, list[Camera]]
     logits[OTHERS:] = 3.0
     quats = torch.randn(n, 4, generator=draw)
     plain = Gaussians(means, quats, log_scales, logits, (colours - 0.5) / SH_C0, torch.empty(n, 0, 3))
-    config = AdaptConfig()
+    config = clod.AdaptConfig()
     settings = replace(config.attenuation(DISTANCE), normalizer=normalizer, cut=cut)
     eye = torch.tensor([0.0, 0.0, -DISTANCE])
     start = _looking(eye, torch.zeros(3))
@@ -85,20 +77,20 @@ def scene(normalizer: str, cut: str) -> tuple[Gaussians, dict[str, list[Camera]]
     leave[OTHERS:-1] = 2.2
     distances = normalized_distances(means, start, settings)
     sigma = sigma_for_extinction(logits, distances, leave, settings).clamp(max=100.0)
-    return attach(plain, sigma, settings), cameras
+    return clod.attach(plain, sigma, settings), cameras
 
 
-def _looking(eye: Tensor, at: Tensor, width: int = 48, height: int = 36) -> Camera:
+def _looking(eye: Tensor, at: Tensor, width: int = 48, height: int = 36) -> clod.Camera:
     forward = torch.nn.functional.normalize(at - eye, dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward), dim=0)
     viewmat = torch.eye(4)
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
     K = torch.tensor([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1.0]])
-    return Camera(viewmat, K, width, height)
+    return clod.Camera(viewmat, K, width, height)
 
 
-def _sweep(some: Gaussians, cameras: dict[str, list[Camera]], sweep: str, steps: int) -> Any:
+def _sweep(some: Gaussians, cameras: dict[str, list[clod.Camera]], sweep: str, steps: int) -> Any:
     assert some.attenuation is not None
     if sweep == "dial":
         return dial_popping(some, cameras[sweep][0], some.attenuation.max_sv, steps=steps)
@@ -106,13 +98,13 @@ def _sweep(some: Gaussians, cameras: dict[str, list[Camera]], sweep: str, steps:
 
 
 def steepest(config: AttenuationConfig) -> float:
-    """L: by how much an opacity under the soft cut can change per unit of log s."""
+    """L: by how much an opacity under the soft threshold can change per unit of log s."""
     x = min(1.5 * config.tau * config.max_sv, math.exp(-0.625))
     return max(2 * x * (1.5 - 4 * math.log(x)), 2 / math.e)
 
 
 @torch.no_grad()
-def bound(some: Gaussians, cameras: dict[str, list[Camera]], sweep: str, steps: int) -> float:
+def bound(some: Gaussians, cameras: dict[str, list[clod.Camera]], sweep: str, steps: int) -> float:
     """``W (255 L h + 1)``: the most that a pixel can change in a step of the default; 0 where no distance changes."""
     assert some.attenuation is not None
     if sweep == "turn":
@@ -143,5 +135,5 @@ def tables(rows: list[dict[str, Any]]) -> str:
         if default:
             lines.append(["its bound", "", *(f"{min(own[end]['bound'], 255):.0f}" for end in ends)])
     held = all(row["pixel"] <= row["bound"] + 0.05 for row in rows if "bound" in row)
-    found = table(["normaliser", "cut", *(f"{name}: 1/{steps}" for name, steps in ends)], lines)
+    found = table(["normalizer", "threshold", *(f"{name}: 1/{steps}" for name, steps in ends)], lines)
     return f"{found}\n\nThe bound {'holds' if held else 'IS BROKEN'}."

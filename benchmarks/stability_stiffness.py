@@ -5,7 +5,7 @@ mean of the last steps:
 
 - ``equation``: Gaussians at distances over eight decades with known sigma_d that meets the target count. The loss is
   the mean square difference of the drawn opacities from the right ones. Starts are off by up to four decades each way.
-  Every optimiser gets the same gradient, of the loss and of the count term.
+  Every optimizer gets the same gradient, of the loss and of the count term.
 - ``stuck`` and ``training``: the same through the training step itself (``stability_stuck.py``).
 """
 
@@ -18,15 +18,6 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-import clod_adapter  # noqa: F401  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-import numpy as np
-import torch
-from common import table
-from stability_stuck import CONFIG, DIALS, STUCK_STEPS, TRAINING_STEPS, scene, stuck_rows, training_rows
-from torch import Tensor
-
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.attenuation import Attenuated, attenuate
 from clod_adapter.distances import normalized_distances
@@ -34,6 +25,12 @@ from clod_adapter.report.style import BLUE, GREEN, ORANGE, PURPLE, QUIET
 from clod_adapter.training.objective import SIGMA_RANGE
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.target_count import count_gradient
+from common import table
+from stability_stuck import CONFIG, DIALS, STUCK_STEPS, TRAINING_STEPS, scene, stuck_rows, training_rows
+
+import numpy as np
+import torch
+from torch import Tensor
 
 RATES = tuple(10 ** (k / 2) for k in range(-8, 1))  # 1e-4 to 1 in half decades
 WRONG = 4.0  # decades, each way
@@ -175,7 +172,7 @@ def _gradients(task: Problem, x: Tensor, log: bool, other: int) -> Tensor:
 
 
 def curves(rows: list[dict[str, Any]], timed: bool) -> dict[tuple[str, str], list[dict[str, Any]]]:
-    """Rows by optimiser and parameter: over the step sizes; or, timed, over the steps at the best step size."""
+    """Rows by optimizer and parameter: over the learning rates; or, timed, over the steps at the best one."""
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in rows:
         if row["what"] == "equation" and ("seconds" in row) == timed:
@@ -197,10 +194,10 @@ def tables(rows: list[dict[str, Any]]) -> str:
     ends = [
         f"{row['from']} start: {row['before']:.3f} to {row['after']:.3f}" for row in rows if row["what"] == "training"
     ]
-    heads = ["optimiser", "sigma_d", "best error", "at", "step sizes that converge", "seconds to it"]
+    heads = ["optimizer", "sigma_d", "best error", "at", "learning rates that converge", "seconds to it"]
     return "\n\n".join([
         table(heads, lines), f"RMS error at the start: {start:.2f}",
-        f"step sizes that converge from starts at most one decade wrong: {'; '.join(near)}",
+        f"learning rates that converge from initial values at most one decade wrong: {'; '.join(near)}",
         table(["cannot come back", "at the start", f"after {STUCK_STEPS} steps"], stuck),
         f"objective, {TRAINING_STEPS} steps: {'; '.join(ends)}",
     ])  # fmt: skip

@@ -1,15 +1,12 @@
-"""From the command to the first training step: seconds by phase, and memory.
+"""Seconds from the command to the first training step, by phase.
 
-    python benchmarks/startup.py                         # everything, on plush_half; several minutes
-    python benchmarks/startup.py warm help               # two cases of it
-    python benchmarks/startup.py --record                # and a row in results/startup.jsonl
+    python benchmarks/startup.py --record                # on plush_half; several minutes
 
-Times the command ``clod-adapt PLY --images DIR --iters 1`` from outside, by its messages and the seconds in its report:
+Times the command ``clod-adapt PLY --images DIR --iters 1`` from outside, by its messages and its report:
 
 - ``help``: ``--help``, and the error for a checkpoint that does not exist;
-- ``warm``: with kernels cached by an earlier run, the median of three runs;
-- ``first``: with an empty cache, where kernels are compiled;
-- ``memory``: the peak of a longer training, beyond that of a process that only imports torch.
+- ``warm``: with cached kernels, the median of three runs;
+- ``first``: with an empty cache, where kernels are compiled.
 """
 
 from __future__ import annotations
@@ -17,14 +14,13 @@ from __future__ import annotations
 import json
 import os
 import statistics
-import sys
 import tempfile
 from pathlib import Path
 
 from common import COMMAND, Process, Row, append, arguments, capture
 
 FILE = "startup.jsonl"
-SCENE, REPEATS, MEMORY_STEPS = "plush_half", 3, 100
+SCENE, REPEATS = "plush_half", 3
 # Messages of the command on stderr at the end of a phase.
 SAID = {
     "checkpoint": r": [\d,]+ Gaussians, SH", "photographs": r": \d+ photographs to train on", "base": r"^base: ",
@@ -33,15 +29,11 @@ SAID = {
 PHASES = ("imports", "reading", "kernels", "base", "importance", "first_step", "to_first_step")
 
 
-def adapt_words(out: Path, iters: int = 1) -> list[object]:
-    folder = capture(SCENE)
-    ply = folder / "pretrained.ply"
-    return [*COMMAND, ply, "--images", folder, "--iters", iters, "--out", out / "dial.ply", "--json"]
-
-
 def adapt(out: Path, cache: Path) -> tuple[Process, dict[str, float]]:
     """One run of one step, and its phases in seconds of wall time."""
-    run = Process(adapt_words(out), SAID, environment={"NUMBA_CACHE_DIR": str(cache)})
+    folder = capture(SCENE)
+    words = [folder / "pretrained.ply", "--images", folder, "--iters", 1, "--out", out / "dial.ply", "--json"]
+    run = Process([*COMMAND, *words], SAID, environment={"NUMBA_CACHE_DIR": str(cache)})
     seconds, at = json.loads(run.out)["seconds"], run.moments
     kernels = seconds.get("kernels", 0.0)
     durations = (
@@ -80,17 +72,7 @@ def case_first(work: Path) -> Row:
     return {"phases": rounded, "cpu_to_first_step": round(run.cpu["trained"], 2)}
 
 
-def case_memory(work: Path) -> Row:
-    empty = Process([sys.executable, "-c", "import torch"])
-    row: Row = {"torch_bytes": empty.peak_bytes, "steps": MEMORY_STEPS}
-    for name in ("compiling", "cached"):
-        cache = {"NUMBA_CACHE_DIR": str(work / "memory")}
-        run = Process(adapt_words(work, MEMORY_STEPS), environment=cache)
-        row[f"{name}_bytes"] = run.peak_bytes - empty.peak_bytes
-    return row
-
-
-CASES = {"help": case_help, "warm": case_warm, "first": case_first, "memory": case_memory}
+CASES = {"help": case_help, "warm": case_warm, "first": case_first}
 
 
 def main() -> None:

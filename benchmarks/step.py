@@ -1,31 +1,27 @@
 """Time of a training step by section and kernel, on real checkpoints.
 
-    python benchmarks/step.py                  # plush_half and bonsai146
-    python benchmarks/step.py plush_half --record
-
 Wall times are means over the steps after the first few, with the default settings at the start of training.
-``splat_share`` is the rasterizer's share of a step, forward and backward. A row names the commit of the imported
-package: to measure another one, put it first on PYTHONPATH.
+``splat_share`` is the rasterizer's share of a step. A row names the commit of the imported package: to measure another
+one, put it first on PYTHONPATH.
 """
 
 from __future__ import annotations
 
+import json
 import time
 from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
-import clod_adapter as clod  # before torch: it sets how OpenMP's threads wait
-
-# isort: split
-import torch
-from common import append, arguments, checkpoint, photographs
-
+import clod_adapter as clod
 from clod_adapter._kernels import threads
 from clod_adapter.initialization.importance import for_training, initialize
 from clod_adapter.rasterizers import cpu
 from clod_adapter.training import objective, optimizer
 from clod_adapter.training.trainer import Trainer
+from common import append, arguments, checkpoint, photographs
+
+import torch
 
 FILE = "step.jsonl"
 THREADS = 2
@@ -67,7 +63,7 @@ def main() -> None:
     clock.wrap(optimizer.RowAdam, "step", "optimiser")
     for scene in args.scenes:
         row = {"benchmark": "step", "scene": scene, "threads": THREADS, **profile(scene, 120, clock)}
-        print(table(row), flush=True)
+        print(json.dumps(row, indent=1), flush=True)
         if args.record:
             append(FILE, row)
 
@@ -88,11 +84,6 @@ def profile(scene: str, steps: int, clock: Clock, warm: int = 5) -> dict[str, An
     sections = {name: round(seconds / steps * 1e3, 2) for name, seconds in clock.seconds.items()}
     splat = (clock.seconds["splat forward"] + clock.seconds["splat backward"]) / steps
     return {"steps": steps, "step_ms": round(total * 1e3, 2), "splat_share": round(splat / total, 3), "ms": sections}
-
-
-def table(row: dict[str, Any]) -> str:
-    lines = [f"{row['scene']}: {row['step_ms']} ms a step, {row['splat_share']:.0%} of it in the rasterizer"]
-    return "\n".join(lines + [f"  {name:26} {ms:7.2f}" for name, ms in row["ms"].items()])
 
 
 if __name__ == "__main__":

@@ -1,12 +1,11 @@
 """Held-out error against seconds of training: ours, the paper's form, and a specialist for each dial value.
 
-    python benchmarks/tradeoff.py plush_half                  # all methods at all budgets, an hour or so
     python benchmarks/tradeoff.py plush_half --iters 150 400 1200
-    python benchmarks/tradeoff.py plush_half --plot           # docs/error_vs_time.html and its PNG of the stored rows
+    python benchmarks/tradeoff.py plush_half --plot     # docs/error_vs_time.html and its PNG, from the stored rows
 
-A budget is a number of steps; each is a run of its own with its own schedule. A specialist is made for one count, which
-ours keeps at that dial value in its longest run: the base merged to it, then tuned for as many
-steps; at s = 1 the whole base, tuned. Each run adds a row to ``results/tradeoff.jsonl``.
+Each number of steps is a separate run with its own schedule. A specialist is the base merged to the count that ours
+keeps at that dial value, then tuned for as many steps; at s = 1 the whole base, tuned. Each run adds a row to
+``results/tradeoff.jsonl``.
 """
 
 from __future__ import annotations
@@ -15,16 +14,13 @@ import sys
 from collections.abc import Callable, Sequence
 from statistics import fmean
 
-from common import RESULTS, ROOT, Row, append, arguments, checkpoint, photographs
-from common import stored as stored_rows
-from merging import merge
-from tuning import Tuning, tune
-
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.report import page
 from clod_adapter.report.charts import draw_training, error, inline_svg, training_chart
 from clod_adapter.report.style import new_figure, save_figure
+from common import RESULTS, ROOT, Row, append, arguments, checkpoint, photographs, stored
+from tuning import Tuning, merge, tune
 
 FILE = "tradeoff.jsonl"
 PAGE = ROOT / "docs" / "error_vs_time.html"
@@ -77,9 +73,7 @@ def dial(
 ) -> tuple[list[float], list[Row]]:
     """Seconds (of the one run that serves every dial value) and the row of each dial value."""
     config = (clod.AdaptConfig if method == "ours" else clod.AdaptConfig.paper)(max_sv=MAX_SV, iters=iters, seed=0)
-    done = clod.adapt(
-        base.gaussians, views, config, lambda p: follow(p.share if p.phase == "training" else 0.0)
-    )  # fmt: skip
+    done = clod.adapt(base.gaussians, views, config, lambda p: follow(p.share if p.phase == "training" else 0.0))
     rows = clod.evaluate(done.gaussians, views.test, DIALS)
     return [done.start_seconds + done.seconds] * len(rows), [row.as_dict() for row in rows]
 
@@ -100,17 +94,17 @@ def specialists(
 
 def counts(scene: str) -> list[int]:
     """Gaussians that ours keeps at each dial value in its longest run, of equal ones the last."""
-    longest = max((r for r in reversed(stored(scene)) if r["method"] == "ours"), key=lambda r: r["iters"])
+    longest = max((r for r in reversed(rows_of(scene)) if r["method"] == "ours"), key=lambda r: r["iters"])
     return [round(row["kept"]) for row in longest["rows"]]
 
 
-def stored(scene: str) -> list[Row]:
-    return [row for row in stored_rows(FILE) if (row["scene"], row["max_sv"]) == (scene, MAX_SV)]
+def rows_of(scene: str) -> list[Row]:
+    return [row for row in stored(FILE) if (row["scene"], row["max_sv"]) == (scene, MAX_SV)]
 
 
 def plot(scene: str) -> None:
     """A panel a dial value: error against seconds of training, the mean over seeds of the last row of each."""
-    rows = list({(r["method"], r["iters"], r["seed"]): r for r in stored(scene)}.values())  # the last of each
+    rows = list({(r["method"], r["iters"], r["seed"]): r for r in rows_of(scene)}.values())  # the last of each
     if not rows:
         sys.exit(f"there are no rows of {scene} in {RESULTS / FILE}")
     dials = [row["virtual_scale"] for row in rows[-1]["rows"]]

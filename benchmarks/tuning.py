@@ -1,43 +1,44 @@
-"""Plain tuning of a splat on photographs, without a dial: of all Gaussians, with or without random prefixes."""
+"""Plain tuning of a splat on photographs, without a dial, and merging by ``splat-transform --decimate`` (NanoGS)."""
 
 from __future__ import annotations
 
 import math
+import sys
+import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-
-import numpy as np
-import torch
-from torch import Tensor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import clod_adapter as clod
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES, detach
 from clod_adapter.cameras import camera_extent
+from clod_adapter.io.formats.splat_transform import SplatTransform
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import splat
 from clod_adapter.training.optimizer import RowAdam
+from common import CACHE
 
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement
+from torch import Tensor
+
+TIMEOUT = 3600.0  # seconds of a merging
 # 3DGS's rates of training; means times the cameras' extent.
 RATES = {"means": 1.6e-4, "quats": 1e-3, "log_scales": 5e-3, "opacity_logits": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tuning:
-    """How a tuning is run.
+    """The settings of a tuning."""
 
-    Attributes:
-        iters: steps, over which the learning rates fall exponentially to ``final`` of RATES.
-        seed: of the order of the views, and of the prefixes' lengths.
-        draw: "log" draws a prefix's share of all log-uniformly from [shortest, 1]; None trains no prefixes.
-    """
-
-    iters: int
-    seed: int = 0
+    iters: int  # steps, over which the learning rates fall exponentially to ``final`` of RATES
+    seed: int = 0  # of the order of the views, and of the prefixes' lengths
     rates: dict[str, float] = field(default_factory=lambda: dict(RATES))
     final: float = 0.05
-    draw: str | None = None
+    draw: str | None = None  # "log": a prefix's share of all is log-uniform in [shortest, 1]; None: no prefixes
     shortest: float = 0.01
 
 
@@ -93,3 +94,38 @@ def _gradients(
         loss = loss + photometric_loss(image, view.image)
     found = torch.autograd.grad(loss, [leaves[name] for name in tuned])
     return float(loss.detach()), dict(zip(tuned, found, strict=True))
+
+
+def find_tool() -> SplatTransform:
+    """splat-transform without a GPU; exits with the install command where it is missing or too old."""
+    try:
+        return replace(SplatTransform.find(), gpu=False)
+    except clod.ClodError as error:
+        sys.exit(str(error))
+
+
+def merge(base: clod.Checkpoint, count: int) -> tuple[clod.Gaussians, float]:
+    """The base merged to ``count`` Gaussians, and the seconds that the tool took, then or now."""
+    tool = find_tool()
+    CACHE.mkdir(parents=True, exist_ok=True)
+    out = CACHE / f"{base.fingerprint[:12]}-{tool.version}-{count}.ply"
+    clock = out.with_suffix(".seconds")
+    if not (out.exists() and clock.exists()):
+        # In a folder of its own: another benchmark may want the same file now.
+        with tempfile.TemporaryDirectory(dir=CACHE) as folder:
+            source, merged = Path(folder) / "base.ply", Path(folder) / "merged.ply"
+            _write_plain(source, base)
+            try:
+                seconds = tool.run("-q", source, "--decimate", str(count), merged, timeout=TIMEOUT)
+            except clod.ClodError as error:
+                sys.exit(str(error))
+            clock.write_text(f"{seconds:.2f}\n", encoding="utf-8")
+            merged.replace(out)
+    return clod.load(out).gaussians, float(clock.read_text(encoding="utf-8"))
+
+
+def _write_plain(path: Path, base: clod.Checkpoint) -> None:
+    """The rows that the reader used, without MaskGaussian's columns, whose averages would mean nothing."""
+    names = [name for name in base.vertex.dtype.names if not name.startswith("masks_")]
+    plain = base.vertex[names].astype([(name, base.vertex.dtype[name]) for name in names])  # a view keeps the gaps
+    PlyData([PlyElement.describe(plain, "vertex")]).write(path)

@@ -1,27 +1,23 @@
 """The page in a headless Chromium against clod_adapter.render: pictures and counts.
 
-    python benchmarks/viewer.py                      # plush_half and bonsai146
-
-Each capture's checkpoint is first adapted for 100 steps (kept in ``benchmarks/cache``), enough to compare pictures. At
-some held-out cameras and dial values, and with the equation off: PSNR between the browser's picture and
-``clod_adapter.render``, and the counts. The time to the first frame is that of WebGL in software. Each capture adds a
-row to ``results/viewer.jsonl``.
+Each capture's checkpoint is first adapted for 100 steps (kept in ``benchmarks/cache``). At some held-out cameras and
+dial values, and with the equation off: PSNR between the browser's picture and ``clod_adapter.render``, and the counts.
+The time to the first frame is that of WebGL in software. Each capture adds a row to ``results/viewer.jsonl``.
 """
 
 from __future__ import annotations
 
-import statistics
 import sys
 import time
 from pathlib import Path
+from statistics import fmean
 from typing import Any
+
+import clod_adapter as clod
+from common import CACHE, COMMAND, ROOT, Process, Row, append, arguments, capture, table
 
 import numpy as np
 import torch
-from common import CACHE, COMMAND, ROOT, Process, Row, append, arguments, capture
-
-import clod_adapter as clod
-from clod_adapter.adapter import detach
 
 sys.path.insert(0, str(ROOT / "tests"))
 import browser  # noqa: E402
@@ -70,7 +66,7 @@ def compare(shown: Shown, gaussians: clod.Gaussians, camera: clod.Camera) -> lis
         shown.run(f"clod.setEquation({str(dial is not None).lower()})")
         shown.run("clod.setDial(given)", dial or 1.0)
         with torch.no_grad():
-            wanted = clod.render(gaussians, camera, dial) if dial else clod.render(detach(gaussians), camera)
+            wanted = clod.render(gaussians, camera, dial) if dial else clod.render(clod.detach(gaussians), camera)
         error = float(((shown.picture().astype(np.float64) - wanted.pixels.numpy()) ** 2).mean())
         rows.append({
             "camera": camera.name, "virtual_scale": dial, "psnr": 10 * float(np.log10(255**2 / max(error, 1e-9))),
@@ -90,15 +86,14 @@ def adapted(name: str) -> Path:
 
 
 def summary(row: Row) -> str:
-    lines = [f"{row['capture']}: {row['gaussians']:,} Gaussians, first frame after {row['first_frame_seconds']:.1f} s"]
+    """PSNR and the largest difference of counts, at each dial value and with the equation off."""
+    lines = []
     for dial in (*DIALS, None):
         found = [each for each in row["rows"] if each["virtual_scale"] == dial]
         errors = [each["psnr"] for each in found]
-        apart = max(abs(each["kept"] - each["kept_in_page"]) for each in found)
-        label = f"s = {dial:g}" if dial else "equation off"
-        lines.append(f"  {label}: {min(errors):.1f} to {max(errors):.1f} dB, mean {statistics.fmean(errors):.1f}, "
-                     f"counts differ by at most {apart}")  # fmt: skip
-    return "\n".join([*lines, f"  errors in the console: {len(row['errors'])}"])
+        psnr = [f"{value:.1f}" for value in (min(errors), max(errors), fmean(errors))]
+        lines.append([dial or "equation off", *psnr, max(abs(each["kept"] - each["kept_in_page"]) for each in found)])
+    return table(["s", "least dB", "most", "mean", "counts differ by"], lines)
 
 
 if __name__ == "__main__":

@@ -10,12 +10,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from clod_adapter.cameras import Camera
+from clod_adapter.gaussians import SH_C0
+
 import numpy as np
 import torch
 from torch import Tensor
-
-from clod_adapter.cameras import Camera
-from clod_adapter.gaussians import SH_C0
 
 # Gaussians, width, height, seed.
 SIZES = {"W1": (50_000, 480, 320, 1), "W2": (300_000, 960, 640, 2)}

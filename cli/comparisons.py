@@ -1,4 +1,4 @@
-"""What ``clod-adapt eval`` compares on request: the base and other files at equal counts, and popping."""
+"""Optional comparisons of ``clod-adapt eval``: the base and other files at equal counts, and popping."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def compare(
     model: Gaussians, rows: Sequence[Row], base: Gaussians | None, others: Mapping[str, Gaussians], scene: Scene,
     metrics: Mapping[str, Metric], console: Console, with_popping: bool,
 ) -> Comparisons:  # fmt: skip
-    """Measures what was requested; after Ctrl-C, what is finished.
+    """Measures the requested comparisons; after Ctrl-C, returns the finished ones.
 
     Args:
         rows: of the model: the base is pruned to their counts, and other files with a dial are measured at their
@@ -113,7 +113,7 @@ def compare(
 
 @dataclass(frozen=True)
 class _Comparing:
-    """The measurements; each yields what is new once it is finished."""
+    """The measurements; each yields its results one by one."""
 
     model: Gaussians
     scene: Scene

@@ -16,7 +16,6 @@ from torch import Tensor
 from clod_adapter._support.text import file_name
 from clod_adapter._support.version import package_version
 from clod_adapter.cameras import View
-from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.lock import output_lock
@@ -27,6 +26,7 @@ from .shared.antialiasing import with_filter
 from .shared.budgets import solve_dials
 from .shared.console import Console
 from .shared.files import make_folder
+from .shared.interrupts import GracefulStop
 from .shared.kernels import prepare_kernels
 from .shared.measure import choose_dials
 from .shared.models import read_model_and_scene
@@ -83,18 +83,15 @@ def image_names(views: Sequence[View]) -> list[Path]:
 
 
 def write_all(images: Iterator[Written], total: int, out: Path, console: Console) -> tuple[list[Written], bool]:
-    """Writes the images with a progress bar; those written, and whether Ctrl-C ended it after the first."""
-    written = list[Written]()
-    try:
-        with output_lock(out / "pictures", of=out), console.meter("render") as meter:
-            for image in images:
-                written.append(image)
-                meter.update(len(written) / total, f"{len(written)}/{total}")
-    except KeyboardInterrupt:
-        if not written:
-            raise
-        return written, True
-    return written, False
+    """Writes the images with a progress bar; those written, and whether Ctrl-C ended it. A second one aborts."""
+    written, stop = list[Written](), GracefulStop()
+    with output_lock(out / "pictures", of=out), console.meter("render") as meter, stop.listening():
+        for image in images:
+            written.append(image)
+            meter.update(len(written) / total, f"{len(written)}/{total}")
+            if stop.requests:
+                break
+    return written, len(written) < total
 
 
 @torch.no_grad()
@@ -113,10 +110,7 @@ def write_images(
 
 def write_png(path: Path, pixels: Tensor) -> None:
     """Writes ``[H, W, 3]`` uint8 pixels; makes the folder if it is missing."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ClodError(f"{path.parent}: cannot be made ({error.strerror or error}); choose another --out") from error
+    make_folder(path.parent)
     with atomic_path(path) as temporary:
         about = PngImagePlugin.PngInfo()
         about.add_text("Software", f"clod-adapter {package_version()}")  # check_ours looks for it

@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from contextlib import suppress
 from typing import Any
 
 from clod_adapter._support.version import package_version
 from clod_adapter.cameras import Camera
 from clod_adapter.io.scene.poses import load_cameras
+from clod_adapter.progress import Stopped
 from clod_adapter.viewer.page import policy, served_page
 from clod_adapter.viewer.payload import Payload, page_config
 from clod_adapter.viewer.server import Response, Server
@@ -19,6 +21,7 @@ from .shared.browsers import open_browser
 from .shared.console import Console
 from .shared.dials import initial_dial
 from .shared.inputs import read_checkpoint
+from .shared.interrupts import interrupt_as_stopped
 from .shared.report import jsonable
 
 MODEL, BASE = "/files/model", "/files/base"
@@ -32,13 +35,13 @@ def run(args: argparse.Namespace) -> None:
         report |= {"url": server.url, "port": server.port}
         # Here, and not by main after the command: a script needs the address while the page is served.
         shown = json.dumps(jsonable(report)) if args.json else f"{server.url}  (Ctrl-C ends)"
-        try:  # around print: a reader of the address may interrupt before the server waits
+        # Around print: a reader of the address may interrupt before the server waits.
+        with suppress(Stopped), interrupt_as_stopped():
             print(shown, file=sys.__stdout__ if args.json else None, flush=True)
             if not args.no_browser and not open_browser(server.url):
                 console.say(f"no browser found; open {server.url}, from another machine through ssh -L")
             server.serve_forever()
-        except KeyboardInterrupt:
-            console.say("ended")
+        console.say("ended")
 
 
 def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Response], dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Shared by the tests of file formats: models with edge cases, damaged files, and splat-transform."""
+"""Helpers of the tests of file formats: models with extreme values, damaged files, splat-transform."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import shutil
 import struct
 import subprocess
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import pytest
 import torch
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
+from scipy.spatial.transform import Rotation
 
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import AttenuationConfig
@@ -31,7 +32,7 @@ ORIGIN = (5.1e5, -4096.0, 0.25)
 
 
 def model(degree: int = 3, count: int = 40) -> Gaussians:
-    """Gaussians with a dial: an opaque one, extreme values of sigma_d, and rotations of any length."""
+    """With a dial; opacity 1, very large, small and zero sigma_d, quaternions of length 1e-30 to 1e30."""
     g = gaussians(count, degree, seed=degree)
     sigma = torch.rand(count, generator=torch.Generator().manual_seed(1)) * 4
     sigma[:4] = torch.tensor([1e9, 0.0, 1e-3, 65504.0])
@@ -42,42 +43,39 @@ def model(degree: int = 3, count: int = 40) -> Gaussians:
     return g.replace(opacity_logits=logits, quats=quats, sigma_d=sigma, attenuation=ATTENUATION)
 
 
+def rotations(quats: torch.Tensor) -> Rotation:
+    return Rotation.from_quat(quats.double().roll(-1, 1).numpy())
+
+
 def turned(a: torch.Tensor, b: torch.Tensor) -> float:
     """The largest angle between rotations, radians."""
-    unit = [q.double() / q.double().abs().amax(1, keepdim=True) for q in (a, b)]
-    unit = [q / q.norm(dim=1, keepdim=True) for q in unit]
-    apart = torch.minimum((unit[0] - unit[1]).norm(dim=1), (unit[0] + unit[1]).norm(dim=1))
-    return float(4 * torch.asin(apart.clamp(max=2**0.5) / 2).max())
+    return float((rotations(a).inv() * rotations(b)).magnitude().max())
 
 
 def covariances(g: Gaussians) -> torch.Tensor:
-    """``[N, 3, 3]`` float64 covariances, which do not depend on the choice among equivalent rotations."""
-    w, x, y, z = (g.quats.double() / g.quats.double().norm(dim=1, keepdim=True)).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    axes = torch.stack(rows, 1).reshape(-1, 3, 3) * g.log_scales.double().exp()[:, None]
+    """``[N, 3, 3]`` float64, the same for every rotation that gives the same ellipsoid."""
+    axes = torch.from_numpy(rotations(g.quats).as_matrix()) * g.log_scales.double().exp()[:, None]
     return axes @ axes.mT
 
 
 def damaged(whole: bytes, data: st.DataObject) -> bytes:
-    """A truncated file, or one with a few bytes changed, mostly near its beginning."""
+    """A truncated file, or one with a few values overwritten, at its beginning more often than in the rest."""
     if data.draw(st.booleans()):
         return whole[: data.draw(st.integers(0, len(whole) - 1))]
     changed = bytearray(whole)
+    words = st.sampled_from([b"\xff" * 8, b"\xff" * 4, b"\0" * 8, b"\0\0\0\x80", b"nan", b" ", b"-1", b"\n", b"#"])
     for _ in range(data.draw(st.integers(1, 4))):
-        end = data.draw(st.sampled_from([16, 64, 1024, len(whole)]))
-        changed[data.draw(st.integers(0, min(end, len(whole)) - 1))] = data.draw(st.integers(0, 255))
+        end = min(data.draw(st.sampled_from([16, 64, 1024, len(whole)])), len(whole))
+        at, value = data.draw(st.integers(0, end - 1)), data.draw(st.binary(min_size=1, max_size=1) | words)
+        changed[at : at + len(value)] = value
     return bytes(changed)
 
 
 def splat_transform(*arguments: str | Path) -> None:
-    """Runs splat-transform from PATH or $CLOD_SPLAT_TRANSFORM; skips the test where it is missing."""
+    """Runs splat-transform, from PATH or $CLOD_SPLAT_TRANSFORM; skips the test if it is missing."""
     command = os.environ.get("CLOD_SPLAT_TRANSFORM") or shutil.which("splat-transform")
     if command is None:
-        pytest.skip("splat-transform is not on PATH, and CLOD_SPLAT_TRANSFORM does not say where it is")
+        pytest.skip("splat-transform is not on PATH, and CLOD_SPLAT_TRANSFORM is not set")
     done = subprocess.run(
         [*command.split(), "-q", "-w", *map(str, arguments)], capture_output=True, text=True, timeout=100
     )
@@ -85,7 +83,7 @@ def splat_transform(*arguments: str | Path) -> None:
 
 
 def rows_by_place(means: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """For each of ``means`` the row of ``others`` that is nearest to it; all different."""
+    """The row of ``others`` nearest to each of ``means``; all different."""
     rows = np.linalg.norm(means[:, None] - others[None], axis=2).argmin(1)
     assert len(set(rows)) == len(rows)
     return rows
@@ -113,11 +111,20 @@ def change_setting(path: Path, name: str, old: str, new: str) -> Path:
     return path
 
 
+def write_rows(path: Path, rows: np.ndarray, order: str = "<", comments: Iterable[str] = ()) -> Path:
+    """A PLY of these vertices, in the byte order "<" or ">", or "ascii"."""
+    return write_elements(path, [PlyElement.describe(rows, "vertex", comments=list(comments))], order)
+
+
+def write_elements(path: Path, elements: Sequence[PlyElement], order: str = "<") -> Path:
+    PlyData(elements, text=order == "ascii", byte_order="=" if order == "ascii" else order).write(str(path))
+    return path
+
+
 def without_comments(path: Path, **columns: Any) -> Path:
     """The file as another tool writes it: without its comments, some columns added or changed in every row."""
-    rows, found = with_columns(PlyData.read(str(path))["vertex"].data, **columns), path.with_name("rewritten.ply")
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(found))
-    return found
+    rows = with_columns(PlyData.read(str(path))["vertex"].data, **columns)
+    return write_rows(path.with_name("rewritten.ply"), rows)
 
 
 def with_columns(old: np.ndarray, **columns: Any) -> np.ndarray:

@@ -16,28 +16,23 @@ BLOCK = 256
 def write_packed(path: Path, gaussians: Gaussians, *, colours: bool = True) -> Path:
     """Writes blocks in the order of the rows; without ``colours`` as in older files, with colours in [0, 1]."""
     count = len(gaussians)
-    means, scales = gaussians.means.numpy(), gaussians.log_scales.numpy()
+    starts, block = np.arange(0, count, BLOCK), np.arange(count) // BLOCK
     rgb = 0.5 + SH_C0 * gaussians.sh0[:, 0].numpy()
-    kinds = [("", means), ("scale_", scales)]
-    names = [f"{end}_{what}{axis}" for what, _ in kinds for end in ("min", "max") for axis in "xyz"]
-    names += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"] if colours else []
-    chunks = np.zeros(-(-count // BLOCK), [(name, "f4") for name in names])
-    shares = [np.zeros((count, 3)) for _ in range(3)]
-    for k in range(len(chunks)):
-        rows = slice(k * BLOCK, (k + 1) * BLOCK)
-        for target, (what, values), axes in zip(shares, [*kinds, ("", rgb)], ["xyz", "xyz", "rgb"], strict=True):
-            low, high = values[rows].min(0), values[rows].max(0)
-            if axes == "rgb" and not colours:
-                low, high = np.zeros(3), np.ones(3)
-            else:
-                for j, axis in enumerate(axes):
-                    chunks[f"min_{what}{axis}"][k], chunks[f"max_{what}{axis}"][k] = low[j], high[j]
-            target[rows] = (values[rows] - low) / np.maximum(high - low, 1e-12)
+    groups = {"xyz": gaussians.means.numpy(), "scale": gaussians.log_scales.numpy()} | ({"rgb": rgb} if colours else {})
+    names = {"xyz": ("x", "y", "z"), "scale": ("scale_x", "scale_y", "scale_z"), "rgb": ("r", "g", "b")}
+    ranges = [f"{end}_{name}" for group in groups for end in ("min", "max") for name in names[group]]
+    chunks = np.zeros(len(starts), [(name, "f4") for name in ranges])
+    shares = {"rgb": rgb}
+    for group, values in groups.items():
+        low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+        for j, name in enumerate(names[group]):
+            chunks[f"min_{name}"], chunks[f"max_{name}"] = low[:, j], high[:, j]
+        shares[group] = (values - low[block]) / np.maximum(high - low, 1e-12)[block]
     opacity = gaussians.opacities.numpy()[:, None]
     vertex = np.zeros(count, [(f"packed_{name}", "u4") for name in ("position", "rotation", "scale", "color")])
-    vertex["packed_position"] = _bits(shares[0], (11, 10, 11))
-    vertex["packed_scale"] = _bits(shares[1], (11, 10, 11))
-    vertex["packed_color"] = _bits(np.concatenate([shares[2], opacity], 1), (8, 8, 8, 8))
+    vertex["packed_position"] = _bits(shares["xyz"], (11, 10, 11))
+    vertex["packed_scale"] = _bits(shares["scale"], (11, 10, 11))
+    vertex["packed_color"] = _bits(np.concatenate([shares["rgb"], opacity], 1), (8, 8, 8, 8))
     vertex["packed_rotation"] = _rotations(gaussians.quats)
     elements = [PlyElement.describe(chunks, "chunk"), PlyElement.describe(vertex, "vertex")]
     bands = gaussians.shN.shape[1]

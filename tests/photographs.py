@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +16,10 @@ from PIL import Image
 from clod_adapter.cameras import Camera
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.io.scene.colmap_library import pycolmap
+from formats import damaged
 
 SIZE = {"width": 160, "height": 120}
+INTRINSICS = {"fl_x": 30.0, "fl_y": 31.0, "cx": 19.25, "cy": 15.5, "w": 40, "h": 30}  # of a transforms file
 LENSES = {
     "SIMPLE_RADIAL": [140, 82, 58, -0.12],
     "RADIAL": [140, 82, 58, -0.15, 0.05],
@@ -58,10 +63,26 @@ def write_scene(folder: Path, count: int = 10) -> tuple[list[Camera], list[str]]
     cameras = [camera(i, focal=30.0 + i % 2) for i in range(count)]
     names = [f"sub/{count - i:03d}.png" for i in range(count)]
     write_model(folder, cameras, names)
-    (folder / "images" / "sub").mkdir(parents=True)
-    for i, name in enumerate(names):
-        Image.fromarray(pixels(i)).save(folder / "images" / name)
+    write_images(folder / "images", names)
     return cameras, names
+
+
+def write_images(folder: Path, names: Sequence[str], **size: int) -> None:
+    """The ``pixels`` of 0, 1, 2, ..."""
+    for i, name in enumerate(names):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels(i, **size)).save(folder / name)
+
+
+def to_world(seed: int) -> list[list[float]]:
+    """``pose(seed)`` as a transforms file has it: camera to world, OpenGL axes."""
+    return (np.linalg.inv(pose(seed).double().numpy()) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
+
+
+def write_frames(folder: Path, frames: list[Any], file: str = "transforms.json", **rest: Any) -> Path:
+    folder.mkdir(exist_ok=True)
+    (folder / file).write_text(json.dumps({**rest, "frames": frames}))
+    return folder
 
 
 def as_text(folder: Path) -> None:
@@ -99,14 +120,6 @@ def psnr_of(picture: np.ndarray, other: np.ndarray) -> float:
 
 
 def damage(data: st.DataObject, files: list[Path]) -> None:
-    """Cuts one of the files, or overwrites some of its bytes, as hypothesis draws."""
+    """Truncates one of the files, or overwrites some of its bytes."""
     path = data.draw(st.sampled_from(files))
-    content = bytearray(path.read_bytes())
-    if data.draw(st.booleans()):
-        del content[data.draw(st.integers(0, len(content) - 1)) :]
-    else:
-        values = [b"\xff" * 8, b"\xff" * 4, b"\0" * 8, b"\0\0\0\x80", b"nan", b" ", b"-1", b"\n", b"#"]
-        for _ in range(data.draw(st.integers(1, 3))):
-            value, at = data.draw(st.sampled_from(values)), data.draw(st.integers(0, len(content) - 1))
-            content[at : at + len(value)] = value
-    path.write_bytes(content)
+    path.write_bytes(damaged(path.read_bytes(), data))

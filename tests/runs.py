@@ -1,4 +1,4 @@
-"""Shared by tests of training: file names, injected errors and signals, and processes that start quickly."""
+"""Shared by tests of the command: file names, injected errors and interrupts, processes that start fast."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ import json, os, signal, sys, tempfile
 import torch
 torch.set_num_threads(1)  # a process that forks must have no threads
 from clod_adapter.cli import main
-from clod_adapter.cli.adapt import processes, resume
+from clod_adapter.cli.adapt import processes, saver
 from clod_adapter.cli.adapt import run as adapt
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.kernels import prepare_kernels
@@ -52,7 +52,7 @@ for line in sys.stdin:
         for stream in (1, 2):
             os.dup2(log, stream)
         torch.set_num_threads(1 if about["environment"] else 2)
-        resume.SAVE_EVERY, resume.SAVE_COST = 0.0, 1e9  # a state after each step
+        saver.SAVE_EVERY, saver.SAVE_COST = 0.0, 1e9  # a state after each step
         code = 1
         try:
             exec(about["before"])
@@ -97,6 +97,11 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
+def notes_of(report: Any) -> list[str]:
+    """Without the note on LPIPS and FLIP, which depends on installed packages."""
+    return [note for note in report["notes"] if not note.startswith("without ")]
+
+
 def log_of(folder: Path, rank: object = "") -> str:
     return Path(f"{folder}{rank}.log").read_text()
 
@@ -124,15 +129,16 @@ def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[.
     return pressed
 
 
-def change_step(
-    patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any], only: Callable[[Any], bool] = lambda config: True
-) -> None:
-    """Applies ``change`` to the gradients of the ``at``-th step of runs whose config satisfies ``only``."""
+def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]) -> None:
+    """Replaces the gradients of the ``at``-th step from here by ``change`` of them, except in runs of one step.
+
+    Such a run prepares the kernels.
+    """
     real, steps = Objective.gradient_sum, count(1)
 
     def changed(self: Objective, *given: Any) -> Any:
         found = real(self, *given)
-        return change(found) if only(self.config) and next(steps) == at else found
+        return change(found) if self.config.iters > 1 and next(steps) == at else found
 
     patch.setattr(Objective, "gradient_sum", changed)
 

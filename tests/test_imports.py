@@ -30,6 +30,7 @@ ORDER: list[set[str]] = [
     {"bake", "initialization"},
     {"io.atomic", "io.screen_filter", "io.settings", "io.sniff"},
     {"io.file_formats", "io.lock", "io.ply", "io.scene", "io.tensor_file"},
+    {"io.content"},
     {"io.checkpoint"},
     {"io.formats"},
     {"io.adapter_file"},

@@ -21,15 +21,16 @@ from clod_adapter.initialization.importance import usable_views
 from clod_adapter.io.scene.image_cache import ImageCache
 from clod_adapter.progress import Phase, Stopped
 from clod_adapter.rasterizers.cpu import release_memory
-from clod_adapter.training.state import Adapted, StateRefused
+from clod_adapter.training.state import Adapted
 
 from ..shared.console import duration
 from ..shared.files import size
 from ..shared.report import machine
 from .block_files import BlockFiles
+from .display import ProgressDisplay
 from .inputs import Inputs
-from .progress import ProgressDisplay
-from .resume import Saver, check_resumed, find_state, settings_key
+from .resume import check_resumed, find_state, settings_key
+from .saver import Saver
 from .setup import Setup
 
 
@@ -43,14 +44,6 @@ class Pass:
 
     def name(self, division: Division) -> str:
         return f"block {self.block + 1} of {division.count}, pass {self.number} of {division.passes}"
-
-
-@dataclass(frozen=True)
-class BlockResult:
-    """The result of one block in one pass; ``failed``: why training ended early in this process."""
-
-    learned: Learned
-    failed: str | None = None
 
 
 @dataclass(frozen=True)
@@ -101,13 +94,13 @@ class Blocks:
         divided, failed, merged, steps, seconds = self.divided(inputs), list[str](), None, 0, 0.0
         start_seconds, division = time.perf_counter() - began, divided.division
         for number in range(1, division.passes + 1):
-            results = [self.train(inputs, divided, Pass(block, number, merged)) for block in range(division.count)]
-            merged = merge(division, [result.learned for result in results])
-            steps, seconds = (
-                steps + sum(result.learned.steps for result in results),
-                seconds + sum(result.learned.seconds for result in results),
-            )
-            failed += [result.failed for result in results if result.failed]
+            jobs = [Pass(block, number, merged) for block in range(division.count)]
+            results = [self.train(inputs, divided, job) for job in jobs]
+            merged = merge(division, results)
+            steps += sum(result.steps for result in results)
+            seconds += sum(result.seconds for result in results)
+            ended = zip(jobs, results, strict=True)
+            failed += [f"{job.name(division)}: {result.failed}" for job, result in ended if result.failed]
         assert merged is not None
         return Adapted(merged, steps, seconds, start_seconds, interrupted=False, failed="; ".join(failed) or None)
 
@@ -123,7 +116,7 @@ class Blocks:
             self._require_block(block, division.count)
             block = int(block) - 1
             number = 1 if not files.block(block, 1).exists() else division.passes
-            before = self.first_pass(inputs, divided) if number == 2 else None
+            before = self.first_pass(divided) if number == 2 else None
             result = self.train(inputs, divided, Pass(block, number, before))
             path = files.block(block, number)
         number = next((n for n in range(1, division.passes + 1) if files.missing(n)), 0)
@@ -133,7 +126,7 @@ class Blocks:
         return {
             "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
             "block": block, "blocks": division.count, "passes": division.passes, "pass": number, "missing": missing,
-            "steps": result.learned.steps if result else 0, "memory": asdict(self.plan), "machine": machine(),
+            "steps": result.steps if result else 0, "memory": asdict(self.plan), "machine": machine(),
             "outputs": {"block": str(path)}, "exit_code": 1 if result and result.failed else 0,
         }  # fmt: skip
 
@@ -142,15 +135,15 @@ class Blocks:
         if int(block) > count:
             raise ClodError(f"--block is {block}, and the number of blocks is {count}; give a number from 1 to {count}")
 
-    def first_pass(self, inputs: Inputs, divided: Divided) -> Gaussians:
-        """The merged result of the first pass."""
-        if missing := divided.files.missing(1):
+    def first_pass(self, divided: Divided) -> Gaussians:
+        """The merged result of the first pass, from its files."""
+        division, files = divided.division, divided.files
+        if missing := files.missing(1):
             raise ClodError(
                 f"block {self.setup.args.block} has its first pass, and the second needs the first of all: run --block "
                 f"{missing[0]} first ({len(missing)} are missing)"
             )
-        results = [self.train(inputs, divided, Pass(block, 1)) for block in range(divided.division.count)]
-        return merge(divided.division, [result.learned for result in results])
+        return merge(division, [files.load_learned(division, block, 1) for block in range(division.count)])
 
     def divided(self, inputs: Inputs) -> Divided:
         """The division in the file, which is made if it does not exist.
@@ -181,7 +174,7 @@ class Blocks:
         )  # fmt: skip
         return Divided(division, views, files)
 
-    def train(self, inputs: Inputs, divided: Divided, job: Pass) -> BlockResult:
+    def train(self, inputs: Inputs, divided: Divided, job: Pass) -> Learned:
         """Trains one block in one pass, unless its file exists.
 
         Raises:
@@ -189,7 +182,7 @@ class Blocks:
         """
         division, files, console = divided.division, divided.files, self.setup.console
         if files.block(job.block, job.number).exists():
-            return BlockResult(files.load_learned(division, job.block, job.number))
+            return files.load_learned(division, job.block, job.number)
         name = job.name(division)
         own = block_config(division, job.block, inputs.config, first=job.number == 1)
         path = files.state(job.block, job.number)
@@ -199,22 +192,20 @@ class Blocks:
         check_resumed(resumed, run_of, f"{self.setup.args.ply} in {files.start}", "before", console)
         saver = Saver(path, run_of, resumed, console, self.setup.stop)
         with saver.rescuing("the same command"):
-            try:
-                with self._display(name) as display:
-                    learned, adapted = adapt_block(
-                        division, divided.views, inputs.config, job.block, after=job.before,
-                        progress=saver.saving(display), resume=resumed.state if resumed else None,
-                        cache=ImageCache(self.plan.cache),
-                    )  # fmt: skip
-            except StateRefused as error:
-                raise saver.naming(error) from error
+            with self._display(name) as display:
+                learned, adapted = adapt_block(
+                    division, divided.views, inputs.config, job.block, after=job.before,
+                    progress=saver.saving(display), resume=resumed.state if resumed else None,
+                    cache=ImageCache(self.plan.cache),
+                )  # fmt: skip
             saver.keep()
             release_memory()
             if adapted.failed or not adapted.interrupted:
                 files.save_learned(learned, job.block, job.number)
-        return self._finished(name, saver, learned, adapted)
+        self._finish(name, saver, learned, adapted)
+        return learned
 
-    def _finished(self, name: str, saver: Saver, learned: Learned, adapted: Adapted) -> BlockResult:
+    def _finish(self, name: str, saver: Saver, learned: Learned, adapted: Adapted) -> None:
         """Says how the training of a block has ended.
 
         Raises:
@@ -229,7 +220,6 @@ class Blocks:
             raise Stopped(f"stopped in {name}")
         saver.close(finished=True)
         say(f"{name}: {len(learned.rows):,} Gaussians, {learned.steps} steps, {duration(learned.seconds)}")
-        return BlockResult(learned, f"{name}: {adapted.failed}" if adapted.failed else None)
 
     def remove(self) -> None:
         """Removes the files of this run, once its outputs are written."""

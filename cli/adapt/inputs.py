@@ -1,4 +1,4 @@
-"""The second value of the pipeline: checkpoint and scene, and what was measured of them before training."""
+"""The second value of the pipeline: checkpoint and scene, and their measurements before training."""
 
 from __future__ import annotations
 

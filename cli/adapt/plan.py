@@ -12,8 +12,8 @@ from clod_adapter.training.plan import Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
 
 from ..shared.console import Console
+from .display import ProgressDisplay
 from .inputs import Inputs
-from .progress import ProgressDisplay
 from .setup import Setup
 
 

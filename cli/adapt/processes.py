@@ -30,7 +30,7 @@ from clod_adapter.training.state import Adapted, TrainingState
 
 from ..shared.interrupts import GracefulStop
 from ..shared.launch import Launch, launched
-from .progress import ProgressDisplay
+from .display import ProgressDisplay
 
 BACKENDS = {"cpu": "gloo", "cuda": "nccl"}  # of torch.distributed, by device
 if TYPE_CHECKING:

@@ -9,7 +9,12 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from clod_adapter._support.version import package_version
+from clod_adapter.adapter import Adapter
 from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.adapter_file import save_adapter
+from clod_adapter.io.atomic import atomic_paths
+from clod_adapter.io.checkpoint import Checkpoint, save
 
 from ..shared.budgets import calibrate
 from ..shared.console import duration
@@ -17,7 +22,6 @@ from ..shared.files import Outputs, size
 from ..shared.interrupts import GracefulStop
 from ..shared.pages import AdaptPage
 from ..shared.report import Stopwatch, machine, table, write_report
-from .files import write
 from .inputs import Inputs
 from .memory import with_rows
 from .processes import describe_processes
@@ -33,8 +37,10 @@ def finish(
     Args:
         written: called once the files are written, with whether the run is complete.
     """
-    measured = measure_result(setup, inputs, result)
-    stop = setup.stop if result.adapted.interrupted else GracefulStop(aborts=setup.stop.aborts)
+    # After a Ctrl-C that ended training the next one aborts, as its message says.
+    stop = setup.stop if result.adapted.interrupted and setup.stop.requests else None
+    measured = measure_result(setup, inputs, result, stop)
+    stop = stop or GracefulStop(aborts=setup.stop.aborts)
     before = stop.requests
     with stop.listening():  # a first Ctrl-C lets the writing finish
         report = write_result(setup, inputs, result, measured)
@@ -61,9 +67,26 @@ def write_result(setup: Setup, inputs: Inputs, result: Result, measured: Measure
             setup.console.say(f"the files have no calibration, so --fps and --psnr-drop will not work: {error}")
     report = describe_run(setup, inputs, result, measured)
     with setup.console.status(f"writing {outputs.ply} ..."):
-        report = write(base, adapter, result.gaussians, outputs, report)
+        report = write_files(base, adapter, result.gaussians, outputs, report)
     setup.console.say(f"wrote {outputs.adapter} and {outputs.ply}")
     return report
+
+
+def write_files(
+    base: Checkpoint, adapter: Adapter, result: Gaussians, outputs: Outputs, report: dict[str, Any]
+) -> dict[str, Any]:
+    """Writes the three files; returns the report with the calibration and the sizes of the other two.
+
+    All three are complete, beside those of an earlier run, before the first replaces its predecessor. Only a kill
+    between two renames leaves files of different runs; if one cannot be written, the earlier files stay.
+    """
+    with atomic_paths(outputs.adapter, outputs.ply, outputs.report) as (small, large, about):
+        save_adapter(small, adapter)
+        save(large, result, base, version=adapter.version, calibration=adapter.calibration)
+        sizes = {"adapter_bytes": small.stat().st_size, "ply_bytes": large.stat().st_size}
+        full = report | {"calibration": adapter.calibration and adapter.calibration.as_dict(), **sizes}
+        write_report(about, full)
+    return full
 
 
 def describe_run(setup: Setup, inputs: Inputs, result: Result, measured: Measurements) -> dict[str, Any]:

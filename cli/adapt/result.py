@@ -11,7 +11,7 @@ from clod_adapter.io.checkpoint import Checkpoint, trimmed
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 
-from ..shared.interrupts import listen_no_more
+from ..shared.interrupts import GracefulStop, listen_no_more
 from ..shared.measure import measure
 from ..shared.report import report_dials
 from .inputs import Inputs
@@ -79,17 +79,20 @@ def training_notes(inputs: Inputs, adapter: Adapter, adapted: Adapted) -> list[s
     return notes
 
 
-def measure_result(setup: Setup, inputs: Inputs, result: Result) -> Measurements:
+def measure_result(setup: Setup, inputs: Inputs, result: Result, stop: GracefulStop | None) -> Measurements:
     """Measures the result on the held-out views, unless the run is to end now.
 
     That is after a Ctrl-C that came when training was complete, and if the launcher ends the processes.
+
+    Args:
+        stop: as in ``measure``.
     """
     if setup.stop.requests > 0 and not result.adapted.interrupted or hurried(result.adapted):
         return Measurements(interrupted=True)
     views, console = inputs.scene.test, setup.console
     with setup.watch.time("evaluate"):
-        rows, interrupted = measure(result.gaussians, views, report_dials(inputs.config.max_sv), console)
+        rows, interrupted = measure(result.gaussians, views, report_dials(inputs.config.max_sv), console, stop=stop)
         if interrupted:
             return Measurements(tuple(rows), (), True)
-        plain, interrupted = measure(detach(result.gaussians), views, [1.0], console, "plain")
+        plain, interrupted = measure(detach(result.gaussians), views, [1.0], console, "plain", stop=stop)
     return Measurements(tuple(rows), tuple(plain), interrupted)

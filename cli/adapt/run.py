@@ -14,20 +14,21 @@ from clod_adapter.io.lock import output_lock
 from clod_adapter.progress import Progress
 from clod_adapter.rasterizers.cpu import release_memory
 from clod_adapter.training.plan import Plan
-from clod_adapter.training.state import Adapted, StateRefused
+from clod_adapter.training.state import Adapted
 
 from ..shared.console import duration
 from ..shared.files import Outputs
 from ..shared.pages import AdaptPage
 from .blocks import Blocks
+from .display import ProgressDisplay
 from .inputs import Inputs, read_inputs, with_base_rows
 from .memory import without_rows
 from .plan import decide
 from .processes import TrainingJob, together
-from .progress import ProgressDisplay
 from .report import finish
 from .result import make_result
-from .resume import Saver, identify
+from .resume import identify
+from .saver import Saver
 from .setup import Setup
 
 
@@ -59,7 +60,7 @@ def adapt_whole(setup: Setup, inputs: Inputs) -> dict[str, Any]:
             adapted = train(setup, inputs, plan, display, saver, page)
             result = make_result(setup, inputs, plan, adapted)
     with saver.rescuing():
-        return finish(setup, inputs, result, page, lambda complete: saver.close(complete))
+        return finish(setup, inputs, result, page, saver.close)
 
 
 def adapt_blocks(setup: Setup, inputs: Inputs, blocks: Blocks) -> dict[str, Any]:
@@ -74,11 +75,8 @@ def adapt_blocks(setup: Setup, inputs: Inputs, blocks: Blocks) -> dict[str, Any]
 
 
 def show_progress(setup: Setup, inputs: Inputs) -> ProgressDisplay:
-    base_row = inputs.base_rows[0] if inputs.base_rows else None
-    views = inputs.scene.test
-    return ProgressDisplay(
-        setup.console, setup.stop, inputs.base.gaussians, views, inputs.config.max_sv, base_row
-    )  # fmt: skip
+    base, row = inputs.base.gaussians, inputs.base_rows[0] if inputs.base_rows else None
+    return ProgressDisplay(setup.console, setup.stop, base, inputs.scene.test, inputs.config.max_sv, row)
 
 
 def make_page(setup: Setup, inputs: Inputs) -> AdaptPage | None:
@@ -106,11 +104,8 @@ def train(
             page(now)
         return display(now)
 
-    try:
-        with closing(display), together(lambda: TrainingJob.of(plan, scene, state), display) as group:
-            adapted = plan.adapt(scene, saver.saving(show), state, group)
-    except StateRefused as error:
-        raise saver.naming(error) from error
+    with closing(display), together(lambda: TrainingJob.of(plan, scene, state), display) as group:
+        adapted = plan.adapt(scene, saver.saving(show), state, group)
     saver.keep()
     adapted = replace(
         adapted, gaussians=plan.whole(base, adapted.gaussians),

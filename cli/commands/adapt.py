@@ -138,8 +138,8 @@ alignment:
 
 interruption:
   Ctrl-C or SIGTERM while training finishes the step and writes the result so
-  far (exit code 0, "interrupted": true); a second one aborts. While measuring
-  it skips the rest; while writing it has no effect.
+  far (exit code 0, "interrupted": true); a second one aborts at any time. A
+  first one while measuring skips the rest; while writing it has no effect.
   Training saves its state in OUT.resume.safetensors (at most 2 % of the time),
   or in the temporary folder if that fails. After Ctrl-C, a crash or a full disk
   the same command with --resume continues and gives the same Gaussians, bit for

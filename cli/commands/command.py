@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Command:
-    """The texts of ``--help``, and what parses, checks and runs a command.
+    """The texts of ``--help``, and the functions that parse, check and run a command.
 
     Attributes:
         module: name below ``clod_adapter.cli``; its ``run(args)`` returns the object that --json prints. It may import

@@ -122,7 +122,7 @@ def check_export_outputs(args: Namespace) -> None:
 
 
 def check_format(args: Namespace, bakes: bool, dial: bool) -> None:
-    """Refuses what the format of --out cannot store."""
+    """Refuses options that the format of --out cannot store."""
     suffix = suffix_of(Path(args.out))
     if dial and not bakes and not FORMATS[suffix].sigma:
         others = ", ".join(other for other in suffixes() if FORMATS[other].sigma)

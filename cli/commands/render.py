@@ -63,7 +63,8 @@ side, in the order given.
     usage="MODEL.ply --images DIR -o FOLDER [options]",
     epilog="""\
 "clod-adapt eval --help" explains the budgets --keep, --fps and --psnr-drop.
-Ctrl-C keeps the images that are finished (exit code 0, "interrupted": true).
+Ctrl-C finishes the image under way (exit code 0, "interrupted": true); a second
+one aborts.
 
 examples:
   clod-adapt render garden_clod.ply --images garden -o out --sv 3

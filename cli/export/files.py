@@ -61,7 +61,7 @@ class Export:
         return gaussians, tuple(dict.fromkeys(about))
 
     def write(self, path: Path, suffix: str, virtual_scale: float | None) -> tuple[int, tuple[str, ...]]:
-        """Writes a file; its number of Gaussians, and notes on what the format cannot store."""
+        """Writes a file; its number of Gaussians, and notes on losses of the format."""
         if suffix == PAGE:
             return len(self.gaussians), self._write_page(path, virtual_scale or 1.0)
         gaussians, about = self.content(virtual_scale)

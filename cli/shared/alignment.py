@@ -59,7 +59,7 @@ def require_alignment(
 
 
 def mismatch(checkpoint: Checkpoint, views: Sequence[View], found: Alignment, guess: Guess | None) -> str:
-    """The measurements, and what to do."""
+    """The measurements, and a remedy."""
     share = f"{found.in_view:.2g}" if 0 < found.in_view < 0.01 else f"{found.in_view:.0%}"
     facts = f"{share} of its Gaussians are in view"
     if found.views:

@@ -33,12 +33,12 @@ class Console:
                 sys.stderr.flush()
 
     def note(self, text: str) -> None:
-        """Writes a note on what was read or written, or a warning if it begins so."""
+        """Writes a note on input or output, or a warning if it begins so."""
         self.say(f"  {text}" if text.startswith(WARNING) else f"  note: {text}")
 
     @contextmanager
     def status(self, text: str) -> Iterator[Callable[[str], None]]:
-        """Shows on a terminal what is being done, if its progress is unknown.
+        """Shows on a terminal the work under way, if its progress is unknown.
 
         Yields a function that changes the text; without a terminal it writes a line now and then.
         """

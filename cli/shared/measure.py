@@ -35,15 +35,22 @@ def measure(
     console: Console,
     label: str = "measure",
     metrics: Mapping[str, Metric] | None = None,
+    stop: GracefulStop | None = None,
 ) -> tuple[list[Row], bool]:
-    """The rows of the dial values, none without views, and whether Ctrl-C ended the measurement early."""
-    stop = GracefulStop(aborts=launched().size == 1)  # launchers repeat signals
+    """The rows of the dial values, none without views, and whether Ctrl-C ended the measurement early.
+
+    Args:
+        stop: counts the signals, if it is not a new one.
+    """
+    stop = stop or GracefulStop(aborts=launched().size == 1)  # launchers repeat signals
+    before = stop.requests
     if not views:
         return [], False
     with console.meter(label) as meter, stop.listening():
 
-        def show(now: Progress) -> None:
+        def show(now: Progress) -> bool:
             meter.update(now.share, f"s={virtual_scales[(now.done - 1) // len(views)]:g}")
+            return stop.requests == before
 
-        rows = evaluate(gaussians, views, virtual_scales, metrics=metrics, progress=stop.heeding(show))
-    return rows, stop.requests > 0
+        rows = evaluate(gaussians, views, virtual_scales, metrics=metrics, progress=show)
+    return rows, stop.requests > before

@@ -64,7 +64,7 @@ def machine() -> dict[str, Any]:
 
 
 def machine_name(device: str = "cpu") -> str:
-    """The machine in one line: what frame times on that type of device depend on most."""
+    """The machine in one line: the hardware that determines frame times on that type of device."""
     about = machine()
     if device == "cuda":
         return about["gpu"]

@@ -41,7 +41,7 @@ def address_limit() -> int | None:
 
 
 def shortage(error: BaseException) -> str | None:
-    """One line on the shortage and what to do; None if the error is another."""
+    """The shortage and its remedy in one line; None for another error."""
     text = (str(error) or "allocating").splitlines()[0]
     if isinstance(error, OSError):
         short = error.errno == errno.ENOMEM or (LLVM in text and address_limit() is not None)

@@ -49,12 +49,14 @@ class Learned:
         rows: ``[n]`` int64, rows of the scene.
         values: their trained attributes and ``sigma_d``, by name.
         steps, seconds: of the training.
+        failed: which step's loss was not finite, so that training ended early.
     """
 
     rows: Tensor
     values: dict[str, Tensor]
     steps: int
     seconds: float
+    failed: str | None = None
 
 
 def adapt_block(
@@ -104,7 +106,7 @@ def _learned(division: Division, rows: Tensor, adapted: Adapted) -> tuple[Learne
         name: value.clone() for name, value in values.items()
         if name == "sigma_d" or not torch.equal(value, getattr(division.initial, name)[rows])
     }  # fmt: skip
-    return Learned(rows, changed, adapted.steps, adapted.seconds), adapted
+    return Learned(rows, changed, adapted.steps, adapted.seconds, adapted.failed), adapted
 
 
 def _with_target_images(

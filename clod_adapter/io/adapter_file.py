@@ -74,10 +74,10 @@ def load_adapter(path: str | Path) -> Adapter:
     Raises:
         ClodError: the file cannot be read, is damaged, not an adapter, or of a newer format.
     """
-    tensors, metadata = load_tensors(Path(path))
+    path = Path(path)
+    tensors, metadata, _ = load_tensors(path)
     if KEY not in metadata:
         raise ClodError(f"{path}: is a safetensors file but not an adapter; give a file that this package wrote")
-    path = Path(path)
     try:
         about = json.loads(metadata[KEY])
         kind, newer = about["format"], about["format"] == FORMAT and about["format_version"] > FORMAT_VERSION

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,23 +12,20 @@ from torch import Tensor
 
 from clod_adapter.adapter import trim
 from clod_adapter.calibration import Calibration, Viewpoint
-from clod_adapter.config import CLASSIC, ScreenFilter
+from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.file_formats import PLY, Model, format_of, read_model
-from clod_adapter.io.ply.columns import SIGMA, column_map, in_shape, read_table, rows_of
+from clod_adapter.io.content import read_content
+from clod_adapter.io.ply.columns import SIGMA, column_map, in_shape, rows_of
 from clod_adapter.io.ply.constants import dial_constants, filter_constants
-from clod_adapter.io.ply.header import PREFIX, write_comments
+from clod_adapter.io.ply.header import write_comments
 from clod_adapter.io.ply.plausible import check_plausible
-from clod_adapter.io.ply.rows import PlyRows, read_ply, usable_blocks, usable_rows
-from clod_adapter.io.ply.values import Activated, as_stored_by_inria
+from clod_adapter.io.ply.values import Activated
 from clod_adapter.io.ply.write import write_rows
-from clod_adapter.io.screen_filter import implied_filter, tagged
 from clod_adapter.io.settings import matching_calibration
-from clod_adapter.io.sniff import file_sha256
-from clod_adapter.origin import NOWHERE, Origin, origin_of, relative
+from clod_adapter.origin import NOWHERE, Origin
 from clod_adapter.units import in_world_units
 
 
@@ -102,114 +98,22 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
             open whether they are activated and ``activated`` is None.
     """
     path = Path(path)
-    source: PlyRows | Model
-    if format_of(path) is PLY:
-        source = read_ply(path)
-        content = _ply_content(path, source, activated, origin)
-    else:
-        source = read_model(path)
-        content = _model_content(path, source, activated, origin)
-    metadata = source.metadata
+    content = read_content(path, activated, origin)
+    metadata = content.metadata
     tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in content.arrays.items()}
     dial = SIGMA in tensors
     screen_filter = metadata.screen_filter or (CLASSIC if dial else content.implied_filter)
     attenuation = metadata.attenuation if dial else None
     gaussians = Gaussians(**tensors, attenuation=attenuation, screen_filter=screen_filter)
-    notes = [*content.changes, *_row_notes(gaussians, content), *metadata.notes]
+    notes = [*content.row_notes(), *metadata.notes]
     if attenuation is not None and not metadata.described:
         notes += check_plausible(gaussians.means, gaussians.opacity_logits, tensors[SIGMA], attenuation)
     calibration, mismatch = matching_calibration(metadata, len(gaussians)) if dial else (None, [])
     return Checkpoint(
-        gaussians, content.vertex, (*content.comments, *content.changes), (*notes, *mismatch, *source.notes),
+        gaussians, content.vertex, (*content.comments, *content.changes), (*notes, *mismatch, *content.notes),
         content.fingerprint, path, calibration, content.origin,
         filter_known=dial or metadata.screen_filter is not None,
     )  # fmt: skip
-
-
-class _Content(NamedTuple):
-    """The usable Gaussians of a file, before the settings are applied.
-
-    Attributes:
-        arrays: of ``Gaussians.tensors``, float32, means relative to ``origin``.
-        vertex, comments, fingerprint, origin: of the ``Checkpoint``.
-        changes: to values that were not stored as logits and logarithms, one line each.
-        dropped: rows by reason.
-        implied_filter: by other programs' comments and columns.
-    """
-
-    arrays: dict[str, np.ndarray]
-    vertex: np.ndarray
-    comments: tuple[str, ...]
-    fingerprint: str
-    origin: Origin
-    changes: list[str]
-    dropped: Counter[str]
-    implied_filter: ScreenFilter
-
-
-def _ply_content(path: Path, rows: PlyRows, activated: Activated | None, origin: Origin | None) -> _Content:
-    implied = implied_filter(rows.comments, rows.vertex.dtype.names or ())
-    vertex, was, changes = as_stored_by_inria(path, rows.vertex, activated if rows.activation_unknown else "none")
-    origin, dropped = origin_of(vertex) if origin is None else origin, Counter[str]()
-    groups = column_map(rows.sh_degree) | ({SIGMA: (SIGMA,)} if SIGMA in (vertex.dtype.names or ()) else {})
-    values = {key: np.empty((len(vertex), len(group)), np.float32) for key, group in groups.items()}
-    keep = np.empty(len(vertex), bool)
-    for block, found, usable in usable_blocks(vertex, rows.sh_degree, origin, dropped):
-        keep[block] = usable
-        for key in groups:
-            values[key][block] = found[key]
-    arrays, vertex = _usable(path, in_shape(values), vertex, keep, dropped)
-    return _Content(arrays, vertex, rows.comments, _fingerprint(was, rows.sha256), origin, changes, dropped, implied)
-
-
-def _model_content(path: Path, model: Model, activated: Activated | None, origin: Origin | None) -> _Content:
-    metadata, arrays = model.metadata, {name: tensor.numpy() for name, tensor in model.gaussians.tensors().items()}
-    vertex, dropped = rows_of(arrays, metadata.origin), Counter[str]()
-    vertex, was, changes = as_stored_by_inria(path, vertex, activated if model.activation_unknown else "none")
-    if changes:
-        arrays["opacity_logits"], scales = vertex["opacity"].copy(), column_map(0)["log_scales"]
-        arrays["log_scales"] = read_table(vertex, scales)
-    if origin is None:
-        origin = metadata.origin if any(metadata.origin) else origin_of(vertex)
-    if origin != metadata.origin:
-        arrays["means"] = relative(vertex, origin)
-    arrays, vertex = _usable(path, arrays, vertex, usable_rows(arrays, dropped), dropped)
-    about = ["".join(c if c.isascii() and c.isprintable() else "?" for c in line) for line in metadata.about]
-    comments = tagged([line for line in about if not line.startswith(PREFIX)], model.gaussians.screen_filter)
-    fingerprint = _fingerprint(was, model.sha256 or file_sha256(path))
-    return _Content(
-        arrays, vertex, tuple(comments), fingerprint, origin, changes, dropped, model.gaussians.screen_filter
-    )  # fmt: skip
-
-
-def _usable(
-    path: Path, arrays: dict[str, np.ndarray], vertex: np.ndarray, keep: np.ndarray, dropped: Counter[str]
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The arrays and rows to keep; refuses a file with none."""
-    if not keep.any():
-        reasons = "; ".join(_dropped_notes(dropped, len(keep))) or "it has 0 rows"
-        raise ClodError(f"{path}: no usable Gaussian in it ({reasons}); export it again")
-    if keep.all():
-        return arrays, vertex
-    return {name: array[keep] for name, array in arrays.items()}, vertex[keep]
-
-
-def _row_notes(gaussians: Gaussians, content: _Content) -> list[str]:
-    notes = _dropped_notes(content.dropped, len(gaussians) + content.dropped.total())
-    if opaque := int((gaussians.opacity_logits == torch.inf).sum()):
-        notes.append(f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque")
-    if any(content.origin):
-        where = ", ".join(f"{value:.10g}" for value in content.origin)
-        notes.append(f"far from 0: read relative to ({where}); outputs have x, y, z as double")
-    return notes
-
-
-def _dropped_notes(dropped: Counter[str], total: int) -> list[str]:
-    return [f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in dropped.items() if lost]
-
-
-def _fingerprint(activated: Activated, sha256: str) -> str:
-    return sha256 if activated == "none" else f"{activated}:{sha256}"
 
 
 def save(

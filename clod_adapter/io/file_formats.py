@@ -22,16 +22,16 @@ class Model(NamedTuple):
     Attributes:
         gaussians: every row of the file, also rows with values that are not finite.
         metadata: its settings.
+        sha256: of the file that was parsed, hex.
         notes: what the reader noticed, one line each, besides the notes of the metadata.
         activation_unknown: whether opacities and scales may be activated already, as the format does not tell.
-        sha256: hex, of the bytes that were parsed; "" where a library reads the file.
     """
 
     gaussians: Gaussians
     metadata: Metadata
+    sha256: str
     notes: tuple[str, ...] = ()
     activation_unknown: bool = False
-    sha256: str = ""
 
 
 class History(NamedTuple):

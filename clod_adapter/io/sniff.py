@@ -1,11 +1,10 @@
-"""First looks at a file: whether it can be read, and, where its name is wrong, what it is and what to do."""
+"""First checks of a file: whether it can be read, and its kind where the suffix is wrong."""
 
 from __future__ import annotations
 
 import hashlib
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import sys
+from io import BufferedReader
 from pathlib import Path
 from typing import NoReturn
 
@@ -15,7 +14,7 @@ _CONVERT = "convert it: splat-transform IN{suffix} OUT.ply; better still, adapt 
 
 _PAGE = "which clod-adapt export wrote to be opened in a browser, or a download went wrong"
 
-# First bytes (after white space) that determine what a file is whatever its name, what it is, and what to do.
+# First bytes (after white space) that determine the kind of a file, its name, and the remedy.
 CONTENTS = (
     (b"version https://git-lfs", "a Git LFS pointer, not the file it stands for", "fetch that: git lfs pull"),
     (b"<!doctype html", f"a web page, {_PAGE}", "download the file itself"),
@@ -78,31 +77,18 @@ def read_start(path: Path, size: int = 64) -> bytes:
         raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
 
 
-def file_sha256(path: Path) -> str:
-    """SHA-256 of the file's bytes, hex.
+def handle_name(file: BufferedReader) -> str:
+    """A name of an open file, for libraries that open a file themselves and take names in UTF-8 only.
 
-    Raises:
-        ClodError: the file cannot be read.
+    It names the same file after another one has replaced it; on Windows nothing replaces an open file.
     """
-    try:
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    return str(file.name) if sys.platform == "win32" else f"/dev/fd/{file.fileno()}"
 
 
-@contextmanager
-def utf8_name(path: Path) -> Iterator[str]:
-    """A name for libraries that encode names as UTF-8: the file's own, or that of a handle where it is not UTF-8."""
-    try:
-        same = str(path).encode() == os.fsencode(path)
-    except UnicodeEncodeError:
-        same = False
-    if same:
-        yield str(path)
-    else:
-        with open(path, "rb") as held:
-            yield f"/dev/fd/{held.fileno()}"
+def file_sha256(file: BufferedReader) -> str:
+    """SHA-256 of an open file, hex."""
+    file.seek(0)
+    return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def refuse_known(path: Path, start: bytes) -> None:
@@ -122,10 +108,10 @@ def refuse_known(path: Path, start: bytes) -> None:
 def refuse(
     path: Path, start: bytes, otherwise: str = "is not a PLY file; convert it to a .ply in Inria's 3DGS layout first"
 ) -> NoReturn:
-    """Refuses a file by its first bytes, naming what it is.
+    """Refuses a file, with its kind by its first bytes.
 
     Args:
-        otherwise: the message for a file that none of the tables knows.
+        otherwise: the message for a file in none of the tables.
 
     Raises:
         ClodError: always.

@@ -4,33 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from safetensors import safe_open
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.sniff import read_start, refuse_known, utf8_name
+from clod_adapter.io.sniff import file_sha256, handle_name, read_start, refuse_known
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors and the metadata of a file; raises OSError, or on damage whatever safetensors does."""
-    with _opened(path, "pt") as file:
-        # Copies, since the file may change under a memory map.
-        return {name: file.get_tensor(name).clone() for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+    """The tensors and the metadata of a file; raises OSError, or for a damaged file any error of safetensors."""
+    with open(path, "rb") as file:
+        return _content(file)
 
 
-def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors and the metadata of an input file.
+def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str], str]:
+    """The tensors, the metadata and the SHA-256, hex, of an input file, which is opened once.
 
     Raises:
         ClodError: it cannot be read, is something else, or damaged.
     """
-    with _one_line_errors(path):
-        return read_tensors(path)
+    with _one_line_errors(path), open(path, "rb") as file:
+        return *_content(file), file_sha256(file)
 
 
 def read_tensor_metadata(path: Path) -> dict[str, str]:
@@ -39,14 +39,14 @@ def read_tensor_metadata(path: Path) -> dict[str, str]:
     Raises:
         ClodError: as ``load_tensors``.
     """
-    with _one_line_errors(path), _opened(path, "np") as file:
-        return file.metadata() or {}
+    with _one_line_errors(path), open(path, "rb") as file, safe_open(handle_name(file), framework="np") as tensors:
+        return tensors.metadata() or {}
 
 
-@contextmanager
-def _opened(path: Path, framework: str) -> Iterator[Any]:
-    with utf8_name(path) as name, safe_open(name, framework=framework) as file:
-        yield file
+def _content(file: BufferedReader) -> tuple[dict[str, Tensor], dict[str, str]]:
+    with safe_open(handle_name(file), framework="pt") as tensors:
+        # Copies, since the file may change under a memory map.
+        return {name: tensors.get_tensor(name).clone() for name in tensors.keys()}, tensors.metadata() or {}  # noqa: SIM118
 
 
 @contextmanager
@@ -58,5 +58,5 @@ def _one_line_errors(path: Path) -> Iterator[None]:
         raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
     except MemoryError:  # of a file that is whole
         raise
-    except Exception as error:  # SafetensorError, and whatever a crafted header provokes
+    except Exception as error:  # SafetensorError, and others for a crafted header
         raise ClodError(f"{path}: is not a safetensors file, or damaged ({error}); copy or export it again") from error

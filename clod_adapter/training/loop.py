@@ -74,7 +74,7 @@ def adapt(
         Stopped: ``progress`` returned False before training.
     """
     config = config or AdaptConfig()
-    _require_trainable(base, scene, config, group)
+    require_trainable(base, scene, config, group)
     began = time.perf_counter()
     # Empty higher SH degrees that are not tuned stay empty, so they are not rendered.
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
@@ -96,7 +96,8 @@ def adapt(
     return _train(trainer, progress)
 
 
-def _require_trainable(base: Gaussians, scene: Scene, config: AdaptConfig, group: ProcessGroup | None) -> None:
+def require_trainable(base: Gaussians, scene: Scene, config: AdaptConfig, group: ProcessGroup | None = None) -> None:
+    """Raises ClodError if there is nothing to train, or on nothing, or a value is not finite."""
     if not scene.train:
         raise ClodError("the scene has no training views: give at least one photograph that is not held out")
     if len(base) == 0:

@@ -16,7 +16,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, initialize, removal_error, spread, usable_views
 from clod_adapter.progress import Listener, Phase, tell, within
 from clod_adapter.training.ablation import seen, sh_degree_losses
-from clod_adapter.training.loop import adapt
+from clod_adapter.training.loop import require_trainable
 from clod_adapter.training.plan import RATES, Decision, Override, Plan
 
 LIMIT = 0.02  # dB: SH degrees are left out if the PSNR of the training views changes by less without them
@@ -53,8 +53,7 @@ class _Planner:
         self, base: Gaussians, scene: Scene, config: AdaptConfig, override: Override, progress: Listener | None
     ) -> None:
         self.base, self.scene, self.config, self.override, self.progress = base, scene, config, override, progress
-        if not scene.train or not len(base):
-            adapt(base, scene, config)  # raises the ClodError
+        require_trainable(base, scene, config)
         self.views = usable_views(base, scene.train)
         self.decisions: list[Decision] = []
         self.seconds: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""The command as users run it, in its own process and, for speed, in this one."""
+"""Runs the command, in its own process or, faster, in this one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ENDS = (signal.SIGINT, signal.SIGTERM)
 
 @pytest.fixture(scope="session", autouse=True)
 def signals_arrive() -> Iterator[None]:
-    """Ctrl-C and SIGTERM reach the tests and their children, whatever the shell that started them ignores or blocks."""
+    """Ctrl-C and SIGTERM reach the tests and their child processes, also if the shell ignores or blocks them."""
     blocked = signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDS)
     before = [signal.signal(*pair) for pair in zip(ENDS, (signal.default_int_handler, signal.SIG_DFL), strict=True)]
     yield
@@ -27,8 +27,8 @@ def signals_arrive() -> Iterator[None]:
     signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
-class Outcome:
-    """Exit code and what was printed."""
+class Done:
+    """Exit code, stdout and stderr."""
 
     def __init__(self, code: int, out: str, err: str) -> None:
         self.code, self.out, self.err = code, out, err
@@ -38,17 +38,17 @@ class Outcome:
 
 
 @pytest.fixture
-def clod(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Outcome]:
+def clod(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Done]:
     """Runs ``clod-adapt`` with these words, in this process, with the test's folder as the current one."""
     monkeypatch.chdir(tmp_path)
 
-    def run(*words: object) -> Outcome:
+    def run(*words: object) -> Done:
         capsys.readouterr()
         try:
             code = main([str(word) for word in words])
         except SystemExit as done:  # argparse, for --help
             code = int(done.code or 0)
-        return Outcome(code, *capsys.readouterr())
+        return Done(code, *capsys.readouterr())
 
     return run
 

@@ -6,10 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
 
-def test_apply(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
-    """The base of the adapter gives the adapted file; any other base is refused."""
+
+def test_apply(clod: Any, capture: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The base of the adapter gives the adapted file, also with another version; any other base is refused."""
     adapter = dialled.with_suffix(".safetensors")
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "99.0")
+    assert clod("--version").out == "clod-adapt 99.0\n"
     done = clod("apply", capture.ply, adapter, "-o", "again.ply", "--json")
     assert done.code == 0 and (tmp_path / "again.ply").read_bytes() == dialled.read_bytes()
     assert json.loads(done.out)["outputs"] == {"ply": "again.ply"}

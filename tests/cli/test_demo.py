@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from clod_adapter.cli import demo
-from clod_adapter.cli.adapt import report, resume
+from clod_adapter.cli.adapt import report, resume, saver
 from clod_adapter.cli.adapt.result import Measurements
 from clod_adapter.cli.main import build_parser
 
@@ -35,7 +35,7 @@ def short(monkeypatch: pytest.MonkeyPatch, capture: Any) -> None:
     monkeypatch.setattr(demo, "ADAPT_STEPS", 2)
 
 
-def test_says_where_things_are_and_what_is_next(clod: Any, short: None, tmp_path: Path) -> None:
+def test_demo_names_its_files_and_the_next_command(clod: Any, short: None, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     done = clod("demo", "--out", "here")
     assert done.code == 0, done
@@ -47,19 +47,19 @@ def test_says_where_things_are_and_what_is_next(clod: Any, short: None, tmp_path
     assert made == {"capture", "base.ply", "gallery.ply", "gallery.safetensors", "gallery.json", *PICTURES}
 
 
-def test_pictures_that_were_not_drawn_are_not_reported(
+def test_figures_that_were_not_drawn_are_not_reported(
     clod: Any, short: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(report, "measure_result", lambda *_: Measurements(interrupted=True))
     (tmp_path / "demo").mkdir()
-    (tmp_path / "demo" / "dial.png").write_text("an earlier run's of clod_adapter")
+    (tmp_path / "demo" / "dial.png").write_text("of an earlier run of clod_adapter")
     done = clod("demo", "--json")
     assert done.code == 0 and json.loads(done.out)["pictures"] == {} and "no figures" in done.err
     assert not any((tmp_path / "demo" / name).exists() for name in PICTURES)
 
 
-def test_a_missing_package_is_named_at_the_start(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_is_named_at_the_start(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module, package in (("matplotlib", "matplotlib"), ("skimage", "scikit-image")):
         with monkeypatch.context() as patch:
             patch.setattr(demo, "EXTRA", {module: package})
@@ -69,7 +69,7 @@ def test_a_missing_package_is_named_at_the_start(clod: Any, tmp_path: Path, monk
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_that_cannot_be_made(clod: Any, tmp_path: Path) -> None:
+def test_folder_that_cannot_be_made(clod: Any, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     (tmp_path / "file").write_text("")
     for out, said in (("file", "file: is a file"), ("file/below", "file/below: cannot be made")):
@@ -77,7 +77,7 @@ def test_a_folder_that_cannot_be_made(clod: Any, tmp_path: Path) -> None:
         assert done.code == 2 and said in done.err and done.err.count("\n") == 1, done
 
 
-def test_the_main_job_gets_its_own_defaults() -> None:
+def test_arguments_for_adapting() -> None:
     flags = ["--quiet", "--json"]
     args = build_parser("demo").parse_args(["--out=-odd", *flags])
     files = [Path("-odd") / name for name in ("base.ply", "capture", "gallery.ply")]
@@ -87,17 +87,17 @@ def test_the_main_job_gets_its_own_defaults() -> None:
     assert vars(given) == vars(build_parser("").parse_args(words))
 
 
-def test_goes_on_with_what_was_interrupted(
+def test_interrupted_demo_is_resumed(
     clod: Any, short: None, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And what keeps it from doing so is said without the main job's --resume, which the demo has not."""
+    """A state that cannot be resumed is an error that does not name --resume, which the demo does not have."""
     pytest.importorskip("matplotlib")
 
     def stop(*_: Any) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(resume.Saver, "keep", stop)
+        patch.setattr(saver.Saver, "keep", stop)
         assert clod("demo").code == 130
     state = tmp_path / "demo" / "gallery.resume.safetensors"
     with monkeypatch.context() as patch:

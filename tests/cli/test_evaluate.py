@@ -13,14 +13,9 @@ import torch
 
 import clod_adapter
 from clod_adapter.cli import comparisons
-from runs import pressing
+from runs import notes_of, pressing
 
 ROW = {"virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"}
-
-
-def notes_of(report: Any) -> list[str]:
-    """Without the one on LPIPS and FLIP, which depends on what is installed."""
-    return [note for note in report["notes"] if not note.startswith("without ")]
 
 
 def test_eval_prints_one_object(clod: Any, capture: Any, dialled: Path) -> None:
@@ -47,7 +42,7 @@ def test_eval_of_a_plain_file(clod: Any, capture: Any) -> None:
     assert len(shown.out.splitlines()) == 5 and shown.err == ""
 
 
-def test_eval_stays_within_what_was_trained(clod: Any, capture: Any) -> None:
+def test_default_dial_values_are_within_the_trained_range(clod: Any, capture: Any) -> None:
     for max_sv, dials in ((2.5, [1, 2, 2.5]), (1, [1]), (7, [1, 2, 3, 5, 7])):
         sigma = torch.linspace(0.5, 5, 300)
         model = clod_adapter.attach(capture.gaussians, sigma, clod_adapter.AttenuationConfig(max_sv=max_sv))
@@ -90,7 +85,7 @@ def test_against_at_matched_counts(clod: Any, capture: Any, dialled: Path, tmp_p
     assert pairs[1][1] == 300 > pairs[1][2] == report["rows"][0]["kept"]
     (note,) = [note for note in report["notes"] if "keeps 300 Gaussians" in note]
     assert note in done.err and "at most" in note
-    for own, row in zip(report["against"][2:], report["rows"], strict=True):  # with itself: the same rows again
+    for own, row in zip(report["against"][2:], report["rows"], strict=True):  # compared with itself
         assert own["theirs"]["psnr"] == row["psnr"] and own["ours"]["kept"] == pytest.approx(row["kept"], rel=2e-3)
     assert "the dial value with the same count" in done.err
 
@@ -125,7 +120,7 @@ def test_popping(clod: Any, capture: Any, dialled: Path) -> None:
     assert re.search(r"^ +what moves +steps +mean", done.err, re.M) and "camera, 002.png to 006.png" in done.err
 
 
-def test_interrupt_keeps_what_is_measured(
+def test_interrupt_keeps_finished_comparisons(
     clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(comparisons, "evaluate", pressing(comparisons.evaluate, signal.SIGINT, at=3))
@@ -137,8 +132,8 @@ def test_interrupt_keeps_what_is_measured(
     assert report["popping"] == []
 
 
-def test_more_metrics_are_columns(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever metrics there are, they are means over the views in the rows and columns of the table."""
+def test_optional_metrics_are_columns(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Means over the views, in the rows and in the table."""
     found = {"flip": lambda image, target: float(image.mean())}
     monkeypatch.setattr("clod_adapter.cli.evaluate.available_metrics", lambda: (found, ["without LPIPS (why)"]))
     done = clod("eval", capture.ply, "--images", capture.scene, "--sv", 1, "--json")

@@ -1,4 +1,4 @@
-"""Errors during and after training: nothing learned is lost, and the message says from where --resume continues."""
+"""Errors during and after training: the state is saved, and the message names the step that --resume starts from."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import pytest
 import torch
 
 import clod_adapter
-from clod_adapter.cli.adapt import files, resume
 from clod_adapter.cli.adapt import report as reporting
-from clod_adapter.cli.adapt.progress import ProgressDisplay
+from clod_adapter.cli.adapt import saver
+from clod_adapter.cli.adapt.display import ProgressDisplay
 from clod_adapter.cli.shared import pages
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Phase, Progress
@@ -34,12 +34,12 @@ def words(capture: Any) -> list[Any]:
 
 @pytest.fixture(scope="module")
 def whole(dialled: Path) -> dict[str, bytes]:
-    """The files of an undisturbed run."""
+    """The files of a run without an error."""
     return {suffix: stripped(dialled.with_suffix(suffix).read_bytes()) for suffix in (".ply", ".safetensors")}
 
 
-def assert_goes_on(clod: Any, words: list[Any], folder: Path, step: int, whole: dict[str, bytes]) -> None:
-    """The same command with --resume goes on from ``step``, and ends as an undisturbed run does."""
+def assert_resumes(clod: Any, words: list[Any], folder: Path, step: int, whole: dict[str, bytes]) -> None:
+    """With --resume the same command starts from ``step``, and writes the files of a run without an error."""
     done = clod(*words, "--resume")
     assert done.code == 0 and f"resuming {STATE} from step {step}" in done.err, done
     assert names(folder) == OUTPUTS
@@ -54,13 +54,8 @@ def raising(error: Exception) -> Any:
     return call
 
 
-def of_run(config: Any) -> bool:
-    """Not of the run that prepares the kernels."""
-    return bool(config.iters == ITERS)
-
-
 def after_step(patch: pytest.MonkeyPatch, step: int, action: Any) -> None:
-    """``action`` follows a step, as the page and the check of the held-out views do."""
+    """Calls ``action`` after a step, as the page and the held-out check are called."""
     call = ProgressDisplay.__call__
 
     def listening(self: ProgressDisplay, progress: Progress) -> bool:
@@ -75,16 +70,16 @@ def after_step(patch: pytest.MonkeyPatch, step: int, action: Any) -> None:
 @pytest.mark.parametrize(
     ("broken", "code", "step"),
     [
-        (lambda patch: change_step(patch, 6, fail, of_run), 1, 5),
+        (lambda patch: change_step(patch, 6, fail), 1, 5),
         (lambda patch: after_step(patch, 7, fail), 1, 7),
         (lambda patch: patch.setattr(reporting, "measure_result", fail), 1, ITERS),
-        (lambda patch: patch.setattr(files, "save", raising(ClodError("dial.ply: cannot be written"))), 2, ITERS),
-        (lambda patch: patch.setattr(files, "save", raising(MemoryError())), 2, ITERS),
-        (lambda patch: patch.setattr(files, "save", fail), 1, ITERS),
+        (lambda patch: patch.setattr(reporting, "save", raising(ClodError("dial.ply: cannot be written"))), 2, ITERS),
+        (lambda patch: patch.setattr(reporting, "save", raising(MemoryError())), 2, ITERS),
+        (lambda patch: patch.setattr(reporting, "save", fail), 1, ITERS),
     ],
     ids=["step, quiet", "listener", "measuring", "full disk", "memory", "writing"],
 )
-def test_a_run_is_resumed_after_an_error(
+def test_resuming_after_an_error(
     clod: Any, words: list[Any], whole: Any, tmp_path: Path, broken: Any, code: int, step: int
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
@@ -93,38 +88,36 @@ def test_a_run_is_resumed_after_an_error(
     assert done.code == code and names(tmp_path) == [STATE], done
     assert f"--resume resumes from step {step}, which is in {STATE}\n" in done.err
     assert ("please report it" in done.err) == ("ZeroDivisionError: of ours" in done.err) == (code == 1)
-    assert_goes_on(clod, words, tmp_path, step, whole)
+    assert_resumes(clod, words, tmp_path, step, whole)
 
 
-def test_a_loss_that_is_not_finite(clod: Any, words: list[Any], whole: Any, tmp_path: Path) -> None:
+def test_non_finite_loss(clod: Any, words: list[Any], whole: Any, tmp_path: Path) -> None:
     """The result before that step is written, and the exit code is 1."""
     with pytest.MonkeyPatch.context() as patch:
-        change_step(patch, 6, lambda found: replace(found, loss=math.nan), of_run)
+        change_step(patch, 6, lambda found: replace(found, loss=math.nan))
         done = clod(*words, "--json")
     report = json.loads(done.out)
     assert done.code == 1 and names(tmp_path) == sorted([*OUTPUTS, STATE]), done
     assert report["interrupted"] and report["steps"] == 5 and len(report["rows"]) > 2
     assert any("the result so far is written: the loss of step 6 is not finite" in n for n in report["notes"])
     assert clod_adapter.load(tmp_path / "dial.ply").gaussians.sigma_d.isfinite().all()
-    assert_goes_on(clod, words, tmp_path, 5, whole)
+    assert_resumes(clod, words, tmp_path, 5, whole)
 
 
-def test_gradients_that_are_not_finite(
-    clod: Any, words: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_non_finite_gradients(clod: Any, words: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def spoil(found: Any) -> Any:
         found.gradients["quats"][5] = math.nan
         return found
 
-    change_step(monkeypatch, 6, spoil, of_run)
+    change_step(monkeypatch, 6, spoil)
     done = clod(*words)
     assert done.code == 0 and "1 Gaussians were not moved by some steps: their gradients" in done.err, done
     found = clod_adapter.load(tmp_path / "dial.ply").gaussians
     assert all(value.isfinite().all() for value in found.tensors().values())
 
 
-def test_an_error_in_the_page(clod: Any, words: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All other files are written by then, and there is nothing to resume."""
+def test_error_in_the_page(clod: Any, words: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All other files are written, and no state remains."""
     monkeypatch.setattr(pages.AdaptPage, "write", fail)
     done = clod(*words, "--report")
     assert done.code == 1 and names(tmp_path) == OUTPUTS and "--resume" not in done.err, done
@@ -133,15 +126,15 @@ def test_an_error_in_the_page(clod: Any, words: list[Any], tmp_path: Path, monke
 
 @pytest.fixture
 def outside(capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Words of a run that writes into a folder of its own, while temporary files go to another."""
+    """Arguments of a run with separate folders for outputs and temporary files."""
     for name in ("temporary", "out"):
         (tmp_path / name).mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     return [capture.ply, "--images", capture.scene, *TINY, "out/dial.ply"]
 
 
-def test_a_folder_that_is_gone(clod: Any, outside: list[Any], whole: Any, tmp_path: Path) -> None:
-    """The state is among the temporary files; moved to its place it is resumed."""
+def test_removed_output_folder(clod: Any, outside: list[Any], whole: Any, tmp_path: Path) -> None:
+    """The state is in the folder for temporary files; moved to its place it is resumed."""
     with pytest.MonkeyPatch.context() as patch:
         after_step(patch, 4, lambda: shutil.rmtree("out"))
         done = clod(*outside)
@@ -156,17 +149,17 @@ def test_a_folder_that_is_gone(clod: Any, outside: list[Any], whole: Any, tmp_pa
     assert stripped((tmp_path / "out" / "dial.ply").read_bytes()) == whole[".ply"]
 
 
-def test_no_place_for_the_state(clod: Any, outside: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The one error is that of the output."""
+def test_state_that_cannot_be_saved(clod: Any, outside: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the error of the output is printed."""
     (tmp_path / "temporary").rmdir()
-    monkeypatch.setattr(reporting, "write", lambda *_: shutil.rmtree("out") or fail())
-    monkeypatch.setattr(resume, "save_state", raising(ClodError("full")))
+    monkeypatch.setattr(reporting, "write_files", lambda *_: shutil.rmtree("out") or fail())
+    monkeypatch.setattr(saver, "save_state", raising(ClodError("full")))
     done = clod(*outside)
     assert done.code == 1 and "ZeroDivisionError: of ours" in done.err and "resumes from" not in done.err, done
 
 
 def test_infinite_opacities(clod: Any, capture: Any, tmp_path: Path) -> None:
-    """A file with five of them is adapted, resumed, applied, measured and adapted again, and they stay infinite."""
+    """They stay infinite through adapting, resuming, applying, measuring and adapting again."""
     logits = capture.gaussians.opacity_logits.clone()
     logits[3:300:60] = math.inf
     capture.write(tmp_path / "opaque.ply", capture.gaussians.replace(opacity_logits=logits))
@@ -179,7 +172,7 @@ def test_infinite_opacities(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert clod("apply", "opaque.ply", "dial.safetensors", "-o", "again.ply").code == 0
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
     with pytest.MonkeyPatch.context() as patch:
-        change_step(patch, 12, fail, of_run)  # by then the state has a mean
+        change_step(patch, 12, fail)  # the state has a mean
         assert clod(*words, "next.ply").code == 1
     assert clod(*words, "next.ply", "--resume").code == 0
     assert stripped((tmp_path / "next.ply").read_bytes()) == stripped((tmp_path / "dial.ply").read_bytes())

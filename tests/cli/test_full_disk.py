@@ -1,7 +1,8 @@
-"""No room for a file, at whichever write: one line, exit code 2, and the files of an earlier run as they were."""
+"""A full disk at any write: one line, exit code 2, unchanged files of an earlier run."""
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ Room = Callable[[int], Any]
 
 @pytest.fixture
 def room() -> Room:
-    """Within, files of this process end at so many bytes, where a write fails as on a full disk."""
+    """Within the block files have at most so many bytes; a longer write fails, as on a full disk."""
 
     @contextmanager
     def limited(size: int) -> Iterator[None]:
@@ -46,8 +47,8 @@ def one_error(done: Any) -> str:
     return errors[0]
 
 
-def test_adapting(clod: Any, capture: Any, tmp_path: Path, room: Room) -> None:
-    """Report, adapter and PLY are ever larger; the page is larger still, and costs nothing but itself."""
+def test_adapt(clod: Any, capture: Any, tmp_path: Path, room: Room) -> None:
+    """At each of the three files. Without room for the page the others are complete."""
     words = (capture.ply, "--images", capture.scene, "--iters", 2, "--max-sv", 2, "-o", "dial.ply")
     assert clod(*words, "--seed", 5).code == 0
     earlier = held(tmp_path)
@@ -58,16 +59,19 @@ def test_adapting(clod: Any, capture: Any, tmp_path: Path, room: Room) -> None:
             one_error(clod(*words))
         assert held(tmp_path) == earlier
     with room(ply + 5000):
-        done = clod(*words, "--report")
-    assert done.code == 0 and "the page was not written: " in done.err
+        done = clod(*words, "--report", "--json")
+    report = json.loads(done.out)
+    assert done.code == 0 and "the page was not written: " in done.err and "page" not in report["outputs"]
+    assert report["rows"] and report["seconds"]["page"] > 0 and "the page was not" in report["notes"][-1]
+    assert report == json.loads((tmp_path / "dial.json").read_text())
     now = held(tmp_path)
     assert now.keys() == earlier.keys() and not any(now[name] == earlier[name] for name in now)
 
 
-def test_a_page(
+def test_page(
     clod: Any, capture: Any, dialled: Path, tmp_path: Path, room: Room, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Page and charts are of one run, also where there is room for the charts alone."""
+    """The earlier page and charts stay, also if there is room for the charts."""
     words = ("eval", dialled, "--images", capture.scene, "--sv", 1, "--report", "page.html")
     assert clod(*words).code == 0
     earlier = held(tmp_path)
@@ -91,14 +95,14 @@ def test_exports(clod: Any, dialled: Path, tmp_path: Path, room: Room, name: str
     assert held(tmp_path) == {name: b"earlier"}
 
 
-def test_pictures_and_applying(clod: Any, capture: Any, dialled: Path, tmp_path: Path, room: Room) -> None:
+def test_render_and_apply(clod: Any, capture: Any, dialled: Path, tmp_path: Path, room: Room) -> None:
     with room(1000):
         one_error(clod("render", dialled, "--images", capture.scene, "-o", "pictures"))
         one_error(clod("apply", capture.ply, dialled.with_suffix(".safetensors"), "-o", "x.ply"))
     assert held(tmp_path) == {} and held(tmp_path / "pictures") == {}
 
 
-def test_the_robustness_experiment(clod: Any, capture: Any, tmp_path: Path, room: Room) -> None:
+def test_robustness(clod: Any, capture: Any, tmp_path: Path, room: Room) -> None:
     words = ("robustness", capture.ply, "--images", capture.scene, "--iters", 2, "--max-sv", 2, "-o", "out")
     for size in (1000, 12000):  # the first cell, and one of the next ones or the figure
         with room(size):

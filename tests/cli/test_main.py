@@ -14,7 +14,7 @@ from clod_adapter._support.version import package_version
 from runs import fail
 
 
-def test_an_error_of_the_system_is_one_line(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_oserror_is_one_line(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device", "some/file")
 
@@ -25,7 +25,7 @@ def test_an_error_of_the_system_is_one_line(clod: Any, capture: Any, monkeypatch
 
 
 def test_torch_is_imported_with_idle_threads_and_the_collector_on() -> None:
-    """The console entry sets OpenMP's waiting policy before torch can read it."""
+    """The command sets OpenMP's wait policy before torch reads it."""
     code = (
         "import sys, gc, os\n"
         "from argparse import Namespace\n"
@@ -51,7 +51,7 @@ def test_closed_pipe(spawn: Any, capture: Any, tmp_path: Path) -> None:
 
 
 def test_ctrl_c_within_compiled_code(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Numba's dispatcher hands it on as a SystemError; other SystemErrors are nobody's Ctrl-C."""
+    """Numba's dispatcher raises a SystemError from it; other SystemErrors are bugs."""
     for cause, code, last in ((KeyboardInterrupt(), 130, "clod-adapt: interrupted"), (None, 1, "please report it")):
 
         def read(*_: object, cause: BaseException | None = cause) -> None:
@@ -62,7 +62,7 @@ def test_ctrl_c_within_compiled_code(clod: Any, capture: Any, monkeypatch: pytes
         assert done.code == code and last in done.err.splitlines()[-1], done
 
 
-def test_an_unknown_error_is_a_traceback_and_where_to_report_it(
+def test_unexpected_error_prints_a_traceback_and_where_to_report_it(
     clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("clod_adapter.cli.shared.models.read_checkpoint", fail)

@@ -1,4 +1,4 @@
-"""``clod-adapt robustness``: the experiment as a user runs it, interrupts it and takes it up again."""
+"""``clod-adapt robustness``: outputs, resuming, interrupts, progress."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OUTPUTS = ["robustness.csv", "robustness.json", "robustness.png"]
 
 @pytest.fixture
 def run(clod: Any, capture: Any, tmp_path: Path) -> Callable[..., Any]:
-    """The command on two checkpoints, the second without its faintest Gaussians."""
+    """Runs the command on two checkpoints, the second without the faintest Gaussians."""
     few = capture.gaussians.select(capture.gaussians.opacities > 0.5)
     paths = (capture.write(tmp_path / "plain.ply", capture.gaussians), capture.write(tmp_path / "masked.ply", few))
 
@@ -47,7 +47,7 @@ def at(cell: dict[str, Any], virtual_scale: float) -> dict[str, Any]:
     return row  # type: ignore[no-any-return]
 
 
-def test_every_checkpoint_at_every_range(run: Any, clod: Any, tmp_path: Path) -> None:
+def test_outputs_of_all_cells(run: Any, clod: Any, tmp_path: Path) -> None:
     done = run("--json")
     assert done.code == 0, done
     folder = tmp_path / "robustness"
@@ -67,7 +67,7 @@ def test_every_checkpoint_at_every_range(run: Any, clod: Any, tmp_path: Path) ->
     (row,) = [r for r in rows if (r["checkpoint"], r["max_sv"], r["virtual_scale"]) == ("masked", "1.0", "2.0")]
     assert float(row["psnr"]) == at(report["cells"][4], 2)["psnr"] and row["within_range"] == "False"
     assert Image.open(folder / "robustness.png").size[0] > 2000
-    # A cell's adapter gives the model that was measured.
+    # The adapter of a cell gives the measured model.
     assert clod("apply", "plain.ply", "robustness/cells/plain_sv3.safetensors", "-o", "x.ply").code == 0
     scene = clod_adapter.load_scene(report["scene"])
     (again,) = clod_adapter.evaluate(clod_adapter.load("x.ply").gaussians, scene.test, [3.0])
@@ -75,7 +75,7 @@ def test_every_checkpoint_at_every_range(run: Any, clod: Any, tmp_path: Path) ->
 
 
 @pytest.mark.usefixtures("blank_figure")
-def test_resumes_what_is_unfinished_or_changed(run: Any, tmp_path: Path) -> None:
+def test_unfinished_and_changed_cells_are_run_again(run: Any, tmp_path: Path) -> None:
     first = run()
     assert first.code == 0 and "done already" not in first.err, first
     folder = tmp_path / "robustness"
@@ -87,7 +87,7 @@ def test_resumes_what_is_unfinished_or_changed(run: Any, tmp_path: Path) -> None
     assert again.code == 0 and "5 of 6 cells are done already" in again.err
     changed = {name for name, stamp in stamps(folder).items() if stamp != before.get(name)}
     assert changed == {"masked_sv1.safetensors", "masked_sv1.json"} and (folder / "robustness.png").exists()
-    other = run("--seed", 1)  # the baselines do not depend on it
+    other = run("--seed", 1)  # baselines do not depend on the seed
     assert "2 of 6 cells are done already: plain_base, masked_base" in other.err
     before = stamps(folder)
     Path("masked.ply").write_bytes(Path("plain.ply").read_bytes())
@@ -98,7 +98,7 @@ def test_resumes_what_is_unfinished_or_changed(run: Any, tmp_path: Path) -> None
 
 
 @pytest.mark.usefixtures("blank_figure")
-def test_ctrl_c_leaves_what_there_is(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupt_keeps_finished_cells(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls, real = [], pressing(command.adapt_at_range, signal.SIGINT, at=2)
     monkeypatch.setattr(command, "adapt_at_range", lambda *a, **options: calls.append(a) or real(*a, **options))
     done = run("--json")
@@ -111,7 +111,7 @@ def test_ctrl_c_leaves_what_there_is(run: Any, tmp_path: Path, monkeypatch: pyte
     assert finished["missing"] == [] and finished["cells"][:2] == report["cells"] and len(calls) == 5
 
 
-def test_ctrl_c_before_the_first_cell(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupt_of_the_first_cell_writes_nothing(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls, real = [], command.scene_fingerprint
     monkeypatch.setattr(command, "scene_fingerprint", lambda scene: calls.append(scene) or real(scene))
     monkeypatch.setattr(command, "baseline", pressing(command.baseline, signal.SIGINT))
@@ -130,9 +130,7 @@ def test_progress_is_over_all_cells(run: Any, monkeypatch: pytest.MonkeyPatch) -
     assert run("--quiet", "--out", "other").err == ""
 
 
-def test_cells_must_be_a_folder_that_can_be_written(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unusable_folder_of_cells(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cells = tmp_path / "robustness" / "cells"
     cells.mkdir(parents=True)
     real = os.access
@@ -144,7 +142,7 @@ def test_cells_must_be_a_folder_that_can_be_written(
         cells.write_text("mine")
 
 
-def test_no_folder_without_readable_inputs_or_matplotlib(
+def test_unreadable_inputs_or_missing_matplotlib_make_no_folder(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = tmp_path / "scene"

@@ -10,7 +10,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path, atomic_paths, remove_leftovers
 
 
-def test_folders(tmp_path: Path) -> None:
+def test_folder_is_written_whole(tmp_path: Path) -> None:
     final = tmp_path / "model"
     with atomic_path(final) as temporary:
         (temporary / "deep").mkdir(parents=True)
@@ -24,7 +24,7 @@ def test_folders(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["model"]
 
 
-def test_several_appear_together(tmp_path: Path) -> None:
+def test_several_files_appear_together(tmp_path: Path) -> None:
     finals = [tmp_path / name for name in ("a", "b", "c")]
     with atomic_paths(*finals) as temporaries:
         for temporary in temporaries:
@@ -36,8 +36,8 @@ def test_several_appear_together(tmp_path: Path) -> None:
     assert [final.read_bytes() for final in finals] == [b"new"] * 3
 
 
-def test_leftovers_of_the_same_file_are_removed(tmp_path: Path) -> None:
-    """Of a temporary's temporary too; what belongs to another file stays."""
+def test_temporaries_of_a_file_are_removed(tmp_path: Path) -> None:
+    """Nested ones too, but none of another file."""
     final, other = tmp_path / "out.ply", tmp_path / "other.ply"
     final.write_bytes(b"final")
     with atomic_path(final) as first, atomic_path(other) as theirs:
@@ -51,8 +51,8 @@ def test_leftovers_of_the_same_file_are_removed(tmp_path: Path) -> None:
     assert final.read_bytes() == b"new"
 
 
-def test_a_file_appears_only_after_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Or is replaced; a folder that cannot be flushed does not matter, as the rename is done by then."""
+def test_file_appears_only_after_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the folder cannot be flushed."""
     final = tmp_path / ("x" * 251 + ".ply")  # as long as a name may be
     with atomic_path(final) as temporary, atomic_path(temporary) as nested:
         assert temporary.parent == tmp_path and temporary.suffix == ".ply"
@@ -73,7 +73,7 @@ def test_a_file_appears_only_after_success(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("error", [RuntimeError(), KeyboardInterrupt(), SystemExit(), OSError(28, "No space left")])
-def test_after_a_failure_the_old_file_alone_remains(tmp_path: Path, error: BaseException) -> None:
+def test_failure_keeps_only_the_old_file(tmp_path: Path, error: BaseException) -> None:
     final = tmp_path / "out"
     final.write_bytes(b"old")
     wanted = ClodError if isinstance(error, OSError) else type(error)
@@ -87,7 +87,7 @@ def test_after_a_failure_the_old_file_alone_remains(tmp_path: Path, error: BaseE
     assert final.read_bytes() == b"old" and os.listdir(tmp_path) == ["out"]
 
 
-def test_targets_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unwritable_targets_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A write-protected file is not replaced, although a rename needs the folder's permission only."""
     target = tmp_path / "a.txt"
     target.write_text("earlier")

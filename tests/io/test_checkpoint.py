@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -16,11 +18,11 @@ from clod_adapter.adapter import detach, trim
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io import checkpoint as checkpoint_file
 from clod_adapter.io.checkpoint import load, save, trimmed
 from clod_adapter.io.file_formats import write as save_as
 from clod_adapter.io.ply.columns import column_map
-from formats import model
+from clod_adapter.io.sniff import handle_name
+from formats import model, write_elements, write_rows
 
 RESTS = (0, 9, 24, 45, 72)
 CONFIG = AttenuationConfig(tau=0.02, eps=1e-7, normalizer="quantile", quantile=1 / 3, max_sv=7.0)
@@ -40,13 +42,11 @@ def make(n: int, names: list[str], seed: int = 0, types: dict[str, str] | None =
     return vertex
 
 
-def write(
-    path: Path, vertex: np.ndarray, kind: str = "<", comments: tuple[str, ...] = (), name: str = "vertex"
-) -> Path:
-    element = PlyElement.describe(vertex, name, comments=list(comments))
-    data = PlyData([element], text=kind == "ascii", byte_order="=" if kind == "ascii" else kind)
-    data.write(str(path))
-    return path
+def rotated(vertex: np.ndarray, value: float) -> np.ndarray:
+    """The rows with this value in every rotation."""
+    for i in range(4):
+        vertex[f"rot_{i}"] = value
+    return vertex
 
 
 def read_back(path: Path) -> tuple[list[str], np.ndarray]:
@@ -80,10 +80,10 @@ def files(draw: st.DrawFn) -> tuple[np.ndarray, str, int]:
 
 @settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(files(), st.integers(0, 1000))
-def test_any_layout_round_trips(tmp_path: Path, file: tuple[np.ndarray, str, int], seed: int) -> None:
+def test_every_layout_round_trips(tmp_path: Path, file: tuple[np.ndarray, str, int], seed: int) -> None:
     """Every column is read and written bit for bit, but for the values that change; what training gives is saved."""
     vertex, kind, degree = file
-    source, out = write(tmp_path / "in.ply", vertex, kind, ("made by hand",)), tmp_path / "out.ply"
+    source, out = write_rows(tmp_path / "in.ply", vertex, kind, ("made by hand",)), tmp_path / "out.ply"
     before = source.read_bytes()
     base = load(source)
     g = base.gaussians
@@ -119,12 +119,11 @@ def test_any_layout_round_trips(tmp_path: Path, file: tuple[np.ndarray, str, int
         assert same(load(source).gaussians, g)
 
 
-def test_extended_header(tmp_path: Path) -> None:
+def test_header_of_an_extended_file(tmp_path: Path) -> None:
     vertex = make(2, ["sigma_d", *needed(0)])
     comments = ("a photo", "clod_adapter tau 0.125", "clod_adapter odd 1")
-    base = load(write(tmp_path / "in.ply", vertex, comments=comments))
+    base = load(write_rows(tmp_path / "in.ply", vertex, comments=comments))
     assert base.gaussians.attenuation == AttenuationConfig(tau=0.125, cut="hard", reference_distance=1.0)
-    assert "odd" in base.notes[1] and "earlier versions: cut, eps, normalizer" in base.notes[0]
     config = dataclasses.replace(CONFIG, reference_distance=np.float64(1) / 3, max_sv=3, tau=np.float32(0.01))
     save(tmp_path / "out.ply", base.gaussians.replace(attenuation=config), base, version="7.8.9")
     assert load(tmp_path / "out.ply").gaussians.attenuation == config
@@ -140,17 +139,13 @@ def test_extended_header(tmp_path: Path) -> None:
 def test_mask_gaussian_layout(tmp_path: Path) -> None:
     names = needed(3)
     at = names.index("opacity") + 1
-    for differences in ([-0.5, 2.0, 0.0, -20.0], [1.0]):
-        vertex = make(len(differences) + 1, [*names[:at], "masks_0", "masks_1", *names[at:]])
-        vertex["masks_0"] = [*differences, 0.25]
-        vertex["masks_1"] = [0.0] * len(differences) + [0.25]  # probability exactly 0.5 stays
-        checkpoint = load(write(tmp_path / "in.ply", vertex))
-        expected = vertex["masks_0"] >= vertex["masks_1"]
-        np.testing.assert_array_equal(checkpoint.gaussians.means[:, 0], vertex["x"][expected])
-        assert checkpoint.vertex.tobytes() == vertex[expected].tobytes()
-        assert ("2 of 5" in checkpoint.notes[0]) if len(vertex) == 5 else checkpoint.notes == ()
-        save(tmp_path / "out.ply", checkpoint.gaussians, checkpoint)
-        assert load(tmp_path / "out.ply").notes == ()
+    vertex = make(5, [*names[:at], "masks_0", "masks_1", *names[at:]])
+    vertex["masks_0"], vertex["masks_1"] = [-0.5, 2.0, 0.0, -20.0, 0.25], [0.0, 0.0, 0.0, 0.0, 0.25]  # 0 keeps the row
+    checkpoint = load(write_rows(tmp_path / "in.ply", vertex))
+    assert "2 of 5" in checkpoint.notes[0] and checkpoint.vertex.tobytes() == vertex[[1, 2, 4]].tobytes()
+    np.testing.assert_array_equal(checkpoint.gaussians.means[:, 0], vertex["x"][[1, 2, 4]])
+    save(tmp_path / "out.ply", checkpoint.gaussians, checkpoint)
+    assert load(tmp_path / "out.ply").notes == ()
 
 
 def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
@@ -159,12 +154,11 @@ def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
     vertex["f_rest_8"][1] = np.inf
     vertex["opacity"][[2, 3, 4, 9]] = np.nan, -np.inf, np.inf, 1e300  # the last is +inf as a float32
     vertex["scale_1"][5] = -np.inf
-    for i in range(4):
-        vertex[f"rot_{i}"][6] = 0
+    rotated(vertex[6:7], 0)
     vertex["sigma_d"][7] = np.nan
     vertex["nx"][8] = np.nan  # not used, so no reason to drop
     vertex["y"][10] = 1e300
-    checkpoint = load(write(tmp_path / "in.ply", vertex))
+    checkpoint = load(write_rows(tmp_path / "in.ply", vertex))
     np.testing.assert_array_equal(checkpoint.gaussians.means[:, 1], vertex["y"][[4, 8, 9]].astype("f4"))
     assert checkpoint.gaussians.opacities[0] == 1
     assert checkpoint.notes[:3] == (
@@ -177,7 +171,7 @@ def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
     assert read_back(tmp_path / "out.ply")[1]["opacity"][2] == 1e300
 
 
-def test_parts_that_are_not_kept_are_noted(tmp_path: Path) -> None:
+def test_elements_that_are_not_written_are_noted(tmp_path: Path) -> None:
     vertex = PlyElement.describe(make(2, needed(0)), "vertex")
     camera = PlyElement.describe(np.zeros(1, [("fx", "f4")]), "intrinsic", comments=["of the camera"])
     PlyData([camera, vertex], byte_order="<", obj_info=["x"], comments=["first"]).write(str(tmp_path / "in.ply"))
@@ -193,23 +187,23 @@ def without(*names: str, add: tuple[str, ...] = (), degree: int = 1) -> list[str
 
 
 @pytest.mark.parametrize(
-    ("names", "message"),
+    ("vertex", "message"),
     [
-        (["packed_position", "packed_rotation"], "compressed PLY without its element chunk"),
-        (without(add=("f_offset_0", "f_anchor_feat_0")), "Scaffold-GS"),
-        (without("scale_2"), "2DGS"),
-        (["x", "y", "z", "nx", "ny", "nz"], "mesh or a point cloud"),
-        (["x", "y", "z", "red"], "mesh or a point cloud"),
-        (without("rot_3"), "property rot_3 is missing"),
-        (without("y"), "property y is missing"),
-        (without("opacity"), "property opacity is missing"),
-        (without("f_dc_1"), "property f_dc_1 is missing"),
-        (without("f_rest_4"), "8 f_rest"),
-        (without("f_rest_4", add=("f_rest_9",)), "property f_rest_4 is missing"),
+        (make(2, ["packed_position", "packed_rotation"]), "compressed PLY without its element chunk"),
+        (make(2, without(add=("f_offset_0", "f_anchor_feat_0"))), "Scaffold-GS"),
+        (make(2, without("scale_2")), "2DGS"),
+        (make(2, ["x", "y", "z", "nx", "ny", "nz"]), "mesh or a point cloud"),
+        (make(2, ["x", "y", "z", "red"]), "mesh or a point cloud"),
+        *((make(2, without(name)), f"property {name} is missing") for name in ("rot_3", "y", "opacity", "f_dc_1")),
+        (make(2, without("f_rest_4")), "8 f_rest"),
+        (make(2, without("f_rest_4", add=("f_rest_9",))), "property f_rest_4 is missing"),
+        (make(2, needed(0), types={"x": "i4"}), "property x is not float"),
+        (make(0, needed(0)), "no usable Gaussian"),
+        *((rotated(make(3, needed(0)), fill), "no usable Gaussian.*3 of 3") for fill in (np.nan, 0.0)),
     ],
-)
-def test_refused_layouts(tmp_path: Path, names: list[str], message: str) -> None:
-    path = write(tmp_path / "in.ply", make(2, names))
+)  # fmt: skip
+def test_refused_layouts(tmp_path: Path, vertex: np.ndarray, message: str) -> None:
+    path = write_rows(tmp_path / "in.ply", vertex)
     with pytest.raises(ClodError, match=message) as caught:
         load(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
@@ -218,30 +212,21 @@ def test_refused_layouts(tmp_path: Path, names: list[str], message: str) -> None
 def test_refused_elements(tmp_path: Path) -> None:
     path = tmp_path / "in.ply"
     with pytest.raises(ClodError, match="no vertex element.*point"):
-        load(write(path, make(2, needed(0)), name="point"))
-    with pytest.raises(ClodError, match="property x is not float"):
-        load(write(path, make(2, needed(0), types={"x": "i4"})))
+        load(write_elements(path, [PlyElement.describe(make(2, needed(0)), "point")]))
+    with pytest.raises(ClodError, match="no usable Gaussian|damaged"):
+        load(write_rows(path, make(0, needed(0)), "ascii"))
     lists = np.ones(2, [(name, "f4") for name in needed(0)] + [("bones", "O")])
     lists["bones"] = [np.array([1], "i4"), np.array([2, 3], "i4")]
     with pytest.raises(ClodError, match="property bones is a list"):
-        load(write(path, lists))
+        load(write_rows(path, lists))
     header = "element vertex 1\nproperty float x\nelement face 999999999\nproperty list uchar int vertex_indices\n"
     path.write_text(f"ply\nformat binary_little_endian 1.0\n{header}end_header\n")
     with pytest.raises(ClodError, match="mesh or a point cloud"):  # without reading its faces
         load(path)
-    for fill in (np.nan, 0.0):
-        vertex = make(3, needed(0))
-        for i in range(4):
-            vertex[f"rot_{i}"] = fill
-        with pytest.raises(ClodError, match="no usable Gaussian.*3 of 3"):
-            load(write(path, vertex))
-    for kind in ("<", "ascii"):
-        with pytest.raises(ClodError, match="no usable Gaussian|damaged"):
-            load(write(path, make(0, needed(0)), kind))
 
 
 def test_refused_saves(tmp_path: Path) -> None:
-    base = load(write(tmp_path / "in.ply", make(3, needed(1))))
+    base = load(write_rows(tmp_path / "in.ply", make(3, needed(1))))
     g, out = base.gaussians, tmp_path / "out.ply"
     refused = [
         (out, g.select(torch.tensor([0, 2])), "2 Gaussians of SH degree 1 do not fit"),
@@ -261,25 +246,29 @@ def test_refused_saves(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [tmp_path / "in.ply"]
 
 
-def test_a_file_that_goes_away_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a format that a library reads; a PLY is read once (ply/test_body)."""
-    path = tmp_path / "in.safetensors"
+@pytest.mark.parametrize(("suffix", "module"), [(".safetensors", "tensor_file"), (".pt", "formats.pt")])
+def test_fingerprint_and_rows_are_of_one_file(
+    tmp_path: Path, suffix: str, module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file is replaced while it is open; for the PLY see ply/test_body."""
+    path, other = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
     save_as(path, detach(model(1)))
-    usable = checkpoint_file.usable_rows
-    monkeypatch.setattr(checkpoint_file, "usable_rows", lambda *args: (path.unlink(), usable(*args))[1])
-    with pytest.raises(ClodError, match="in.safetensors: cannot be read"):
-        load(path)
+    save_as(other, detach(model(0)))
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    monkeypatch.setattr("clod_adapter.io.file_formats.check_readable", lambda path: None)
+    name = f"clod_adapter.io.{module}.handle_name"
+    monkeypatch.setattr(name, lambda file: (os.replace(other, path), handle_name(file))[1])
+    found = load(path)
+    assert found.fingerprint == digest and found.gaussians.sh_degree == 1 and not other.exists()
 
 
 @pytest.mark.parametrize(
     ("file", "count", "degree"),
     [
-        ("ci_banana/pretrained.ply", 20_000, 3),
-        ("splats/playbot_lod4_from_sog.ply", 8_406, 2),
-        ("splats/lod_tiles/lod5_tile_0.ply", 111, 3),
-        ("plush_half/pretrained_mask.ply", 58_438, 3),
+        ("ci_banana/pretrained.ply", 20_000, 3), ("splats/playbot_lod4_from_sog.ply", 8_406, 2),
+        ("splats/lod_tiles/lod5_tile_0.ply", 111, 3), ("plush_half/pretrained_mask.ply", 58_438, 3),
     ],
-)
+)  # fmt: skip
 def test_real_files(tmp_path: Path, shared_data: Callable[[str], Path], file: str, count: int, degree: int) -> None:
     path = shared_data(file)
     checkpoint = load(path)
@@ -295,10 +284,8 @@ def test_real_files(tmp_path: Path, shared_data: Callable[[str], Path], file: st
 
 
 @pytest.mark.parametrize(("rows", "degree"), [(None, 1), ([1, 4, 8], None), ([1, 4, 8], 0)])
-def test_a_trimmed_checkpoint_keeps_its_other_columns(
-    tmp_path: Path, rows: list[int] | None, degree: int | None
-) -> None:
-    checkpoint = load(write(tmp_path / "base.ply", make(9, ["label", *reversed(needed(2))], types={"label": "u1"})))
+def test_trimmed_checkpoint_keeps_its_other_columns(tmp_path: Path, rows: list[int] | None, degree: int | None) -> None:
+    checkpoint = load(write_rows(tmp_path / "a.ply", make(9, ["label", *reversed(needed(2))], types={"label": "u1"})))
     kept = None if rows is None else torch.isin(torch.arange(9), torch.tensor(rows))
     less = trimmed(checkpoint, kept, degree)
     save(tmp_path / "less.ply", less.gaussians, less)

@@ -12,10 +12,10 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import remove_leftovers
 from clod_adapter.io.lock import output_lock
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="locks are those of POSIX")
+fcntl = pytest.importorskip("fcntl", reason="locks are those of POSIX")
 
 
-def test_a_killed_holder_holds_nothing(tmp_path: Path) -> None:
+def test_killed_process_releases_the_lock(tmp_path: Path) -> None:
     final = tmp_path / "out.ply"
     code = (
         "import os, sys; from pathlib import Path; from clod_adapter.io.lock import output_lock\n"
@@ -28,9 +28,7 @@ def test_a_killed_holder_holds_nothing(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
-def test_a_file_system_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import fcntl
-
+def test_file_system_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise OSError(95, "Operation not supported")
 
@@ -39,10 +37,8 @@ def test_a_file_system_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert os.listdir(tmp_path) == []
 
 
-def test_the_last_holder_may_remove_the_file_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A lock on a file that is there no more would be of nothing."""
-    import fcntl
-
+def test_lock_file_removed_by_the_last_holder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Then the lock is taken on a new file."""
     lock, removed = fcntl.flock, []
 
     def late(handle: int, how: int) -> None:
@@ -62,15 +58,15 @@ def test_the_last_holder_may_remove_the_file_meanwhile(tmp_path: Path, monkeypat
 
 
 def refused(path: Path, **how: Any) -> None:
-    said = rf"^{how.get('of', path)}: another run \(process {os.getpid()}\) is writing it; wait for that"
-    with pytest.raises(ClodError, match=said), output_lock(path, **how):
+    message = rf"^{how.get('of', path)}: another run \(process {os.getpid()}\) is writing it; wait for that"
+    with pytest.raises(ClodError, match=message), output_lock(path, **how):
         raise AssertionError("the body must not run")
 
 
-def test_one_run_holds_it_or_jobs_share_it(tmp_path: Path) -> None:
+def test_exclusive_and_shared_locks(tmp_path: Path) -> None:
     final = tmp_path / "out.ply"
     with output_lock(final), output_lock(tmp_path / "other.ply"):
-        remove_leftovers(final)  # which a second run would do, had it not been refused
+        remove_leftovers(final)  # as a second run would
         refused(final)
         refused(final, of=Path("all"), shared=True)
     assert os.listdir(tmp_path) == []

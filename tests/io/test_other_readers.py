@@ -1,4 +1,4 @@
-"""Files of this package in readers of other programs, and PLYs of theirs."""
+"""Files exchanged with gsply and splat-transform."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from formats import covariances, model, splat_transform, turned
 @pytest.mark.parametrize(
     ("suffix", "degree", "atol"), [(".ply", 0, 0.0), (".ply", 2, 0.0), (".ply", 3, 0.0), (".spz", 3, 1e-5)]
 )
-def test_gsply_reads_it(tmp_path: Path, suffix: str, degree: int, atol: float) -> None:
+def test_gsply_reads_files(tmp_path: Path, suffix: str, degree: int, atol: float) -> None:
     gsply = pytest.importorskip("gsply.spz", reason="gsply is not installed")
     path = tmp_path / f"a{suffix}"
     write(path, model(degree))
@@ -32,7 +32,7 @@ def test_gsply_reads_it(tmp_path: Path, suffix: str, degree: int, atol: float) -
     np.testing.assert_allclose(opacities, ours.opacities, atol=max(110 * atol, 1e-6))
 
 
-def test_gsply_writes_it(tmp_path: Path) -> None:
+def test_files_of_gsply_are_read(tmp_path: Path) -> None:
     gsply = pytest.importorskip("gsply", reason="gsply is not installed")
     g = model(3)
     arrays = {name: tensor.numpy() for name, tensor in g.tensors().items()}
@@ -44,8 +44,8 @@ def test_gsply_writes_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".splat"])
-def test_splat_transform_reads_it(tmp_path: Path, suffix: str) -> None:
-    """Of a PLY it keeps sigma_d bit for bit and in order, but not the comments, and with them the settings."""
+def test_splat_transform_reads_files(tmp_path: Path, suffix: str) -> None:
+    """It keeps sigma_d of a PLY bit for bit and in order, but drops the comments with the settings."""
     write(tmp_path / f"a{suffix}", detach(model(0)) if suffix == ".splat" else model(3))
     splat_transform(tmp_path / f"a{suffix}", tmp_path / "b.ply")
     ours, found = load(tmp_path / f"a{suffix}").gaussians, load(tmp_path / "b.ply")
@@ -56,9 +56,8 @@ def test_splat_transform_reads_it(tmp_path: Path, suffix: str) -> None:
         assert turned(theirs.quats, ours.quats) < 0.02
     else:
         torch.testing.assert_close(covariances(theirs), covariances(ours), atol=1e-6, rtol=1e-3)
-    torch.testing.assert_close(
-        theirs.opacities, ours.opacities, atol=1.1e-3, rtol=0
-    )  # 0 and 255 are read as 1/4 inside
+    # 1.1e-3: the levels 0 and 255 are read as a quarter of a level inside.
+    torch.testing.assert_close(theirs.opacities, ours.opacities, atol=1.1e-3, rtol=0)
     if suffix == ".ply":
         assert theirs.sigma_d is not None and torch.equal(theirs.sigma_d, ours.sigma_d)
         assert theirs.attenuation == AttenuationConfig() and "its dial is not described" in found.notes[0]

@@ -1,4 +1,4 @@
-"""What files say of the filter: ours in full and in every format, other programs' as far as they do."""
+"""The screen-space filter in files of other programs and in columns; for other settings see test_settings."""
 
 from __future__ import annotations
 
@@ -15,21 +15,18 @@ from clod_adapter.io.file_formats import write
 from clod_adapter.io.screen_filter import implied_filter, is_antialiased, tagged
 from formats import model, without_comments
 
-OTHER = ScreenFilter(variance=0.123456789, compensate=True)
-SUFFIXES = [".ply", ".glb", ".spz", ".safetensors", ".pt"]
 
-
-def test_the_comments_of_other_programs_stay_true() -> None:
+def test_comments_of_other_programs_are_corrected() -> None:
     mixed = ["made by hand", "SplatRenderMode: default", "antialiased 0"]
     assert tagged(mixed, CLASSIC) == mixed
     assert tagged(mixed, FILTERS["on"]) == ["made by hand", "SplatRenderMode: mip"]
-    for said in ("SplatRenderMode: mip", "antialiased 1"):
-        assert tagged(["made by hand", said], FILTERS["on"]) == ["made by hand", said]
-        assert tagged(["made by hand", said], CLASSIC) == ["made by hand"]
+    for comment in ("SplatRenderMode: mip", "antialiased 1"):
+        assert tagged(["made by hand", comment], FILTERS["on"]) == ["made by hand", comment]
+        assert tagged(["made by hand", comment], CLASSIC) == ["made by hand"]
 
 
-def test_the_flag_of_spz(tmp_path: Path) -> None:
-    """Bit 0 of the flags: written with every compensating filter, and read of others' files, which say no more."""
+def test_spz_flag(tmp_path: Path) -> None:
+    """Bit 0: written with every compensating filter; other programs store nothing else."""
 
     def flags(path: Path) -> bytearray:
         return bytearray(zlib.decompress(path.read_bytes(), wbits=31))
@@ -48,8 +45,8 @@ def test_the_flag_of_spz(tmp_path: Path) -> None:
     assert is_antialiased(found.comments)
 
 
-def test_a_dial_was_tuned_with_what_its_file_says(tmp_path: Path) -> None:
-    """Also where another program's comment, that its base had, says otherwise."""
+def test_filter_of_a_dial_is_that_of_its_settings(tmp_path: Path) -> None:
+    """It takes precedence over a comment of another program."""
     write(tmp_path / "a.ply", model(1))
     data = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "a.ply").write_bytes(data.replace(b"end_header", b"comment antialiased 1\nend_header", 1))
@@ -59,7 +56,7 @@ def test_a_dial_was_tuned_with_what_its_file_says(tmp_path: Path) -> None:
     assert not is_antialiased(load(tmp_path / "b.ply").comments)
 
 
-def test_what_other_programs_state() -> None:
+def test_filters_of_other_programs() -> None:
     assert not is_antialiased(["SplatRenderMode: default", "antialiased 0", "not antialiased 1"])
     assert implied_filter((), ("x", "y")) == implied_filter(("antialiased 0",), ()) == CLASSIC
     assert implied_filter(("Exported from Brush", "SplatRenderMode: mip"), ()) == FILTERS["mip"]  # Brush's has 0.1 px^2
@@ -67,8 +64,8 @@ def test_what_other_programs_state() -> None:
 
 
 @pytest.mark.parametrize("screen_filter", [*FILTERS.values(), ScreenFilter(variance=0.123, compensate=True)], ids=str)
-def test_columns_keep_it_where_comments_are_dropped(tmp_path: Path, screen_filter: ScreenFilter) -> None:
-    """Of a file with a dial; a plain one has the columns of Inria's layout and no others."""
+def test_columns_store_the_filter(tmp_path: Path, screen_filter: ScreenFilter) -> None:
+    """In a file with a dial; a plain one has no columns but those of Inria's layout."""
     write(tmp_path / "a.ply", model(1).replace(screen_filter=screen_filter))
     found = load(without_comments(tmp_path / "a.ply"))
     assert found.gaussians.screen_filter == screen_filter and found.filter_known and found.comments == ()
@@ -76,7 +73,7 @@ def test_columns_keep_it_where_comments_are_dropped(tmp_path: Path, screen_filte
     assert not any(name.startswith("clod_") for name in load(tmp_path / "b.ply").vertex.dtype.names or ())
 
 
-def test_columns_of_other_programs_and_damaged_ones(tmp_path: Path) -> None:
+def test_columns_of_other_programs_and_damaged_columns(tmp_path: Path) -> None:
     write(tmp_path / "a.ply", detach(model(1)))
     found = load(without_comments(tmp_path / "a.ply", filter_3D=0.01))  # of Mip-Splatting
     assert found.gaussians.screen_filter == FILTERS["mip"] and not found.filter_known

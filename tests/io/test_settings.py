@@ -1,4 +1,4 @@
-"""Settings in files: one reader of them, and every format and adapters pass through it."""
+"""Settings in files: one reader, which every format and the adapter use."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from plyfile import PlyData, PlyElement
 
 from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.calibration import Calibration
@@ -21,7 +20,7 @@ from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.metadata import parse_metadata
 from clod_adapter.io.ply.columns import inria_dtype
 from clod_adapter.io.settings import EARLIER, read_metadata
-from formats import ATTENUATION, CALIBRATION, change_setting, model
+from formats import ATTENUATION, CALIBRATION, change_setting, model, write_rows
 
 pytest.importorskip("pygltflib", reason="pygltflib is not installed")
 KINDS = ["a.ply", "a.glb", "a.spz", "a.safetensors", "a.pt", "adapter.safetensors"]
@@ -60,7 +59,7 @@ def read(path: Path) -> Read:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_format_passes_through_the_reader(tmp_path: Path, kind: str) -> None:
+def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
     path, ply = tmp_path / kind, kind == "a.ply"
     for screen_filter in (CLASSIC, OTHER):
         assert read(written(path, screen_filter)) == (ATTENUATION, screen_filter, CALIBRATION, ())
@@ -116,12 +115,12 @@ def nested(name: str, **changes: Any) -> dict[str, Any]:
         ({"format": ...}, "format"), ({"about": ["long"] * 20_000}, "more than 65,536 characters"),
     ],
 )  # fmt: skip
-def test_a_damaged_setting_is_refused(change: dict[str, Any], message: str) -> None:
+def test_damaged_setting_is_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ClodError, match=f"a.glb: its settings are damaged .*{message}.*; restore them, or export"):
         parse(**change)
 
 
-def test_a_missing_setting_has_the_default_of_earlier_versions() -> None:
+def test_missing_setting_has_the_default_of_earlier_versions() -> None:
     found = parse(attenuation={"scene_distance": 3.5})
     assert found.attenuation == AttenuationConfig(**EARLIER | {"scene_distance": 3.5, "reference_distance": 3.5})
     assert "earlier versions: tau, cut, eps, normalizer, quantile, max_sv" in found.notes[0]
@@ -138,30 +137,24 @@ def test_a_missing_setting_has_the_default_of_earlier_versions() -> None:
         ({"against": "paintings"}, "unusable and ignored.*against 'paintings'"),
     ],
 )
-def test_a_damaged_calibration_is_ignored(change: dict[str, Any], note: str) -> None:
+def test_damaged_calibration_is_ignored(change: dict[str, Any], note: str) -> None:
     found = parse(**nested("calibration", **change))
     assert found.calibration is None and found.attenuation == ATTENUATION
     assert len(found.notes) == 1 and re.search(note, found.notes[0])
 
 
 # As an earlier version wrote them.
-HEADER = """version 0.1.0
-tau 0.02
-cut soft
-eps 1e-08
-normalizer scene
-quantile 0.95
-scene_distance 9.894437842071056
-max_sv 5.0"""
+HEADER = "version 0.1.0, tau 0.02, cut soft, eps 1e-08, normalizer scene, quantile 0.95, "
+HEADER += "scene_distance 9.894437842071056, max_sv 5.0"
 
 
-def test_a_header_of_an_earlier_version_is_read_as_before(tmp_path: Path) -> None:
+def test_header_of_an_earlier_version(tmp_path: Path) -> None:
     rng, path = np.random.default_rng(0), tmp_path / "a.ply"
     rows = np.zeros(50, inria_dtype(0, dial=True))
     for name in rows.dtype.names or ():
         rows[name] = rng.normal(size=50)
-    lines = [f"clod_adapter {comment}" for comment in HEADER.splitlines()]
-    PlyData([PlyElement.describe(rows, "vertex", comments=lines)], byte_order="<").write(str(path))
+    lines = [f"clod_adapter {comment}" for comment in HEADER.split(", ")]
+    write_rows(path, rows, comments=lines)
     checkpoint = load(path)
     want = AttenuationConfig(scene_distance=9.894437842071056, reference_distance=9.894437842071056)
     assert checkpoint.gaussians.attenuation == want and checkpoint.notes == ()
@@ -176,6 +169,6 @@ def test_a_header_of_an_earlier_version_is_read_as_before(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("tau", [0.19, 0.2, 0.98])
-def test_an_unknown_range_fits_the_tau(tmp_path: Path, tau: float) -> None:
+def test_unknown_range_fits_tau(tmp_path: Path, tau: float) -> None:
     found = read_metadata(tmp_path, {"attenuation": {"tau": tau}}, dial=True, described=False).attenuation
     assert found is not None and found.tau == tau and found.max_sv >= 1 and (found.max_sv == 5) == (tau < 0.2)

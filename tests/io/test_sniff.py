@@ -39,7 +39,7 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 248\n"
         ("a.ply", b"plyx", "is not a PLY file"),
     ],
 )  # fmt: skip
-def test_what_it_is_and_what_to_do(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+def test_error_names_the_kind_of_file(tmp_path: Path, name: str, content: bytes, message: str) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ClodError, match=f"{name}: .*{message}"):
         load(tmp_path / name)

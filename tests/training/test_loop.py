@@ -273,11 +273,13 @@ def test_bad_inputs_are_refused(captured: Pair) -> None:
             run(base, Scene((), scene.test))
         with pytest.raises(ClodError, match="no Gaussians"):
             run(gaussians(0, 1, 0), scene)
-    for name, value in (("sh0", math.inf), ("log_scales", -math.inf), ("opacity_logits", math.nan)):
+    for run, name, value in (
+        (make_plan, "sh0", math.inf), (adapt, "log_scales", -math.inf), (adapt, "opacity_logits", math.nan),
+    ):  # fmt: skip
         values = getattr(base, name).clone()
         values[5:7] = value
         with pytest.raises(ClodError, match=rf"{name} is not finite in 2 rows \(the first is 5\); leave out"):
-            adapt(base.replace(**{name: values}), scene, config_of(iters=1))
+            run(base.replace(**{name: values}), scene, config_of(iters=1))
     huge = torch.full_like(base.sh0, 1e38)
     huge[7] = 2e38
     for how in ("importance", "identity"):  # looked at before training, or found by its first step

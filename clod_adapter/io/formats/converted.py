@@ -38,12 +38,13 @@ def load_converted(path: Path, version: str = "") -> Model:
     Raises:
         ClodError: splat-transform is missing, or cannot read the file.
     """
-    from clod_adapter.io.formats.arrays import gaussians_of  # here: check_converted needs no torch
+    # Here: check_converted needs no torch.
+    from clod_adapter.io.formats.arrays import gaussians_of, read_whole, sha256_of
     from clod_adapter.io.ply.columns import column_map, in_shape, read_table
     from clod_adapter.io.ply.rows import read_ply
     from clod_adapter.io.settings import Metadata
 
-    tool = check_converted(path, version)
+    tool, sha256 = check_converted(path, version), sha256_of(read_whole(path))
     with TemporaryDirectory() as folder:
         converted = Path(folder) / "converted.ply"
         try:
@@ -54,4 +55,4 @@ def load_converted(path: Path, version: str = "") -> Model:
     values = {name: read_table(rows.vertex, group) for name, group in column_map(rows.sh_degree).items()}
     note = f"quantised: {path.suffix} stores positions, scales, rotations and colours in a few bits each"
     notes = (note, f"read through splat-transform {tool.version}")
-    return Model(gaussians_of(path, in_shape(values), Metadata()), Metadata(), notes)
+    return Model(gaussians_of(path, in_shape(values), Metadata()), Metadata(), sha256, notes)

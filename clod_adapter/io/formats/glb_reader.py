@@ -67,7 +67,7 @@ def load_glb(path: Path) -> Model:
     if moved != metadata.origin:  # another program moved the node
         stored["means"], moved = _moved(stored["means"], moved)
         metadata = replace(metadata, origin=moved)
-    return Model(gaussians_of(path, stored, metadata), metadata, tuple(ignored), sha256=sha256_of(data))
+    return Model(gaussians_of(path, stored, metadata), metadata, sha256_of(data), tuple(ignored))
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:

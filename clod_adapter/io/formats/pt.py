@@ -22,7 +22,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.formats.metadata import KEY
 from clod_adapter.io.ply.columns import SIGMA
 from clod_adapter.io.settings import damaged
-from clod_adapter.io.sniff import read_start, refuse, utf8_name
+from clod_adapter.io.sniff import file_sha256, handle_name, read_start, refuse
 
 # As gsplat's trainer names its parameters, and as they are called here.
 NAMES = {
@@ -77,8 +77,8 @@ def _check_pickle(path: Path, data: bytes) -> None:
         raise ClodError(f"{path}: is damaged ({error}); copy or export it again") from error
 
 
-def read_splats(path: Path) -> tuple[dict[str, np.ndarray], str | None]:
-    """The parameters by gsplat's names, float32, in matching shapes; and the JSON document, if any.
+def read_splats(path: Path) -> tuple[dict[str, np.ndarray], str | None, str]:
+    """The parameters by gsplat's names, float32, in matching shapes; the JSON document, if any; the SHA-256, hex.
 
     Scales are logarithms, opacities logits, as in Inria's layout. Read with ``weights_only``: a pickle that calls
     anything but what makes tensors is refused, and nothing is called.
@@ -86,7 +86,7 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], str | None]:
     Raises:
         ClodError: not such a checkpoint, damaged, or more than tensors.
     """
-    checkpoint = _load(path)
+    checkpoint, sha256 = _load(path)
     splats = checkpoint.get("splats") if isinstance(checkpoint, dict) else None
     if not isinstance(splats, dict):
         found = (
@@ -101,17 +101,17 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], str | None]:
     text = checkpoint.get(KEY)
     if text is not None and not isinstance(text, str):
         raise damaged(path, TypeError(f"a {type(text).__name__}, not text"))
-    return values, text
+    return values, text, sha256
 
 
-def _load(path: Path) -> Any:
+def _load(path: Path) -> tuple[Any, str]:
     import torch  # here and not above, as check_pt does without
 
     check_pt(path)
     try:
         # Mapped, so that what else a checkpoint holds (optimisers, networks) is not read.
-        with warnings.catch_warnings(action="ignore"), utf8_name(path) as name:
-            return torch.load(name, map_location="cpu", weights_only=True, mmap=True)
+        with warnings.catch_warnings(action="ignore"), open(path, "rb") as file:
+            return torch.load(handle_name(file), map_location="cpu", weights_only=True, mmap=True), file_sha256(file)
     except pickle.UnpicklingError as error:
         raise ClodError(
             f"{path}: holds more than tensors, or is damaged, and was not unpickled; export the checkpoint as a PLY"

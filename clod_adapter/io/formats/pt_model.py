@@ -1,4 +1,4 @@
-"""Models as checkpoints of gsplat's trainer; ``pt`` checks the pickle and reads its tensors."""
+"""Models as checkpoints of gsplat's trainer, read and written; ``pt`` checks the pickle and reads its tensors."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def load_pt(path: Path) -> Model:
     Raises:
         ClodError: as ``pt.read_splats``, or its settings are damaged.
     """
-    values, text = read_splats(path)
+    values, text, sha256 = read_splats(path)
     metadata = parse_metadata(path, text, dial=SIGMA in values)
     arrays = {NAMES.get(name, name): value for name, value in values.items()}
     notes = () if metadata.described else (FRAME,)
-    return Model(gaussians_of(path, arrays, metadata), metadata, notes, activation_unknown=not metadata.described)
+    return Model(gaussians_of(path, arrays, metadata), metadata, sha256, notes, not metadata.described)

@@ -37,7 +37,7 @@ def load_safetensors(path: Path) -> Model:
     Raises:
         ClodError: the file cannot be read, is damaged, an adapter or another safetensors file.
     """
-    tensors, stored = load_tensors(path)
+    tensors, stored, sha256 = load_tensors(path)
     if KEY not in stored:
         raise ClodError(f"{path}: is a safetensors file but not a model of clod-adapter; give a file that it wrote")
     metadata = parse_metadata(path, stored[KEY], dial="sigma_d" in tensors)
@@ -47,4 +47,4 @@ def load_safetensors(path: Path) -> Model:
     if odd := [name for name in wanted if not tensors[name].is_floating_point()]:
         raise ClodError(f"{path}: tensor {odd[0]!r} is not of floating-point numbers; export it again")
     arrays = {name: tensors[name].float().numpy() for name in wanted}
-    return Model(gaussians_of(path, arrays, metadata), metadata)
+    return Model(gaussians_of(path, arrays, metadata), metadata, sha256)

@@ -70,4 +70,4 @@ def load_splat(path: Path) -> Model:
         "opacity_logits": logits_of_bytes(rows["rgba"][:, 3]), "shN": np.zeros((len(rows), 0, 3)),
         "sh0": ((rgba[:, None, :3] / 255) - 0.5) / SH_C0,
     }  # fmt: skip
-    return Model(gaussians_of(path, arrays, Metadata()), Metadata(), (QUANTISED,), sha256=sha256_of(data))
+    return Model(gaussians_of(path, arrays, Metadata()), Metadata(), sha256_of(data), (QUANTISED,))

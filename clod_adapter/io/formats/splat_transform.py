@@ -1,4 +1,4 @@
-"""splat-transform, PlayCanvas's converter of splat files: an optional tool of its own that needs Node, found and run.
+"""Finds and runs splat-transform, PlayCanvas's converter of splat files: an optional tool that needs Node.
 
 It compresses to SOG and to compressed PLY, makes streaming sets of several levels, and merges Gaussians.
 """
@@ -27,11 +27,11 @@ HELP = (
 )
 ASKING = 30.0  # seconds that a question about itself may take
 LIMIT, LIMIT_EACH = 600.0, 0.02  # seconds for a run, and per Gaussian; ten times what was measured
-TICK = 0.2  # seconds between two looks at whether it is done
+TICK = 0.2  # seconds between two checks for its end
 # Without a GPU, where a round of SOG's clustering of spherical harmonics takes minutes, and its usual ten take an hour.
 # Two rounds more give 0.02 dB.
 ON_CPU = ("-g", "cpu", "-i", "1")
-# Has the very Node that runs the tool say its version, whatever wrapper or symbolic link starts it.
+# Prints the version of the Node that runs the tool, also if a wrapper or a symbolic link starts it.
 _SAY_NODE = "--import=data:text/javascript,process.stderr.write(`node:${process.version};`)"
 
 
@@ -63,8 +63,8 @@ class SplatTransform:
             where = f"{name}, which {VARIABLE} names, is" if given else "splat-transform is"
             raise ClodError(f"{where} not installed; {HELP}")
         command = (program, *more)
-        said = _ask(command, "--version")
-        version, node = re.search(r"splat-transform v(\d+)\.(\d+)\.(\d+)", said), re.search(r"node:v(\d+)", said)
+        output = _ask(command, "--version")
+        version, node = re.search(r"splat-transform v(\d+)\.(\d+)\.(\d+)", output), re.search(r"node:v(\d+)", output)
         if node is not None and int(node[1]) < NODE_NEEDED:
             raise ClodError(f"splat-transform is run by Node {node[1]} and needs {NODE_NEEDED} or newer; {HELP}")
         if version is None:
@@ -79,15 +79,15 @@ class SplatTransform:
     def run(self, *words: str | Path, timeout: float, progress: Callable[[float], None] | None = None) -> float:
         """Runs it with these words, replacing outputs; the seconds it took.
 
-        A Path is made absolute, so that it is no option and no address, whatever it begins with. Ctrl-C, and whatever
-        else is raised here meanwhile, ends it too.
+        A Path is made absolute, so that it is read neither as an option nor as an address. Ctrl-C and every other
+        exception raised here end the tool.
 
         Args:
             timeout: seconds after which it is ended.
             progress: called now and then with the seconds so far.
 
         Raises:
-            ClodError: it fails, with the last it said, or takes longer than that.
+            ClodError: it fails, with the last line of its output, or takes longer than that.
         """
         command = [*self.command, "-w", *(() if self.gpu else ON_CPU), *map(_word, words)]
         began = time.perf_counter()
@@ -96,21 +96,21 @@ class SplatTransform:
             encoding="utf-8", errors="replace",
         )  # fmt: skip
         try:
-            said = None
-            while said is None:
+            output = None
+            while output is None:
                 taken = time.perf_counter() - began
                 if taken > timeout:
                     raise ClodError(f"splat-transform was ended, it took longer than {timeout:.0f} s")
                 if progress:
                     progress(taken)
                 with suppress(subprocess.TimeoutExpired):
-                    said, _ = process.communicate(timeout=TICK)
+                    output, _ = process.communicate(timeout=TICK)
         except BaseException:
             process.kill()
             process.communicate()
             raise
         if process.returncode:
-            raise ClodError(f"splat-transform {self.version} failed: {_reason(said)}")
+            raise ClodError(f"splat-transform {self.version} failed: {_reason(output)}")
         return time.perf_counter() - began
 
 
@@ -134,7 +134,7 @@ def _word(word: str | Path) -> str:
 
 
 def _ask(command: tuple[str, ...], question: str) -> str:
-    """All it says to a question about itself; nothing where it does not run."""
+    """Its output for an option that asks about it; empty where it does not run."""
     options = f"{os.environ.get('NODE_OPTIONS', '')} {_SAY_NODE}".strip()
     try:
         done = subprocess.run(
@@ -146,9 +146,9 @@ def _ask(command: tuple[str, ...], question: str) -> str:
     return f"{done.stderr}\n{done.stdout}"
 
 
-def _reason(said: str) -> str:
-    """The line that says what went wrong, or the last one; not where in the tool's own code, nor how long it took."""
-    lines = [line.strip(" \t✗·▸") for line in said.splitlines()]
+def _reason(output: str) -> str:
+    """The line with the error, or the last one; without the stack trace and the duration."""
+    lines = [line.strip(" \t✗·▸") for line in output.splitlines()]
     lines = [line for line in lines if line and not line.startswith(("at ", "failed in "))]
     errors = [line for line in lines if "Error" in line]
-    return (errors or lines or ["it said nothing"])[-1]
+    return (errors or lines or ["no output"])[-1]

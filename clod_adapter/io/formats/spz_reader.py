@@ -63,7 +63,7 @@ def load_spz(path: Path) -> Model:
     if flags & ANTIALIASED and not gaussians.screen_filter.compensate:  # by another program, which states no variance
         gaussians = gaussians.replace(screen_filter=FILTERS["on"])
         metadata = replace(metadata, about=(*metadata.about, TAG))
-    return Model(gaussians, metadata, (QUANTISED,), sha256=sha256_of(whole))
+    return Model(gaussians, metadata, sha256_of(whole), (QUANTISED,))
 
 
 def _unpacked(path: Path, data: bytes) -> bytes:

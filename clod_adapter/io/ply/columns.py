@@ -19,15 +19,6 @@ from clod_adapter.origin import AXES, NOWHERE, Origin
 SIGMA = "sigma_d"
 MASKS = ("masks_0", "masks_1")
 
-# (column pattern, what such a file is, what to do about it)
-FOREIGN = (
-    (
-        r"f_offset_\d+|f_anchor_feat_\d+",
-        "a Scaffold-GS or Octree-GS file: anchors from which a network makes Gaussians per view",
-        "use a checkpoint of 3DGS or of a method that keeps plain Gaussians",
-    ),
-)
-
 
 def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
     """The columns of each Gaussians attribute, in the order of its flattened values.
@@ -134,10 +125,11 @@ def degree_of(path: Path, rest: int) -> int:
 
 
 def _refuse_foreign(path: Path, names: set[str]) -> None:
-    for pattern, what, remedy in FOREIGN:
-        found = sorted(name for name in names if re.fullmatch(pattern, name))
-        if found:
-            raise ClodError(f"{path}: property {found[0]} says this is {what}; {remedy}")
+    if anchors := sorted(name for name in names if re.fullmatch(r"f_offset_\d+|f_anchor_feat_\d+", name)):
+        raise ClodError(
+            f"{path}: property {anchors[0]} is of a Scaffold-GS or Octree-GS file: anchors from which a network makes "
+            "Gaussians per view; use a checkpoint of 3DGS or of a method that keeps plain Gaussians"
+        )
     if not names & {"f_dc_0", "scale_0"}:
         raise ClodError(
             f"{path}: properties f_dc_0 and scale_0 are missing, so this is a mesh or a point cloud; "

@@ -14,7 +14,7 @@ def check_records(model: Path) -> None:
     """Walks the binary records, as COLMAP reads past the end of a cut file until memory runs out.
 
     Raises:
-        ClodError: a file cannot be read or does not hold the records that it says.
+        ClodError: a file cannot be read or does not hold the number of records that it states.
     """
     for name, after in _RECORDS.items():
         path = model / name

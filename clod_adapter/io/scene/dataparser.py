@@ -27,9 +27,7 @@ import numpy as np
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.posed import HUGE, PosedImage, check_posed
-from clod_adapter.io.scene.transforms import DATAPARSER, read_json
-
-_ORTHOGONAL = 0.01  # a file may have few digits
+from clod_adapter.io.scene.transforms import DATAPARSER, read_json, read_pose
 
 
 @dataclass(frozen=True)
@@ -77,11 +75,11 @@ def trained_frame(folder: Path, cameras: Path) -> TrainedFrame | None:
     if not path.is_file():
         return None
     values = _object(path)
-    pose, scale = _pose(path, values, "transform"), _number(path, values.get("scale", 1.0), "scale")
+    pose, scale = read_pose(path, values, "transform"), _number(path, values.get("scale", 1.0), "scale")
     if cameras.is_file():
         applied = _object(cameras)
         if applied.get("applied_transform") is not None:
-            pose = pose @ np.linalg.inv(_pose(cameras, applied, "applied_transform"))
+            pose = pose @ np.linalg.inv(read_pose(cameras, applied, "applied_transform"))
         if applied.get("applied_scale") is not None:
             scale /= _number(cameras, applied["applied_scale"], "applied_scale")
     left, _, right = np.linalg.svd(pose[:3, :3])
@@ -94,19 +92,6 @@ def _object(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ClodError(f"{path}: is no JSON object; copy it again from beside the config.yml of ns-train")
     return content
-
-
-def _pose(path: Path, values: dict[str, Any], key: str) -> np.ndarray:
-    try:
-        pose = np.array(values.get(key), np.float64)
-    except (TypeError, ValueError, OverflowError):
-        pose = np.zeros(0)
-    if pose.shape not in ((3, 4), (4, 4)) or not (np.abs(pose) < HUGE).all():
-        raise ClodError(f"{path}: {key} is no 3x4 matrix of finite numbers; copy or export it again")
-    turn = pose[:3, :3]
-    if not np.abs(turn.T @ turn - np.eye(3)).max() < _ORTHOGONAL or np.linalg.det(turn) < 0:
-        raise ClodError(f"{path}: {key} is no rotation and translation; copy or export it again")
-    return np.vstack([pose[:3], [0.0, 0.0, 0.0, 1.0]])
 
 
 def _number(path: Path, value: Any, key: str) -> float:

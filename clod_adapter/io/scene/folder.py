@@ -23,7 +23,7 @@ LONGEST_NAME, LONGEST_PART = 4000, 255  # characters of a path, bytes of one of 
 
 
 def find_cameras(folder: Path) -> Path:
-    """The folder of a COLMAP model, or the transforms file of a scene: what says where each photograph was taken.
+    """The folder of a COLMAP model, or the transforms file of a scene.
 
     A model is looked for in ``sparse/0``, ``sparse`` and ``folder`` itself; then ``transforms_train.json`` and
     ``transforms.json`` there; then a model in the first two beside ``folder``, which may be the images' own.
@@ -111,12 +111,12 @@ def name_parts(name: str, cameras: Path) -> tuple[str, ...]:
     if as_text(name) != name:
         raise ClodError(f"{cameras}: image name {as_text(name)[:80]!r} is not UTF-8; rename the photograph, there too")
     path = PureWindowsPath(name)
-    if any(sign < " " or "\x7f" <= sign <= "\x9f" for sign in name) or len(name) > LONGEST_NAME:
+    longest = max((len(part.encode()) for part in path.parts), default=0)
+    control = any(sign < " " or "\x7f" <= sign <= "\x9f" for sign in name)
+    if control or len(name) > LONGEST_NAME or longest > LONGEST_PART:
         raise ClodError(f"{cameras}: image name {name[:40]!r} ({len(name)} characters) is no file's name; rename it")
     if not path.parts or path.anchor or ".." in path.parts:
         raise ClodError(f"{cameras}: image name {name[:80]!r} leaves the images folder or is no name; rename it there")
-    if max(len(part.encode()) for part in path.parts) > LONGEST_PART:
-        raise ClodError(f"{cameras}: image name {name[:40]!r} ({len(name)} characters) is no file's name; rename it")
     return path.parts
 
 

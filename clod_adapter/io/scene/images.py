@@ -79,11 +79,11 @@ def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Ima
         if factor > 1:
             source.draft(source.mode, (size[0] // factor, size[1] // factor))  # of JPEG alone
             factor = max(1, factor * source.width // size[0])
-            notes.append((f"have more than {LARGE / 1e6:.0f} million pixels, which takes long: brought down first", ""))
+            notes.append((f"have more than {LARGE / 1e6:.0f} million pixels, which takes long: reduced first", ""))
         pixels = _rgb(path, source, factor, notes)
     if turn is not None:
         pixels = pixels.transpose(turn)
-        notes.append(("turned as their EXIF says, as the cameras have the turned shape", ""))
+        notes.append(("rotated by their EXIF orientation, as the cameras are", ""))
     return pixels, size, list(dict.fromkeys(notes))
 
 

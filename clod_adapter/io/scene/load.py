@@ -1,4 +1,4 @@
-"""Posed photographs in, whichever way they come."""
+"""Reads posed photographs from a COLMAP model or a transforms file."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from clod_adapter.io.scene.colmap import read_colmap
 from clod_adapter.io.scene.dataparser import trained_frame
 from clod_adapter.io.scene.folder import find_cameras, find_photographs
 from clod_adapter.io.scene.image_cache import ImageCache
-from clod_adapter.io.scene.images import LARGE, TRANSPARENT, Note, Photograph, Room, image_size, read_image
+from clod_adapter.io.scene.images import LARGE, Note, Photograph, Room, image_size, read_image
 from clod_adapter.io.scene.posed import HUGE, TEST_EVERY, PosedImage, held_out
-from clod_adapter.io.scene.transforms import MASKS, read_transforms
+from clod_adapter.io.scene.transforms import read_transforms
 from clod_adapter.origin import NOWHERE
 from clod_adapter.progress import Listener, Phase, tell
 
@@ -62,7 +62,7 @@ def load_scene(
         folder: usually the one with ``images/`` and ``sparse/0/``.
         test_every: one view in this many is held out; at least 2.
         max_width: wider images are scaled down to this many pixels, with Pillow's bicubic filter as
-            in Inria's code; the intrinsics follow, and a note says so.
+            in Inria's code; the intrinsics are scaled too, and a note states it.
         origin: ``[3]`` what the cameras' world is to be relative to, in its units: ``Checkpoint.origin``.
         progress: called in ``Phase.PHOTOGRAPHS`` after each image.
         cache: keeps the photographs, where not all are to be in memory; they are then read again when looked at.
@@ -92,7 +92,7 @@ def load_scene(
     train = tuple(view for view in views if view.camera.name not in testing)
     test = tuple(view for view in views if view.camera.name in testing)
     pinhole = all(image.is_pinhole for image, _ in present)
-    spared = _left_out(views, sizes, done, pinhole, any(note.startswith(MASKS) for note in notes))
+    spared = _left_out(views, sizes, pinhole)
     return in_its_unit(Scene(train, test, (*notes, *_summary(done, len(views))), spared))
 
 
@@ -104,7 +104,11 @@ def _load(
     keep: ImageCache | None,
 ) -> tuple[list[View], list[tuple[int, int]], list[Note]]:
     """The views of the images, their sizes in the files, and notes. Each worker holds one of full size at a time."""
-    cache = None if all(image.is_pinhole for image, _ in present) else _cache_folder(folder)
+    cache = None
+    if not all(image.is_pinhole for image, _ in present):
+        from clod_adapter.io.scene.undistort import cache_folder
+
+        cache = cache_folder(folder)
     views, sizes, notes = list[View](), list[tuple[int, int]](), list[Note]()
     workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
     with warnings.catch_warnings():
@@ -120,35 +124,21 @@ def _load(
     return views, sizes, notes
 
 
-def _left_out(
-    views: Sequence[View], sizes: Sequence[tuple[int, int]], notes: Sequence[Note], pinhole: bool, masked: bool
-) -> tuple[tuple[str, str], ...]:
-    """What of the reading these photographs do not need, and why: ``Scene.left_out``.
+def _left_out(views: Sequence[View], sizes: Sequence[tuple[int, int]], pinhole: bool) -> tuple[tuple[str, str], ...]:
+    """Steps of reading, or pixels, that are left out, and why: ``Scene.left_out``.
 
     Args:
         sizes: of the photographs in their files.
-        pinhole, masked: whether all cameras are pinholes, and whether the scene has masks.
+        pinhole: whether all cameras are pinholes.
     """
     whole, used = sum(3 * w * h for w, h in sizes), sum(3 * view.camera.width * view.camera.height for view in views)
-    found = [("exposure", "not modelled: photographs are used without exposure compensation")]
-    if pinhole:
-        found.append(("undistortion", f"all {len(views)} cameras are pinholes"))
-    if TRANSPARENT not in notes:
-        found.append(("alpha", f"none of {len(views)} photographs has transparency"))
-    if not masked:
-        found.append(("masks", "the scene has no masks"))
+    found = [("undistortion", f"all {len(views)} cameras are pinholes")] if pinhole else []
     if used < whole:
         kept = f"{used / 1e6:,.3g} MB of the {whole / 1e6:,.3g} MB in the files"
         found.append(("pixels", f"kept are {kept}: photographs are scaled as they are decoded"))
     else:
         found.append(("scaling", f"all {len(views)} photographs are used at full resolution"))
     return tuple(found)
-
-
-def _cache_folder(folder: Path) -> Path:
-    from clod_adapter.io.scene.undistort import cache_folder
-
-    return cache_folder(folder)
 
 
 def _again(load: Callable[[], tuple[View, tuple[int, int], list[Note]]]) -> torch.Tensor:
@@ -189,7 +179,7 @@ def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
     with ROOM.of(width * height):
         photograph = _worked_on(image, path, max_width)
         if width * height > LARGE:
-            release()  # or this thread keeps for itself what the next one takes again
+            release()  # or this thread keeps memory that the next one allocates again
         return photograph
 
 
@@ -197,7 +187,7 @@ def _worked_on(image: PosedImage, path: Path, max_width: int) -> Photograph:
     camera = copy(image.camera)
     pixels, source, notes = read_image(path, camera.width, camera.height, max_width)
     if pixels.size != (camera.width, camera.height):
-        sizes = f"{pixels.width}x{pixels.height} where the model says {camera.width}x{camera.height}"
+        sizes = f"{pixels.width}x{pixels.height} where the model has {camera.width}x{camera.height}"
         notes.append(("are {}: intrinsics scaled", sizes))
         # With pixel centres at +0.5, in COLMAP as here, the principal point scales like the focal length.
         camera.rescale(*pixels.size)

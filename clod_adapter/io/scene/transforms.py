@@ -20,7 +20,6 @@ from clod_adapter.io.scene.images import image_size
 from clod_adapter.io.scene.posed import PosedImage, check_posed
 
 DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in
-MASKS = "the masks"  # how the note on them begins
 MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 PERSPECTIVE = ("", "SIMPLE_PINHOLE", "PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -72,7 +71,7 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
     if "applied_transform" in content and not path.with_name(DATAPARSER).is_file():
         notes.append(f"{path.name} turned COLMAP's world (applied_transform): a checkpoint of the turned one is needed")
     if any("mask_path" in frame for frame in frames):
-        notes.append(f"{MASKS} of {path.name} are not used")
+        notes.append(f"the masks of {path.name} are not used")
     return images, notes
 
 
@@ -98,22 +97,29 @@ def _name(path: Path, file_path: str) -> str:
     return next((name + ending for ending in endings if isfile(path.parent / file_name(name + ending))), name)
 
 
-def _viewmat(where: str, frame: Mapping[str, Any]) -> np.ndarray:
+def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
+    """``[4, 4]`` float64: the rotation, as the file rounds it, and translation under ``key``, 3x4 or 4x4.
+
+    Raises:
+        ClodError: it is something else; the message begins with ``where``.
+    """
     try:
-        pose = np.array(frame.get("transform_matrix"), np.float64)
+        pose = np.array(values.get(key), np.float64)
     except (TypeError, ValueError, OverflowError):
         pose = np.zeros(0)
     if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
-        raise ClodError(f"{where}: transform_matrix is no 4x4 matrix of finite numbers; export the file again")
+        raise ClodError(f"{where}: {key} is no 3x4 or 4x4 matrix of finite numbers; copy or export it again")
+    whole, turn = np.vstack([pose[:3], [0.0, 0.0, 0.0, 1.0]]), pose[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max()
+        off = np.abs(turn.T @ turn - np.eye(3)).max()
     # A file may have few digits, but a scale or a mirror image would give a picture of another scene.
-    if (
-        not off < 0.01
-        or np.linalg.det(pose[:3, :3]) < 0
-        or not np.array_equal(pose[3:], np.eye(4)[3:][: len(pose) - 3])
-    ):
-        raise ClodError(f"{where}: transform_matrix is no rotation and translation; export the file again")
+    if not off < 0.01 or np.linalg.det(turn) < 0 or not np.array_equal(pose, whole[: len(pose)]):
+        raise ClodError(f"{where}: {key} is no rotation and translation; copy or export it again")
+    return whole
+
+
+def _viewmat(where: str, frame: Mapping[str, Any]) -> np.ndarray:
+    pose = read_pose(where, frame, "transform_matrix")
     left, _, right = np.linalg.svd(pose[:3, :3])
     viewmat = np.eye(4)
     viewmat[:3, :3] = (left @ right @ np.diag([1.0, -1.0, -1.0])).T
@@ -146,12 +152,8 @@ def _camera(where: str, photograph: Path, values: Mapping[str, Any]) -> pycolmap
     if model not in PERSPECTIVE or k4:  # of k4 some writers mean a power of the radius, some a divisor
         what = "k4 of a camera that is no fisheye" if k4 else f"camera_model {model[:40]!r}"
         raise ClodError(f"{where}: {what} is not known; give the COLMAP model that the file was made from")
-    return pycolmap.Camera(
-        model="FULL_OPENCV" if k3 else "OPENCV",
-        width=width,
-        height=height,
-        params=[*params, k1, k2, p1, p2, *([k3, 0, 0, 0] if k3 else [])],
-    )
+    params += [k1, k2, p1, p2, *([k3, 0, 0, 0] if k3 else [])]
+    return pycolmap.Camera(model="FULL_OPENCV" if k3 else "OPENCV", width=width, height=height, params=params)
 
 
 def _focal(pixels: int, angle: float) -> float:

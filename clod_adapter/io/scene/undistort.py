@@ -82,8 +82,8 @@ def kept(folder: Path, image: PosedImage, path: Path, max_width: int, make: Call
         return Photograph(source.convert("RGB"), np.array(about["K"]), tuple(about["source"]), notes)
     photograph = make()
     about = PngImagePlugin.PngInfo()
-    says = {"K": photograph.K.tolist(), "source": photograph.source, "notes": photograph.notes}
-    about.add_text(_KEY, json.dumps(says))
+    values = {"K": photograph.K.tolist(), "source": photograph.source, "notes": photograph.notes}
+    about.add_text(_KEY, json.dumps(values))
     with atomic_path(file) as temporary:
         photograph.pixels.save(temporary, pnginfo=about, compress_level=1)
     return photograph

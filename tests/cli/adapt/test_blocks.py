@@ -1,4 +1,4 @@
-"""``--memory`` and ``--block``: one process or many jobs, killed or not, the same files; errors in one line."""
+"""``--memory`` and ``--block``: one process and separate jobs write the same files, also after a kill."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from clod_adapter.blocks import memory
 from clod_adapter.blocks.file import KEY, load_block, save_block
 from clod_adapter.blocks.memory import MemoryPlan, plan_for_limit
 from clod_adapter.cli.adapt import memory as memory_option
-from clod_adapter.cli.adapt import resume
-from clod_adapter.cli.adapt.progress import ProgressDisplay
+from clod_adapter.cli.adapt import saver
+from clod_adapter.cli.adapt.display import ProgressDisplay
 from clod_adapter.progress import Phase, Progress
 from runs import change_step, fail, names
 from scenes import stripped
@@ -30,7 +30,7 @@ KINDS = ("json", "ply", "safetensors")
 
 @pytest.fixture
 def forced(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What fits is adapted in blocks all the same."""
+    """Trains in blocks, although the scene fits in memory."""
 
     def plan(*args: Any) -> MemoryPlan:
         return replace(plan_for_limit(*args), blocks=BLOCKS)
@@ -40,7 +40,7 @@ def forced(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def adapt(clod: Callable[..., Any], capture: Any, forced: None) -> Callable[..., Any]:
-    """Runs the main job in blocks."""
+    """Adapts in blocks."""
 
     def run(out: str, *more: object) -> Any:
         given = ["--images", capture.scene, "--iters", 9, "--max-sv", 3, "--memory", "8GB", "--out", out]
@@ -56,7 +56,7 @@ def kept() -> dict[str, bytes]:
 
 @pytest.fixture
 def whole(adapt: Callable[..., Any], tmp_path: Path, kept: dict[str, bytes]) -> dict[str, bytes]:
-    """The files of one process; run once."""
+    """The files that one process writes; it runs once."""
     if kept:
         return kept
     (tmp_path / "one.blocks.safetensors").write_bytes(b"the user's")
@@ -76,7 +76,9 @@ def outputs(folder: Path, name: str) -> dict[str, bytes]:
     return {suffix: stripped((folder / f"{name}{suffix}").read_bytes()) for suffix in (".ply", ".safetensors")}
 
 
-def test_jobs_end_as_one_process_does(adapt: Callable[..., Any], whole: dict[str, bytes], tmp_path: Path) -> None:
+def test_jobs_write_the_files_of_one_process(
+    adapt: Callable[..., Any], whole: dict[str, bytes], tmp_path: Path
+) -> None:
     done = adapt("jobs.ply", "--block", "start", "--json")
     about = json.loads(done.out)
     assert done.code == 0 and about["blocks"] == BLOCKS and (about["pass"], about["missing"]) == (1, [1, 2, 3])
@@ -90,28 +92,23 @@ def test_jobs_end_as_one_process_does(adapt: Callable[..., Any], whole: dict[str
     done = adapt("jobs.ply", "--block", 2, "--json")
     assert json.loads(done.out)["missing"] == [1, 3] and (tmp_path / "jobs.block2.pass2.safetensors").exists()
     before = (tmp_path / "jobs.block2.pass2.safetensors").read_bytes()
-    assert adapt("jobs.ply", "--block", 2).code == 0  # again: it is there
+    assert adapt("jobs.ply", "--block", 2).code == 0  # its file exists
     assert (tmp_path / "jobs.block2.pass2.safetensors").read_bytes() == before
-    done = adapt("jobs.ply")  # what is missing, and the whole
+    done = adapt("jobs.ply")  # trains the missing blocks, and merges
     assert done.code == 0 and "block 3 of 3, pass 2" in done.err
     assert "pass 1 of" not in done.err and "block 2 of" not in done.err
     assert outputs(tmp_path, "jobs") == whole
     assert not [path for path in tmp_path.iterdir() if "block" in path.name or "start" in path.name]
 
 
-def of_run(config: Any) -> bool:
-    """Not of the run that prepares the kernels."""
-    return bool(config.max_sv == 3)
-
-
 class Killed(BaseException):
-    """Ends a run without any of its own handling."""
+    """Ends a run, and the run does not handle it."""
 
 
 def kill(patch: pytest.MonkeyPatch) -> None:
-    saving = resume.Saver.saving
+    saving = saver.Saver.saving
 
-    def dying(self: resume.Saver, listener: Any) -> Any:
+    def dying(self: saver.Saver, listener: Any) -> Any:
         call = saving(self, listener)
 
         def step(progress: Progress) -> Any:
@@ -123,10 +120,10 @@ def kill(patch: pytest.MonkeyPatch) -> None:
 
         return step
 
-    patch.setattr(resume.Saver, "saving", dying)
+    patch.setattr(saver.Saver, "saving", dying)
 
 
-def press(patch: pytest.MonkeyPatch) -> None:
+def interrupt(patch: pytest.MonkeyPatch) -> None:
     call = ProgressDisplay.__call__
 
     def pressed(self: ProgressDisplay, progress: Progress) -> bool:
@@ -141,16 +138,16 @@ def press(patch: pytest.MonkeyPatch) -> None:
     ("ended", "code", "said", "state", "steps"),
     [
         (kill, None, "", "a.block2.pass1.resume.safetensors", 5),
-        (press, 130, "pass 1 of 2: stopped after step 3; the same command", "a.block2.pass1.resume.safetensors", 3),
-        (lambda patch: change_step(patch, 6, fail, of_run), 1, "the same command resumes from step 5, which is in "
+        (interrupt, 130, "pass 1 of 2: stopped after step 3; the same command", "a.block2.pass1.resume.safetensors", 3),
+        (lambda patch: change_step(patch, 6, fail), 1, "the same command resumes from step 5, which is in "
          "a.block1.pass1.resume.safetensors\n", "a.block1.pass1.resume.safetensors", 5),
     ],
     ids=["killed", "ctrl-c", "error"],
 )  # fmt: skip
-def test_a_block_that_was_ended_is_resumed(
+def test_same_command_resumes_an_interrupted_block(
     adapt: Any, whole: dict[str, bytes], tmp_path: Path, ended: Any, code: Any, said: str, state: str, steps: int
 ) -> None:
-    """The same command keeps finished blocks, resumes the one that was ended, and gives the same files."""
+    """Finished blocks are kept, the interrupted one is resumed, and the files are the same."""
     with pytest.MonkeyPatch.context() as patch:
         ended(patch)
         if code is None:
@@ -168,7 +165,7 @@ def test_a_block_that_was_ended_is_resumed(
 def test_files_of_another_run_are_refused(
     adapt: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of other settings or another number of blocks, of another block or start, and damaged ones."""
+    """Other settings, number of blocks, block or initialization, and damaged files."""
 
     def refused(message: str, *more: object) -> None:
         done = adapt("a.ply", *more)
@@ -187,7 +184,7 @@ def test_files_of_another_run_are_refused(
     with safe_open(start, "pt") as file:
         belongs = json.loads(file.metadata()[KEY])["belongs"]
     tensors, about = load_block(start, belongs)
-    save_block(start, tensors | {"block": tensors["block"].flip(0)}, about, belongs)  # of a machine that rounds unlike
+    save_block(start, tensors | {"block": tensors["block"].flip(0)}, about, belongs)  # as other rounding would
     refused("a.block1.pass1.safetensors: is of a run with another start; remove it")
     first.write_bytes(b"no block")
     refused("a.block1.pass1.safetensors: is no block or damaged")
@@ -206,7 +203,7 @@ def test_files_of_another_run_are_refused(
     assert memory.MOST_BLOCKS > BLOCKS
 
 
-def test_what_cannot_be(clod: Callable[..., Any], capture: Any, adapt: Callable[..., Any], tmp_path: Path) -> None:
+def test_unusable_options(clod: Callable[..., Any], capture: Any, adapt: Callable[..., Any], tmp_path: Path) -> None:
     given = [capture.ply, "--images", capture.scene]
     for words, message in (
         (["--memory", "8"], "--memory is '8'; give a number and its unit, as in 8GB"),
@@ -223,8 +220,8 @@ def test_what_cannot_be(clod: Callable[..., Any], capture: Any, adapt: Callable[
     assert not list(tmp_path.iterdir())
 
 
-def test_what_fits_is_as_without(clod: Callable[..., Any], capture: Any, tmp_path: Path) -> None:
-    """A limit that is large enough changes nothing, also as a job, whose files are then removed."""
+def test_sufficient_memory_changes_nothing(clod: Callable[..., Any], capture: Any, tmp_path: Path) -> None:
+    """Also with a job, whose files are removed after the merge."""
     given = [capture.ply, "--images", capture.scene, "--iters", 6, "--max-sv", 3, "--out"]
     assert clod(*given, "a.ply").code == 0
     done = clod(*given, "b.ply", "--memory", "8GB")
@@ -237,8 +234,9 @@ def test_what_fits_is_as_without(clod: Callable[..., Any], capture: Any, tmp_pat
     assert outputs(tmp_path, "a") == outputs(tmp_path, "b")
 
 
-def test_opaque_gaussians_are_handed_on(clod: Callable[..., Any], capture: Any, forced: None, tmp_path: Path) -> None:
-    """Opacity +inf, as files in the wild have it, is a value that a job's file may hold."""
+def test_block_files_hold_infinite_opacities(
+    clod: Callable[..., Any], capture: Any, forced: None, tmp_path: Path
+) -> None:
     logits = capture.gaussians.opacity_logits.clone()
     logits[::7] = float("inf")
     ply = capture.write(tmp_path / "opaque.ply", capture.gaussians.replace(opacity_logits=logits))
@@ -250,14 +248,16 @@ def test_opaque_gaussians_are_handed_on(clod: Callable[..., Any], capture: Any, 
     assert torch.equal(found.isinf(), logits.isinf()) and not found.isnan().any()
 
 
-def test_a_block_whose_loss_is_not_finite_ends_early(
+def test_non_finite_loss_of_a_job_is_reported_by_the_merge(
     adapt: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The others do not, and all that was learned is written."""
-    change_step(monkeypatch, 3, lambda found: replace(found, loss=float("nan")), of_run)
+    """That block ends early, and the exit code is 1, as without blocks; all that was learned is written."""
+    with monkeypatch.context() as patch:
+        change_step(patch, 3, lambda found: replace(found, loss=float("nan")))
+        done = adapt("a.ply", "--block", 1)
+    assert done.code == 1 and "block 1 of 3, pass 1 of 2: ended after step 2: the loss of step 3" in done.err, done
     done = adapt("a.ply", "--json")
     report = json.loads(done.out)
     note = "block 1 of 3, pass 1 of 2: the loss of step 3 is not finite"
     assert done.code == 1 and any(note in each for each in report["notes"]) and len(report["rows"]) > 2, done
-    assert "block 1 of 3, pass 1 of 2: ended after step 2: the loss of step 3" in done.err
     assert clod_adapter.load(tmp_path / "a.ply").gaussians.sigma_d is not None

@@ -11,15 +11,16 @@ import pytest
 import torch
 
 import clod_adapter
+from clod_adapter.cli.adapt.display import ProgressDisplay
 from clod_adapter.cli.commands import adapt as adapt_command
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Phase, Progress
 from clod_adapter.training import planner
 from clod_adapter.training.plan import NAMES
 from clod_adapter.training.state_file import load_state, save_state
+from runs import OUTPUTS
 
 TINY = ("--iters", 24, "--max-sv", 4, "--out", "dial.ply")
-OUTPUTS = ["dial.json", "dial.ply", "dial.safetensors"]
 
 
 @pytest.fixture
@@ -37,13 +38,7 @@ def decisions(folder: Path) -> dict[str, dict[str, Any]]:
     return {d["what"]: d for d in json.loads((folder / "dial.json").read_text())["plan"]["decisions"]}
 
 
-def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir() if path.is_file())
-
-
-def test_the_plan_is_printed_before_training_and_stored(
-    clod: Any, capture: Any, wasteful: Path, tmp_path: Path
-) -> None:
+def test_plan_is_printed_before_training_and_stored(clod: Any, capture: Any, wasteful: Path, tmp_path: Path) -> None:
     done = clod(wasteful, "--images", capture.scene, *TINY)
     assert done.code == 0, done
     lines = done.err.splitlines()
@@ -54,7 +49,8 @@ def test_the_plan_is_printed_before_training_and_stored(
     assert re.search(r"left out +0\.0\d\d dB +change without it, 8 training views +--with bands$", table["SH degree 2"])
     assert re.search(r"kept +\d+\.\d+ dB +change without them, .* --without bands$", table["SH degree 1 to 2"])
     assert re.search(r"left out +\d+ +of 350 change no pixel of 8 .* --with unseen$", table["unseen Gaussians"])
-    assert re.search(r"left out +- +all 10 cameras are pinholes$", table["undistortion"])  # what reading them spared
+    assert re.search(r"left out +- +all 10 cameras are pinholes$", table["undistortion"])
+    assert not {"exposure", "alpha", "masks"} & set(table), done  # of which the scene has none
     assert not {"means", "quats", "scales", "opacities", "sh0"} & set(table), done  # listed only if frozen
     report = json.loads((tmp_path / "dial.json").read_text())
     stored = decisions(tmp_path)
@@ -62,12 +58,12 @@ def test_the_plan_is_printed_before_training_and_stored(
     assert set(report["plan"]["seconds"]) == {"bands", "unseen", "start"}
     assert min(report["plan"]["seconds"].values()) >= 0 and report["seconds"]["plan"] > 0
     base, result = (clod_adapter.load(path).gaussians for path in (wasteful, tmp_path / "dial.ply"))
-    assert len(result) == 350 and torch.equal(result.shN, base.shN)  # what was left out is there
+    assert len(result) == 350 and torch.equal(result.shN, base.shN)  # with the part that was left out
     assert torch.equal(result.means[:50], base.means[:50]) and not torch.equal(result.means[50:], base.means[50:])
     assert "plan:" not in clod(wasteful, "--images", capture.scene, *TINY, "--quiet").err
 
 
-def test_trimmed_files_are_made_again_bit_for_bit(clod: Any, capture: Any, wasteful: Path, tmp_path: Path) -> None:
+def test_apply_rebuilds_trimmed_files(clod: Any, capture: Any, wasteful: Path, tmp_path: Path) -> None:
     clod(wasteful, "--images", capture.scene, *TINY)
     whole = clod_adapter.load(tmp_path / "dial.ply").gaussians
     large = (tmp_path / "dial.ply").stat().st_size
@@ -81,7 +77,7 @@ def test_trimmed_files_are_made_again_bit_for_bit(clod: Any, capture: Any, waste
     assert "held out" in stored["what is left out"]["why"] and stored["what is left out"]["number"] < 0.02
     adapter = clod_adapter.load_adapter(tmp_path / "dial.safetensors")
     assert adapter.kept is not None and int((~adapter.kept).sum()) == gone and not adapter.kept[:50].any()
-    # The same training: only what was left out is missing, but for the rounding of differences to what stays.
+    # The same training, except for rounding.
     for name, value in trimmed.tensors().items():
         assert torch.allclose(value, whole.tensors()[name][adapter.kept][:, :3] if name == "shN"
                               else whole.tensors()[name][adapter.kept], rtol=2e-3, atol=1e-5), name  # fmt: skip
@@ -92,30 +88,18 @@ def test_trimmed_files_are_made_again_bit_for_bit(clod: Any, capture: Any, waste
     assert refused.code == 2 and "a different base was given" in refused.err
 
 
-def test_trimming_by_placed_cameras_warns(
+def test_trimming_without_photographs_warns(
     clod: Any, capture: Any, wasteful: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What they do not see others may."""
     scene = clod_adapter.load_scene(capture.scene)
     monkeypatch.setattr("clod_adapter.cli.adapt.inputs.place_scene", lambda *_: scene)
-    settled = ("--iters", 2, "--with", "bands", "--trim")
-    assert "no placed camera sees them, but" in clod(wasteful, *settled, "--out", "dial.ply").err
-    assert "no placed camera" not in clod(wasteful, *settled, "--images", capture.scene, "--out", "dial.ply").err
+    words = ("--iters", 2, "--with", "bands", "--trim")
+    assert "no placed camera sees them, but" in clod(wasteful, *words, "--out", "dial.ply").err
+    assert "no placed camera" not in clod(wasteful, *words, "--images", capture.scene, "--out", "dial.ply").err
 
 
-def test_nothing_to_trim(clod: Any, capture: Any, tmp_path: Path) -> None:
-    """Whoever trims what has nothing to spare gets the usual files, which earlier versions read."""
-    for name, options in (("dial.ply", ()), ("trimmed.ply", ("--trim",))):
-        words = ("--iters", 6, "--max-sv", 4, "--with", "unseen", "bands", "--out", name)
-        assert clod(capture.ply, "--images", capture.scene, *words, *options).code == 0
-    loaded = [clod_adapter.load(tmp_path / name).gaussians for name in ("dial.ply", "trimmed.ply")]
-    assert all(torch.equal(value, loaded[1].tensors()[name]) for name, value in loaded[0].tensors().items())
-    adapter = clod_adapter.load_adapter(tmp_path / "trimmed.safetensors")
-    assert adapter.kept is None and adapter.sh_degree is None
-
-
-def test_overridden(clod: Any, capture: Any, wasteful: Path, tmp_path: Path) -> None:
-    options = ("--with", "bands", "unseen", "--without", "quats", "--with", "sh0", "--without", "means")
+def test_overrides(clod: Any, capture: Any, wasteful: Path, tmp_path: Path) -> None:
+    options = ("--with", "bands", "unseen", "--without", "quats", "--with", "sh0", "--without", "means", "--trim")
     done = clod(wasteful, "--images", capture.scene, *TINY, *options)
     assert done.code == 0, done
     stored = decisions(tmp_path)
@@ -124,53 +108,19 @@ def test_overridden(clod: Any, capture: Any, wasteful: Path, tmp_path: Path) -> 
         "means": "frozen", "quats": "frozen",
     }  # fmt: skip
     assert re.search(r"^  quats +frozen +- +as requested, not measured +--with quats$", done.err, re.M), done
-    assert set(clod_adapter.load_adapter(tmp_path / "dial.safetensors").updates) == {
-        "log_scales", "opacity_logits", "sh0",
-    }  # fmt: skip
+    adapter = clod_adapter.load_adapter(tmp_path / "dial.safetensors")
+    assert set(adapter.updates) == {"log_scales", "opacity_logits", "sh0"}
+    assert adapter.kept is None and adapter.sh_degree is None  # nothing to trim: earlier versions read the file
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--with", "colour"), "argument --with: invalid choice: 'colour' (choose from "),
-        (("--without",), "argument --without: expected at least one argument"),
-        (("--with", "quats", "--without", "sh0", "quats"), "--with and --without both name quats"),
-    ],
-)
-def test_misuse(clod: Any, capture: Any, tmp_path: Path, options: Any, message: str) -> None:
-    done = clod(capture.ply, "--images", capture.scene, *TINY, *options)
-    assert done.code == 2 and message in done.err and done.err.count("\n") == 1 and names(tmp_path) == []
-    if "colour" in options:
-        assert all(name in done.err for name in adapt_command.NAMES)
-
-
-def test_the_options_name_what_the_plan_decides() -> None:
+def test_options_name_the_items_of_the_plan() -> None:
     assert adapt_command.NAMES == NAMES
-
-
-@pytest.mark.parametrize("phase", [Phase.SH_DEGREES, Phase.IMPORTANCE, Phase.PRUNING_ORDER])
-def test_an_interrupt_leaves_nothing(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: Phase
-) -> None:
-    from clod_adapter.cli.adapt.progress import ProgressDisplay
-
-    follow = ProgressDisplay.__call__
-
-    def interrupted(self: ProgressDisplay, now: Progress) -> bool:
-        self.stop.requests += now.phase == phase
-        return follow(self, now)
-
-    monkeypatch.setattr(ProgressDisplay, "__call__", interrupted)
-    done = clod(capture.ply, "--images", capture.scene, *TINY)
-    assert done.code == 130 and "plan:" not in done.err and names(tmp_path) == [], done
 
 
 def test_resuming_with_a_frozen_attribute(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Resumes to the same bits with the same options; a state of other trained attributes is refused."""
-    from clod_adapter.cli.adapt.progress import ProgressDisplay
-
+    """The same options give the same bits; a state of other trained attributes is refused."""
     plain = (capture.ply, "--images", capture.scene, *TINY)
     words = (*plain, "--without", "quats")
     assert clod(*words).code == 0
@@ -199,4 +149,4 @@ def test_resuming_with_a_frozen_attribute(
     assert clod(*words, "--resume").code == 0
     found = clod_adapter.load(tmp_path / "dial.ply").gaussians
     assert all(torch.equal(value, found.tensors()[name]) for name, value in want.tensors().items())
-    assert names(tmp_path) == OUTPUTS
+    assert [path.name for path in sorted(tmp_path.iterdir()) if path.is_file()] == OUTPUTS

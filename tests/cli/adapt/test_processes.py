@@ -1,4 +1,4 @@
-"""Several processes: they end where one does, and a loss, a Ctrl-C or bad input ends all of them, usably and once."""
+"""Several processes: the result of one; a killed process, an interrupt or bad input ends all of them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from clod_adapter.training.state_file import load_state
 from runs import OUTPUTS, STATE, Server, log_of, names, wait_for
 
 TINY = ("--max-sv", 4, "--out", "dial.ply", "--batch", 2, "--iters", 12)
-LONG = (*TINY[:-1], 4000)  # ended by what happens to it
+LONG = (*TINY[:-1], 4000)  # does not end by itself
 
 
 @dataclass
@@ -35,7 +35,7 @@ class Launched:
     server: Server
     folder: Path
     pids: list[int]
-    store: Any  # which has to live as long as they do
+    store: Any  # has to exist as long as the processes
 
     def log(self, rank: int) -> str:
         return log_of(self.folder, rank)
@@ -80,7 +80,7 @@ def alone(server: Server, words: list[Any], tmp_path_factory: pytest.TempPathFac
 
 
 def assert_close(folder: Path, want: Path) -> None:
-    """Within rounding, which sums in another order have."""
+    """Within the rounding of sums in another order."""
     found, wanted = (clod_adapter.load(path / "dial.ply").gaussians for path in (folder, want))
     assert found.attenuation == wanted.attenuation
     for name, tensor in wanted.tensors().items():
@@ -89,7 +89,7 @@ def assert_close(folder: Path, want: Path) -> None:
     assert [row["psnr"] for row in one] == pytest.approx([row["psnr"] for row in other], abs=1e-3)
 
 
-def test_two_end_where_one_does(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
+def test_two_give_the_result_of_one(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
     run = launch(server, tmp_path / "two", *words, *TINY, "--resume")
     assert run.wait() == [0, 0], run.log(0) + run.log(1)
     assert_close(run.folder, alone)
@@ -109,8 +109,8 @@ def test_three_with_uneven_shares(server: Server, words: list[Any], tmp_path: Pa
     assert_close(three.folder, one.folder)
 
 
-def test_a_loss_that_is_not_finite_ends_both(server: Server, words: list[Any], tmp_path: Path) -> None:
-    """After the same step, whichever has it; the result so far is written and measured."""
+def test_non_finite_loss_ends_both(server: Server, words: list[Any], tmp_path: Path) -> None:
+    """After the same step; the result so far is written and measured."""
     spoil = (
         "from dataclasses import replace; from clod_adapter.training.objective import Objective\n"
         "pull, steps = Objective.gradient_sum, []\n"
@@ -127,16 +127,16 @@ def test_a_loss_that_is_not_finite_ends_both(server: Server, words: list[Any], t
     assert load_state(run.folder / STATE)[0].steps == 3
 
 
-def test_a_time_budget_ends_all_at_once(server: Server, words: list[Any], tmp_path: Path) -> None:
-    """By the first one's clock: that of the second is far ahead."""
+def test_time_budget_ends_all_after_the_same_step(server: Server, words: list[Any], tmp_path: Path) -> None:
+    """By the clock of the first process; that of the second is far ahead."""
     ahead = "import clod_adapter.training.loop as t; at = t.time.perf_counter; t.time.perf_counter = lambda: 1e3 * at()"
     run = launch(server, tmp_path / "run", *words, *LONG, "--time-budget", 0.3, before={1: ahead})
     assert run.wait() == [0, 0], run.log(0)
     assert 1 <= run.report()["steps"] < 4000 and not run.report()["interrupted"]
 
 
-@pytest.mark.parametrize("launcher", ["alive", "gone"])  # whose store tells the reason and hears that all is over
-def test_the_second_is_killed(server: Server, words: list[Any], tmp_path: Path, launcher: str) -> None:
+@pytest.mark.parametrize("launcher", ["alive", "gone"])  # its store has the reason of a lost process
+def test_killed_second_process(server: Server, words: list[Any], tmp_path: Path, launcher: str) -> None:
     run = launch(server, tmp_path / "run", *words, *LONG, wait=STATE)
     if launcher == "gone":
         run.store = None
@@ -151,8 +151,8 @@ def test_the_second_is_killed(server: Server, words: list[Any], tmp_path: Path, 
     assert load_state(run.folder / STATE)[0].steps == steps
 
 
-def test_the_launcher_s_signals_end_no_writing(server: Server, words: list[Any], tmp_path: Path) -> None:
-    """It sends one for the loss, and others pass theirs on: while the files are written, and right to the end."""
+def test_signals_of_the_launcher_do_not_end_the_writing(server: Server, words: list[Any], tmp_path: Path) -> None:
+    """It sends them after a lost process, and repeats its own, until the process ends."""
     pressed = (
         "import argparse; from clod_adapter.cli.adapt import report, result\n"
         "def pressing(real):\n"
@@ -161,7 +161,7 @@ def test_the_launcher_s_signals_end_no_writing(server: Server, words: list[Any],
         "        return real(*arguments, **more)\n"
         "    return call\n"
         "result.explain = pressing(result.explain)\n"
-        "for name in ('write', 'print_summary'): setattr(report, name, pressing(getattr(report, name)))\n"
+        "for name in ('write_files', 'print_summary'): setattr(report, name, pressing(getattr(report, name)))\n"
         "main.json = argparse.Namespace(dumps=pressing(json.dumps))"
     )
     run = launch(server, tmp_path / "run", *words, *LONG, "--quiet", "--json", before={0: pressed}, wait=STATE)
@@ -170,8 +170,10 @@ def test_the_launcher_s_signals_end_no_writing(server: Server, words: list[Any],
     assert json.loads(run.log(0))["steps"] == run.report()["steps"]
 
 
-def test_a_loss_within_a_step_loses_none(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
-    """The second fails in its fifth step, and says why by way of the first; going on ends as if it had not."""
+def test_process_lost_within_a_step_loses_no_step(
+    server: Server, words: list[Any], alone: Path, tmp_path: Path
+) -> None:
+    """The first one prints the error of the second; a resumed run gives the result of an uninterrupted one."""
     fail = (
         "from clod_adapter.training.objective import Objective; real, calls = Objective.gradient_sum, []\n"
         "def pull(*arguments):\n"
@@ -190,8 +192,8 @@ def test_a_loss_within_a_step_loses_none(server: Server, words: list[Any], alone
     assert_close(run.folder, alone)
 
 
-def test_a_loss_before_the_first_step(server: Server, words: list[Any], tmp_path: Path) -> None:
-    """There is nothing to write then; here for want of a second GPU."""
+def test_process_lost_before_the_first_step(server: Server, words: list[Any], tmp_path: Path) -> None:
+    """Nothing is written; here there is no second GPU."""
     on_gpus = (
         "real = processes.ProcessGroup.broadcast\n"
         "def broadcast(*arguments):\n"
@@ -207,8 +209,8 @@ def test_a_loss_before_the_first_step(server: Server, words: list[Any], tmp_path
     assert log.count("error:") == 1 and f"; {why}; this was before the first step, so start again\n" in log
 
 
-def test_the_first_is_killed(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
-    """The state that it saved last is there, for any number of processes; the others wait for the launcher's signal."""
+def test_killed_first_process(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
+    """Any number of processes can resume its last state; the others wait for the launcher's signal."""
     slowly = "from clod_adapter.training.trainer import Trainer; real = Trainer.step\n"
     slowly += "def step(*a):\n    processes.time.sleep(0.05)\n    real(*a)\nTrainer.step = step"
     run = launch(server, tmp_path / "run", *words, *TINY, before={0: slowly}, wait=STATE)
@@ -221,9 +223,9 @@ def test_the_first_is_killed(server: Server, words: list[Any], alone: Path, tmp_
     assert_close(run.folder, alone)
 
 
-def test_an_interrupt_stops_all_after_the_same_step(server: Server, words: list[Any], tmp_path: Path) -> None:
+def test_interrupt_stops_all_after_the_same_step(server: Server, words: list[Any], tmp_path: Path) -> None:
     run = launch(server, tmp_path / "run", *words, *LONG, wait=STATE)
-    os.kill(run.pids[1], signal.SIGINT)  # either of them is enough
+    os.kill(run.pids[1], signal.SIGINT)  # either process
     assert run.wait() == [0, 0], run.log(0)
     report = run.report()
     assert report["interrupted"] and load_state(run.folder / STATE)[0].steps == report["steps"], run.log(0)
@@ -239,7 +241,7 @@ def test_an_interrupt_stops_all_after_the_same_step(server: Server, words: list[
         (("eval", "nowhere.ply", "--images", "scene"), "only adapting takes several processes"),
     ],
 )
-def test_bad_input_is_said_once(server: Server, words: list[Any], tmp_path: Path, wrong: Any, message: str) -> None:
+def test_bad_input_is_reported_once(server: Server, words: list[Any], tmp_path: Path, wrong: Any, message: str) -> None:
     given = wrong if "nowhere.ply" in wrong else (*words, *wrong)
     run = launch(server, tmp_path / "run", *given)
     codes = run.wait()
@@ -248,8 +250,7 @@ def test_bad_input_is_said_once(server: Server, words: list[Any], tmp_path: Path
 
 
 @pytest.mark.timeout(240)
-def test_torchrun_and_a_loss(words: list[Any], tmp_path: Path) -> None:
-    """The launcher itself, whose second process is killed."""
+def test_torchrun_with_a_killed_process(words: list[Any], tmp_path: Path) -> None:
     environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     run = subprocess.Popen(
@@ -282,7 +283,7 @@ AT = {"MASTER_ADDR": "localhost", "MASTER_PORT": "1"}
     ("environment", "want"),
     [
         ({}, Launch()),
-        ({"WORLD_SIZE": "4", "RANK": "1"}, Launch()),  # where nobody says where to meet
+        ({"WORLD_SIZE": "4", "RANK": "1"}, Launch()),  # without an address
         (AT | {"WORLD_SIZE": "4", "RANK": "1", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2"}, Launch(1, 4, 1, 2)),
         (AT | {"WORLD_SIZE": "4", "RANK": "4"}, None),
         (AT | {"WORLD_SIZE": "4", "RANK": "one"}, None),
@@ -298,7 +299,7 @@ def test_rank_from_the_environment(monkeypatch: pytest.MonkeyPatch, environment:
             launched()
 
 
-def test_default_steps_see_as_many_views(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_default_steps_take_the_same_number_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
     for words, size, want in (
         ((), 1, (1, 1500)), ((), 4, (4, 375)), (("--batch", "3"), 2, (3, 500)), (("--batch", "4000"), 1, (4000, 1)),
         (("--iters", "100"), 4, (4, 100)), (("--iters", "0"), 1, (1, 0)),

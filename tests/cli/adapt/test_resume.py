@@ -1,4 +1,4 @@
-"""Resuming: a state of this run is continued to the same bits; one of another run, or a damaged one, is refused."""
+"""Resuming: the state of the same run gives the same bits; one of another run, or a damaged one, is refused."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ from safetensors.torch import load_file, save_file
 
 from clod_adapter._support.version import package_version
 from clod_adapter.cli.adapt import inputs as adapt_inputs
-from clod_adapter.cli.adapt import resume
+from clod_adapter.cli.adapt import resume, saver
 from clod_adapter.cli.adapt import run as adapt_command
-from clod_adapter.cli.adapt.resume import Resumed, RunKey, Saver, find_state, identify
+from clod_adapter.cli.adapt.resume import Resumed, RunKey, find_state, identify
+from clod_adapter.cli.adapt.saver import Saver
 from clod_adapter.cli.shared import inputs
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.interrupts import GracefulStop
@@ -45,7 +46,7 @@ REQUESTED = {"keep_in": ["means"], "leave_out": []}
 
 
 class Saved:
-    """A state after two of three steps, what it belongs to, and going on from a file like it."""
+    """A state after two of three steps, and resuming from files like it."""
 
     def __init__(self, path: Path) -> None:
         self.base, self.scene = small_capture(40, views=4, width=16, height=12)
@@ -59,8 +60,8 @@ class Saved:
         args = Namespace(ply="base.ply", images="images", **REQUESTED)
         return identify(resumed, self.base, self.scene, CONFIG, args, QUIET)
 
-    def go_on(self, path: Path) -> Gaussians:
-        """All that the command does with a state."""
+    def resume(self, path: Path) -> Gaussians:
+        """What the command does with a state."""
         resumed = find_state(path, True, CONFIG, QUIET)
         assert resumed
         self._key(resumed)
@@ -73,10 +74,10 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Saved:
     return Saved(tmp_path_factory.mktemp("saved") / "dial.resume.safetensors")
 
 
-def assert_read_or_refused(saved: Saved, path: Path, tensors: dict[str, torch.Tensor], about: Any) -> None:
+def assert_resumed_or_refused(saved: Saved, path: Path, tensors: dict[str, torch.Tensor], about: Any) -> None:
     save_file(tensors, path, {KEY: json.dumps(about)})
     try:
-        found = saved.go_on(path)
+        found = saved.resume(path)
     except ClodError as error:
         assert "\n" not in str(error) and ("start over" in str(error) or "use " in str(error)), error
     else:
@@ -84,7 +85,7 @@ def assert_read_or_refused(saved: Saved, path: Path, tensors: dict[str, torch.Te
 
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Of every entry of a JSON document, at any depth."""
+    """The paths of all entries of a JSON document, at any depth."""
     below = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [*([path] if path else []), *(place for key, each in below for place in places(each, (*path, key)))]
 
@@ -99,8 +100,8 @@ HOW = settings(max_examples=120, deadline=None, suppress_health_check=[HealthChe
 
 @HOW
 @given(data=st.data())
-def test_a_record_with_entries_that_are_wrong(saved: Saved, tmp_path: Path, data: Any) -> None:
-    """Of another type, out of range, missing, or too many, at any depth."""
+def test_wrong_metadata_is_refused(saved: Saved, tmp_path: Path, data: Any) -> None:
+    """Entries of another type, out of range, missing, or too many, at any depth."""
     about = json.loads(json.dumps(saved.about))
     for _ in range(data.draw(st.integers(1, 2))):
         *way, last = data.draw(st.sampled_from(places(about)))
@@ -114,7 +115,7 @@ def test_a_record_with_entries_that_are_wrong(saved: Saved, tmp_path: Path, data
             parent[data.draw(st.text(max_size=4))] = data.draw(VALUES)
         else:
             parent[last] = data.draw(VALUES)
-    assert_read_or_refused(saved, tmp_path / "state", saved.tensors, about)
+    assert_resumed_or_refused(saved, tmp_path / "state", saved.tensors, about)
 
 
 def change(tensor: torch.Tensor, how: str, value: float, row: int) -> torch.Tensor | None:
@@ -131,7 +132,7 @@ def change(tensor: torch.Tensor, how: str, value: float, row: int) -> torch.Tens
 
 @HOW
 @given(data=st.data())
-def test_tensors_that_are_wrong(saved: Saved, tmp_path: Path, data: Any) -> None:
+def test_wrong_tensors_are_refused(saved: Saved, tmp_path: Path, data: Any) -> None:
     tensors = dict(saved.tensors)
     name = data.draw(st.sampled_from(sorted(tensors)))
     how = data.draw(st.sampled_from(["remove", "type", "shape", "value", "value", "value"]))
@@ -141,7 +142,7 @@ def test_tensors_that_are_wrong(saved: Saved, tmp_path: Path, data: Any) -> None
     changed = change(tensors.pop(name), how, value, data.draw(st.integers(0, 500)))
     if changed is not None:
         tensors[name] = changed
-    assert_read_or_refused(saved, tmp_path / "state", tensors, saved.about)
+    assert_resumed_or_refused(saved, tmp_path / "state", tensors, saved.about)
 
 
 @pytest.mark.parametrize(
@@ -150,17 +151,17 @@ def test_tensors_that_are_wrong(saved: Saved, tmp_path: Path, data: Any) -> None
      ("overruled", {"--with": 3}, "overruled {'--with': 3}"), ("config", 3, "is of other settings"),
      ("version", None, "is of version None"), ("base_sha256", [1], "is of another checkpoint")],
 )  # fmt: skip
-def test_a_record_of_the_wrong_type_is_named(saved: Saved, tmp_path: Path, entry: str, value: Any, said: str) -> None:
+def test_error_names_a_wrong_entry(saved: Saved, tmp_path: Path, entry: str, value: Any, said: str) -> None:
     path = tmp_path / "state"
     belongs = saved.about["belongs"] | {entry: value}
     save_file(saved.tensors, path, {KEY: json.dumps(saved.about | {"belongs": belongs})})
     with pytest.raises(ClodError, match=f"^{path}: .*{said}"):
-        saved.go_on(path)
+        saved.resume(path)
 
 
-def test_the_undamaged_state_is_gone_on_from(saved: Saved, tmp_path: Path) -> None:
+def test_undamaged_state_is_resumed(saved: Saved, tmp_path: Path) -> None:
     save_file(saved.tensors, tmp_path / "state", {KEY: json.dumps(saved.about)})
-    found, want = saved.go_on(tmp_path / "state"), adapt(saved.base, saved.scene, CONFIG).gaussians
+    found, want = saved.resume(tmp_path / "state"), adapt(saved.base, saved.scene, CONFIG).gaussians
     for name, value in want.tensors().items():
         assert torch.equal(found.tensors()[name], value), name
     assert saved.about["belongs"]["config"] == asdict(CONFIG)
@@ -175,8 +176,8 @@ def words(capture: Any) -> list[Any]:
 
 
 @pytest.fixture
-def broken_off(clod: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Runs the command up to the end of training, before its last save: the state after step 1 is there."""
+def aborted(clod: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Runs the command to the end of training, before its last save: the saved state is that of step 1."""
 
     def stop(*_: Any) -> None:
         raise KeyboardInterrupt
@@ -190,9 +191,9 @@ def broken_off(clod: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None
 
 
 def test_other_settings_are_refused(
-    clod: Any, words: list[Any], tmp_path: Path, broken_off: Any, monkeypatch: pytest.MonkeyPatch
+    clod: Any, words: list[Any], tmp_path: Path, aborted: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    broken_off(*words)
+    aborted(*words)
     before = (tmp_path / STATE).read_bytes()
     with monkeypatch.context() as patch:
         patch.setattr(adapt_inputs, "read_checkpoint", lambda *_: pytest.fail("read"))
@@ -210,9 +211,9 @@ def test_other_settings_are_refused(
 
 
 def test_other_inputs_are_refused(
-    clod: Any, capture: Any, words: list[Any], tmp_path: Path, broken_off: Any, monkeypatch: pytest.MonkeyPatch
+    clod: Any, capture: Any, words: list[Any], tmp_path: Path, aborted: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    broken_off(*words)
+    aborted(*words)
     state = (tmp_path / STATE).read_bytes()
     capture.write(tmp_path / "other.ply", capture.gaussians.select(torch.arange(300) < 299))
     shutil.copytree(capture.scene, tmp_path / "fewer")
@@ -237,36 +238,38 @@ def test_other_inputs_are_refused(
         f"clod-adapt: error: {STATE}: the training state has impossible values of first.means; delete it to start over"
     )
     (tmp_path / STATE).write_bytes(state[:-9])
-    for more in ([], ["--resume"]):  # another file, such as an adapter, is not replaced either
+    for more in ([], ["--resume"]):  # nor is a file of another kind, such as an adapter, replaced
         done = clod(*words, *more)
         assert done.code == 2 and f"error: {STATE}: is not a training state or is damaged" in done.err
 
 
-def test_the_same_inputs_of_other_names(clod: Any, capture: Any, words: Any, tmp_path: Path, broken_off: Any) -> None:
-    broken_off(*words)
+def test_same_inputs_with_other_names_are_resumed(
+    clod: Any, capture: Any, words: Any, tmp_path: Path, aborted: Any
+) -> None:
+    aborted(*words)
     shutil.copy(capture.ply, tmp_path / "moved.ply")
     shutil.copytree(capture.scene, tmp_path / "moved")
     done = clod("moved.ply", "--images", "moved", *TINY, "--resume")
     assert done.code == 0 and f"resuming {STATE} from step 1" in done.err, done
 
 
-def test_without_a_state_or_without_resume(
-    clod: Any, words: list[Any], tmp_path: Path, broken_off: Any, monkeypatch: pytest.MonkeyPatch
+def test_without_a_state_or_resume_training_starts_over(
+    clod: Any, words: list[Any], tmp_path: Path, aborted: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Training starts at step 0; an earlier state stays until the next one replaces it, or fails to."""
+    """An earlier state stays until a new one replaces it; a state that cannot be saved costs nothing else."""
     done = clod(*words, "--resume", "--json")
     assert done.code == 0 and f"there is no {STATE} to resume from: starting from the beginning" in done.err
     assert json.loads(done.out)["resumed_from"] is None and names(tmp_path) == OUTPUTS
-    broken_off(*words)
+    aborted(*words)
     before, seen, look = (tmp_path / STATE).read_bytes(), [], adapt_command.with_base_rows
 
     def full(path: Path, *_: Any) -> None:
         raise ClodError(f"{path}: cannot be written: No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(resume, "save_state", full)
-        patch.setattr(resume, "SAVE_EVERY", 0.0)
-        patch.setattr(resume, "SAVE_COST", 1e9)
+        patch.setattr(saver, "save_state", full)
+        patch.setattr(saver, "SAVE_EVERY", 0.0)
+        patch.setattr(saver, "SAVE_COST", 1e9)
         done = clod(*words, "--seed", 4)
     assert done.code == 0 and done.err.count(f"will not find it: {STATE}: cannot be written: No space") == 1
     assert names(tmp_path) == sorted([*OUTPUTS, STATE]) and (tmp_path / STATE).read_bytes() == before
@@ -279,28 +282,28 @@ def test_without_a_state_or_without_resume(
 
 
 def test_resuming_without_photographs(
-    clod: Any, capture: Any, tmp_path: Path, broken_off: Any, monkeypatch: pytest.MonkeyPatch
+    clod: Any, capture: Any, tmp_path: Path, aborted: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(inputs, "place_cameras", partial(inputs.place_cameras, views=4))
     words = (capture.ply, "--iters", 3, "--max-sv", 2, "--out")
     assert clod(*words, "whole.ply", "--quiet").code == 0
-    broken_off(*words, "dial.ply")
+    aborted(*words, "dial.ply")
     done = clod(*words, "dial.ply", "--resume", "--json")
     assert done.code == 0 and json.loads(done.out)["resumed_from"] == 1
     for kind in ("ply", "safetensors"):
         assert stripped((tmp_path / f"dial.{kind}").read_bytes()) == stripped((tmp_path / f"whole.{kind}").read_bytes())
 
 
-def test_saves_take_their_share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After the first step, then as often as saves of a tenth of a second take no more than 1.5 % of the time."""
+def test_saving_takes_a_small_share_of_the_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the first step, then so that saves of 0.1 s take at most 1.5 % of the time."""
     clock, saved = [0.0], []
-    monkeypatch.setattr(resume.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr("clod_adapter.cli.adapt.saver.time.perf_counter", lambda: clock[0])
 
     def save(path: Path, state: int, run_of: Any) -> None:
         saved.append(state)
         clock[0] += 0.1
 
-    monkeypatch.setattr(resume, "save_state", save)
+    monkeypatch.setattr("clod_adapter.cli.adapt.saver.save_state", save)
     saver = Saver(tmp_path / STATE, {}, None, Console(quiet=True), GracefulStop())
     follow = saver.saving(lambda progress: None)
     for step in range(1, 601):

@@ -1,4 +1,4 @@
-"""The main job: ``clod-adapt PLY --images DIR``."""
+"""``clod-adapt PLY --images DIR``: files, report, progress, interrupts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from PIL import Image
 from plyfile import PlyData
 
 import clod_adapter
-from clod_adapter.cli.adapt import files, inputs, result, setup
+from clod_adapter.cli.adapt import inputs, result, setup
 from clod_adapter.cli.adapt import report as reporting
 from clod_adapter.cli.shared import measure
 from clod_adapter.cli.shared.report import machine_name, report_dials
@@ -29,7 +29,7 @@ from runs import OUTPUTS, STATE, names, pressing
 from scenes import stripped
 
 TINY = ("--iters", 12, "--max-sv", 4, "--out", "dial.ply")
-EARLIER = "an earlier run's of clod_adapter"
+EARLIER = "of an earlier run of clod_adapter"
 
 
 def test_writes_three_files(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
@@ -43,6 +43,9 @@ def test_writes_three_files(clod: Any, capture: Any, dialled: Path, tmp_path: Pa
     assert (report["model"], report["scene"]) == (str(capture.ply), str(capture.scene))
     assert (report["base_count"], report["sh_degree"], report["steps"]) == (300, 1, 12)
     assert report["interrupted"] is False and report["notes"] == []
+    assert (report["alignment"]["guess"], report["alignment"]["explained"]) == (None, 1)
+    assert report["screen_filter"] == {"variance": 0.3, "compensate": False}
+    assert b"screen_filter" not in (tmp_path / "dial.ply").read_bytes()
     assert set(report["config"]) == set(AdaptConfig.__dataclass_fields__) and report["config"]["max_sv"] == 4
     assert report["attenuation"]["max_sv"] == 4
     assert set(report["machine"]) >= {"cpu", "cores", "python", "torch", "numba"}
@@ -54,7 +57,7 @@ def test_writes_three_files(clod: Any, capture: Any, dialled: Path, tmp_path: Pa
     shares = [row["kept_share"] for row in report["rows"]]
     assert shares == sorted(shares, reverse=True) and 0 < shares[-1] < 0.5
     assert list(PlyData.read(str(tmp_path / "dial.ply"))["vertex"].data.dtype.names or ())[-1] == "sigma_d"
-    for suffix in (".ply", ".safetensors"):  # of the same seed
+    for suffix in (".ply", ".safetensors"):  # with the same seed
         assert stripped((tmp_path / f"dial{suffix}").read_bytes()) == stripped(dialled.with_suffix(suffix).read_bytes())
     table = [line.split() for line in done.out.splitlines()[1:11]]
     assert [line[0] for line in table] == ["dial", "base", "1", "1.25", "1.5", "2", "2.5", "3", "4", "plain"]
@@ -69,8 +72,8 @@ def test_progress_has_eta_and_held_out_error(clod: Any, capture: Any, monkeypatc
     monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
     done = clod(capture.ply, "--images", capture.scene, *TINY)
     assert re.search(r"^training   8%, \d.* left, 1/12, base \d+\.\d\d dB$", done.err, re.M), done
-    monkeypatch.setattr("clod_adapter.cli.adapt.progress.CHECK_EVERY", 0)
-    monkeypatch.setattr("clod_adapter.cli.adapt.progress.CHECK_COST", 1e9)
+    monkeypatch.setattr("clod_adapter.cli.adapt.display.CHECK_EVERY", 0)
+    monkeypatch.setattr("clod_adapter.cli.adapt.display.CHECK_COST", 1e9)
     done = clod(capture.ply, "--images", capture.scene, *TINY)
     assert re.search(r"^base: \d+\.\d\d dB on the held-out photographs$", done.err, re.M), done
     error, base = r"\d+\.\d\d dB \d+%", r"\d+\.\d\d dB on these \d views"
@@ -78,25 +81,17 @@ def test_progress_has_eta_and_held_out_error(clod: Any, capture: Any, monkeypatc
     assert re.search(rf"^training  50%, \d.* left, 6/12, s=1 {error}, s=4 {error}, base {base}$", done.err, re.M), done
 
 
-def test_json_is_alone_on_stdout(spawn: Any, capture: Any, tmp_path: Path) -> None:
-    process = spawn(capture.ply, "--images", capture.scene, *TINY, "--json", cwd=tmp_path)
-    out, err = process.communicate(timeout=100)
-    assert process.returncode == 0, err
-    printed, written = json.loads(out), json.loads((tmp_path / "dial.json").read_text())
-    assert out.count("\n") == 1 and printed == written and "base" in err
-
-
-def test_quiet_json_leaves_stderr_alone(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
+def test_quiet_json_writes_nothing_to_stderr(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     for words in ((*TINY, "--seed", 4), ("--iters", -1)):
         done = clod(capture.ply, "--images", capture.scene, *words, "--quiet", "--json")
         assert done.err == "" if len(words) > 2 else done.err.count("\n") == 1 and "error" in done.err, done
-    assert stripped((tmp_path / "dial.ply").read_bytes()) != stripped(dialled.read_bytes())  # of another seed
+    assert stripped((tmp_path / "dial.ply").read_bytes()) != stripped(dialled.read_bytes())  # with another seed
     assert clod("eval", "dial.ply", "--images", capture.scene, "--quiet", "--json").err == ""
     assert clod("apply", capture.ply, "dial.safetensors", "-o", "again.ply", "--quiet", "--json").err == ""
 
 
-def test_the_report_agrees_with_the_files(clod: Any, capture: Any, dialled: Path) -> None:
-    """Quality at the ends of the dial and without it, and the calibration."""
+def test_report_agrees_with_the_files(clod: Any, capture: Any, dialled: Path) -> None:
+    """PSNR and SSIM at both ends of the dial and without it, and the calibration."""
     report = json.loads(dialled.with_suffix(".json").read_text())
     model, views = clod_adapter.load(dialled), clod_adapter.load_scene(capture.scene).test
     (want,) = clod_adapter.evaluate(clod_adapter.detach(model.gaussians), views, [1.0])
@@ -113,39 +108,27 @@ def test_the_report_agrees_with_the_files(clod: Any, capture: Any, dialled: Path
     assert stored.machine == machine_name() and report["ply_bytes"] == dialled.stat().st_size
 
 
-@pytest.mark.parametrize("device", ["auto", "cpu"])
-def test_device(clod: Any, capture: Any, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    moved = []
-    to = clod_adapter.Gaussians.to
-    monkeypatch.setattr(clod_adapter.Gaussians, "to", lambda self, where: moved.append(where) or to(self, where))
-    done = clod(capture.ply, "--images", capture.scene, "--iters", 0, "--device", device, "--json")
-    assert set(moved) == {torch.device("cpu")} and json.loads(done.out)["device"] == "cpu"
-
-
-def test_apply_of_another_version_gives_the_same_file(
-    clod: Any, capture: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_default_output_name_and_device(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("importlib.metadata.version", lambda name: "99.0")
-    assert clod("--version").out == "clod-adapt 99.0\n"
-    assert clod("apply", capture.ply, dialled.with_suffix(".safetensors"), "-o", "same.ply").code == 0
-    assert (tmp_path / "same.ply").read_bytes() == dialled.read_bytes()
-
-
-def test_default_name(clod: Any, capture: Any, tmp_path: Path) -> None:
-    done = clod(capture.ply, "--images", capture.scene, "--iters", 0, "--quiet")
+    moved, to = [], clod_adapter.Gaussians.to
+    monkeypatch.setattr(clod_adapter.Gaussians, "to", lambda self, where: moved.append(where) or to(self, where))
+    done = clod(capture.ply, "--images", capture.scene, "--iters", 0, "--device", "cpu", "--quiet")
     assert done.code == 0 and names(tmp_path) == ["base_clod.json", "base_clod.ply", "base_clod.safetensors"]
-    assert done.err == "" and done.out.splitlines()[2].split()[0] == "base"
+    assert done.err == "" and done.out.splitlines()[2].split()[0] == "base" and set(moved) == {torch.device("cpu")}
+    assert json.loads((tmp_path / "base_clod.json").read_text())["device"] == "cpu"
 
 
-def test_continues_from_sigma_d(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
+def test_training_continues_from_sigma_d(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     again = clod(dialled, "--images", capture.scene, "--iters", 2, "--max-sv", 4, "--out", "again.ply")
     assert again.code == 0 and "continuing from its sigma_d" in again.err
     assert clod("apply", dialled, "again.safetensors", "-o", "same.ply").code == 0
     assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "again.ply").read_bytes()
 
 
-def test_interrupt_of_the_measuring(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The frame is finished, and what is measured by then is reported."""
+def test_interrupt_of_the_measurement_keeps_finished_rows(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     real = measure.evaluate
 
     def evaluate(gaussians: Any, views: Any, dials: list[float], progress: Any, **rest: Any) -> Any:
@@ -163,7 +146,7 @@ def test_interrupt_of_the_measuring(clod: Any, capture: Any, tmp_path: Path, mon
     assert done.code == 2 and "no calibration in its header" in done.err
 
 
-def test_an_interrupt_at_the_end_of_training_skips_the_measurement(
+def test_interrupt_at_the_end_of_training_skips_the_measurement(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(result, "extract", pressing(result.extract, signal.SIGINT))
@@ -179,42 +162,45 @@ def test_an_interrupt_at_the_end_of_training_skips_the_measurement(
     assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("module", "step", "presses"),
-    [(files, "save_adapter", 1), (files, "save_adapter", 2), (files, "save", 1), (reporting, "calibrate", 2)],
-)
-def test_an_interrupt_of_the_writing(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: Any, step: str, presses: int
+@pytest.mark.parametrize(("step", "presses"), [("save_adapter", 1), ("save_adapter", 2), ("save", 1), ("calibrate", 2)])
+def test_interrupts_of_the_writing(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, presses: int
 ) -> None:
-    """One press lets it finish, without a page; two leave the state."""
+    """After one the files are written, without a page; after two only the state remains."""
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr(module, step, pressing(getattr(module, step), *[signal.SIGINT] * presses))
+    monkeypatch.setattr(reporting, step, pressing(getattr(reporting, step), *[signal.SIGINT] * presses))
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--report", "--json")
     assert (done.code, names(tmp_path)) == ((0, OUTPUTS) if presses == 1 else (130, [STATE])), done
     if presses == 1:
         assert json.loads(done.out)["calibration"] and clod_adapter.load(tmp_path / "dial.ply").calibration
 
 
-def test_a_report_is_of_the_files_beside_it(
+def test_outputs_replace_earlier_ones_together(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An earlier run's stays with its files until all three are replaced, once, after they are measured."""
+    """Once, after the measurement, also without a calibration."""
     for name in OUTPUTS:
         (tmp_path / name).write_text(EARLIER)
-    save, seen = files.save, []
+    save, seen = reporting.save, []
 
     def watched(*args: Any, **rest: Any) -> None:
         save(*args, **rest)
         seen.append({(tmp_path / name).read_text() for name in OUTPUTS})
 
-    monkeypatch.setattr(files, "save", watched)
-    assert clod(capture.ply, "--images", capture.scene, *TINY).code == 0
+    def infinite(*_: Any) -> None:
+        raise ClodError("a PSNR is infinite")
+
+    monkeypatch.setattr(reporting, "save", watched)
+    monkeypatch.setattr(reporting, "calibrate", infinite)
+    done = clod(capture.ply, "--images", capture.scene, *TINY)
+    assert done.code == 0 and "the files have no calibration" in done.err, done
     report = json.loads((tmp_path / "dial.json").read_text())
     assert seen == [{EARLIER}] and names(tmp_path) == OUTPUTS and len(report["rows"]) == 7
-    assert report["ply_bytes"] == (tmp_path / "dial.ply").stat().st_size
+    assert report["ply_bytes"] == (tmp_path / "dial.ply").stat().st_size and report["calibration"] is None
+    assert clod_adapter.load_adapter(tmp_path / "dial.safetensors").calibration is None
 
 
-def test_an_unusable_config_fails_before_the_work(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unusable_config_is_refused_before_reading(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(setup, "asdict", lambda config: {"time_budget": float("inf")})
     monkeypatch.setattr(inputs, "read_checkpoint", lambda *_: pytest.fail("read"))
     done = clod(capture.ply, "--images", capture.scene, *TINY)
@@ -244,7 +230,7 @@ def test_without_photographs(clod: Any, capture: Any, tmp_path: Path, monkeypatc
     assert re.match(r"no photographs: 84 pseudo views to train on, 12 held out, 186x138, ", report["notes"][0])
     assert "held-out photographs" not in done.err and "other coordinates" not in done.err
     assert re.search(r"if there are any:\n  clod-adapt eval dial.ply --images DIR --sv 1 4$", done.err, re.M)
-    # The teacher is the base itself, but for the rounding to bytes.
+    # The target images are renders of the base, rounded to bytes.
     assert report["base_rows"][0]["psnr"] > 50 > report["rows"][-1]["psnr"] and len(report["rows"]) == 7
     assert clod("apply", capture.ply, "dial.safetensors", "-o", "same.ply").code == 0
     assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
@@ -255,7 +241,7 @@ def test_without_photographs(clod: Any, capture: Any, tmp_path: Path, monkeypatc
     assert photographs[0]["psnr"] > 20 and photographs[0]["psnr"] > photographs[1]["psnr"]
 
 
-def test_a_checkpoint_that_shows_nothing_cannot_be_its_own_teacher(clod: Any, capture: Any, tmp_path: Path) -> None:
+def test_invisible_checkpoint_without_photographs_is_refused(clod: Any, capture: Any, tmp_path: Path) -> None:
     unseen = capture.gaussians.replace(opacity_logits=capture.gaussians.opacity_logits - 20)
     done = clod(capture.write(tmp_path / "unseen.ply", unseen), "--out", "dial.ply", "--quiet")
     assert (done.code, done.err.count("\n"), names(tmp_path)) == (2, 1, ["unseen.ply"])
@@ -277,20 +263,6 @@ def test_ci_banana(clod: Any, shared_data: Callable[[str], Path], tmp_path: Path
     assert report["rows"][-1]["kept_share"] < 0.3
     assert clod("apply", scene / "pretrained.ply", "dial.safetensors", "-o", "same.ply").code == 0
     assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
-
-
-def test_without_a_calibration_the_files_are_written_all_the_same(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def infinite(*_: Any) -> None:
-        raise ClodError("a PSNR is infinite")
-
-    monkeypatch.setattr(reporting, "calibrate", infinite)
-    done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
-    report = json.loads(done.out)
-    assert done.code == 0 and "the files have no calibration" in done.err and len(report["rows"]) == 7
-    assert report["calibration"] is None and names(tmp_path) == OUTPUTS
-    assert clod_adapter.load_adapter(tmp_path / "dial.safetensors").calibration is None
 
 
 def test_few_photographs_get_pseudo_views(clod: Any, capture: Any, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ def exported(clod: Any, *words: object) -> Any:
     return json.loads(done.out)
 
 
-def test_with_the_scene_it_is_for_the_training_cameras(clod: Any, capture: Any, dialled: Path) -> None:
+def test_baking_for_the_training_cameras_of_the_scene(clod: Any, capture: Any, dialled: Path) -> None:
     model, train = load(dialled), clod_adapter.load_scene(capture.scene).train
     assert model.gaussians.attenuation is not None and len(model.viewpoints) == len(train) == 8
     for stored, view in zip(model.viewpoints, train, strict=True):
@@ -44,7 +44,7 @@ def without_viewpoints(path: Path, out: Path) -> Path:
     return out
 
 
-def test_where_no_camera_is_known_some_are_placed(
+def test_baking_without_cameras_places_some(
     clod: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(baking, "PLACED", 3)
@@ -57,7 +57,7 @@ def test_where_no_camera_is_known_some_are_placed(
     assert "baked at s = 2 by clod-adapter for 3 placed cameras" in load("x.ply").comments
 
 
-def test_where_nothing_can_be_seen_no_camera_is_placed(clod: Any, dialled: Path, tmp_path: Path) -> None:
+def test_baking_an_invisible_model_without_cameras_is_refused(clod: Any, dialled: Path, tmp_path: Path) -> None:
     model = load(without_viewpoints(dialled, tmp_path / "old.ply"))
     faint = model.gaussians.replace(opacity_logits=model.gaussians.opacity_logits - 20)
     clod_adapter.save("faint.ply", faint)
@@ -68,7 +68,7 @@ def test_where_nothing_can_be_seen_no_camera_is_placed(clod: Any, dialled: Path,
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".splat"])
-def test_a_psnr_budget_is_true_of_the_file(clod: Any, capture: Any, dialled: Path, suffix: str) -> None:
+def test_psnr_drop_is_that_of_the_file(clod: Any, capture: Any, dialled: Path, suffix: str) -> None:
     model, test = load(dialled), clod_adapter.load_scene(capture.scene).test
     reference = clod_adapter.evaluate(model.gaussians, test, [1])[0].psnr
 
@@ -86,7 +86,7 @@ def test_a_psnr_budget_is_true_of_the_file(clod: Any, capture: Any, dialled: Pat
     assert 1 < s < 4 and reference - found <= drop < lost(min(1.011 * s, 4.0))
 
 
-def test_a_psnr_that_no_file_has(clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_psnr_drop_out_of_reach(clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = baking.Photographs.drop_of
     monkeypatch.setattr(baking.Photographs, "drop_of", lambda *words: real(*words) + 1)
     done = clod("export", dialled, "--psnr-drop", 0.1, "--images", capture.scene, "-o", "x.ply")
@@ -94,12 +94,12 @@ def test_a_psnr_that_no_file_has(clod: Any, capture: Any, dialled: Path, monkeyp
     assert " out of reach: the file baked at s = 1 is " in done.err.splitlines()[-1]
 
 
-def test_without_photographs_the_figure_is_of_the_dial(clod: Any, dialled: Path) -> None:
+def test_psnr_drop_without_photographs_is_that_of_the_dial(clod: Any, dialled: Path) -> None:
     report = exported(clod, dialled, "--psnr-drop", 1, "-o", "x.ply")
     assert "psnr" not in report["outputs"][0] and any("measured the dial" in note for note in report["notes"])
 
 
-def test_the_largest_dial_value_within() -> None:
+def test_largest_within() -> None:
     cases: list[tuple[Callable[[float], float], float, float, float]] = [
         (lambda s: s, 3.0, 8.0, 3.0), (lambda s: s, 9.0, 8.0, 8.0), (lambda s: s, 1.0, 8.0, 1.0),
         (lambda s: 0.0, 0.1, 1.0, 1.0), (lambda s: 1 / s if s < 2 else s, 5.0, 20.0, 5.0),

@@ -15,7 +15,7 @@ import clod_adapter
 
 @pytest.mark.usefixtures("without_splat_transform")
 @pytest.mark.parametrize("sv", [None, 2, 9])
-def test_a_page_holds_the_splat_and_its_dial(clod: Any, dialled: Path, tmp_path: Path, sv: int | None) -> None:
+def test_page_holds_the_splat_and_its_dial(clod: Any, dialled: Path, tmp_path: Path, sv: int | None) -> None:
     done = clod("export", dialled, "-o", "page.html", *(["--sv", sv] if sv else []), "--json")
     assert done.code == 0 and "there-is-none" in done.err and "exact" not in done.err, done
     report = json.loads(done.out)
@@ -32,16 +32,9 @@ def test_a_page_holds_the_splat_and_its_dial(clod: Any, dialled: Path, tmp_path:
     assert [path.name for path in tmp_path.glob(".tmp-*")] == []
 
 
-def test_a_page_has_the_cameras_of_the_scene(clod: Any, dialled: Path, capture: Any, tmp_path: Path) -> None:
+def test_page_has_the_cameras_of_the_scene(clod: Any, dialled: Path, capture: Any, tmp_path: Path) -> None:
     done = clod("export", dialled, "-o", "page.html", "--images", capture.scene, "--sv", 2)
     assert done.code == 0 and "Gaussians, initial dial value s = 2" in done.out and " of " not in done.out
     (config,) = re.findall('id="clod-config">(.*?)</script>', (tmp_path / "page.html").read_text(encoding="utf-8"))
     names = [camera["name"] for camera in json.loads(config)["cameras"]]
     assert names == sorted(path.name for path in (capture.scene / "images").iterdir())
-
-
-@pytest.mark.parametrize("words", [("--levels", "1,2"), ("--order", "extinction")])
-def test_a_page_is_of_the_whole_dial(clod: Any, dialled: Path, tmp_path: Path, words: tuple[str, ...]) -> None:
-    done = clod("export", dialled, "-o", "page.html", *words)
-    assert done.code == 2 and "remove --levels, --camera and --order" in done.err
-    assert not list(tmp_path.glob("page*"))

@@ -1,4 +1,4 @@
-"""``export``: baked files, levels, streaming sets, orders and other formats, as users ask for them."""
+"""``clod-adapt export``: baked files, levels, streaming sets, orders and other formats."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ elif words != ["--list-gpus"]:
 
 @pytest.fixture
 def tool(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """A stand-in for splat-transform that notes what it was asked for, and then does as it is told."""
+    """A stand-in for splat-transform that stores its arguments and runs ``behave``."""
 
     def make(behave: str = "pass") -> None:
         script = tmp_path_factory.mktemp("tool") / "tool.py"
@@ -55,7 +55,7 @@ def tool(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPat
 
 @pytest.fixture
 def real_tool() -> None:
-    """Skips where splat-transform is not."""
+    """Skips if splat-transform is not installed."""
     from clod_adapter.io.formats.splat_transform import SplatTransform
 
     try:
@@ -65,14 +65,14 @@ def real_tool() -> None:
 
 
 def baked(path: Path | str, s: float) -> Any:
-    """What a dial value of a file is to be, for the cameras that the file stores."""
+    """A dial value of a file, baked for the cameras that the file stores."""
     model = load(path)
     assert model.viewpoints
     return clod_adapter.bake(model.gaussians, s, cameras=model.viewpoints)
 
 
 def files(folder: Path) -> list[str]:
-    """All that is in a folder, hidden ones too."""
+    """All files and folders in a folder, also hidden ones."""
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
@@ -125,7 +125,7 @@ def test_baking_for_a_camera(clod: Any, capture: Any, dialled: Path, monkeypatch
     assert report["outputs"][0]["virtual_scale"] == 2 and [each.name for each in seen] == ["003.png"]
 
 
-def test_a_camera_that_two_photographs_are(clod: Any, capture: Any, dialled: Path, monkeypatch: Any) -> None:
+def test_camera_that_matches_two_photographs(clod: Any, capture: Any, dialled: Path, monkeypatch: Any) -> None:
     from clod_adapter.cli.export import baking
 
     (first, second, *rest), notes = baking.load_cameras(capture.scene)
@@ -181,14 +181,9 @@ def test_level_names() -> None:
     assert suffix_of(Path("b.Compressed.Ply")) == ".compressed.ply"
 
 
-def test_every_format_is_in_the_help() -> None:
-    assert set(WRITABLE) <= set(FORMATS) and not set(WRITABLE) & set(PACKED)
-    for suffix, writer in ((suffix, FILE_FORMATS[suffix]) for suffix in WRITABLE):
-        assert FORMATS[suffix].sigma == writer.carries_sigma, suffix
-
-
 @pytest.mark.parametrize("suffix", WRITABLE)
-def test_every_format_is_written_with_its_dial_where_it_has_room(clod: Any, dialled: Path, suffix: str) -> None:
+def test_formats_keep_the_dial_if_they_can(clod: Any, dialled: Path, suffix: str) -> None:
+    assert suffix not in PACKED and FORMATS[suffix].sigma == FILE_FORMATS[suffix].carries_sigma
     words = () if FORMATS[suffix].sigma else ("--sv", 1)
     done = clod("export", dialled, "-o", f"x{suffix}", *words, "--json")
     (output,) = json.loads(done.out)["outputs"]
@@ -207,13 +202,13 @@ def test_every_format_is_written_with_its_dial_where_it_has_room(clod: Any, dial
     assert json.loads(plain.out)["outputs"][0]["count"] == len(baked(dialled, 2.0))
 
 
-def test_a_plain_file_is_converted(clod: Any, capture: Any) -> None:
+def test_plain_file(clod: Any, capture: Any) -> None:
     report = json.loads(clod("export", capture.ply, "-o", "x.splat", "--json").out)
     assert report["outputs"][0] == {"file": "x.splat", "virtual_scale": None, "count": 300, "bytes": 300 * 32}
     assert "view-dependent colour is dropped" in report["notes"]
 
 
-def test_what_other_columns_there_were_is_said(clod: Any, dialled: Path, tmp_path: Path) -> None:
+def test_dropped_columns_are_noted(clod: Any, dialled: Path, tmp_path: Path) -> None:
     vertex = PlyData.read(str(dialled), mmap=False)["vertex"]
     labelled = np.empty(300, [("label", "i4"), *vertex.data.dtype.descr])
     for name in vertex.data.dtype.names:
@@ -223,14 +218,14 @@ def test_what_other_columns_there_were_is_said(clod: Any, dialled: Path, tmp_pat
     report = json.loads(clod("export", "labelled.ply", "-o", "x.ply", "--json").out)
     assert report["notes"] == ["columns dropped: label"]
     assert same(load("x.ply").gaussians, load(dialled).gaussians)
-    model = load(dialled).gaussians  # columns of settings are none of these
+    model = load(dialled).gaussians  # columns of settings are not dropped
     save("hard.ply", model.replace(attenuation=replace(model.attenuation, tau=0.01, cut="hard")))  # type: ignore[type-var]
     report = json.loads(clod("export", "hard.ply", "-o", "y.ply", "--json").out)
     assert report["notes"] == [] and load("y.ply").vertex.dtype == load("hard.ply").vertex.dtype
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".glb", ".pt", ".safetensors"])
-def test_what_the_file_says_of_itself_goes_along(clod: Any, dialled: Path, tmp_path: Path, suffix: str) -> None:
+def test_file_metadata_is_kept(clod: Any, dialled: Path, tmp_path: Path, suffix: str) -> None:
     data = dialled.read_bytes().replace(b"\nproperty", b"\ncomment SplatRenderMode: default\nproperty", 1)
     (tmp_path / "said.ply").write_bytes(data)
     assert clod("export", "said.ply", "--sv", 2, "-o", f"baked{suffix}").code == 0
@@ -240,7 +235,7 @@ def test_what_the_file_says_of_itself_goes_along(clod: Any, dialled: Path, tmp_p
         assert header.count(f"comment {line}\n") == 1
 
 
-def test_far_from_0_doubles_are_noted(clod: Any, dialled: Path, tmp_path: Path) -> None:
+def test_float64_positions_are_noted(clod: Any, dialled: Path, tmp_path: Path) -> None:
     vertex = PlyData.read(str(dialled), mmap=False)["vertex"]
     far = vertex.data.astype([(n, "f8" if n in "xyz" else t) for n, t in vertex.data.dtype.descr])
     far["x"] += 437_000.0
@@ -258,7 +253,7 @@ def test_far_from_0_doubles_are_noted(clod: Any, dialled: Path, tmp_path: Path) 
     )
 
 
-def test_an_order_for_prefixes(clod: Any, dialled: Path) -> None:
+def test_order_by_extinction(clod: Any, dialled: Path) -> None:
     gaussians = load(dialled).gaussians
     rows = clod_adapter.order_by_extinction(gaussians, load(dialled).viewpoints)
     done = clod("export", dialled, "--order", "extinction", "-o", "ordered.ply", "--json")
@@ -271,7 +266,7 @@ def test_an_order_for_prefixes(clod: Any, dialled: Path) -> None:
     assert torch.equal(load("first.ply").gaussians.means, gaussians.means[rows[:n]])
 
 
-def test_an_order_over_the_scenes_cameras(clod: Any, capture: Any, dialled: Path) -> None:
+def test_order_by_extinction_for_cameras_of_the_scene(clod: Any, capture: Any, dialled: Path) -> None:
     gaussians, cameras = load(dialled).gaussians, [view.camera for view in clod_adapter.load_scene(capture.scene).train]
     words = ("export", dialled, "--order", "extinction", "--images", capture.scene)
     assert clod(*words, "-o", "all.ply").code == 0
@@ -295,11 +290,11 @@ def saved(path: Path, degree: int) -> Any:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_baked_files_are_the_structs_that_sibr_reads(clod: Any, tmp_path: Path, degree: int) -> None:
-    """Its loadPly takes the count from the third line, skips to end_header, and reads RichPoint<D> after that.
+def test_sibr_reads_baked_files(clod: Any, tmp_path: Path, degree: int) -> None:
+    """SIBR's loadPly takes the count from the third line, skips to end_header, and then reads RichPoint<D>.
 
     Position, three normals, (D + 1)^2 x 3 harmonics (channel after channel behind the first three), opacity, three
-    scales, four of the rotation: all float32, and nothing between them. D is cfg_args's, so the file's own has to stay.
+    scales, four of the rotation: all float32, without gaps. D is that of cfg_args, so the SH degree must not change.
     """
     saved(tmp_path / "model.ply", degree)
     assert clod("export", "model.ply", "--sv", 2, "-o", "baked.ply").code == 0
@@ -320,25 +315,7 @@ def test_baked_files_are_the_structs_that_sibr_reads(clod: Any, tmp_path: Path, 
         assert list(values[6 + harmonics :]) == torch.cat(rest).tolist()
 
 
-@pytest.mark.parametrize("degree", [0, 2])
-def test_a_foreign_reader_finds_the_same(clod: Any, tmp_path: Path, degree: int) -> None:
-    gsply = pytest.importorskip("gsply")
-    model = saved(tmp_path / "model.ply", degree)
-    rows = clod_adapter.order_by_extinction(model, load("model.ply").viewpoints)
-    assert clod("export", "model.ply", "--sv", 2, "-o", "baked.ply").code == 0
-    assert clod("export", "model.ply", "--order", "extinction", "-o", "ordered.ply").code == 0
-    for name, want in (("baked.ply", baked("model.ply", 2.0)), ("ordered.ply", model.select(rows))):
-        read = gsply.plyread(str(tmp_path / name))
-        pairs = [
-            (read.means, want.means), (read.scales, want.log_scales), (read.quats, want.quats),
-            (read.opacities.reshape(-1), want.opacity_logits), (read.sh0, want.sh0[:, 0]),
-        ]  # fmt: skip
-        pairs += [(read.shN, want.shN)] if degree else []
-        for theirs, ours in pairs:
-            assert np.array_equal(theirs, ours.numpy())
-
-
-def test_packing(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
+def test_packed_formats(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
     tool()
     for suffix in PACKED:
         done = clod("export", dialled, "--levels", "1,4", "-o", f"x{suffix}", "--json")
@@ -353,11 +330,11 @@ def test_packing(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
     assert files(tmp_path) == sorted(f"x_s{s}{suffix}" for s in (1, 4) for suffix in PACKED)
 
 
-def test_a_streaming_set(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
+def test_streaming_set(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
     tool("(out.parent / '0_0').mkdir(); (out.parent / '0_0' / 'a.webp').write_text('1234')")
-    assert clod("export", dialled, "--levels", "1,4", "--lod-meta", "--out=-o").code == 0  # no option of the tool's
+    assert clod("export", dialled, "--levels", "1,4", "--lod-meta", "--out=-o").code == 0  # not an option of the tool
     shutil.rmtree(tmp_path / "-o")
-    (tmp_path / "out").mkdir()  # empty, and so not in the way
+    (tmp_path / "out").mkdir()  # empty
     done = clod("export", dialled, "--levels", "1,2,4", "--lod-meta", "-o", "out", "--json")
     (output,) = json.loads(done.out)["outputs"]
     counts = [len(baked(dialled, s)) for s in (1.0, 2.0, 4.0)]
@@ -400,7 +377,7 @@ def test_refusals_before_any_work(clod: Any, dialled: Path, tmp_path: Path, tool
         ("import time; time.sleep(60)", "was ended, it took longer than 1 s", ("--lod-meta", "-o", "out")),
     ],
 )
-def test_a_failure_of_the_tool_leaves_no_file(
+def test_failure_of_the_tool_leaves_no_file(
     clod: Any, dialled: Path, tmp_path: Path, tool: Any, monkeypatch: Any, behave: str, said: str, words: Any
 ) -> None:
     monkeypatch.setattr("clod_adapter.io.formats.splat_transform.LIMIT", 1.0)

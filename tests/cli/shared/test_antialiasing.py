@@ -1,4 +1,4 @@
-"""``--antialiasing``: believed, found out or told; tuned, measured, stored and passed on so."""
+"""``--antialiasing``: stored, detected or requested; used for training, measuring and export."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FAST = ("--iters", 3, "--max-sv", 4, "--out", "dial.ply", "--json")
 
 @pytest.fixture(scope="session")
 def trained(capture: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A checkpoint of small Gaussians that does not say it was trained antialiased, and photographs that do."""
+    """A checkpoint of small Gaussians without metadata on antialiasing, and antialiased photographs."""
     folder = tmp_path_factory.mktemp("antialiased")
     small = capture.gaussians.replace(log_scales=capture.gaussians.log_scales - 1.2)
     scene, shown = folder / "scene", small.replace(screen_filter=FILTERS["on"])
@@ -38,14 +38,14 @@ def trained(capture: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     return capture.write(folder / "base.ply", small), scene
 
 
-def test_found_out_tuned_and_stored(clod: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
+def test_adapting_detects_and_stores_the_filter(clod: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
     ply, scene = trained
     done = clod(ply, "--images", scene, *FAST)
     assert done.code == 0 and "trained with antialiasing: " in done.err and "--antialiasing off overrides" in done.err
     report = json.loads(done.out)
     (note,) = [note for note in report["notes"] if "antialiasing" in note]
     assert note in done.err and report["screen_filter"] == {"variance": 0.3, "compensate": True}
-    assert report["base_rows"][0]["psnr"] > 45  # but for the rounding to bytes it is what the photographs are of
+    assert report["base_rows"][0]["psnr"] > 45  # the photographs are its renders, rounded to bytes
     found = clod_adapter.load(tmp_path / "dial.ply")
     assert found.gaussians.screen_filter == FILTERS["on"] and found.filter_known
     assert clod_adapter.load_adapter(tmp_path / "dial.safetensors").screen_filter == FILTERS["on"]
@@ -53,13 +53,7 @@ def test_found_out_tuned_and_stored(clod: Any, trained: tuple[Path, Path], tmp_p
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
 
 
-def test_a_classic_checkpoint_stays_one_without_a_note(dialled: Path) -> None:
-    report = json.loads(dialled.with_suffix(".json").read_text())
-    assert report["notes"] == [] and report["screen_filter"] == {"variance": 0.3, "compensate": False}
-    assert b"screen_filter" not in dialled.read_bytes()
-
-
-def test_measured_and_rendered_with_what_is_found_out(clod: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
+def test_eval_and_render_use_the_detected_filter(clod: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
     ply, scene = trained
     for command in (("eval", ply, "--sv", 1), ("render", ply, "-o", tmp_path / "pictures")):
         own = json.loads(clod(*command, "--images", scene, "--json").out)
@@ -75,8 +69,8 @@ def test_measured_and_rendered_with_what_is_found_out(clod: Any, trained: tuple[
     assert report["base_row"]["psnr"] > 45 and report["against"][0]["theirs"]["psnr"] > 45
 
 
-def test_settings_of_the_option_and_of_the_file(clod: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
-    """``--antialiasing`` decides how a file is adapted; its result stores that, and an override of it is noted."""
+def test_option_overrides_the_file(clod: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
+    """The result of adapting stores the filter of the option; a note names an override of it."""
     ply, scene = trained
     done = clod(ply, "--images", scene, *FAST, "--antialiasing", "mip")
     assert done.code == 0 and "by the photographs" not in done.err, done
@@ -91,13 +85,13 @@ def test_settings_of_the_option_and_of_the_file(clod: Any, trained: tuple[Path, 
     assert json.loads(clod("inspect", "dial.ply", "--json").out)["splat"]["screen_filter"]["variance"] == 0.1
 
 
-def test_what_a_run_is_resumed_by_depends_on_the_filter(trained: tuple[Path, Path]) -> None:
+def test_key_of_a_run_depends_on_the_filter(trained: tuple[Path, Path]) -> None:
     some = clod_adapter.load(trained[0]).gaussians
     assert len({_fingerprint(some.replace(screen_filter=each)) for each in FILTERS.values()}) == len(FILTERS)
 
 
 @pytest.mark.usefixtures("blank_figure")
-def test_robustness_finds_out_for_each(clod: Any, capture: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
+def test_robustness_detects_the_filter(clod: Any, capture: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
     ply, scene = trained
     words = ("robustness", ply, "--images", scene, "--max-sv", 1, "--iters", 2, "-o", tmp_path / "rob", "--json")
     done = clod(*words)
@@ -113,7 +107,7 @@ def test_robustness_finds_out_for_each(clod: Any, capture: Any, trained: tuple[P
 
 @pytest.mark.usefixtures("without_splat_transform")
 @pytest.mark.parametrize("out", ["a.ply", "a.spz", "a.html", "a.splat"])
-def test_exports_carry_it_or_say_that_they_do_not(clod: Any, trained: tuple[Path, Path], out: str) -> None:
+def test_exports_store_the_filter_or_note_its_loss(clod: Any, trained: tuple[Path, Path], out: str) -> None:
     done = clod("export", trained[0], "-o", out, "--antialiasing", "on", "--json")
     notes = [note for note in json.loads(done.out)["notes"] if "antialias" in note]
     assert len(notes) == (out in ("a.ply", "a.splat"))
@@ -126,8 +120,10 @@ def test_exports_carry_it_or_say_that_they_do_not(clod: Any, trained: tuple[Path
         assert clod_adapter.load(out).gaussians.screen_filter == CLASSIC
 
 
-def test_the_base_beside_a_model_is_drawn_alike(clod: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
-    """Without photographs, and although its own file does not say."""
+def test_viewer_draws_the_base_with_the_filter_of_the_model(
+    clod: Any, trained: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Without photographs, and without metadata in the file of the base."""
     assert clod(trained[0], "--images", trained[1], *FAST).code == 0
     words = ["dial.ply", "--base", str(trained[0])]
     for more, want in ((), FILTERS["on"]), (("--antialiasing", "off"), FILTERS["off"]):

@@ -1,4 +1,4 @@
-"""Progress, on a terminal and off it."""
+"""Progress and messages, with and without a terminal."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Closed(io.StringIO):
 
 
 @pytest.mark.parametrize("width", [30, 80])
-def test_a_bar_fits_its_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bar_fits_the_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", terminal := Terminal())
     monkeypatch.setattr("tqdm.std._screen_shape_wrapper", lambda: lambda file: (width, 24))
     with Console().meter("training") as meter:
@@ -32,10 +32,10 @@ def test_a_bar_fits_its_terminal(width: int, monkeypatch: pytest.MonkeyPatch) ->
             meter.update(step / 4, f"{step}/4, s=1 25.81 dB 100%, s=5 21.02 dB 9%")
     lines = terminal.getvalue().split("\r")
     assert any("50%" in line for line in lines) and max(map(len, lines)) <= width
-    assert "\n" not in terminal.getvalue() and not lines[-1].strip()  # cleared away in the end
+    assert "\n" not in terminal.getvalue() and not lines[-1].strip()  # cleared at the end
 
 
-def test_lines_off_a_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_lines_without_a_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
     monkeypatch.setattr("clod_adapter.cli.shared.console.time", SimpleNamespace(perf_counter=lambda: now))
     meter = Meter(Console(), "training", began=0, printed=0)
@@ -44,12 +44,12 @@ def test_lines_off_a_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: p
     assert capsys.readouterr().err.splitlines() == [
         "training  11%, 1:20 left, step 10", "training  22%, 1:10 left, step 20", "training  33%, 1:00 left, step 30",
     ]  # fmt: skip
-    now = 10.0  # work of an earlier run does not count as speed
+    now = 10.0  # the time left does not count the work of an earlier run
     Meter(Console(), "training", began=0, printed=0, initial=0.5).update(0.6)
     assert capsys.readouterr().err == "training  60%, 40 s left\n"
 
 
-def test_a_slow_meter_shows_from_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_meter_is_shown_from_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", terminal := Terminal())
     Meter(Console(), "compiling", slow=True).close()
     Meter(Console(), "training").close()
@@ -57,7 +57,7 @@ def test_a_slow_meter_shows_from_the_start(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_status(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a terminal, while it lasts."""
+    """Shown on a terminal, until the block ends."""
     for quiet, stream in ((False, Terminal()), (True, Terminal()), (False, io.StringIO())):
         monkeypatch.setattr(sys, "stderr", stream)
         with pytest.raises(KeyboardInterrupt), Console(quiet).status("reading a file ..."):
@@ -68,7 +68,7 @@ def test_status(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("stream", [Terminal, Closed])
 def test_quiet_and_closed(stream: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is written, and nothing is lost when it cannot be."""
+    """Nothing is written, and a closed stream raises no error."""
     monkeypatch.setattr(sys, "stderr", first := stream())
     console = Console(quiet=stream is Terminal)
     console.say("a line")
@@ -85,7 +85,7 @@ def test_duration() -> None:
     assert {seconds: duration(seconds) for seconds in texts} == texts
 
 
-def test_a_status_may_say_more(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_text_of_a_status_changes(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
     monkeypatch.setattr("clod_adapter.cli.shared.console.time", SimpleNamespace(perf_counter=lambda: now))
     with Console().status("packing ...") as show:
@@ -100,16 +100,3 @@ def test_a_status_may_say_more(capsys: pytest.CaptureFixture[str], monkeypatch: 
     with Console(quiet=True).status("packing ...") as show:
         show("packing, 99 s")
     assert "99" not in terminal.getvalue()
-
-
-def test_a_clock_that_is_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bars look at the clock of the day; nothing else does."""
-    hours = iter(range(1000, 0, -1))
-    monkeypatch.setattr("tqdm.std.time", lambda: 3600.0 * next(hours))
-    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
-    with Console().meter("training") as meter:
-        meter.bar.delay = 0
-        for step in range(1, 5):
-            meter.update(step / 4)
-            meter.bar.refresh()
-    assert "100%" in terminal.getvalue()

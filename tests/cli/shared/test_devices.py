@@ -1,10 +1,7 @@
-"""Which device is picked, and what is said of a GPU that cannot be used."""
+"""The device of a command, and the message for a GPU that cannot be used."""
 
 from __future__ import annotations
 
-import builtins
-import sys
-from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,7 +12,6 @@ from clod_adapter.cli.shared import devices
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.devices import pick_device
 from clod_adapter.errors import ClodError
-from clod_adapter.rasterizers import cuda
 
 
 def test_auto_and_named_devices(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -39,10 +35,10 @@ def test_auto_and_named_devices(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="torch computes on the GPU that is here")
-def test_a_gpu_that_torch_cannot_compute_on_is_left(
+def test_gpu_that_torch_cannot_compute_on_is_not_used(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of a compute capability that this torch has no code for, say: it is seen, and the first operation fails."""
+    """For example, torch has no code for its compute capability: torch finds it, and the first operation fails."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(devices, "unusable", lambda: pytest.fail("gsplat would be compiled for nothing"))
     assert pick_device("auto", Console()) == torch.device("cpu")
@@ -61,35 +57,3 @@ def test_cuda_without_a_gpu_is_refused(
         assert main(words) == 2
         last = capsys.readouterr().err.strip().splitlines()[-1]
         assert why in last and last.endswith("or use --device cpu")
-
-
-@pytest.mark.parametrize("missing", ["the package", "its kernels", "a library", "a version"])
-def test_what_gsplat_lacks(monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
-    cuda.unusable.cache_clear()
-    backend = ModuleType("gsplat.cuda._backend")
-    backend._C = None if missing == "its kernels" else SimpleNamespace()
-    package = ModuleType("gsplat.cuda")
-    package._backend = backend
-    top = ModuleType("gsplat")
-    top.__version__ = "1.4.0" if missing == "a version" else "1.5.3+pt24cu124"
-    for name, module in (("gsplat", top), ("gsplat.cuda", package), ("gsplat.cuda._backend", backend)):
-        monkeypatch.setitem(sys.modules, name, None if missing == "the package" else module)
-    real = builtins.__import__
-
-    def importing(name: str, *args: Any, **kwargs: Any) -> Any:
-        if missing == "a library" and name == "gsplat":
-            raise OSError("libcudart.so.12: cannot open shared object file")
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", importing)
-    try:
-        reason = cuda.unusable()
-    finally:
-        cuda.unusable.cache_clear()
-    assert reason is not None and "\n" not in reason
-    assert ("pip install gsplat==1.5.3" in reason) != (missing == "its kernels")
-    expected = {
-        "the package": "gsplat", "its kernels": "install nvcc", "a library": "libcudart.so.12",
-        "a version": "gsplat 1.4.0 is too old",
-    }  # fmt: skip
-    assert expected[missing] in reason

@@ -1,4 +1,4 @@
-"""Kernels are made ready before anything is timed, and compiling them is announced."""
+"""Kernels are compiled before any measurement of time, with a message."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from clod_adapter.cli.shared.kernels import OTHER, SHARES, announced_compiling, 
 
 
 def kernels() -> dict[str, Dispatcher]:
-    """All that Python calls, by name; each has a cache, or none only where no folder can be written."""
+    """The kernels that Python calls, by name."""
     modules = [
         importlib.import_module(f"{_kernels.__name__}.{m.name}") for m in pkgutil.iter_modules(_kernels.__path__)
     ]
@@ -26,10 +26,12 @@ def kernels() -> dict[str, Dispatcher]:
     return {d.py_func.__name__: d for d in found if not d.targetoptions.get("forceinline")}
 
 
-def test_all_that_a_job_needs_is_ready(capture: Any) -> None:
-    """Whatever the checkpoint's SH degree; of every kernel there is the one variant for these argument types."""
+def test_adapting_compiles_nothing_more(capture: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    """For any SH degree; without compiling nothing is printed."""
     base, scene = capture.gaussians, clod_adapter.load_scene(capture.scene)
     prepare_kernels(Console(quiet=True))
+    prepare_kernels(Console())
+    assert capsys.readouterr().err == ""
     before = {name: len(kernel.signatures) for name, kernel in kernels().items()}
     assert min(before.values()) >= 1, before
     for bands in (0, 3):
@@ -39,7 +41,7 @@ def test_all_that_a_job_needs_is_ready(capture: Any) -> None:
     assert {name: len(kernel.signatures) for name, kernel in kernels().items()} == before
 
 
-def test_shares_are_of_kernels() -> None:
+def test_shares_name_kernels() -> None:
     assert set(SHARES) - {OTHER} < set(kernels())
     assert sum(SHARES.get(name, SHARES[OTHER]) for name in kernels()) == pytest.approx(1, abs=0.1)
 
@@ -56,10 +58,7 @@ def test_compiling_is_announced_once(kept: bool, capsys: pytest.CaptureFixture[s
     said, *progress = capsys.readouterr().err.splitlines()
     why = "first run only, well under a minute" if kept else "on every run, .* set NUMBA_CACHE_DIR"
     assert re.fullmatch(rf"compiling kernels \({why}\) \.\.\.", said)
-    assert [line.split(",")[0] for line in progress] == ["compiling  25%", "compiling  50%"]  # not of what is within
-
-
-def test_nothing_is_said_without_compiling(capsys: pytest.CaptureFixture[str]) -> None:
-    prepare_kernels(Console(quiet=True))
-    prepare_kernels(Console())
-    assert capsys.readouterr().err == ""
+    assert [line.split(",")[0] for line in progress] == [
+        "compiling  25%",
+        "compiling  50%",
+    ]  # without the inner function

@@ -1,4 +1,4 @@
-"""``--report``: the page as a user asks for it."""
+"""``--report``: the page, and interrupts of it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import pytest
 from clod_adapter.cli.shared import pages
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.config import AdaptConfig
-from clod_adapter.errors import ClodError
 from clod_adapter.training.loop import adapt
 from runs import OUTPUTS, names, pressing
 from scenes import capture as small_capture
@@ -53,9 +52,7 @@ def test_adapt(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert text.count('data-name=""') == pages.FRAMES and text.count('data-name="base"') == 1
 
 
-def test_without_photographs_nothing_is_said_of_any(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_page_without_photographs(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("clod_adapter.training.camera_placement.WIDTH", 62)
     monkeypatch.setattr("clod_adapter.training.camera_placement.HEIGHT", 46)
     done = clod(capture.ply, *TINY, "--report", "--json")
@@ -67,8 +64,7 @@ def test_without_photographs_nothing_is_said_of_any(
     before_the_notes = shown[: shown.index("Settings and machine")]
     assert re.findall(r"\S+ photograph", before_the_notes) == ["without photograph"]
     assert text.count('data-name="photograph"') == 0 and text.count('data-name="base"') == 1
-    # The base, whose only error is the rounding, is a row and not a line or a point of the charts: the name stands
-    # with its two pictures, twice each, and in the table.
+    # Twice for each of its two images, and in the table; the charts do not show the base.
     assert shown.count("base, unadapted") == 5
     assert stored(tmp_path / "dial.html")["training"]["base_psnr"] > 50
 
@@ -99,7 +95,7 @@ def test_eval(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     assert plain.code == 0 and "It reaches" in text and "<input" not in text  # no dial, no slider
 
 
-def test_ctrl_c_while_the_page_is_made_loses_nothing_else(
+def test_interrupt_of_the_page_keeps_the_other_files(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pages, "pictures", pressing(pages.pictures, signal.SIGINT))
@@ -109,26 +105,7 @@ def test_ctrl_c_while_the_page_is_made_loses_nothing_else(
     assert names(tmp_path) == OUTPUTS
 
 
-@pytest.mark.parametrize("command", ["adapt", "eval"])
-def test_a_page_that_fails_costs_no_measured_rows(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
-    def full(*_: Any) -> Any:
-        if command == "adapt":  # its report is done already, whatever happens now
-            assert json.loads((tmp_path / "dial.json").read_text())["rows"]
-        raise ClodError("page.html: cannot be written (No space left on device)")
-
-    monkeypatch.setattr(pages, "write_tradeoff_report", full)
-    words = (*TINY, "--report") if command == "adapt" else ("--sv", 1, "--report", "page.html")
-    done = clod(*(["eval"] if command == "eval" else []), capture.ply, "--images", capture.scene, *words, "--json")
-    report = json.loads(done.out)
-    assert done.code == 0 and report["rows"] and "page" not in report.get("outputs", {})
-    assert any("No space left" in note and note in done.err for note in report["notes"])
-    if command == "adapt":
-        assert report == json.loads((tmp_path / "dial.json").read_text()) and report["seconds"]["page"] > 0
-
-
-def test_refused_before_anything_is_done(
+def test_unusable_page_is_refused_before_reading(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = ("--images", capture.scene)

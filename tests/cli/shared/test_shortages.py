@@ -1,4 +1,4 @@
-"""Memory and threads that run out, by themselves or at a limit that the shell sets."""
+"""Exhausted memory and threads, also at a limit of the shell."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="limits are thos
 
 
 def limited(kilobytes: int, code: str, *words: object) -> subprocess.CompletedProcess[str]:
-    """Runs Python with these words, its address space limited to so much once ``limit()`` is called."""
+    """Runs Python with these arguments; ``limit()`` in ``code`` limits its address space."""
     start = (
         "import resource, sys\nfrom clod_adapter.cli.main import main\n"
         f"def limit(): resource.setrlimit(resource.RLIMIT_AS, ({kilobytes * 1024},) * 2)\n"
@@ -30,8 +30,8 @@ def limited(kilobytes: int, code: str, *words: object) -> subprocess.CompletedPr
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
 
 
-def test_an_address_space_too_small_for_the_libraries(capture: Any, tmp_path: Path) -> None:
-    """Unchecked, this waits for good, aborts or ends in a traceback, by how large it is."""
+def test_address_space_too_small_for_the_libraries(capture: Any, tmp_path: Path) -> None:
+    """Without the check the process hangs, aborts or prints a traceback."""
     words = (capture.ply, "--images", capture.scene, "-o", tmp_path / "dial.ply")
     done = limited(1_200_000, "limit(); sys.exit(main())", *words)
     assert (done.returncode, done.stdout) == (2, "")
@@ -42,7 +42,7 @@ def test_an_address_space_too_small_for_the_libraries(capture: Any, tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_limit_that_is_met_later(capture: Any) -> None:
+def test_limit_reached_during_the_work(capture: Any) -> None:
     """torch's allocator raises a RuntimeError."""
     code = (
         "import torch\nfrom clod_adapter.cli import inspect\n"
@@ -67,7 +67,7 @@ def test_a_limit_that_is_met_later(capture: Any) -> None:
         OSError(12, "Cannot allocate memory"),
     ],
 )
-def test_errors_that_say_so(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+def test_errors_of_a_shortage(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     def run(_: object) -> None:
         raise error
 
@@ -77,12 +77,12 @@ def test_errors_that_say_so(clod: Any, capture: Any, monkeypatch: pytest.MonkeyP
     assert done.err.endswith("); free some memory\n")
 
 
-def test_errors_that_do_not() -> None:
+def test_other_errors() -> None:
     assert shortage(OSError(13, "Permission denied")) is None and shortage(ImportError("no module")) is None
     assert shortage(RuntimeError("an unknown one")) is None
 
 
-def test_memory_that_a_photograph_lacks_is_not_its_damage(capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shortage_while_reading_a_photograph_is_not_damage(capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def short(*_: object) -> np.ndarray:
         raise MemoryError("Unable to allocate")
 

@@ -23,7 +23,7 @@ def stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None
 
 
 @pytest.mark.parametrize("name", ["a.sog", "a.KSPLAT", "a.spz"])
-def test_reads_what_it_converts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_converted_file_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     was = gaussians(5, 1, 0)
     save(tmp_path / "plain.ply", was, blank(5, 1))
     stand_in(tmp_path, monkeypatch, f'cd \'{tmp_path}\'; echo "$@" >seen; cp plain.ply "$last"')
@@ -35,7 +35,7 @@ def test_reads_what_it_converts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     assert f" {tmp_path / name} " in (tmp_path / "seen").read_text()
 
 
-def test_failures_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_conversion_errors_name_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.sog").write_bytes(b"PK\x03\x04")
     with monkeypatch.context() as patch:
         patch.setenv("PATH", str(tmp_path))
@@ -49,7 +49,7 @@ def test_failures_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize("name", ["a.sog", "a.spz"])
-def test_the_real_one(tmp_path: Path, name: str) -> None:
+def test_splat_transform_converts(tmp_path: Path, name: str) -> None:
     was = gaussians(300, 1, 0)
     save(tmp_path / "plain.ply", was, blank(300, 1))
     splat_transform("-g", "cpu", tmp_path / "plain.ply", tmp_path / name)

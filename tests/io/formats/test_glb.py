@@ -22,7 +22,7 @@ pygltflib = pytest.importorskip("pygltflib", reason="pygltflib is not installed"
 KHR = "KHR_gaussian_splatting"
 
 
-def test_as_an_independent_reader_sees_it(tmp_path: Path) -> None:
+def test_written_file_in_pygltflib(tmp_path: Path) -> None:
     g = model(3)
     write(tmp_path / "a.glb", g, origin=ORIGIN)
     gltf = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
@@ -61,8 +61,8 @@ def test_as_an_independent_reader_sees_it(tmp_path: Path) -> None:
     assert node.rotation == [0, 0, 1, 0] and node.translation == [-ORIGIN[0], -ORIGIN[1], ORIGIN[2]]
 
 
-def test_what_splat_transform_writes(tmp_path: Path) -> None:
-    """Its numbers are turned into glTF's axes, its node is not; read back they are the checkpoint's."""
+def test_file_of_splat_transform(tmp_path: Path) -> None:
+    """Its values are in glTF's axes and its node has no rotation; read back they equal the checkpoint's."""
     g = gaussians(40, 3, 2)
     save(tmp_path / "a.ply", g)
     splat_transform(tmp_path / "a.ply", tmp_path / "b.glb")
@@ -95,17 +95,17 @@ def test_what_splat_transform_writes(tmp_path: Path) -> None:
         (lambda g: g.pop("accessors"), "damaged"),
     ],
 )
-def test_numbers_that_are_not_to_be_trusted(tmp_path: Path, change: Any, message: str) -> None:
+def test_invalid_json_is_refused(tmp_path: Path, change: Any, message: str) -> None:
     write(tmp_path / "a.glb", model(0, 5))
     with pytest.raises(ClodError, match=message):
         load_glb(change_glb(tmp_path / "a.glb", change))
 
 
-def test_files_of_others(tmp_path: Path) -> None:
-    """Interleaved, in short integers, moved, without a description: sigma_d then has the default settings."""
+def test_file_of_another_program(tmp_path: Path) -> None:
+    """Interleaved, in short integers, moved, without metadata: sigma_d then has the default settings."""
     write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
     path = change_glb(tmp_path / "a.glb", lambda g: g["asset"].pop("extras"))
-    again, metadata, notes = load_glb(path)[:3]
+    again, metadata, _, notes, _ = load_glb(path)
     assert metadata.origin == ORIGIN and not notes and again.sigma_d is not None
     assert again.attenuation == AttenuationConfig()
     rows = np.zeros(5, [("position", "<f4", 3), ("rotation", "<i2", 4), ("opacity", "u1"), ("pad", "u1", 3)])
@@ -130,8 +130,8 @@ def test_files_of_others(tmp_path: Path) -> None:
     assert g.quats.tolist() == [[1, 0, 0, 0]] * 5 and torch.isposinf(g.opacity_logits).all()
 
 
-def test_a_model_of_ours_that_was_moved(tmp_path: Path) -> None:
-    """Where its node stands now is where it is, whatever its description says."""
+def test_moved_node_moves_the_model(tmp_path: Path) -> None:
+    """The node takes precedence over the origin in the metadata."""
     write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
     to = [-1e6, 0.0, 0.0]
     again, metadata = load_glb(change_glb(tmp_path / "a.glb", lambda g: g["nodes"][0].update(translation=to)))[:2]
@@ -142,7 +142,7 @@ def test_a_model_of_ours_that_was_moved(tmp_path: Path) -> None:
     torch.testing.assert_close(moved.means, again.means + torch.tensor([-1.0, 2.0, 4.0]))
 
 
-def test_what_is_not_heeded_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unused_content_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path / "a.glb", model(0, 5))
 
     def change(g: dict[str, Any]) -> None:

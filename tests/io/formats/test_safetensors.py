@@ -23,7 +23,7 @@ from scenes import gaussians
         ({"quats": None}, "has no tensor 'quats'"),
     ],
 )
-def test_other_tensors(tmp_path: Path, change: dict[str, torch.Tensor | None], message: str) -> None:
+def test_invalid_tensors_are_refused(tmp_path: Path, change: dict[str, torch.Tensor | None], message: str) -> None:
     write(tmp_path / "a.safetensors", gaussians(5, 1, 0))
     about = {"format": "clod-model", "format_version": 1, "package_version": "0"}
     tensors = {**load_file(tmp_path / "a.safetensors"), **change}

@@ -12,7 +12,7 @@ from clod_adapter.io.formats.splat import load_splat
 from formats import ORIGIN, model, rows_by_place, turned
 
 
-def test_rows(tmp_path: Path) -> None:
+def test_layout_of_a_row(tmp_path: Path) -> None:
     """The layout, byte by byte, as its viewers document it."""
     g = detach(model(0)).select(torch.arange(1))
     assert len(write(tmp_path / "a.splat", g)) == 1
@@ -27,7 +27,7 @@ def test_rows(tmp_path: Path) -> None:
     np.testing.assert_array_equal(levels[4:], (quat * 128 + 128).round().clamp(max=255))
 
 
-def test_what_is_lost(tmp_path: Path) -> None:
+def test_losses(tmp_path: Path) -> None:
     """Precision, view-dependent colours, the origin, and the order: the largest come first."""
     g = detach(model(1, 300))
     notes = write(tmp_path / "a.splat", g, origin=ORIGIN)

@@ -1,4 +1,4 @@
-"""The tool that may or may not be there: stand-ins for what can be wrong with it, and the real one where it is."""
+"""Finding and running splat-transform, with substitutes that fail in every way."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GOOD = "'node:v22.1.0;splat-transform v3.7.2 (abc)'"
 
 @pytest.fixture
 def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Makes a stand-in that runs these lines of Python with ``words``, and has the environment name it."""
+    """Makes a substitute that runs these lines of Python with ``words``; the environment names it."""
 
     def make(*lines: str) -> None:
         script = tmp_path / "with space" / "tool.py"
@@ -29,7 +29,7 @@ def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     return make
 
 
-def test_it_is_run_with_the_words_and_timed(tmp_path: Path) -> None:
+def test_run_passes_arguments_and_measures_time(tmp_path: Path) -> None:
     out, ticks = tmp_path / "out", list[float]()
     tool = stand_in("open(words[-1], 'w').write(' '.join(words[:-1]))", "time.sleep(0.5)")
     seconds = tool.run("a.ply", out, timeout=60, progress=ticks.append)
@@ -39,7 +39,7 @@ def test_it_is_run_with_the_words_and_timed(tmp_path: Path) -> None:
     assert out.read_text() == f"-w {Path.cwd() / '-a.ply'}"
 
 
-def test_finding_it(tool: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_find(tool: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for gpus, has_gpu in (("[0] A GPU", True), ("No GPU adapters found.", False)):
         tool(f"print({GOOD} if words == ['--version'] else {gpus!r})")
         found = SplatTransform.find()
@@ -71,18 +71,18 @@ def stand_in(*lines: str) -> SplatTransform:
     return SplatTransform((sys.executable, "-c", code), "3.7.0")
 
 
-def test_its_error_message_is_passed_on() -> None:
+def test_error_message_is_passed_on() -> None:
     for lines, message in (
         (["print('splat-transform v3.7.0')", "print('  \\u2717 Error: no room')", "print('    at f (x.mjs:1)')",
           "print('\\u2717 failed in 0.1s')", "sys.exit(1)"], "Error: no room"),
         (["sys.stderr.write('first\\nlast\\n')", "sys.exit(3)"], "last"),
-        (["sys.exit(1)"], "it said nothing"),
+        (["sys.exit(1)"], "no output"),
     ):  # fmt: skip
         with pytest.raises(ClodError, match=f"^splat-transform 3.7.0 failed: {message}$"):
             stand_in("sys.stdout.reconfigure(encoding='utf-8')", *lines).run(timeout=60)
 
 
-def test_it_is_ended_on_timeout_and_interrupt(tmp_path: Path) -> None:
+def test_process_ends_on_timeout_and_interrupt(tmp_path: Path) -> None:
     began, mark = time.perf_counter(), tmp_path / "mark"
     tool = stand_in("time.sleep(3)", f"open({str(mark)!r}, 'w')")
     with pytest.raises(ClodError, match="took longer than 1 s"):

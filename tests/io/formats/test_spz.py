@@ -16,20 +16,20 @@ from formats import ATTENUATION, model, splat_transform, turned
 
 
 @pytest.mark.parametrize(("typical", "known"), [(250.0, True), (40_000.0, False)])
-def test_a_dial_of_large_units_fits(tmp_path: Path, typical: float, known: bool) -> None:
+def test_sigma_of_large_units_is_not_clipped(tmp_path: Path, typical: float, known: bool) -> None:
     g = model(0)
     sigma = typical * torch.logspace(-1, 1.5, len(g))
     direction = torch.randn(len(g), 3, generator=torch.Generator().manual_seed(0))
     config = replace(ATTENUATION, reference_distance=typical if known else 0.0)
     means = typical * torch.nn.functional.normalize(direction)
     write(tmp_path / "a.spz", g.replace(sigma_d=sigma, means=means, attenuation=config))
-    again, metadata, _ = load_spz(tmp_path / "a.spz")[:3]
+    again, metadata = load_spz(tmp_path / "a.spz")[:2]
     assert metadata.attenuation == again.attenuation is not None and again.attenuation.scene_distance == 1
     assert again.attenuation.eps == config.eps and (not known or again.attenuation.reference_distance == typical)
     torch.testing.assert_close(again.sigma_d, sigma, rtol=2.0**-11, atol=0)
 
 
-def test_the_header_and_the_record(tmp_path: Path) -> None:
+def test_header_and_record(tmp_path: Path) -> None:
     g = model(1)
     write(tmp_path / "a.spz", g)
     data = gzip.decompress((tmp_path / "a.spz").read_bytes())
@@ -45,7 +45,7 @@ def test_the_header_and_the_record(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("axes", "signs"), [(4, [1, -1, -1]), (7, [-1, -1, 1])])
-def test_other_axes_are_turned(tmp_path: Path, axes: int, signs: list[int]) -> None:
+def test_other_axes_are_rotated(tmp_path: Path, axes: int, signs: list[int]) -> None:
     write(tmp_path / "a.spz", model(1))
     data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
     struct.pack_into("<I", data, 16 + 40 * 29 + 8, axes)
@@ -58,11 +58,11 @@ def test_other_axes_are_turned(tmp_path: Path, axes: int, signs: list[int]) -> N
         load_spz(tmp_path / "b.spz")
 
 
-def test_what_splat_transform_writes(tmp_path: Path) -> None:
+def test_file_of_splat_transform(tmp_path: Path) -> None:
     g = model(3).select(torch.arange(4, 40))  # without the rotations of odd length, on which it fails
     write(tmp_path / "a.ply", g)
     splat_transform("--spz-version", "3", tmp_path / "a.ply", tmp_path / "b.spz")
-    again, metadata, (note,) = load_spz(tmp_path / "b.spz")[:3]
+    again, metadata, _, (note,), _ = load_spz(tmp_path / "b.spz")
     assert again.sigma_d is None and metadata.version == "" and note.startswith("quantised: positions in 24 bits")
     assert (again.means - g.means).abs().max() <= 2.0**-13
     assert (again.opacities - g.opacities).abs().max() <= 0.501 / 255
@@ -83,7 +83,7 @@ def test_version_2(tmp_path: Path) -> None:
     assert g.opacity_logits.isfinite().all()
 
 
-def test_bombs_and_lies(tmp_path: Path) -> None:
+def test_false_sizes_are_refused(tmp_path: Path) -> None:
     def claiming(count: int) -> bytes:
         return gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, count, 3, 12, 0, 0), mtime=0)
 

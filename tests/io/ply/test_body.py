@@ -17,6 +17,7 @@ from clod_adapter.io.checkpoint import load
 from clod_adapter.io.ply.body import read_elements
 from clod_adapter.io.ply.columns import inria_dtype
 from clod_adapter.io.ply.header import parse_head, read_head
+from formats import write_elements, write_rows
 
 
 def rows(count: int, seed: int = 0) -> np.ndarray:
@@ -35,7 +36,7 @@ def header(form: str, count: object, before: str = "", after: str = "") -> bytes
 @pytest.mark.parametrize(
     ("form", "count"), [("ascii", 1 << 31), ("binary_little_endian", (1 << 64) - 1), ("binary_big_endian", 10)]
 )
-def test_a_header_that_claims_too_much_allocates_nothing(tmp_path: Path, form: str, count: int) -> None:
+def test_false_row_counts_allocate_nothing(tmp_path: Path, form: str, count: int) -> None:
     path = tmp_path / "in.ply"
     path.write_bytes(header(form, count) + b"0 " * 30)
     read_head(path)  # so that nothing is imported while it is measured
@@ -56,7 +57,7 @@ def test_a_header_that_claims_too_much_allocates_nothing(tmp_path: Path, form: s
         ("binary_big_endian", "property list uchar int a\n"),
     ],
 )  # fmt: skip
-def test_other_elements_that_claim_too_much(tmp_path: Path, form: str, other: str) -> None:
+def test_false_counts_of_other_elements_are_refused(tmp_path: Path, form: str, other: str) -> None:
     body = "".join("0 " * 17 + "\n").encode() if form == "ascii" else bytes(17 * 4)
     for before, after in ((f"element a {1 << 40}\n{other}", ""), ("", f"element a {1 << 40}\n{other}")):
         (tmp_path / "in.ply").write_bytes(header(form, 1, before, after) + body)
@@ -67,14 +68,12 @@ def test_other_elements_that_claim_too_much(tmp_path: Path, form: str, other: st
 
 
 @pytest.mark.parametrize("order", ["<", ">", "ascii"])
-def test_rows_are_those_of_plyfile(tmp_path: Path, order: str) -> None:
+def test_rows_equal_those_of_plyfile(tmp_path: Path, order: str) -> None:
     vertex = rows(50)
     vertex["x"][:3] = np.nan, np.inf, -np.inf
     camera = PlyElement.describe(np.zeros(3, [("fx", "f8"), ("n", "i2")]), "intrinsic")
     face = PlyElement.describe(np.array([([0, 1],)], [("corners", "O")]), "face", val_types={"corners": "i4"})
-    text = order == "ascii"
-    elements = [camera, PlyElement.describe(vertex, "vertex"), face]
-    PlyData(elements, text=text, byte_order="=" if text else order).write(str(tmp_path / "in.ply"))
+    write_elements(tmp_path / "in.ply", [camera, PlyElement.describe(vertex, "vertex"), face], order)
     found = read_elements(tmp_path / "in.ply", lambda path, ply: ("vertex",)).elements["vertex"]
     expected = PlyData.read(str(tmp_path / "in.ply"))["vertex"].data
     assert found.dtype == vertex.dtype and found.dtype.isnative and found.flags.writeable
@@ -83,31 +82,30 @@ def test_rows_are_those_of_plyfile(tmp_path: Path, order: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["f4", "f8"])
-def test_values_at_the_ends_warn_of_nothing(tmp_path: Path, kind: str) -> None:
+def test_extreme_values_raise_no_warning(tmp_path: Path, kind: str) -> None:
     vertex = np.zeros(20, [(name, kind) for name in inria_dtype(0).names or ()])
     vertex["rot_0"], vertex["opacity"] = 1, np.linspace(-3, 3, 20)
     vertex["x"] = np.linspace(-1, 1, 20)
     vertex["x"][:2] = -np.finfo(kind).max, np.finfo(kind).max
     for name in ("x", "opacity", "scale_0"):  # NaNs that signal
         vertex[name].view("u4" if kind == "f4" else "u8")[3] = 0x7F800001 if kind == "f4" else 0x7FF0000000000001
-    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(tmp_path / "in.ply"))
+    write_rows(tmp_path / "in.ply", vertex)
     with warnings.catch_warnings(action="error"):
         loaded = load(tmp_path / "in.ply", activated="none")
     assert 0 < len(loaded.gaussians) < 20
 
 
 @pytest.mark.parametrize(("order", "limit"), [("<", 1 << 20), (">", 1500), ("ascii", 1 << 20), ("ascii", 1500)])
-def test_the_fingerprint_is_of_the_bytes_that_were_parsed(
+def test_fingerprint_is_of_the_bytes_parsed(
     tmp_path: Path, order: str, limit: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever becomes of the file meanwhile: replaced, or overwritten in place; elements around the rows count too."""
+    """Also if the file is replaced or overwritten meanwhile; elements around the rows count too."""
     monkeypatch.setattr("clod_adapter.io.ply.header.HEADER_LIMIT", limit)
     path, text = tmp_path / "in.ply", order == "ascii"
     around = [PlyElement.describe(np.arange(3).astype([("n", "i4")]), name) for name in ("before", "after")]
     files = []
     for seed in (0, 1):
-        elements = [around[0], PlyElement.describe(rows(200, seed), "vertex"), around[1]]
-        PlyData(elements, text=text, byte_order="=" if text else order).write(str(path))
+        write_elements(path, [around[0], PlyElement.describe(rows(200, seed), "vertex"), around[1]], order)
         files.append(path.read_bytes())
     old, new = files
     path.write_bytes(old)
@@ -134,9 +132,9 @@ def test_the_fingerprint_is_of_the_bytes_that_were_parsed(
         assert load(path).fingerprint == hashlib.sha256(old[:limit] + new[limit:]).hexdigest()
 
 
-def test_reading_takes_the_memory_of_the_rows_once(tmp_path: Path) -> None:
+def test_reading_allocates_the_rows_once(tmp_path: Path) -> None:
     vertex = rows(60_000)
-    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(tmp_path / "in.ply"))
+    write_rows(tmp_path / "in.ply", vertex)
     read_head(tmp_path / "in.ply")
     tracemalloc.start()
     try:
@@ -169,7 +167,7 @@ LIST = "element face 1\nproperty list uchar int a\n"
         (b"ply\nformat ascii 1.0\n" + b"comment x\n" * 200_000 + b"end_header\n", "no end"),
     ],
 )  # fmt: skip
-def test_malformed_files(tmp_path: Path, content: bytes, message: str) -> None:
+def test_malformed_files_are_refused(tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "in.ply").write_bytes(content)
     with pytest.raises(ClodError, match=message):
         load(tmp_path / "in.ply")

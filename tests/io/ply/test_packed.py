@@ -18,7 +18,7 @@ from scenes import gaussians
 
 @settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(1, 600), st.integers(0, 3), st.booleans(), st.integers(0, 99))
-def test_unpacks_to_within_the_quantisation(tmp_path: Path, count: int, degree: int, colours: bool, seed: int) -> None:
+def test_values_are_within_the_quantisation(tmp_path: Path, count: int, degree: int, colours: bool, seed: int) -> None:
     was = gaussians(count, degree, seed)
     found = load(write_packed(tmp_path / "a.ply", was, colours=colours))
     g = found.gaussians
@@ -51,7 +51,7 @@ def test_unpacks_to_within_the_quantisation(tmp_path: Path, count: int, degree: 
         (b"element vertex 7", b"element vertex 7000000", "is truncated"),
     ],
 )
-def test_damage_is_named(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
+def test_damage_is_refused(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
     path = write_packed(tmp_path / "a.ply", gaussians(7, 1, 0))
     content = path.read_bytes()
     assert old in content
@@ -60,7 +60,7 @@ def test_damage_is_named(tmp_path: Path, old: bytes, new: bytes, message: str) -
         load(path)
 
 
-def test_it_is_checked_converted_and_saved_as_other_files(tmp_path: Path) -> None:
+def test_packed_file_is_checked_and_saved(tmp_path: Path) -> None:
     path = write_packed(tmp_path / "a.compressed.ply", gaussians(700, 3, 5))
     base = load(path)
     save(tmp_path / "out.ply", base.gaussians, base)
@@ -73,7 +73,7 @@ def test_it_is_checked_converted_and_saved_as_other_files(tmp_path: Path) -> Non
         load(path)
 
 
-def test_splat_transform_unpacks_the_same(tmp_path: Path) -> None:
+def test_splat_transform_gives_the_same_values(tmp_path: Path) -> None:
     packed = write_packed(tmp_path / "a.compressed.ply", gaussians(700, 3, 5))
     splat_transform(packed, tmp_path / "b.ply")
     ours, theirs = (read_ply(path).vertex for path in (packed, tmp_path / "b.ply"))

@@ -1,4 +1,4 @@
-"""A dial that nothing describes: a note with what its reading keeps, a warning where that is too little."""
+"""A dial without settings: a note with the share that it keeps, a warning where that is too small."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from scenes import gaussians
 
 
 @pytest.mark.parametrize("normalizer", ["max", "quantile"])
-def test_no_scale_changes_the_other_normalisers(normalizer: str) -> None:
+def test_other_normalizers_need_no_note(normalizer: str) -> None:
     config = AttenuationConfig(normalizer=normalizer)
     some = gaussians(20, 0, 0)
     assert check_plausible(some.means, some.opacity_logits, torch.full((20,), 1e-6), config) == []
@@ -32,9 +32,7 @@ def test_no_scale_changes_the_other_normalisers(normalizer: str) -> None:
         (0.05, "warning: ", ["keeps 0% at s = 1", "likely not what was adapted"]),
     ],
 )
-def test_a_file_without_settings_is_read_with_a_note(
-    tmp_path: Path, factor: float, begin: str, parts: list[str]
-) -> None:
+def test_file_without_settings_has_a_note(tmp_path: Path, factor: float, begin: str, parts: list[str]) -> None:
     """The file keeps six tenths at s = 1 from its typical distance; sigma_d is multiplied by ``factor``."""
     config, path, some = AttenuationConfig(), tmp_path / "a.ply", gaussians(500, 0, 1)
     some = some.replace(means=10 * some.means, opacity_logits=some.opacity_logits.clamp(min=-2))

@@ -9,14 +9,15 @@ import torch
 from PIL import Image
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap import read_colmap, write_model
+from clod_adapter.io.scene.colmap import load_points, read_colmap, write_model
 from clod_adapter.io.scene.colmap_library import pycolmap
 from clod_adapter.io.scene.load import load_scene
-from photographs import as_text, camera, model_of, pixels, pose, write_scene
+from photographs import as_text, camera, pixels, pose, write_scene
 
 
 @pytest.mark.parametrize("form", ["binary", "text", "before rigs"])
-def test_round_trip(tmp_path: Path, form: str) -> None:
+@pytest.mark.usefixtures("library")
+def test_scene_round_trips(tmp_path: Path, form: str) -> None:
     cameras, names = write_scene(tmp_path)
     if form == "text":
         as_text(tmp_path)
@@ -37,7 +38,7 @@ def test_round_trip(tmp_path: Path, form: str) -> None:
         np.testing.assert_array_equal(view.image, pixels(i))
 
 
-def test_model_and_images_elsewhere(tmp_path: Path) -> None:
+def test_model_and_images_are_found_in_other_folders(tmp_path: Path) -> None:
     write_scene(tmp_path, 2)
     model = tmp_path / "sparse" / "0"
     assert len(load_scene(model).train) == 1  # images beside the model's parent
@@ -52,34 +53,34 @@ def test_model_and_images_elsewhere(tmp_path: Path) -> None:
         load_scene(tmp_path / "images" / "deeper")
 
 
-def test_written_points_and_cameras(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("library")
+def test_written_model_is_read_by_pycolmap(tmp_path: Path) -> None:
     xyz, rgb = np.arange(12.0).reshape(4, 3), np.arange(12, dtype=np.uint8).reshape(4, 3)
-    same = [camera(0), camera(1), camera(2, focal=50.0)]
-    write_model(tmp_path, same, ["a.png", "b.png", "c.png"], xyz, rgb)
+    cameras, names = [camera(0), camera(1), camera(2, focal=50.0)], ["a b.png", "c.png", "ü.png"]
+    write_model(tmp_path, cameras, names, xyz, rgb)
     assert {p.name for p in (tmp_path / "sparse").iterdir()} == {"0"}
-    reconstruction = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
-    assert len(reconstruction.cameras) == 2 and {c.model_name for c in reconstruction.cameras.values()} == {"PINHOLE"}
-    points = [reconstruction.points3D[i] for i in sorted(reconstruction.points3D)]
-    np.testing.assert_array_equal([p.xyz for p in points], xyz)
-    np.testing.assert_array_equal([p.color for p in points], rgb)
-    with pytest.raises(ClodError, match="not empty"):
-        write_model(tmp_path, same[:1], ["a.png"])
-    with pytest.raises(ClodError, match="as many different names"):
-        write_model(tmp_path, same[:2], ["a.png", "a.png"])
-    with pytest.raises(ClodError, match="does not exist"):
-        write_model(tmp_path / "no", same[:1], ["a.png"])
-
-
-def test_simple_pinhole(tmp_path: Path) -> None:
-    model_of(tmp_path, "SIMPLE_PINHOLE", [33.0, 20.0, 15.0])
-    Image.fromarray(pixels(0)).save(tmp_path / "a.png")
-    K = load_scene(tmp_path).train[0].camera.K
-    assert K.tolist() == [[33, 0, 20], [0, 33, 15], [0, 0, 1]]
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    assert len(model.cameras) == 2 and {c.model_name for c in model.cameras.values()} == {"PINHOLE"}
+    found = sorted(model.images.values(), key=lambda image: image.name)
+    assert [image.name for image in found] == names
+    for image, wanted in zip(found, cameras, strict=True):
+        np.testing.assert_allclose(image.cam_from_world().matrix(), wanted.viewmat[:3], atol=1e-6)
+    points = [model.points3D[i] for i in sorted(model.points3D)]
+    np.testing.assert_array_equal([point.xyz for point in points], xyz)
+    np.testing.assert_array_equal([point.color for point in points], rgb)
+    assert sorted(load_points(tmp_path).tolist()) == xyz.tolist()
+    for folder, names, message in (
+        (tmp_path, ["a.png"], "not empty"),
+        (tmp_path, ["a.png", "a.png"], "as many different names"),
+        (tmp_path / "no", ["a.png"], "does not exist"),
+    ):
+        with pytest.raises(ClodError, match=message):
+            write_model(folder, cameras[: len(names)], names)
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin", "frames.bin", "rigs.bin"])
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.95])
-def test_cut_models(tmp_path: Path, file: str, share: float) -> None:
+def test_truncated_model_is_refused(tmp_path: Path, file: str, share: float) -> None:
     if file in ("frames.bin", "rigs.bin"):
         pytest.importorskip("pycolmap")  # which alone writes them
     # Handed to COLMAP as it is, a cut points3D.bin makes it allocate until memory runs out.
@@ -91,7 +92,7 @@ def test_cut_models(tmp_path: Path, file: str, share: float) -> None:
         load_scene(tmp_path)
 
 
-def test_rigs_of_several_cameras(tmp_path: Path) -> None:
+def test_poses_of_a_rig_are_composed(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")  # which alone writes rigs
     reconstruction = pycolmap.Reconstruction()
     for i in (1, 2, 3):
@@ -125,7 +126,7 @@ def test_rigs_of_several_cameras(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_empty_and_broken_models(tmp_path: Path) -> None:
+def test_empty_and_damaged_models_are_refused(tmp_path: Path) -> None:
     write_model(tmp_path, [], [])
     with pytest.raises(ClodError, match="no registered image"):
         load_scene(tmp_path)
@@ -139,7 +140,7 @@ def test_empty_and_broken_models(tmp_path: Path) -> None:
     ("name", "train", "test", "size"),
     [("ci_banana", 12, 2, (332, 221)), ("plush_half", 84, 13, (494, 370)), ("bonsai146", 127, 19, (798, 531))],
 )
-def test_real_scenes(
+def test_real_scenes_load(
     shared_data: Callable[[str], Path], name: str, train: int, test: int, size: tuple[int, int]
 ) -> None:
     loaded = load_scene(shared_data(name))
@@ -151,7 +152,7 @@ def test_real_scenes(
     torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
 
 
-def test_a_model_that_cannot_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unreadable_model_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "cameras.bin").write_bytes(b"")
 
     def refuse(path: Path) -> bytes:

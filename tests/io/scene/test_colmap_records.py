@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from PIL import Image
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import read_colmap
 from clod_adapter.io.scene.colmap_records import check_records
 from clod_adapter.io.scene.load import load_scene
-from photographs import damage
+from photographs import damage, write_images
 
 pycolmap = pytest.importorskip("pycolmap")  # which alone writes rigs, frames and text
 FORMS = ("binary", "text")
@@ -41,7 +40,8 @@ def model(folder: Path, form: str, names: tuple[str, ...] = ("a.png", "sub/b.png
 
 @settings(deadline=None, max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data(), st.sampled_from(FORMS), st.booleans())
-def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject, form: str, rigs: bool) -> None:
+@pytest.mark.usefixtures("library")
+def test_damage_raises_only_clod_error(tmp_path: Path, data: st.DataObject, form: str, rigs: bool) -> None:
     whole = model(tmp_path / form, form)
     damaged = tmp_path / "damaged"
     shutil.rmtree(damaged, ignore_errors=True)
@@ -58,7 +58,7 @@ def test_damage_is_never_another_exception(tmp_path: Path, data: st.DataObject, 
 
 @pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])
 @pytest.mark.parametrize("count", [1 << 31, 1 << 62, (1 << 64) - 1])
-def test_counts_of_what_is_not_there(tmp_path: Path, file: str, count: int) -> None:
+def test_counts_beyond_the_file_are_refused(tmp_path: Path, file: str, count: int) -> None:
     path = model(tmp_path, "binary") / f"{file}.bin"
     path.write_bytes(count.to_bytes(8, "little") + path.read_bytes()[8:])
     with pytest.raises(ClodError, match=f"{file}.bin: is truncated or damaged"):
@@ -66,7 +66,7 @@ def test_counts_of_what_is_not_there(tmp_path: Path, file: str, count: int) -> N
 
 
 @pytest.mark.parametrize("file", ["rigs.bin", "frames.txt"])
-def test_pipes_are_not_waited_for(tmp_path: Path, file: str) -> None:
+def test_pipes_are_refused(tmp_path: Path, file: str) -> None:
     target = model(tmp_path, "binary")
     (target / file).unlink(missing_ok=True)
     os.mkfifo(target / file)
@@ -75,7 +75,7 @@ def test_pipes_are_not_waited_for(tmp_path: Path, file: str) -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_long_and_steering_names_are_refused(tmp_path: Path, form: str) -> None:
+def test_long_names_and_control_characters_are_refused(tmp_path: Path, form: str) -> None:
     for name in ("a" * 300 + ".png", "\x1b[2Ja.png"):
         target = model(tmp_path, form, (name,))
         with pytest.raises(ClodError, match="is no file's name") as caught:
@@ -84,23 +84,18 @@ def test_long_and_steering_names_are_refused(tmp_path: Path, form: str) -> None:
 
 
 @pytest.mark.skipif(sys.getfilesystemencoding() != "utf-8", reason="files have ASCII names here")
-def test_usual_and_odd_names_are_names(tmp_path: Path) -> None:
+def test_unusual_names_are_read(tmp_path: Path) -> None:
     names = ("$HOME.png", "a.b/c d.png", "sub\\of windows.png", "~/a.png", "äö ü/日本 (1).png")
     model(tmp_path, "binary", names)
-    for name in names:
-        path = tmp_path / "images" / name.replace("\\", "/")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(path)
+    write_images(tmp_path / "images", [name.replace("\\", "/") for name in names], width=8, height=6)
     scene = load_scene(tmp_path)
     assert [view.camera.name for view in (*scene.test, *scene.train)] == list(names)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links take rights there")
-def test_links_in_the_images_folder_are_followed(tmp_path: Path) -> None:
-    """Whoever made the folder made them, as people do with large captures; a name in a model cannot make one."""
+def test_symbolic_links_to_images_are_followed(tmp_path: Path) -> None:
+    """They are the user's; a name in a model cannot create one."""
     model(tmp_path / "scene", "binary")
-    (tmp_path / "elsewhere" / "sub").mkdir(parents=True)
-    for name in ("a.png", "sub/b.png"):
-        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "elsewhere" / name)
+    write_images(tmp_path / "elsewhere", ["a.png", "sub/b.png"], width=8, height=6)
     (tmp_path / "scene" / "images").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
     assert len(load_scene(tmp_path / "scene").train) == 1

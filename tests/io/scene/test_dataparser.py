@@ -11,19 +11,19 @@ import pytest
 import torch
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
-from PIL import Image
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.io.scene.load import load_scene
 from nerfstudio_frames import APPLIED, trained
-from photographs import camera, pixels, pose
+from photographs import INTRINSICS, camera, to_world, write_frames, write_images
+
+NAMES = [f"images/{i:03d}.png" for i in range(9)]
 
 
 def in_colmap(count: int, seed: int) -> np.ndarray:
     """``[N, 4, 4]`` camera to world of COLMAP, in OpenGL's axes, as nerfstudio has them before it turns the world."""
-    opengl = np.diag([1.0, -1, -1, 1])
-    return np.stack([np.linalg.inv(pose(seed + i).double().numpy()) @ opengl for i in range(count)])
+    return np.array([to_world(seed + i) for i in range(count)])
 
 
 def turned(poses: np.ndarray, applied: Any) -> np.ndarray:
@@ -31,18 +31,11 @@ def turned(poses: np.ndarray, applied: Any) -> np.ndarray:
     return np.vstack([applied, [0, 0, 0, 1.0]]) @ poses if applied is not None else poses
 
 
-def write_transforms(folder: Path, poses: np.ndarray, **rest: Any) -> None:
-    frames = [
-        {"file_path": f"images/{i:03d}.png", "transform_matrix": matrix.tolist()} for i, matrix in enumerate(poses)
-    ]
-    shared = {"fl_x": 30.0, "fl_y": 31.0, "cx": 19.25, "cy": 15.5, "w": 40, "h": 30}
-    (folder / "transforms.json").write_text(json.dumps({**shared, **rest, "frames": frames}))
-
-
-def write_photographs(folder: Path, count: int) -> None:
-    (folder / "images").mkdir(parents=True, exist_ok=True)
-    for i in range(count):
-        Image.fromarray(pixels(i)).save(folder / "images" / f"{i:03d}.png")
+def write_data(folder: Path, poses: np.ndarray, **rest: Any) -> None:
+    """Photographs, and a transforms.json of their poses."""
+    frames = [{"file_path": name, "transform_matrix": p.tolist()} for name, p in zip(NAMES, poses, strict=False)]
+    write_images(folder, NAMES[: len(poses)])
+    write_frames(folder, frames, **INTRINSICS, **rest)
 
 
 def require_poses(folder: Path, want: np.ndarray) -> None:
@@ -58,7 +51,7 @@ def require_poses(folder: Path, want: np.ndarray) -> None:
 
 @settings(deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(["today", "older", "none"]), st.integers(0, 50), st.sampled_from([1.0, 0.25]))
-def test_nerfstudio_data(tmp_path: Path, turn: str, seed: int, applied_scale: float) -> None:
+def test_cameras_of_nerfstudio_data(tmp_path: Path, turn: str, seed: int, applied_scale: float) -> None:
     applied = APPLIED.get(turn)
     given_poses = turned(in_colmap(9, seed), applied)
     up = given_poses[:, :3, 1].mean(0)
@@ -66,27 +59,25 @@ def test_nerfstudio_data(tmp_path: Path, turn: str, seed: int, applied_scale: fl
     want, written = trained(given_poses, applied, applied_scale)
     rest = {} if applied is None else {"applied_transform": applied}
     rest |= {"applied_scale": applied_scale} if applied_scale != 1 else {}
-    write_photographs(tmp_path, 9)
-    write_transforms(tmp_path, given_poses, **rest)
+    write_data(tmp_path, given_poses, **rest)
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps(written))
     require_poses(tmp_path, want)
 
 
 @pytest.mark.parametrize("turn", ["today", "older"])
-def test_the_colmap_model_that_it_was_made_from(tmp_path: Path, turn: str) -> None:
+def test_cameras_of_the_colmap_model(tmp_path: Path, turn: str) -> None:
     """The colmap dataparser, or ns-process-data and its model: the world that is turned is COLMAP's."""
     want, written = trained(turned(in_colmap(9, 0), APPLIED[turn]), APPLIED[turn])
-    write_model(tmp_path, [camera(i) for i in range(9)], [f"{i:03d}.png" for i in range(9)])
-    write_photographs(tmp_path, 9)
+    write_model(tmp_path, [camera(i) for i in range(9)], [Path(name).name for name in NAMES])
+    write_images(tmp_path, NAMES)
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps(written))
     require_poses(tmp_path, want)
 
 
-def test_untouched_poses_stay(tmp_path: Path) -> None:
+def test_poses_that_nerfstudio_did_not_change(tmp_path: Path) -> None:
     """--orientation-method none --center-method none --auto-scale-poses False writes no more than applied_transform."""
     poses = turned(in_colmap(9, 3), APPLIED["today"])
-    write_photographs(tmp_path, 9)
-    write_transforms(tmp_path, poses, applied_transform=APPLIED["today"])
+    write_data(tmp_path, poses, applied_transform=APPLIED["today"])
     written = {"transform": APPLIED["today"], "scale": 1.0}
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps(written))
     require_poses(tmp_path, poses)
@@ -97,29 +88,25 @@ def test_untouched_poses_stay(tmp_path: Path) -> None:
     [
         ("[1, 2]", "is no JSON object"),
         ("{", "is no JSON or damaged"),
-        ("{}", "transform is no 3x4 matrix"),
-        ('{"transform": "x"}', "transform is no 3x4 matrix"),
-        ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1e400]]}', "transform is no 3x4 matrix"),
+        ("{}", "transform is no 3x4 or 4x4 matrix"),
+        ('{"transform": "x"}', "transform is no 3x4 or 4x4 matrix"),
+        ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1e400]]}', "transform is no 3x4 or 4x4 matrix"),
         ('{"transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}', "transform is no rotation"),
         ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]]}', "transform is no rotation"),
-        ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 0}', "scale is 0"),
-        ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": NaN}', "scale is nan"),
-        ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": [1]}', "scale is "),
-        ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": true}', "scale is True"),
+        *((f'{{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": {scale}}}', f"scale is {message}")
+          for scale, message in (("0", "0"), ("NaN", "nan"), ("[1]", ""), ("true", "True"))),
     ],
-)
-def test_damage_is_named(tmp_path: Path, content: str, message: str) -> None:
-    write_photographs(tmp_path, 3)
-    write_transforms(tmp_path, in_colmap(3, 0))
+)  # fmt: skip
+def test_damaged_file_is_refused(tmp_path: Path, content: str, message: str) -> None:
+    write_data(tmp_path, in_colmap(3, 0))
     (tmp_path / "dataparser_transforms.json").write_text(content)
     with pytest.raises(ClodError, match=f"dataparser_transforms.json: {message}"):
         load_scene(tmp_path)
 
 
 @pytest.mark.parametrize("extra", [{"applied_transform": [[1]]}, {"applied_scale": -1}])
-def test_a_transforms_file_that_says_nonsense(tmp_path: Path, extra: dict[str, Any]) -> None:
-    write_photographs(tmp_path, 3)
-    write_transforms(tmp_path, in_colmap(3, 0), **extra)
+def test_invalid_applied_transform_is_refused(tmp_path: Path, extra: dict[str, Any]) -> None:
+    write_data(tmp_path, in_colmap(3, 0), **extra)
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps(trained(in_colmap(3, 0), None)[1]))
     with pytest.raises(ClodError, match=f"transforms.json: {next(iter(extra))} is"):
         load_scene(tmp_path)

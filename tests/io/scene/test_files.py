@@ -16,7 +16,7 @@ def there(folder: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_a_model_and_its_photographs(tmp_path: Path, text: bool) -> None:
+def test_files_of_a_colmap_scene(tmp_path: Path, text: bool) -> None:
     write_scene(tmp_path, 3)
     if text:
         as_text(tmp_path)
@@ -29,7 +29,7 @@ def test_a_model_and_its_photographs(tmp_path: Path, text: bool) -> None:
     assert len(model) >= 3 and there(tmp_path) == model | photographs | {"dataparser_transforms.json"}
 
 
-def test_transforms_and_what_they_name(tmp_path: Path) -> None:
+def test_files_of_transforms_scenes(tmp_path: Path) -> None:
     train = {"frames": [{"file_path": "./train/r_0", "mask_path": "masks/0.png"}, {"file_path": "train\\ü.jpg"}, 7]}
     test = {"frames": [{"file_path": "test/r_0.png", "depth_file_path": "depth/0.tif"}, {"file_path": "a\0\ud800"}]}
     (tmp_path / "transforms_train.json").write_text(json.dumps(train))
@@ -44,7 +44,7 @@ def test_transforms_and_what_they_name(tmp_path: Path) -> None:
     assert there(tmp_path) == {*names, *files}
 
 
-def test_damage_is_for_the_reader_to_say(tmp_path: Path) -> None:
+def test_truncated_model_gives_its_own_path(tmp_path: Path) -> None:
     write_scene(tmp_path, 3)
     images = tmp_path / "sparse" / "0" / "images.bin"
     data = images.read_bytes()

@@ -19,19 +19,19 @@ from clod_adapter.io.scene.folder import name_parts, user_caches
         ("..\\a.png", "leaves the images folder"), ("C:\\a.png", "leaves the images folder"),
     ],
 )  # fmt: skip
-def test_names_that_no_photograph_has(name: str, message: str) -> None:
+def test_invalid_image_names_are_refused(name: str, message: str) -> None:
     with pytest.raises(ClodError, match=f"transforms.json: image name .*{message}") as caught:
         name_parts(name, Path("transforms.json"))
     assert str(caught.value).isprintable()
 
 
-def test_names_that_photographs_have() -> None:
+def test_unusual_image_names_are_split() -> None:
     for name in ("\u00e4\u00f6 \u00fc/\u65e5\u672c (1).png", "a.b/c d.png", "~/a.png", "$HOME.png", "x\u202fPM.png"):
         assert name_parts(name, Path("model")) == tuple(name.split("/"))
     assert name_parts("sub\\a.png", Path("model")) == ("sub", "a.png")
 
 
-def test_caches(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", "/there")
     assert user_caches() == Path("/there")
     monkeypatch.delenv("XDG_CACHE_HOME")

@@ -1,8 +1,9 @@
-"""Photographs that are read when looked at: the same pixels, within the bytes given, and read no more than needed."""
+"""Photographs that are read on access: the same pixels, within the limit, and read no more often than needed."""
 
 from __future__ import annotations
 
 import pickle
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -36,7 +37,7 @@ def numbered(count: int, cache: ImageCache) -> tuple[list[View], list[int]]:
 
 
 @pytest.mark.parametrize("room", [0, 1, 3, 10])
-def test_never_more_than_the_limit(room: int) -> None:
+def test_size_stays_within_the_limit(room: int) -> None:
     cache = ImageCache(room * ONE + ONE // 2)
     views, _ = numbered(8, cache)
     for k in [*range(8), 3, 3, 0, 7, 7, 2]:
@@ -44,7 +45,7 @@ def test_never_more_than_the_limit(room: int) -> None:
         assert cache.held <= cache.limit and cache.held == min(room, 8) * ONE
 
 
-def test_the_latest_stay() -> None:
+def test_most_recently_used_images_are_kept() -> None:
     cache = ImageCache(2 * ONE)
     views, reads = numbered(3, cache)  # 1 and 2 are kept
     for k in (1, 2, 1, 2):
@@ -54,7 +55,7 @@ def test_the_latest_stay() -> None:
     assert reads == [1, 1, 0] and cache.reads == 2
 
 
-def test_a_scene_in_a_small_cache_is_the_same_scene(capture: Any) -> None:
+def test_cached_scene_equals_the_scene(capture: Any) -> None:
     whole, cache = load_scene(capture.scene), ImageCache(2 * ONE)
     stored = load_scene(capture.scene, cache=cache)
     assert stored.notes == whole.notes
@@ -67,9 +68,7 @@ def test_a_scene_in_a_small_cache_is_the_same_scene(capture: Any) -> None:
     assert cache.held <= 2 * ONE and cache.reads > 0
 
 
-def test_a_photograph_that_changes_while_in_use(capture: Any, tmp_path: Path) -> None:
-    import shutil
-
+def test_photograph_that_changes_is_refused(capture: Any, tmp_path: Path) -> None:
     shutil.copytree(capture.scene, tmp_path / "scene")
     stored = load_scene(tmp_path / "scene", cache=ImageCache(0))
     for path in (tmp_path / "scene" / "images").iterdir():
@@ -78,8 +77,7 @@ def test_a_photograph_that_changes_while_in_use(capture: Any, tmp_path: Path) ->
         _ = stored.train[0].image
 
 
-def test_a_stored_view_is_a_view_to_python() -> None:
-    """Replaced, compared, hashed and pickled."""
+def test_stored_view_can_be_replaced_compared_and_pickled() -> None:
     cache = ImageCache(0)
     (view, other), reads = numbered(2, cache)
     assert view == view and view != other and len({view, other, view}) == 2 and reads == [0, 0]
@@ -89,7 +87,7 @@ def test_a_stored_view_is_a_view_to_python() -> None:
     assert type(again) is View and again.camera.name == "1" and torch.equal(again.image, other.image)
 
 
-def test_many_threads_look_at_once() -> None:
+def test_concurrent_reads() -> None:
     cache = ImageCache(2 * ONE)
     views, _ = numbered(5, cache)
     with ThreadPoolExecutor(8) as pool:

@@ -32,7 +32,7 @@ def deep_png(path: Path, values: np.ndarray) -> None:
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
 
 
-def test_grey_and_palette(tmp_path: Path) -> None:
+def test_grey_and_palette_images(tmp_path: Path) -> None:
     Image.fromarray(GREY).save(tmp_path / "grey.png")
     Image.fromarray(GREY).convert("P").save(tmp_path / "palette.png")
     Image.fromarray(GREY > 99).save(tmp_path / "bits.png")
@@ -42,7 +42,7 @@ def test_grey_and_palette(tmp_path: Path) -> None:
         assert notes == []
 
 
-def test_16_bits(tmp_path: Path) -> None:
+def test_16_bit_images(tmp_path: Path) -> None:
     """Grey to the nearest level. Colour by Pillow: exact for former 8 bits, within a level for others."""
     deep = np.random.default_rng(0).integers(0, 65536, (30, 40, 3), dtype=np.uint16)
     deep[0, :3, 0] = 0, 65535, 128  # the ends, and the last value that is nearest to black
@@ -55,7 +55,7 @@ def test_16_bits(tmp_path: Path) -> None:
     assert np.abs(read(tmp_path / "a.png")[0] - deep / 257).max() <= 1
 
 
-def test_planes_of_16_bits_and_32_bits_are_refused(tmp_path: Path) -> None:
+def test_separate_planes_and_32_bits_are_refused(tmp_path: Path) -> None:
     for kind in (np.float32, np.int32):
         Image.fromarray(GREY.astype(kind)).save(tmp_path / "a.tif")
         with pytest.raises(ClodError, match="a.tif: has 32 bits per channel"):
@@ -67,7 +67,7 @@ def test_planes_of_16_bits_and_32_bits_are_refused(tmp_path: Path) -> None:
         read(tmp_path / "a.tif")
 
 
-def test_transparency(tmp_path: Path) -> None:
+def test_transparency_is_laid_over_black(tmp_path: Path) -> None:
     alpha = np.where(GREY > 99, 255, 0).astype(np.uint8)
     Image.fromarray(np.dstack([pixels(0), alpha])).save(tmp_path / "a.png")
     got, notes = read(tmp_path / "a.png")
@@ -82,7 +82,7 @@ def test_transparency(tmp_path: Path) -> None:
     assert got[0, 0].tolist() == [0, 0, 0] and len(notes) == 1
 
 
-def test_cmyk(tmp_path: Path) -> None:
+def test_cmyk_becomes_rgb(tmp_path: Path) -> None:
     smooth = np.broadcast_to(np.linspace(0, 255, 40).astype(np.uint8)[None, :, None], (30, 40, 3))
     Image.fromarray(smooth).convert("CMYK").save(tmp_path / "a.jpg", quality=95)
     got, notes = read(tmp_path / "a.jpg")
@@ -91,7 +91,7 @@ def test_cmyk(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
-def test_exif_rotation_is_applied_where_the_camera_has_the_turned_shape(tmp_path: Path, orientation: int) -> None:
+def test_exif_rotation_is_applied_if_the_camera_has_the_rotated_shape(tmp_path: Path, orientation: int) -> None:
     exif = Image.Exif()
     exif[0x0112] = orientation
     Image.fromarray(pixels(0)).save(tmp_path / "a.png", exif=exif)
@@ -101,10 +101,10 @@ def test_exif_rotation_is_applied_where_the_camera_has_the_turned_shape(tmp_path
     turned, notes = read(tmp_path / "a.png", 300, 400)
     a, b = {5: (0, 0), 6: (-1, 0), 7: (-1, -1), 8: (0, -1)}[orientation]  # what is at the top left once turned
     np.testing.assert_array_equal(turned[0, 0], pixels(0)[a, b])
-    assert turned.shape == (40, 30, 3) and notes == ["turned as their EXIF says, as the cameras have the turned shape"]
+    assert turned.shape == (40, 30, 3) and notes == ["rotated by their EXIF orientation, as the cameras are"]
 
 
-def test_damaged_exif_is_not_looked_at_where_the_shape_fits(tmp_path: Path) -> None:
+def test_damaged_exif_is_ignored_if_the_shape_fits(tmp_path: Path) -> None:
     Image.fromarray(pixels(0)).save(tmp_path / "a.png", exif=b"Exif\0\0" + bytes(range(200)))
     np.testing.assert_array_equal(read(tmp_path / "a.png")[0], pixels(0))
     with pytest.raises(ClodError, match="a.png: "):
@@ -112,7 +112,7 @@ def test_damaged_exif_is_not_looked_at_where_the_shape_fits(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("content", [b"", b"no image", b"\0\0\0\x18ftypheic" + bytes(100)])
-def test_no_known_format(tmp_path: Path, content: bytes) -> None:
+def test_unknown_format_is_refused(tmp_path: Path, content: bytes) -> None:
     with pytest.raises(ClodError, match="a.png: cannot be decoded .*No such file"):
         read(tmp_path / "a.png")
     (tmp_path / "a.heic").write_bytes(content)
@@ -122,7 +122,7 @@ def test_no_known_format(tmp_path: Path, content: bytes) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.webp"])
-def test_cut_files(tmp_path: Path, name: str) -> None:
+def test_truncated_images_are_refused(tmp_path: Path, name: str) -> None:
     Image.fromarray(pixels(0)).save(tmp_path / name)
     content = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes(content[: len(content) * 2 // 3])
@@ -130,7 +130,7 @@ def test_cut_files(tmp_path: Path, name: str) -> None:
         read(tmp_path / name)
 
 
-def test_too_many_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_pixels_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Image.new("1", (60, 40)).save(tmp_path / "a.png")
     assert 2 * Image.MAX_IMAGE_PIXELS == 178_956_970
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
@@ -138,18 +138,16 @@ def test_too_many_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         read(tmp_path / "a.png", 60, 40)
 
 
-def brought_down(path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int, max_width: int) -> np.ndarray:
+def reduced(path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int, max_width: int) -> np.ndarray:
     monkeypatch.setattr(images, "LARGE", 1000)
     image, size, notes = read_image(path, width, height, max_width)
     assert size in ((width, height), (height, width)) and len(notes) == len(set(notes))
-    assert sum("which takes long: brought down first" in what for what, _ in notes) == 1
+    assert sum("which takes long: reduced first" in what for what, _ in notes) == 1
     return np.asarray(image).astype(float)
 
 
 @pytest.mark.parametrize("kind", ["RGB", "L", "RGBA", "P", "I;16", "CMYK"])
-def test_a_large_photograph_is_brought_down_as_its_own_mean(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
+def test_large_image_is_reduced_to_block_means(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """By 3, so that it is at least twice as wide as what is made of it; in bands, of which the last one is cut."""
     width, height = 200, 3 * BAND + 70
     rgb = pixels(3, width, height)
@@ -163,13 +161,13 @@ def test_a_large_photograph_is_brought_down_as_its_own_mean(
     path = tmp_path / ("a.tif" if kind == "CMYK" else "a.png")
     image.save(path)
     whole = read(path, width, height)[0].astype(float)
-    got = brought_down(path, monkeypatch, width, height, 33)
+    got = reduced(path, monkeypatch, width, height, 33)
     assert got.shape == (-(-height // 3), -(-width // 3), 3)
     want = whole[: height // 3 * 3, : width // 3 * 3].reshape(height // 3, 3, width // 3, 3, 3).mean((1, 3))
     assert np.abs(got[: height // 3, : width // 3] - want).max() <= 1
 
 
-def test_a_large_jpeg_is_brought_down_while_it_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_jpeg_is_reduced_while_decoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ramp = np.linspace(0, 255, 400 * 300).reshape(300, 400).astype(np.uint8)
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -178,12 +176,12 @@ def test_a_large_jpeg_is_brought_down_while_it_is_decoded(tmp_path: Path, monkey
     loaded = []
     convert = images._converted
     monkeypatch.setattr(images, "_converted", lambda image, *rest: loaded.append(image.size) or convert(image, *rest))
-    got = brought_down(tmp_path / "a.jpg", monkeypatch, 300, 400, 30)  # by 5, of which 4 by the decoder
+    got = reduced(tmp_path / "a.jpg", monkeypatch, 300, 400, 30)  # by 5, of which 4 by the decoder
     assert loaded == [(100, 75)] and got.shape == (100, 75, 3)
     assert np.abs(got - whole.reshape(100, 4, 75, 4, 3).mean((1, 3))).max() < 4
 
 
-def test_another_shape_is_said_before_anything_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_shape_is_refused_before_decoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Image.fromarray(GREY).save(tmp_path / "a.png")
     monkeypatch.setattr(images, "_rgb", None)
     for height in (30, 40):  # a turned one, too, as there is no EXIF
@@ -191,7 +189,7 @@ def test_another_shape_is_said_before_anything_is_decoded(tmp_path: Path, monkey
             read(tmp_path / "a.png", 30, height)
 
 
-def test_room_for_pixels() -> None:
+def test_pixels_in_work_are_limited() -> None:
     """Two that fit are worked on together, a third waits, and one that is too large for all comes in alone."""
     room, order = Room(100), list[str]()
     ready = threading.Barrier(3)

@@ -11,16 +11,17 @@ import pytest
 import torch
 from PIL import Image
 
+from clod_adapter._support.workers import in_order
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.io.scene.images import read_image
 from clod_adapter.io.scene.load import load_scene
 from clod_adapter.progress import Stopped
-from photographs import as_text, camera, model_of, pixels, write_scene
+from photographs import as_text, camera, pixels, write_scene
 
 
-def test_missing_images(tmp_path: Path) -> None:
-    """Named, and left out without a change to what is held out; too many are refused."""
+def test_missing_images_are_noted_or_refused(tmp_path: Path) -> None:
+    """The held-out images stay the same; more than half missing is an error."""
     names = sorted(write_scene(tmp_path, 18)[1])
     for name in names[2:11]:
         (tmp_path / "images" / name).unlink()
@@ -31,12 +32,12 @@ def test_missing_images(tmp_path: Path) -> None:
     assert [view.camera.name for view in loaded.test] == [names[0], names[16]]  # the 8th is missing, the rest stay
     assert [view.camera.name for view in loaded.train] == [names[1], *names[11:16], names[17]]
     (tmp_path / "images" / names[0]).unlink()
-    said = r"10 of 18 images of the model are missing \(sub/001.png, sub/003.png, sub/004.png, \.\.\.\), more than half"
-    with pytest.raises(ClodError, match=said):
+    text = r"10 of 18 images of the model are missing \(sub/001.png, sub/003.png, sub/004.png, \.\.\.\), more than half"
+    with pytest.raises(ClodError, match=text):
         load_scene(tmp_path)
 
 
-def test_smaller_copies_where_there_are_no_images(tmp_path: Path) -> None:
+def test_smaller_copies_replace_missing_images(tmp_path: Path) -> None:
     write_scene(tmp_path, 3)
     (tmp_path / "images").rename(tmp_path / "images_2")
     for name in ("images_4", "input"):
@@ -49,7 +50,7 @@ def test_smaller_copies_where_there_are_no_images(tmp_path: Path) -> None:
     loaded = load_scene(tmp_path)
     assert loaded.notes == (
         "the photographs are those in images_2, as there are more than in images",
-        "3 of 3 images are 20x15 where the model says 40x30: intrinsics scaled",
+        "3 of 3 images are 20x15 where the model has 40x30: intrinsics scaled",
     )
     torch.testing.assert_close(loaded.test[0].camera.K[:2] * 2, camera(2, focal=30.0).K[:2])
     for file in (tmp_path / "images_2" / "sub").iterdir():
@@ -61,7 +62,7 @@ def test_smaller_copies_where_there_are_no_images(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_several_cameras_and_sizes(tmp_path: Path) -> None:
+def test_images_of_another_size_scale_the_intrinsics(tmp_path: Path) -> None:
     cameras = [camera(0), camera(1, 64, 48), camera(2, 30, 40)]
     write_model(tmp_path, cameras, ["a.png", "b.png", "c.png"])
     (tmp_path / "images").mkdir()
@@ -70,11 +71,13 @@ def test_several_cameras_and_sizes(tmp_path: Path) -> None:
         image.resize((image.width // 2, image.height // 2)).save(tmp_path / "images" / f"{name}.png")
     loaded = load_scene(tmp_path)
     views = [*loaded.test, *loaded.train]
+    for view, was in zip(views, cameras, strict=True):
+        torch.testing.assert_close(view.camera.K, was.K / torch.tensor([[2.0], [2.0], [1.0]]))
     assert [(view.camera.width, view.camera.height) for view in views] == [(20, 15), (32, 24), (15, 20)]
-    assert loaded.notes == ("3 of 3 images are 20x15 where the model says 40x30 (and 2 more): intrinsics scaled",)
+    assert loaded.notes == ("3 of 3 images are 20x15 where the model has 40x30 (and 2 more): intrinsics scaled",)
 
 
-def test_two_images_of_one_name(tmp_path: Path) -> None:
+def test_duplicate_image_names_are_refused(tmp_path: Path) -> None:
     write_scene(tmp_path, 2)
     as_text(tmp_path)
     listed = tmp_path / "sparse" / "0" / "images.txt"
@@ -83,7 +86,7 @@ def test_two_images_of_one_name(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_an_interrupted_load_reads_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stopped_load_reads_no_more_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_scene(tmp_path, 40)
     read: list[Path] = []
 
@@ -112,18 +115,7 @@ def test_wide_images_are_scaled_with_their_intrinsics(tmp_path: Path) -> None:
     assert load_scene(tmp_path, max_width=40).notes == ()
 
 
-def test_images_of_another_size_than_the_camera(tmp_path: Path) -> None:
-    model_of(tmp_path, "PINHOLE", [330, 340, 200, 150], width=400, height=300)
-    Image.fromarray(pixels(0)).save(tmp_path / "a.png")
-    loaded = load_scene(tmp_path)
-    assert loaded.notes == ("1 of 1 images are 40x30 where the model says 400x300: intrinsics scaled",)
-    torch.testing.assert_close(loaded.train[0].camera.K, torch.tensor([[33.0, 0, 20], [0, 34, 15], [0, 0, 1]]))
-    Image.fromarray(pixels(0, 30, 40)).save(tmp_path / "a.png")
-    with pytest.raises(ClodError, match="a.png: is 30x40, its camera 400x300, another shape"):
-        load_scene(tmp_path)
-
-
-def test_split_and_single_image(tmp_path: Path) -> None:
+def test_train_and_test_split(tmp_path: Path) -> None:
     (tmp_path / "ten").mkdir()
     (tmp_path / "one").mkdir()
     write_scene(tmp_path / "ten")
@@ -142,73 +134,51 @@ def test_split_and_single_image(tmp_path: Path) -> None:
         load_scene(tmp_path / "two")
 
 
-def test_what_the_scene_does_not_need(tmp_path: Path) -> None:
-    """Of each the reason, and none that the scene does need."""
+def test_left_out_names_skipped_steps_only(tmp_path: Path) -> None:
+    """Each with its reason; nothing that the scene does not have and no default would do."""
     (tmp_path / "plain").mkdir()
     write_scene(tmp_path / "plain", 3)
     spared = dict(load_scene(tmp_path / "plain").left_out)
-    assert set(spared) == {"undistortion", "alpha", "masks", "exposure", "scaling"}
+    assert set(spared) == {"undistortion", "scaling"}
     assert spared["undistortion"] == "all 3 cameras are pinholes"
-    assert spared["alpha"] == "none of 3 photographs has transparency"
     assert spared["scaling"] == "all 3 photographs are used at full resolution"
     scaled = dict(load_scene(tmp_path / "plain", max_width=20).left_out)
     assert "scaling" not in scaled
     assert scaled["pixels"].startswith("kept are 0.0027 MB of the 0.0108 MB in the files")  # 3 x 20x15 and 40x30, RGB
-    (see_through := Image.fromarray(pixels(0))).putalpha(99)
-    see_through.save(tmp_path / "plain" / "images" / "sub" / "002.png")
-    assert "alpha" not in dict(load_scene(tmp_path / "plain").left_out)
 
 
-def test_undistortion_is_not_even_imported_for_pinholes(tmp_path: Path) -> None:
-    (tmp_path / "pinhole").mkdir()
-    write_scene(tmp_path / "pinhole", 2)
-    model_of(tmp_path / "lens", "SIMPLE_RADIAL", [33, 20, 15, -0.1])
-    Image.fromarray(pixels(0)).save(tmp_path / "lens" / "a.png")
+def test_undistortion_is_not_imported_for_pinholes(tmp_path: Path) -> None:
+    write_scene(tmp_path, 2)
     code = (
-        "import os, sys\n"
-        "import clod_adapter.io.checkpoint, clod_adapter.io.adapter_file\n"
+        "import sys, clod_adapter.io.checkpoint, clod_adapter.io.adapter_file\n"
         "assert 'pycolmap' not in sys.modules\n"
-        "from clod_adapter import load_scene\n"
-        "for name in ('pinhole', 'lens'):\n"
-        "    spared = dict(load_scene(name).left_out)\n"
-        "    loaded = 'clod_adapter.io.scene.undistort' in sys.modules\n"
-        "    print(name, loaded, 'undistortion' in spared, os.path.exists('cache'))"
+        "import clod_adapter\n"
+        "clod_adapter.load_scene('.')\n"
+        "assert 'clod_adapter.io.scene.undistort' not in sys.modules"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")},
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert done.stdout.split("\n")[:2] == ["pinhole False True False", "lens True False True"]
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)
+    assert not (tmp_path / "cache").exists()
 
 
-def test_a_photograph_in_colour_is_in_memory_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Converting what is RGB already copies it, as large as it is in the file."""
+def test_rgb_image_is_not_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``Image.convert`` would copy it at full size."""
     Image.fromarray(pixels(0, 64, 48)).save(tmp_path / "a.jpg")
     monkeypatch.setattr(Image.Image, "convert", lambda *_, **__: pytest.fail("copies"))
     read, *_ = read_image(tmp_path / "a.jpg", 64, 48, 1600)
     assert read.mode == "RGB" and np.asarray(read).shape == (48, 64, 3)
 
 
-def test_only_so_many_photographs_are_decoded_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As many as torch has threads, at least two; what comes out does not depend on it."""
+@pytest.mark.parametrize(("threads", "workers"), [(1, 2), (5, 5), (99, 8)])
+def test_number_of_decoding_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int, workers: int
+) -> None:
+    """That of torch, within 2 to 8; the views do not depend on it."""
     write_scene(tmp_path, 12)
-    now, most = [0], [0]
-
-    def counted(path: Path, width: int, height: int, max_width: int) -> object:
-        now[0] += 1
-        most[0] = max(most[0], now[0])
-        time.sleep(0.01)
-        now[0] -= 1
-        return read_image(path, width, height, max_width)
-
-    monkeypatch.setattr("clod_adapter.io.scene.load.read_image", counted)
-    found = []
-    for threads, limit in ((1, 2), (5, 5), (99, 8)):
-        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
-        most[0] = 0
-        found.append(load_scene(tmp_path))
-        assert 1 <= most[0] <= limit
-    assert most[0] > 2
-    for other in found[1:]:
-        pairs = zip((*found[0].train, *found[0].test), (*other.train, *other.test), strict=True)
-        assert all(a.image.equal(b.image) and a.camera.name == b.camera.name for a, b in pairs)
+    before, used = load_scene(tmp_path), list[int]()
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    name = "clod_adapter.io.scene.load.in_order"
+    monkeypatch.setattr(name, lambda loads, count: used.append(count) or in_order(loads, count))
+    after = load_scene(tmp_path)
+    pairs = zip((*before.train, *before.test), (*after.train, *after.test), strict=True)
+    assert all(a.image.equal(b.image) and a.camera.name == b.camera.name for a, b in pairs) and used == [workers]

@@ -20,7 +20,7 @@ from clod_adapter.io.scene.poses import load_cameras
 
 
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (10.0, -20.0, 30.0)])
-def test_as_with_photographs(capture: Any, origin: tuple[float, float, float]) -> None:
+def test_cameras_equal_those_of_load_scene(capture: Any, origin: tuple[float, float, float]) -> None:
     scene = clod_adapter.load_scene(capture.scene, origin=origin)
     views = sorted([*scene.train, *scene.test], key=lambda view: view.camera.name)
     cameras, notes = load_cameras(capture.scene, origin)
@@ -32,7 +32,7 @@ def test_as_with_photographs(capture: Any, origin: tuple[float, float, float]) -
     assert names == [view.camera.name for view in scene.train] and len(names) == 8
 
 
-def test_the_frame_that_nerfstudio_trained_in(capture: Any, tmp_path: Path) -> None:
+def test_cameras_are_in_the_frame_of_nerfstudio(capture: Any, tmp_path: Path) -> None:
     shutil.copytree(capture.scene, tmp_path / "scene")
     frame = {"transform": [[0, 1, 0, 1], [-1, 0, 0, 2], [0, 0, 1, 3]], "scale": 0.5}
     (tmp_path / "scene" / "dataparser_transforms.json").write_text(json.dumps(frame))
@@ -41,7 +41,7 @@ def test_the_frame_that_nerfstudio_trained_in(capture: Any, tmp_path: Path) -> N
     assert torch.equal(camera.viewmat, want.viewmat) and camera.near == want.near
 
 
-def test_a_scene_in_a_small_unit_has_a_near_plane_that_fits(tmp_path: Path) -> None:
+def test_near_plane_follows_the_unit_of_length(tmp_path: Path) -> None:
     size = 1e-3
     cameras = [replace(c, viewmat=_moved(c.viewmat, size)) for c in scenes.ring(4, 20, 10)]
     write_model(tmp_path, cameras, [camera.name for camera in cameras])
@@ -53,7 +53,7 @@ def _moved(viewmat: torch.Tensor, by: float) -> torch.Tensor:
     return torch.cat([viewmat[:, :3], viewmat[:, 3:] * torch.tensor([[by], [by], [by], [1.0]])], 1)
 
 
-def test_photographs_need_not_be_there(capture: Any, tmp_path: Path) -> None:
+def test_missing_photographs_are_no_error(capture: Any, tmp_path: Path) -> None:
     shutil.copytree(capture.scene / "sparse", tmp_path / "sparse")
     assert len(load_cameras(tmp_path)[0]) == 10
     shutil.rmtree(tmp_path / "sparse")
@@ -61,7 +61,7 @@ def test_photographs_need_not_be_there(capture: Any, tmp_path: Path) -> None:
         load_cameras(tmp_path)
 
 
-def test_a_camera_without_a_size_is_left_out(tmp_path: Path) -> None:
+def test_camera_without_a_size_is_left_out(tmp_path: Path) -> None:
     frames = [{"file_path": f"{k}.png", "transform_matrix": torch.eye(4).tolist()} for k in range(2)]
     frames[1] |= {"w": 20, "h": 10}
     (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))

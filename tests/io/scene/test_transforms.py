@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -13,38 +12,29 @@ from PIL import Image
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap_library import pycolmap
 from clod_adapter.io.scene.load import load_scene
-from photographs import camera, model_of, pixels, pose, psnr_of, seen
-
-SHARED = {"fl_x": 30.0, "fl_y": 31.0, "cx": 19.25, "cy": 15.5, "w": 40, "h": 30}
-
-
-def to_world(seed: int) -> list[list[float]]:
-    """The pose of ``photographs.camera(seed)`` as a transforms file has it."""
-    opengl = np.diag([1.0, -1.0, -1.0, 1.0])
-    return (np.linalg.inv(pose(seed).double().numpy()) @ opengl).tolist()
+from photographs import (
+    INTRINSICS,
+    camera,
+    model_of,
+    pixels,
+    pose,
+    psnr_of,
+    seen,
+    to_world,
+    write_frames,
+    write_images,
+)
 
 
 def frame(i: int, **rest: Any) -> dict[str, Any]:
     return {"file_path": f"images/{i:03d}.png", "transform_matrix": to_world(i), **rest}
 
 
-def write(folder: Path, frames: list[Any], file: str = "transforms.json", **rest: Any) -> Path:
-    folder.mkdir(exist_ok=True)
-    (folder / file).write_text(json.dumps({**rest, "frames": frames}))
-    return folder
-
-
-def photographs(folder: Path, names: list[str]) -> None:
-    for i, name in enumerate(names):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(pixels(i)).save(folder / name)
-
-
-def test_nerfstudio(tmp_path: Path) -> None:
+def test_nerfstudio_file(tmp_path: Path) -> None:
     frames = [frame(i) for i in reversed(range(10))]  # sorted by name, whatever the order in the file
     frames[0]["fl_x"] = 33.0  # its own camera
-    write(tmp_path, frames, camera_model="OPENCV", k1=0, k2=0, p1=0, p2=0, ply_file_path="../no.ply", **SHARED)
-    photographs(tmp_path, [f"images/{i:03d}.png" for i in range(10)])
+    write_frames(tmp_path, frames, camera_model="OPENCV", k1=0, k2=0, p1=0, p2=0, ply_file_path="no.ply", **INTRINSICS)
+    write_images(tmp_path, [f"images/{i:03d}.png" for i in range(10)])
     loaded = load_scene(tmp_path)
     assert loaded.notes == ()
     assert [view.camera.name for view in loaded.test] == ["images/000.png", "images/008.png"]
@@ -57,24 +47,24 @@ def test_nerfstudio(tmp_path: Path) -> None:
         np.testing.assert_array_equal(view.image, pixels(i))
 
 
-def test_axes_are_opengls(tmp_path: Path) -> None:
+def test_axes_are_those_of_opengl(tmp_path: Path) -> None:
     """A camera at z = 4 that looks down the z axis with y up sees a point above the origin above the middle."""
     matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
-    write(tmp_path, [{"file_path": "a.png", "transform_matrix": matrix}], **SHARED)
-    photographs(tmp_path, ["a.png"])
+    write_frames(tmp_path, [{"file_path": "a.png", "transform_matrix": matrix}], **INTRINSICS)
+    write_images(tmp_path, ["a.png"])
     view = load_scene(tmp_path).train[0]
     assert (view.camera.viewmat @ torch.tensor([0.5, 1.0, 0.0, 1.0])).tolist() == [0.5, -1, 4, 1]
     assert view.camera.position.tolist() == [0, 0, 4]
 
 
-def test_blender(tmp_path: Path) -> None:
+def test_blender_files(tmp_path: Path) -> None:
     """Names without an extension, a field of view and no size, and files for training and testing."""
     angle = 2 * math.atan(20 / 50)
     for split, count in (("train", 3), ("test", 2), ("val", 1)):
         names = [f"./{split}/r_{i}" for i in range(count)]
         frames = [{"file_path": name, "rotation": 0.01, "transform_matrix": to_world(2)} for name in names]
-        write(tmp_path, frames, f"transforms_{split}.json", camera_angle_x=angle)
-        photographs(tmp_path, [f"{name}.png" for name in names])
+        write_frames(tmp_path, frames, f"transforms_{split}.json", camera_angle_x=angle)
+        write_images(tmp_path, [f"{name}.png" for name in names])
     loaded = load_scene(tmp_path)
     assert [view.camera.name for view in loaded.train] == ["train/r_0.png", "train/r_1.png", "train/r_2.png"]
     assert [view.camera.name for view in loaded.test] == ["test/r_0.png", "test/r_1.png"]
@@ -85,13 +75,13 @@ def test_blender(tmp_path: Path) -> None:
     assert ([view.camera.name for view in loaded.test], len(loaded.train)) == (["train/r_0.png"], 2)
 
 
-def test_instant_ngp(tmp_path: Path) -> None:
+def test_instant_ngp_file(tmp_path: Path) -> None:
     """Angles in place of focal lengths; one focal length for both axes; JPEGs under names without an extension."""
     angles = {"camera_angle_x": 1.0, "camera_angle_y": 0.8}
-    one = write(tmp_path / "one", [frame(0)], aabb_scale=16, w=40, h=30, **angles)
-    two = write(tmp_path / "two", [frame(0), {**frame(1), "file_path": "images/b.001"}], fl_x=30.0, scale=0.3)
-    photographs(one, ["images/000.png"])
-    photographs(two, ["images/000.png", "images/b.001.jpg"])
+    one = write_frames(tmp_path / "one", [frame(0)], aabb_scale=16, w=40, h=30, **angles)
+    two = write_frames(tmp_path / "two", [frame(0), {**frame(1), "file_path": "images/b.001"}], fl_x=30.0, scale=0.3)
+    write_images(one, ["images/000.png"])
+    write_images(two, ["images/000.png", "images/b.001.jpg"])
     K = load_scene(one).train[0].camera.K
     torch.testing.assert_close(K.diag()[:2], torch.tensor([20 / math.tan(0.5), 15 / math.tan(0.4)]))
     view = load_scene(two).train[0]
@@ -104,7 +94,7 @@ ROUND = {"k1": 0.03, "k2": -0.01, "k3": 0.002, "k4": 0.001}
 
 
 @pytest.mark.parametrize(
-    ("said", "model", "params"),
+    ("message", "model", "params"),
     [
         ({"camera_model": "OPENCV", **LENS}, "OPENCV", [*LENS.values()]),
         ({**LENS, "k3": 0.02}, "FULL_OPENCV", [*LENS.values(), 0.02, 0, 0, 0]),
@@ -112,13 +102,13 @@ ROUND = {"k1": 0.03, "k2": -0.01, "k3": 0.002, "k4": 0.001}
         ({"is_fisheye": True, **ROUND}, "OPENCV_FISHEYE", [*ROUND.values()]),
     ],
 )
-def test_distortion(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: dict[str, Any], model: str, params: list[float]
+def test_distorted_photographs_are_undistorted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: dict[str, Any], model: str, params: list[float]
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     lens = pycolmap.Camera(model=model, width=160, height=120, params=[120, 122, 82, 58, *params])
-    shared = {"fl_x": 120, "fl_y": 122, "cx": 82, "cy": 58, "w": 160, "h": 120, **said}
-    scene = write(tmp_path / "scene", [{"file_path": "a.png", "transform_matrix": to_world(0)}], **shared)
+    shared = {"fl_x": 120, "fl_y": 122, "cx": 82, "cy": 58, "w": 160, "h": 120, **message}
+    scene = write_frames(tmp_path / "scene", [{"file_path": "a.png", "transform_matrix": to_world(0)}], **shared)
     Image.fromarray(seen(lens)).save(scene / "a.png")
     loaded = load_scene(scene)
     view, K = loaded.train[0], loaded.train[0].camera.K
@@ -128,21 +118,21 @@ def test_distortion(
     assert f"undistorted from {model} into" in loaded.notes[0]
 
 
-def test_the_colmap_model_is_taken_where_there_are_both(tmp_path: Path) -> None:
+def test_colmap_model_takes_precedence(tmp_path: Path) -> None:
     model_of(tmp_path, "PINHOLE", [33, 33, 20, 15])
-    write(tmp_path, [frame(0)], **SHARED)
-    photographs(tmp_path, ["images/a.png"])
+    write_frames(tmp_path, [frame(0)], **INTRINSICS)
+    write_images(tmp_path, ["images/a.png"])
     loaded = load_scene(tmp_path)
     assert loaded.notes == ("the cameras are the COLMAP model's, not those of transforms.json",)
     assert loaded.train[0].camera.K[0, 0] == 33
-    deeper = write(tmp_path / "images", [{**frame(0), "file_path": "a"}], **SHARED)
+    deeper = write_frames(tmp_path / "images", [{**frame(0), "file_path": "a"}], **INTRINSICS)
     assert load_scene(deeper).train[0].camera.K[0, 0] == 30  # nearer than the model beside the folder
 
 
-def test_missing_photographs_and_what_is_not_used(tmp_path: Path) -> None:
+def test_missing_photographs_and_unused_entries_are_noted(tmp_path: Path) -> None:
     frames = [frame(i, mask_path="masks/0.png") for i in range(10)]
-    write(tmp_path, frames, fl_x=30.0, applied_transform=[[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
-    photographs(tmp_path, [f"images/{i:03d}.png" for i in range(10) if i != 3])
+    write_frames(tmp_path, frames, fl_x=30.0, applied_transform=[[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
+    write_images(tmp_path, [f"images/{i:03d}.png" for i in range(10) if i != 3])
     assert load_scene(tmp_path).notes == (
         "transforms.json turned COLMAP's world (applied_transform): a checkpoint of the turned one is needed",
         "the masks of transforms.json are not used",
@@ -154,10 +144,10 @@ def test_missing_photographs_and_what_is_not_used(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_few_digits_are_rounded_rotations(tmp_path: Path) -> None:
+def test_rotation_of_few_digits_is_made_orthogonal(tmp_path: Path) -> None:
     rounded = np.round(to_world(5), 3).tolist()
-    write(tmp_path, [{"file_path": "a.png", "transform_matrix": rounded}], **SHARED)
-    photographs(tmp_path, ["a.png"])
+    write_frames(tmp_path, [{"file_path": "a.png", "transform_matrix": rounded}], **INTRINSICS)
+    write_images(tmp_path, ["a.png"])
     viewmat = load_scene(tmp_path).train[0].camera.viewmat
     torch.testing.assert_close(viewmat, pose(5), atol=0.01, rtol=0)
     torch.testing.assert_close(viewmat[:3, :3] @ viewmat[:3, :3].T, torch.eye(3), atol=1e-6, rtol=0)
@@ -170,26 +160,20 @@ def changed(row: int, column: int, value: float) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"file_path": "../a.png"}, "leaves the images folder"),
         ({"file_path": "a\x1b[2J.png"}, "is no file's name"),
         ({"file_path": 3}, "frame 0 has no file_path"),
-        ({"transform_matrix": None}, "frame a.png: transform_matrix is no 4x4 matrix"),
-        ({"transform_matrix": "none"}, "no 4x4 matrix"),
-        ({"transform_matrix": [[1, 0, 0], [0, 1, 0]]}, "no 4x4 matrix"),
-        ({"transform_matrix": [[1, 0, 0, 0], [0, 1]]}, "no 4x4 matrix"),
-        ({"transform_matrix": [[10**400, 0, 0, 0]] * 4}, "no 4x4 matrix"),
-        (changed(0, 0, math.nan), "no 4x4 matrix of finite"),
+        ({"transform_matrix": None}, "frame a.png: transform_matrix is no 3x4 or 4x4 matrix"),
+        *(({"transform_matrix": matrix}, "no 3x4 or 4x4 matrix of finite") for matrix in (
+            "none", [[1, 0, 0], [0, 1, 0]], [[1, 0, 0, 0], [0, 1]], [[10**400, 0, 0, 0]] * 4)),
+        (changed(0, 0, math.nan), "no 3x4 or 4x4 matrix of finite"),
         (changed(0, 3, 1e12), "'a.png' has a camera or pose that is not usable"),
-        (changed(0, 0, 1e200), "frame a.png: transform_matrix is no rotation"),
-        (changed(0, 0, 1.1), "no rotation"),
-        (changed(1, 1, -1), "no rotation"),
-        (changed(3, 0, 1), "no rotation"),
-        ({"fl_x": "wide"}, "fl_x is no number"),
-        ({"fl_x": math.inf}, "fl_x is no number"),
-        ({"fl_x": -30}, "neither fl_x nor camera_angle_x"),
-        ({"fl_x": 0, "camera_angle_x": 4}, "neither fl_x nor camera_angle_x"),
+        *((changed(*entry), "frame a.png: transform_matrix is no rotation") for entry in (
+            (0, 0, 1e200), (0, 0, 1.1), (1, 1, -1), (3, 0, 1))),
+        *(({"fl_x": value}, "fl_x is no number") for value in ("wide", math.inf)),
+        *((change, "neither fl_x nor camera_angle_x") for change in ({"fl_x": -30}, {"fl_x": 0, "camera_angle_x": 4})),
         ({"w": 1e30}, "w is no number below"),
         ({"cx": [1]}, "cx is no number"),
         ({"k1": math.nan}, "k1 is no number"),
@@ -197,34 +181,27 @@ def changed(row: int, column: int, value: float) -> dict[str, Any]:
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR' is not known"),
         ({"camera_model": {"a": 1}}, "camera_model .* is not known"),
     ],
-)
-def test_bad_frames_are_named(tmp_path: Path, change: dict[str, Any], said: str) -> None:
-    write(tmp_path, [{"file_path": "a.png", "transform_matrix": to_world(0), **SHARED, **change}])
-    with pytest.raises(ClodError, match=said) as caught:
+)  # fmt: skip
+def test_invalid_frame_is_named(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    write_frames(tmp_path, [{"file_path": "a.png", "transform_matrix": to_world(0), **INTRINSICS, **change}])
+    with pytest.raises(ClodError, match=message) as caught:
         load_scene(tmp_path)
     assert len(str(caught.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
-        (b"", "no JSON or damaged"),
-        (b'{"frames": [', "no JSON or damaged"),
-        (b"\xff\xfe\x00", "no JSON or damaged"),
-        (b"[" * 100_000, "no JSON or damaged"),
-        (b'{"frames": ' + b"9" * 10_000 + b"}", "no JSON or damaged"),
-        (b"[]", "no list of frames"),
-        (b"3", "no list of frames"),
-        (b'{"frames": []}', "no list of frames"),
-        (b'{"frames": {}}', "no list of frames"),
-        (b'{"frames": [3]}', "frame 0 has no file_path"),
-        (b"{", "is larger than 256 MB"),
+        *((content, "no JSON or damaged") for content in (
+            b"", b'{"frames": [', b"\xff\xfe\x00", b"[" * 100_000, b'{"frames": ' + b"9" * 10_000 + b"}")),
+        *((content, "no list of frames") for content in (b"[]", b"3", b'{"frames": []}', b'{"frames": {}}')),
+        (b'{"frames": [3]}', "frame 0 has no file_path"), (b"{", "is larger than 256 MB"),
     ],
-)
-def test_damaged_files(tmp_path: Path, content: bytes, said: str) -> None:
+)  # fmt: skip
+def test_damaged_file_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
     with (tmp_path / "transforms.json").open("wb") as file:
         file.write(content)
-        if said.startswith("is larger"):
+        if message.startswith("is larger"):
             file.truncate(300 * 2**20)
-    with pytest.raises(ClodError, match=f"transforms.json: .*{said}"):
+    with pytest.raises(ClodError, match=f"transforms.json: .*{message}"):
         load_scene(tmp_path)
