@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from clod_adapter.attenuation import SIGMA_MAX
+from clod_adapter.equation.attenuation import SIGMA_MAX
 
 import mpmath
 import numpy as np

@@ -19,9 +19,9 @@ from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import exact
-from clod_adapter.attenuation import SIGMA_MAX, attenuate, log_attenuation
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.extinction import extinction_scale, sigma_for_extinction
+from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate, log_attenuation
+from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.training.target_count import count_slope, soft_count
 from common import table
 from equation_tally import Tallies

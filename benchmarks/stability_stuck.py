@@ -15,8 +15,8 @@ from dataclasses import replace
 from typing import Any
 
 import clod_adapter as clod
-from clod_adapter.attenuation import SIGMA_MAX, attenuate
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.initialization.importance import sigma_from_importance
 from clod_adapter.losses import photometric_loss
 from clod_adapter.training.target_count import count_gradient, soft_count, target_curve

@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from clod_adapter._support.version import package_version
-from clod_adapter.attenuation import SIGMA_MAX
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter
+from clod_adapter.equation.attenuation import SIGMA_MAX
+from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.origin import NOWHERE, Origin
-from clod_adapter.units import in_world_units
 
 HALF_ERROR = 2e-3  # the rounding that a difference may suffer, as a share of the largest
 ATTRIBUTES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import detach
-from clod_adapter.attenuation import Attenuated
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera
-from clod_adapter.distances import typical_distance
+from clod_adapter.equation.attenuation import Attenuated
+from clod_adapter.equation.distances import typical_distance
+from clod_adapter.equation.extinction import extinction_scale
 from clod_adapter.errors import ClodError
-from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import OPAQUE, Gaussians
 from clod_adapter.render import dial
 

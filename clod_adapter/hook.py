@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import Attenuated, attenuate, check_dial
 from clod_adapter.cameras import NEAR, Camera
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import Attenuated, attenuate, check_dial
 from clod_adapter.errors import ClodError
 
 Array = TypeVar("Array", Tensor, np.ndarray[Any, Any])

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import Attenuated, attenuate
 from clod_adapter.cameras import Camera
+from clod_adapter.equation.attenuation import Attenuated, attenuate
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import Rasterizer, for_device

@@ -105,8 +105,8 @@ def equation_picture(path: Path) -> None:
     """Left: opacity against distance for three decays. Right: the same Gaussians over the dial, and the threshold."""
     import torch
 
-    from clod_adapter.attenuation import attenuate
     from clod_adapter.config import AttenuationConfig
+    from clod_adapter.equation.attenuation import attenuate
     from clod_adapter.report.style import INK, ORANGE, QUIET, label_log, new_figure, save_figure, shades, tidy
 
     def drawn(sigma: float, distances: Sequence[float], dials: Sequence[float], cut: str) -> list[float]:

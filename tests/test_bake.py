@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import attenuate
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.distances import normalized_distances, viewpoint_of
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.distances import normalized_distances, viewpoint_of
+from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for
-from clod_adapter.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
 from scenes import camera, gaussians, ring

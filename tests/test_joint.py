@@ -15,20 +15,21 @@ import torch
 from torch import Tensor
 
 import inria_forks
-from clod_adapter import attenuation
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.blocks.divide import divide
 from clod_adapter.blocks.targets import context_rows, with_target_shares
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.equation import attenuation
+from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.evaluation.budget import dial_for
 from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.initialization.importance import sigma_from_importance
 from clod_adapter.render import render
 from clod_adapter.training.objective import Objective, TrainableSubset
+from clod_adapter.training.view_sampler import Sample
 from clod_adapter.viewer.payload import Payload
 from scenes import gaussians, photograph, ring
 
@@ -62,7 +63,7 @@ def objective(config: AdaptConfig, trained: int = N, **part: Any) -> Callable[[G
         asked = Objective(config, model.attenuation, ("means", "sh0"), TrainableSubset(trained, **part))
         parameters = {name: value for name, value in model.tensors().items() if name != "sigma_d"}
         parameters[asked.decay] = asked.parameter(model.sigma_d)
-        found = asked.gradient_sum(parameters, [(views_of(model)[0], [1.0, DIAL])])
+        found = asked.gradient_sum(parameters, [Sample(views_of(model)[0], [1.0, DIAL])])
         return [found.loss, found.kept, *found.gradients.values()]
 
     return gradients

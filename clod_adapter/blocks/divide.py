@@ -12,7 +12,7 @@ from torch import Tensor
 
 from clod_adapter.cameras import Camera, View, camera_extent
 from clod_adapter.config import AdaptConfig
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.importance import initialize

@@ -14,7 +14,7 @@ from torch import Tensor
 from clod_adapter.blocks.divide import DIALS, Division, coverage, dial_grid, kept_counts
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.importance import spread
 from clod_adapter.losses import unit

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.extinction import extinction_scale
+from clod_adapter.equation.extinction import extinction_scale
+from clod_adapter.equation.growth import growth_distance, growth_factors
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.growth import growth_distance, growth_factors
 
 DIALS = 24  # dial values of the fit, evenly spaced in log s
 MOST = 1.0  # of the initial exponents

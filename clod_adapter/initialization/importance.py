@@ -9,19 +9,19 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import SIGMA_MAX
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.distances import camera_unit, typical_distance
+from clod_adapter.equation.attenuation import SIGMA_MAX
+from clod_adapter.equation.distances import camera_unit, typical_distance
+from clod_adapter.equation.extinction import sigma_for_extinction
+from clod_adapter.equation.units import in_world_units, known_distance, with_distance
 from clod_adapter.errors import ClodError
-from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.finite import bad_rows, largest_colour
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.growth_start import initial_growth
 from clod_adapter.initialization.pruning_order import pruning_order
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
-from clod_adapter.units import in_world_units, known_distance, with_distance
 
 T = TypeVar("T")
 

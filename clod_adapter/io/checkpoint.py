@@ -13,6 +13,7 @@ from torch import Tensor
 from clod_adapter.adapter import trim
 from clod_adapter.calibration import Calibration, Viewpoint
 from clod_adapter.config import CLASSIC
+from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
@@ -26,7 +27,6 @@ from clod_adapter.io.ply.values import Activated
 from clod_adapter.io.ply.write import write_rows
 from clod_adapter.io.settings import matching_calibration
 from clod_adapter.origin import NOWHERE, Origin
-from clod_adapter.units import in_world_units
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,7 @@ def write(
         raise ClodError(f"{path}: {suffix or 'no suffix'} is no format to write; choose one of {', '.join(WRITABLE)}")
     if gaussians.sigma_d is not None and not FORMATS[suffix].carries_sigma:
         raise ClodError(f"{path}: {Path(path).suffix} has no room for sigma_d; choose a dial value to bake")
-    from clod_adapter.units import in_world_units  # here: the table needs no torch
+    from clod_adapter.equation.units import in_world_units  # here: the table needs no torch
 
     history = History(tuple(about), origin, calibration)
     return _call(FORMATS[suffix].write, Path(path), in_world_units(gaussians), history)

@@ -9,6 +9,7 @@ import torch
 
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.units import in_world_units, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.finite import LossNotFinite, largest_colour, require_finite
 from clod_adapter.gaussians import Gaussians
@@ -19,7 +20,6 @@ from clod_adapter.training.interrupts import DeferredInterrupt
 from clod_adapter.training.objective import TrainableSubset
 from clod_adapter.training.state import Adapted, StateRefused, TrainingState
 from clod_adapter.training.trainer import Trainer
-from clod_adapter.units import in_world_units, with_distance
 
 __all__ = ["Adapted", "Progress", "TrainingState", "adapt"]
 

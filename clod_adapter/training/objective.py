@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.attenuation import SIGMA_MAX, Attenuated, attenuate
 from clod_adapter.cameras import Camera, StoredView, View
 from clod_adapter.config import CLASSIC, AdaptConfig, AttenuationConfig, ScreenFilter
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.attenuation import SIGMA_MAX, Attenuated, attenuate
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import splat

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from clod_adapter.attenuation import Attenuated, conform, log_threshold
 from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.attenuation import Attenuated, conform, log_threshold
 
 # Lower bound of the sigmoid's slope, which is at most 1/4, for culled Gaussians while too few are kept. Some widths
 # below the culling threshold it is exactly 0, and so is the image's gradient: no step would bring such a sigma back.

@@ -12,16 +12,16 @@ from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.cameras import View, camera_extent
 from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.growth import GROWTH_RANGE
+from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.finite import LossNotFinite, require_finite, spoilt_rows
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.growth import GROWTH_RANGE
 from clod_adapter.training.distributed import ProcessGroup
 from clod_adapter.training.objective import GradientSum, Objective, TrainableSubset
 from clod_adapter.training.optimizer import RowAdam, add_to_mean
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.view_sampler import ViewSampler
-from clod_adapter.units import in_world_units
 
 # Adam's decay rates per view. A batch takes their powers and multiplies learning rates by its square root, so that
 # each view has the same effect (Zhao et al., "On Scaling Up 3D Gaussian Splatting Training", ICLR 2025).

@@ -14,9 +14,9 @@ from torch import Tensor
 from clod_adapter import attenuation
 from clod_adapter._support import fusing
 from clod_adapter._support.fusing import Fused
-from clod_adapter.attenuation import attenuate
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.training import optimizer
 from clod_adapter.training.optimizer import RowAdam
 from scenes import camera

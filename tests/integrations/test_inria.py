@@ -11,9 +11,9 @@ from torch import Tensor
 
 import inria_forks
 from backends import fresh_copy
-from clod_adapter.attenuation import attenuate
 from clod_adapter.config import FILTERS, AttenuationConfig
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render

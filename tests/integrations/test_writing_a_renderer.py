@@ -17,8 +17,8 @@ from PIL import Image
 import clod_adapter
 import gsplat_in_torch
 from clod_adapter import integrations
-from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.hook import Hook
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from clod_adapter.adapter import ATTRIBUTES, attach
-from clod_adapter.attenuation import SIGMA_MAX, log_attenuation
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.attenuation import SIGMA_MAX, log_attenuation
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import attenuate
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import FILTERS
+from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization import importance
 from clod_adapter.initialization.importance import initialize

@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.target_count import (
     count_gradient,

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.extinction import extinction_scale
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.extinction import extinction_scale
 
 COLUMNS = ("opacity", "sigma", "distance", "scale", "eps", "tau", "soft", "faded", "drawn")
 TOLERANCE = 3e-5  # float32 rounding times the steepest slope and the largest exponent, with a margin

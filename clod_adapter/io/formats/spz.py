@@ -26,13 +26,13 @@ from pathlib import Path
 import numpy as np
 
 from clod_adapter.config import CLASSIC
+from clod_adapter.equation.units import estimated_distance, known_distance, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import History
 from clod_adapter.io.formats.arrays import arrays_of, bytes_of, normalized, sigmoid
 from clod_adapter.io.formats.metadata import metadata_text, write_metadata
-from clod_adapter.units import estimated_distance, known_distance, with_distance
 
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
 MAGIC, VERSION = 0x5053474E, 3

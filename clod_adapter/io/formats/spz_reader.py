@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from clod_adapter.config import FILTERS, SH_COUNTS
+from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import Model
 from clod_adapter.io.formats.arrays import gaussians_of, half_turn, logits_of_bytes, read_whole, sha256_of
@@ -17,7 +18,6 @@ from clod_adapter.io.formats.converted import load_converted
 from clod_adapter.io.formats.metadata import parse_metadata
 from clod_adapter.io.formats.spz import ANTIALIASED, AXES, COLOR, EXTENDED, HEADER, MAGIC, MAGNITUDE, MOST, RDF, RECORD
 from clod_adapter.io.screen_filter import TAG
-from clod_adapter.units import in_world_units
 
 QUANTISED = "quantised: positions in 24 bits, scales, opacities and harmonics in 8, rotations in 10 or 8"
 _BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10

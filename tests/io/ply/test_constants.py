@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from plyfile import PlyData
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.inspection.report import inspect

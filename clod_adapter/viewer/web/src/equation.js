@@ -1,4 +1,4 @@
-// The dial's equation in float64, as in clod_adapter/attenuation.py and extinction.py. A Gaussian is kept iff
+// The dial's equation in float64, as in clod_adapter/equation/attenuation.py and extinction.py. A Gaussian is kept iff
 // log a - (d s)^2 / (2 v) > log(tau s),  d = |mean - eye| / D,  2 v = 2 relu(sigma_d)^2 + eps,  a the opacity. Runs in the
 // worker (worker.js).
 

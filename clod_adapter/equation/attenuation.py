@@ -39,9 +39,9 @@ from torch.autograd.function import once_differentiable
 from clod_adapter._support.fusing import Fused, Number
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, require
-from clod_adapter.distances import euclidean, normalized_distances, normalizing_distance
+from clod_adapter.equation.distances import euclidean, normalized_distances, normalizing_distance
+from clod_adapter.equation.growth import growth_distance, growth_factors
 from clod_adapter.errors import ClodError
-from clod_adapter.growth import growth_distance, growth_factors
 
 SIGMA_MAX = 1e9
 """Stands for an infinite sigma_d. The factor is exactly 1 for d s < 2e5 in float32, d s < 10 in float64."""

@@ -13,8 +13,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import SIGMA_MAX, twice_variance
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import SIGMA_MAX, twice_variance
 from clod_adapter.gaussians import Gaussians
 
 # Quantile of the distances from the centre of a scene that estimates the typical distance. In three captures it is
