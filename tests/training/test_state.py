@@ -83,7 +83,7 @@ def test_a_state_holds_trained_parameters_only(captured: Pair) -> None:
     base, states = captured[0], dict[int, TrainingState]()
     still = {"lr_shN": 0.0, "lr_means": 0.0, "average": 0.5}
     adapt(*captured, config_of(iters=4, **still), states_of({1, 3}, states))
-    changing = {"quats", "log_scales", "opacity_logits", "sh0", "log_sigma"}
+    changing = {"quats", "log_scales", "opacity_logits", "sh0", "log_sigma", "growth_d"}
     for step, kinds in ((1, {"parameter", "first", "second", "steps"}), (3, {"mean"})):
         assert {name.split(".")[1] for name in states[step].tensors} == changing
         assert kinds <= {name.split(".")[0] for name in states[step].tensors}
