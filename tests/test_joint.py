@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 import inria_forks
+from clod_adapter.adapter import ATTRIBUTES, attach, detach
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.blocks.divide import divide
 from clod_adapter.blocks.targets import context_rows, with_target_shares
@@ -41,11 +42,12 @@ CAMERAS = ring(3, 24, 18)
 def model_of(tau: float) -> Gaussians:
     sigma_d = 0.3 + 2 * torch.rand(N, generator=torch.Generator().manual_seed(1))
     settings = AttenuationConfig(tau=tau, scene_distance=4.0, reference_distance=4.0, max_sv=4.0)
-    return gaussians(N, 1, 0, size=0.15).replace(sigma_d=sigma_d, attenuation=settings)
+    growth_d = torch.linspace(-0.5, 1, N)
+    return attach(gaussians(N, 1, 0, size=0.15), sigma_d, settings, growth_d)
 
 
 def views_of(model: Gaussians) -> tuple[View, ...]:
-    return photograph(model.replace(sigma_d=None, attenuation=None), CAMERAS)
+    return photograph(detach(model), CAMERAS)
 
 
 def rendering(model: Gaussians) -> list[Tensor]:
@@ -61,7 +63,8 @@ def objective(config: AdaptConfig, trained: int = N, **part: Any) -> Callable[[G
     def gradients(model: Gaussians) -> list[Any]:
         assert model.attenuation is not None and model.sigma_d is not None
         asked = Objective(config, model.attenuation, ("means", "sh0"), TrainableSubset(trained, **part))
-        parameters = {name: value for name, value in model.tensors().items() if name != "sigma_d"}
+        names = ("growth_d",) if config.growth == "on" else ()
+        parameters = {name: getattr(model, name) for name in (*ATTRIBUTES, *names)}
         parameters[asked.decay] = asked.parameter(model.sigma_d)
         found = asked.gradient_sum(parameters, [Sample(views_of(model)[0], [1.0, DIAL])])
         return [found.loss, found.kept, *found.gradients.values()]
