@@ -126,7 +126,7 @@ def check_growth(tallies: Tallies) -> None:
         config = AttenuationConfig(reference_distance=r, max_sv=1)
         got = attenuate(zero, zero, distance, s, config, growth_d=leaf).growth
         assert got is not None
-        naive = (distance * s / r).clamp(min=1) ** leaf
+        naive = ((distance * s / r).clamp(min=1) ** leaf).clamp(math.exp(-LOG_GROWTH_MAX), math.exp(LOG_GROWTH_MAX))
         allowed = 4 + 2 * np.abs(h) * (1 + log_m)
         sure = np.abs(np.abs(log_g) - LOG_GROWTH_MAX) > info.eps * allowed
         sure &= steep < torch.finfo(DTYPES[dtype]).max
