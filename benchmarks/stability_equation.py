@@ -117,6 +117,7 @@ def check_growth(tallies: Tallies) -> None:
     dtype, info, axes = tallies.dtype, tallies.info, exact.growth_axes(tallies.dtype)
     h, d = exact.columns(*axes)
     zero = torch.zeros(len(h), dtype=DTYPES[dtype])
+    largest = min(math.exp(LOG_GROWTH_MAX), torch.finfo(DTYPES[dtype]).max)
     for s, r in itertools.product(exact.SCALES, exact.REACHES):
         log_m = np.tile(wide([exact.log_magnification(x, s, r) for x in axes[1]]), len(axes[0]))
         log_g = Wide(h) * log_m
@@ -126,7 +127,7 @@ def check_growth(tallies: Tallies) -> None:
         config = AttenuationConfig(reference_distance=r, max_sv=1)
         got = attenuate(zero, zero, distance, s, config, growth_d=leaf).growth
         assert got is not None
-        naive = ((distance * s / r).clamp(min=1) ** leaf).clamp(math.exp(-LOG_GROWTH_MAX), math.exp(LOG_GROWTH_MAX))
+        naive = ((distance * s / r).clamp(min=1) ** leaf).clamp(1 / largest, largest)
         allowed = 4 + 2 * np.abs(h) * (1 + log_m)
         sure = np.abs(np.abs(log_g) - LOG_GROWTH_MAX) > info.eps * allowed
         sure &= steep < torch.finfo(DTYPES[dtype]).max
