@@ -50,14 +50,14 @@ def test_training_improves_psnr(captured: Pair, trained: Trained) -> None:
     assert losses[-1] < 0.7 * losses[0]
 
 
-@pytest.mark.parametrize("steps", [0, 120])
-def test_growth_improves_the_far_end(captured: Pair, trained: Trained, steps: int) -> None:
+@pytest.mark.parametrize(("steps", "gain"), [(0, 0.5), (120, 3.0)])
+def test_growth_improves_the_far_end(captured: Pair, trained: Trained, steps: int, gain: float) -> None:
     """By the initialization alone and by training; counts do not depend on it."""
     with_growth = trained[0] if steps else adapt(*captured, config_of(iters=0))
     plain = adapt(*captured, config_of(iters=steps, growth="off"))
     assert plain.gaussians.growth_d is None
     found, wanted = (evaluate(one.gaussians, captured[1].test, (1.0, 5.0)) for one in (with_growth, plain))
-    assert found[1].psnr > wanted[1].psnr + 3 and found[0].psnr > wanted[0].psnr - 0.3
+    assert found[1].psnr > wanted[1].psnr + gain and found[0].psnr > wanted[0].psnr - 0.3
     assert [row.kept_share for row in found] == pytest.approx([row.kept_share for row in wanted], abs=0.03)
 
 
