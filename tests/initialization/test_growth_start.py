@@ -33,7 +33,7 @@ def equal_ones(opacities: list[float], until: list[float]) -> tuple[Gaussians, T
 @pytest.mark.parametrize(
     ("opacities", "until", "substitutes", "larger"),
     [([0.5, 0.5], [2.0, 9.0], [1, 1], 2.0), ([0.25, 0.5], [2.0, 9.0], [1, 1], 1.5),
-     ([0.5, 0.5, 0.5], [2.0, 3.0, 9.0], [1, 2, 2], 3.0), ([0.5, 0.5], [9.0, 9.0], [1, 1], 1.0)],
+     ([0.1] * 4 + [0.5], [2.0, 2.5, 3.0, 3.5, 9.0], [1, 2, 3, 4, 4], 1.8), ([0.5, 0.5], [9.0, 9.0], [1, 1], 1.0)],
     ids=["equal", "half as opaque", "chain", "both are kept"],
 )  # fmt: skip
 def test_growth_preserves_the_area(

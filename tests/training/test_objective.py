@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -127,6 +128,10 @@ def test_gradient_of_growth_equals_finite_differences(monkeypatch: pytest.Monkey
     def of(growth_d: Tensor) -> GradientSum:
         return run.objective.gradient_sum(exact | {"growth_d": growth_d}, [Sample(views[0], [2.0])])
 
+    plain = replace(run.objective, config=replace(config, growth="off"))
+    none = {name: value for name, value in exact.items() if name != "growth_d"}
+    ungrown = plain.gradient_sum(none, [Sample(views[0], [2.0])]).loss
+    assert of(torch.zeros(count)).loss == ungrown != of(exact["growth_d"]).loss
     found, step = of(exact["growth_d"]), 1e-6 * torch.eye(count, dtype=torch.float64)
     slopes = [(of(exact["growth_d"] + row).loss - of(exact["growth_d"] - row).loss) / 2e-6 for row in step]
     wanted = run.objective._weight(2.0, alone=True) * torch.tensor(slopes, dtype=torch.float64)

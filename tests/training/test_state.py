@@ -67,10 +67,11 @@ def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str, kind: 
 
 @pytest.mark.parametrize("distance", [1.0, 4.0])
 def test_untrained_rows_keep_their_units_when_resumed(captured: Pair, distance: float) -> None:
-    """Their sigma_d is not in the state, but the base's, in its unit."""
+    """Their dial is not in the state, but the base's, sigma_d in its unit, growth 0 where it has none."""
     base, scene = captured
     settings = AttenuationConfig(scene_distance=distance, reference_distance=4.0)
-    base = attach(base, torch.linspace(0.3, 3, len(base)) * 4 / distance, settings)
+    growth_d = torch.linspace(-0.5, 1, len(base)) if distance == 1 else None
+    base = attach(base, torch.linspace(0.3, 3, len(base)) * 4 / distance, settings, growth_d)
     part, states = TrainableSubset(len(base) // 2), dict[int, TrainingState]()
     whole = adapt(base, scene, config_of(iters=4), states_of({2}, states), subset=part)
     again = adapt(base, scene, config_of(iters=4), None, states[2], subset=part)
