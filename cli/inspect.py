@@ -57,7 +57,7 @@ def splat_lines(splat: Splat) -> list[str]:
         lines.append(_line("layout", f"{splat.encoding}, {len(splat.columns)} properties{more}"))
     lines += _block("says", (comment[:LONGEST] for comment in splat.comments))
     rows = [*zip("xyz", v.position, strict=True), ("scale", v.scale), ("opacity", v.opacity)]
-    rows += [("sigma_d", v.sigma)] if v.sigma is not None else []
+    rows += [(name, spread) for name, spread in (("sigma_d", v.sigma), ("growth_d", v.growth)) if spread is not None]
     lines += ["", *spread_table(rows), ""]
     lines.append(
         _line("shares", f"{v.fainter_than_tau:.1%} fainter than tau = {splat.tau:.3g}, "
@@ -66,7 +66,8 @@ def splat_lines(splat: Splat) -> list[str]:
     if splat.dial is None:
         return [*lines, _line("dial", "none: no sigma_d")]
     a = splat.dial.attenuation
-    lines.append(_line("dial", f"s = 1 to {a.max_sv:g}, {a.cut} culling at tau, distances {_unit(a)}"))
+    how = f"s = 1 to {a.max_sv:g}, {a.cut} culling at tau, distances {_unit(a)}"
+    lines.append(_line("dial", f"{splat.dial_columns}, {how}"))
     return lines + calibration_lines(splat.dial.calibration)
 
 

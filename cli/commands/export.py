@@ -127,7 +127,7 @@ def check_format(args: Namespace, bakes: bool, dial: bool) -> None:
     if dial and not bakes and not FORMATS[suffix].sigma:
         others = ", ".join(other for other in suffixes() if FORMATS[other].sigma)
         raise ClodError(
-            f"{args.out}: {suffix} cannot store sigma_d; choose a dial value to bake, as in --sv 1, or another format "
+            f"{args.out}: {suffix} cannot store a dial; choose a dial value to bake, as in --sv 1, or another format "
             f"({others})"
         )
     if args.order and not FORMATS[suffix].ordered:
@@ -150,8 +150,8 @@ Without a dial value nothing is baked. Columns that Inria's layout does not have
 are dropped.
 
 baking:
-  A baked file has the Gaussians of one dial value, with fixed opacities. This
-  is lossy; keep MODEL. The dial depends on the distance to the camera; baking
+  A baked file has the Gaussians of one dial value, with its opacities and grown
+  scales, fixed. This is lossy; keep MODEL. The dial depends on the distance to the camera; baking
   takes each Gaussian's mean distance to the training cameras of --images, else
   to those stored in MODEL, else to 16 placed ones (at worst 0.5 dB lower).
   With --camera the file is exact at that camera.

@@ -34,7 +34,8 @@ class Checkpoint:
     """A file as read: its Gaussians, and what the writer keeps of it.
 
     Attributes:
-        gaussians: the usable Gaussians, float32; with sigma_d and attenuation if the file is extended.
+        gaussians: the usable Gaussians, float32; with sigma_d and attenuation, and perhaps growth_d, if the file is
+            extended.
         vertex: ``[N]`` structured array, the same rows with every column of the file, in file order and type, native
             byte order; activated values and filters are undone.
         comments: the header's, or the lines of history of another format.
@@ -124,7 +125,7 @@ def save(
     version: str | None = None,
     calibration: Calibration | None = None,
 ) -> None:
-    """Writes ``gaussians`` as an extended file: the base's columns, then ``sigma_d``.
+    """Writes ``gaussians`` as an extended file: the base's columns, then ``sigma_d`` and ``growth_d``.
 
     Without a base the columns are those of Inria's layout.
 
@@ -155,7 +156,7 @@ def save(
         )
     gaussians = in_world_units(gaussians)
     comments = write_comments(gaussians.attenuation, base.comments, version, calibration, gaussians.screen_filter)
-    constants = dial_constants(gaussians.attenuation)
+    constants = dial_constants(gaussians.attenuation, gaussians.growth_d is not None)
     if gaussians.sigma_d is not None:  # a plain file has the columns of Inria's layout and no others
         constants |= filter_constants(gaussians.screen_filter)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:

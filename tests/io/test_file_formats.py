@@ -148,7 +148,7 @@ def test_refused_write_leaves_no_file(tmp_path: Path, suffix: str) -> None:
     if suffix in (".glb", ".splat"):
         unfit.append((plain.replace(log_scales=torch.full((40, 3), 90.0)), "a scale is beyond"))
     if suffix not in DIAL:
-        unfit.append((model(), "no room for sigma_d; choose a dial value to bake"))
+        unfit.append((model(), "no room for a dial; choose a dial value to bake"))
     for g, message in unfit:
         with pytest.raises(ClodError, match=f"a{suffix}: .*{message}"):
             write(tmp_path / f"a{suffix}", g)
