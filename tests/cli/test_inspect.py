@@ -43,9 +43,10 @@ def test_json_of_a_dial(clod: Any, dialled: Path) -> None:
     report = json.loads(done.out)
     assert done.code == 0 and done.err == "" and report["command"] == "inspect" and report["path"] == str(dialled)
     splat = report["splat"]
-    assert splat["count"] == splat["total"] == 300 and splat["columns"][-1] == ["sigma_d", "float32"]
+    assert splat["count"] == splat["total"] == 300 and splat["columns"][-1] == ["growth_d", "float32"]
     assert splat["dial"]["attenuation"]["max_sv"] == 4 and splat["dial"]["calibration"]["rows"][0]["virtual_scale"] == 1
-    assert {"least", "low", "median", "high", "greatest"} == set(splat["sigma"]) and len(splat["position"]) == 3
+    assert len(splat["position"]) == 3
+    assert {"least", "low", "median", "high", "greatest"} == set(splat["sigma"]) == set(splat["growth"])
     told = json.loads(dialled.with_suffix(".json").read_text())
     assert splat["dial"]["calibration"] == told["calibration"]
 
