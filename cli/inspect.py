@@ -103,12 +103,15 @@ def tensor_lines(about: dict[str, Any]) -> list[str]:
         after = f"{about['steps']} steps in {duration(about['seconds'])}, loss {about['loss']:.4g}"
         return [*lines, _line("after", after), _line("of", ", ".join(f"{k} {v}" for k, v in about["belongs"].items()))]
     lines.append(_line("for the file", f"with SHA-256 {about['base']}"))
-    lines.append(_line("changes", ", ".join(f"{k} ({v})" for k, v in about["updates"].items()) or "only sigma_d"))
+    lines.append(_line("changes", ", ".join(f"{k} ({v})" for k, v in about["updates"].items()) or "only the dial"))
     settings = ", ".join(f"{key} {value}" for key, value in about["config"].items() if key in SETTINGS)
     lines.append(_line("trained with", settings or "unknown settings"))
-    lines += ["", *spread_table([("sigma_d", Spread(**about["sigma"]))]), ""]
+    columns = {name: Spread(**about[key]) for name, key in (("sigma_d", "sigma"), ("growth_d", "growth")) if about[key]}
+    lines += ["", *spread_table([*columns.items()]), ""]
     a = about["attenuation"]
-    lines.append(_line("dial", f"s = 1 to {a['max_sv']:g}, {a['cut']} culling at tau = {a['tau']:.3g}"))
+    lines.append(
+        _line("dial", f"{' and '.join(columns)}, s = 1 to {a['max_sv']:g}, {a['cut']} culling at tau = {a['tau']:.3g}")
+    )
     calibration = about["calibration"]
     return lines + calibration_lines(calibration and Calibration.from_dict(calibration))
 

@@ -55,4 +55,6 @@ def test_adapter(clod: Any, dialled: Path) -> None:
     done = clod("inspect", dialled.with_suffix(".safetensors"))
     assert done.code == 0 and "an adapter" in done.out and "with SHA-256 " in done.out and "max_sv 4" in done.out
     report = json.loads(clod("inspect", dialled.with_suffix(".safetensors"), "--json").out)
+    assert len(report["about"]["growth"]) == 5 and "\ngrowth_d " in done.out
+    assert "\ndial         sigma_d and growth_d, s = 1 to 4" in done.out
     assert report["about"]["count"] == 300 and report["splat"] is None and report["about"]["config"]["iters"] == 12

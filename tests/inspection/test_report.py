@@ -237,6 +237,7 @@ def test_adapters_and_states(tmp_path: Path) -> None:
     assert found.about is not None and found.splat is None and "an adapter" in found.what
     assert (found.about["count"], found.about["base"]) == (40, "ab" * 32)
     assert found.about["updates"] == {"means": "float16 [40, 3]"} and found.about["attenuation"]["max_sv"] == 6
+    assert found.about["growth"] is None and not any("growth" in line for line in lines_of(found))
     found = inspect(state_of(tmp_path / "a.resume.safetensors"))
     assert found.about is not None and "interrupted run" in found.what
     assert (found.about["count"], found.about["steps"], found.about["belongs"]["base"]) == (7, 9, "abc")
