@@ -5,6 +5,7 @@ import json
 import struct
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -72,6 +73,30 @@ def test_growth_is_the_same_in_other_units(tmp_path: Path, typical: float, known
     again = load_spz(tmp_path / "a.spz").gaussians
     for s in (1.0, 6.0):
         assert (grown(again, s) - grown(g, s)).abs().max() <= 0.04  # half a step of the scales, of 1/16
+
+
+@pytest.mark.parametrize(
+    ("columns", "values", "fits"),
+    [
+        (["sigma_d"], 40, True), (["sigma_d", "growth_d"], 80, True), (["sigma_d", "growth_d"], 0, True),
+        (["sigma_d", "growth_d"], 40, False), (["sigma_d"], 80, False), (["growth_d", "sigma_d"], 80, False), (7, 40, False),
+    ],
+)  # fmt: skip
+def test_record_of_other_columns(tmp_path: Path, columns: Any, values: int, fits: bool) -> None:
+    write(tmp_path / "a.spz", model(0))
+    data = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    at = 16 + 40 * 20 + 12
+    text = json.dumps(
+        json.loads(data[at + 12 : at + 12 + struct.unpack_from("<I", data, at + 8)[0]]) | {"columns": columns}
+    )
+    body = struct.pack("<I", len(text)) + text.encode() + bytes(2 * values)
+    (tmp_path / "b.spz").write_bytes(gzip.compress(data[:at] + struct.pack("<II", 0x434C0001, len(body)) + body))
+    if not fits:
+        with pytest.raises(ClodError, match="b.spz: its record of sigma_d is damaged"):
+            load_spz(tmp_path / "b.spz")
+    else:
+        g = load_spz(tmp_path / "b.spz").gaussians
+        assert (g.sigma_d is None, g.growth_d is None) == (values == 0, values < 80)
 
 
 @pytest.mark.parametrize(("axes", "signs"), [(4, [1, -1, -1]), (7, [-1, -1, 1])])
