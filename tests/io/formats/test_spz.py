@@ -79,7 +79,8 @@ def test_growth_is_the_same_in_other_units(tmp_path: Path, typical: float, known
     ("columns", "values", "fits"),
     [
         (["sigma_d"], 40, True), (["sigma_d", "growth_d"], 80, True), (["sigma_d", "growth_d"], 0, True),
-        (["sigma_d", "growth_d"], 40, False), (["sigma_d"], 80, False), (["growth_d", "sigma_d"], 80, False), (7, 40, False),
+        (["sigma_d", "growth_d"], 40, False), (["sigma_d"], 80, False), (["growth_d", "sigma_d"], 80, False),
+        (7, 40, False),
     ],
 )  # fmt: skip
 def test_record_of_other_columns(tmp_path: Path, columns: Any, values: int, fits: bool) -> None:
