@@ -185,7 +185,7 @@ def attach(
 
 def detach(gaussians: Gaussians) -> Gaussians:
     """The Gaussians without their dial; the other attributes stay as they are."""
-    return gaussians.replace(sigma_d=None, attenuation=None)
+    return gaussians.replace(sigma_d=None, growth_d=None, attenuation=None)
 
 
 def _update(name: str, old: Tensor, new: Tensor) -> Tensor:

@@ -30,9 +30,10 @@ def bake(
     *,
     cameras: Sequence[Camera | Viewpoint] = (),
 ) -> Gaussians:
-    """The Gaussians that one dial value keeps, with the opacities of that dial value and without a dial.
+    """The Gaussians that one dial value keeps, with the opacities and scales of that dial value and without a dial.
 
-    ``logit' = log o - log(1 - o)`` with ``o`` the drawn opacity (``attenuation.attenuate``). Lossy: the result has
+    ``logit' = log o - log(1 - o)`` with ``o`` the drawn opacity, ``log_scales' = log_scales + log g`` with ``g`` the
+    growth (``attenuation.attenuate``). Lossy: the result has
     neither the dial nor the culled Gaussians.
 
     For one ``camera`` the image from there equals the rendering at s: ``o`` is taken at its distances.
@@ -64,8 +65,10 @@ def bake(
     if not dialled.keep.any():
         raise ClodError(f"no Gaussian is kept at s = {virtual_scale:g}; bake a smaller s")
     shown = dialled if camera else dial(gaussians, distances, virtual_scale**FADED)
-    logits = _logits_drawn(shown, gaussians.opacity_logits)
-    return detach(gaussians.replace(opacity_logits=logits)).select(dialled.keep)
+    baked = {"opacity_logits": _logits_drawn(shown, gaussians.opacity_logits)}
+    if dialled.growth is not None:
+        baked["log_scales"] = gaussians.log_scales + dialled.growth.log()[:, None]
+    return detach(gaussians.replace(**baked)).select(dialled.keep)
 
 
 @torch.no_grad()
