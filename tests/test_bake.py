@@ -112,11 +112,11 @@ def test_several_cameras_share_one_distance_per_gaussian() -> None:
     assert some.sigma_d is not None and some.attenuation is not None
     d = torch.stack([normalized_distances(some.means, each, CONFIG).log() for each in cameras]).mean(0).exp()
     given = (some.opacity_logits, some.sigma_d, d)
-    kept, shown = (attenuate(*given, x, some.attenuation, growth_d=some.growth_d) for x in (s, s**0.75))
+    kept, shown, grown = (attenuate(*given, x, some.attenuation, growth_d=some.growth_d) for x in (s, s**0.75, s**0.9))
     baked = bake(some, s, cameras=cameras)
     assert torch.equal(baked.means, some.means[kept.keep]) and 0 < len(baked) < 300
     torch.testing.assert_close(baked.opacities, shown.drawn[kept.keep], atol=1e-6, rtol=1e-5)
-    torch.testing.assert_close(baked.scales, (some.scales * kept.growth[:, None])[kept.keep], atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(baked.scales, (some.scales * grown.growth[:, None])[kept.keep], atol=1e-6, rtol=1e-5)
     places = [viewpoint_of(each, some.means, CONFIG) for each in cameras]
     assert torch.equal(bake(some, s, cameras=places).means, baked.means)
 

@@ -1,8 +1,8 @@
 """Popping: whether the image changes evenly or in jumps as the dial turns or the camera moves.
 
 Neighbouring steps k, k+1 of a sweep are compared *from one camera*, so that only the level of detail counts and not
-the motion of the camera. With ``I_c(k)`` the image, clamped to [0, 1], from camera c with the opacities and scales of step k,
-step k changes it by
+the motion of the camera. With ``I_c(k)`` the image, clamped to [0, 1], from camera c with the opacities and scales of
+step k, step k changes it by
 
     delta_k = I_c(k+1) - I_c(k)      c the camera of step k+1
     change_k = 255 rms(delta_k)      root mean square over pixels and channels, in levels of 255
