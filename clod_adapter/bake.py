@@ -17,9 +17,9 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import OPAQUE, Gaussians
 from clod_adapter.render import dial
 
-# Exponents of the dial value that opacities and scales are baked at for several cameras. Measured on held-out photographs
-# for FADED of 0, 0.5, 0.75 and 1, and for GROWN of 0, 0.5, 0.75, 0.85, 0.9, 1 and 1.25 with that FADED: at equal counts
-# the file was never below the dial by more than 0.05 dB, and up to 0.65 dB above it.
+# Exponents of the dial value that opacities and scales are baked at for several cameras. Measured on held-out
+# photographs: FADED of 0, 0.5, 0.75 and 1, and with that FADED, GROWN of 0, 0.5, 0.75, 0.85, 0.9, 1 and 1.25. At equal
+# counts the file was never below the dial by more than 0.05 dB, and up to 0.65 dB above it.
 FADED, GROWN = 0.75, 0.9
 
 
