@@ -147,11 +147,13 @@ class AdaptConfig:
         "initialization of sigma_d: importance (by rank of importance; replaceable neighbours are culled earlier), "
         "error (by rank of removal error), constant (1) or identity (no fading)",
     )
-    start_share: float = option(0.62, "share of Gaussians that the initialization keeps at s = 1")
+    start_share: float | None = option(
+        None, "share of Gaussians to keep at s = 1 (default: as the plan measures; 0.62 without a plan)"
+    )
     parameter: str = option("log", "trained parameter: log (of sigma_d) or linear (sigma_d itself, the paper's)")
     sampling: str = option("pair", "dial values per step: pair (1 and a log-uniform one), log or uniform (the paper's)")
     full_weight: float = option(
-        1.0, "weight of the loss at s = 1 relative to that at the other dial value (sampling pair)"
+        1.25, "weight of the loss at s = 1 relative to that at the other dial value (sampling pair)"
     )
     full_share: float = option(0.0, "share of steps at s = 1 (samplings log and uniform)")
     exponent: float = option(1.5, "target-count curve: the target share of Gaussians at s is s^-exponent")
@@ -184,7 +186,7 @@ class AdaptConfig:
         require(self.batch >= 1, "batch", self.batch, "at least 1")
         require(0 <= self.seed < 2**63, "seed", self.seed, "at least 0 and below 2^63")
         require(self.time_budget is None or self.time_budget > 0, "time_budget", self.time_budget, "positive seconds")
-        require(0.5 < self.start_share <= 1, "start_share", self.start_share, "above 0.5 and at most 1")
+        require(0.5 < self.share <= 1, "start_share", self.start_share, "above 0.5 and at most 1")
         choices = {
             "start": STARTS,
             "parameter": PARAMETERS,
@@ -224,6 +226,11 @@ class AdaptConfig:
             "lr_scales": 8e-3, "lr_opacities": 5e-2, "lr_sh0": 2e-3,
         }  # fmt: skip
         return cls(**{**own, **changes})
+
+    @property
+    def share(self) -> float:
+        """``start_share``, or 0.62 if it is not set."""
+        return 0.62 if self.start_share is None else self.start_share
 
     @property
     def has_target_count(self) -> bool:

@@ -105,7 +105,7 @@ def _target_share(
     """The target of ``count`` of ``total`` Gaussians, which are ``parts [DIALS]`` of the kept ones in a view."""
     at = math.log(virtual_scale) / math.log(config.max_sv) * (DIALS - 1)
     part = float(np.interp(at, np.arange(DIALS), parts))
-    whole = target_curve(virtual_scale, config.start_share, config.exponent)
+    whole = target_curve(virtual_scale, config.share, config.exponent)
     wanted = max(whole * total * part, 1.0)
     return TargetShare(wanted / count, stands_for * count / (whole * total))
 

@@ -11,8 +11,8 @@ from clod_adapter.equation.growth import growth_distance, growth_factors
 from clod_adapter.gaussians import Gaussians
 
 DIALS = 24  # dial values of the fit, evenly spaced in log s
-MOST = 1.0  # of the initial exponents
-SHARE = 0.8  # of the fitted exponents
+MOST = 0.5  # of the initial exponents
+SHARE = 0.4  # of the fitted exponents
 
 
 @torch.no_grad()

@@ -68,7 +68,7 @@ def initialize(
     pruned = pruning_order(base, error.sqrt() * base.opacities, progress) if config.start == "importance" else None
     distances = typical_distance(base.means, [view.camera for view in views], attenuation)
     sigma = sigma_from_importance(
-        base, error if pruned is None else pruned.position, distances, attenuation, share=config.start_share,
+        base, error if pruned is None else pruned.position, distances, attenuation, share=config.share,
         exponent=config.exponent,
     )  # fmt: skip
     sigma = sigma.minimum(WIDEST * config.max_sv * distances)

@@ -178,12 +178,15 @@ class Objective:
 
     @torch.no_grad()
     def _counted(self, parameters: dict[str, Tensor], view: View, s: float, loss: float) -> Tensor:
-        """``_count_gradient`` at a dial value that is not rendered; at most halfway from max_sv to 1/tau."""
+        """``_count_gradient`` at a dial value that is not rendered, at most halfway from max_sv to 1/tau.
+
+        Its weight is not w_s: with that, counts at the far end were 1.2 times the target.
+        """
         s, first = min(s, (self.config.max_sv + 1 / self.attenuation.tau) / 2), slice(self.trained)
         d = normalized_distances(parameters["means"][first], view.camera, self.attenuation)
         logits, sigma = parameters["opacity_logits"][first], self.sigma(parameters[self.decay][first])
         dialled = attenuate(logits, sigma, d, s, self.attenuation)
-        return self._count_gradient(dialled, logits, view, s, self._weight(s, alone=False) * loss)
+        return self._count_gradient(dialled, logits, view, s, loss)
 
     def _count_gradient(self, dialled: Attenuated, logits: Tensor, view: View, s: float, loss: float) -> Tensor:
         """``[trained]`` the count term's gradient of log sigma_d at one dial value."""

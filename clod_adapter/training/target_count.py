@@ -48,7 +48,7 @@ def target_share(virtual_scale: float, count: int, config: AdaptConfig, total: i
             sees them: the target may then exceed ``count``. By default ``count``.
     """
     total = total or max(count, 1)
-    share = max(target_curve(virtual_scale, config.start_share, config.exponent), 1 / total) * (total / max(count, 1))
+    share = max(target_curve(virtual_scale, config.share, config.exponent), 1 / total) * (total / max(count, 1))
     return TargetShare(share, 1 / share)
 
 

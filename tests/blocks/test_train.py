@@ -141,7 +141,7 @@ def test_target_shares_add_up_to_the_curve(divided: Division, captured: tuple[Ga
         for k in range(2):
             for s in (1.0, 1.7, 3.0, CONFIG.max_sv):
                 asked = [block[k].target_share(s) for block in shown]
-                share = target_curve(s, CONFIG.start_share, CONFIG.exponent)
+                share = target_curve(s, CONFIG.share, CONFIG.exponent)
                 wanted = sum(q.share * len(divided.rows(block)) for block, q in enumerate(asked))
                 assert wanted == pytest.approx(share * count, rel=0.05)
                 for block, q in enumerate(asked):

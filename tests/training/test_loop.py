@@ -179,7 +179,7 @@ def test_a_zero_sigma_recovers(captured: Pair) -> None:
     assert evaluate(dead, scene.train, [1.0])[0].kept == 0
     result = adapt(dead, scene, config).gaussians
     assert (result.sigma_d > 1e-3).all() and result.sigma_d.isfinite().all()
-    assert evaluate(result, scene.train, [1.0])[0].kept_share > 0.8 * config.start_share
+    assert evaluate(result, scene.train, [1.0])[0].kept_share > 0.8 * config.share
 
 
 @pytest.mark.parametrize(("share", "steps"), [(1.0, [1, 2, 3, 4]), (0.5, [3, 4])])
