@@ -67,14 +67,15 @@ class Checkpoint:
         return tuple(viewpoint.moved([-value for value in self.origin]) for viewpoint in stored)
 
     def hook(self, virtual_scale: float = 1.0) -> Hook:
-        """The dial for a renderer that has these Gaussians: it maps their opacities to attenuated ones.
+        """The dial for a renderer that has these Gaussians: attenuated opacities, and factors of the scales.
 
         Raises:
             ClodError: the file has no sigma_d, or the dial is below 1 or not finite.
         """
-        if self.gaussians.sigma_d is None or self.gaussians.attenuation is None:
+        own = self.gaussians
+        if own.sigma_d is None or own.attenuation is None:
             raise ClodError(f"{self.path}: it has no sigma_d, so there is no dial; clod-adapt adapt gives it one")
-        return Hook(self.gaussians.sigma_d, self.gaussians.attenuation, virtual_scale)
+        return Hook(own.sigma_d, own.attenuation, virtual_scale, own.growth_d)
 
 
 def load(path: str | Path, *, activated: Activated | None = None, origin: Origin | None = None) -> Checkpoint:
