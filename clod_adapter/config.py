@@ -167,7 +167,9 @@ class AdaptConfig:
     temperature: float = option(0.15, "width of the sigmoid of the straight-through count, in log opacity")
     ssim_weight: float = option(0.2, "weight w of 1 - SSIM; L1 has 1 - w")
     lr_sigma: float = option(0.1, "learning rate of log sigma_d: its largest relative change per step")
-    growth: str = option("on", "growth of the scales of Gaussians that remain: on or off (the paper's)")
+    growth: str = option(
+        "on", "growth of the Gaussians that remain, by a growth_d beside sigma_d: on or off (the paper's)"
+    )
     lr_growth: float = option(1.2e-2, "learning rate of growth_d")
     lr_means: float = option(5.2e-4, "learning rate of means, times the extent of the cameras")
     lr_quats: float = option(1.6e-3, "learning rate of quats")

@@ -32,8 +32,8 @@ and refuse invalid values.
 ## AdaptConfig
 
 Settings of an adaptation: `clod.adapt(gaussians, scene, clod.AdaptConfig(max_sv=5, iters=400))`. The command line
-has `--max-sv`, `--iters`, `--batch`, `--time-budget`, `--seed` and `--form`; the other fields are for experiments
-([Method](method.md) has their measured effects). `AdaptConfig.paper()` is the paper's own form.
+has `--max-sv`, `--iters`, `--batch`, `--time-budget`, `--seed`, `--growth` and `--form`; the other fields are for
+experiments ([Method](method.md) has their measured effects). `AdaptConfig.paper()` is the paper's own form.
 
 | field | default | paper | meaning |
 |---|---|---|---|

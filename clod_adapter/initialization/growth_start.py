@@ -51,6 +51,8 @@ def _kept_substitutes(kept: Tensor, substitutes: Tensor) -> Tensor:
     """``[N]`` the first kept one of each Gaussian, its substitute, the substitute of that and so on."""
     own = torch.arange(len(kept), device=kept.device)
     found = torch.where(kept, own, substitutes)
-    while not torch.equal(further := found[found], found):  # doubles the length of the chains each time
+    for _ in range(len(kept).bit_length()):  # each time chains are twice as long; there may be circles of removed ones
+        if torch.equal(further := found[found], found):
+            break
         found = further
     return found

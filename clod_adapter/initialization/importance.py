@@ -55,13 +55,13 @@ def initialize(
     """
     if base.attenuation is not None and has_dial(base):
         own = dataclasses.replace(base.attenuation, max_sv=config.max_sv)
-        return in_world_units(_with_growth(base.replace(attenuation=own), config, base.growth_d))
+        return in_world_units(with_growth(base.replace(attenuation=own), config, base.growth_d))
     views = spread(views, MOST_VIEWS)
     attenuation = config.attenuation(scene_distance(base, views, config.quantile))
     if config.start in ("constant", "identity"):
         value = 1.0 if config.start == "constant" else WIDEST * config.max_sv
         constant = torch.full_like(base.means[:, 0], value)
-        return in_world_units(_with_growth(base.replace(sigma_d=constant, attenuation=attenuation), config))
+        return in_world_units(with_growth(base.replace(sigma_d=constant, attenuation=attenuation), config))
     if error is None:
         error = removal_error(base, views, seed=config.seed, progress=progress)
     attenuation = dataclasses.replace(attenuation, tau=fitting_tau(base.opacities, error, config))
@@ -74,10 +74,10 @@ def initialize(
     sigma = sigma.minimum(WIDEST * config.max_sv * distances)
     initial = base.replace(sigma_d=sigma, attenuation=attenuation)
     grown = initial_growth(initial, pruned.substitute, distances) if pruned and config.growth == "on" else None
-    return in_world_units(_with_growth(initial, config, grown))
+    return in_world_units(with_growth(initial, config, grown))
 
 
-def _with_growth(initial: Gaussians, config: AdaptConfig, growth_d: Tensor | None = None) -> Gaussians:
+def with_growth(initial: Gaussians, config: AdaptConfig, growth_d: Tensor | None = None) -> Gaussians:
     """``initial`` with ``growth_d``, by default 0; without one if the config has no growth."""
     if config.growth == "off":
         return initial.replace(growth_d=None)

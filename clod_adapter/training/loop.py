@@ -13,7 +13,7 @@ from clod_adapter.equation.units import in_world_units, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.finite import LossNotFinite, largest_colour, require_finite
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import for_training, initialize, usable_views
+from clod_adapter.initialization.importance import for_training, initialize, usable_views, with_growth
 from clod_adapter.progress import Listener, Phase, Progress
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost
 from clod_adapter.training.interrupts import DeferredInterrupt
@@ -111,7 +111,7 @@ def _initialized(
     lean: Gaussians, views: tuple[View, ...], config: AdaptConfig, progress: Listener | None,
     group: ProcessGroup | None,
 ) -> Gaussians:  # fmt: skip
-    """The Gaussians with the initial sigma_d, the same bits in all processes."""
+    """The Gaussians with the initial dial, the same bits in all processes."""
     begun = for_training(initialize(lean, views, config, progress), views, config)
     if group:
         own = {"sigma_d": begun.sigma_d, "growth_d": begun.growth_d, "attenuation": begun.attenuation}
@@ -120,14 +120,10 @@ def _initialized(
 
 
 def _initialized_from(lean: Gaussians, resume: TrainingState, config: AdaptConfig) -> Gaussians:
-    """The Gaussians with the sigma_d of rows that are rendered only; the state has that of the trained rows."""
-    unset = torch.ones_like(lean.opacity_logits)
+    """The Gaussians with the dial of rows that are rendered only; the state has that of the trained rows."""
     dialled = with_distance(in_world_units(lean), resume.attenuation.scene_distance)  # rounded as in the first call
-    growth = unset if lean.growth_d is None else lean.growth_d
-    return lean.replace(
-        sigma_d=unset if lean.sigma_d is None else dialled.sigma_d, attenuation=resume.attenuation,
-        growth_d=growth if config.growth == "on" else None,
-    )  # fmt: skip
+    sigma_d = torch.ones_like(lean.opacity_logits) if lean.sigma_d is None else dialled.sigma_d
+    return with_growth(lean.replace(sigma_d=sigma_d, attenuation=resume.attenuation), config, lean.growth_d)
 
 
 def _train(trainer: Trainer, progress: Listener | None) -> Adapted:

@@ -19,7 +19,7 @@ from clod_adapter.training.plan import NAMES, RATES, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
 from scenes import assert_equal, with_unseen
 
-CONFIG = AdaptConfig(iters=40, max_sv=4.0)
+CONFIG = AdaptConfig(iters=40, max_sv=4.0, start_share=0.62)
 ALL = frozenset(NAMES)
 
 

@@ -28,7 +28,7 @@ RATES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 RESUMED = {
     "ours": {},
     "paper": vars(AdaptConfig.paper(iters=12, max_sv=4.0)),
-    "linear": {"parameter": "linear", "lr_shN": 0.0},
+    "linear": {"parameter": "linear", "lr_shN": 0.0, "growth": "off"},
     "mean of all": {"average": 1.0, "max_sv": 1.0},
     "sigma_d alone": {f"lr_{name}": 0.0 for name in RATES} | {"average": 0.0},
 }
@@ -83,7 +83,7 @@ def test_a_state_holds_trained_parameters_only(captured: Pair) -> None:
     base, states = captured[0], dict[int, TrainingState]()
     still = {"lr_shN": 0.0, "lr_means": 0.0, "average": 0.5}
     adapt(*captured, config_of(iters=4, **still), states_of({1, 3}, states))
-    changing = {"quats", "log_scales", "opacity_logits", "sh0", "log_sigma"}
+    changing = {"quats", "log_scales", "opacity_logits", "sh0", "log_sigma", "growth_d"}
     for step, kinds in ((1, {"parameter", "first", "second", "steps"}), (3, {"mean"})):
         assert {name.split(".")[1] for name in states[step].tensors} == changing
         assert kinds <= {name.split(".")[0] for name in states[step].tensors}
@@ -96,9 +96,18 @@ def test_a_state_of_another_run_is_refused(captured: Pair) -> None:
     adapt(base, scene, config, states_of({1}, states))
     state = states[1]
     few, fewer = base.select(torch.arange(len(base)) < 9), Scene(scene.train[:1], ())
-    for other in ((few, scene, config), (base, fewer, config), (base, scene, config_of(iters=2, parameter="linear"))):
+    for other in (
+        (few, scene, config),
+        (base, fewer, config),
+        (base, scene, config_of(iters=2, parameter="linear")),
+        (base, scene, config_of(iters=2, growth="off")),
+    ):
         with pytest.raises(ClodError, match="of other Gaussians, views or settings"):
             adapt(*other, None, state)
+    grown = {name: tensor for name, tensor in state.tensors.items() if "growth_d" not in name}
+    assert len(grown) == len(state.tensors) - 4
+    with pytest.raises(ClodError, match="of other Gaussians, views or settings"):
+        adapt(base, scene, config, None, replace(state, tensors=grown))
     damaged = dict(state.tensors) | {"steps.sh0": state.tensors["steps.sh0"] - 2}
     for impossible in (
         {"tensors": damaged}, {"steps": 0}, {"averaged": -1}, {"averaged": 9}, {"seconds": math.nan}, {"seconds": -1.0},
