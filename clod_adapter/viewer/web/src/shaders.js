@@ -73,16 +73,13 @@ void main() {
   if (pixel.y * ${WIDTH} + pixel.x >= drawn) return;
   int row = int(texelFetch(order, pixel, 0).r), record = row * 4;
   vec4 mean = texelFetch(records, texelAt(record), 0), shape = texelFetch(records, texelAt(record + 2), 0);
-  vec4 tint = texelFetch(records, texelAt(record + 3), 0);
   vec3 ray = mean.xyz - eye, point = view * ray;
   if (!(point.z >= size.z)) return;
-  float opacity = mean.w;
-  if (attenuated) {
-    float distance = length(ray) / distance_unit;
-    opacity = clodOpacity(opacity, shape.w, distance, dial, eps, tau, soft);
-    shape.xyz *= clodScale(tint.a, distance, dial, reach);
-  }
+  float opacity = mean.w, distance = length(ray) / distance_unit;
+  if (attenuated) opacity = clodOpacity(opacity, shape.w, distance, dial, eps, tau, soft);
   if (opacity < 1.0 / 255.0) return;
+  vec4 tint = texelFetch(records, texelAt(record + 3), 0);
+  if (attenuated) shape.xyz *= clodScale(tint.a, distance, dial, reach);
 
   vec2 margin = 0.15 * size.xy / pinhole.xy;
   vec2 slope = clamp(point.xy / point.z, -pinhole.zw / pinhole.xy - margin, (size.xy - pinhole.zw) / pinhole.xy + margin);
