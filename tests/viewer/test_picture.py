@@ -77,6 +77,17 @@ def test_growth(shown: Shown, artefacts: Path, tmp_path: Path, degree: int, sett
     assert_same(shown, render(plain.replace(sigma_d=None, attenuation=None), camera), artefacts / "growth_off.png")
 
 
+def test_gaussians_that_grow_far_beyond_the_picture(shown: Shown, artefacts: Path, tmp_path: Path) -> None:
+    """By factors up to 1e8. Quads of that size would be drawn inexactly; they end at the picture's farthest corner."""
+    model = scenes.dialled(1500, 0, 7, max_sv=40.0, reference_distance=2.0)
+    model, camera = model.replace(growth_d=torch.linspace(-1, 5, 1500)), scenes.camera(320, 240)
+    (tmp_path / "grown.ply").write_bytes(b"".join(Payload("grown.ply", model).blocks()))
+    take(shown, tmp_path / "grown.ply")
+    shown.camera(camera)
+    shown.run("clod.setDial(given)", 20.0)
+    assert_same(shown, render(model, camera, 20.0), artefacts / "far_beyond.png")
+
+
 def test_through_cameras_of_other_shapes(shown: Shown, save: Any, artefacts: Path) -> None:
     """Portrait format, the principal point in a corner, and a small unit of length with a nearer near plane."""
     gaussians = scenes.dialled(1500, 0, 7)

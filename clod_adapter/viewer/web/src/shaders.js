@@ -105,8 +105,9 @@ void main() {
   if (any(lessThan(centre + extent, vec2(0.0))) || any(greaterThan(centre - extent, size.xy))) return;
   vec3 rgb = tint.rgb;
   ${degree ? "rgb += shColor(row, normalize(ray));" : ""}
-  footprint = floatBitsToUint(vec4(centre, radius * sqrt(major) * normalize(direction)));
-  conic = floatBitsToUint(vec4(vec3(yy, -xy, xx) / det, radius * sqrt(minor)));
+  float far = length(abs(centre - 0.5 * size.xy) + 0.5 * size.xy);   // to the farthest corner: no quad need be longer
+  footprint = floatBitsToUint(vec4(centre, min(radius * sqrt(major), far) * normalize(direction)));
+  conic = floatBitsToUint(vec4(vec3(yy, -xy, xx) / det, min(radius * sqrt(minor), far)));
   color = floatBitsToUint(vec4(max(rgb, 0.0), opacity));
 }`;
 
