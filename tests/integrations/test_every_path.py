@@ -111,7 +111,6 @@ def test_growth_and_fading_are_visible() -> None:
         assert (wanted(other) - wanted(model)).abs().max() > 0.1
 
 
-@pytest.mark.skip(reason="the page does not draw growth yet")  # remove this line once it does
 def test_the_page_agrees(checkpoint: Checkpoint, chromium: Any, tmp_path: Path) -> None:
     camera = scenes.camera(320, 240)
     with serve(checkpoint.path, "--sv", DIAL) as url, closing(chromium.new_page()) as page:
