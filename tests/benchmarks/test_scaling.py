@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import growth_rows as measured
+import scaling_rows as measured
 import pytest
 
 SIZES = (measured.FLOOR, *measured.SIZES)
