@@ -3,8 +3,8 @@
     python benchmarks/scaling.py            # some 15 minutes, 12 GB of memory, 8 GB of disk; --plot runs nothing
 
 Runs each command in its own process on synthetic cities, which are kept in benchmarks/cache. Measures wall and CPU
-seconds and resident memory by phase. A city of 1000 Gaussians gives the start-up cost. Rows go to results/scaling.jsonl;
-the last row of a kind counts. Writes docs/images/scaling.png and the tables of docs/scaling.md.
+seconds and resident memory by phase. A city of 1000 Gaussians gives the start-up cost. Rows go to
+results/scaling.jsonl; the last row of a kind counts. Writes docs/images/scaling.png and the tables of docs/scaling.md.
 """
 
 from __future__ import annotations
