@@ -86,7 +86,9 @@ class Contest:
         for share, count in self.counts.items():
             merged, seconds = merge(self.base, count)
             for seed in self.args.seed:
-                self.tune("specialist", "merged, then tuned", merged, seed, [share], merge_seconds=seconds)
+                self.tune(
+                    "specialist", f"merged {MERGINGS[0]}, then tuned", merged, seed, [share], merge_seconds=seconds
+                )
 
     def tuned(self) -> None:
         for seed in self.args.seed:
