@@ -199,7 +199,8 @@ def run(scene: str, label: str, config: clod.AdaptConfig, changed: dict[str, obj
         "benchmark": "adapt", "scene": scene, "label": label, "changed": changed, "config": asdict(config),
         "base_count": len(base.gaussians), "base": base_row.as_dict(), "rows": [row.as_dict() for row in rows],
         "at_shares": at_shares(result, views.test), "steps": adapted.steps, "share": plan.config.share,
-        "start_seconds": round(sum(plan.seconds.values()) + adapted.start_seconds, 2), "train_seconds": round(adapted.seconds, 2),
+        "start_seconds": round(sum(plan.seconds.values()) + adapted.start_seconds, 2),
+        "train_seconds": round(adapted.seconds, 2),
         "popping": jumps(result, views.test) if popping else None,
     })  # fmt: skip
 

@@ -15,7 +15,7 @@ import numpy as np
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load
 from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
-from clod_adapter.viewer.payload import Payload, dial_columns
+from clod_adapter.viewer.payload import Payload, dial_of
 
 BITS = 11  # stored fraction bits of the dial's columns; their relative error is at most 2^-12
 
@@ -26,7 +26,7 @@ class PackedSplat:
 
     Attributes:
         sog: the .sog file.
-        columns: ``payload.dial_columns``: each as gzip of ``[N]`` little-endian float32 in the row order of ``sog``.
+        columns: ``payload.dial_of``: each as gzip of ``[N]`` little-endian float32 in the row order of ``sog``.
     """
 
     sog: bytes
@@ -61,7 +61,7 @@ def pack_sog(
             raise ClodError(
                 f"splat-transform {tool.version} has written {len(found)} of {count} Gaussians; try another version"
             )
-        columns = {name: _rounded(value.numpy()).tobytes() for name, value in dial_columns(found).items()}
+        columns = {name: _rounded(value.numpy()).tobytes() for name, value in dial_of(found).items()}
         return PackedSplat(sog.read_bytes(), {name: gzip.compress(data) for name, data in columns.items()})
 
 
