@@ -129,7 +129,7 @@ def _one_camera(given: dict[str, Any], virtual_scale: float, config: Attenuation
     shown = hook.attenuate(given["means"].reshape(-1, 3), opacities.flatten(), camera)
     arguments["opacities"] = shown.drawn.to(opacities).reshape(opacities.shape)
     if shown.growth is not None:
-        name, growth = ("scales", shown.growth) if given["covars"] is None else ("covars", shown.growth.square())
+        name, growth = ("scales", shown.growth) if given.get("covars") is None else ("covars", shown.growth.square())
         old = given[name]
         arguments[name] = old * growth.to(old).reshape(opacities.shape + (1,) * (old.dim() - opacities.dim()))
     return gsplat.rasterization(**arguments)
