@@ -1,4 +1,4 @@
-"""Growth without training: the exponents with which Gaussians that remain cover the area of those whose substitutes they are."""
+"""Growth without training: exponents with which the Gaussians that remain cover the area of those that are culled."""
 
 from __future__ import annotations
 
