@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,7 +53,7 @@ class ViewSampler:
             rendered = [1.0, drawn] if config.max_sv > 1 else [1.0]
         if not config.has_target_count:
             return Sample(view, rendered)
-        return Sample(view, rendered, (COUNTED_BEYOND * config.max_sv) ** math.sqrt(self.random.random()))
+        return Sample(view, rendered, (COUNTED_BEYOND * config.max_sv) ** self.random.random())
 
     def state(self) -> tuple[dict[str, Any], tuple[int, ...]]:
         """Everything that later samples depend on: the generator's state, and the order."""
