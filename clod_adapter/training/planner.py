@@ -19,6 +19,7 @@ from clod_adapter.training.ablation import needed_share, seen, sh_degree_losses
 from clod_adapter.training.loop import require_trainable
 from clod_adapter.training.plan import RATES, Decision, Override, Plan
 
+SHARE_LIMIT = 0.01  # dB: the share kept at s = 1 loses less on these views
 LIMIT = 0.02  # dB: SH degrees and Gaussians are left out if the PSNR of the training views changes by less without them
 VIEWS = 8  # evenly spread training views on which that is measured
 REQUESTED = "as requested, not measured"
@@ -128,7 +129,7 @@ class _Planner:
             return self.config
         with self._time("share"):
             views = spread(self.views, VIEWS)
-            share, loss = needed_share(few, views, error, LIMIT)
+            share, loss = needed_share(few, views, error, SHARE_LIMIT)
         why = f"lost without the other {1 - share:.0%}, untrained, {_counted(len(views))}"
         self._decide(f"{share:.0%} of the Gaussians at s = 1", "kept", why, "", loss, "dB")
         return replace(self.config, start_share=share)
