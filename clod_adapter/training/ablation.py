@@ -63,9 +63,9 @@ def seen(base: Gaussians, views: Sequence[View], error: Tensor, seed: int, progr
 def needed_share(base: Gaussians, views: Sequence[View], error: Tensor, limit: float) -> tuple[float, float]:
     """The smallest share of the Gaussians that loses less than ``limit`` dB, in hundredths, and that loss.
 
-    In (0.5, 1], by bisection. The Gaussians with the largest removal error remain, unattenuated. The loss is that of
-    the mean PSNR over the views, ``10 log10(e' / e)`` with e the mean squared error, which is taken as at least
-    ERROR_FLOOR: against its own renderings a checkpoint would have no error, and every Gaussian would be needed.
+    In (0.5, 1], by bisection. The Gaussians with the largest removal error remain, unattenuated. The loss of a view is
+    ``10 log10(e' / e)``, and e, the base's mean squared error, at least ERROR_FLOOR: against its own renderings a
+    checkpoint would have no error, and every Gaussian would be needed.
 
     Args:
         error: ``[N]`` from ``removal_error``.
@@ -76,7 +76,7 @@ def needed_share(base: Gaussians, views: Sequence[View], error: Tensor, limit: f
     def loss(percent: int) -> float:
         less = base.select(order[: max(round(percent / 100 * len(base)), 1)])
         return fmean(
-            10 * math.log10(max(_squared_error(less, view) + floor, floor) / (mse + floor))
+            10 * math.log10((_squared_error(less, view) + floor) / (mse + floor))
             for view, mse in zip(views, whole, strict=True)
             for floor in [max(ERROR_FLOOR - mse, 0.0)]
         )
