@@ -72,21 +72,22 @@ def test_extreme_areas_and_circles_of_substitutes() -> None:
         assert found.isfinite().all() and found.min() >= 0 and found.max() <= MOST * SHARE
 
 
-@pytest.mark.parametrize("start", ["constant", "identity", "error"])
-def test_other_initializations_have_no_growth(start: str) -> None:
-    """They have no substitutes; an exponent of 0 is trained as any other."""
+@pytest.mark.parametrize(
+    ("start", "iters"), [("constant", 0), ("identity", 0), ("error", 0), ("importance", 1), ("importance", 0)]
+)
+def test_growth_is_fitted_without_training_only(start: str, iters: int) -> None:
+    """The other initializations have no substitutes; an exponent of 0 is trained as any other."""
     some = gaussians(60, 0, 0)
     views = photograph(some, ring(2, 16, 12))
-    found = initialize(some, views, AdaptConfig(start=start)).growth_d
-    assert found is not None and torch.equal(found, torch.zeros(60))
-    assert initialize(some, views, AdaptConfig()).growth_d.any()
+    found = initialize(some, views, AdaptConfig(start=start, iters=iters)).growth_d
+    assert found is not None and bool(found.any()) == ((start, iters) == ("importance", 0))
 
 
 def test_a_dial_of_the_base_keeps_its_growth(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it has none growth starts at 0, and without growth it is dropped."""
     some = gaussians(60, 0, 0)
     views, fitted = photograph(some, ring(2, 16, 12)), list[Any]()
-    grown = initialize(some, views, AdaptConfig())
+    grown = initialize(some, views, AdaptConfig(iters=0))
     plain = initialize(some, views, AdaptConfig(growth="off"))
     assert plain.growth_d is None and torch.equal(plain.sigma_d, grown.sigma_d)
 
