@@ -104,7 +104,7 @@ def find_tool() -> SplatTransform:
         sys.exit(str(error))
 
 
-MERGINGS = ("--decimate-adaptive", "--decimate")  # the first is the better one (docs/method.md)
+MERGINGS = ("--decimate-adaptive", "--decimate")
 
 
 def merge(base: clod.Checkpoint, count: int, method: str = MERGINGS[0]) -> tuple[clod.Gaussians, float]:
