@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from clod_adapter.attenuation import SIGMA_MAX
+from clod_adapter.equation.attenuation import SIGMA_MAX
 
 import mpmath
 import numpy as np
@@ -28,6 +28,7 @@ LOGITS, SIGMAS, DISTANCES = 33, 48, 16  # how many of each; with 50 pairs of s a
 SCALES = [1.0, 1.3, math.sqrt(3), math.pi, 7.0, 23.7, 100.0, 612.5, 3333.3, 1e4]
 EPSILONS = [0.0, 1e-12, 1e-8, 3e-5, 1e-2]
 TAUS = [1e-6, 1e-5, 3e-4, 1 / 255, 0.02, 0.1, 0.3, 0.5, 0.9, 0.999]  # s goes to 1e4: all but one are past 1/s there
+REACHES = [1e-3, 0.3, 1.0, math.e, 400.0]  # of growth
 TEMPERATURES = [1e-300, 1e-30, 1e-6, 1e-3, 0.02, 0.15, 0.5, 1.0, 10.0, 1e6]
 
 
@@ -149,6 +150,19 @@ def at_the_threshold(dtype: str) -> Iterator[Case]:
         logs = [log_sigmoid(logit) for logit in logits]
         parts = logs, [-mpmath.expm1(log) for log in logs], u, [exponential(value) for value in u], slope
         yield Case(logits, sigma, d, *(wide(list(part)) for part in parts), s, tau, eps)
+
+
+def growth_axes(dtype: str) -> tuple[Array, Array]:
+    """Exponents and distances: the ends of their ranges, trained ones, and random ones between."""
+    random = np.random.default_rng(5)
+    exponents = [-20, -1, 0, 1e-6, 3, 20, *random.uniform(-1, 3, 21), *random.uniform(-20, 20, 5)]
+    distances = [0, 1e-6, 1e-3, 0.3, 1, 1 + 1e-7, 400, 1e4, *10.0 ** random.uniform(-2, 3, 24)]
+    return rounded(exponents, dtype), rounded(distances, dtype)
+
+
+def log_magnification(d: float, s: float, r: float) -> Any:
+    """log m of growth."""
+    return max(mpmath.log(mpf(d) * mpf(s) / mpf(r)), mpf(0)) if d > 0 else mpf(0)
 
 
 def newton(at: Array, unit: Array, upper: Array) -> Array:

@@ -28,8 +28,8 @@ from typing import Any
 
 import clod_adapter as clod
 from city import city, city_cameras, perturb
-from clod_adapter.attenuation import attenuate
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.metrics import psnr
 from clod_adapter.rasterizers import cuda, wait_for
 from clod_adapter.render import dial, splat

@@ -3,7 +3,7 @@
     python benchmarks/rivals.py plush_half bonsai146 --iters 1500
     python benchmarks/rivals.py --table                    # the rows as a Markdown table
 
-- ``merging``: ``splat-transform --decimate``, without training, one file per count;
+- ``merging``: ``splat-transform``, both of its methods, without training, one file per count;
 - ``specialist``: the merged file, tuned for that count alone;
 - ``tuned``: the whole base, tuned for as many steps;
 - ``prefix``: one file whose prefixes are the counts, tuned with random prefixes (``tuning.tune``);
@@ -26,7 +26,7 @@ from clod_adapter.gaussians import SH_C0
 from clod_adapter.initialization.importance import removal_error
 from clod_adapter.render import splat
 from common import append, arguments, checkpoint, falling, head, photographs, stored, table
-from tuning import Tuning, find_tool, merge, tune
+from tuning import MERGINGS, Tuning, find_tool, merge, tune
 
 import torch
 from torch import Tensor
@@ -75,17 +75,20 @@ class Contest:
         })  # fmt: skip
 
     def merging(self) -> None:
-        rows = []
-        for share, count in self.counts.items():
-            merged, seconds = merge(self.base, count)
-            rows.append({**self.measure(merged, share), "seconds": seconds})
-        self.record("merging", f"splat-transform {find_tool().version} --decimate", rows)
+        for method in MERGINGS:
+            rows = []
+            for share, count in self.counts.items():
+                merged, seconds = merge(self.base, count, method)
+                rows.append({**self.measure(merged, share), "seconds": seconds})
+            self.record("merging", f"splat-transform {find_tool().version} {method}", rows)
 
     def specialist(self) -> None:
         for share, count in self.counts.items():
             merged, seconds = merge(self.base, count)
             for seed in self.args.seed:
-                self.tune("specialist", "merged, then tuned", merged, seed, [share], merge_seconds=seconds)
+                self.tune(
+                    "specialist", f"merged {MERGINGS[0]}, then tuned", merged, seed, [share], merge_seconds=seconds
+                )
 
     def tuned(self) -> None:
         for seed in self.args.seed:

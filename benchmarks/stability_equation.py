@@ -19,9 +19,10 @@ from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import exact
-from clod_adapter.attenuation import SIGMA_MAX, attenuate, log_attenuation
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.extinction import extinction_scale, sigma_for_extinction
+from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate, log_attenuation
+from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
+from clod_adapter.equation.growth import LOG_GROWTH_MAX
 from clod_adapter.training.target_count import count_slope, soft_count
 from common import table
 from equation_tally import Tallies
@@ -109,6 +110,33 @@ def check_drawn(tallies: Tallies, case: Case, place: str) -> None:
     (by_sigma,), (other,) = gradients(out.drawn, sigma), gradients(naive["soft"], sigma)
     row = tallies.of(f"gradient of drawn by sigma_d, soft cut, {place}", "8 + 10 (abs(log tau s) + 1)" + more, True)
     row.add(by_sigma, steep, 4 + steady + 10 * logs, where, other, sure & (np.abs(x - FADE) > margin))
+
+
+def check_growth(tallies: Tallies) -> None:
+    """Growth and its gradient, which is not compared within rounding of the clamp and where it overflows."""
+    dtype, info, axes = tallies.dtype, tallies.info, exact.growth_axes(tallies.dtype)
+    h, d = exact.columns(*axes)
+    zero = torch.zeros(len(h), dtype=DTYPES[dtype])
+    largest = min(math.exp(LOG_GROWTH_MAX), torch.finfo(DTYPES[dtype]).max)
+    for s, r in itertools.product(exact.SCALES, exact.REACHES):
+        log_m = np.tile(wide([exact.log_magnification(x, s, r) for x in axes[1]]), len(axes[0]))
+        log_g = Wide(h) * log_m
+        want = np.exp(np.clip(log_g, -LOG_GROWTH_MAX, LOG_GROWTH_MAX))
+        steep = np.where(np.abs(log_g) < LOG_GROWTH_MAX, want * log_m, 0)
+        leaf, distance = tensor(h, dtype, True), tensor(d, dtype)
+        config = AttenuationConfig(reference_distance=r, max_sv=1)
+        got = attenuate(zero, zero, distance, s, config, growth_d=leaf).growth
+        assert got is not None
+        naive = ((distance * s / r).clamp(min=1) ** leaf).clamp(1 / largest, largest)
+        allowed = 4 + 2 * np.abs(h) * (1 + log_m)
+        sure = np.abs(np.abs(log_g) - LOG_GROWTH_MAX) > info.eps * allowed
+        sure &= steep < torch.finfo(DTYPES[dtype]).max
+        where = {"growth_d": h, "d": d, "s": s, "r": r}
+        (slope,), (other,) = gradients(got, leaf), gradients(naive, leaf)
+        bound = "4 + 2 abs(h) (1 + log m)"
+        tallies.of("growth", bound).add(plain(got), want, allowed, where, plain(naive))
+        row = tallies.of("gradient of growth by growth_d", bound + " + 2 / log m", True)
+        row.add(slope, steep, allowed + 2 / np.maximum(log_m, 1e-300), where, other, sure)
 
 
 def check_extinction(tallies: Tallies) -> None:
@@ -227,6 +255,7 @@ def check(part: str, dtype: str) -> list[dict[str, Any]]:
     elif part == "rest":
         for case in exact.at_the_threshold(dtype):
             check_drawn(tallies, case, "at the threshold")
+        check_growth(tallies)
         check_extinction(tallies)
         check_inverse(tallies)
         check_counts(tallies)

@@ -49,7 +49,8 @@ def stiffness(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def popping(rows: list[dict[str, Any]], path: Path) -> None:
-    """Log-log, a panel a sweep: a colour a normalizer, dashes for the hard threshold."""
+    """Log-log, a panel a sweep: a colour a normalizer, dashes for the hard threshold; without growth."""
+    rows = [row for row in rows if not row["growth"]]
     colours = {"scene": BLUE, "quantile": GREEN, "max": ORANGE}
     with new_figure((10.4, 3.9), layout="constrained") as figure:
         panels = figure.subplots(1, len(SWEEPS), sharey=True)

@@ -2,27 +2,31 @@
 
 The scene is made to pop: Gaussians in one place with one extinction scale, and one far away that enters the frustum
 while the camera turns. A fade changes in proportion to the step's length (slope 1), a pop by the same amount (slope 0).
-The default, one D for the scene and the soft threshold, has a bound. For the drawn opacities (``attenuation``)::
+The default, one D for the scene and the soft threshold, has a bound. For the drawn opacities (``attenuation``), and
+for the footprint f of a Gaussian on a pixel, ``exp(-q/2)`` times the compensation of the screen filter::
 
     |change of opacity| <= L h    L = 2 x (1.5 - 4 ln x), x = min(1.5 tau max_sv, exp(-5/8)); at most 4.3
+    |change of f| <= 2/e G h      G = max |growth_d|
 
-``h`` is the change of ``log s``, or of the logarithm of the distance. With ``W`` the largest sum of the Gaussians'
-footprints over one pixel, no pixel changes by more than ``W (255 L h + 1)`` levels: rasterizers drop an alpha < 1/255.
+``h`` is the change of ``log s``, or of the logarithm of the distance. With ``n`` the largest number of Gaussians on one
+pixel and ``W`` the largest sum of their footprints, no pixel changes by more than ``255 (W L + 2/e n G) h + n`` levels:
+rasterizers drop an alpha < 1/255. docs/stability.md derives it.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise, product
 from typing import Any
 
 import clod_adapter as clod
 from clod_adapter.config import CUTS, NORMALIZERS, AttenuationConfig
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.distances import normalized_distances
+from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.evaluation.popping import dial_popping, path, path_popping
-from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.gaussians import SH_C0, Gaussians
-from clod_adapter.render import splat
+from clod_adapter.render import dial, splat
 from common import table
 
 import torch
@@ -31,22 +35,23 @@ from torch import Tensor
 STEPS = (20, 40, 80, 160)
 SWEEPS = {"dial": "the dial from 1 to 5", "turn": "a camera that turns, s = 2", "path": "a camera that moves, s = 2"}
 OTHERS, TOGETHER, SCALE = 120, 4, 2.0
+GROWTH, INTERVALS = 0.75, 8  # growth_d that preserves area; of a sweep, for its bound
+DEFAULT = ("scene", "soft")
 DISTANCE = 4.0  # of the camera from the middle
 
 
 def measure() -> list[dict[str, Any]]:
     rows = []
-    for normalizer in NORMALIZERS:
-        for cut in CUTS:
-            some, cameras = scene(normalizer, cut)
-            for sweep in SWEEPS:
-                for steps in STEPS:
-                    found = _sweep(some, cameras, sweep, steps)
-                    row = {"part": "popping", "normalizer": normalizer, "cut": cut, "sweep": sweep, "steps": steps,
-                           "pixel": found.pixel, "persistence": found.pixel_persistence}  # fmt: skip
-                    if (normalizer, cut) == ("scene", "soft"):
-                        row["bound"] = bound(some, cameras, sweep, steps)
-                    rows.append(row)
+    for normalizer, cut, growth in [*product(NORMALIZERS, CUTS, [0.0]), (*DEFAULT, GROWTH)]:
+        some, cameras = scene(normalizer, cut)
+        some = some.replace(growth_d=torch.full((len(some),), growth))
+        for sweep, steps in product(SWEEPS, STEPS):
+            found = _sweep(some, cameras, sweep, steps)
+            row = {"part": "popping", "normalizer": normalizer, "cut": cut, "growth": growth, "sweep": sweep,
+                   "steps": steps, "pixel": found.pixel, "persistence": found.pixel_persistence}  # fmt: skip
+            if (normalizer, cut) == DEFAULT:
+                row["bound"] = bound(some, cameras, sweep, steps)
+            rows.append(row)
     return rows
 
 
@@ -105,34 +110,43 @@ def steepest(config: AttenuationConfig) -> float:
 
 @torch.no_grad()
 def bound(some: Gaussians, cameras: dict[str, list[clod.Camera]], sweep: str, steps: int) -> float:
-    """``W (255 L h + 1)``: the most that a pixel can change in a step of the default; 0 where no distance changes."""
-    assert some.attenuation is not None
+    """``255 (W L + 2/e n G) h + n``, the most that a pixel can change in a step of the default; 0 if no distance does.
+
+    W and n are the largest of a few intervals of the sweep, of the Gaussians that an interval keeps somewhere, with
+    their largest scales in it; growth_d is >= 0.
+    """
+    assert some.attenuation is not None and some.growth_d is not None
     if sweep == "turn":
         return 0.0
     if sweep == "dial":
-        seen, h = cameras[sweep], math.log(some.attenuation.max_sv) / steps
+        h = math.log(some.attenuation.max_sv) / steps
+        positions = [(cameras[sweep][0], some.attenuation.max_sv ** (k / INTERVALS)) for k in range(INTERVALS + 1)]
     else:
         seen = path(cameras[sweep], steps)
         away = torch.stack([(some.means - camera.position).norm(dim=1) for camera in seen]).log()
         h = float((away[1:] - away[:-1]).abs().max())
-    covers = [
-        torch.stack(
-            [splat(one, torch.ones(1), camera)[1] for one in map(some.select, torch.arange(len(some))[:, None])]
-        )
-        for camera in seen[:: max(steps // 4, 1)]
-    ]
-    return float(max(cover.sum(0).max() for cover in covers)) * (255 * steepest(some.attenuation) * h + 1)
+        positions = [(camera, SCALE) for camera in seen[:: max(steps // INTERVALS, 1)]]
+    sums, counts = 0.0, 0
+    for ends in pairwise(positions):
+        turned = [dial(some, *end) for end in ends]
+        growth = torch.stack([each.growth for each in turned]).amax(0)
+        grown = some.replace(log_scales=some.log_scales + growth.log()[:, None])
+        rows = torch.stack([each.keep for each in turned]).any(0).nonzero()
+        covers = torch.stack([splat(grown.select(row), torch.ones(1), ends[1][0])[1] for row in rows])
+        sums, counts = max(sums, float(covers.sum(0).max())), max(counts, int((covers > 0).sum(0).max()))
+    growing = 2 / math.e * counts * float(some.growth_d.abs().max())
+    return 255 * h * (sums * steepest(some.attenuation) + growing) + counts
 
 
 def tables(rows: list[dict[str, Any]]) -> str:
     """Largest change of a pixel in the longest and the shortest steps; the default's bound below its row."""
     ends, lines = [(name, steps) for name in SWEEPS for steps in (min(STEPS), max(STEPS))], []
-    for normalizer, cut in dict.fromkeys((row["normalizer"], row["cut"]) for row in rows):
-        own = {(r["sweep"], r["steps"]): r for r in rows if (r["normalizer"], r["cut"]) == (normalizer, cut)}
-        default = (normalizer, cut) == ("scene", "soft")
-        pixels = [f"{own[end]['pixel']:.1f}" for end in ends]
-        lines.append([f"{normalizer}{' (default)' if default else ''}", cut, *pixels])
-        if default:
+    for key in dict.fromkeys((row["normalizer"], row["cut"], row["growth"]) for row in rows):
+        own = {(r["sweep"], r["steps"]): r for r in rows if (r["normalizer"], r["cut"], r["growth"]) == key}
+        normalizer, cut, growth = key
+        of = f", growth_d {growth:g}" if growth else " (default)" if key[:2] == DEFAULT else ""
+        lines.append([f"{normalizer}{of}", cut, *(f"{own[end]['pixel']:.1f}" for end in ends)])
+        if key[:2] == DEFAULT:
             lines.append(["its bound", "", *(f"{min(own[end]['bound'], 255):.0f}" for end in ends)])
     held = all(row["pixel"] <= row["bound"] + 0.05 for row in rows if "bound" in row)
     found = table(["normalizer", "threshold", *(f"{name}: 1/{steps}" for name, steps in ends)], lines)

@@ -19,8 +19,8 @@ from itertools import product
 from typing import Any
 
 from clod_adapter._kernels.threads import torch_on_one_thread
-from clod_adapter.attenuation import Attenuated, attenuate
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.attenuation import Attenuated, attenuate
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.report.style import BLUE, GREEN, ORANGE, PURPLE, QUIET
 from clod_adapter.training.objective import SIGMA_RANGE
 from clod_adapter.training.optimizer import RowAdam

@@ -15,8 +15,8 @@ from dataclasses import replace
 from typing import Any
 
 import clod_adapter as clod
-from clod_adapter.attenuation import SIGMA_MAX, attenuate
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.initialization.importance import sigma_from_importance
 from clod_adapter.losses import photometric_loss
 from clod_adapter.training.target_count import count_gradient, soft_count, target_curve
@@ -86,9 +86,9 @@ def scene(n: int = 192, seed: int = 0) -> tuple[clod.Gaussians, clod.Camera]:
     settings = CONFIG.attenuation(unit)
     distances = normalized_distances(some.means, camera, settings)
     rank = torch.rand(n, generator=draw)
-    right = sigma_from_importance(
-        some, rank, distances, settings, share=CONFIG.start_share, exponent=CONFIG.exponent
-    ).clamp(max=1e6)
+    right = sigma_from_importance(some, rank, distances, settings, share=CONFIG.share, exponent=CONFIG.exponent).clamp(
+        max=1e6
+    )
     return clod.attach(some, right, settings), camera
 
 
@@ -114,7 +114,7 @@ def objective(run: Trainer) -> float:
     for s in DIALS:
         shown = clod.render(found, view.camera, s)
         weight = (1 - config.weight_slope * s / config.max_sv) ** 2
-        off = float(shown.kept.float().mean()) / target_curve(s, config.start_share, config.exponent) - 1
+        off = float(shown.kept.float().mean()) / target_curve(s, config.share, config.exponent) - 1
         total += weight * float(photometric_loss(shown.image, view.image)) * (1 + config.reg_weight * off**2)
     return total / len(DIALS)
 

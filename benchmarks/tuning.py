@@ -104,11 +104,18 @@ def find_tool() -> SplatTransform:
         sys.exit(str(error))
 
 
-def merge(base: clod.Checkpoint, count: int) -> tuple[clod.Gaussians, float]:
-    """The base merged to ``count`` Gaussians, and the seconds that the tool took, then or now."""
+MERGINGS = ("--decimate-adaptive", "--decimate")
+
+
+def merge(base: clod.Checkpoint, count: int, method: str = MERGINGS[0]) -> tuple[clod.Gaussians, float]:
+    """The base merged to ``count`` Gaussians, and the seconds that the tool took, then or now.
+
+    Args:
+        method: of MERGINGS.
+    """
     tool = find_tool()
     CACHE.mkdir(parents=True, exist_ok=True)
-    out = CACHE / f"{base.fingerprint[:12]}-{tool.version}-{count}.ply"
+    out = CACHE / f"{base.fingerprint[:12]}-{tool.version}{method}-{count}.ply"
     clock = out.with_suffix(".seconds")
     if not (out.exists() and clock.exists()):
         # In a folder of its own: another benchmark may want the same file now.
@@ -116,7 +123,7 @@ def merge(base: clod.Checkpoint, count: int) -> tuple[clod.Gaussians, float]:
             source, merged = Path(folder) / "base.ply", Path(folder) / "merged.ply"
             _write_plain(source, base)
             try:
-                seconds = tool.run("-q", source, "--decimate", str(count), merged, timeout=TIMEOUT)
+                seconds = tool.run("-q", source, method, str(count), merged, timeout=TIMEOUT)
             except clod.ClodError as error:
                 sys.exit(str(error))
             clock.write_text(f"{seconds:.2f}\n", encoding="utf-8")

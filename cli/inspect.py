@@ -57,7 +57,7 @@ def splat_lines(splat: Splat) -> list[str]:
         lines.append(_line("layout", f"{splat.encoding}, {len(splat.columns)} properties{more}"))
     lines += _block("says", (comment[:LONGEST] for comment in splat.comments))
     rows = [*zip("xyz", v.position, strict=True), ("scale", v.scale), ("opacity", v.opacity)]
-    rows += [("sigma_d", v.sigma)] if v.sigma is not None else []
+    rows += [(name, spread) for name, spread in (("sigma_d", v.sigma), ("growth_d", v.growth)) if spread is not None]
     lines += ["", *spread_table(rows), ""]
     lines.append(
         _line("shares", f"{v.fainter_than_tau:.1%} fainter than tau = {splat.tau:.3g}, "
@@ -66,7 +66,8 @@ def splat_lines(splat: Splat) -> list[str]:
     if splat.dial is None:
         return [*lines, _line("dial", "none: no sigma_d")]
     a = splat.dial.attenuation
-    lines.append(_line("dial", f"s = 1 to {a.max_sv:g}, {a.cut} culling at tau, distances {_unit(a)}"))
+    how = f"s = 1 to {a.max_sv:g}, {a.cut} culling at tau, distances {_unit(a)}"
+    lines.append(_line("dial", f"{splat.dial_columns}, {how}"))
     return lines + calibration_lines(splat.dial.calibration)
 
 
@@ -102,12 +103,15 @@ def tensor_lines(about: dict[str, Any]) -> list[str]:
         after = f"{about['steps']} steps in {duration(about['seconds'])}, loss {about['loss']:.4g}"
         return [*lines, _line("after", after), _line("of", ", ".join(f"{k} {v}" for k, v in about["belongs"].items()))]
     lines.append(_line("for the file", f"with SHA-256 {about['base']}"))
-    lines.append(_line("changes", ", ".join(f"{k} ({v})" for k, v in about["updates"].items()) or "only sigma_d"))
+    lines.append(_line("changes", ", ".join(f"{k} ({v})" for k, v in about["updates"].items()) or "only the dial"))
     settings = ", ".join(f"{key} {value}" for key, value in about["config"].items() if key in SETTINGS)
     lines.append(_line("trained with", settings or "unknown settings"))
-    lines += ["", *spread_table([("sigma_d", Spread(**about["sigma"]))]), ""]
+    columns = {name: Spread(**about[key]) for name, key in (("sigma_d", "sigma"), ("growth_d", "growth")) if about[key]}
+    lines += ["", *spread_table([*columns.items()]), ""]
     a = about["attenuation"]
-    lines.append(_line("dial", f"s = 1 to {a['max_sv']:g}, {a['cut']} culling at tau = {a['tau']:.3g}"))
+    lines.append(
+        _line("dial", f"{' and '.join(columns)}, s = 1 to {a['max_sv']:g}, {a['cut']} culling at tau = {a['tau']:.3g}")
+    )
     calibration = about["calibration"]
     return lines + calibration_lines(calibration and Calibration.from_dict(calibration))
 

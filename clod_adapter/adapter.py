@@ -13,16 +13,17 @@ import torch
 from torch import Tensor
 
 from clod_adapter._support.version import package_version
-from clod_adapter.attenuation import SIGMA_MAX
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter
+from clod_adapter.equation.attenuation import SIGMA_MAX
+from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.origin import NOWHERE, Origin
-from clod_adapter.units import in_world_units
 
 HALF_ERROR = 2e-3  # the rounding that a difference may suffer, as a share of the largest
 ATTRIBUTES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
+DIAL = ("sigma_d", "growth_d")
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,11 @@ class Adapter:
         kept: of a result with fewer rows than its base, ``[base_count]`` bool: the rows that it has. None for all.
         sh_degree: of a result with fewer SH bands than its base. None for the base's.
         screen_filter: that it was trained with, and the result is drawn with.
+        growth_d: ``[N]`` float32, finite, exponents of the growth of the scales. None for no growth.
         notes: of reading its file: settings that were ignored or filled in.
 
     Raises:
-        ClodError: a tensor has the wrong type or shape, sigma_d is not finite, or version is no plain text.
+        ClodError: a tensor has the wrong type or shape, sigma_d or growth_d is not finite, or version is no plain text.
     """
 
     sigma_d: Tensor
@@ -59,13 +61,16 @@ class Adapter:
     kept: Tensor | None = None
     sh_degree: int | None = None
     screen_filter: ScreenFilter = CLASSIC
+    growth_d: Tensor | None = None
     notes: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
-        if self.sigma_d.dim() != 1 or self.sigma_d.dtype != torch.float32:
-            raise ClodError(f"Adapter.sigma_d is {_kind(self.sigma_d)}, it must be float32 [N]")
-        if not self.sigma_d.isfinite().all():
-            raise ClodError("Adapter.sigma_d holds a value that is not finite; the training has diverged")
+        count = self.sigma_d.numel()
+        for name, column in dial_columns(self).items():
+            if column.shape != (count,) or column.dtype != torch.float32:
+                raise ClodError(f"Adapter.{name} is {_kind(column)}, it must be float32 [{count}]")
+            if not column.isfinite().all():
+                raise ClodError(f"Adapter.{name} holds a value that is not finite; the training has diverged")
         if not (self.version.isascii() and self.version.isprintable()):
             raise ClodError(f"Adapter.version is {self.version!r}, it must be printable ASCII")
         for name, update in self.updates.items():
@@ -124,10 +129,13 @@ class Adapter:
             if update.dtype == torch.float16:  # old, not old + 0, where nothing changed: that would turn -0 into 0
                 update = torch.where(update == 0, old, old + update.float())
             changes[name] = update
-        return base.replace(
-            **changes, sigma_d=self.sigma_d.to(base.means.device), attenuation=self.attenuation,
-            screen_filter=self.screen_filter,
-        )  # fmt: skip
+        changes |= {name: column.to(base.means.device) for name, column in dial_columns(self).items()}
+        return detach(base).replace(**changes, attenuation=self.attenuation, screen_filter=self.screen_filter)
+
+
+def dial_columns(owner: Adapter | Gaussians) -> dict[str, Tensor]:
+    """The columns of DIAL that it has, by name."""
+    return {name: column for name in DIAL if (column := getattr(owner, name)) is not None}
 
 
 def trim(gaussians: Gaussians, kept: Tensor | None, sh_degree: int | None) -> Gaussians:
@@ -155,37 +163,40 @@ def extract(
     """
     if adapted.sigma_d is None or adapted.attenuation is None:
         raise ClodError("the adapted Gaussians have no sigma_d; attach a dial first")
-    adapted, updates = in_world_units(adapted), {}
+    adapted = in_world_units(adapted)
+    updates, columns = dict[str, Tensor](), dict[str, Any]()
     for name in ATTRIBUTES:
         old, new = getattr(base, name).detach().float(), getattr(adapted, name).detach().float()
         if old.shape != new.shape:
             raise ClodError(f"{name} is {_kind(new)}, in the base {_kind(old)}; give the Gaussians that were adapted")
         if not torch.equal(old, new):
             updates[name] = _update(name, old, new).cpu()
-    assert adapted.sigma_d is not None and adapted.attenuation is not None
-    sigma_d = adapted.sigma_d.detach().float().cpu().clone()
+    for name, column in dial_columns(adapted).items():
+        columns[name] = column.detach().float().cpu().clone()
+    assert adapted.attenuation is not None
     return Adapter(
-        sigma_d, adapted.attenuation, updates, fingerprint, dict(config), origin=origin,
-        screen_filter=adapted.screen_filter,
+        **columns, attenuation=adapted.attenuation, updates=updates, base_fingerprint=fingerprint, config=dict(config),
+        origin=origin, screen_filter=adapted.screen_filter,
     )  # fmt: skip
 
 
 def attach(
-    gaussians: Gaussians, sigma_d: Tensor | None = None, attenuation: AttenuationConfig | None = None
-) -> Gaussians:
-    """The Gaussians with a dial, by the default settings; without ``sigma_d`` one that changes nothing.
+    gaussians: Gaussians, sigma_d: Tensor | None = None, attenuation: AttenuationConfig | None = None,
+    growth_d: Tensor | None = None,
+) -> Gaussians:  # fmt: skip
+    """The Gaussians with this dial alone, by the default settings; without ``sigma_d`` one that changes nothing.
 
     That is SIGMA_MAX, and unless told otherwise a hard cut at 1/255, below which rasterizers draw nothing anyway.
     """
     if sigma_d is None:
         sigma_d = torch.full_like(gaussians.opacity_logits, SIGMA_MAX, dtype=torch.float32)
         attenuation = attenuation or AttenuationConfig(tau=1 / 255, cut="hard")
-    return gaussians.replace(sigma_d=sigma_d, attenuation=attenuation or AttenuationConfig())
+    return gaussians.replace(sigma_d=sigma_d, growth_d=growth_d, attenuation=attenuation or AttenuationConfig())
 
 
 def detach(gaussians: Gaussians) -> Gaussians:
     """The Gaussians without their dial; the other attributes stay as they are."""
-    return gaussians.replace(sigma_d=None, attenuation=None)
+    return gaussians.replace(sigma_d=None, growth_d=None, attenuation=None)
 
 
 def _update(name: str, old: Tensor, new: Tensor) -> Tensor:

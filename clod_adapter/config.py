@@ -17,6 +17,7 @@ STARTS = ("importance", "error", "constant", "identity")
 PARAMETERS = ("log", "linear")
 SAMPLINGS = ("pair", "log", "uniform")
 COUNT_TERMS = ("law", "paper")
+GROWTHS = ("on", "off")
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
 
 
@@ -146,11 +147,13 @@ class AdaptConfig:
         "initialization of sigma_d: importance (by rank of importance; replaceable neighbours are culled earlier), "
         "error (by rank of removal error), constant (1) or identity (no fading)",
     )
-    start_share: float = option(0.62, "share of Gaussians that the initialization keeps at s = 1")
+    start_share: float | None = option(
+        None, "share of Gaussians to keep at s = 1 (default: as the plan measures; 0.62 without a plan)"
+    )
     parameter: str = option("log", "trained parameter: log (of sigma_d) or linear (sigma_d itself, the paper's)")
     sampling: str = option("pair", "dial values per step: pair (1 and a log-uniform one), log or uniform (the paper's)")
     full_weight: float = option(
-        1.0, "weight of the loss at s = 1 relative to that at the other dial value (sampling pair)"
+        1.75, "weight of the loss at s = 1 relative to that at the other dial value (sampling pair)"
     )
     full_share: float = option(0.0, "share of steps at s = 1 (samplings log and uniform)")
     exponent: float = option(1.5, "target-count curve: the target share of Gaussians at s is s^-exponent")
@@ -164,6 +167,10 @@ class AdaptConfig:
     temperature: float = option(0.15, "width of the sigmoid of the straight-through count, in log opacity")
     ssim_weight: float = option(0.2, "weight w of 1 - SSIM; L1 has 1 - w")
     lr_sigma: float = option(0.1, "learning rate of log sigma_d: its largest relative change per step")
+    growth: str = option(
+        "on", "growth of the Gaussians that remain, by a growth_d beside sigma_d: on or off (the paper's)"
+    )
+    lr_growth: float = option(1.2e-2, "learning rate of growth_d")
     lr_means: float = option(5.2e-4, "learning rate of means, times the extent of the cameras")
     lr_quats: float = option(1.6e-3, "learning rate of quats")
     lr_scales: float = option(1.6e-2, "learning rate of log_scales")
@@ -181,8 +188,14 @@ class AdaptConfig:
         require(self.batch >= 1, "batch", self.batch, "at least 1")
         require(0 <= self.seed < 2**63, "seed", self.seed, "at least 0 and below 2^63")
         require(self.time_budget is None or self.time_budget > 0, "time_budget", self.time_budget, "positive seconds")
-        require(0.5 < self.start_share <= 1, "start_share", self.start_share, "above 0.5 and at most 1")
-        choices = {"start": STARTS, "parameter": PARAMETERS, "sampling": SAMPLINGS, "count_term": COUNT_TERMS}
+        require(0.5 < self.share <= 1, "start_share", self.start_share, "above 0.5 and at most 1")
+        choices = {
+            "start": STARTS,
+            "parameter": PARAMETERS,
+            "sampling": SAMPLINGS,
+            "count_term": COUNT_TERMS,
+            "growth": GROWTHS,
+        }
         for name, allowed in choices.items():
             require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
         require(0 <= self.full_share <= 1, "full_share", self.full_share, "between 0 and 1")
@@ -194,7 +207,7 @@ class AdaptConfig:
         require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
         require(0 < self.lr_final <= 1, "lr_final", self.lr_final, "above 0 and at most 1")
         require(0 <= self.average <= 1, "average", self.average, "between 0 and 1")
-        for name in ("sigma", "means", "quats", "scales", "opacities", "sh0", "shN"):
+        for name in ("sigma", "growth", "means", "quats", "scales", "opacities", "sh0", "shN"):
             rate = getattr(self, f"lr_{name}")  # larger ones overflow float32 in the end
             require(0 <= rate <= 1e6, f"lr_{name}", rate, "between 0 and 1e6")
         self.attenuation(1.0)  # checks the rest
@@ -211,10 +224,20 @@ class AdaptConfig:
         own: dict[str, Any] = {
             "tau": 1 / 255, "cut": "hard", "normalizer": "max", "start": "constant", "parameter": "linear",
             "sampling": "uniform", "count_term": "paper", "reg_weight": 1.0, "weight_slope": 0.5, "lr_sigma": 1e-2,
-            "temperature": 0.5, "average": 0.0, "lr_final": 0.05, "lr_means": 2.6e-4, "lr_quats": 8e-4,
+            "growth": "off", "temperature": 0.5, "average": 0.0, "lr_final": 0.05, "lr_means": 2.6e-4, "lr_quats": 8e-4,
             "lr_scales": 8e-3, "lr_opacities": 5e-2, "lr_sh0": 2e-3,
         }  # fmt: skip
         return cls(**{**own, **changes})
+
+    @property
+    def share(self) -> float:
+        """``start_share``, or 0.62 if it is not set."""
+        return 0.62 if self.start_share is None else self.start_share
+
+    @property
+    def has_target_count(self) -> bool:
+        """Whether the target-count curve is part of the objective; with a single dial value it is not."""
+        return self.count_term == "law" and self.max_sv > 1
 
     def lighter(self, share: float) -> AdaptConfig:
         """A copy with the learning rates of all attributes but sigma_d multiplied by ``share``."""

@@ -31,6 +31,8 @@ class Gaussians:
         shN: ``[N, K-1, 3]`` spherical harmonics of degrees 1 and up, K in {1, 4, 9, 16, 25}.
         sigma_d: ``[N]`` distance decay of opacity, or None for a checkpoint without a dial.
         attenuation: settings of the equation that reads ``sigma_d``; None exactly if ``sigma_d`` is None.
+        growth_d: ``[N]`` exponent of the growth of the scales with distance and dial (``growth.py``), or None for no
+            growth. Needs a ``sigma_d``.
         screen_filter: the filter for rendering, that of training.
 
     Raises:
@@ -45,13 +47,13 @@ class Gaussians:
     shN: Tensor
     sigma_d: Tensor | None = None
     attenuation: AttenuationConfig | None = None
+    growth_d: Tensor | None = None
     screen_filter: ScreenFilter = CLASSIC
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
         expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,), "sh0": (n, 1, 3)}
-        if self.sigma_d is not None:
-            expected["sigma_d"] = (n,)
+        expected |= {name: (n,) for name in ("sigma_d", "growth_d") if getattr(self, name) is not None}
         for name, shape in expected.items():
             found = tuple(getattr(self, name).shape)
             if found != shape:
@@ -62,6 +64,8 @@ class Gaussians:
             )
         if (self.sigma_d is None) != (self.attenuation is None):
             raise ClodError("Gaussians needs both sigma_d and attenuation, or neither")
+        if self.growth_d is not None and self.sigma_d is None:
+            raise ClodError("Gaussians with growth_d need a sigma_d")
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -81,7 +85,7 @@ class Gaussians:
         return self.opacity_logits.sigmoid()
 
     def tensors(self) -> dict[str, Tensor]:
-        """The tensor fields by name; without sigma_d if that is None."""
+        """The tensor fields by name; without those that are None."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, Tensor)}
 

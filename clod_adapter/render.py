@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import Attenuated, attenuate
 from clod_adapter.cameras import Camera
+from clod_adapter.equation.attenuation import Attenuated, attenuate
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import Rasterizer, for_device
@@ -35,7 +35,7 @@ class Rendering:
 
 
 def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float) -> Attenuated:
-    """``attenuation.attenuate`` of a container of Gaussians: their opacities at one dial value.
+    """``attenuation.attenuate`` of a container of Gaussians: their opacities and growth at one dial value.
 
     Without a ``sigma_d`` the dial has no effect: stored opacities, all kept.
 
@@ -46,7 +46,10 @@ def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float)
         ClodError: the dial is below 1 or not finite.
     """
     where = seen_from if isinstance(seen_from, Tensor) else (gaussians.means, seen_from)
-    return attenuate(gaussians.opacity_logits, gaussians.sigma_d, where, virtual_scale, gaussians.attenuation)
+    return attenuate(
+        gaussians.opacity_logits, gaussians.sigma_d, where, virtual_scale, gaussians.attenuation,
+        growth_d=gaussians.growth_d,
+    )  # fmt: skip
 
 
 def splat(
@@ -54,10 +57,14 @@ def splat(
     opacities: Tensor,
     camera: Camera,
     *,
+    growth: Tensor | None = None,
     background: Tensor | None = None,
     rasterizer: Rasterizer | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Image ``[H, W, 3]`` and alpha ``[H, W]`` of the Gaussians with the given ``opacities [N]``.
+
+    Args:
+        growth: ``[N]`` factor of the scales; None for 1.
 
     Raises:
         ClodError: the opacities or the background have the wrong shape.
@@ -69,8 +76,9 @@ def splat(
             f"background is {tuple(behind.shape)} and must be (3,), opacities {tuple(opacities.shape)} and must be "
             f"({len(gaussians)},)"
         )
+    scales = gaussians.scales if growth is None else gaussians.scales * growth[:, None]
     return rasterize(
-        gaussians.means, gaussians.quats, gaussians.scales, opacities, gaussians.sh0, gaussians.shN, camera, behind,
+        gaussians.means, gaussians.quats, scales, opacities, gaussians.sh0, gaussians.shN, camera, behind,
         gaussians.screen_filter,
     )  # fmt: skip
 
@@ -96,5 +104,7 @@ def render(
         ClodError: the dial is below 1 or not finite.
     """
     attenuated = dial(gaussians, camera, virtual_scale)
-    image, alpha = splat(gaussians, attenuated.drawn, camera, background=background, rasterizer=rasterizer)
+    image, alpha = splat(
+        gaussians, attenuated.drawn, camera, growth=attenuated.growth, background=background, rasterizer=rasterizer
+    )
     return Rendering(image, alpha, attenuated.keep)

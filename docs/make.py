@@ -32,8 +32,8 @@ and refuse invalid values.
 ## AdaptConfig
 
 Settings of an adaptation: `clod.adapt(gaussians, scene, clod.AdaptConfig(max_sv=5, iters=400))`. The command line
-has `--max-sv`, `--iters`, `--batch`, `--time-budget`, `--seed` and `--form`; the other fields are for experiments
-([Method](method.md) has their measured effects). `AdaptConfig.paper()` is the paper's own form.
+has `--max-sv`, `--iters`, `--batch`, `--time-budget`, `--seed`, `--growth` and `--form`; the other fields are for
+experiments ([Method](method.md) has their measured effects). `AdaptConfig.paper()` is the paper's own form.
 
 | field | default | paper | meaning |
 |---|---|---|---|
@@ -105,8 +105,8 @@ def equation_picture(path: Path) -> None:
     """Left: opacity against distance for three decays. Right: the same Gaussians over the dial, and the threshold."""
     import torch
 
-    from clod_adapter.attenuation import attenuate
     from clod_adapter.config import AttenuationConfig
+    from clod_adapter.equation.attenuation import attenuate
     from clod_adapter.report.style import INK, ORANGE, QUIET, label_log, new_figure, save_figure, shades, tidy
 
     def drawn(sigma: float, distances: Sequence[float], dials: Sequence[float], cut: str) -> list[float]:

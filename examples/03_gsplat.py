@@ -1,4 +1,4 @@
-"""Draw an adapted file with gsplat: its own call, and the dial as three more arguments.
+"""Draw an adapted file with gsplat: its own call, and the dial as four more arguments.
 
     python examples/03_gsplat.py adapted.ply scene/
 
@@ -35,7 +35,7 @@ def main(model: str, folder: str, device: str = "cuda") -> None:
     for virtual_scale in DIALS:
         images, _, meta = gsplat.rasterization(
             g.means, g.quats, g.scales, g.opacities, colors, viewmats, Ks, width, height, sh_degree=g.sh_degree,
-            sigma_d=g.sigma_d, attenuation=g.attenuation, virtual_scale=virtual_scale,
+            sigma_d=g.sigma_d, growth_d=g.growth_d, attenuation=g.attenuation, virtual_scale=virtual_scale,
         )  # fmt: skip
         name = f"{Path(model).stem}_gsplat_sv{virtual_scale}.png"
         Image.fromarray((images[0].clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()).save(name)

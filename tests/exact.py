@@ -81,6 +81,13 @@ def reference_extinction(logit: float, sigma: float, d: float, tau: float, eps: 
     return upper * mpmath.exp(-mpmath.lambertw((upper * d) ** 2 / v).real / 2)
 
 
+@cache
+def reference_growth(h: float, d: float, s: float, r: float) -> tuple[mpmath.mpf, mpmath.mpf]:
+    """``(log g, log m)`` without the clamp of g, at 50 digits."""
+    log_m = max(mpmath.log(mpmath.mpf(d) * s / mpmath.mpf(r)), ZERO) if d else ZERO
+    return h * log_m, log_m
+
+
 def config(tau: float = 1 / 255, eps: float = 1e-8, **other: object) -> AttenuationConfig:
     return AttenuationConfig(tau=tau, eps=eps, **{"max_sv": 1.0} | other)
 

@@ -31,8 +31,12 @@ ABOUT = ("made in a test", "of two lines")
 ORIGIN = (5.1e5, -4096.0, 0.25)
 
 
-def model(degree: int = 3, count: int = 40) -> Gaussians:
-    """With a dial; opacity 1, very large, small and zero sigma_d, quaternions of length 1e-30 to 1e30."""
+def model(degree: int = 3, count: int = 40, *, growth: bool = True) -> Gaussians:
+    """With a dial; opacity 1, very large, small and zero sigma_d, quaternions of length 1e-30 to 1e30.
+
+    Args:
+        growth: whether with growth_d, from -1 to 3, some 0.
+    """
     g = gaussians(count, degree, seed=degree)
     sigma = torch.rand(count, generator=torch.Generator().manual_seed(1)) * 4
     sigma[:4] = torch.tensor([1e9, 0.0, 1e-3, 65504.0])
@@ -40,7 +44,8 @@ def model(degree: int = 3, count: int = 40) -> Gaussians:
     logits[0] = torch.inf
     quats = g.quats.clone()
     quats[1:4] *= torch.tensor([1e-30, 1e30, 3.0])[:, None]
-    return g.replace(opacity_logits=logits, quats=quats, sigma_d=sigma, attenuation=ATTENUATION)
+    growth_d = torch.linspace(-1, 3, count).where(torch.arange(count) % 5 != 2, 0) if growth else None
+    return g.replace(opacity_logits=logits, quats=quats, sigma_d=sigma, growth_d=growth_d, attenuation=ATTENUATION)
 
 
 def rotations(quats: torch.Tensor) -> Rotation:

@@ -34,14 +34,17 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def fully_fused_projection(
-    means: Tensor, covars: None, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int,
-    *, eps2d: float, packed: bool, near_plane: float, far_plane: float, radius_clip: float, sparse_grad: bool,
-    calc_compensations: bool, camera_model: str, opacities: Tensor,
+    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, *, eps2d: float, packed: bool, near_plane: float, far_plane: float, radius_clip: float,
+    sparse_grad: bool, calc_compensations: bool, camera_model: str, opacities: Tensor,
 ) -> tuple[Any, ...]:  # fmt: skip
     from gsplat.cuda import _torch_impl
 
-    quats = quats / quats.norm(dim=-1, keepdim=True)  # as the kernel: of any length, and NaN where it is 0
-    covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
+    if covars is None:
+        quats = quats / quats.norm(dim=-1, keepdim=True)  # as the kernel: of any length, and NaN where it is 0
+        covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
+    else:
+        covars = covars[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))  # from the upper triangle
     radii, *values, compensations = _torch_impl._fully_fused_projection(
         means, covars, viewmats, Ks, width, height, eps2d, near_plane, far_plane, calc_compensations, camera_model
     )

@@ -7,6 +7,7 @@ and alpha, feature-3dgs. All of them cull what is nearer than 0.2 before anythin
 from __future__ import annotations
 
 from collections import namedtuple
+from inspect import Parameter, Signature
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -65,6 +66,10 @@ def module(name: str) -> Any:
             drawn = _draw(self.raster_settings, given)
             return tuple(drawn[result] for result in fork.results.split())
 
+    forward: Any = GaussianRasterizer.forward
+    forward.__signature__ = Signature(
+        [Parameter(each, Parameter.POSITIONAL_OR_KEYWORD, default=None) for each in ("self", *fork.call.split())]
+    )
     made: Any = ModuleType("diff_gaussian_rasterization")
     made.GaussianRasterizer = GaussianRasterizer
     made.GaussianRasterizationSettings = namedtuple("GaussianRasterizationSettings", f"{SETTINGS} {fork.settings}")

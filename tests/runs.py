@@ -146,7 +146,7 @@ def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]
 def config_of(**changes: Any) -> AdaptConfig:
     """Fixed settings, so that the tests do not depend on the defaults."""
     settings = {
-        "start_share": 0.6, "full_share": 0.5, "lr_sigma": 1e-2, "lr_means": 3e-5, "lr_quats": 4e-4,
+        "start_share": 0.6, "full_share": 0.5, "lr_sigma": 1e-2, "lr_growth": 1e-2, "lr_means": 3e-5, "lr_quats": 4e-4,
         "lr_scales": 2e-3, "lr_opacities": 1e-2, "lr_sh0": 1e-3, "lr_shN": 5e-5,
     }  # fmt: skip
     return AdaptConfig(**(settings | changes))

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clod_adapter.adapter import ATTRIBUTES, SIGMA_MAX, Adapter, attach, detach, extract, trim
+from clod_adapter.adapter import ATTRIBUTES, DIAL, SIGMA_MAX, Adapter, attach, detach, extract, trim
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
@@ -27,29 +27,33 @@ def bits(g: Gaussians) -> dict[str, list[int]]:
     return {name: value.detach().view(torch.int32).flatten().tolist() for name, value in g.tensors().items()}
 
 
-def adapt(base: Gaussians, names: list[str], scale: float = 0.01, seed: int = 1) -> Gaussians:
+def adapt(base: Gaussians, names: list[str], scale: float = 0.01, seed: int = 1, growth: bool = True) -> Gaussians:
     g = torch.Generator().manual_seed(seed)
     changes = {}
     for name in names:
         old = getattr(base, name)
         changes[name] = old + scale * torch.randn(old.shape, generator=g)
-    return attach(base.replace(**changes), torch.rand(len(base), generator=g), CONFIG)
+    sigma_d, growth_d = torch.rand(2, len(base), generator=g)
+    return attach(base.replace(**changes), sigma_d, CONFIG, growth_d if growth else None)
 
 
 @settings(deadline=None)
 @given(
     st.lists(st.sampled_from(ATTRIBUTES), unique=True), st.sampled_from([1e-9, 1e-3, 1.0, 1e4, 1e6]),
-    st.integers(0, 1000), st.sampled_from([0, 3, 15]),
+    st.integers(0, 1000), st.sampled_from([0, 3, 15]), st.booleans(),
 )  # fmt: skip
-def test_applying_an_adapter_gives_the_result(names: list[str], scale: float, seed: int, bands: int) -> None:
+def test_applying_an_adapter_gives_the_result(
+    names: list[str], scale: float, seed: int, bands: int, growth: bool
+) -> None:
     base = gaussians(seed=seed, bands=bands)
-    adapted = adapt(base, names, scale, seed + 1)
+    adapted = adapt(base, names, scale, seed + 1, growth)
     before = bits(base)
     adapter = extract(base, adapted, fingerprint="f", config={"steps": 1})
     result = adapter.apply(base, "f")
     assert bits(adapter.apply(base)) == bits(result) and bits(base) == before
     assert result.attenuation == CONFIG and adapter.sigma_d is not adapted.sigma_d
-    assert bits(result)["sigma_d"] == bits(adapted)["sigma_d"]
+    assert all(bits(result).get(name) == bits(adapted).get(name) for name in DIAL)
+    assert ("growth_d" in bits(result)) == growth
     # Extracting the result from itself changes nothing any more.
     assert bits(extract(base, result, fingerprint="f", config={}).apply(base)) == bits(result)
     for name in ATTRIBUTES:
@@ -103,6 +107,8 @@ def test_attach_and_detach() -> None:
     on, chosen = attach(base), attach(base, sigma_d, CONFIG)
     assert on.attenuation == AttenuationConfig(tau=1 / 255, cut="hard") and bits(detach(on)) == bits(base)
     assert detach(on).sigma_d is None and detach(on).attenuation is None
+    grown = attach(base, sigma_d, CONFIG, torch.rand(6))
+    assert bits(detach(grown)) == bits(base) and bits(attach(grown, sigma_d, CONFIG)) == bits(chosen)
     assert (on.sigma_d == SIGMA_MAX).all() and attach(base, sigma_d).attenuation == AttenuationConfig()
     distance = torch.logspace(-6, 4, 1000)
     for sigma in (torch.tensor(SIGMA_MAX), torch.tensor(SIGMA_MAX, dtype=torch.float64)):
@@ -114,11 +120,14 @@ def test_attach_and_detach() -> None:
 
 def test_extracting_ignores_a_dial_of_the_base_and_drops_graphs() -> None:
     base = gaussians()
-    old = attach(base, torch.ones(6))
-    adapted = adapt(base, ["sh0"]).replace(sh0=(base.sh0 + 1).requires_grad_(), sigma_d=torch.rand(6).requires_grad_())
-    fresh, again = (extract(each, adapted, fingerprint="f", config={}) for each in (base, old))
-    assert bits(fresh.apply(old)) == bits(again.apply(base))
-    assert not fresh.sigma_d.requires_grad and not fresh.updates["sh0"].requires_grad
+    old = attach(base, torch.ones(6), growth_d=torch.ones(6))
+    leaves = {name: torch.rand(6).requires_grad_() for name in DIAL}
+    adapted = adapt(base, ["sh0"]).replace(sh0=(base.sh0 + 1).requires_grad_(), **leaves)
+    for result in (adapted, adapted.replace(growth_d=None)):
+        fresh, again = (extract(each, result, fingerprint="f", config={}) for each in (base, old))
+        assert bits(fresh.apply(old)) == bits(again.apply(base))
+        assert not fresh.sigma_d.requires_grad and not fresh.updates["sh0"].requires_grad
+        assert fresh.growth_d is None or not fresh.growth_d.requires_grad
 
 
 def test_a_different_base_is_refused() -> None:
@@ -140,14 +149,19 @@ def test_extract_refuses_other_results() -> None:
         extract(base, attach(gaussians(5)), fingerprint="f", config={})
     with pytest.raises(ClodError, match="diverged"):
         extract(base, attach(base, torch.full((6,), torch.nan)), fingerprint="f", config={})
+    with pytest.raises(ClodError, match="growth_d holds a value that is not finite"):
+        extract(base, attach(base, torch.ones(6), growth_d=torch.full((6,), torch.inf)), fingerprint="f", config={})
     for bad in (torch.nan, torch.inf):
         with pytest.raises(ClodError, match="sh0 holds a new value"):
             extract(base, attach(base.replace(sh0=torch.full((6, 1, 3), bad))), fingerprint="f", config={})
 
 
 def test_an_adapter_checks_its_fields() -> None:
-    with pytest.raises(ClodError, match="float32"):
+    with pytest.raises(ClodError, match=r"sigma_d is float64 \[3\], it must be float32 \[3\]"):
         Adapter(torch.ones(3).double(), CONFIG, {}, "f", {})
+    for growth_d in (torch.ones(4), torch.ones(3, 1), torch.ones(3).half()):
+        with pytest.raises(ClodError, match=r"growth_d is .*, it must be float32 \[3\]"):
+            Adapter(torch.ones(3), CONFIG, {}, "f", {}, growth_d=growth_d)
     with pytest.raises(ClodError, match="'colour'"):
         Adapter(torch.ones(3), CONFIG, {"colour": torch.ones(3)}, "f", {})
     for bad in ("1.0\nproperty float x", "1.0ä"):

@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import attenuate
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.distances import normalized_distances, viewpoint_of
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.distances import normalized_distances, viewpoint_of
+from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for
-from clod_adapter.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
 from scenes import camera, gaussians, ring
@@ -64,9 +64,10 @@ def test_a_dial_without_effect_changes_nothing() -> None:
 
 
 def spread(n: int = 300, normalizer: str = "scene", cut: str = "soft") -> Gaussians:
-    """Gaussians at many distances from ``camera()``, some of which are culled."""
-    sigma = torch.rand(n, generator=torch.Generator().manual_seed(2)) * 2 + 0.1
-    return attach(gaussians(n, 1, 7), sigma, replace(CONFIG, cut=cut, normalizer=normalizer))
+    """Gaussians at many distances from ``camera()``, some of which are culled, and most of which grow."""
+    sigma, growth = torch.rand(2, n, generator=torch.Generator().manual_seed(2))
+    some = attach(gaussians(n, 1, 7), 2 * sigma + 0.1, replace(CONFIG, cut=cut, normalizer=normalizer))
+    return some.replace(growth_d=1.5 * growth - 0.25)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +77,7 @@ def spread(n: int = 300, normalizer: str = "scene", cut: str = "soft") -> Gaussi
 def test_baked_image_matches_render_from_its_camera(cut: str, normalizer: str, s: float) -> None:
     some = spread(normalizer=normalizer, cut=cut)
     want, baked = render(some, camera(), s), bake(some, s, camera())
-    assert baked.sigma_d is None and baked.attenuation is None and 0 < len(baked) < 300
+    assert baked.sigma_d is baked.growth_d is baked.attenuation is None and 0 < len(baked) < 300
     assert len(baked) == want.kept.sum()
     torch.testing.assert_close(render(baked, camera()).image, want.image, atol=2e-5, rtol=0)
     elsewhere = bake(some, s, cameras=ring(4, 61, 45))
@@ -110,12 +111,21 @@ def test_several_cameras_share_one_distance_per_gaussian() -> None:
     some, cameras, s = spread(), ring(3, 61, 45), 3.0
     assert some.sigma_d is not None and some.attenuation is not None
     d = torch.stack([normalized_distances(some.means, each, CONFIG).log() for each in cameras]).mean(0).exp()
-    kept, shown = (attenuate(some.opacity_logits, some.sigma_d, d, x, some.attenuation) for x in (s, s**0.75))
+    given = (some.opacity_logits, some.sigma_d, d)
+    kept, shown, grown = (attenuate(*given, x, some.attenuation, growth_d=some.growth_d) for x in (s, s**0.75, s**0.9))
     baked = bake(some, s, cameras=cameras)
     assert torch.equal(baked.means, some.means[kept.keep]) and 0 < len(baked) < 300
     torch.testing.assert_close(baked.opacities, shown.drawn[kept.keep], atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(baked.scales, (some.scales * grown.growth[:, None])[kept.keep], atol=1e-6, rtol=1e-5)
     places = [viewpoint_of(each, some.means, CONFIG) for each in cameras]
     assert torch.equal(bake(some, s, cameras=places).means, baked.means)
+
+
+def test_without_growth_scales_are_unchanged() -> None:
+    some = spread()
+    for growth_d in (None, torch.zeros(300)):
+        baked = bake(some.replace(growth_d=growth_d), 2.5, camera())
+        assert torch.equal(baked.log_scales, some.log_scales[render(some, camera(), 2.5).kept])
 
 
 @pytest.mark.parametrize("several", [False, True])

@@ -16,6 +16,7 @@ from torch import Tensor
 
 import gsplat_in_torch
 from clod_adapter import Gaussians, evaluate, render
+from clod_adapter.adapter import detach
 from clod_adapter.alignment.check import check_alignment
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.blocks.divide import divide
@@ -102,8 +103,8 @@ def test_render_and_its_gradients(setup: Setup) -> None:
 @pytest.mark.parametrize("kind", ["importance", "error", "constant", "identity"])
 def test_the_initialization(setup: Setup, kind: str) -> None:
     assert len(usable_views(setup.there, setup.scene.train)) == len(setup.scene.train)
-    plain, config = {"sigma_d": None, "attenuation": None}, replace(CONFIG, start=kind)
-    mine, want = on_both(setup, lambda model: initialize(model.replace(**plain), setup.scene.train, config).sigma_d)
+    config = replace(CONFIG, start=kind)
+    mine, want = on_both(setup, lambda model: initialize(detach(model), setup.scene.train, config).sigma_d)
     assert mine.device == setup.device
     torch.testing.assert_close(mine.cpu().log(), want.log(), rtol=0.02, atol=0.02)
 
@@ -145,7 +146,7 @@ def test_placed_cameras_match_the_cpu(setup: Setup) -> None:
 
 def test_training_a_block(setup: Setup) -> None:
     views, config = setup.scene.train[:2], replace(CONFIG, iters=2)
-    division = divide(setup.there.replace(sigma_d=None, attenuation=None), views, config, 2)
+    division = divide(detach(setup.there), views, config, 2)
     aimed = target_image(division.initial, 25, views[0])
     assert aimed.device.type == "cpu" and aimed.dtype == torch.uint8  # photographs of a whole block
     merged = merge(division, [adapt_block(division, views, config, block)[0] for block in range(2)])
@@ -154,7 +155,7 @@ def test_training_a_block(setup: Setup) -> None:
 
 def test_plan_and_training(setup: Setup) -> None:
     """Parts that the plan leaves out are restored after training."""
-    plain, scene = setup.there.replace(sigma_d=None, attenuation=None), Scene(setup.scene.train[:2], ())
+    plain, scene = detach(setup.there), Scene(setup.scene.train[:2], ())
     config = AdaptConfig(iters=10, max_sv=4.0)
     plan = make_plan(plain, scene, config)
     want = make_plan(plain.to("cpu"), scene, config)

@@ -23,13 +23,13 @@ N = 200
 
 def adapted(**settings: Any) -> Gaussians:
     plain = gaussians(N, 1, 0)
-    sigma_d = torch.rand(N, generator=torch.Generator().manual_seed(1)) * 1.5
+    sigma_d, growth_d = torch.rand(2, N, generator=torch.Generator().manual_seed(1)) * 1.5
     values = {"tau": 0.02, "scene_distance": 3.0, "max_sv": 5.0}
-    return plain.replace(sigma_d=sigma_d, attenuation=AttenuationConfig(**(values | settings)))
+    return plain.replace(sigma_d=sigma_d, growth_d=growth_d - 0.5, attenuation=AttenuationConfig(**(values | settings)))
 
 
 def hook_of(model: Gaussians, virtual_scale: float = 3.0) -> Hook:
-    return Hook(model.sigma_d, model.attenuation, virtual_scale)
+    return Hook(model.sigma_d, model.attenuation, virtual_scale, model.growth_d)
 
 
 @pytest.mark.parametrize(("normalizer", "cut"), [("scene", "hard"), ("quantile", "soft"), ("max", "soft")])
@@ -40,15 +40,32 @@ def test_numpy_and_torch_agree_with_a_rendering(tmp_path: Path, normalizer: str,
     given, counts = (model.means, model.opacities, view.viewmat, view.K), []
     for s in (2.0, 3.0, 5.0):
         turned = replace(hook, virtual_scale=s)
-        drawn, keep = turned(*given, view.width, view.height)
+        drawn, keep, growth = turned(*given, view.width, view.height, growth=True)
         want = dial(model, view, s)
         assert torch.equal(keep, want.keep) and 0 < int(keep.sum()) < N
         torch.testing.assert_close(drawn, want.drawn)
-        same, who = turned(*(tensor.numpy() for tensor in given), view.width, view.height)
-        assert (type(same).__name__, same.dtype, who.dtype) == ("ndarray", "float32", "bool")
-        assert (same == drawn.numpy()).all() and (who == keep.numpy()).all()
+        torch.testing.assert_close(growth, want.growth)
+        assert growth.min() < 0.9 and growth.max() > 1.1
+        arrays = tuple(tensor.numpy() for tensor in given)
+        found = turned(*arrays, view.width, view.height, growth=True)
+        assert [(type(each).__name__, str(each.dtype)) for each in found] == [
+            ("ndarray", dtype) for dtype in ("float32", "bool", "float32")
+        ]
+        for array, tensor in zip(found, (drawn, keep, growth), strict=True):
+            assert (array == tensor.numpy()).all()
+        two = turned(*arrays, view.width, view.height)
+        assert len(two) == 2 and all((a == b).all() for a, b in zip(two, found, strict=False))
         counts.append(int(keep.sum()))
     assert counts[0] > counts[1] > counts[2]
+
+
+def test_without_growth_d_factors_are_ones() -> None:
+    model, view = adapted(), camera()
+    hook = replace(hook_of(model), growth_d=None)
+    growth = hook(model.means, model.opacities, view.viewmat, growth=True)[2]
+    assert torch.equal(growth, torch.ones(N))
+    double = hook(model.means.double().numpy(), model.opacities.double().numpy(), view.viewmat, growth=True)[2]
+    assert double.dtype == np.float64 and (double == 1).all()
 
 
 def test_shape_and_type_are_those_of_the_opacities() -> None:
@@ -100,18 +117,19 @@ def test_mixed_and_strided_arrays_are_accepted() -> None:
     assert (of_whole == of_floats).all()
 
 
-def test_gradients_reach_opacities_and_sigma_d_only() -> None:
+def test_gradients_reach_opacities_sigma_d_and_growth_d_only() -> None:
     model, view = adapted(), camera()
-    given = (model.opacities, model.sigma_d, model.means)
+    given = (model.opacities, model.sigma_d, model.growth_d, model.means)
     keep = hook_of(model, 2.0)(model.means, model.opacities, view.viewmat)[1]
-    a, sigma, means = (tensor[keep].double().requires_grad_() for tensor in given)
+    a, sigma, growth, means = (tensor[keep].double().requires_grad_() for tensor in given)
     viewmat = view.viewmat.double().requires_grad_()
 
-    def drawn(a: torch.Tensor, sigma: torch.Tensor) -> torch.Tensor:
-        return Hook(sigma, model.attenuation, 2.0)(means, a, viewmat)[0]
+    def drawn(a: torch.Tensor, sigma: torch.Tensor, growth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return Hook(sigma, model.attenuation, 2.0, growth)(means, a, viewmat, growth=True)[::2]
 
-    assert torch.autograd.gradcheck(drawn, (a, sigma), eps=1e-8)
-    assert torch.autograd.grad(drawn(a, sigma).sum(), [means, viewmat], allow_unused=True) == (None, None)
+    assert torch.autograd.gradcheck(drawn, (a, sigma, growth), eps=1e-8)
+    total = sum(each.sum() for each in drawn(a, sigma, growth))
+    assert torch.autograd.grad(total, [means, viewmat], allow_unused=True) == (None, None)
 
 
 def test_bad_arguments_are_refused(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""One function decides what is drawn: raise its culling threshold, and everything that uses a dial follows."""
+"""One function decides what is drawn: change its threshold or its growth, and everything that uses a dial follows."""
 
 from __future__ import annotations
 
@@ -15,20 +15,23 @@ import torch
 from torch import Tensor
 
 import inria_forks
-from clod_adapter import attenuation
+from clod_adapter.adapter import ATTRIBUTES, attach, detach
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.blocks.divide import divide
 from clod_adapter.blocks.targets import context_rows, with_target_shares
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.equation import attenuation, growth
+from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.evaluation.budget import dial_for
 from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.extinction import extinction_scale, sigma_for_extinction
+from clod_adapter.evaluation.popping import dial_popping, path_popping
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.initialization.importance import sigma_from_importance
 from clod_adapter.render import render
 from clod_adapter.training.objective import Objective, TrainableSubset
+from clod_adapter.training.view_sampler import Sample
 from clod_adapter.viewer.payload import Payload
 from scenes import gaussians, photograph, ring
 
@@ -40,11 +43,12 @@ CAMERAS = ring(3, 24, 18)
 def model_of(tau: float) -> Gaussians:
     sigma_d = 0.3 + 2 * torch.rand(N, generator=torch.Generator().manual_seed(1))
     settings = AttenuationConfig(tau=tau, scene_distance=4.0, reference_distance=4.0, max_sv=4.0)
-    return gaussians(N, 1, 0, size=0.15).replace(sigma_d=sigma_d, attenuation=settings)
+    growth_d = torch.linspace(-0.5, 1, N)
+    return attach(gaussians(N, 1, 0, size=0.15), sigma_d, settings, growth_d)
 
 
 def views_of(model: Gaussians) -> tuple[View, ...]:
-    return photograph(model.replace(sigma_d=None, attenuation=None), CAMERAS)
+    return photograph(detach(model), CAMERAS)
 
 
 def rendering(model: Gaussians) -> list[Tensor]:
@@ -60,9 +64,10 @@ def objective(config: AdaptConfig, trained: int = N, **part: Any) -> Callable[[G
     def gradients(model: Gaussians) -> list[Any]:
         assert model.attenuation is not None and model.sigma_d is not None
         asked = Objective(config, model.attenuation, ("means", "sh0"), TrainableSubset(trained, **part))
-        parameters = {name: value for name, value in model.tensors().items() if name != "sigma_d"}
+        names = ("growth_d",) if config.growth == "on" else ()
+        parameters = {name: getattr(model, name) for name in (*ATTRIBUTES, *names)}
         parameters[asked.decay] = asked.parameter(model.sigma_d)
-        found = asked.gradient_sum(parameters, [(views_of(model)[0], [1.0, DIAL])])
+        found = asked.gradient_sum(parameters, [Sample(views_of(model)[0], [1.0, DIAL])])
         return [found.loss, found.kept, *found.gradients.values()]
 
     return gradients
@@ -81,8 +86,8 @@ def baked(**given: Any) -> Callable[[Gaussians], list[Tensor]]:
 
 def hook(model: Gaussians) -> list[Tensor]:
     assert model.attenuation is not None and model.sigma_d is not None
-    view = CAMERAS[0]
-    return list(Hook(model.sigma_d, model.attenuation, DIAL)(model.means, model.opacities, view.viewmat))
+    view, dialled = CAMERAS[0], Hook(model.sigma_d, model.attenuation, DIAL, model.growth_d)
+    return list(dialled(model.means, model.opacities, view.viewmat, growth=True))
 
 
 def copy_with(name: str, installed: ModuleType, needs: str) -> Any:
@@ -97,23 +102,24 @@ def copy_with(name: str, installed: ModuleType, needs: str) -> Any:
 
 
 def gsplat(model: Gaussians) -> list[Tensor]:
-    """The opacities that gsplat is called with."""
+    """The opacities and scales that gsplat is called with."""
 
     def rasterization(
         means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
         width: int, height: int, near_plane: float = 0.01, sh_degree: int | None = None, distributed: bool = False,
+        covars: Tensor | None = None,
     ) -> Any:  # fmt: skip
-        return opacities
+        return opacities, scales
 
     installed = ModuleType("gsplat")
     installed.rasterization = rasterization  # type: ignore[attr-defined]
     view = CAMERAS[0]
-    return [
-        copy_with("gsplat", installed, "gsplat").rasterization(
-            model.means, model.quats, model.scales, model.opacities, model.sh0[:, 0], view.viewmat[None], view.K[None],
-            view.width, view.height, sigma_d=model.sigma_d, attenuation=model.attenuation, virtual_scale=DIAL,
-        )
-    ]  # fmt: skip
+    dial: Any = {"sigma_d": model.sigma_d, "growth_d": model.growth_d, "attenuation": model.attenuation}
+    found = copy_with("gsplat", installed, "gsplat").rasterization(
+        model.means, model.quats, model.scales, model.opacities, model.sh0[:, 0], view.viewmat[None], view.K[None],
+        view.width, view.height, virtual_scale=DIAL, **dial,
+    )  # fmt: skip
+    return list(found)
 
 
 def inria(model: Gaussians) -> list[Tensor]:
@@ -125,8 +131,8 @@ def inria(model: Gaussians) -> list[Tensor]:
         "means3D": model.means, "means2D": torch.zeros(N, 3), "opacities": model.opacities[:, None],
         "shs": torch.cat([model.sh0, model.shN], 1), "scales": model.scales, "rotations": model.quats,
     }  # fmt: skip
-    dial = {"sigma_d": model.sigma_d, "attenuation": model.attenuation, "virtual_scale": DIAL}
-    return [rasterizer(**given, **dial)[0]]
+    dial = {"sigma_d": model.sigma_d, "growth_d": model.growth_d, "attenuation": model.attenuation}
+    return [rasterizer(**given, **dial, virtual_scale=DIAL)[0]]
 
 
 def blocks(model: Gaussians) -> list[Any]:
@@ -134,7 +140,12 @@ def blocks(model: Gaussians) -> list[Any]:
     views, config = views_of(model), AdaptConfig(max_sv=4.0)
     division = divide(model, views, config, 2)
     shares = with_target_shares(division, 0, [views[k] for k in division.views(0)], config, first=False)
-    return [division.kept, context_rows(division, 0, views), *(share.target_share(DIAL) for share in shares)]
+    context = [context_rows(division, 0, views, after) for after in (None, model)]
+    return [division.kept, *context, *(share.target_share(DIAL) for share in shares)]
+
+
+def popping(model: Gaussians) -> list[Any]:
+    return [dial_popping(model, CAMERAS[0], DIAL, steps=2), path_popping(model, CAMERAS[:2], DIAL, steps=2)]
 
 
 def order(model: Gaussians) -> list[Tensor]:
@@ -168,6 +179,7 @@ CONSUMERS: dict[str, Callable[[Gaussians], list[Any]]] = {
     "Hook": hook,
     "gsplat": gsplat,
     "diff-gaussian-rasterization": inria,
+    "popping": popping,
     "blocks": blocks,
     "order_by_extinction": order,
     "extinction": extinction,
@@ -176,6 +188,12 @@ CONSUMERS: dict[str, Callable[[Gaussians], list[Any]]] = {
 
 
 CLOSED_FORMS = ("order_by_extinction", "extinction", "initialization")  # these share the threshold with the cut alone
+
+
+# Growth is no part of the culling rule, and none of the paper's form.
+WITHOUT_GROWTH = (
+    *CLOSED_FORMS, "the paper's objective", "dial_for one camera", "dial_for several cameras", "dial_for a baked file",
+)  # fmt: skip
 
 
 def same(these: list[Any], those: list[Any]) -> bool:
@@ -208,6 +226,17 @@ def test_everything_passes_through_the_cut(name: str, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(attenuation, "_cut", strict)
     assert not same(consumer(model_of(TAU)), before)
+
+
+@pytest.mark.parametrize("name", CONSUMERS)
+def test_everything_grows_by_one_function(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other factors change whatever draws, and nothing that counts or culls."""
+    consumer = CONSUMERS[name]
+    before = consumer(model_of(TAU))
+    monkeypatch.setattr(
+        growth.growth_factors, "__code__", (lambda growth_d, d, s, r: (3 * growth_d.to(d)).exp()).__code__
+    )
+    assert same(consumer(model_of(TAU)), before) == (name in WITHOUT_GROWTH)
 
 
 def test_the_viewer_takes_the_settings_of_the_file() -> None:

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from clod_adapter.adapter import attach, detach
-from clod_adapter.attenuation import attenuate
 from clod_adapter.config import FILTERS, AttenuationConfig
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import reference

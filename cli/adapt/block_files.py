@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from clod_adapter.adapter import DIAL, attach, dial_columns
 from clod_adapter.blocks.divide import DIALS, Division
 from clod_adapter.blocks.file import checked, load_block, refused_if_damaged, save_block
 from clod_adapter.blocks.train import Learned
@@ -55,10 +56,9 @@ class BlockFiles:
         """Writes a division, unless another job has written one."""
         if self.start.exists():
             return
-        assert division.initial.sigma_d is not None
-        tensors = {"sigma_d": division.initial.sigma_d, "block": division.block, "seen": division.seen}
+        tensors = {"block": division.block, "seen": division.seen, "kept": division.kept}
         about = {"extent": division.extent, "attenuation": division.initial.attenuation}
-        save_block(self.start, tensors | {"kept": division.kept}, about, self.run_of)
+        save_block(self.start, dial_columns(division.initial) | tensors, about, self.run_of)
 
     def load_start(self, base: Gaussians, views: Sequence[View]) -> tuple[Division, BlockFiles]:
         """The division of the file, and the files of the blocks that it makes.
@@ -69,8 +69,9 @@ class BlockFiles:
         tensors, about = load_block(self.start, self.run_of)
         device = base.means.device
         count = tensors["seen"].shape[-1] if "seen" in tensors and tensors["seen"].dim() else 0
-        shapes = {
-            "sigma_d": (torch.float32, (len(base),)), "block": (torch.int16, (len(base),)),
+        names = DIAL if self.run_of["settings"]["growth"] == "on" else DIAL[:1]
+        shapes = {name: (torch.float32, (len(base),)) for name in names} | {
+            "block": (torch.int16, (len(base),)),
             "seen": (torch.float32, (len(views), count)), "kept": (torch.float32, (len(views), DIALS)),
         }  # fmt: skip
         checked(self.start, tensors, shapes)
@@ -78,7 +79,8 @@ class BlockFiles:
             raise ClodError(f"{self.start}: a block has no Gaussians; delete it to make it again")
         with refused_if_damaged(self.start):
             settings, extent = AttenuationConfig(**about["attenuation"]), float(about["extent"])
-        begun = base.replace(sigma_d=tensors["sigma_d"].to(device), attenuation=settings)
+        dial = {name: tensors[name].to(device) for name in names}
+        begun = attach(base, attenuation=settings, **dial)
         division = Division(begun, tensors["block"].to(device), tensors["seen"], tensors["kept"], extent)
         return division, replace(self, run_of=self.run_of | {"start": _digest(tensors)}, count=count)
 

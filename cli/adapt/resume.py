@@ -64,9 +64,10 @@ class Resumed:
         if not isinstance(then, dict) or then.keys() != now.keys():
             raise ClodError(f"{self.path}: is of other settings; {ORIGINAL}")
         different = [name for name in now if now[name] != then[name]]
-        options = [_as_option(name, then[name]) for name in different if name in OPTIONS]
+        of_form = [name for name in different if name not in OPTIONS]
         if different:
-            what = ", ".join(options) or f"another --form ({different[0]} {then[different[0]]})"
+            options = ", ".join(_as_option(name, then[name]) for name in different)
+            what = f"another --form ({of_form[0]} {then[of_form[0]]})" if of_form else options
             raise ClodError(f"{self.path}: is of a run with {what}; {ORIGINAL}")
 
 

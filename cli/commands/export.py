@@ -127,7 +127,7 @@ def check_format(args: Namespace, bakes: bool, dial: bool) -> None:
     if dial and not bakes and not FORMATS[suffix].sigma:
         others = ", ".join(other for other in suffixes() if FORMATS[other].sigma)
         raise ClodError(
-            f"{args.out}: {suffix} cannot store sigma_d; choose a dial value to bake, as in --sv 1, or another format "
+            f"{args.out}: {suffix} cannot store a dial; choose a dial value to bake, as in --sv 1, or another format "
             f"({others})"
         )
     if args.order and not FORMATS[suffix].ordered:
@@ -150,11 +150,11 @@ Without a dial value nothing is baked. Columns that Inria's layout does not have
 are dropped.
 
 baking:
-  A baked file has the Gaussians of one dial value, with fixed opacities. This
-  is lossy; keep MODEL. The dial depends on the distance to the camera; baking
-  takes each Gaussian's mean distance to the training cameras of --images, else
-  to those stored in MODEL, else to 16 placed ones (at worst 0.5 dB lower).
-  With --camera the file is exact at that camera.
+  A baked file has the Gaussians of one dial value, with fixed opacities and
+  grown scales. This is lossy; keep MODEL. The dial depends on the distance to
+  the camera; baking takes each Gaussian's mean distance to the training cameras
+  of --images, else to those stored in MODEL, else to 16 placed ones (at worst
+  0.5 dB lower). With --camera the file is exact at that camera.
 
 budgets:
   --keep is exact: OUT has N Gaussians. With --images, --psnr-drop finds the
@@ -167,8 +167,8 @@ levels and order:
   --lod-meta OUT is a new folder with lod-meta.json, level 0 the finest, and the
   chunks that a streaming viewer loads.
   --order extinction is for renderers that draw the first n rows: for any n
-  these are the rows of --keep n, with the opacities of the file. They pop
-  where the dial fades.
+  these are the rows of --keep n, with the opacities and scales of the file.
+  They pop where the dial fades.
 
 other tools:
   SIBR reads a baked .ply of SH degree 1 to 3, and takes the degree from

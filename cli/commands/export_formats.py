@@ -20,7 +20,7 @@ class ExportFormat:
     Attributes:
         about: precision of the values, lines of at most 54 letters.
         ordered: whether the rows keep their order.
-        sigma: whether it stores sigma_d; if not, a dial value has to be baked.
+        sigma: whether it stores the dial; if not, a dial value has to be baked.
     """
 
     about: tuple[str, ...]
@@ -35,8 +35,8 @@ PACKED = {
 }
 FORMATS = {
     ".ply": ExportFormat(("exact; baked, in Inria's layout",)),
-    ".glb": ExportFormat(("float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D)")),
-    ".spz": ExportFormat(("6 to 24 bits, SH degree up to 3, sigma_d 16-bit floats",)),
+    ".glb": ExportFormat(("float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D, _GROWTH_D)")),
+    ".spz": ExportFormat(("6 to 24 bits, SH degree up to 3, the dial 16-bit floats",)),
     ".safetensors": ExportFormat(("exact; for Python",)),
     ".pt": ExportFormat(("exact; layout of gsplat's trainer",)),
     ".splat": ExportFormat(("8 bits, SH degree 0",), ordered=False, sigma=False),

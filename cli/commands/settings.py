@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 OPTIONS: dict[str, Any] = {
     "max_sv": ("S", float), "iters": ("N", int), "batch": ("N", int), "time_budget": ("SEC", float),
-    "seed": ("N", int),
+    "seed": ("N", int), "growth": ("on|off", str),
 }  # fmt: skip
 # Defaults that depend on another option: the number of views seen stays the same for every batch.
-DEFAULTS = {"iters": "1500 divided by the batch", "batch": "1 per process"}
+DEFAULTS = {"iters": "1500 divided by the batch", "batch": "1 per process", "growth": "on, with --form paper off"}
 
 
 def add_settings(options: _ActionsContainer, without: Sequence[str] = ()) -> None:
@@ -55,6 +55,7 @@ def make_config(args: argparse.Namespace) -> AdaptConfig:
     given["batch"] = size if given["batch"] is None else given["batch"]
     if given["iters"] is None:
         given["iters"] = max(round(make().iters / max(given["batch"], 1)), 1)
+    given["growth"] = given["growth"] or make().growth
     for name, value in given.items():  # one at a time, so that the error can name the option
         try:
             make(**{name: value})

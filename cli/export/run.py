@@ -14,7 +14,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.lock import output_lock
-from clod_adapter.io.ply.columns import MASKS, SIGMA, inria_dtype
+from clod_adapter.io.ply.columns import MASKS, dial_columns, inria_dtype
 from clod_adapter.io.ply.constants import PREFIX
 from clod_adapter.io.scene.poses import load_cameras
 
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         console.note(note)
     print("\n".join(output_line(output, len(export.gaussians)) for output in outputs))
     if dials is not None and not page:
-        print(baking_line(export.target))
+        print(baking_line(export.target, model.gaussians.growth_d is not None))
     camera = export.target.camera
     return {
         "command": "export", "version": package_version(), "model": args.model, "base_count": len(export.gaussians),
@@ -109,8 +109,8 @@ def dial_values(
 
 def dropped_columns(model: Checkpoint) -> list[str]:
     """A note on columns of the model that outputs do not have."""
-    known = {*(inria_dtype(model.gaussians.sh_degree).names or ()), SIGMA, *MASKS}
     names = model.vertex.dtype.names or ()
+    known = {*(inria_dtype(model.gaussians.sh_degree, dial=dial_columns(names)).names or ()), *MASKS}
     others = [name for name in names if name not in known and not name.startswith(PREFIX)]  # the prefix marks settings
     return [f"columns dropped: {', '.join(others)}"] if others else []
 
@@ -190,7 +190,8 @@ def output_line(output: dict[str, Any], total: int) -> str:
     return f"{line}; {output['psnr']:.2f} dB on {output['views']} held-out photographs, {below} the model at s = 1"
 
 
-def baking_line(target: Target) -> str:
-    """The cameras that a baked file is for."""
+def baking_line(target: Target, growth: bool) -> str:
+    """The cameras that a baked file is for, and what it lacks."""
     cameras = f"exact at the camera of {target.camera.name} only" if target.camera else f"baked for {target.about}"
-    return f"{cameras}; lossy: without the dial and the Gaussians culled at this dial value"
+    scales = "; the scales have grown to it" if growth else ""
+    return f"{cameras}; lossy: without the dial and the Gaussians culled at this dial value{scales}"

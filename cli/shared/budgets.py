@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from clod_adapter.calibration import Calibration, Viewpoint
 from clod_adapter.cameras import Camera, Scene
-from clod_adapter.distances import viewpoint_of
+from clod_adapter.equation.distances import viewpoint_of
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for, dial_for_times, frame_times
 from clod_adapter.evaluation.evaluate import Row

@@ -8,6 +8,7 @@ from clod_adapter.cameras import Scene
 from clod_adapter.config import CLASSIC, AdaptConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint, load
+from clod_adapter.io.ply.columns import dial_columns
 from clod_adapter.io.ply.values import Activated
 from clod_adapter.io.scene.image_cache import ImageCache
 from clod_adapter.io.scene.load import load_scene
@@ -27,7 +28,8 @@ def read_checkpoint(
     with console.status(f"reading {path} ({size(Path(path))}) ..."):
         checkpoint = load(path, activated=activated, origin=origin)
     gaussians = checkpoint.gaussians
-    dial = ", with sigma_d" if gaussians.sigma_d is not None else ""
+    columns = " and ".join(dial_columns(gaussians.tensors()))
+    dial = f", with {columns}" if columns else ""
     drawn = gaussians.screen_filter
     filtered = "" if drawn == CLASSIC else f", drawn with {drawn.description}"
     console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{dial}{filtered}")

@@ -24,7 +24,8 @@ class Fused:
     """A function of tensors and floats that runs compiled on a GPU and plain elsewhere.
 
     In compiled calls a float becomes a 0-d float64 tensor, so that torch does not compile for each value; keyword
-    arguments are constants of the compilation. If compiling fails, the plain function runs and one warning is given.
+    arguments other than tensors are constants of the compilation. If compiling fails, the plain function runs and one
+    warning is given.
     Compiled graphs allow one backward pass: for retain_graph=True, set TORCH_COMPILE_DISABLE=1.
 
     Args:

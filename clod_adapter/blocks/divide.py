@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from clod_adapter.adapter import attach
 from clod_adapter.cameras import Camera, View, camera_extent
 from clod_adapter.config import AdaptConfig
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.importance import initialize
@@ -29,7 +30,7 @@ class Division:
     """A scene divided into blocks, with its initialization.
 
     Attributes:
-        initial: the Gaussians with the initial sigma_d.
+        initial: the Gaussians with the initial dial.
         block: ``[N]`` int16, the block of each Gaussian.
         seen: ``[V, B]`` float32, the share of each view's image that each block covers.
         kept: ``[V, DIALS]`` float32, Gaussians that the initialization keeps in each view, at even steps of log s.
@@ -111,7 +112,7 @@ def divide(
     count: int,
     progress: Listener | None = None,
 ) -> Division:
-    """Splits a scene into ``count`` blocks and initializes sigma_d on the whole scene.
+    """Splits a scene into ``count`` blocks and initializes the dial on the whole scene.
 
     Args:
         views: ``importance.usable_views`` of the training views.
@@ -135,7 +136,7 @@ def divide(
         seen[k] = (shown.new_zeros(count).index_add_(0, block.long(), shown) / shown.sum().clamp(min=1e-9)).float()
         kept[k] = torch.tensor(kept_counts(initial, view, dial_grid(config)))
         tell(progress, Phase.COVERAGE, k + 1, len(views))
-    initial = base.replace(sigma_d=initial.sigma_d, attenuation=initial.attenuation)
+    initial = attach(base, initial.sigma_d, initial.attenuation, initial.growth_d)
     extent = camera_extent([view.camera for view in views]) or initial.attenuation.reference_distance  # type: ignore[union-attr]
     return Division(initial, block, seen, kept, extent)
 
@@ -162,14 +163,17 @@ def kept_counts(gaussians: Gaussians, view: View, dials: Sequence[float]) -> lis
     return [float(dial(gaussians, distances, s).keep.sum()) for s in dials]
 
 
-def coverage(gaussians: Gaussians, opacities: Tensor, camera: Camera) -> Tensor:
+def coverage(gaussians: Gaussians, opacities: Tensor, camera: Camera, growth: Tensor | None = None) -> Tensor:
     """``[N]`` pixels that each Gaussian covers: the sum over the image of its transmittance times its alpha.
 
     This is the gradient of the image by the Gaussians' colours.
+
+    Args:
+        growth: ``[N]`` factor of the scales; None for 1.
     """
     grey = gaussians.sh0.new_zeros(gaussians.sh0.shape).requires_grad_()
-    plain = gaussians.replace(sh0=grey, shN=gaussians.shN[:, :0], sigma_d=None, attenuation=None)
-    image, _ = splat(plain, opacities, camera)
+    plain = gaussians.replace(sh0=grey, shN=gaussians.shN[:, :0])
+    image, _ = splat(plain, opacities, camera, growth=growth)
     (gradient,) = torch.autograd.grad(image[..., 0].sum(), grey)
     return gradient[:, 0, 0] / SH_C0
 

@@ -11,10 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from clod_adapter.adapter import detach
 from clod_adapter.blocks.divide import DIALS, Division, coverage, dial_grid, kept_counts
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.importance import spread
 from clod_adapter.losses import unit
@@ -52,9 +53,12 @@ def context_rows(
     for k, view in enumerate(views):
         distances = normalized_distances(scene.means, view.camera, scene.attenuation)
         for s in (1.0, scene.attenuation.max_sv):
-            dialled = dial(scene, distances, s).drawn
-            opacities = dialled if after else torch.where(own, dialled, scene.opacities)
-            covered = coverage(scene, opacities, view.camera)
+            dialled = dial(scene, distances, s)
+            opacities, growth = dialled.drawn, dialled.growth
+            if not after:
+                opacities = torch.where(own, opacities, scene.opacities)
+                growth = growth if growth is None else torch.where(own, growth, 1)
+            covered = coverage(scene, opacities, view.camera, growth)
             drawn |= covered > _least_covered(covered)
         tell(progress, Phase.CONTEXT, k + 1, len(views))
     return (drawn & ~own).nonzero()[:, 0]
@@ -105,7 +109,7 @@ def _target_share(
     """The target of ``count`` of ``total`` Gaussians, which are ``parts [DIALS]`` of the kept ones in a view."""
     at = math.log(virtual_scale) / math.log(config.max_sv) * (DIALS - 1)
     part = float(np.interp(at, np.arange(DIALS), parts))
-    whole = target_curve(virtual_scale, config.start_share, config.exponent)
+    whole = target_curve(virtual_scale, config.share, config.exponent)
     wanted = max(whole * total * part, 1.0)
     return TargetShare(wanted / count, stands_for * count / (whole * total))
 
@@ -118,7 +122,7 @@ def target_image(gaussians: Gaussians, own: int, view: View) -> Tensor:
     Over all blocks these parts add up to 1, so the requested changes add up to the whole difference, and no two blocks
     correct the same error.
     """
-    plain = gaussians.replace(sigma_d=None, attenuation=None)
+    plain = detach(gaussians)
     image, alpha = splat(plain, gaussians.opacities, view.camera)
     marked = torch.full_like(gaussians.sh0, -0.5 / SH_C0)
     marked[:own] = 0.5 / SH_C0
@@ -139,7 +143,7 @@ def block_config(division: Division, block: int, config: AdaptConfig, *, first: 
     # Learning rates decay as in an undivided run: from 1 to middle to lr_final.
     middle = config.lr_final ** (1 - light / max(steps, 1))
     last = replace(
-        config.lighter(middle), lr_sigma=middle * config.lr_sigma, lr_final=config.lr_final / middle,
-        average=min(config.average * steps / max(light, 1), 1.0),
+        config.lighter(middle), lr_sigma=middle * config.lr_sigma, lr_growth=middle * config.lr_growth,
+        lr_final=config.lr_final / middle, average=min(config.average * steps / max(light, 1), 1.0),
     )  # fmt: skip
     return replace(replace(config, lr_final=middle) if first else last, iters=own, time_budget=budget, seed=seed)

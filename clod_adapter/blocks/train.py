@@ -10,7 +10,7 @@ their rows are then merged.
 
 Each block has its share of an undivided run:
 
-- The initialization (importance, pruning order, sigma_d, tau) is that of the whole scene.
+- The initialization (importance, pruning order, sigma_d, growth_d, tau) is that of the whole scene.
 - The unit of position steps is the extent of all cameras.
 - A block takes as many steps as the undivided run takes of the views that see it, so that each Gaussian is stepped as
   often. All blocks together take more, as a view may see several.
@@ -27,7 +27,6 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.blocks.divide import Division
 from clod_adapter.blocks.targets import block_config, context_rows, target_image, with_target_shares
 from clod_adapter.cameras import Scene, View
@@ -47,7 +46,7 @@ class Learned:
 
     Attributes:
         rows: ``[n]`` int64, rows of the scene.
-        values: their trained attributes and ``sigma_d``, by name.
+        values: ``sigma_d`` and what else training changed, by name.
         steps, seconds: of the training.
         failed: which step's loss was not finite, so that training ended early.
     """
@@ -134,9 +133,9 @@ def merge(division: Division, learned: Sequence[Learned]) -> Gaussians:
     if not bool((times == 1).all()):
         raise ClodError(f"{int((times != 1).sum())} Gaussians are in no block or in two; give each block once")
     merged = {}
-    for name in (*ATTRIBUTES, "sigma_d"):
+    for name, initial in division.initial.tensors().items():
         if any(name in part.values for part in learned):
-            merged[name] = getattr(division.initial, name).clone()
+            merged[name] = initial.clone()
             for part in learned:
                 if name in part.values:
                     merged[name][part.rows] = part.values[name]

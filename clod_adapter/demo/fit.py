@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import attach, detach
-from clod_adapter.attenuation import SIGMA_MAX
 from clod_adapter.cameras import Scene
 from clod_adapter.config import SH_COUNTS, AdaptConfig
+from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.progress import Listener, Stopped
 from clod_adapter.training.loop import adapt

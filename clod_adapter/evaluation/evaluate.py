@@ -12,7 +12,7 @@ import torch
 
 from clod_adapter.cameras import View
 from clod_adapter.config import require
-from clod_adapter.distances import in_frustum
+from clod_adapter.equation.distances import in_frustum
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.perceptual import Metric
 from clod_adapter.gaussians import Gaussians

@@ -1,8 +1,8 @@
 """Popping: whether the image changes evenly or in jumps as the dial turns or the camera moves.
 
 Neighbouring steps k, k+1 of a sweep are compared *from one camera*, so that only the level of detail counts and not
-the motion of the camera. With ``I_c(k)`` the image, clamped to [0, 1], from camera c with the opacities of step k,
-step k changes it by
+the motion of the camera. With ``I_c(k)`` the image, clamped to [0, 1], from camera c with the opacities and scales of
+step k, step k changes it by
 
     delta_k = I_c(k+1) - I_c(k)      c the camera of step k+1
     change_k = 255 rms(delta_k)      root mean square over pixels and channels, in levels of 255
@@ -132,13 +132,12 @@ def path_popping(
     """
     gaussians, shown = gaussians.without_empty_bands(), path(cameras, steps)
 
-    @lru_cache(maxsize=3)
-    def opacities(j: int) -> Tensor:
-        attenuated = dial(gaussians, shown[j], virtual_scale)
-        return attenuated.drawn
+    dialled = lru_cache(maxsize=3)(lambda j: dial(gaussians, shown[j], virtual_scale))
 
-    positions = [k / steps for k in range(steps + 1)]
-    return sweep(lambda k, j: splat(gaussians, opacities(j), shown[k])[0], positions, progress)
+    def picture(k: int, j: int) -> Tensor:
+        return splat(gaussians, dialled(j).drawn, shown[k], growth=dialled(j).growth)[0]
+
+    return sweep(picture, [k / steps for k in range(steps + 1)], progress)
 
 
 def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:

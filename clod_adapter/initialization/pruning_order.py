@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -23,8 +25,20 @@ CROWD = 64  # Gaussians with equal centres, from which on these are displaced,
 JITTER = 1e-6  # by this share of their size: a k-d tree cannot split equal points, and compares each with all others
 
 
-def pruning_order(gaussians: Gaussians, importance: Tensor, progress: Listener | None = None) -> Tensor:
-    """``[N]`` int64, how many Gaussians are removed before each: half-edge collapse, as for the levels of a mesh.
+class PruningOrder(NamedTuple):
+    """The order in which Gaussians are removed.
+
+    Attributes:
+        position: ``[N]`` int64, how many Gaussians are removed before each.
+        substitute: ``[N]`` int64, the similar neighbour, removed later, that took its importance; itself for the last.
+    """
+
+    position: Tensor
+    substitute: Tensor
+
+
+def pruning_order(gaussians: Gaussians, importance: Tensor, progress: Listener | None = None) -> PruningOrder:
+    """Half-edge collapse, as for the levels of a mesh: which Gaussians can be removed first, and in whose favour.
 
     In rounds. Removing Gaussian i costs the minimum over its NEIGHBOURS nearest centres j of
     ``w_i (|c_i - c_j|^2 + COLOUR_FLOOR^2 + APART r^2 / (r^2 + (l_i + l_j)^2))``, with w the importance, c the colours
@@ -50,6 +64,7 @@ def pruning_order(gaussians: Gaussians, importance: Tensor, progress: Listener |
     colours = 0.5 + SH_C0 * gaussians.sh0.detach()[:, 0].double().cpu().numpy()
     sizes = gaussians.log_scales.detach().double().exp().amax(1).cpu().numpy() if count else np.empty(0)
     weights, order = importance.detach().double().cpu().numpy().copy(), np.empty(count, np.int64)
+    favoured = np.arange(count)
     centres = _without_crowds(centres, sizes)
     left, gone = np.arange(count), 0
     while len(left) > 1:
@@ -57,12 +72,13 @@ def pruning_order(gaussians: Gaussians, importance: Tensor, progress: Listener |
         removed = _removed(weights[left] * difference, substitute)
         np.add.at(weights, left[substitute[removed]], weights[left[removed]])
         order[left[removed]] = gone + np.arange(len(removed))
+        favoured[left[removed]] = left[substitute[removed]]
         gone += len(removed)
         left = np.delete(left, removed)
         tell(progress, Phase.PRUNING_ORDER, gone, count)
     order[left] = gone
     tell(progress, Phase.PRUNING_ORDER, count, count)
-    return torch.from_numpy(order).to(importance.device)
+    return PruningOrder(*(torch.from_numpy(rows).to(importance.device) for rows in (order, favoured)))
 
 
 def _without_crowds(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 
 from clod_adapter.config import SH_COUNTS
-from clod_adapter.io.ply.columns import MASKS, SIGMA, column_map, inria_dtype
+from clod_adapter.io.ply.columns import MASKS, column_map, dial_columns, inria_dtype
+from clod_adapter.io.ply.constants import PREFIX as CONSTANT
 from clod_adapter.io.ply.header import PREFIX, Head, all_comments
 from clod_adapter.io.ply.packed import is_packed
 from clod_adapter.io.ply.values import FILTER
@@ -42,7 +43,7 @@ def _by_layout(names: list[str]) -> str | None:
         return "MaskGaussian's trainer, an early version"
     if FILTER in names:
         return "Mip-Splatting's trainer"
-    plain = [name for name in names if name != SIGMA]
+    plain = [name for name in names if name not in dial_columns(names) and not name.startswith(CONSTANT)]
     rest = sum(name.startswith("f_rest_") for name in names)
     degree = next((degree for degree, count in SH_COUNTS.items() if 3 * (count - 1) == rest), 0)
     inria = list(inria_dtype(degree).names or ())

@@ -15,7 +15,7 @@ from clod_adapter.inspection.authorship import NERFSTUDIO, looks_like
 from clod_adapter.inspection.splat import Anomaly, Dial, Splat, anomalies_of, left_out_of
 from clod_adapter.inspection.statistics import values_of
 from clod_adapter.io.file_formats import PLY, Model, format_of, read_model
-from clod_adapter.io.ply.columns import MASKS, SIGMA, column_map, read_table, rows_of
+from clod_adapter.io.ply.columns import MASKS, SIGMA, column_map, dial_columns, read_table, rows_of
 from clod_adapter.io.ply.constants import PREFIX as CONSTANT
 from clod_adapter.io.ply.header import PREFIX, Head
 from clod_adapter.io.ply.packed import is_packed
@@ -151,7 +151,7 @@ def _encoding(head: Head | None) -> str:
 
 
 def _what(path: Path, source: PlyRows | Model, splat: Splat) -> str:
-    kind = "an adapted splat, with sigma_d" if splat.dial else "a splat"
+    kind = f"an adapted splat, with {splat.dial_columns}" if splat.dial else "a splat"
     packed = any("quantised" in note for note in source.notes)
     suffix = path.suffix.lower() or "PLY"
     return f"{kind}, {'compressed ' if packed else ''}{'PLY' if splat.encoding else suffix}"
@@ -159,5 +159,5 @@ def _what(path: Path, source: PlyRows | Model, splat: Splat) -> str:
 
 def _extra(names: Sequence[str], sh_degree: int) -> tuple[str, ...]:
     known = {name for group in column_map(sh_degree).values() for name in group}
-    known |= {*NORMALS, SIGMA, *MASKS, FILTER}
+    known |= {*NORMALS, *dial_columns(names), *MASKS, FILTER}
     return tuple(name for name in names if name not in known and not name.startswith(CONSTANT))

@@ -29,7 +29,7 @@ class Anomaly:
 
 @dataclass(frozen=True)
 class Dial:
-    """The settings of a file with sigma_d."""
+    """The settings of a file with a dial."""
 
     attenuation: AttenuationConfig
     calibration: Calibration | None
@@ -60,6 +60,11 @@ class Splat:
     origin: Origin
     dial: Dial | None
     screen_filter: ScreenFilter
+
+    @property
+    def dial_columns(self) -> str:
+        """The columns of the dial, of a file that has one."""
+        return "sigma_d" if self.values.growth is None else "sigma_d and growth_d"
 
 
 def anomalies_of(splat: Splat, questions: dict[str, tuple[float, float]]) -> list[Anomaly]:

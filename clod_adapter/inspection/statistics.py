@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from clod_adapter.config import SH_COUNTS
-from clod_adapter.io.ply.columns import SIGMA, column_map
+from clod_adapter.io.ply.columns import GROWTH, SIGMA, column_map, dial_columns
 from clod_adapter.io.ply.rows import usable_blocks
 from clod_adapter.origin import Origin
 
@@ -55,7 +55,7 @@ class Values:
         far: rows FAR times as far from the median position as nine tenths are.
         giant: rows whose largest standard deviation is over half the diagonal of the middle 98 %.
         fainter_than_tau, fainter_than_visible: shares whose opacity is below ``values_of``'s ``tau``, and FAINT.
-        sigma: of sigma_d, where there is one.
+        sigma, growth: of sigma_d and growth_d, where they are there.
     """
 
     total: int
@@ -76,6 +76,7 @@ class Values:
     fainter_than_tau: float
     fainter_than_visible: float
     sigma: Spread | None
+    growth: Spread | None
 
 
 def values_of(vertex: np.ndarray, sh_degree: int, origin: Origin, tau: float) -> Values | None:
@@ -109,6 +110,7 @@ def values_of(vertex: np.ndarray, sh_degree: int, origin: Origin, tau: float) ->
         giant=int((scales[2] > diagonal / 2).sum()) if diagonal > 0 else 0,
         fainter_than_tau=float((opacities < tau).mean()), fainter_than_visible=float((opacities < FAINT).mean()),
         sigma=Spread.of(columns[SIGMA][0]) if SIGMA in columns else None,
+        growth=Spread.of(columns[GROWTH][0]) if GROWTH in columns else None,
     )  # fmt: skip
 
 
@@ -120,7 +122,7 @@ def _gather(
     The higher harmonics, three quarters of a file, are examined and not kept.
     """
     groups = column_map(sh_degree)
-    wanted = {key: groups[key] for key in _MAIN} | ({SIGMA: (SIGMA,)} if SIGMA in (vertex.dtype.names or ()) else {})
+    wanted = {key: groups[key] for key in _MAIN} | dial_columns(vertex.dtype.names or ())
     columns = {key: np.empty((len(group), len(vertex)), np.float32) for key, group in wanted.items()}
     keep, dropped, used = np.zeros(len(vertex), bool), Counter[str](), np.zeros(len(groups["shN"]), bool)
     for rows, values, usable in usable_blocks(vertex, sh_degree, origin, dropped):

@@ -31,10 +31,12 @@ def inspect_tensors(path: Path) -> tuple[str, dict[str, Any], tuple[str, ...]] |
 
 def _adapter(adapter: Adapter) -> dict[str, Any]:
     kinds = {name: f"{str(t.dtype).removeprefix('torch.')} {list(t.shape)}" for name, t in adapter.updates.items()}
+    growth = None if adapter.growth_d is None else asdict(Spread.of(adapter.growth_d.numpy()))
     return {
         "kind": "adapter", "writer": f"clod-adapter {adapter.version}", "count": len(adapter.sigma_d),
         "base": adapter.base_fingerprint, "attenuation": asdict(adapter.attenuation), "config": adapter.config,
         "updates": kinds, "origin": list(adapter.origin), "sigma": asdict(Spread.of(adapter.sigma_d.numpy())),
+        "growth": growth,
         "calibration": adapter.calibration and adapter.calibration.as_dict(),
     }  # fmt: skip
 

@@ -1,16 +1,16 @@
-"""gsplat's ``rasterization`` with a dial: same arguments plus three, same results.
+"""gsplat's ``rasterization`` with a dial: same arguments plus four, same results.
 
 from clod_adapter.integrations import gsplat as clod_gsplat
 colors, alphas, meta = clod_gsplat.rasterization(
     means, quats, scales, opacities, colors, viewmats, Ks, width, height,
-    sigma_d=model.sigma_d, attenuation=model.attenuation, virtual_scale=3,
+    sigma_d=model.sigma_d, growth_d=model.growth_d, attenuation=model.attenuation, virtual_scale=3,
 )
 
-gsplat takes one opacity per Gaussian for all cameras; the dial gives one for each camera. So each camera is one call of
-gsplat, and the results are joined in gsplat's form, including ids, order and gradients. (A batch of scenes could share
-a call, but gsplat 1.5.3's packed projection culls all scenes by the opacities of the first.) Culled Gaussians get
-opacity 0: gsplat drops such rows in its projection, before colours, sorting and blending, so nothing has to be
-gathered, and rows and ids stay those of the caller. Written for gsplat 1.5.3.
+gsplat takes one opacity and scale per Gaussian for all cameras; the dial gives one for each camera. So each camera is
+one call of gsplat, and the results are joined in gsplat's form, including ids, order and gradients. (A batch of scenes
+could share a call, but gsplat 1.5.3's packed projection culls all scenes by the opacities of the first.) Culled
+Gaussians get opacity 0: gsplat drops such rows in its projection, before colours, sorting and blending, so nothing has
+to be gathered, and rows and ids stay those of the caller. Written for gsplat 1.5.3.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ try:
 except ImportError as error:
     raise ImportError("gsplat cannot be imported; it needs torch and CUDA: pip install gsplat==1.5.3") from error
 
-PER_GAUSSIAN = ("means", "quats", "scales", "opacities", "covars", "sigma_d")
+PER_GAUSSIAN = ("means", "quats", "scales", "opacities", "covars", "sigma_d", "growth_d")
 PER_CAMERA = (
     "viewmats", "Ks", "backgrounds", "viewmats_rs", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs",
 )  # fmt: skip
@@ -50,15 +50,17 @@ def rasterization(
     sigma_d: Tensor | None = None,
     virtual_scale: float = 1.0,
     attenuation: AttenuationConfig | None = None,
+    growth_d: Tensor | None = None,
     **kwargs: Any,
 ) -> Rendered:
-    """``gsplat.rasterization`` with the opacities of one dial value, attenuated for each camera.
+    """``gsplat.rasterization`` with the opacities and scales of one dial value, for each camera.
 
-    Equals gsplat called with the opacities of ``attenuation.attenuate``, camera by camera for ``[..., C, 4, 4]``.
-    Differentiable in ``sigma_d`` and all that gsplat differentiates in; the distances are constants, so the dial adds
-    nothing to the gradients of ``means`` and ``viewmats``. ``meta`` is gsplat's: ``means2d`` takes ``retain_grad()``
-    and, with ``absgrad``, has its ``absgrad``, as densification strategies need it. (With several cameras ``means2d``
-    is a copy, which ``torch.autograd.grad`` and hooks on it do not reach.)
+    Equals gsplat called with the opacities of ``attenuation.attenuate`` and ``scales`` times its growth (``covars``,
+    where given, times its square), camera by camera for ``[..., C, 4, 4]``. Differentiable in ``sigma_d``, ``growth_d``
+    and all that gsplat differentiates in; the distances are constants, so the dial adds nothing to the gradients of
+    ``means`` and ``viewmats``. ``meta`` is gsplat's: ``means2d`` takes ``retain_grad()`` and, with ``absgrad``, has its
+    ``absgrad``, as densification strategies need it. (With several cameras ``means2d`` is a copy, which
+    ``torch.autograd.grad`` and hooks on it do not reach.)
 
     Pass a file's ``Gaussians.screen_filter`` as without a dial: ``eps2d`` is its variance, and
     ``rasterize_mode="antialiased"`` its compensation of opacities.
@@ -73,24 +75,27 @@ def rasterization(
         virtual_scale: the dial s >= 1.
         attenuation: settings of the equation, ``Gaussians.attenuation`` of the file; by default
             ``AttenuationConfig()``, with distances in world units.
+        growth_d: ``[..., N]`` exponents of the growth of the scales; None for no growth.
 
     Returns:
         ``render_colors [..., C, H, W, X]``, ``render_alphas [..., C, H, W, 1]`` and ``meta``.
 
     Raises:
-        ClodError: the dial is below 1, the shapes of sigma_d and opacities differ, or ``distributed`` is set, with
-            which the cameras of all processes share one opacity.
+        ClodError: the dial is below 1, sigma_d or growth_d differs from opacities in shape, or ``distributed`` is set,
+            with which the cameras of all processes share one opacity.
     """
     if sigma_d is None:
         return gsplat.rasterization(*args, **kwargs)
     bound = inspect.signature(gsplat.rasterization).bind(*args, **kwargs)
     bound.apply_defaults()
-    given: dict[str, Any] = {**bound.arguments, "sigma_d": sigma_d}
+    ours = {"sigma_d": sigma_d, "growth_d": growth_d}
+    given: dict[str, Any] = {**bound.arguments, **ours}
     if given["distributed"]:
         raise ClodError("distributed=True shares one opacity among all cameras, a dial needs one each; set it to False")
-    if given["opacities"].shape != sigma_d.shape:
-        shapes = f"sigma_d is {tuple(sigma_d.shape)} and opacities {tuple(given['opacities'].shape)}"
-        raise ClodError(f"{shapes}; both must be [..., N]")
+    for name, value in ours.items():
+        if value is not None and value.shape != given["opacities"].shape:
+            shapes = f"{name} is {tuple(value.shape)} and opacities {tuple(given['opacities'].shape)}"
+            raise ClodError(f"{shapes}; both must be [..., N]")
     shape = given["viewmats"].shape[:-2]
     config = attenuation or AttenuationConfig()
     if math.prod(shape) == 1:
@@ -118,9 +123,15 @@ def _one_camera(given: dict[str, Any], virtual_scale: float, config: Attenuation
         near=given["near_plane"],
     )  # fmt: skip
     arguments = dict(given)
-    hook, opacities = Hook(arguments.pop("sigma_d").flatten(), config, virtual_scale), given["opacities"]
-    drawn = hook.attenuate(given["means"].reshape(-1, 3), opacities.flatten(), camera).drawn
-    arguments["opacities"] = drawn.to(opacities).reshape(opacities.shape)
+    sigma_d, growth_d = (arguments.pop(name) for name in ("sigma_d", "growth_d"))
+    hook = Hook(sigma_d.flatten(), config, virtual_scale, None if growth_d is None else growth_d.flatten())
+    opacities = given["opacities"]
+    shown = hook.attenuate(given["means"].reshape(-1, 3), opacities.flatten(), camera)
+    arguments["opacities"] = shown.drawn.to(opacities).reshape(opacities.shape)
+    if shown.growth is not None:
+        name, growth = ("scales", shown.growth) if given.get("covars") is None else ("covars", shown.growth.square())
+        old = given[name]
+        arguments[name] = old * growth.to(old).reshape(opacities.shape + (1,) * (old.dim() - opacities.dim()))
     return gsplat.rasterization(**arguments)
 
 

@@ -3,7 +3,7 @@
 from clod_adapter.integrations.inria import GaussianRasterizationSettings, GaussianRasterizer
 color, radii, *others = GaussianRasterizer(raster_settings)(
     means3D=means, means2D=points, opacities=opacities, shs=shs, scales=scales, rotations=rotations,
-    sigma_d=model.sigma_d, attenuation=model.attenuation, virtual_scale=3,
+    sigma_d=model.sigma_d, growth_d=model.growth_d, attenuation=model.attenuation, virtual_scale=3,
 )
 
 Forks differ in settings, further arguments and results; this class is derived from the installed one and passes all of
@@ -14,6 +14,7 @@ view, which opacity 0 alone would not achieve. All rows keep their places: radii
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import torch
@@ -48,12 +49,14 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
         sigma_d: Tensor | None = None,
         virtual_scale: float = 1.0,
         attenuation: AttenuationConfig | None = None,
+        growth_d: Tensor | None = None,
         **kwargs: Any,
     ) -> Any:
-        """The installed fork's result with the opacities of one dial value, attenuated for the camera.
+        """The installed fork's result with the opacities and scales of one dial value.
 
-        Equals the fork called with the opacities of ``attenuation.attenuate`` and without culled rows, plus rows of
-        radius 0 for these. Differentiable in ``sigma_d``; the distances are constants. A file's
+        Equals the fork called with the opacities of ``attenuation.attenuate``, ``scales`` times its growth
+        (``cov3D_precomp``, where given, times its square) and without culled rows, plus rows of radius 0 for these.
+        Differentiable in ``sigma_d`` and ``growth_d``; the distances are constants. A file's
         ``Gaussians.screen_filter`` belongs in the settings of forks that support it (``antialiasing``,
         Mip-Splatting's ``kernel_size``).
 
@@ -63,6 +66,7 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
             virtual_scale: the dial s >= 1.
             attenuation: settings of the equation, ``Gaussians.attenuation`` of the file; by default
                 ``AttenuationConfig()``, with distances in world units.
+            growth_d: ``[N]`` exponents of the growth of the scales; None for no growth.
 
         Raises:
             ClodError: the dial is below 1, the shapes do not match, or the settings have ``prefiltered``, with which
@@ -75,14 +79,19 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
             raise ClodError(
                 "raster_settings.prefiltered is True, but culled Gaussians are out of view; set it to False"
             )
-        hook = Hook(sigma_d, attenuation or AttenuationConfig(), virtual_scale)
+        hook = Hook(sigma_d, attenuation or AttenuationConfig(), virtual_scale, growth_d)
         viewmat = settings.viewmatrix.T  # Inria's matrices multiply from the right
-        drawn, keep = hook(
-            means3D, opacities, viewmat, _intrinsics(settings), settings.image_width, settings.image_height
-        )
+        drawn, keep, growth = hook(
+            means3D, opacities, viewmat, _intrinsics(settings), settings.image_width, settings.image_height,
+            growth=True,
+        )  # fmt: skip
         hidden = settings.campos - NEAR * settings.viewmatrix[:3, 2]  # opposite to the viewing direction
         means3D = torch.where(keep[:, None], means3D, hidden.to(means3D))
-        return super().forward(means3D, means2D, drawn, *args, **kwargs)
+        bound = inspect.signature(super().forward).bind(means3D, means2D, drawn, *args, **kwargs)
+        for name, power in () if growth_d is None else (("scales", 1), ("cov3D_precomp", 2)):
+            if (value := bound.arguments.get(name)) is not None:
+                bound.arguments[name] = value * growth.to(value)[:, None] ** power
+        return super().forward(*bound.args, **bound.kwargs)
 
 
 def _intrinsics(settings: Any) -> Tensor:

@@ -1,9 +1,9 @@
 """Adapters as safetensors files: tensors, and one JSON document.
 
-Tensors: ``sigma_d`` float32, and each update under the name of its attribute: float16 for a difference from the base,
-float32 for new values. Where the result has fewer rows than the base also ``kept``, uint8: one bit per row of the base,
-the first row the highest bit. The JSON is stored under the metadata key ``clod_adapter``, keys sorted: equal adapters
-give equal files.
+Tensors: ``sigma_d`` float32, with growth also ``growth_d`` float32, and each update under the name of its attribute:
+float16 for a difference from the base, float32 for new values. Where the result has fewer rows than the base also
+``kept``, uint8: one bit per row of the base, the first row the highest bit. The JSON is stored under the metadata key
+``clod_adapter``, keys sorted: equal adapters give equal files.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from safetensors.torch import save
 
-from clod_adapter.adapter import Adapter
+from clod_adapter.adapter import Adapter, dial_columns
 from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
@@ -26,8 +26,8 @@ from clod_adapter.io.tensor_file import load_tensors
 
 KEY = "clod_adapter"
 FORMAT = "clod-adapter"
-FORMAT_VERSION = 2
-UNTRIMMED = 1  # format of an adapter that is not trimmed, which earlier versions of this package read
+FORMAT_VERSION = 3
+UNTRIMMED, TRIMMED = 1, 2  # formats of adapters without growth, which earlier versions of this package read
 
 
 def save_adapter(path: str | Path, adapter: Adapter) -> None:
@@ -37,8 +37,9 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
         ClodError: its config is not plain JSON, or the file cannot be written.
     """
     trimmed = adapter.kept is not None or adapter.sh_degree is not None
+    lowest = TRIMMED if trimmed else UNTRIMMED
     about = {
-        **document(FORMAT, FORMAT_VERSION if trimmed else UNTRIMMED),
+        **document(FORMAT, lowest if adapter.growth_d is None else FORMAT_VERSION),
         "package_version": adapter.version,
         "base_sha256": adapter.base_fingerprint,
         "config": adapter.config,
@@ -48,7 +49,7 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
         about["trimmed"] = {"base_count": adapter.base_count, "sh_degree": adapter.sh_degree}
     check_config(adapter.config)
     metadata = {KEY: json.dumps(about, sort_keys=True, allow_nan=False)}
-    tensors = {"sigma_d": adapter.sigma_d, **adapter.updates}
+    tensors = {**dial_columns(adapter), **adapter.updates}
     if adapter.kept is not None:
         tensors["kept"] = torch.from_numpy(np.packbits(adapter.kept.cpu().numpy()))
     with atomic_path(path) as temporary:
@@ -99,6 +100,7 @@ def load_adapter(path: str | Path) -> Adapter:
         kept = _rows(tensors.pop("kept"), trimmed["base_count"]) if "kept" in tensors else None
         return Adapter(
             sigma_d=tensors.pop("sigma_d"),
+            growth_d=tensors.pop("growth_d", None),
             attenuation=settings.attenuation,
             updates=tensors,
             base_fingerprint=about["base_sha256"],

@@ -13,6 +13,7 @@ from torch import Tensor
 from clod_adapter.adapter import trim
 from clod_adapter.calibration import Calibration, Viewpoint
 from clod_adapter.config import CLASSIC
+from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
@@ -26,7 +27,6 @@ from clod_adapter.io.ply.values import Activated
 from clod_adapter.io.ply.write import write_rows
 from clod_adapter.io.settings import matching_calibration
 from clod_adapter.origin import NOWHERE, Origin
-from clod_adapter.units import in_world_units
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,8 @@ class Checkpoint:
     """A file as read: its Gaussians, and what the writer keeps of it.
 
     Attributes:
-        gaussians: the usable Gaussians, float32; with sigma_d and attenuation if the file is extended.
+        gaussians: the usable Gaussians, float32; with sigma_d and attenuation, and perhaps growth_d, if the file is
+            extended.
         vertex: ``[N]`` structured array, the same rows with every column of the file, in file order and type, native
             byte order; activated values and filters are undone.
         comments: the header's, or the lines of history of another format.
@@ -66,14 +67,15 @@ class Checkpoint:
         return tuple(viewpoint.moved([-value for value in self.origin]) for viewpoint in stored)
 
     def hook(self, virtual_scale: float = 1.0) -> Hook:
-        """The dial for a renderer that has these Gaussians: it maps their opacities to attenuated ones.
+        """The dial for a renderer that has these Gaussians: attenuated opacities, and factors of the scales.
 
         Raises:
             ClodError: the file has no sigma_d, or the dial is below 1 or not finite.
         """
-        if self.gaussians.sigma_d is None or self.gaussians.attenuation is None:
+        own = self.gaussians
+        if own.sigma_d is None or own.attenuation is None:
             raise ClodError(f"{self.path}: it has no sigma_d, so there is no dial; clod-adapt adapt gives it one")
-        return Hook(self.gaussians.sigma_d, self.gaussians.attenuation, virtual_scale)
+        return Hook(own.sigma_d, own.attenuation, virtual_scale, own.growth_d)
 
 
 def load(path: str | Path, *, activated: Activated | None = None, origin: Origin | None = None) -> Checkpoint:
@@ -124,7 +126,7 @@ def save(
     version: str | None = None,
     calibration: Calibration | None = None,
 ) -> None:
-    """Writes ``gaussians`` as an extended file: the base's columns, then ``sigma_d``.
+    """Writes ``gaussians`` as an extended file: the base's columns, then ``sigma_d`` and ``growth_d``.
 
     Without a base the columns are those of Inria's layout.
 
@@ -155,7 +157,7 @@ def save(
         )
     gaussians = in_world_units(gaussians)
     comments = write_comments(gaussians.attenuation, base.comments, version, calibration, gaussians.screen_filter)
-    constants = dial_constants(gaussians.attenuation)
+    constants = dial_constants(gaussians.attenuation, gaussians.growth_d is not None)
     if gaussians.sigma_d is not None:  # a plain file has the columns of Inria's layout and no others
         constants |= filter_constants(gaussians.screen_filter)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:

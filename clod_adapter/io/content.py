@@ -11,7 +11,7 @@ import numpy as np
 from clod_adapter.config import ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import PLY, Model, format_of, read_model
-from clod_adapter.io.ply.columns import SIGMA, column_map, in_shape, read_table, rows_of
+from clod_adapter.io.ply.columns import column_map, dial_columns, in_shape, read_table, rows_of
 from clod_adapter.io.ply.header import PREFIX
 from clod_adapter.io.ply.rows import PlyRows, read_ply, usable_blocks, usable_rows
 from clod_adapter.io.ply.values import Activated, as_stored_by_inria
@@ -66,7 +66,7 @@ def _ply_content(path: Path, rows: PlyRows, activated: Activated | None, origin:
     implied = implied_filter(rows.comments, rows.vertex.dtype.names or ())
     vertex, was, changes = as_stored_by_inria(path, rows.vertex, activated if rows.activation_unknown else "none")
     origin, dropped = origin_of(vertex) if origin is None else origin, Counter[str]()
-    groups = column_map(rows.sh_degree) | ({SIGMA: (SIGMA,)} if SIGMA in (vertex.dtype.names or ()) else {})
+    groups = column_map(rows.sh_degree) | dial_columns(vertex.dtype.names or ())
     values = {key: np.empty((len(vertex), len(group)), np.float32) for key, group in groups.items()}
     keep = np.empty(len(vertex), bool)
     for block, found, usable in usable_blocks(vertex, rows.sh_degree, origin, dropped):

@@ -51,7 +51,7 @@ class Format(NamedTuple):
         has_dial: whether a file has a sigma_d; "" where none can.
         write: called with path, Gaussians in world units and a ``History``; gives a line for each loss; "" where the
             format is only read.
-        carries_sigma: whether sigma_d and its settings are written.
+        carries_sigma: whether the dial is written: sigma_d, growth_d and their settings.
     """
 
     read: str
@@ -127,7 +127,7 @@ def write(
     """Writes Gaussians in the format of the name's suffix, whole or not at all, sigma_d in world units.
 
     Args:
-        gaussians: with or without sigma_d.
+        gaussians: with or without a dial.
         about: lines on their history, printable ASCII, for formats that store text.
         origin: what their means are relative to (``Checkpoint.origin``), world units.
         calibration: of these Gaussians, for formats that store text.
@@ -143,8 +143,8 @@ def write(
     if suffix not in WRITABLE:
         raise ClodError(f"{path}: {suffix or 'no suffix'} is no format to write; choose one of {', '.join(WRITABLE)}")
     if gaussians.sigma_d is not None and not FORMATS[suffix].carries_sigma:
-        raise ClodError(f"{path}: {Path(path).suffix} has no room for sigma_d; choose a dial value to bake")
-    from clod_adapter.units import in_world_units  # here: the table needs no torch
+        raise ClodError(f"{path}: {Path(path).suffix} has no room for a dial; choose a dial value to bake")
+    from clod_adapter.equation.units import in_world_units  # here: the table needs no torch
 
     history = History(tuple(about), origin, calibration)
     return _call(FORMATS[suffix].write, Path(path), in_world_units(gaussians), history)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from statistics import fmean
 
@@ -15,6 +16,8 @@ from clod_adapter.losses import psnr
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.rasterizers import ALPHA_MAX
 from clod_adapter.render import render
+
+ERROR_FLOOR = 1e-3  # mean squared error of a render at 30 dB
 
 
 @torch.no_grad()
@@ -54,6 +57,40 @@ def seen(base: Gaussians, views: Sequence[View], error: Tensor, seed: int, progr
     others = [view for k, view in enumerate(views) if k not in rendered]
     moves = (error > 0) | (removal_error(base, others, seed=seed, progress=progress) > 0)
     return moves | (base.opacities > ALPHA_MAX)
+
+
+@torch.no_grad()
+def needed_share(base: Gaussians, views: Sequence[View], error: Tensor, limit: float) -> tuple[float, float]:
+    """The smallest share of the Gaussians that loses less than ``limit`` dB, in hundredths, and that loss.
+
+    In (0.5, 1], by bisection. The Gaussians with the largest removal error remain, unattenuated. The loss of a view is
+    ``10 log10(e' / e)``, and e, the base's mean squared error, at least ERROR_FLOOR: against its own renderings a
+    checkpoint would have no error, and every Gaussian would be needed.
+
+    Args:
+        error: ``[N]`` from ``removal_error``.
+    """
+    order = error.argsort(descending=True, stable=True)
+    whole = [_squared_error(base, view) for view in views]
+
+    def loss(percent: int) -> float:
+        less = base.select(order[: max(round(percent / 100 * len(base)), 1)])
+        return fmean(
+            10 * math.log10((_squared_error(less, view) + floor) / (mse + floor))
+            for view, mse in zip(views, whole, strict=True)
+            for floor in [max(ERROR_FLOOR - mse, 0.0)]
+        )
+
+    low, high, found = 50, 100, 0.0
+    while high - low > 1:
+        middle = (low + high) // 2
+        lost = loss(middle)
+        low, high, found = (low, middle, lost) if lost < limit else (middle, high, found)
+    return high / 100, found
+
+
+def _squared_error(gaussians: Gaussians, view: View) -> float:
+    return 10 ** (-psnr(render(gaussians, view.camera).image, view.image) / 10)
 
 
 @torch.no_grad()

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from clod_adapter.adapter import detach
 from clod_adapter.cameras import Camera, near_plane
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
@@ -104,7 +105,7 @@ def typical_reach(gaussians: Gaussians, field: float = FIELD) -> float:
 
 def _usable(gaussians: Gaussians) -> Gaussians:
     """The visible and finite Gaussians, without a dial. An infinite opacity logit is a fully opaque Gaussian."""
-    plain = gaussians.replace(sigma_d=None, attenuation=None)
+    plain = detach(gaussians)
     rows = plain.opacities > VISIBLE
     for values in plain.tensors().values():
         if values.shape[1:].numel() and values is not plain.opacity_logits:

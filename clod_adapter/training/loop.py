@@ -9,17 +9,17 @@ import torch
 
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.units import in_world_units, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.finite import LossNotFinite, largest_colour, require_finite
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import for_training, initialize, usable_views
+from clod_adapter.initialization.importance import for_training, initialize, usable_views, with_growth
 from clod_adapter.progress import Listener, Phase, Progress
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost
 from clod_adapter.training.interrupts import DeferredInterrupt
 from clod_adapter.training.objective import TrainableSubset
 from clod_adapter.training.state import Adapted, StateRefused, TrainingState
 from clod_adapter.training.trainer import Trainer
-from clod_adapter.units import in_world_units, with_distance
 
 __all__ = ["Adapted", "Progress", "TrainingState", "adapt"]
 
@@ -79,7 +79,11 @@ def adapt(
     # Empty higher SH degrees that are not tuned stay empty, so they are not rendered.
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
     views = usable_views(base, scene.train)
-    begun = _initialized(lean, views, config, progress, group) if resume is None else _initialized_from(lean, resume)
+    begun = (
+        _initialized(lean, views, config, progress, group)
+        if resume is None
+        else _initialized_from(lean, resume, config)
+    )
     trainer = Trainer(begun, views, config, subset, group)
     trainer.empty_sh = None if lean is base else base.shN.clone()
     trainer.start_seconds = time.perf_counter() - began
@@ -107,19 +111,19 @@ def _initialized(
     lean: Gaussians, views: tuple[View, ...], config: AdaptConfig, progress: Listener | None,
     group: ProcessGroup | None,
 ) -> Gaussians:  # fmt: skip
-    """The Gaussians with the initial sigma_d, the same bits in all processes."""
+    """The Gaussians with the initial dial, the same bits in all processes."""
     begun = for_training(initialize(lean, views, config, progress), views, config)
     if group:
-        own = {"sigma_d": begun.sigma_d, "attenuation": begun.attenuation}
+        own = {"sigma_d": begun.sigma_d, "growth_d": begun.growth_d, "attenuation": begun.attenuation}
         begun = begun.replace(**group.broadcast(own)).to(begun.means.device)
     return begun
 
 
-def _initialized_from(lean: Gaussians, resume: TrainingState) -> Gaussians:
-    """The Gaussians with the sigma_d of rows that are rendered only; the state has that of the trained rows."""
-    unset = torch.ones_like(lean.opacity_logits)
+def _initialized_from(lean: Gaussians, resume: TrainingState, config: AdaptConfig) -> Gaussians:
+    """The Gaussians with the dial of rows that are rendered only; the state has that of the trained rows."""
     dialled = with_distance(in_world_units(lean), resume.attenuation.scene_distance)  # rounded as in the first call
-    return lean.replace(sigma_d=unset if lean.sigma_d is None else dialled.sigma_d, attenuation=resume.attenuation)
+    sigma_d = torch.ones_like(lean.opacity_logits) if lean.sigma_d is None else dialled.sigma_d
+    return with_growth(lean.replace(sigma_d=sigma_d, attenuation=resume.attenuation), config, lean.growth_d)
 
 
 def _train(trainer: Trainer, progress: Listener | None) -> Adapted:

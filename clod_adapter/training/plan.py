@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from clod_adapter.adapter import trim
+from clod_adapter.adapter import attach, trim
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
@@ -79,7 +79,7 @@ class Plan:
 
     Attributes:
         decisions: one for each part of the checkpoint.
-        start: all rows of the base with the initial sigma_d, without the SH degrees that are left out.
+        start: all rows of the base with the initial dial, without the SH degrees that are left out.
         kept: ``[N]`` bool, the rows that are trained; None for all.
         sh_degree: the SH degree that is trained.
         config: with learning rate 0 for frozen attributes.
@@ -114,7 +114,7 @@ class Plan:
         return adapt(self.lean, scene, self.config, progress, resume, subset=self.subset, group=group)
 
     def whole(self, base: Gaussians, lean: Gaussians) -> Gaussians:
-        """``lean`` after training, together with what was left out: the base's values and the initial sigma_d.
+        """``lean`` after training, together with what was left out: the base's values and the initial dial.
 
         Args:
             base: the checkpoint that the plan was made for.
@@ -122,7 +122,7 @@ class Plan:
         if not self.trims(base):
             return lean
         rows = slice(None) if self.kept is None else self.kept
-        values = base.replace(sigma_d=self.start.sigma_d, attenuation=lean.attenuation).tensors()
+        values = attach(base, self.start.sigma_d, lean.attenuation, self.start.growth_d).tensors()
         for name, new in lean.tensors().items():
             if name == "shN" and self.config.lr_shN == 0:
                 continue  # the base's, without a copy of the largest part

@@ -15,11 +15,12 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, initialize, removal_error, spread, usable_views
 from clod_adapter.progress import Listener, Phase, tell, within
-from clod_adapter.training.ablation import seen, sh_degree_losses
+from clod_adapter.training.ablation import needed_share, seen, sh_degree_losses
 from clod_adapter.training.loop import require_trainable
 from clod_adapter.training.plan import RATES, Decision, Override, Plan
 
-LIMIT = 0.02  # dB: SH degrees are left out if the PSNR of the training views changes by less without them
+SHARE_LIMIT = 0.01  # dB: the share kept at s = 1 loses less on these views
+LIMIT = 0.02  # dB: SH degrees and Gaussians are left out if the PSNR of the training views changes by less without them
 VIEWS = 8  # evenly spread training views on which that is measured
 REQUESTED = "as requested, not measured"
 
@@ -63,9 +64,10 @@ class _Planner:
             degree = self._sh_degree()
         few = self.base.without_bands(degree)
         kept, error = self._unseen(few)
+        config = self._share(few, error)
         with self._time("start"):
-            initial = initialize(few, self.views, self.config, self.progress, error=error)
-        config = self._freeze()
+            initial = initialize(few, self.views, config, self.progress, error=error)
+        config = self._freeze(config)
         for item, reason in self.scene.left_out:
             self._decide(item, "left out", reason)
         return Plan(tuple(self.decisions), initial, kept, degree, config, self.seconds)
@@ -121,13 +123,24 @@ class _Planner:
             return f"not measured: with a {self.config.start} initialization none is culled at any dial value"
         return ""
 
-    def _freeze(self) -> AdaptConfig:
+    def _share(self, few: Gaussians, error: Tensor | None) -> AdaptConfig:
+        """The settings with the share of Gaussians to keep at s = 1."""
+        if self.config.start_share is not None or error is None or self.config.max_sv == 1:
+            return self.config
+        with self._time("share"):
+            views = spread(self.views, VIEWS)
+            share, loss = needed_share(few, views, error, SHARE_LIMIT)
+        why = f"lost without the other {1 - share:.0%}, untrained, {_counted(len(views))}"
+        self._decide(f"{share:.0%} of the Gaussians at s = 1", "kept", why, "", loss, "dB")
+        return replace(self.config, start_share=share)
+
+    def _freeze(self, config: AdaptConfig) -> AdaptConfig:
         """The settings with learning rate 0 for the attributes to freeze."""
         frozen = [name for name in RATES if name in self.override.leave_out]
         for name in frozen:
             self._decide(name, "frozen", REQUESTED, name)
         rates: dict[str, Any] = {RATES[name]: 0.0 for name in frozen}
-        return replace(self.config, **rates)
+        return replace(config, **rates)
 
     def _decide(
         self, what: str, verdict: str, why: str, name: str = "", number: float | None = None, unit: str = ""

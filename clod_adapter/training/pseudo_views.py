@@ -43,7 +43,7 @@ def render_pseudo_views(gaussians: Gaussians, cameras: list[Camera], *, progress
 
 
 def add_pseudo_views(gaussians: Gaussians, scene: Scene, config: AdaptConfig) -> tuple[Scene, AdaptConfig]:
-    """Adds OWN pseudo views, and halves all learning rates but that of sigma_d, with fewer than FEW photographs.
+    """Adds OWN pseudo views, and halves all learning rates but the dial's, with fewer than FEW photographs.
 
     So few photographs do not show the whole scene, and training would damage the rest. Pseudo views have the field of
     view of the first photograph. With more photographs they harm more than they help, as they contain the errors of
@@ -59,7 +59,7 @@ def add_pseudo_views(gaussians: Gaussians, scene: Scene, config: AdaptConfig) ->
         added = f"{len(own)} pseudo views, the checkpoint's own renderings from placed cameras, are added"
     except ClodError as error:
         own, added = (), f"no pseudo views can be added ({error})"
-    note = f"only {len(scene.train)} photographs to train on: {added}, and all learning rates but sigma_d's are halved"
+    note = f"only {len(scene.train)} photographs to train on: {added}, and all learning rates but the dial's are halved"
     return replace(scene, train=(*scene.train, *own), notes=(*scene.notes, note)), config.lighter(0.5)
 
 

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from clod_adapter.attenuation import Attenuated, conform, log_threshold
 from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.attenuation import Attenuated, conform, log_threshold
 
 # Lower bound of the sigmoid's slope, which is at most 1/4, for culled Gaussians while too few are kept. Some widths
 # below the culling threshold it is exactly 0, and so is the image's gradient: no step would bring such a sigma back.
@@ -48,7 +48,7 @@ def target_share(virtual_scale: float, count: int, config: AdaptConfig, total: i
             sees them: the target may then exceed ``count``. By default ``count``.
     """
     total = total or max(count, 1)
-    share = max(target_curve(virtual_scale, config.start_share, config.exponent), 1 / total) * (total / max(count, 1))
+    share = max(target_curve(virtual_scale, config.share, config.exponent), 1 / total) * (total / max(count, 1))
     return TargetShare(share, 1 / share)
 
 

@@ -12,6 +12,8 @@ from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.cameras import View, camera_extent
 from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.growth import GROWTH_RANGE
+from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.finite import LossNotFinite, require_finite, spoilt_rows
 from clod_adapter.gaussians import Gaussians
@@ -20,7 +22,6 @@ from clod_adapter.training.objective import GradientSum, Objective, TrainableSub
 from clod_adapter.training.optimizer import RowAdam, add_to_mean
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.view_sampler import ViewSampler
-from clod_adapter.units import in_world_units
 
 # Adam's decay rates per view. A batch takes their powers and multiplies learning rates by its square root, so that
 # each view has the same effect (Zhao et al., "On Scaling Up 3D Gaussian Splatting Training", ICLR 2025).
@@ -52,11 +53,15 @@ class Trainer:
         self.decay, self.stepped = self.objective.decay, self.objective.stepped
         self.decay_range = self.objective.decay_range
         self.rates = rates | {self.decay: config.lr_sigma * math.sqrt(config.batch)}
+        self.rates["growth_d"] = config.lr_growth * math.sqrt(config.batch)
         own = {"dtype": torch.float32, "memory_format": torch.contiguous_format}
         self.parameters = {
             name: getattr(start, name).detach().to(**own, copy=name in self.stepped) for name in ATTRIBUTES
         }
         self.parameters[self.decay] = self.objective.parameter(start.sigma_d)
+        if config.growth == "on":
+            assert start.growth_d is not None
+            self.parameters["growth_d"] = start.growth_d.detach().float().clamp(*GROWTH_RANGE)
         self.optimizer = RowAdam(self._trained(), beta1=BETA1**config.batch, beta2=BETA2**config.batch)
         self.empty_sh: Tensor | None = None  # the whole shN of a base whose empty degrees were removed
         self.done, self.seconds, self.start_seconds, self.loss = 0, 0.0, 0.0, math.nan
@@ -84,6 +89,8 @@ class Trainer:
         for rows, names in ((found.kept & finite, set(self.stepped) - everywhere), (finite, everywhere)):
             self.optimizer.step({name: found.gradients[name] for name in self.stepped if name in names}, rows, rates)
         self.parameters[self.decay].clamp_(*self.decay_range)
+        if self.config.growth == "on":
+            self.parameters["growth_d"].clamp_(*GROWTH_RANGE)
         if share_done >= 1 - self.config.average:  # the optimizer continues from the parameters, not from the mean
             self.averaged += 1
             add_to_mean(self.mean, self._trained(), self.averaged)
@@ -101,7 +108,7 @@ class Trainer:
             found = self.objective.gradient_sum(self.parameters, self.group.share(samples) if self.group else samples)
             found = self.group.sum(found) if self.group else found
             if not math.isfinite(found.loss):
-                names = ", ".join(view.camera.name or "a view without a name" for view, _ in samples)
+                names = ", ".join(view.camera.name or "a view without a name" for view, *_ in samples)
                 raise LossNotFinite(f"the loss of step {self.done + 1} is not finite ({names})")
             return found
         except Exception:
@@ -150,7 +157,8 @@ class Trainer:
         if self.empty_sh is not None:
             values["shN"] = self.empty_sh
         dial: Any = {
-            "sigma_d": self.objective.sigma(parameters[self.decay]), "attenuation": self.objective.attenuation
+            "sigma_d": self.objective.sigma(parameters[self.decay]), "attenuation": self.objective.attenuation,
+            "growth_d": parameters.get("growth_d"),
         }  # fmt: skip
         return in_world_units(Gaussians(**values, **dial, screen_filter=self.objective.screen_filter))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,6 +10,22 @@ from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.training.state import OTHER_RUN
+
+COUNTED_BEYOND = 1.5  # times max_sv: counts at the end of the dial follow the curve as they do within it
+
+
+class Sample(NamedTuple):
+    """What one step does with one view.
+
+    Attributes:
+        view: camera and photograph.
+        rendered: the dial values that it is rendered at.
+        counted: a dial value that Gaussians are only counted at; None if there is no target-count curve.
+    """
+
+    view: View
+    rendered: list[float]
+    counted: float | None = None
 
 
 class ViewSampler:
@@ -24,16 +40,20 @@ class ViewSampler:
         self.random = np.random.default_rng(config.seed)
         self.order: list[int] = []
 
-    def draw(self) -> tuple[View, list[float]]:
-        """The next view (each one once per round) and the dial values that it is rendered at."""
+    def draw(self) -> Sample:
+        """The next view, each one once per round, and its dial values."""
         if not self.order:
             self.order = self.random.permutation(len(self.views)).tolist()
         view, config = self.views[self.order.pop()], self.config
         uniform, full = self.random.random(), self.random.random() < config.full_share
         drawn = 1 + (config.max_sv - 1) * uniform if config.sampling == "uniform" else config.max_sv**uniform
-        if config.sampling == "pair":
-            return view, [1.0, drawn] if config.max_sv > 1 else [1.0]
-        return view, [1.0 if full else drawn]
+        if config.sampling != "pair":
+            rendered = [1.0 if full else drawn]
+        else:
+            rendered = [1.0, drawn] if config.max_sv > 1 else [1.0]
+        if not config.has_target_count:
+            return Sample(view, rendered)
+        return Sample(view, rendered, (COUNTED_BEYOND * config.max_sv) ** self.random.random())
 
     def state(self) -> tuple[dict[str, Any], tuple[int, ...]]:
         """Everything that later samples depend on: the generator's state, and the order."""

@@ -75,11 +75,9 @@ def _embed(
     """A splat's entry in the configuration, and its bytes in the page by the id of their element."""
     if packed is None:
         return payload.describe(element=element), {element: payload.blocks()}
-    if packed.sigma_d is None:
-        return payload.describe(element=element, format="sog"), {element: (packed.sog,)}
-    sigma_element = f"{element}-sigma"
-    entry = payload.describe(element=element, format="sog", sigma={"element": sigma_element, "gzip": True})
-    return entry, {element: (packed.sog,), sigma_element: (packed.sigma_d,)}
+    columns = {name: {"element": f"{element}-{name}", "gzip": True} for name in packed.columns}
+    entry = payload.describe(element=element, format="sog", columns=columns)
+    return entry, {element: (packed.sog,), **{f"{element}-{name}": (data,) for name, data in packed.columns.items()}}
 
 
 def policy(connect: str = "") -> str:

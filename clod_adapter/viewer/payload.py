@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from plyfile import PlyData, PlyElement
+from torch import Tensor
 
 from clod_adapter._support.text import as_text
 from clod_adapter._support.version import package_version
@@ -20,7 +21,7 @@ from clod_adapter.calibration import Calibration
 from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import OPAQUE, Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.ply.columns import SIGMA, column_map, inria_dtype
+from clod_adapter.io.ply.columns import column_map, dial_columns, inria_dtype
 from clod_adapter.io.ply.header import write_comments
 
 BLOCK_ROWS = 1 << 14
@@ -47,10 +48,9 @@ class Payload:
     @cached_property
     def header(self) -> bytes:
         """The PLY's header, with attenuation settings and calibration as comments."""
-        names = [name for name in inria_dtype(self.gaussians.sh_degree).names or () if name not in ("nx", "ny", "nz")]
-        names += [SIGMA] if self.gaussians.sigma_d is not None else []
-        row = np.zeros((), [(name, "<f4") for name in names])
         g = self.gaussians
+        layout = inria_dtype(g.sh_degree, dial=dial_of(g))
+        row = np.zeros((), [(name, "<f4") for name in layout.names or () if name not in ("nx", "ny", "nz")])
         comments = write_comments(g.attenuation, (), calibration=self.calibration, screen_filter=g.screen_filter)
         element = PlyElement.describe(np.broadcast_to(row, len(self.gaussians)), "vertex", comments=comments)
         return f"{PlyData([element], byte_order='<').header}\n".encode("ascii")
@@ -58,11 +58,11 @@ class Payload:
     @property
     def size(self) -> int:
         """Bytes of the PLY."""
-        attributes = 4 * sum(map(len, column_map(self.gaussians.sh_degree).values()))
-        return len(self.header) + len(self.gaussians) * (attributes + 4 * (self.gaussians.sigma_d is not None))
+        columns = sum(map(len, column_map(self.gaussians.sh_degree).values())) + len(dial_of(self.gaussians))
+        return len(self.header) + 4 * columns * len(self.gaussians)
 
     def blocks(self) -> Iterator[bytes]:
-        """The PLY in blocks of rows: little-endian float32, Inria's layout without normals, ``sigma_d`` last.
+        """The PLY in blocks of rows: little-endian float32, Inria's layout without normals, the dial last.
 
         A logit above 20 is written as 20, the same opacity in float32.
         """
@@ -74,7 +74,7 @@ class Payload:
         """The splat's entry in the page's configuration; ``location`` overrides where the data are."""
         attenuation = self.gaussians.attenuation
         return {
-            "name": self.name, "href": None, "element": None, "format": "ply", "sigma": None,
+            "name": self.name, "href": None, "element": None, "format": "ply", "columns": {},
             "count": len(self.gaussians), "max_sv": attenuation.max_sv if attenuation else 1.0,
             "attenuation": asdict(attenuation) if attenuation else None,
             "screen_filter": asdict(self.gaussians.screen_filter),
@@ -103,6 +103,12 @@ def no_dial(name: str) -> str:
     return f"{name} has no sigma_d, so it has no dial; add one: clod-adapt {name} --images SCENE"
 
 
+def dial_of(gaussians: Gaussians) -> dict[str, Tensor]:
+    """``[N]`` values of the dial's columns, by name; none without a dial."""
+    tensors = gaussians.tensors()
+    return {name: tensors[name] for name in dial_columns(tensors)}
+
+
 def _values(gaussians: Gaussians, rows: slice) -> np.ndarray:
     """``[n, P]`` float32 values of these rows in the order of the header."""
     g = gaussians
@@ -111,7 +117,7 @@ def _values(gaussians: Gaussians, rows: slice) -> np.ndarray:
         g.means[rows], g.sh0[rows].reshape(count, 3), g.shN[rows].transpose(1, 2).reshape(count, -1),
         g.opacity_logits[rows].clamp(max=OPAQUE)[:, None], g.log_scales[rows], g.quats[rows],
     ]  # fmt: skip
-    parts += [g.sigma_d[rows][:, None]] if g.sigma_d is not None else []
+    parts += [column[rows][:, None] for column in dial_of(g).values()]
     return torch.cat(parts, 1).detach().float().cpu().numpy()
 
 

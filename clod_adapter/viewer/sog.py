@@ -1,4 +1,6 @@
-"""Packs a splat for a standalone page with splat-transform: SOG, a fifth of the PLY's size, and sigma_d separately."""
+"""Packs a splat for a standalone page with splat-transform: SOG, a fifth of the PLY's size, and the dial's columns
+separately.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +15,9 @@ import numpy as np
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load
 from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
-from clod_adapter.viewer.payload import Payload
+from clod_adapter.viewer.payload import Payload, dial_of
 
-BITS = 11  # stored fraction bits of sigma_d; its relative error is at most 2^-12
+BITS = 11  # stored fraction bits of the dial's columns; their relative error is at most 2^-12
 
 
 @dataclass(frozen=True)
@@ -24,11 +26,11 @@ class PackedSplat:
 
     Attributes:
         sog: the .sog file.
-        sigma_d: gzip of ``[N]`` little-endian float32 sigma_d in the row order of ``sog``; None without a dial.
+        columns: ``payload.dial_of``: each as gzip of ``[N]`` little-endian float32 in the row order of ``sog``.
     """
 
     sog: bytes
-    sigma_d: bytes | None
+    columns: dict[str, bytes]
 
 
 def pack_sog(
@@ -36,8 +38,8 @@ def pack_sog(
 ) -> PackedSplat:
     """Packs a splat.
 
-    SOG has no field for sigma_d and sorts the rows in Morton order. So a PLY, which keeps all columns, is sorted first;
-    sorting it again does not change the order.
+    SOG has no field for the dial's columns and sorts the rows in Morton order. So a PLY, which keeps all columns, is
+    sorted first; sorting it again does not change the order.
 
     Args:
         folder: absolute, with space for three PLYs in a temporary folder.
@@ -59,8 +61,8 @@ def pack_sog(
             raise ClodError(
                 f"splat-transform {tool.version} has written {len(found)} of {count} Gaussians; try another version"
             )
-        sigma_d = None if found.sigma_d is None else gzip.compress(_rounded(found.sigma_d.numpy()).tobytes())
-        return PackedSplat(sog.read_bytes(), sigma_d)
+        columns = {name: _rounded(value.numpy()).tobytes() for name, value in dial_of(found).items()}
+        return PackedSplat(sog.read_bytes(), {name: gzip.compress(data) for name, data in columns.items()})
 
 
 def _rounded(values: np.ndarray) -> np.ndarray:

@@ -11,12 +11,12 @@ import torch
 import torch._functorch.config
 from torch import Tensor
 
-from clod_adapter import attenuation
 from clod_adapter._support import fusing
 from clod_adapter._support.fusing import Fused
-from clod_adapter.attenuation import attenuate
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation import attenuation
+from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.training import optimizer
 from clod_adapter.training.optimizer import RowAdam
 from scenes import camera
@@ -46,23 +46,25 @@ def inputs(n: int = 3001) -> dict[str, Tensor]:
     g = torch.Generator().manual_seed(0)
     logits, sigma = 3 * torch.randn(n, generator=g), 3 * torch.rand(n, generator=g)
     logits[:3], sigma[3:6] = torch.tensor([torch.inf, -torch.inf, 0.0]), torch.tensor([0.0, 1e9, 1e-4])
-    return {"means": torch.randn(n, 3, generator=g), "logits": logits, "sigma": sigma}
+    means, growth = torch.randn(n, 3, generator=g), torch.rand(n, generator=g) - 0.3
+    return {"means": means, "logits": logits, "sigma": sigma, "growth": growth}
 
 
 def results(given: dict[str, Tensor], view: Camera, config: AttenuationConfig, form: str) -> list[Tensor]:
-    """The four fields at each dial value, and their gradients of logits and sigma."""
-    logits, sigma = given["logits"].clone().requires_grad_(), given["sigma"].clone().requires_grad_()
+    """The five fields at each dial value, and their gradients of logits, sigma and growth."""
+    leaves = [given[name].clone().requires_grad_() for name in ("logits", "sigma", "growth")]
+    logits, sigma, growth = leaves
     d = given["means"].norm(dim=1)
     found: list[Tensor] = []
     for s in DIALS:
         if form == "seen":
-            out = attenuate(logits, sigma, (given["means"], view), s, config)
+            out = attenuate(logits, sigma, (given["means"], view), s, config, growth_d=growth)
         elif form == "logits":
-            out = attenuate(logits, sigma, d, s, config)
+            out = attenuate(logits, sigma, d, s, config, growth_d=growth)
         else:
-            out = attenuate(logits.sigmoid(), sigma, d, s, config, activated=True)
-        loss = (out.drawn * d).sum() + out.log_opacities.clamp(min=-30).sum()
-        found += [*(x.detach() for x in out), *torch.autograd.grad(loss, [logits, sigma])]
+            out = attenuate(logits.sigmoid(), sigma, d, s, config, activated=True, growth_d=growth)
+        loss = (out.drawn * d).sum() + out.log_opacities.clamp(min=-30).sum() + (out.growth * d).sum()
+        found += [*(x.detach() for x in out), *torch.autograd.grad(loss, leaves)]
     return found
 
 

@@ -27,6 +27,7 @@ from clod_adapter.training.target_count import target_curve
 from scenes import capture, gaussians
 
 CONFIG = AdaptConfig(iters=120)
+RATES = ("lr_sigma", "lr_growth", "lr_means", "lr_quats", "lr_scales", "lr_opacities", "lr_sh0")
 BLOCKS = 4
 
 
@@ -104,6 +105,8 @@ def test_a_block_has_the_views_that_see_it(divided: Division, captured: tuple[Ga
     config = replace(CONFIG, time_budget=8.0)
     passes = [[block_config(division, k, config, first=first) for first in (True, False)] for k in (0, 1)]
     assert [[each.iters for each in both] for both in passes] == [[68, 22], [22, 8]]
+    ratios = [{name: getattr(both[1], name) / getattr(both[0], name) for name in RATES} for both in passes]
+    assert all(each == pytest.approx(dict.fromkeys(RATES, CONFIG.lr_final**0.75), rel=0.05) for each in ratios)
     assert sum(each.time_budget for both in passes for each in both) == pytest.approx(8.0)
     whole = replace(CONFIG, seed=2**63 - 1)
     seeds = {block_config(divided, k, whole, first=first).seed for k in range(BLOCKS) for first in (True, False)}
@@ -114,6 +117,7 @@ def test_a_block_has_the_views_that_see_it(divided: Division, captured: tuple[Ga
     base, scene = captured
     begun = initialize(base, scene.train, CONFIG)  # that of the whole scene
     assert torch.equal(divided.initial.sigma_d, begun.sigma_d) and divided.initial.attenuation == begun.attenuation
+    assert torch.equal(divided.initial.growth_d, begun.growth_d)
     assert divided.extent == camera_extent([view.camera for view in scene.train])
 
 
@@ -141,7 +145,7 @@ def test_target_shares_add_up_to_the_curve(divided: Division, captured: tuple[Ga
         for k in range(2):
             for s in (1.0, 1.7, 3.0, CONFIG.max_sv):
                 asked = [block[k].target_share(s) for block in shown]
-                share = target_curve(s, CONFIG.start_share, CONFIG.exponent)
+                share = target_curve(s, CONFIG.share, CONFIG.exponent)
                 wanted = sum(q.share * len(divided.rows(block)) for block, q in enumerate(asked))
                 assert wanted == pytest.approx(share * count, rel=0.05)
                 for block, q in enumerate(asked):
@@ -164,6 +168,7 @@ def test_target_images_of_blocks_add_up_to_the_photograph(captured: tuple[Gaussi
 def test_merging_takes_each_row_from_its_block(divided: Division, learned: list[Learned]) -> None:
     whole = merge(divided, learned)
     for part in learned:
+        assert "growth_d" in part.values
         for name, values in part.values.items():
             assert torch.equal(getattr(whole, name)[part.rows], values), name
             assert not torch.equal(values, getattr(divided.initial, name)[part.rows]), name
@@ -213,6 +218,22 @@ def test_a_block_resumes_with_the_same_bits(
         assert all(torch.equal(value, once.values[name]) for name, value in part.values.items())
     for phase in (Phase.CONTEXT, Phase.TARGET_IMAGES, Phase.TARGET_COUNTS):  # each wait is reported
         assert [one[1:] for one in told if one[0] == phase] == [(k + 1, len(views)) for k in range(len(views))]
+
+
+def test_growth_is_drawn_in_the_context(divided: Division, captured: tuple[Gaussians, Scene]) -> None:
+    """Gaussians of other blocks as the first pass trained them, its own from the first pass on."""
+    views, initial = captured[1].train, divided.initial
+    small = divided.block == 1
+    initial = initial.replace(
+        sigma_d=torch.full_like(initial.sigma_d, 1e3), log_scales=initial.log_scales - 4 * small[:, None].float()
+    )
+    grown = [
+        initial.replace(growth_d=torch.where(small, exponent, initial.growth_d))
+        for exponent in (torch.tensor(0.0), torch.tensor(3.0))
+    ]
+    few, many = (len(context_rows(divided, 0, views, after=each)) for each in grown)
+    assert few < many
+    assert torch.equal(*(context_rows(replace(divided, initial=each), 0, views) for each in grown))
 
 
 @pytest.mark.parametrize("drawn", [True, False])

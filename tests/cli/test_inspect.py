@@ -43,9 +43,10 @@ def test_json_of_a_dial(clod: Any, dialled: Path) -> None:
     report = json.loads(done.out)
     assert done.code == 0 and done.err == "" and report["command"] == "inspect" and report["path"] == str(dialled)
     splat = report["splat"]
-    assert splat["count"] == splat["total"] == 300 and splat["columns"][-1] == ["sigma_d", "float32"]
+    assert splat["count"] == splat["total"] == 300 and splat["columns"][-1] == ["growth_d", "float32"]
     assert splat["dial"]["attenuation"]["max_sv"] == 4 and splat["dial"]["calibration"]["rows"][0]["virtual_scale"] == 1
-    assert {"least", "low", "median", "high", "greatest"} == set(splat["sigma"]) and len(splat["position"]) == 3
+    assert len(splat["position"]) == 3
+    assert {"least", "low", "median", "high", "greatest"} == set(splat["sigma"]) == set(splat["growth"])
     told = json.loads(dialled.with_suffix(".json").read_text())
     assert splat["dial"]["calibration"] == told["calibration"]
 
@@ -54,4 +55,6 @@ def test_adapter(clod: Any, dialled: Path) -> None:
     done = clod("inspect", dialled.with_suffix(".safetensors"))
     assert done.code == 0 and "an adapter" in done.out and "with SHA-256 " in done.out and "max_sv 4" in done.out
     report = json.loads(clod("inspect", dialled.with_suffix(".safetensors"), "--json").out)
+    assert len(report["about"]["growth"]) == 5 and "\ngrowth_d " in done.out
+    assert "\ndial         sigma_d and growth_d, s = 1 to 4" in done.out
     assert report["about"]["count"] == 300 and report["splat"] is None and report["about"]["config"]["iters"] == 12

@@ -16,8 +16,8 @@ from PIL import Image
 
 import clod_adapter
 from clod_adapter.cli import render as command
-from clod_adapter.distances import normalized_distances
-from clod_adapter.extinction import extinction_scale
+from clod_adapter.equation.distances import normalized_distances
+from clod_adapter.equation.extinction import extinction_scale
 from clod_adapter.io.checkpoint import load
 from runs import names, pressing
 

@@ -88,7 +88,7 @@ def test_target_counts_match_training() -> None:
     config = AdaptConfig()
     (dials, shares) = next(rows for rows in tables(DOCS / "equation.md") if rows[0][0] == "s")
     for s, share in zip(dials[1:], shares[1:], strict=True):
-        assert share == f"{target_curve(float(s), config.start_share, config.exponent):.0%}".replace("%", " %")
+        assert share == f"{target_curve(float(s), config.share, config.exponent):.0%}".replace("%", " %")
 
 
 def test_keys_match_the_viewer() -> None:

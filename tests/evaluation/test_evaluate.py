@@ -11,7 +11,7 @@ import torch
 from clod_adapter.adapter import attach
 from clod_adapter.cameras import View
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.distances import in_frustum
+from clod_adapter.equation.distances import in_frustum
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians

@@ -10,13 +10,13 @@ import torch
 
 from clod_adapter.adapter import attach
 from clod_adapter.cameras import Camera
-from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.distances import normalized_distances
+from clod_adapter.config import FILTERS, AdaptConfig, AttenuationConfig
+from clod_adapter.equation.distances import normalized_distances
+from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.popping import dial_popping, path, path_popping, sweep
-from clod_adapter.extinction import sigma_for_extinction
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.render import render
+from clod_adapter.render import dial, render
 from scenes import gaussians, ring
 
 
@@ -135,17 +135,57 @@ def adversary(normalizer: str, cut: str) -> tuple[Gaussians, list[Camera]]:
     return attach(some, sigma, config), [camera, dataclasses.replace(camera, viewmat=turn @ camera.viewmat)]
 
 
-def test_soft_culling_bounds_popping_and_hard_culling_does_not() -> None:
-    """Drawn opacity changes by at most 2.73 per unit of log s up to max_sv 5; the rasterizer adds one level each."""
+@pytest.mark.parametrize("growth", [0.0, 1.0])
+def test_soft_culling_bounds_popping_and_hard_culling_does_not(growth: float) -> None:
+    """Drawn opacity changes by at most 2.73 per unit of log s up to max_sv 5, the footprint of a Gaussian that grows
+    by 2/e growth_d; the rasterizer adds one level each."""
     pixels = {}
     for cut in ("soft", "hard"):
         some, cameras = adversary("scene", cut)
+        some = some.replace(growth_d=torch.full((7,), growth))
         for steps in (60, 120):
             pixels[cut, steps] = dial_popping(some, cameras[0], 5.0, steps=steps).pixel
-            bound = 6 * (255 * 2.73 * math.log(5) / steps + 1)  # six lie behind each other
+            # Six lie behind each other.
+            bound = 6 * (255 * (2.73 + 2 / math.e * growth) * math.log(5) / steps + 1)
             assert cut == "hard" or pixels[cut, steps] < bound
     assert pixels["soft", 120] < 0.7 * pixels["soft", 60]
     assert pixels["hard", 120] > 0.9 * pixels["hard", 60] > 30
+
+
+@pytest.mark.parametrize("name", ["off", "on"])
+@pytest.mark.parametrize("growth", [0.5, 1.5, -1.0])
+def test_growth_alone_changes_a_pixel_by_its_bound(growth: float, name: str) -> None:
+    """One white opaque Gaussian that never fades. Its footprint changes by up to 2/e |growth_d| per unit of log s."""
+    camera, size = ring(1, 64, 48)[0], math.log(0.3) - min(growth, 0) * math.log(5)
+    some = attach(gaussians(1, 0, 0), torch.tensor([1e9]), AttenuationConfig(scene_distance=4.0)).replace(
+        means=torch.zeros(1, 3), log_scales=torch.full((1, 3), size), opacity_logits=torch.tensor([20.0]),
+        sh0=torch.full((1, 1, 3), 1.75), growth_d=torch.tensor([growth]), screen_filter=FILTERS[name],
+    )  # fmt: skip
+    for steps in (40, 80):
+        bound = 255 * 2 / math.e * abs(growth) * math.log(5) / steps
+        assert 0.9 * bound < dial_popping(some, camera, 5.0, steps=steps).pixel < bound
+
+
+def test_scales_grow_as_a_camera_moves_away() -> None:
+    """Compared from one camera, a path changes the scales by at most exp(|growth_d| h), and within reach not at all."""
+    some, near = dialled().replace(sigma_d=torch.full((200,), 1e9)), ring(1, 32, 24)[0]
+    viewmat = near.viewmat.clone()
+    viewmat[:3, 3] *= 2
+    cameras = [near, dataclasses.replace(near, viewmat=viewmat)]
+    log_growth, distances = [], []
+    for growth_d in (0.0, 0.5):
+        growing = some.replace(growth_d=torch.full((200,), growth_d))
+        moved = path_popping(growing, cameras, 1.0, steps=6)
+        assert (moved.largest > 0.1) == (growth_d > 0)
+    for camera in path(cameras, 6):
+        log_growth.append(dial(growing, camera, 1.0).growth.log())
+        distances.append(normalized_distances(some.means, camera, some.attenuation))
+    change = torch.stack(log_growth).diff(dim=0).abs()
+    assert (change <= 0.5 * torch.stack(distances).log().diff(dim=0).abs() + 1e-6).all() and change.max() > 0
+    still = some.replace(
+        growth_d=torch.ones(200), attenuation=dataclasses.replace(some.attenuation, reference_distance=40.0)
+    )
+    assert path_popping(still, cameras, 1.0, steps=6).largest == 0
 
 
 def test_scene_normalizer_does_not_pop_as_a_camera_turns() -> None:

@@ -8,12 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import attenuate
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.distances import normalized_distances, typical_distance
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.distances import normalized_distances, typical_distance
+from clod_adapter.equation.extinction import extinction_scale
 from clod_adapter.errors import ClodError
-from clod_adapter.extinction import extinction_scale
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization import importance
 from clod_adapter.initialization.importance import (
@@ -134,7 +134,7 @@ def test_initialization_culls_in_the_configured_order() -> None:
         return extinction_scale(dialled.opacity_logits, dialled.sigma_d, d, dialled.attenuation).argsort()
 
     assert torch.equal(culling_order(by_error)[100:180], error.argsort(stable=True)[100:180])
-    order = pruning_order(some, error.sqrt() * some.opacities)
+    order = pruning_order(some, error.sqrt() * some.opacities).position
     assert torch.equal(culling_order(by_default)[100:180], order.argsort()[100:180])
     assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
 

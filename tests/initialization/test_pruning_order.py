@@ -51,7 +51,7 @@ def plainly(some: Gaussians, worth: Tensor) -> list[int]:
 def test_order_matches_the_plain_implementation(n: int, seed: int) -> None:
     some, seen = gaussians(n, 1, seed), []
     worth = torch.rand(n, generator=torch.Generator().manual_seed(seed))
-    order = pruning_order(some, worth, lambda now: seen.append((now.done, now.total)))
+    order = pruning_order(some, worth, lambda now: seen.append((now.done, now.total))).position
     assert order.argsort().tolist() == plainly(some, worth), f"n {n}, seed {seed}"
     assert n < 60 or (seen == sorted(seen) and 0 < seen[0][0] < 30 and seen[-1] == (60, 60))
 
@@ -63,14 +63,16 @@ def test_a_duplicate_is_pruned_before_a_less_important_single() -> None:
     three = three.replace(
         means=means, sh0=three.sh0[:1].expand(3, 1, 3).contiguous(), log_scales=torch.full((3, 3), -2.0)
     )
-    order = pruning_order(three, torch.tensor([1.0, 1.1, 0.9]))
+    order = pruning_order(three, torch.tensor([1.0, 1.1, 0.9])).position
     assert order.tolist() == [0, 2, 1]
 
 
 def test_order_is_independent_of_row_order() -> None:
     some, worth = gaussians(80, 1, 4), torch.rand(80, generator=torch.Generator().manual_seed(4))
     rows = torch.randperm(80, generator=torch.Generator().manual_seed(5))
-    assert torch.equal(pruning_order(some.select(rows), worth[rows]), pruning_order(some, worth)[rows])
+    assert torch.equal(
+        pruning_order(some.select(rows), worth[rows]).position, pruning_order(some, worth).position[rows]
+    )
 
 
 def test_coincident_gaussians_are_moved_apart() -> None:
@@ -86,7 +88,7 @@ def test_coincident_gaussians_are_moved_apart() -> None:
     # Of no worth and no size at all: ties, and nothing to divide by.
     for one in (alike, alike.replace(log_scales=torch.full((2000, 3), -400.0))):
         seen.clear()
-        order = pruning_order(one, torch.zeros(2000), lambda now: seen.append((now.done, now.total)))
+        order = pruning_order(one, torch.zeros(2000), lambda now: seen.append((now.done, now.total))).position
         assert order.sort().values.equal(torch.arange(2000)) and len(seen) < 300
 
 
@@ -95,6 +97,6 @@ def test_nonfinite_values() -> None:
     some = gaussians(20, 0, 0)
     odd = some.replace(sh0=some.sh0.index_fill(0, torch.tensor([3, 4]), math.inf))
     odd = odd.replace(log_scales=some.log_scales.index_fill(0, torch.tensor([5]), math.nan))
-    assert sorted(pruning_order(odd, torch.rand(20)).tolist()) == list(range(20))
+    assert sorted(pruning_order(odd, torch.rand(20)).position.tolist()) == list(range(20))
     with pytest.raises(ClodError, match="means are not all finite"):
         pruning_order(some.replace(means=some.means.index_fill(0, torch.tensor([3]), math.nan)), torch.rand(20))

@@ -52,9 +52,11 @@ def kinds(found: Inspection) -> dict[str, int]:
     return {anomaly.kind: anomaly.count for anomaly in found.anomalies}
 
 
-def adapted(path: Path) -> Path:
+def adapted(path: Path, growth: bool = False) -> Path:
     """A file with a dial and its calibration."""
-    save(path, attach(scenes.gaussians(40, 1, 0), attenuation=ATTENUATION), blank(40, 1), calibration=CALIBRATION)
+    g = attach(scenes.gaussians(40, 1, 0), attenuation=ATTENUATION)
+    g = g.replace(growth_d=torch.linspace(-1, 3, 40)) if growth else g
+    save(path, g, blank(40, 1), calibration=CALIBRATION)
     return path
 
 
@@ -211,6 +213,23 @@ def test_a_dial_and_its_calibration(tmp_path: Path) -> None:
     assert found.splat.dial.attenuation == ATTENUATION and found.splat.tau == 0.01
     assert found.what == "an adapted splat, with sigma_d, PLY" and "clod-adapter" in (found.writer or "")
     assert found.splat.values.sigma is not None and found.splat.values.sigma.least > 0 and found.splat.comments == ()
+    assert found.splat.values.growth is None and not any("growth" in line for line in lines_of(found))
+    assert any(line.startswith("dial         sigma_d, s = 1 to 6") for line in lines_of(found))
+
+
+def test_growth(tmp_path: Path) -> None:
+    found = inspect(adapted(tmp_path / "a.ply", growth=True))
+    assert found.splat is not None and found.what == "an adapted splat, with sigma_d and growth_d, PLY"
+    growth = found.as_dict()["splat"]["growth"]
+    assert (growth["least"], growth["median"], growth["greatest"]) == (-1, 1, 3)
+    lines = lines_of(found)
+    (row,) = (line for line in lines if line.startswith("growth_d"))
+    assert row.split() == ["growth_d", "-1", "-0.96", "1", "2.96", "3"] and found.splat.extra == ()
+    assert any(line.startswith("dial         sigma_d and growth_d, s = 1 to 6") for line in lines)
+    assert found.writer == inspect(adapted(tmp_path / "b.ply")).writer
+    # Another tool's column of the same name, which is no growth without a sigma_d.
+    found = inspect(write(tmp_path / "c.ply", with_columns(table(), growth_d=0.5)))
+    assert found.splat is not None and found.splat.values.growth is None and found.splat.extra == ("growth_d",)
 
 
 def test_adapters_and_states(tmp_path: Path) -> None:
@@ -218,6 +237,7 @@ def test_adapters_and_states(tmp_path: Path) -> None:
     assert found.about is not None and found.splat is None and "an adapter" in found.what
     assert (found.about["count"], found.about["base"]) == (40, "ab" * 32)
     assert found.about["updates"] == {"means": "float16 [40, 3]"} and found.about["attenuation"]["max_sv"] == 6
+    assert found.about["growth"] is None and not any("growth" in line for line in lines_of(found))
     found = inspect(state_of(tmp_path / "a.resume.safetensors"))
     assert found.about is not None and "interrupted run" in found.what
     assert (found.about["count"], found.about["steps"], found.about["belongs"]["base"]) == (7, 9, "abc")
@@ -265,7 +285,7 @@ def mutants(folder: Path) -> list[bytes]:
     """The bytes of a file of every kind, each preceded by its suffix."""
     paths = [
         write(folder / "a.ply", table(6, 1)), write(folder / "b.ply", table(4, 0), order="ascii"),
-        write_packed(folder / "c.ply", scenes.gaussians(6, 1, 0)), adapted(folder / "d.ply"),
+        write_packed(folder / "c.ply", scenes.gaussians(6, 1, 0)), adapted(folder / "d.ply", growth=True),
         adapter_of(folder / "e.safetensors", 5), state_of(folder / "f.safetensors"), gsplat_checkpoint(folder / "g.pt"),
     ]  # fmt: skip
     for suffix in (".glb", ".spz", ".safetensors", ".splat"):

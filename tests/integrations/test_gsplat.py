@@ -15,10 +15,10 @@ from torch import Tensor
 
 import gsplat_in_torch
 from backends import fresh_copy
-from clod_adapter.attenuation import attenuate
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, AttenuationConfig
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
@@ -35,7 +35,7 @@ STORED = (
     "tangential_coeffs=None thin_prism_coeffs=None ftheta_coeffs=None "
     "rolling_shutter=<RollingShutterType.GLOBAL: 4> viewmats_rs=None"
 ).replace(": 4", ":4")
-OURS = ["*", "sigma_d=None", "virtual_scale=1.0", "attenuation=None"]
+OURS = ["*", "sigma_d=None", "virtual_scale=1.0", "attenuation=None", "growth_d=None"]
 
 
 class Tools(SimpleNamespace):
@@ -89,7 +89,7 @@ def test_arguments_are_passed_to_a_stand_in(monkeypatch: pytest.MonkeyPatch) -> 
     plain = wrapper.rasterization(*given.values(), *views.values(), 0.3, packed=False)
     assert (plain["near_plane"], plain["packed"], plain["tile_size"]) == (0.3, False, 16)
     passed = wrapper.rasterization(*given.values(), *views.values(), sigma_d=torch.full((N,), 1e9), attenuation=SOFT)
-    same(passed.pop("opacities"), faded(given, views, torch.full((N,), 1e9), 1.0, SOFT)[0])
+    same(passed.pop("opacities"), dialled(given, views, torch.full((N,), 1e9), 1.0, SOFT)[0]["opacities"])
     want = space["rasterization"](*given.values(), *views.values())
     assert all(passed[name] is want[name] for name in passed)
 
@@ -109,14 +109,20 @@ def arguments(n: int, cameras: int, batch: tuple[int, ...] = (), **dtype: Any) -
     return given, {**shaped, "width": WIDTH, "height": HEIGHT}
 
 
-def faded(
-    given: dict[str, Any], views: dict[str, Any], sigma_d: Tensor, dial: float, config: AttenuationConfig
-) -> list[Tensor]:
-    """Attenuated opacities ``[N]`` for each camera of unbatched arguments."""
+def dialled(
+    given: dict[str, Any], views: dict[str, Any], sigma_d: Tensor, dial: float, config: AttenuationConfig,
+    growth_d: Tensor | None = None,
+) -> list[dict[str, Tensor]]:  # fmt: skip
+    """Attenuated opacities ``[N]`` and grown scales or covariances for each camera of unbatched arguments."""
     found = []
     for viewmat, K in zip(views["viewmats"], views["Ks"], strict=True):
         d = normalized_distances(given["means"], Camera(viewmat, K, WIDTH, HEIGHT), config)
-        found.append(attenuate(given["opacities"].logit(), sigma_d, d, dial, config).drawn)
+        shown = attenuate(given["opacities"].logit(), sigma_d, d, dial, config, growth_d=growth_d)
+        found.append({"opacities": shown.drawn})
+        if shown.growth is not None and "covars" in given:
+            found[-1]["covars"] = given["covars"] * shown.growth[:, None, None] ** 2
+        elif shown.growth is not None:
+            found[-1]["scales"] = given["scales"] * shown.growth[:, None]
     return found
 
 
@@ -165,7 +171,7 @@ def test_images_match_render_with_each_screen_filter(tools: Tools, name: str) ->
     image, alpha, _ = tools.ours(**moved, **options, sigma_d=sigma[1])
     model = Gaussians(
         given["means"], given["quats"], given["scales"].log(), given["opacities"].logit(), given["colors"][:, :1],
-        given["colors"][:, 1:], sigma[0], SOFT, FILTERS[name],
+        given["colors"][:, 1:], sigma[0], SOFT, screen_filter=FILTERS[name],
     )  # fmt: skip
     own = render(model, camera(WIDTH, HEIGHT), 2.0)
     torch.testing.assert_close(image[0].cpu(), own.image, rtol=1e-3, atol=1e-3)
@@ -178,26 +184,38 @@ def test_images_match_render_with_each_screen_filter(tools: Tools, name: str) ->
 
 
 @pytest.mark.parametrize(
-    ("cameras", "packed", "cut"), [(1, True, "hard"), (1, False, "soft"), (3, True, "soft"), (3, False, "hard")]
-)
-def test_attenuated_results_match_gsplat_per_camera(tools: Tools, cameras: int, packed: bool, cut: str) -> None:
+    ("cameras", "packed", "cut", "growing"),
+    [(1, True, "hard", ""), (1, False, "soft", "scales"), (3, True, "soft", "scales"), (3, False, "hard", ""),
+     (3, False, "hard", "covars")],
+)  # fmt: skip
+def test_attenuated_results_match_gsplat_per_camera(
+    tools: Tools, cameras: int, packed: bool, cut: str, growing: str
+) -> None:
     """Images, alphas and all gradients, including those of the projected centres."""
     config = AttenuationConfig(tau=0.02, cut=cut, normalizer="quantile", max_sv=5.0)
     given, views = arguments(N, cameras, device=tools.device)
+    if growing == "covars":
+        axes = torch.randn(N, 3, 3, generator=torch.Generator().manual_seed(5)).to(tools.device)
+        given["covars"] = 0.02 * axes @ axes.mT + 0.01 * torch.eye(3, device=tools.device)
+        del given["quats"], given["scales"]
     leaves = {name: value.clone().requires_grad_() for name, value in given.items()}
     leaves |= {"viewmats": views["viewmats"].clone().requires_grad_(), "sigma_d": reach(N, device=tools.device)}
     leaves["sigma_d"].requires_grad_()
+    if growing:
+        leaves["growth_d"] = (2 * reach(N, device=tools.device) - 1).requires_grad_()
     options = {"sh_degree": 1, "packed": packed, "absgrad": True}
 
     views = views | {"viewmats": leaves["viewmats"]}
     inputs = {name: leaves[name] for name in given}
-    ours = tools.ours(**inputs, **views, **options, sigma_d=leaves["sigma_d"], virtual_scale=2.0, attenuation=config)
-    opacities = faded(inputs, views, leaves["sigma_d"], 2.0, config)
-    assert any(0 < int((drawn == 0).sum()) < N for drawn in opacities)
+    absent = dict.fromkeys({"quats", "scales"} - set(given))
+    dial = {"sigma_d": leaves["sigma_d"], "growth_d": leaves.get("growth_d")}
+    ours = tools.ours(**inputs, **absent, **views, **options, **dial, virtual_scale=2.0, attenuation=config)
+    turned = dialled(inputs, views, dial["sigma_d"], 2.0, config, dial["growth_d"])
+    assert any(0 < int((drawn["opacities"] == 0).sum()) < N for drawn in turned)
     theirs = []
-    for c, drawn in enumerate(opacities):
+    for c, drawn in enumerate(turned):
         single = {"viewmats": views["viewmats"][c : c + 1], "Ks": views["Ks"][c : c + 1]}
-        theirs.append(tools.theirs(**inputs | {"opacities": drawn}, **views | single, **options))
+        theirs.append(tools.theirs(**inputs | absent | drawn, **views | single, **options))
     torch.testing.assert_close(ours[0], torch.cat([part[0] for part in theirs]), rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(ours[1], torch.cat([part[1] for part in theirs]), rtol=1e-4, atol=1e-5)
 
@@ -226,8 +244,8 @@ def test_colours_and_backgrounds_per_camera(tools: Tools) -> None:
     given["colors"] = torch.rand(2, 2, N, 5, generator=torch.Generator().manual_seed(0)).to(tools.device)
     options = {"packed": False, "backgrounds": torch.rand(2, 2, 5).to(tools.device)}
     wide = torch.full_like(given["opacities"], 1e9)
-    ours = tools.ours(**given, **views, **options, sigma_d=wide, attenuation=AttenuationConfig(tau=1e-6))
-    same(ours[0], tools.theirs(**given, **views, **options)[0])
+    dial = {"sigma_d": wide, "growth_d": 0 * wide, "attenuation": AttenuationConfig(tau=1e-6)}
+    same(tools.ours(**given, **views, **options, **dial)[0], tools.theirs(**given, **views, **options)[0])
 
 
 @pytest.mark.parametrize("packed", [True, False], ids=["packed", "unpacked"])
@@ -281,6 +299,8 @@ def test_bad_arguments_are_refused(tools: Tools) -> None:
         tools.ours(**given, **views, distributed=True, sigma_d=given["opacities"])
     with pytest.raises(ClodError, match=r"sigma_d is \(39,\) and opacities \(40,\)"):
         tools.ours(**given, **views, sigma_d=given["opacities"][1:])
+    with pytest.raises(ClodError, match=r"growth_d is \(39,\) and opacities \(40,\)"):
+        tools.ours(**given, **views, sigma_d=given["opacities"], growth_d=given["opacities"][1:])
     with pytest.raises(ClodError, match="virtual_scale is 0.5"):
         tools.ours(**given, **views, sigma_d=given["opacities"], virtual_scale=0.5)
     with pytest.raises(TypeError, match="missing a required argument: 'viewmats'"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from types import ModuleType
 from typing import Any
 
@@ -11,9 +12,9 @@ from torch import Tensor
 
 import inria_forks
 from backends import fresh_copy
-from clod_adapter.attenuation import attenuate
 from clod_adapter.config import FILTERS, AttenuationConfig
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
@@ -46,36 +47,41 @@ def config(**changes: Any) -> AttenuationConfig:
     )
 
 
-def faded(given: dict[str, Any], sigma_d: Tensor, settings: AttenuationConfig) -> Any:
+def faded(given: dict[str, Any], sigma_d: Tensor, settings: AttenuationConfig, growth_d: Tensor | None = None) -> Any:
     d = normalized_distances(given["means3D"], VIEW, settings)
-    return attenuate(given["opacities"][:, 0].logit(), sigma_d, d, DIAL, settings)
+    return attenuate(given["opacities"][:, 0].logit(), sigma_d, d, DIAL, settings, growth_d=growth_d)
 
 
 def reach() -> Tensor:
     return (0.2 + torch.rand(N, generator=torch.Generator().manual_seed(7))).requires_grad_()
 
 
+@pytest.mark.parametrize("grows", [False, True], ids=["fades", "fades and grows"])
 @pytest.mark.parametrize("name", inria_forks.FORKS)
-def test_kept_rows_are_drawn_as_by_the_fork(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kept_rows_are_drawn_as_by_the_fork(name: str, grows: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     further, results = inria_forks.FORKS[name].further, inria_forks.FORKS[name].results.split()
     fork, settings = inria_forks.module(name), config(normalizer="quantile" if name == "w-pose" else "scene")
     raster_settings = inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
     given, sigma_d = arguments(*further), reach()
-    result = faded(given, sigma_d, settings)
+    growth_d = (2 * reach().detach() - 1).requires_grad_() if grows else None
+    result = faded(given, sigma_d, settings, growth_d)
     keep = result.keep
     assert 0 < int(keep.sum()) < N
     rows = {key: value[keep] for key, value in given.items()} | {"opacities": result.drawn[keep, None]}
+    if grows:
+        rows["scales"] = rows["scales"] * result.growth[keep, None]
     want = fork.GaussianRasterizer(raster_settings)(**rows)
 
     ours = wrapper(monkeypatch, fork).GaussianRasterizer(raster_settings)
-    got = ours(**given, sigma_d=sigma_d, virtual_scale=DIAL, attenuation=settings)
+    dial = {"sigma_d": sigma_d, "growth_d": growth_d, "virtual_scale": DIAL, "attenuation": settings}
+    got = ours(**given, **dial)
     for result, mine, theirs in zip(results, got, want, strict=True):
         if result in ("radii", "touched"):  # of all rows, 0 for culled ones
             assert torch.equal(mine[keep], theirs) and len(mine) == N and not mine[~keep].any()
         elif result != "features":
             torch.testing.assert_close(mine, theirs, rtol=1e-5, atol=1e-5)
 
-    leaves = [value for value in given.values() if value.requires_grad] + [sigma_d]
+    leaves = [value for value in (*given.values(), sigma_d, growth_d) if value is not None and value.requires_grad]
     weights = torch.rand(got[0].shape, generator=torch.Generator().manual_seed(1))
     slopes = [torch.autograd.grad((picture[0] * weights).sum(), leaves) for picture in (got, want)]
     for leaf, mine, theirs in zip(leaves, *slopes, strict=True):
@@ -99,7 +105,7 @@ def test_images_match_render_with_a_screen_filter(
     color = ours(**given, sigma_d=sigma_d, virtual_scale=DIAL, attenuation=config())[0].permute(1, 2, 0)
     own = Gaussians(
         given["means3D"], given["rotations"], given["scales"].log(), given["opacities"][:, 0].logit(),
-        given["shs"][:, :1], given["shs"][:, 1:], sigma_d, config(), FILTERS[name],
+        given["shs"][:, :1], given["shs"][:, 1:], sigma_d, config(), screen_filter=FILTERS[name],
     )  # fmt: skip
     torch.testing.assert_close(color, render(own, VIEW, DIAL).image, rtol=1e-3, atol=1e-3)
     usual = render(own.replace(screen_filter=FILTERS["off"]), VIEW, DIAL).image
@@ -131,14 +137,39 @@ def test_culled_rows_are_invisible_to_a_fork_that_culls_at_zero(monkeypatch: pyt
         assert not rasterizer(**given, sigma_d=sigma_d, virtual_scale=DIAL, attenuation=config())[1].any()
 
 
-def test_positional_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
-    fork = inria_forks.module("w-pose")
+@pytest.mark.parametrize("name", inria_forks.FORKS)
+def test_positional_arguments(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    fork = inria_forks.module(name)
     settings = inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
-    ours = wrapper(monkeypatch, fork).GaussianRasterizer(settings)
-    g, theta = arguments(), torch.zeros(3)
-    more = {"sigma_d": reach(), "virtual_scale": DIAL, "attenuation": config()}
-    by_position = ours(*(g.get(name) for name in inria_forks.CALL.split()), theta, theta, **more)
-    assert torch.equal(by_position[0], ours(**g, theta=theta, rho=theta, **more)[0])
+    ours, g = wrapper(monkeypatch, fork).GaussianRasterizer(settings), arguments(*inria_forks.FORKS[name].further)
+    for growth_d in (None, reach()):
+        more = {"sigma_d": reach(), "growth_d": growth_d, "virtual_scale": DIAL, "attenuation": config()}
+        by_position = ours(*map(g.get, inria_forks.FORKS[name].call.split()), **more)
+        assert torch.equal(by_position[0], ours(**g, **more)[0])
+
+
+def test_covariances_grow_by_the_square(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``cov3D_precomp`` instead of scales and rotations, by name and by position."""
+    fork, given, passed = inria_forks.module("inria 2023"), arguments(), []
+    names = inria_forks.CALL.split()
+    given["cov3D_precomp"] = torch.rand(N, 6, generator=torch.Generator().manual_seed(3))
+    del given["scales"], given["rotations"]
+
+    def forward(self: Any, *args: Any, **kwargs: Any) -> None:
+        passed.append(dict(zip(names, args, strict=False)) | kwargs)
+
+    forward.__signature__ = inspect.signature(fork.GaussianRasterizer.forward)  # type: ignore[attr-defined]
+    monkeypatch.setattr(fork.GaussianRasterizer, "forward", forward)
+    settings = inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
+    ours, growth_d = wrapper(monkeypatch, fork).GaussianRasterizer(settings), 2 * reach() - 1
+    more = {"sigma_d": reach(), "growth_d": growth_d, "virtual_scale": DIAL, "attenuation": config()}
+    ours(**given, **more)
+    ours(*map(given.get, names), **more)
+    growth = faded(given, reach(), config(), growth_d).growth
+    assert growth.min() < 0.9 and growth.max() > 1.1
+    for each in passed:
+        torch.testing.assert_close(each["cov3D_precomp"], given["cov3D_precomp"] * growth[:, None].square())
+        assert each.get("scales") is None and each.get("rotations") is None
 
 
 def test_bad_arguments_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,6 +180,8 @@ def test_bad_arguments_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         ours(inria_forks.settings_of(kind, VIEW, prefiltered=True))(**given, sigma_d=reach())
     with pytest.raises(ClodError, match=r"the dial is for 149 Gaussians, but means is \(150, 3\)"):
         ours(inria_forks.settings_of(kind, VIEW))(**given, sigma_d=reach()[1:])
+    with pytest.raises(ClodError, match=r"sigma_d \(150,\), growth_d \(149,\)"):
+        ours(inria_forks.settings_of(kind, VIEW))(**given, sigma_d=reach(), growth_d=reach()[1:])
     with pytest.raises(ClodError, match="virtual_scale is 0"):
         ours(inria_forks.settings_of(kind, VIEW))(**given, sigma_d=reach(), virtual_scale=0)
     with pytest.raises(ImportError, match="pip install .*graphdeco-inria/diff-gaussian-rasterization"):

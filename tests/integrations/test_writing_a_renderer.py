@@ -17,8 +17,9 @@ from PIL import Image
 import clod_adapter
 import gsplat_in_torch
 from clod_adapter import integrations
-from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.growth import growth_factors
 from clod_adapter.hook import Hook
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,13 +36,19 @@ def my_opacity(
     return float(attenuate(*values, scale, config, activated=True).drawn)
 
 
+def my_scale(growth: float, distance: float, scale: float, reach: float) -> float:
+    """The package's factor of the scales, in float32."""
+    growth_d, d = (torch.tensor([value], dtype=torch.float32) for value in (growth, distance))
+    return float(growth_factors(growth_d, d, scale, reach))
+
+
 @pytest.fixture
 def adapted(capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> clod_adapter.Gaussians:
     """Gaussians with a dial, saved as adapted.ply in the test's folder."""
     monkeypatch.chdir(tmp_path)
-    sigma_d = 2.5 + 15 * torch.rand(len(capture.gaussians), generator=torch.Generator().manual_seed(0))
+    sigma_d, growth_d = torch.rand(2, len(capture.gaussians), generator=torch.Generator().manual_seed(0))
     attenuation = AttenuationConfig(tau=0.02, cut="soft", reference_distance=5.0)
-    gaussians = capture.gaussians.replace(sigma_d=sigma_d, attenuation=attenuation)
+    gaussians = capture.gaussians.replace(sigma_d=2.5 + 15 * sigma_d, growth_d=growth_d, attenuation=attenuation)
     clod_adapter.save("adapted.ply", gaussians)
     return gaussians
 
@@ -53,17 +60,22 @@ def block(word: str) -> str:
 
 
 def test_golden_loop_of_the_page_runs() -> None:
-    exec(block("golden"), {"my_opacity": my_opacity})
-    with pytest.raises(AssertionError):
-        exec(block("golden"), {"my_opacity": lambda *row: my_opacity(*row) * 1.001})
+    own = {"my_opacity": my_opacity, "my_scale": my_scale}
+    exec(block("golden"), dict(own))
+    for name, function in own.items():
+        with pytest.raises(AssertionError):
+            exec(block("golden"), own | {name: lambda *row, function=function: function(*row) * 1.001})
 
 
 def test_hook_code_of_the_page_runs(adapted: clod_adapter.Gaussians) -> None:
     names: dict[str, Any] = {"means": adapted.means, "opacities": adapted.opacities, "viewmat": torch.eye(4)}
+    names["scales"] = adapted.scales
     Path("adapted.ply").rename("model.ply")
     exec(block(".hook("), names | {"clod_adapter": clod_adapter, "K": torch.eye(3), "width": 2, "height": 2}, names)
-    want = Hook(adapted.sigma_d, adapted.attenuation, 3.0)(adapted.means, adapted.opacities, torch.eye(4))
+    hook = Hook(adapted.sigma_d, adapted.attenuation, 3.0, adapted.growth_d)
+    want = hook(adapted.means, adapted.opacities, torch.eye(4), growth=True)
     assert torch.equal(names["opacities"], want[0]) and torch.equal(names["keep"], want[1])
+    assert torch.equal(names["scales"], adapted.scales * want[2][:, None]) and want[2].max() > 1.1
 
 
 def test_defaults_of_the_page_match_the_reader() -> None:

@@ -33,13 +33,17 @@ def adapter(n: int = 5, config: dict[str, object] | None = None, tau: float = 0.
 
 
 @settings(deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.integers(0, 20), st.floats(1e-9, 0.1, exclude_min=True))
-def test_adapter_round_trips(tmp_path: Path, n: int, tau: float) -> None:
-    saved = adapter(n, CONFIG, tau)
+@given(st.integers(0, 20), st.floats(1e-9, 0.1, exclude_min=True), st.booleans())
+def test_adapter_round_trips(tmp_path: Path, n: int, tau: float, growth: bool) -> None:
+    """Without growth the file has no trace of it: that of earlier versions."""
+    saved = replace(adapter(n, CONFIG, tau), growth_d=torch.linspace(-1, 3, n) if growth else None)
     save_adapter(tmp_path / "a.safetensors", saved)
     loaded = load_adapter(str(tmp_path / "a.safetensors"))
     assert (loaded.attenuation, loaded.config, loaded.base_fingerprint) == (saved.attenuation, CONFIG, "ab" * 32)
     assert torch.equal(loaded.sigma_d, saved.sigma_d) and loaded.updates.keys() == saved.updates.keys()
+    assert torch.equal(loaded.growth_d, saved.growth_d) if growth else loaded.growth_d is None
+    about, tensors = stored(tmp_path / "a.safetensors")
+    assert ("growth_d" in tensors) == growth and about["format_version"] == (3 if growth else 1)
     for name, update in saved.updates.items():
         assert loaded.updates[name].dtype == update.dtype and torch.equal(loaded.updates[name], update)
     save_adapter(tmp_path / "b.safetensors", loaded)
@@ -73,6 +77,8 @@ def test_invalid_tensors_are_refused(tmp_path: Path) -> None:
         ({"means": torch.ones(5, 3, dtype=torch.int32)}, "float16 or float32"),
         ({"sigma_d": torch.full((5,), torch.nan)}, "not finite"),
         ({"sigma_d": torch.ones(5, 1)}, "float32"),
+        ({"growth_d": torch.full((5,), torch.inf)}, "growth_d holds a value that is not finite"),
+        ({"growth_d": torch.ones(4)}, r"growth_d is float32 \[4\], it must be float32 \[5\]"),
     ):
         refused(tmp_path / "b", about, tensors | change, message)
     refused(tmp_path / "b", about, {name: t for name, t in tensors.items() if name != "sigma_d"}, "sigma_d")

@@ -70,7 +70,7 @@ def files(draw: st.DrawFn) -> tuple[np.ndarray, str, int]:
     degree = draw(st.integers(0, 4))
     names = needed(degree)
     names += ["nx", "ny", "nz"] if draw(st.booleans()) else []
-    names += draw(st.lists(st.sampled_from(["label", "confidence", "time_7"]), unique=True))
+    names += draw(st.lists(st.sampled_from(["label", "confidence", "time_7", "growth_d"]), unique=True))
     names = draw(st.permutations(names))
     doubles = draw(st.lists(st.sampled_from(names), max_size=5))
     types = {name: "f8" for name in doubles} | {"label": draw(st.sampled_from(["u1", "i4", "i2"]))}
@@ -81,13 +81,19 @@ def files(draw: st.DrawFn) -> tuple[np.ndarray, str, int]:
 @settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(files(), st.integers(0, 1000))
 def test_every_layout_round_trips(tmp_path: Path, file: tuple[np.ndarray, str, int], seed: int) -> None:
-    """Every column is read and written bit for bit, but for the values that change; what training gives is saved."""
+    """Every column is read and written bit for bit, but for the values that change; what training gives is saved.
+
+    A growth_d without a sigma_d is a column like others, until there is a dial.
+    """
     vertex, kind, degree = file
     source, out = write_rows(tmp_path / "in.ply", vertex, kind, ("made by hand",)), tmp_path / "out.ply"
     before = source.read_bytes()
     base = load(source)
     g = base.gaussians
-    assert g.sh_degree == degree and g.sigma_d is None and g.means.dtype == torch.float32 and base.notes == ()
+    assert g.sh_degree == degree and g.sigma_d is g.growth_d is None and g.means.dtype == torch.float32
+    assert base.notes == ()
+    save(out, g, base)
+    assert read_back(out)[1].dtype.names == vertex.dtype.names
     f32 = {name: vertex[name].astype(np.float32) for name in vertex.dtype.names}
     columns = {"y": g.means[:, 1], "rot_0": g.quats[:, 0], "scale_2": g.log_scales[:, 2], "f_dc_2": g.sh0[:, 0, 2]}
     bands = RESTS[degree] // 3
@@ -100,12 +106,15 @@ def test_every_layout_round_trips(tmp_path: Path, file: tuple[np.ndarray, str, i
         touched = torch.rand(old.shape, generator=generator) < 0.3 * (seed % 2)
         changes[name] = torch.where(touched, torch.randn(old.shape, generator=generator), old)
     sigma_d = torch.linspace(0.1, 3, len(g))
-    tuned = g.replace(**changes, sigma_d=sigma_d, attenuation=CONFIG)
+    growth_d = torch.linspace(-1, 3, len(g)) if seed % 3 else None
+    tuned = g.replace(**changes, sigma_d=sigma_d, growth_d=growth_d, attenuation=CONFIG)
     save(out, tuned.replace(means=changes["means"].requires_grad_(), sigma_d=sigma_d.double().requires_grad_()), base)
     _, rows = read_back(out)
-    constants = ("clod_eps", "clod_quantile", "sigma_d")  # of CONFIG, what is not the default, but for max_sv
-    assert rows.dtype.names == (*vertex.dtype.names, *constants) and rows.dtype["sigma_d"] == "<f4"
-    for name in vertex.dtype.names:
+    own = [name for name in vertex.dtype.names if name != "growth_d"]
+    added = ["clod_eps", "clod_quantile", "sigma_d"]  # of CONFIG, what is not the default, but for max_sv
+    added += ["growth_d"] if growth_d is not None else []
+    assert list(rows.dtype.names) == own + added and {rows.dtype[name].str for name in added} == {"<f4"}
+    for name in own:
         assert rows.dtype[name] == vertex.dtype[name]
         unchanged = rows[name].astype(np.float32) == f32[name] if seed % 2 else slice(None)
         assert rows[name][unchanged].tobytes() == vertex[name].astype(rows.dtype[name])[unchanged].tobytes(), name
@@ -149,7 +158,7 @@ def test_mask_gaussian_layout(tmp_path: Path) -> None:
 
 
 def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
-    vertex = make(11, [*needed(1), "nx", "sigma_d"], types={"y": "f8", "opacity": "f8"})
+    vertex = make(12, [*needed(1), "nx", "sigma_d", "growth_d"], types={"y": "f8", "opacity": "f8"})
     vertex["x"][0] = np.nan
     vertex["f_rest_8"][1] = np.inf
     vertex["opacity"][[2, 3, 4, 9]] = np.nan, -np.inf, np.inf, 1e300  # the last is +inf as a float32
@@ -158,12 +167,13 @@ def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
     vertex["sigma_d"][7] = np.nan
     vertex["nx"][8] = np.nan  # not used, so no reason to drop
     vertex["y"][10] = 1e300
+    vertex["growth_d"][11] = np.inf
     checkpoint = load(write_rows(tmp_path / "in.ply", vertex))
     np.testing.assert_array_equal(checkpoint.gaussians.means[:, 1], vertex["y"][[4, 8, 9]].astype("f4"))
     assert checkpoint.gaussians.opacities[0] == 1
     assert checkpoint.notes[:3] == (
-        "7 of 11 Gaussians dropped: a value is not finite",
-        "1 of 11 Gaussians dropped: rotation is zero",
+        "8 of 12 Gaussians dropped: a value is not finite",
+        "1 of 12 Gaussians dropped: rotation is zero",
         "2 Gaussians have opacity = +inf and are taken as fully opaque",
     )
     save(tmp_path / "out.ply", checkpoint.gaussians, checkpoint)
@@ -236,7 +246,9 @@ def test_refused_saves(tmp_path: Path) -> None:
     ]  # fmt: skip
     for bad in (torch.inf, torch.nan):
         sigma_d = g.replace(sigma_d=torch.tensor([1.0, bad, 1.0]), attenuation=CONFIG)
-        refused.append((out, sigma_d, "sigma_d"))
+        refused.append((out, sigma_d, "sigma_d holds a value that is not finite; use a large number"))
+        growth_d = g.replace(sigma_d=torch.ones(3), growth_d=torch.tensor([1.0, bad, 1.0]), attenuation=CONFIG)
+        refused.append((out, growth_d, "growth_d holds a value that is not finite; use 0 for no growth"))
         refused.append((out, g.replace(means=torch.full((3, 3), bad)), "means holds a new value that is not finite"))
     for path, changed, message in refused:
         with pytest.raises(ClodError, match=message):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import subprocess
 import sys
@@ -69,6 +70,9 @@ def same(suffix: str, g: Gaussians, again: Gaussians) -> None:
     assert again.sigma_d is not None and g.sigma_d is not None
     most = g.sigma_d.clamp(max=65504) if loss else g.sigma_d  # the largest float16
     torch.testing.assert_close(again.sigma_d, most, rtol=sigma, atol=1e-6 * sigma)
+    assert (again.growth_d is None) == (g.growth_d is None)
+    if again.growth_d is not None:
+        torch.testing.assert_close(again.growth_d, g.growth_d, rtol=sigma, atol=1e-6 * sigma)
 
 
 def test_functions_of_the_table_exist() -> None:
@@ -93,11 +97,12 @@ def test_checks_need_no_torch(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("suffix", "degree", "far"),
-    [(suffix, (k + 2 * j) % 5, bool(j % 2)) for k, suffix in enumerate(DIAL) for j in range(3)],
+    ("suffix", "degree", "far", "growth"),
+    [(suffix, (k + 2 * j) % 5, bool(j % 2), j > 0) for k, suffix in enumerate(DIAL) for j in range(3)],
 )
-def test_dial_round_trips(tmp_path: Path, suffix: str, degree: int, far: bool) -> None:
-    g, origin, path = model(degree), ORIGIN if far else (0.0, 0.0, 0.0), tmp_path / f"a{suffix.upper()}"
+def test_dial_round_trips(tmp_path: Path, suffix: str, degree: int, far: bool, growth: bool) -> None:
+    g, origin = model(degree, growth=growth), ORIGIN if far else (0.0, 0.0, 0.0)
+    path = tmp_path / f"a{suffix.upper()}"
     notes = write(path, g, ABOUT, origin=origin, calibration=CALIBRATION)
     assert ("above degree 3" in " ".join(notes)) == (degree == 4 and suffix in (".glb", ".spz"))
     check_readable(path)
@@ -113,11 +118,51 @@ def test_dial_round_trips(tmp_path: Path, suffix: str, degree: int, far: bool) -
     assert path.read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
     seen = inspect(path)
     assert seen.splat is not None and seen.splat.dial is not None and seen.splat.dial.calibration == CALIBRATION
+    assert seen.splat.dial_columns == "sigma_d" + growth * " and growth_d"
     save(tmp_path / "out.ply", found.gaussians, found, calibration=found.calibration)
     again = load(tmp_path / "out.ply", origin=found.origin)
     tensors = again.gaussians.tensors()
     assert all(torch.equal(tensor, tensors[name]) for name, tensor in found.gaussians.tensors().items())
     assert (again.gaussians.attenuation, again.calibration) == (ATTENUATION, CALIBRATION)
+
+
+def unpacked(path: Path) -> bytes:
+    """The bytes of a file, of an SPZ before compression."""
+    return zlib.decompress(path.read_bytes(), wbits=31) if path.suffix == ".spz" else path.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", DIAL)
+def test_growth_is_named_only_where_it_is(tmp_path: Path, suffix: str) -> None:
+    for growth in (False, True):
+        write(tmp_path / f"a{suffix}", model(1, growth=growth))
+        data = unpacked(tmp_path / f"a{suffix}").lower()
+        assert (b"growth" in data) == growth and (b"clod_reference" in data) == (growth and suffix == ".ply")
+        assert (b'"columns"' in data) == (growth and suffix == ".spz")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "digest"),
+    [
+        (".ply", "068c5c7341ae3762826af2d5e94abb7f4f966217f12af9cda87580a57c4be3e2"),
+        (".spz", "afe02cff4caa6f555ebe27bb424322c5b9a3493f850828489df7668160b3b36e"),
+    ],
+)
+def test_file_without_growth_is_as_before(
+    tmp_path: Path, suffix: str, digest: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The bytes of before there was growth, of values that every machine computes alike; rewritten too."""
+    for module in ("settings", "ply.header"):
+        monkeypatch.setattr(f"clod_adapter.io.{module}.package_version", lambda: "0.1.0")
+    n = torch.arange(6.0)
+    colours = torch.stack([n / 4, -n / 2, n / 8], 1)[:, None]
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(6, 1)
+    g = Gaussians(n[:, None] * torch.ones(3), quats, torch.zeros(6, 3), 0 * n, colours, torch.zeros(6, 0, 3))
+    g = g.replace(sigma_d=n / 4, attenuation=ATTENUATION)
+    path = tmp_path / f"a{suffix}"
+    for _ in range(2):
+        write(path, g, ABOUT)
+        assert hashlib.sha256(unpacked(path)).hexdigest() == digest
+        g = load(path).gaussians
 
 
 @pytest.mark.parametrize("suffix", WRITABLE)
@@ -129,8 +174,7 @@ def test_model_without_dial_round_trips(tmp_path: Path, suffix: str) -> None:
     rows = torch.from_numpy(rows_by_place(g.means.numpy(), found.gaussians.means.numpy()))
     assert found.gaussians.sigma_d is None and (found.gaussians.means[rows] - g.means).abs().max() <= 2.0**-20
     assert any("quantised" in note for note in found.notes) == (suffix in (".spz", ".splat"))
-    data = path.read_bytes()
-    data = zlib.decompress(data, wbits=31) if suffix == ".spz" else data
+    data = unpacked(path)
     assert b"screen_filter" not in data and b"SplatRenderMode" not in data and b"compensate" not in data
     seen = inspect(path)
     assert seen.splat is not None and seen.splat.dial is None
@@ -148,7 +192,7 @@ def test_refused_write_leaves_no_file(tmp_path: Path, suffix: str) -> None:
     if suffix in (".glb", ".splat"):
         unfit.append((plain.replace(log_scales=torch.full((40, 3), 90.0)), "a scale is beyond"))
     if suffix not in DIAL:
-        unfit.append((model(), "no room for sigma_d; choose a dial value to bake"))
+        unfit.append((model(), "no room for a dial; choose a dial value to bake"))
     for g, message in unfit:
         with pytest.raises(ClodError, match=f"a{suffix}: .*{message}"):
             write(tmp_path / f"a{suffix}", g)

@@ -45,7 +45,7 @@ def test_files_of_gsply_are_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".splat"])
 def test_splat_transform_reads_files(tmp_path: Path, suffix: str) -> None:
-    """It keeps sigma_d of a PLY bit for bit and in order, but drops the comments with the settings."""
+    """It keeps the dial's columns of a PLY bit for bit and in order, but drops the comments with the settings."""
     write(tmp_path / f"a{suffix}", detach(model(0)) if suffix == ".splat" else model(3))
     splat_transform(tmp_path / f"a{suffix}", tmp_path / "b.ply")
     ours, found = load(tmp_path / f"a{suffix}").gaussians, load(tmp_path / "b.ply")
@@ -59,5 +59,7 @@ def test_splat_transform_reads_files(tmp_path: Path, suffix: str) -> None:
     # 1.1e-3: the levels 0 and 255 are read as a quarter of a level inside.
     torch.testing.assert_close(theirs.opacities, ours.opacities, atol=1.1e-3, rtol=0)
     if suffix == ".ply":
-        assert theirs.sigma_d is not None and torch.equal(theirs.sigma_d, ours.sigma_d)
-        assert theirs.attenuation == AttenuationConfig() and "its dial is not described" in found.notes[0]
+        for name in ("sigma_d", "growth_d"):
+            assert torch.equal(getattr(theirs, name), getattr(ours, name))
+        assert theirs.attenuation == AttenuationConfig(reference_distance=3.217)
+        assert any("its dial is not described" in note for note in found.notes)

@@ -13,7 +13,7 @@ from clod_adapter.initialization import importance
 from clod_adapter.initialization.importance import removal_error
 from clod_adapter.render import render
 from clod_adapter.training import ablation
-from clod_adapter.training.ablation import largest_change, seen, sh_degree_losses
+from clod_adapter.training.ablation import largest_change, needed_share, seen, sh_degree_losses
 from scenes import gaussians, photograph, ring
 
 LIMIT = 0.02
@@ -102,3 +102,17 @@ def test_largest_change(captured: tuple[Gaussians, Scene]) -> None:
     with torch.no_grad():
         images = [render(g, scene.train[0].camera).image.clamp(0, 1) for g in (base, less)]
     assert change == float((images[0] - images[1]).abs().max()) > 0.1 and lost > 1
+
+
+def test_needed_share_is_that_of_the_visible_gaussians() -> None:
+    """A quarter is too faint to matter; the others are all needed, also against the base's own renderings."""
+    truth, cameras = gaussians(200, 2, 0), ring(4, 48, 36)
+    faint = torch.arange(200) < 50
+    base = truth.replace(opacity_logits=torch.where(faint, -9.0, 2.0))
+    views = photograph(base, cameras)
+    error = removal_error(base, views)
+    share, loss = needed_share(base, views, error, LIMIT)
+    assert 0.6 < share <= 0.76 and 0 <= loss < LIMIT
+    assert needed_share(base, views, error, 3.0)[0] < share
+    opaque = base.replace(opacity_logits=torch.full((200,), -9.0))
+    assert needed_share(opaque, views, error, LIMIT)[0] == 0.51

@@ -37,9 +37,10 @@ def test_a_group_of_one_exchanges_with_itself(peers: ProcessGroup) -> None:
     assert peers.waiting > 0 and peers.exchanging > 0
 
 
-def test_a_group_of_one_changes_no_bit(peers: ProcessGroup) -> None:
+@pytest.mark.parametrize("growth", ["on", "off"])
+def test_a_group_of_one_changes_no_bit(peers: ProcessGroup, growth: str) -> None:
     base, scene = capture(n=60, views=4)
-    config = AdaptConfig(iters=3, batch=2)
+    config = AdaptConfig(iters=3, batch=2, growth=growth)
     want, found = adapt(base, scene, config), adapt(base, scene, config, group=peers)
     assert_equal(found.gaussians, want.gaussians)
     assert found.waiting > 0 and want.waiting == want.exchanging == 0 and found.lost is None

@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from clod_adapter.adapter import ATTRIBUTES, attach
-from clod_adapter.attenuation import SIGMA_MAX, log_attenuation
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.attenuation import SIGMA_MAX, log_attenuation
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
@@ -48,6 +48,17 @@ def test_training_improves_psnr(captured: Pair, trained: Trained) -> None:
             assert new.psnr > old.psnr + 0.5, f"s {new.virtual_scale}"
     losses = [p.loss for p in trained[1] if p.phase == Phase.TRAINING]
     assert losses[-1] < 0.7 * losses[0]
+
+
+@pytest.mark.parametrize(("steps", "gain"), [(0, 0.5), (120, 1.5)])
+def test_growth_improves_the_far_end(captured: Pair, trained: Trained, steps: int, gain: float) -> None:
+    """By the initialization alone and by training; counts do not depend on it."""
+    with_growth = trained[0] if steps else adapt(*captured, config_of(iters=0))
+    plain = adapt(*captured, config_of(iters=steps, growth="off"))
+    assert plain.gaussians.growth_d is None
+    found, wanted = (evaluate(one.gaussians, captured[1].test, (1.0, 5.0)) for one in (with_growth, plain))
+    assert found[1].psnr > wanted[1].psnr + gain and found[0].psnr > wanted[0].psnr - 0.3
+    assert [row.kept_share for row in found] == pytest.approx([row.kept_share for row in wanted], abs=0.03)
 
 
 def test_trained_dial_trades_quality_for_count(captured: Pair, trained: Trained) -> None:
@@ -153,6 +164,7 @@ def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Trained, l
     assert result.attenuation == replace(first.attenuation, max_sv=3.0, reference_distance=found)
     assert initialize(first, captured[1].train, config).sigma_d is first.sigma_d
     assert (result.sigma_d / first.sigma_d).log().abs().max() <= 1.01e-2  # a step of log sigma
+    assert (result.growth_d - first.growth_d).abs().max() <= 1.01e-2 and first.growth_d.unique().numel() > 50
     # A sigma_d learned under one tau and normalizer means something else under others: the file's are kept.
     own = AttenuationConfig(tau=0.02, eps=1e-6, normalizer="max", scene_distance=2.0, max_sv=4.0)
     dialled = attach(captured[0], torch.full((len(captured[0]),), 1.5), own)
@@ -179,7 +191,7 @@ def test_a_zero_sigma_recovers(captured: Pair) -> None:
     assert evaluate(dead, scene.train, [1.0])[0].kept == 0
     result = adapt(dead, scene, config).gaussians
     assert (result.sigma_d > 1e-3).all() and result.sigma_d.isfinite().all()
-    assert evaluate(result, scene.train, [1.0])[0].kept_share > 0.8 * config.start_share
+    assert evaluate(result, scene.train, [1.0])[0].kept_share > 0.8 * config.share
 
 
 @pytest.mark.parametrize(("share", "steps"), [(1.0, [1, 2, 3, 4]), (0.5, [3, 4])])

@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import attenuate
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import FILTERS
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.growth import GROWTH_RANGE
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization import importance
 from clod_adapter.initialization.importance import initialize
 from clod_adapter.losses import photometric_loss
 from clod_adapter.progress import Progress
+from clod_adapter.rasterizers import reference
 from clod_adapter.render import render, splat
 from clod_adapter.training import objective
 from clod_adapter.training.loop import TrainingState, adapt
-from clod_adapter.training.objective import TrainableSubset
+from clod_adapter.training.objective import GradientSum, TrainableSubset
 from clod_adapter.training.trainer import Trainer
-from clod_adapter.training.view_sampler import ViewSampler
+from clod_adapter.training.view_sampler import Sample, ViewSampler
 from runs import config_of, states_of
-from scenes import assert_equal, gaussians
+from scenes import assert_equal, gaussians, photograph, ring
 
 Pair = tuple[Gaussians, Scene]
 
@@ -38,7 +43,7 @@ def test_screen_filter_is_used_and_empty_harmonics_are_skipped(
     seen, shown = set(), set()
     for module in (objective, importance):
         monkeypatch.setattr(
-            module, "splat", lambda g, *rest: seen.add((g.shN.shape[1], g.screen_filter)) or splat(g, *rest)
+            module, "splat", lambda g, *a, **k: seen.add((g.shN.shape[1], g.screen_filter)) or splat(g, *a, **k)
         )
 
     def look(now: Progress) -> None:
@@ -81,7 +86,7 @@ def test_batch_gradient_is_the_sum_over_views(captured: Pair) -> None:
     begun, views = initialize(base, scene.train, config_of()), scene.train[:2]
     config = config_of(batch=2, sampling="pair")
     run = Trainer(begun, views, config)
-    draws = [(view, [1.0, 2.0]) for view in views]
+    draws = [Sample(view, [1.0, 2.0]) for view in views]
     one, two = (run.objective.gradient_sum(run.parameters, [draw]) for draw in draws)
     both = run.objective.gradient_sum(run.parameters, draws)
     assert both.loss == one.loss + two.loss and torch.equal(both.kept, one.kept | two.kept)
@@ -109,15 +114,46 @@ def test_only_the_first_rows_are_trained(captured: Pair) -> None:
     assert not torch.equal(without.sh0, found.sh0[:few])
 
 
+@pytest.mark.parametrize("context", [0, 5], ids=["all rows", "rows of a block"])
+def test_gradient_of_growth_equals_finite_differences(monkeypatch: pytest.MonkeyPatch, context: int) -> None:
+    """In float64, at a dial value of its own; the context of a block does not grow."""
+    monkeypatch.setattr(objective, "splat", partial(splat, rasterizer=reference.rasterize))
+    count, config = 12, config_of(sampling="log", start="identity", max_sv=4.0)
+    some = gaussians(count, 1, 0, size=0.3)
+    begun = initialize(some, views := photograph(some, ring(2, 16, 12)), config)
+    run = Trainer(begun, views, config, TrainableSubset(count - context, full_context=context > 0))
+    exact = {name: value.double() for name, value in run.parameters.items()}
+    exact["growth_d"] = torch.linspace(-0.5, 1.2, count, dtype=torch.float64)
+
+    def of(growth_d: Tensor) -> GradientSum:
+        return run.objective.gradient_sum(exact | {"growth_d": growth_d}, [Sample(views[0], [2.0])])
+
+    plain = replace(run.objective, config=replace(config, growth="off"))
+    none = {name: value for name, value in exact.items() if name != "growth_d"}
+    ungrown = plain.gradient_sum(none, [Sample(views[0], [2.0])]).loss
+    assert of(torch.zeros(count)).loss == ungrown != of(exact["growth_d"]).loss
+    found, step = of(exact["growth_d"]), 1e-6 * torch.eye(count, dtype=torch.float64)
+    slopes = [(of(exact["growth_d"] + row).loss - of(exact["growth_d"] - row).loss) / 2e-6 for row in step]
+    wanted = run.objective._weight(2.0, alone=True) * torch.tensor(slopes, dtype=torch.float64)
+    assert (wanted[: count - context].abs() > 1e-5).sum() > 3 and not wanted[count - context :].any()
+    torch.testing.assert_close(found.gradients["growth_d"], wanted[: count - context], rtol=1e-4, atol=1e-8)
+
+
+def test_trained_growth_stays_in_its_range(captured: Pair) -> None:
+    found = adapt(*captured, config_of(iters=4, lr_growth=1e3, average=0.0)).gaussians.growth_d
+    assert found is not None and (found.min(), found.max()) == GROWTH_RANGE
+
+
 @pytest.mark.parametrize("sampling", ["pair", "log"])
 def test_steps_use_the_sampled_views_and_dial_values(
     captured: Pair, monkeypatch: pytest.MonkeyPatch, sampling: str
 ) -> None:
     taken: list[Any] = []
-    monkeypatch.setattr(objective, "attenuate", lambda *a: taken.append(a[3]) or attenuate(*a))
+    monkeypatch.setattr(objective, "attenuate", lambda *a, **k: taken.append(a[3]) or attenuate(*a, **k))
     monkeypatch.setattr(objective, "photometric_loss", lambda *a: taken.append(id(a[1])) or photometric_loss(*a))
     config = config_of(iters=14, max_sv=4.0, sampling=sampling)
     adapt(attach(gaussians(5, 0, 0), torch.ones(5)), captured[1], config)
     sampler = ViewSampler(captured[1].train, config)
     draws = [sampler.draw() for _ in range(14)]
-    assert sorted(map(str, taken)) == sorted(str(x) for v, dials in draws for s in dials for x in (s, id(v.image)))
+    rendered = [x for view, dials, _ in draws for s in dials for x in (s, id(view.image))]
+    assert sorted(map(str, taken)) == sorted(map(str, [*rendered, *(counted for *_, counted in draws)]))

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from clod_adapter.adapter import ATTRIBUTES
+from clod_adapter.adapter import ATTRIBUTES, DIAL
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
@@ -21,7 +21,7 @@ from clod_adapter.training.plan import NAMES, Override
 from clod_adapter.training.planner import make_plan
 from scenes import assert_equal, with_unseen
 
-CONFIG = AdaptConfig(iters=40, max_sv=4.0)
+CONFIG = AdaptConfig(iters=40, max_sv=4.0, start_share=0.62)
 ALL = frozenset(NAMES)
 
 
@@ -66,10 +66,21 @@ def test_unseen_gaussians_are_unchanged(visible: tuple[Gaussians, Scene]) -> Non
     for name in ATTRIBUTES:
         assert torch.equal(getattr(whole, name)[~plan.kept], getattr(base, name)[~plan.kept]), name
         assert torch.equal(getattr(whole, name)[plan.kept], getattr(lean, name)), name
-    assert whole.sigma_d is not None and initial.sigma_d is not None and lean.sigma_d is not None
-    assert torch.equal(whole.sigma_d[~plan.kept], initial.sigma_d[~plan.kept])
-    assert torch.equal(whole.sigma_d[plan.kept], lean.sigma_d)
+    for name in DIAL:
+        assert torch.equal(getattr(whole, name)[~plan.kept], getattr(initial, name)[~plan.kept]), name
+        assert torch.equal(getattr(whole, name)[plan.kept], getattr(lean, name)), name
     assert not torch.equal(lean.means, base.means[plan.kept])  # seen ones are trained
+
+
+def test_growth_of_the_base_is_dropped_without_growth(visible: tuple[Gaussians, Scene]) -> None:
+    """Also of Gaussians that are left out, and if it is trained from an earlier result."""
+    base, scene = with_unseen(visible[0])[0], visible[1]
+    plan = make_plan(base.replace(shN=0 * base.shN), scene, replace(CONFIG, iters=2, growth="off"))
+    assert plan.kept is not None and plan.sh_degree == 0
+    assert plan.whole(base, plan.adapt(scene).gaussians).growth_d is None
+    grown = initialize(base, scene.train, CONFIG)
+    plan = make_plan(grown, scene, replace(CONFIG, iters=2, growth="off"), Override(leave_out=frozenset({"bands"})))
+    assert plan.trims(grown) and plan.whole(grown, plan.adapt(scene).gaussians).growth_d is None
 
 
 def test_target_counts_are_shares_of_all_gaussians(visible: tuple[Gaussians, Scene]) -> None:

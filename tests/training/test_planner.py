@@ -13,13 +13,14 @@ from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Phase, Stopped
+from clod_adapter.render import render
 from clod_adapter.training import planner
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.plan import NAMES, RATES, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
 from scenes import assert_equal, with_unseen
 
-CONFIG = AdaptConfig(iters=40, max_sv=4.0)
+CONFIG = AdaptConfig(iters=40, max_sv=4.0, start_share=0.62)
 ALL = frozenset(NAMES)
 
 
@@ -41,6 +42,20 @@ def test_sh_degrees_are_kept_or_left_out(visible: tuple[Gaussians, Scene]) -> No
     assert verdicts(plan)["SH degree 1"] == "left out" and plan.sh_degree == 0
     plan = make_plan(base, scene, CONFIG)
     assert verdicts(plan) == {"SH degree 1": "kept", "unseen Gaussians": "kept"} and plan.sh_degree == 1
+
+
+def test_share_at_full_quality_is_measured(visible: tuple[Gaussians, Scene]) -> None:
+    base, scene = visible
+    plan = make_plan(base, scene, replace(CONFIG, start_share=None))
+    (decision,) = (one for one in plan.decisions if "at s = 1" in one.what)
+    share = plan.config.start_share
+    assert share is not None and decision.what == f"{share:.0%} of the Gaussians at s = 1" and decision.number < 0.01
+    first = render(plan.start, scene.train[0].camera, 1.0).kept.float().mean()
+    assert abs(float(first) - share) < 0.15
+    for fixed in (CONFIG, replace(CONFIG, start_share=None, max_sv=1.0)):
+        unmeasured = make_plan(base, scene, fixed)
+        assert unmeasured.config.start_share == fixed.start_share
+        assert not any("at s = 1" in one.what for one in unmeasured.decisions)
 
 
 def test_empty_sh_degrees_are_one_line(visible: tuple[Gaussians, Scene]) -> None:

@@ -28,7 +28,7 @@ RATES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 RESUMED = {
     "ours": {},
     "paper": vars(AdaptConfig.paper(iters=12, max_sv=4.0)),
-    "linear": {"parameter": "linear", "lr_shN": 0.0},
+    "linear": {"parameter": "linear", "lr_shN": 0.0, "growth": "off"},
     "mean of all": {"average": 1.0, "max_sv": 1.0},
     "sigma_d alone": {f"lr_{name}": 0.0 for name in RATES} | {"average": 0.0},
 }
@@ -67,10 +67,11 @@ def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str, kind: 
 
 @pytest.mark.parametrize("distance", [1.0, 4.0])
 def test_untrained_rows_keep_their_units_when_resumed(captured: Pair, distance: float) -> None:
-    """Their sigma_d is not in the state, but the base's, in its unit."""
+    """Their dial is not in the state, but the base's, sigma_d in its unit, growth 0 where it has none."""
     base, scene = captured
     settings = AttenuationConfig(scene_distance=distance, reference_distance=4.0)
-    base = attach(base, torch.linspace(0.3, 3, len(base)) * 4 / distance, settings)
+    growth_d = torch.linspace(-0.5, 1, len(base)) if distance == 1 else None
+    base = attach(base, torch.linspace(0.3, 3, len(base)) * 4 / distance, settings, growth_d)
     part, states = TrainableSubset(len(base) // 2), dict[int, TrainingState]()
     whole = adapt(base, scene, config_of(iters=4), states_of({2}, states), subset=part)
     again = adapt(base, scene, config_of(iters=4), None, states[2], subset=part)
@@ -83,7 +84,7 @@ def test_a_state_holds_trained_parameters_only(captured: Pair) -> None:
     base, states = captured[0], dict[int, TrainingState]()
     still = {"lr_shN": 0.0, "lr_means": 0.0, "average": 0.5}
     adapt(*captured, config_of(iters=4, **still), states_of({1, 3}, states))
-    changing = {"quats", "log_scales", "opacity_logits", "sh0", "log_sigma"}
+    changing = {"quats", "log_scales", "opacity_logits", "sh0", "log_sigma", "growth_d"}
     for step, kinds in ((1, {"parameter", "first", "second", "steps"}), (3, {"mean"})):
         assert {name.split(".")[1] for name in states[step].tensors} == changing
         assert kinds <= {name.split(".")[0] for name in states[step].tensors}
@@ -96,9 +97,18 @@ def test_a_state_of_another_run_is_refused(captured: Pair) -> None:
     adapt(base, scene, config, states_of({1}, states))
     state = states[1]
     few, fewer = base.select(torch.arange(len(base)) < 9), Scene(scene.train[:1], ())
-    for other in ((few, scene, config), (base, fewer, config), (base, scene, config_of(iters=2, parameter="linear"))):
+    for other in (
+        (few, scene, config),
+        (base, fewer, config),
+        (base, scene, config_of(iters=2, parameter="linear")),
+        (base, scene, config_of(iters=2, growth="off")),
+    ):
         with pytest.raises(ClodError, match="of other Gaussians, views or settings"):
             adapt(*other, None, state)
+    grown = {name: tensor for name, tensor in state.tensors.items() if "growth_d" not in name}
+    assert len(grown) == len(state.tensors) - 4
+    with pytest.raises(ClodError, match="of other Gaussians, views or settings"):
+        adapt(base, scene, config, None, replace(state, tensors=grown))
     damaged = dict(state.tensors) | {"steps.sh0": state.tensors["steps.sh0"] - 2}
     for impossible in (
         {"tensors": damaged}, {"steps": 0}, {"averaged": -1}, {"averaged": 9}, {"seconds": math.nan}, {"seconds": -1.0},

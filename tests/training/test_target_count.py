@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.target_count import (
     count_gradient,
@@ -57,7 +57,7 @@ def test_count_gradient_penalises_excess_and_deficit() -> None:
     for s in (1.5, 6.0):
         dialled = attenuate(logits, log_sigma.exp(), d, s, ATTENUATION)
         slope = count_slope(logits, dialled.log_opacities, s, ATTENUATION.tau, CONFIG.temperature)
-        share = target_curve(s, CONFIG.start_share, CONFIG.exponent)
+        share = target_curve(s, CONFIG.share, CONFIG.exponent)
         excess = float(dialled.keep.float().mean()) / share - 1
         want = 0.1 * 2 * CONFIG.reg_weight * excess / share * slope
         torch.testing.assert_close(gradient(logits, log_sigma, d, s), want)
@@ -91,7 +91,7 @@ def test_counts_reach_the_curve_without_an_image_loss(start: float | None) -> No
     def worst(dials: list[float]) -> float:
         """Largest deviation of the shares kept from the curve, as a logarithm."""
         kept = [attenuate(logits, log_sigma.exp(), d, s, ATTENUATION).keep.float().mean() for s in dials]
-        curve = [target_curve(s, CONFIG.start_share, CONFIG.exponent) for s in dials]
+        curve = [target_curve(s, CONFIG.share, CONFIG.exponent) for s in dials]
         return max(abs(math.log(max(float(eta), 1e-9) / want)) for eta, want in zip(kept, curve, strict=True))
 
     dials = [1.0, 1.4, 2.0, 3.1, 4.5, 6.0]

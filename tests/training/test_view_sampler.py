@@ -18,7 +18,7 @@ VIEWS = capture(n=20)[1].train
 
 
 def nine(draws: ViewSampler) -> list[tuple[str, list[float]]]:
-    return [(view.camera.name, dials) for view, dials in (draws.draw() for _ in range(9))]
+    return [(view.camera.name, dials) for view, dials, _ in (draws.draw() for _ in range(9))]
 
 
 @pytest.mark.parametrize("sampling", ["pair", "log", "uniform"])

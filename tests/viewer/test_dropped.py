@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import gzip
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from plyfile import PlyData, PlyElement
 
 import clod_adapter
@@ -87,6 +89,34 @@ def test_the_screen_filter_of_the_file_is_used(
         assert found.screen_filter == FILTERS[name]
         drop_file(shown, path, 1.0)
         assert_same(shown, render(found, CAMERA), artefacts / f"filter_{form}.png")
+
+
+def test_growth_is_read_from_every_format(shown: Shown, gaussians: Gaussians, artefacts: Path, tmp_path: Path) -> None:
+    """With its reference distance, also from columns alone; a row with a growth_d that is not finite is removed."""
+    growth_d = torch.linspace(-1, 1, 400)
+    settings = replace(gaussians.attenuation, reference_distance=1.5, max_sv=6.0)
+    model = gaussians.replace(growth_d=growth_d, attenuation=settings)
+    for form, suffix in (("comments", "ply"), ("columns", "ply"), ("row", "ply"), ("record", "spz")):
+        path = tmp_path / f"{form}.{suffix}"
+        write(path, model)
+        if form == "columns":
+            path.write_bytes(re.sub(rb"(?m)^comment .*\n", b"", path.read_bytes()))
+        if form == "row":
+            data = path.read_bytes()
+            path.write_bytes(data.replace(growth_d[7].numpy().tobytes(), np.float32(np.nan).tobytes()))
+        found = clod_adapter.load(path).gaussians
+        assert len(found) == 400 - (form == "row")
+        drop_file(shown, path, 4.0)
+        assert_same(shown, render(found, CAMERA, 4.0), artefacts / f"growth_{form}.png")
+
+
+def test_no_growth_and_exponents_of_0_are_the_same_picture(shown: Shown, gaussians: Gaussians, tmp_path: Path) -> None:
+    pictures = []
+    for growth_d in (None, torch.zeros(400)):
+        write(tmp_path / "a.ply", gaussians.replace(growth_d=growth_d))
+        drop_file(shown, tmp_path / "a.ply", 4.0)
+        pictures.append(shown.picture())
+    assert np.array_equal(*pictures)
 
 
 def test_a_damaged_file_is_an_error_and_the_picture_stays(shown: Shown, model: Path) -> None:

@@ -38,15 +38,17 @@ def assert_same(one: Gaussians, other: Gaussians) -> None:
         assert torch.equal(value, other.tensors()[name]), name
 
 
-@pytest.mark.parametrize("degree", [0, 4])
-def test_bytes_are_a_plain_ply(degree: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("degree", "growth"), [(0, False), (4, True)])
+def test_bytes_are_a_plain_ply(degree: int, growth: bool, tmp_path: Path) -> None:
     gaussians = dialled(BLOCK_ROWS + 3, degree)  # more than one block
+    gaussians = gaussians.replace(growth_d=torch.linspace(-1, 2, len(gaussians)) if growth else None)
     calibration = Calibration((CalibrationRow(1.0, 30.5, 29.25, 0.9, 4.0),), len(gaussians), 2, 8, 6, "a machine")
     read = read_back(Payload("a.ply", gaussians, calibration), tmp_path)
     assert_same(read.gaussians, gaussians)
     assert read.calibration == calibration
     names = PlyData.read(str(tmp_path / "payload.ply"))["vertex"].data.dtype
-    assert names.names[:6] == ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2") and names.names[-1] == "sigma_d"
+    assert names.names[:6] == ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2")
+    assert names.names[names.names.index("rot_3") + 1 :] == (("sigma_d", "growth_d") if growth else ("sigma_d",))
     assert {names[name].str for name in names.names} == {"<f4"}
     rest = [name for name in names.names if name.startswith("f_rest_")]
     assert rest == [f"f_rest_{k}" for k in range(3 * (degree + 1) ** 2 - 3)]
@@ -80,7 +82,7 @@ def test_description() -> None:
     payload = Payload("a b.ply", dialled(), Calibration(rows, 40, 2, 8, 6, "a machine"))
     entry = payload.describe(href="/files/model")
     assert (entry["name"], entry["href"], entry["element"], entry["format"]) == ("a b.ply", "/files/model", None, "ply")
-    assert (entry["count"], entry["max_sv"], entry["no_dial"], entry["sigma"]) == (40, 5.0, None, None)
+    assert (entry["count"], entry["max_sv"], entry["no_dial"], entry["columns"]) == (40, 5.0, None, {})
     assert entry["attenuation"] == dataclasses.asdict(AttenuationConfig(tau=0.02, cut="soft"))
     assert entry["calibration"][1] == {"virtual_scale": 3.0, "count": 9.0, "psnr": 28.0}
     plain = Payload("p.ply", scenes.gaussians(5, 0, 0)).describe()

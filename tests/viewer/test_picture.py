@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import scenes
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, ScreenFilter
 from clod_adapter.render import render
+from clod_adapter.viewer.payload import Payload
 from shown import Shown, assert_alike, assert_same, take
 
 
@@ -52,6 +54,38 @@ def test_settings_and_screen_filters(
     assert_same(shown, wanted, artefacts / f"filter_{screen_filter.variance}.png")
     with pytest.raises(AssertionError):
         assert_alike(shown.picture(), render(classic, camera, 2.0).pixels.numpy(), artefacts / "classic.png")
+
+
+@pytest.mark.parametrize(
+    ("degree", "settings"), [(0, {}), (3, {"normalizer": "quantile", "quantile": 0.3})], ids=["scene", "quantile"]
+)
+def test_growth(shown: Shown, artefacts: Path, tmp_path: Path, degree: int, settings: dict[str, Any]) -> None:
+    """Exponents of both signs. Some Gaussians have their centre outside the picture and grow into it."""
+    plain = scenes.dialled(1500, degree, 7, max_sv=10.0, reference_distance=4.5, **settings)
+    camera = scenes.camera(320, 240, fov=40)
+    plain = plain.replace(log_scales=plain.log_scales - 1.0)
+    model = plain.replace(growth_d=torch.linspace(-1, 1.5, 1500))
+    (tmp_path / "grown.ply").write_bytes(b"".join(Payload("grown.ply", model).blocks()))
+    take(shown, tmp_path / "grown.ply")
+    shown.camera(camera)
+    for s in (1.0, 3.0, 8.0):
+        shown.run("clod.setDial(given)", s)
+        assert_same(shown, render(model, camera, s), artefacts / f"growth{degree}_s{s:g}.png")
+        with pytest.raises(AssertionError):
+            assert_same(shown, render(plain, camera, s), artefacts / "not_grown.png")
+    shown.run("clod.setEquation(false)")
+    assert_same(shown, render(plain.replace(sigma_d=None, attenuation=None), camera), artefacts / "growth_off.png")
+
+
+def test_gaussians_that_grow_far_beyond_the_picture(shown: Shown, artefacts: Path, tmp_path: Path) -> None:
+    """By factors up to 1e8. Quads of that size would be drawn inexactly; they end at the picture's farthest corner."""
+    model = scenes.dialled(1500, 0, 7, max_sv=40.0, reference_distance=2.0)
+    model, camera = model.replace(growth_d=torch.linspace(-1, 5, 1500)), scenes.camera(320, 240)
+    (tmp_path / "grown.ply").write_bytes(b"".join(Payload("grown.ply", model).blocks()))
+    take(shown, tmp_path / "grown.ply")
+    shown.camera(camera)
+    shown.run("clod.setDial(given)", 20.0)
+    assert_same(shown, render(model, camera, 20.0), artefacts / "far_beyond.png")
 
 
 def test_through_cameras_of_other_shapes(shown: Shown, save: Any, artefacts: Path) -> None:

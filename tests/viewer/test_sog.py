@@ -1,4 +1,4 @@
-"""The order of sigma_d in a packed splat, and packed pages; the latter need splat-transform."""
+"""The order of the dial's columns in a packed splat, and packed pages; the latter need splat-transform."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from shown import SIZE, Shown, assert_same
 
 
 def dialled(degree: int) -> Gaussians:
-    """1000 Gaussians, some too transparent for the 8 bits of an opacity in SOG."""
+    """1000 Gaussians that grow, some too transparent for the 8 bits of an opacity in SOG."""
     model = scenes.dialled(1000, degree, 4, scene_distance=1.0, reference_distance=3.0)
     logits, sigma_d = model.opacity_logits.clone(), model.sigma_d.clone()
     logits[::20] = -12.0
     sigma_d[:3] = torch.tensor([0.0, 1e9, -0.5])
-    return model.replace(opacity_logits=logits, sigma_d=sigma_d)
+    return model.replace(opacity_logits=logits, sigma_d=sigma_d, growth_d=torch.linspace(-0.5, 1, 1000))
 
 
 class Reversing:
@@ -51,17 +51,20 @@ class Reversing:
         return 0.0
 
 
-def test_sigma_d_follows_the_rows(tmp_path: Path) -> None:
+def test_the_dials_columns_follow_the_rows(tmp_path: Path) -> None:
     gaussians = dialled(0)
     packed = pack_sog(Payload("a.ply", gaussians), Reversing(), tmp_path)  # type: ignore[arg-type]
-    sigma = np.frombuffer(gzip.decompress(packed.sigma_d or b""), "<f4")
-    wanted = gaussians.sigma_d.numpy()[::-1]
     assert packed.sog == b"packed" and list(tmp_path.iterdir()) == []
-    assert (np.abs(sigma - wanted) <= 2.0**-12 * np.abs(wanted)).all()
+    assert list(packed.columns) == ["sigma_d", "growth_d"]
+    for name, data in packed.columns.items():
+        wanted = gaussians.tensors()[name].numpy()[::-1]
+        assert (np.abs(np.frombuffer(gzip.decompress(data), "<f4") - wanted) <= 2.0**-12 * np.abs(wanted)).all()
     with pytest.raises(ClodError, match="has written 998 of 1000 Gaussians"):
         pack_sog(Payload("a.ply", gaussians), Reversing(2), tmp_path)  # type: ignore[arg-type]
-    plain = gaussians.replace(sigma_d=None, attenuation=None)
-    assert pack_sog(Payload("a.ply", plain), Reversing(), tmp_path).sigma_d is None  # type: ignore[arg-type]
+    ungrown = gaussians.replace(growth_d=None)
+    for model, names in ((ungrown, ["sigma_d"]), (ungrown.replace(sigma_d=None, attenuation=None), [])):
+        packed = pack_sog(Payload("a.ply", model), Reversing(), tmp_path)  # type: ignore[arg-type]
+        assert list(packed.columns) == names
 
 
 @pytest.mark.parametrize("degree", [0, 1])
@@ -97,6 +100,7 @@ def unpacked(page: Path, tool: SplatTransform) -> Gaussians:
     sog, ply = page.with_name("packed.sog"), page.with_name("packed.ply")
     sog.write_bytes(data("clod-model"))
     tool.run(sog, ply, timeout=60)
-    sigma_d = torch.from_numpy(np.frombuffer(gzip.decompress(data("clod-model-sigma")), "<f4").copy())
+    dial = {name: data(f"clod-model-{name}") for name in ("sigma_d", "growth_d")}
+    columns = {name: torch.from_numpy(np.frombuffer(gzip.decompress(dial[name]), "<f4").copy()) for name in dial}
     found = clod_adapter.load(ply, activated="none").gaussians
-    return found.replace(sigma_d=sigma_d, attenuation=dialled(0).attenuation)
+    return found.replace(**columns, attenuation=dialled(0).attenuation)

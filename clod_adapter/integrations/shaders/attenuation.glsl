@@ -23,3 +23,13 @@ float clodOpacity(float opacity, float sigma, float distance, float scale, float
   if (!(faded > threshold)) return 0.0;
   return soft ? faded * min(2.0 * (faded / threshold - 1.0), 1.0) : faded;
 }
+
+// The factor of the three scales of a Gaussian: those that the dial keeps grow with distance and dial; 1 for growth 0.
+//   growth    the file's growth_d
+//   distance  as above
+//   scale     the dial s, as above
+//   reach     reference_distance / D of the header; 1 where reference_distance is 0, or for another normalizer
+float clodScale(float growth, float distance, float scale, float reach) {
+  float magnification = clamp(distance * scale / reach, 1.0, 3e38);
+  return exp(clamp(growth * log(magnification), -20.0, 20.0));
+}

@@ -21,3 +21,13 @@ fn clodOpacity(opacity: f32, sigma: f32, distance: f32, scale: f32, eps: f32, ta
   if (!(faded > threshold)) { return 0.0; }
   return select(faded, faded * min(2.0 * (faded / threshold - 1.0), 1.0), soft);
 }
+
+// The factor of the three scales of a Gaussian: those that the dial keeps grow with distance and dial; 1 for growth 0.
+//   growth    the file's growth_d
+//   distance  as above
+//   scale     the dial s, as above
+//   reach     reference_distance / D of the header; 1 where reference_distance is 0, or for another normalizer
+fn clodScale(growth: f32, distance: f32, scale: f32, reach: f32) -> f32 {
+  let magnification = clamp(distance * scale / reach, 1.0, 3e38);
+  return exp(clamp(growth * log(magnification), -20.0, 20.0));
+}

@@ -5,6 +5,9 @@
 A row has the inputs opacity, sigma, distance, scale, eps, tau, soft, and the results ``faded``, the attenuated opacity
 ``a''``, and ``drawn``, the opacity for the rasterizer. Inputs are float32 numbers, written in full. A float32
 implementation passes if for every row ``|result - drawn| <= tolerance faded``, and 0 where drawn is 0.
+
+A row of ``scale_rows`` has the inputs growth, distance, scale, reach, and the result ``factor``, by which the three
+scales are multiplied. A float32 implementation passes if ``|result - factor| <= tolerance factor``.
 """
 
 from __future__ import annotations
@@ -17,11 +20,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.extinction import extinction_scale
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.extinction import extinction_scale
+from clod_adapter.equation.growth import growth_factors
 
 COLUMNS = ("opacity", "sigma", "distance", "scale", "eps", "tau", "soft", "faded", "drawn")
+SCALE_COLUMNS = ("growth", "distance", "scale", "reach", "factor")
 TOLERANCE = 3e-5  # float32 rounding times the steepest slope and the largest exponent, with a margin
 TAU, EPS = 0.02, 1e-8
 
@@ -44,10 +49,24 @@ def rows() -> list[list[Any]]:
     return [[*row, soft] for row in found for soft in (False, True)]
 
 
+def scale_rows() -> list[list[float]]:
+    """The inputs: ordinary values on both sides of the reach, then products and factors that overflow."""
+    ordinary = itertools.product((-1.0, 0.0, 0.3, 0.75, 3.0), (0.2, 1.0, 4.2), (1.0, 2.5, 7.0), (1.0, 3.8))
+    extreme = itertools.chain(
+        itertools.product((-1.0, 0.0, 0.75), (0.0, 1e-30, 1e30), (1.0, 100.0), (1e-4, 1e4)),
+        itertools.product((-1e4, 1e4), (0.0, 1e3), (40.0,), (1.0,)),
+    )
+    return [list(map(_float32, row)) for row in itertools.chain(ordinary, extreme)]
+
+
 def golden() -> dict[str, Any]:
     """The file's contents."""
     finished = [[*row, *_results(row)] for row in rows()]
-    return {"columns": COLUMNS, "tolerance": TOLERANCE, "rows": finished}
+    factors = [[*row, _factor(*row)] for row in scale_rows()]
+    return {
+        "columns": COLUMNS, "tolerance": TOLERANCE, "rows": finished,
+        "scale_columns": SCALE_COLUMNS, "scale_rows": factors,
+    }  # fmt: skip
 
 
 def _results(row: list[Any]) -> tuple[float, float]:
@@ -56,6 +75,11 @@ def _results(row: list[Any]) -> tuple[float, float]:
     opacity, sigma, distance = (torch.tensor([value], dtype=torch.float64) for value in values)
     result = attenuate(opacity, sigma, distance, scale, config, activated=True)
     return float(result.opacities), float(result.drawn)
+
+
+def _factor(growth: float, distance: float, scale: float, reach: float) -> float:
+    growth_d, d = (torch.tensor([value], dtype=torch.float64) for value in (growth, distance))
+    return float(growth_factors(growth_d, d, scale, reach))
 
 
 def _culled_at(opacity: float, sigma: float, distance: float) -> float:
@@ -70,9 +94,11 @@ def _float32(value: float) -> float:
 
 def text() -> str:
     """The file's text, one row per line."""
-    content = golden()
-    lines = ",\n".join(f"  {json.dumps(row)}" for row in content.pop("rows"))
-    return f'{json.dumps(content)[:-1]}, "rows": [\n{lines}\n]}}\n'
+    parts = []
+    for name, value in golden().items():
+        lines = ",\n".join(f"  {json.dumps(row)}" for row in value) if name.endswith("rows") else ""
+        parts.append(f'"{name}": ' + (f"[\n{lines}\n]" if lines else json.dumps(value)))
+    return f"{{{', '.join(parts)}}}\n"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""glTF binary files with ``KHR_gaussian_splatting`` (Khronos, ratified 2026), and ``_SIGMA_D`` where there is a dial.
+"""glTF binary files with ``KHR_gaussian_splatting`` (Khronos, ratified 2026), with ``_SIGMA_D`` and ``_GROWTH_D``
+where there is a dial.
 
 One POINTS primitive, every attribute float32: activated opacities and scales, rotations of unit length as xyzw,
 spherical harmonics up to degree 3 with a VEC3 for each coefficient, and 8-bit ``COLOR_0`` for readers without the
@@ -20,10 +21,11 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import History
 from clod_adapter.io.formats.arrays import arrays_of, colours_of, normalized, scales_of, sigmoid
 from clod_adapter.io.formats.metadata import KEY, write_metadata
+from clod_adapter.io.ply.columns import GROWTH, SIGMA, dial_columns
 from clod_adapter.origin import Origin
 
 EXTENSION = "KHR_gaussian_splatting"
-SIGMA = "_SIGMA_D"
+DIAL = {SIGMA: "_SIGMA_D", GROWTH: "_GROWTH_D"}
 COLOR_SPACE = "srgb_rec709_display"
 DEGREE = 3  # the highest that the extension has
 HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # about z, as xyzw: x right, y down becomes x left, y up; as splat-transform has it
@@ -96,8 +98,7 @@ def _columns(path: Path, gaussians: Gaussians) -> tuple[dict[str, np.ndarray], t
     for band in range(1, degree + 1):
         for index in range(2 * band + 1):
             columns[coefficient(band, index)] = np.ascontiguousarray(arrays["shN"][:, band**2 - 1 + index])
-    if "sigma_d" in arrays:
-        columns[SIGMA] = arrays["sigma_d"]
+    columns |= {DIAL[name]: arrays[name] for name in dial_columns(arrays)}
     lost = arrays["shN"][:, (degree + 1) ** 2 - 1 :].any()
     return columns, (f"spherical harmonics above degree {DEGREE} are dropped",) if lost else ()
 

@@ -14,8 +14,9 @@ from numpy.lib import recfunctions as rec
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import Model
 from clod_adapter.io.formats.arrays import gaussians_of, half_turn, logit, logs_of, read_whole, sha256_of
-from clod_adapter.io.formats.glb import COLOR_SPACE, DEGREE, EXTENSION, HALF_TURN, SIGMA, coefficient
+from clod_adapter.io.formats.glb import COLOR_SPACE, DEGREE, DIAL, EXTENSION, HALF_TURN, coefficient
 from clod_adapter.io.formats.metadata import KEY, parse_metadata
+from clod_adapter.io.ply.columns import SIGMA, dial_columns
 from clod_adapter.origin import AXES, NOWHERE, Origin, origin_of
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
@@ -54,15 +55,15 @@ def load_glb(path: Path) -> Model:
         bands = [coefficient(band, index) for band in range(1, degree + 1) for index in range(2 * band + 1)]
         rest = [_read(gltf, binary, attributes[name], 3) for name in bands]
         arrays["shN"] = np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
-        if SIGMA in attributes:
-            arrays["sigma_d"] = _read(gltf, binary, attributes[SIGMA], 1)
+        for name in dial_columns([name for name, attribute in DIAL.items() if attribute in attributes]):
+            arrays[name] = _read(gltf, binary, attributes[DIAL[name]], 1)
         text = gltf["asset"].get("extras", {}).get(KEY)
         turned, moved = _placed(gltf, mesh)
     except ClodError as error:
         raise ClodError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
     except (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
         raise ClodError(f"{path}: is damaged or no such .glb ({error!r:.80}); {_REMEDY}") from error
-    metadata = parse_metadata(path, text, dial="sigma_d" in arrays)
+    metadata = parse_metadata(path, text, dial=SIGMA in arrays)
     stored = _stored(arrays) if turned else half_turn(_stored(arrays), "z")
     if moved != metadata.origin:  # another program moved the node
         stored["means"], moved = _moved(stored["means"], moved)

@@ -1,4 +1,4 @@
-"""Writes Gaussians without a base as a PLY: Inria's layout, and ``sigma_d`` where they have it."""
+"""Writes Gaussians without a base as a PLY: Inria's layout, and the columns of the dial where they have one."""
 
 from __future__ import annotations
 

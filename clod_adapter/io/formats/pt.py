@@ -1,7 +1,7 @@
 """Checkpoints of gsplat's trainer, ``.pt``: the only format that is a pickle, of which only tensors are read.
 
-Files of this package have one more tensor among the ``splats``, ``sigma_d``, and the JSON document (``metadata``) as a
-string under ``clod_adapter``. The trainer and its viewers read the tensors that they know, by name.
+Files of this package have more tensors among the ``splats``, ``sigma_d`` and ``growth_d``, and the JSON document
+(``metadata``) as a string under ``clod_adapter``. The trainer and its viewers read the tensors that they know, by name.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
 from clod_adapter.io.formats.metadata import KEY
-from clod_adapter.io.ply.columns import SIGMA
+from clod_adapter.io.ply.columns import GROWTH, SIGMA, dial_columns
 from clod_adapter.io.settings import damaged
 from clod_adapter.io.sniff import file_sha256, handle_name, read_start, refuse
 
@@ -95,7 +95,7 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], str | None, str]:
         raise ClodError(
             f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {found}); export it as a PLY"
         )
-    wanted = (*NAMES, SIGMA) if SIGMA in splats else tuple(NAMES)
+    wanted = (*NAMES, *dial_columns(splats))
     values = {name: _values(path, name, splats) for name in wanted}
     _check_shapes(path, values)
     text = checkpoint.get(KEY)
@@ -142,7 +142,7 @@ def _check_shapes(path: Path, values: dict[str, np.ndarray]) -> None:
     bands = values["shN"].shape[1] if values["shN"].ndim == 3 else -1
     shapes = {
         "means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,), "sh0": (count, 1, 3),
-        "shN": (count, bands, 3), SIGMA: (count,),
+        "shN": (count, bands, 3), SIGMA: (count,), GROWTH: (count,),
     }  # fmt: skip
     for name, value in values.items():
         if value.shape != shapes[name]:

@@ -13,15 +13,14 @@ from clod_adapter.io.file_formats import History, Model
 from clod_adapter.io.formats.arrays import arrays_of, gaussians_of
 from clod_adapter.io.formats.metadata import KEY, metadata_text, parse_metadata, write_metadata
 from clod_adapter.io.formats.pt import FRAME, NAMES, read_splats
-from clod_adapter.io.ply.columns import SIGMA
+from clod_adapter.io.ply.columns import SIGMA, dial_columns
 
 
 def write_pt(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
     """Writes every value unchanged; arguments and errors as ``file_formats.write``."""
     arrays = arrays_of(path, gaussians)
-    splats = {name: torch.from_numpy(arrays[ours]) for name, ours in NAMES.items()}
-    if SIGMA in arrays:
-        splats[SIGMA] = torch.from_numpy(arrays[SIGMA])
+    names = NAMES | {name: name for name in dial_columns(arrays)}
+    splats = {name: torch.from_numpy(arrays[ours]) for name, ours in names.items()}
     text = metadata_text(write_metadata(gaussians, history))
     # By way of memory, as the entries of a file are named after it, and this one's name is temporary.
     buffer = io.BytesIO()

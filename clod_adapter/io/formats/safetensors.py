@@ -16,6 +16,7 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import History, Model
 from clod_adapter.io.formats.arrays import arrays_of, gaussians_of
 from clod_adapter.io.formats.metadata import KEY, metadata_text, parse_metadata, write_metadata
+from clod_adapter.io.ply.columns import SIGMA, dial_columns
 from clod_adapter.io.tensor_file import load_tensors
 
 _NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
@@ -40,10 +41,10 @@ def load_safetensors(path: Path) -> Model:
     tensors, stored, sha256 = load_tensors(path)
     if KEY not in stored:
         raise ClodError(f"{path}: is a safetensors file but not a model of clod-adapter; give a file that it wrote")
-    metadata = parse_metadata(path, stored[KEY], dial="sigma_d" in tensors)
+    metadata = parse_metadata(path, stored[KEY], dial=SIGMA in tensors)
     if missing := [name for name in _NAMES if name not in tensors]:
         raise ClodError(f"{path}: has no tensor {missing[0]!r}; export it again")
-    wanted = (*_NAMES, "sigma_d") if "sigma_d" in tensors else _NAMES
+    wanted = (*_NAMES, *dial_columns(tensors))
     if odd := [name for name in wanted if not tensors[name].is_floating_point()]:
         raise ClodError(f"{path}: tensor {odd[0]!r} is not of floating-point numbers; export it again")
     arrays = {name: tensors[name].float().numpy() for name in wanted}

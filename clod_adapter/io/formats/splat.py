@@ -1,7 +1,7 @@
 """``.splat``: the 32-byte rows of antimatter15's web viewer, which many others read.
 
 A row is the position and the standard deviations, three float32 each, then four bytes of RGBA and four of the rotation
-(wxyz, ``128 q + 128``). Colours are those of SH degree 0; higher degrees and sigma_d are not stored. The largest
+(wxyz, ``128 q + 128``). Colours are those of SH degree 0; higher degrees and the dial are not stored. The largest
 and most opaque come first (by volume times opacity), as viewers draw what has arrived.
 """
 

@@ -1,4 +1,4 @@
-"""SPZ files (Niantic), version 3, and in a record of our own sigma_d where there is a dial.
+"""SPZ files (Niantic), version 3, and in a record of our own the dial where there is one.
 
 One gzip stream: a 16-byte header, then one array after another: positions in 24-bit fixed point, opacities, colours
 and logarithms of scales in bytes, rotations in four bytes, spherical harmonics in bytes, as the reference
@@ -11,9 +11,10 @@ know; most do not even read so far. Two are written:
 - Adobe's of the axes, which says that they are a checkpoint's (x right, y down, z ahead). The format's own are
   OpenGL's, but the reference's ``ply_to_spz``, splat-transform, SuperSplat and gsply all leave those of the PLY, so
   that turned numbers would be upside down in them;
-- ours, ``RECORD``: the length of the JSON document (``metadata``) as uint32, the document, then sigma_d as float16, to
-  5e-4. What is larger than there is room for becomes the largest, 65504, which is no decay: it takes less
-  than ``(d' s)^2 1.2e-10`` of an opacity.
+- ours, ``RECORD``: the length of the JSON document (``metadata``) as uint32, the document, then the columns of the
+  dial as float16, to 5e-4: sigma_d, and growth_d where the document has ``"columns": ["sigma_d", "growth_d"]``. What is
+  larger than there is room for becomes the largest, 65504. Of sigma_d that is no decay: it takes less than
+  ``(d' s)^2 1.2e-10`` of an opacity.
 """
 
 from __future__ import annotations
@@ -26,17 +27,19 @@ from pathlib import Path
 import numpy as np
 
 from clod_adapter.config import CLASSIC
+from clod_adapter.equation.units import estimated_distance, known_distance, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import History
 from clod_adapter.io.formats.arrays import arrays_of, bytes_of, normalized, sigmoid
 from clod_adapter.io.formats.metadata import metadata_text, write_metadata
-from clod_adapter.units import estimated_distance, known_distance, with_distance
+from clod_adapter.io.ply.columns import GROWTH, SIGMA, dial_columns
 
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
 MAGIC, VERSION = 0x5053474E, 3
 RECORD = 0x434C0001  # vendor "CL", its first extension
+COLUMNS = "columns"  # of the record, in the document
 AXES = 0xADBE0003  # SPZ_ADOBE_coordinate_system
 RDF = 6  # right, down, forward
 ANTIALIASED, EXTENDED = 1, 2  # flags: of a filter that compensates opacities, of records after the arrays
@@ -45,7 +48,7 @@ DEGREE = 3  # the highest that all readers know
 COLOR = 0.15  # of the range of bytes to one of sh0
 MAGNITUDE = 511 * math.sqrt(2)  # of the three components of a rotation that are not the largest
 _BITS = 6  # of a harmonic
-_SIGMA_MOST = float(np.finfo(np.float16).max)
+_MOST = float(np.finfo(np.float16).max)
 _FAR = 100.0  # world units: a typical distance from which on some sigma_d that fade at high dial values are beyond that
 
 
@@ -71,9 +74,11 @@ def write_spz(path: Path, gaussians: Gaussians, history: History) -> tuple[str, 
     header = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, bits, flags, 0)
     parts = [header, *_packed(arrays, bits, degree), struct.pack("<III", AXES, 4, RDF)]
     if gaussians.sigma_d is not None or history != History() or screen_filter != CLASSIC:
-        text = metadata_text(write_metadata(gaussians, history)).encode()
-        sigma = np.clip(arrays.get("sigma_d", np.zeros(0)), -_SIGMA_MOST, _SIGMA_MOST).astype("<f2").tobytes()
-        parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(sigma), len(text)) + text + sigma)
+        columns = list(dial_columns(arrays))
+        named = {COLUMNS: columns} if GROWTH in columns else {}  # sigma_d alone needs no name
+        text = metadata_text(write_metadata(gaussians, history) | named).encode()
+        values = b"".join(np.clip(arrays[name], -_MOST, _MOST).astype("<f2").tobytes() for name in columns)
+        parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(values), len(text)) + text + values)
     with atomic_path(path) as temporary:
         gzip = zlib.compressobj(wbits=31)
         temporary.write_bytes(gzip.compress(b"".join(parts)) + gzip.flush())
@@ -93,7 +98,8 @@ def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, 
     """The arrays, the bits of the fraction that they leave, and a line if the farthest were moved for it.
 
     What is beyond 8 times the distance that 99 % keep to (rounded up to a power of two) is moved towards 0 and made
-    smaller by the same factor, and its sigma_d with it: from 0 it looks as before, from nearby very nearly.
+    smaller by the same factor, and its sigma_d with it: from 0 it looks as before, from nearby very nearly. Its growth
+    ``(d s / r)^h`` is less at the smaller distance, by ``factor^h``; its scales are divided by that.
     """
     reach = np.abs(arrays["means"]).max(1).astype(np.float64)
     most = min(float(reach.max()), 8 * float(np.quantile(reach, 0.99)))
@@ -103,8 +109,10 @@ def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, 
     if not moved:
         return arrays, bits, ()
     nearer = {**arrays, "means": arrays["means"] * factor, "log_scales": arrays["log_scales"] + np.log(factor)}
-    if "sigma_d" in arrays:
-        nearer["sigma_d"] = arrays["sigma_d"] * factor[:, 0]
+    if SIGMA in arrays:
+        nearer[SIGMA] = arrays[SIGMA] * factor[:, 0]
+    if GROWTH in arrays:
+        nearer["log_scales"] -= arrays[GROWTH][:, None] * np.log(factor)
     return nearer, bits, (f"the {moved} farthest are moved to {2.0 ** (23 - bits):g} from 0, and made as much smaller",)
 
 

@@ -2,22 +2,38 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from clod_adapter.config import FILTERS, SH_COUNTS
+from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import Model
 from clod_adapter.io.formats.arrays import gaussians_of, half_turn, logits_of_bytes, read_whole, sha256_of
 from clod_adapter.io.formats.converted import load_converted
 from clod_adapter.io.formats.metadata import parse_metadata
-from clod_adapter.io.formats.spz import ANTIALIASED, AXES, COLOR, EXTENDED, HEADER, MAGIC, MAGNITUDE, MOST, RDF, RECORD
+from clod_adapter.io.formats.spz import (
+    ANTIALIASED,
+    AXES,
+    COLOR,
+    COLUMNS,
+    EXTENDED,
+    HEADER,
+    MAGIC,
+    MAGNITUDE,
+    MOST,
+    RDF,
+    RECORD,
+)
+from clod_adapter.io.ply.columns import GROWTH, SIGMA
 from clod_adapter.io.screen_filter import TAG
-from clod_adapter.units import in_world_units
+from clod_adapter.io.settings import DAMAGE, damaged
 
 QUANTISED = "quantised: positions in 24 bits, scales, opacities and harmonics in 8, rotations in 10 or 8"
 _BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10
@@ -52,12 +68,10 @@ def load_spz(path: Path) -> Model:
         columns[name] = np.frombuffer(data, np.uint8, count * size, start).reshape(count, size)
         start += count * size
     records = _records(data[end:]) if flags & EXTENDED else {}
-    text, sigma = _ours(path, records[RECORD], count) if RECORD in records else (None, None)
-    metadata = parse_metadata(path, text, dial=sigma is not None)
+    document, dial = _ours(path, records[RECORD], count) if RECORD in records else (None, {})
+    metadata = parse_metadata(path, document, dial=bool(dial))
     arrays = _unquantized(columns, bits, bands)
-    arrays = _in_our_axes(path, arrays, records.get(AXES, _UNTURNED))
-    if sigma is not None:
-        arrays["sigma_d"] = sigma
+    arrays = _in_our_axes(path, arrays, records.get(AXES, _UNTURNED)) | dial
     gaussians = in_world_units(gaussians_of(path, arrays, metadata))
     metadata = replace(metadata, attenuation=gaussians.attenuation)
     if flags & ANTIALIASED and not gaussians.screen_filter.compensate:  # by another program, which states no variance
@@ -93,14 +107,19 @@ def _records(data: bytes) -> dict[int, bytes]:
     return found
 
 
-def _ours(path: Path, body: bytes, count: int) -> tuple[bytes, np.ndarray | None]:
-    """The JSON document of our record, and sigma_d if it is there."""
+def _ours(path: Path, body: bytes, count: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The JSON document of our record, and the columns of the dial if they are there."""
     length = struct.unpack_from("<I", body)[0] if len(body) >= 4 else 0
-    rest = len(body) - 4 - length
-    if rest not in (0, 2 * count):
+    text, values = body[4 : 4 + length], body[4 + length :]
+    try:
+        document = json.loads(text)
+        names = document.get(COLUMNS, [SIGMA])
+    except DAMAGE as error:
+        raise damaged(path, error) from error
+    if names not in ([SIGMA], [SIGMA, GROWTH]) or len(values) not in (0, 2 * count * len(names)):
         raise ClodError(f"{path}: its record of sigma_d is damaged; copy or export it again")
-    sigma = np.frombuffer(body, "<f2", offset=4 + length).astype(np.float32) if rest else None
-    return body[4 : 4 + length], sigma
+    table = np.frombuffer(values, "<f2").astype(np.float32).reshape(-1, count)
+    return document, dict(zip(names, table, strict=False))  # no rows without a dial
 
 
 def _in_our_axes(path: Path, arrays: dict[str, np.ndarray], record: bytes) -> dict[str, np.ndarray]:

@@ -6,7 +6,7 @@ Reader and writer share the map of names.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
 from clod_adapter.origin import AXES, NOWHERE, Origin
 
-SIGMA = "sigma_d"
+SIGMA, GROWTH = "sigma_d", "growth_d"
 MASKS = ("masks_0", "masks_1")
 
 
@@ -36,17 +36,22 @@ def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
     }
 
 
+def dial_columns(names: Container[str]) -> dict[str, tuple[str, ...]]:
+    """The dial's columns among ``names``, as in ``column_map``; growth_d without a sigma_d is another tool's."""
+    return {name: (name,) for name in (SIGMA, GROWTH) if name in names} if SIGMA in names else {}
+
+
 def rows_of(attributes: Mapping[str, np.ndarray], origin: Origin = NOWHERE) -> np.ndarray:
-    """``[N]`` rows in Inria's layout of the values of each Gaussians attribute, ``[N, ...]``; sigma_d last.
+    """``[N]`` rows in Inria's layout of the values of each Gaussians attribute, ``[N, ...]``; the dial last.
 
     Args:
         origin: what the means are relative to, world units; where it is not 0, x, y and z are doubles.
     """
     count, coefficients = len(attributes["means"]), attributes["shN"].shape[1] + 1
     sh_degree = next(degree for degree, number in SH_COUNTS.items() if number == coefficients)
-    columns = column_map(sh_degree) | ({SIGMA: (SIGMA,)} if SIGMA in attributes else {})
-    vertex = np.zeros(count, inria_dtype(sh_degree, origin, dial=SIGMA in attributes))
-    for attribute, group in columns.items():
+    dial = dial_columns(attributes)
+    vertex = np.zeros(count, inria_dtype(sh_degree, origin, dial))
+    for attribute, group in (column_map(sh_degree) | dial).items():
         flat = attributes[attribute].reshape(count, len(group))
         for k, column in enumerate(group):
             shift = origin[k] if attribute == "means" else 0.0
@@ -57,7 +62,7 @@ def rows_of(attributes: Mapping[str, np.ndarray], origin: Origin = NOWHERE) -> n
 def in_shape(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The attributes' columns ``[N, P]`` in the shapes of ``Gaussians``, as views."""
     arrays = dict(values)
-    for name in ("opacity_logits", SIGMA):
+    for name in ("opacity_logits", SIGMA, GROWTH):
         if name in arrays:
             arrays[name] = arrays[name][:, 0]
     for name in ("sh0", "shN"):
@@ -65,12 +70,15 @@ def in_shape(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def inria_dtype(sh_degree: int, origin: Origin = NOWHERE, *, dial: bool = False) -> np.dtype:
-    """The rows of the file that Inria's trainer writes, normals included; doubles for positions with an origin."""
+def inria_dtype(sh_degree: int, origin: Origin = NOWHERE, dial: Iterable[str] = ()) -> np.dtype:
+    """The rows of the file that Inria's trainer writes, normals included, and the dial's columns.
+
+    Positions with an origin are doubles.
+    """
     groups = column_map(sh_degree)
     rest = sorted(groups["shN"], key=lambda name: int(name.rsplit("_", 1)[1]))  # the map lists them by coefficient
     names = [*groups["means"], "nx", "ny", "nz", *groups["sh0"], *rest]
-    names += [*groups["opacity_logits"], *groups["log_scales"], *groups["quats"], *([SIGMA] if dial else [])]
+    names += [*groups["opacity_logits"], *groups["log_scales"], *groups["quats"], *dial]
     return np.dtype([(name, "f8" if any(origin) and name in AXES else "f4") for name in names])
 
 

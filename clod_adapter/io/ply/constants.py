@@ -1,6 +1,7 @@
 """Settings as constant columns, for tools that keep the columns of a PLY and drop its comments.
 
 A setting that is not the default is stored in a float column whose name begins with ``clod_``, before ``sigma_d``.
+``reference_distance`` is stored so where there is a ``growth_d``, which is measured in it.
 ``max_sv``, the end of the trained range, has no column: reading sigma_d does not need it.
 """
 
@@ -18,12 +19,17 @@ from clod_adapter.io.settings import FILTER
 
 PREFIX = "clod_"
 TAU, EPS, HARD, QUANTILE, MAX = "clod_tau", "clod_eps", "clod_hard_cut", "clod_quantile", "clod_max"
+REFERENCE = "clod_reference_distance"
 VARIANCE, COMPENSATE = "clod_screen_variance", "clod_compensate"
 DIGITS = 6  # decimal digits that every float32 holds
 
 
-def dial_constants(config: AttenuationConfig | None) -> dict[str, float]:
-    """The columns, by name, of settings that are not the defaults; sigma_d in world units."""
+def dial_constants(config: AttenuationConfig | None, growth: bool) -> dict[str, float]:
+    """The columns, by name, of settings that are not the defaults; sigma_d in world units.
+
+    Args:
+        growth: whether there is a growth_d.
+    """
     if config is None:
         return {}
     usual = AttenuationConfig()
@@ -31,6 +37,7 @@ def dial_constants(config: AttenuationConfig | None) -> dict[str, float]:
     found |= {EPS: config.eps} if config.eps != usual.eps else {}
     found |= {HARD: 1.0} if config.cut == "hard" else {}
     found |= {QUANTILE: config.quantile} if config.normalizer == "quantile" else {}
+    found |= {REFERENCE: config.reference_distance} if growth and config.reference_distance else {}
     return found | ({MAX: 1.0} if config.normalizer == "max" else {})
 
 
@@ -43,7 +50,7 @@ def filter_constants(screen_filter: ScreenFilter) -> dict[str, float]:
 def constant_settings(constants: Mapping[str, float]) -> dict[str, Any]:
     """The settings in the columns, as ``settings.read_metadata`` takes them; the inverse of the two functions above."""
     found: dict[str, Any] = {}
-    for column, name in ((TAU, "tau"), (EPS, "eps"), (QUANTILE, "quantile")):
+    for column, name in ((TAU, "tau"), (EPS, "eps"), (QUANTILE, "quantile"), (REFERENCE, "reference_distance")):
         if column in constants:
             found[name] = constants[column]
     if constants.get(HARD):

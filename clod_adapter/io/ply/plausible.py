@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.units import nominal_distance
 from clod_adapter.io.settings import WARNING
-from clod_adapter.units import nominal_distance
 
 # Adapted files of three captures keep 38 to 97 % here, with sigma_d in units of the typical distance 3 to 43 %.
 DOUBTFUL = 0.25

@@ -11,7 +11,7 @@ import numpy as np
 from plyfile import PlyData
 
 from clod_adapter.io.ply.body import read_elements
-from clod_adapter.io.ply.columns import MASKS, SIGMA, column_map, read_table, sh_degree_of
+from clod_adapter.io.ply.columns import MASKS, SIGMA, column_map, dial_columns, read_table, sh_degree_of
 from clod_adapter.io.ply.constants import constant_settings, read_constants
 from clod_adapter.io.ply.header import Head, all_comments, described, read_head, stored_settings
 from clod_adapter.io.ply.packed import NOTE, check_packed, is_packed, packed_elements, unpack
@@ -115,13 +115,13 @@ def usable_blocks(
 ) -> Iterator[tuple[slice, dict[str, np.ndarray], np.ndarray]]:
     """Blocks of rows: the slice, attributes ``[n, P]`` float32 with means relative to ``origin``, ``[n]`` bool usable.
 
-    The attributes are those of ``column_map``, and sigma_d and masks where the rows have them.
+    The attributes are those of ``column_map``, and the dial's and masks where the rows have them.
 
     Args:
         dropped: counts the other rows by reason.
     """
     names = vertex.dtype.names or ()
-    groups = column_map(sh_degree) | ({SIGMA: (SIGMA,)} if SIGMA in names else {})
+    groups = column_map(sh_degree) | dial_columns(names)
     groups |= {"masks": MASKS} if set(MASKS) <= set(names) else {}
     columns = [name for group in groups.values() for name in group]
     for start in range(0, len(vertex), ROWS):

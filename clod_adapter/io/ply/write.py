@@ -1,4 +1,4 @@
-"""The rows of an output: the base's with changed values, constant columns, and last ``sigma_d``.
+"""The rows of an output: the base's with changed values, constant columns, and last the dial's.
 
 Rows are written in blocks that fit in the processor's cache, which is several times as fast, and a large file is never
 held twice.
@@ -16,7 +16,7 @@ from plyfile import PlyData, PlyElement
 
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.ply.columns import SIGMA, column_map, read_table
+from clod_adapter.io.ply.columns import GROWTH, SIGMA, column_map, dial_columns, read_table
 from clod_adapter.io.ply.constants import PREFIX
 from clod_adapter.io.ply.rows import ROWS
 from clod_adapter.origin import AXES, Origin, relative
@@ -38,19 +38,21 @@ def write_rows(
     Raises:
         ClodError: a new value is not finite.
     """
-    kind = _dtype(vertex, origin, [*constants, *([SIGMA] if gaussians.sigma_d is not None else [])])
+    dial = dial_columns(gaussians.tensors())
+    gone = {SIGMA, GROWTH} if dial else dial_columns(vertex.dtype.names or ())  # growth_d alone is another tool's
+    own = [name for name in vertex.dtype.names or () if name not in gone and not name.startswith(PREFIX)]
+    kind = _dtype(vertex, own, origin, [*constants, *dial])
     one = np.broadcast_to(np.zeros((), kind), len(vertex))  # of which plyfile makes a header without the rows
     element = PlyElement.describe(one, "vertex", comments=comments)
     file.write(f"{PlyData([element], byte_order='<').header}\n".encode("ascii"))
-    for block in _blocks(path, gaussians, vertex, origin, kind):
+    for block in _blocks(path, gaussians, vertex, own, origin, kind):
         for name, value in constants.items():
             block[name] = value
         file.write(block.astype(kind.newbyteorder("<"), copy=False).data)
 
 
-def _dtype(vertex: np.ndarray, origin: Origin, added: list[str]) -> np.dtype:
+def _dtype(vertex: np.ndarray, own: list[str], origin: Origin, added: list[str]) -> np.dtype:
     """Names, order and types of the base, but for coordinates that need more digits, as those far from 0 do."""
-    own = [name for name in vertex.dtype.names or () if name != SIGMA and not name.startswith(PREFIX)]
     columns = [(name, vertex.dtype[name]) for name in own]
     if any(origin):
         columns = [(name, np.dtype("f8") if name in AXES else kind) for name, kind in columns]
@@ -58,23 +60,23 @@ def _dtype(vertex: np.ndarray, origin: Origin, added: list[str]) -> np.dtype:
 
 
 def _blocks(
-    path: Path, gaussians: Gaussians, vertex: np.ndarray, origin: Origin, kind: np.dtype
+    path: Path, gaussians: Gaussians, vertex: np.ndarray, own: list[str], origin: Origin, kind: np.dtype
 ) -> Iterator[np.ndarray]:
-    groups = column_map(gaussians.sh_degree)
+    groups, dial = column_map(gaussians.sh_degree), dial_columns(gaussians.tensors())
     tensors = {name: tensor.detach() for name, tensor in gaussians.tensors().items()}
     for start in range(0, len(vertex), ROWS):
         rows = slice(start, start + ROWS)
         old, block = vertex[rows], np.empty(len(vertex[rows]), kind)
-        for name in kind.names or ():
-            if name != SIGMA and not name.startswith(PREFIX):
-                block[name] = old[name]
+        for name in own:
+            block[name] = old[name]
         for attribute, group in groups.items():
             new = _numpy(tensors[attribute][rows]).reshape(len(old), -1)
             _write_changes(path, attribute, group, new, old, origin, block)
-        if gaussians.sigma_d is not None:
-            block[SIGMA] = _numpy(tensors[SIGMA][rows])
-            if not np.isfinite(block[SIGMA]).all():
-                raise ClodError(f"{path}: {SIGMA} holds a value that is not finite; use a large number for no decay")
+        for name in dial:
+            block[name] = _numpy(tensors[name][rows])
+            if not np.isfinite(block[name]).all():
+                instead = "a large number for no decay" if name == SIGMA else "0 for no growth"
+                raise ClodError(f"{path}: {name} holds a value that is not finite; use {instead}")
         yield block
 
 

@@ -14,6 +14,7 @@ import torch
 from safetensors import safe_open
 
 import clod_adapter
+from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.blocks import memory
 from clod_adapter.blocks.file import KEY, load_block, save_block
 from clod_adapter.blocks.memory import MemoryPlan, plan_for_limit
@@ -194,13 +195,24 @@ def test_files_of_another_run_are_refused(
     for name, worse, message in (
         ("block", tensors["block"].clamp(max=1), "a block has no Gaussians"),
         ("sigma_d", tensors["sigma_d"][:-1], "its sigma_d is not that of this scene"),
+        ("growth_d", tensors["growth_d"].double(), "its growth_d is not that of this scene"),
         ("kept", tensors["kept"] * float("nan"), "not finite"),
     ):
         save_block(start, tensors | {name: worse}, about, belongs)
         refused(message, "--block", 1)
+    save_block(start, {name: tensor for name, tensor in tensors.items() if name != "growth_d"}, about, belongs)
+    refused("its growth_d is not that of this scene", "--block", 1)
     start.write_bytes(start.read_bytes()[:-9])
     refused("damaged")
     assert memory.MOST_BLOCKS > BLOCKS
+
+
+def test_blocks_without_growth(adapt: Callable[..., Any], tmp_path: Path) -> None:
+    assert adapt("a.ply", "--block", "start", "--growth", "off").code == 0
+    with safe_open(tmp_path / "a.start.safetensors", "pt") as file:
+        assert set(file.keys()) == {"sigma_d", "block", "seen", "kept"}
+    assert adapt("a.ply", "--growth", "off").code == 0
+    assert set(clod_adapter.load(tmp_path / "a.ply").gaussians.tensors()) == {*ATTRIBUTES, "sigma_d"}
 
 
 def test_unusable_options(clod: Callable[..., Any], capture: Any, adapt: Callable[..., Any], tmp_path: Path) -> None:

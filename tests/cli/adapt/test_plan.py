@@ -55,7 +55,7 @@ def test_plan_is_printed_before_training_and_stored(clod: Any, capture: Any, was
     report = json.loads((tmp_path / "dial.json").read_text())
     stored = decisions(tmp_path)
     assert list(stored) == list(table) and stored["unseen Gaussians"]["number"] >= 50
-    assert set(report["plan"]["seconds"]) == {"bands", "unseen", "start"}
+    assert set(report["plan"]["seconds"]) == {"bands", "unseen", "share", "start"}
     assert min(report["plan"]["seconds"].values()) >= 0 and report["seconds"]["plan"] > 0
     base, result = (clod_adapter.load(path).gaussians for path in (wasteful, tmp_path / "dial.ply"))
     assert len(result) == 350 and torch.equal(result.shN, base.shN)  # with the part that was left out

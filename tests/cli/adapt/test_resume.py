@@ -201,6 +201,7 @@ def test_other_settings_are_refused(
             (("--iters", 13), "is of a run with --iters 12; use the original arguments"),
             (("--seed", 5, "--time-budget", 9), "is of a run with no --time-budget, --seed 0; use"),
             (("--form", "paper"), "is of a run with another --form"),
+            (("--growth", "off"), "is of a run with --growth on; use"),
         ):
             done = clod(*words, *changes, "--resume")
             assert done.code == 2 and done.err.count("\n") == 1 and f"error: {STATE}: {message}" in done.err, done

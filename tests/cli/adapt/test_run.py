@@ -15,6 +15,7 @@ import pytest
 import torch
 from PIL import Image
 from plyfile import PlyData
+from safetensors import safe_open
 
 import clod_adapter
 from clod_adapter.cli.adapt import inputs, result, setup
@@ -30,6 +31,10 @@ from scenes import stripped
 
 TINY = ("--iters", 12, "--max-sv", 4, "--out", "dial.ply")
 EARLIER = "of an earlier run of clod_adapter"
+
+
+def columns(path: Path) -> list[str]:
+    return list(PlyData.read(str(path))["vertex"].data.dtype.names or ())
 
 
 def test_writes_three_files(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
@@ -56,7 +61,7 @@ def test_writes_three_files(clod: Any, capture: Any, dialled: Path, tmp_path: Pa
     assert [row["kept"] for row in report["base_rows"]] == [300]
     shares = [row["kept_share"] for row in report["rows"]]
     assert shares == sorted(shares, reverse=True) and 0 < shares[-1] < 0.5
-    assert list(PlyData.read(str(tmp_path / "dial.ply"))["vertex"].data.dtype.names or ())[-1] == "sigma_d"
+    assert columns(tmp_path / "dial.ply")[-2:] == ["sigma_d", "growth_d"]
     for suffix in (".ply", ".safetensors"):  # with the same seed
         assert stripped((tmp_path / f"dial{suffix}").read_bytes()) == stripped(dialled.with_suffix(suffix).read_bytes())
     table = [line.split() for line in done.out.splitlines()[1:11]]
@@ -121,9 +126,33 @@ def test_default_output_name_and_device(
 
 def test_training_continues_from_sigma_d(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     again = clod(dialled, "--images", capture.scene, "--iters", 2, "--max-sv", 4, "--out", "again.ply")
-    assert again.code == 0 and "continuing from its sigma_d" in again.err
+    assert again.code == 0 and f"{dialled} has a dial already: continuing from its sigma_d and growth_d\n" in again.err
     assert clod("apply", dialled, "again.safetensors", "-o", "same.ply").code == 0
     assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "again.ply").read_bytes()
+
+
+@pytest.mark.parametrize("option", [("--growth", "off"), ("--form", "paper")])
+def test_without_growth_sigma_d_is_written_alone(clod: Any, capture: Any, tmp_path: Path, option: Any) -> None:
+    assert clod(capture.ply, "--images", capture.scene, *TINY, *option, "--quiet").code == 0
+    assert columns(tmp_path / "dial.ply")[-1] == "sigma_d"
+    assert clod_adapter.load_adapter("dial.safetensors").growth_d is None
+    with safe_open("dial.safetensors", "pt") as file:
+        assert "growth_d" not in set(file.keys())
+
+
+def test_growth_of_the_checkpoint_is_dropped_or_added(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
+    """Without growth it is dropped, which a note says; a dial without growth starts with exponents of 0."""
+    given = ("--images", capture.scene, "--max-sv", 4, "--iters", 0, "--json")
+    done = clod(dialled, *given, "--growth", "off", "--out", "off.ply")
+    note = f"{dialled} has a dial already: continuing from its sigma_d; its growth_d is dropped, as growth is off"
+    assert done.code == 0 and note in json.loads(done.out)["notes"], done
+    assert columns(tmp_path / "off.ply")[-1] == "sigma_d"
+    assert clod("apply", dialled, "off.safetensors", "-o", "same.ply").code == 0
+    assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "off.ply").read_bytes()
+    done = clod("off.ply", *given, "--out", "on.ply")
+    assert "off.ply has a dial already: continuing from its sigma_d" in json.loads(done.out)["notes"], done
+    growth_d = clod_adapter.load(tmp_path / "on.ply").gaussians.growth_d
+    assert growth_d is not None and not growth_d.any()
 
 
 def test_interrupt_of_the_measurement_keeps_finished_rows(

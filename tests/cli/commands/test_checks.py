@@ -116,7 +116,7 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("export DIALLED", "required: -o/--out"),
         ("export DIALLED -o x", "x: --out must end in one of .ply, .*, which is the format"),
         ("export DIALLED -o .ply --sv 2", ".ply: --out must end in one of"),
-        ("export DIALLED -o x.splat", "x.splat: .splat cannot store sigma_d; choose a dial value .* format .*.ply"),
+        ("export DIALLED -o x.splat", "x.splat: .splat cannot store a dial; choose a dial value .* format .*.ply"),
         ("export DIALLED -o x.splat --sv 2 --order extinction", "x.splat: .splat sorts the Gaussians itself"),
         ("export DIALLED -o dialled.ply --sv 2 --json", "dialled.ply: is an input file"),
         ("export DIALLED -o folder.ply --sv 2", "folder.ply: is a folder"),

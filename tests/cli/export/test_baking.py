@@ -14,7 +14,7 @@ import torch
 import clod_adapter
 from clod_adapter.cli.export import baking
 from clod_adapter.cli.export.baking import largest_within
-from clod_adapter.distances import viewpoint_of
+from clod_adapter.equation.distances import viewpoint_of
 from clod_adapter.io.checkpoint import load
 
 

@@ -277,12 +277,13 @@ def test_order_by_extinction_for_cameras_of_the_scene(clod: Any, capture: Any, d
     assert same(load("one.ply").gaussians, clod_adapter.bake(ordered, 2.0, camera))
 
 
-def saved(path: Path, degree: int) -> Any:
+def saved(path: Path, degree: int, *, growth: bool = True) -> Any:
     """A model of that SH degree with a dial at ``path``."""
     from scenes import gaussians
 
     sigma = torch.linspace(0.9, 9, 50)
     model = clod_adapter.attach(gaussians(50, degree, 4), sigma, clod_adapter.AttenuationConfig(reference_distance=3.0))
+    model = model.replace(growth_d=torch.linspace(-1, 3, 50) if growth else None)
     places = (Viewpoint(0.0, 0.0, -4.0, 1.0), Viewpoint(1.0, 0.0, 4.0, 1.0))
     row = CalibrationRow(1.0, 40.0, 30.0, 0.9, 5.0)
     save(path, model, calibration=Calibration((row,), 50, 1, 8, 6, "a machine", viewpoints=places))
@@ -313,6 +314,21 @@ def test_sibr_reads_baked_files(clod: Any, tmp_path: Path, degree: int) -> None:
         assert list(sh[3:]) == want.shN[row].T.reshape(-1).tolist()
         rest = [want.opacity_logits[row : row + 1], want.log_scales[row], want.quats[row]]
         assert list(values[6 + harmonics :]) == torch.cat(rest).tolist()
+
+
+@pytest.mark.parametrize("growth", [True, False])
+def test_growth(clod: Any, tmp_path: Path, growth: bool) -> None:
+    """It is kept in step with the rows, and a baked file is said to have the grown scales."""
+    g = saved(tmp_path / "model.ply", 0, growth=growth)
+    rows = clod_adapter.order_by_extinction(g, load("model.ply").viewpoints)
+    for suffix in (".ply", ".glb", ".pt"):
+        done = clod("export", "model.ply", "--order", "extinction", "-o", f"x{suffix}")
+        ordered = load(f"x{suffix}").gaussians
+        assert done.code == 0 and ordered.sigma_d is not None and torch.equal(ordered.sigma_d, g.sigma_d[rows])
+        assert (ordered.growth_d is not None) == growth
+        assert ordered.growth_d is None or torch.equal(ordered.growth_d, g.growth_d[rows])
+    done = clod("export", "model.ply", "--sv", 2, "-o", "baked.splat")
+    assert done.code == 0 and "lossy" in done.out and ("the scales have grown to it" in done.out) == growth
 
 
 def test_packed_formats(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:

@@ -47,7 +47,7 @@ def test_written_file_in_pygltflib(tmp_path: Path) -> None:
         if name == "POSITION":
             assert accessor.min == g.means.amin(0).tolist() and accessor.max == g.means.amax(0).tolist()
     assert set(found) == {
-        "POSITION", "COLOR_0", "_SIGMA_D", f"{KHR}:ROTATION", f"{KHR}:SCALE", f"{KHR}:OPACITY",
+        "POSITION", "COLOR_0", "_SIGMA_D", "_GROWTH_D", f"{KHR}:ROTATION", f"{KHR}:SCALE", f"{KHR}:OPACITY",
         *(f"{KHR}:SH_DEGREE_{d}_COEF_{k}" for d in range(4) for k in range(2 * d + 1)),
     }  # fmt: skip
     np.testing.assert_allclose(found[f"{KHR}:SCALE"], g.scales, rtol=1e-6)
@@ -56,6 +56,7 @@ def test_written_file_in_pygltflib(tmp_path: Path) -> None:
     assert turned(torch.from_numpy(found[f"{KHR}:ROTATION"][:, [3, 0, 1, 2]].copy()), g.quats) < 1e-6
     np.testing.assert_array_equal(found[f"{KHR}:SH_DEGREE_2_COEF_1"], g.shN[:, 4])
     np.testing.assert_array_equal(found["_SIGMA_D"][:, 0], g.sigma_d)
+    np.testing.assert_array_equal(found["_GROWTH_D"][:, 0], g.growth_d)
     np.testing.assert_allclose(found["COLOR_0"][:, :3] / 255, (0.5 + SH_C0 * g.sh0[:, 0]).clamp(0, 1), atol=2.1e-3)
     # The node turns y down into glTF's y up: (x, y, z) becomes (-x, -y, z).
     assert node.rotation == [0, 0, 1, 0] and node.translation == [-ORIGIN[0], -ORIGIN[1], ORIGIN[2]]

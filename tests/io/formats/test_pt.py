@@ -105,6 +105,7 @@ def test_false_sizes_allocate_nothing(tmp_path: Path) -> None:
         ({"splats": splats() | {"sigma_d": torch.ones(3)}}, "sigma_d.*shape .3,., not .12,."),
         ({"splats": splats() | {"sigma_d": torch.ones(12).int()}}, "no plain tensor"),
         ({"splats": splats() | {"sigma_d": "1"}}, "no plain tensor"),
+        ({"splats": splats() | {"sigma_d": torch.ones(12), "growth_d": torch.ones(3)}}, "growth_d.*shape .3,., not"),
     ],
 )  # fmt: skip
 def test_invalid_checkpoint_is_refused(tmp_path: Path, checkpoint: Any, message: str) -> None:
@@ -119,6 +120,6 @@ def test_written_tensors_are_those_of_gsplat(tmp_path: Path) -> None:
     checkpoint = torch.load(tmp_path / "a.pt", map_location="cpu", weights_only=True)
     splats = checkpoint["splats"]
     for theirs, ours in {"means": "means", "quats": "quats", "scales": "log_scales", "opacities": "opacity_logits",
-                         "sh0": "sh0", "shN": "shN", "sigma_d": "sigma_d"}.items():  # fmt: skip
+                         "sh0": "sh0", "shN": "shN", "sigma_d": "sigma_d", "growth_d": "growth_d"}.items():  # fmt: skip
         assert torch.equal(splats[theirs], getattr(g, ours))
     assert torch.cat([splats["sh0"], splats["shN"]], dim=-2).shape == (40, 9, 3) and checkpoint["step"] == 0

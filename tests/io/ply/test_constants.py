@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from plyfile import PlyData
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import attenuate
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.inspection.report import inspect
@@ -34,9 +34,9 @@ EACH = {
 }  # fmt: skip
 
 
-def model(config: AttenuationConfig) -> Gaussians:
-    some = gaussians(400, 1, 2)
-    return attach(some, torch.logspace(-1, 1.3, 400), config)
+def model(config: AttenuationConfig, growth: bool = False) -> Gaussians:
+    some = attach(gaussians(400, 1, 2), torch.logspace(-1, 1.3, 400), config)
+    return some.replace(growth_d=torch.linspace(-1, 3, 400)) if growth else some
 
 
 def same_dial(found: Gaussians, g: Gaussians) -> None:
@@ -73,6 +73,24 @@ def test_dial_survives_a_rewrite_without_comments(tmp_path: Path, name: str) -> 
         other = load(tmp_path / "b.ply")
         assert not any("clod_adapter" in comment for comment in other.comments)
         same_dial(other.gaussians, g)
+
+
+@pytest.mark.parametrize("unit", [1.0, 7.0])
+@pytest.mark.parametrize("distance", [0.0, 3.0, 0.123456789])
+@pytest.mark.parametrize("name", ["usual", "paper", "median"])
+def test_growth_survives_a_rewrite_without_comments(tmp_path: Path, name: str, distance: float, unit: float) -> None:
+    g = model(replace(EACH[name], reference_distance=distance, scene_distance=unit), growth=True)
+    save(tmp_path / "a.ply", g)
+    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    assert rows.dtype.names[-2:] == ("sigma_d", "growth_d")
+    again = load(without_comments(tmp_path / "a.ply")).gaussians
+    for s in (1.7, 3.1):
+        want, got = (
+            attenuate(x.opacity_logits, x.sigma_d, (x.means, camera()), s, x.attenuation, growth_d=x.growth_d).growth
+            for x in (g, again)
+        )
+        assert want is not None and got is not None and want.max() > 1.1
+        torch.testing.assert_close(got, want, rtol=1e-5, atol=0)  # the columns are float32
 
 
 def test_comments_take_precedence_over_columns(tmp_path: Path) -> None:

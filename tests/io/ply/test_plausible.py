@@ -9,11 +9,11 @@ import torch
 
 from clod_adapter.adapter import attach
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.extinction import sigma_for_extinction
+from clod_adapter.equation.extinction import sigma_for_extinction
+from clod_adapter.equation.units import estimated_distance
 from clod_adapter.inspection.report import inspect
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.ply.plausible import check_plausible
-from clod_adapter.units import estimated_distance
 from formats import without_comments
 from scenes import gaussians
 

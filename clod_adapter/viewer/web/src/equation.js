@@ -1,6 +1,6 @@
-// The dial's equation in float64, as in clod_adapter/attenuation.py and extinction.py. A Gaussian is kept iff
+// The dial's equation in float64, as in clod_adapter/equation/. A Gaussian is kept iff
 // log a - (d s)^2 / (2 v) > log(tau s),  d = |mean - eye| / D,  2 v = 2 relu(sigma_d)^2 + eps,  a the opacity. Runs in the
-// worker (worker.js).
+// worker (worker.js), except for growth_d, which culling does not use: shaders.js multiplies the scales.
 
 const HUGE = 1e300; // replaces 1/0: 0 * HUGE is 0, as at d = 0 a Gaussian is not attenuated for any sigma_d
 
@@ -43,6 +43,11 @@ function inFrustum(px, py, pz, { rotation: r, eye, fx, fy, cx, cy, width, height
   const u = fx * (r[0] * x + r[1] * y + r[2] * z) + cx * depth;
   const v = fy * (r[3] * x + r[4] * y + r[5] * z) + cy * depth;
   return u >= 0 && u < width * depth && v >= 0 && v < height * depth;
+}
+
+/** r, in units of D: the distance from which on scales grow (equation/growth.py). */
+export function growthDistance({ normalizer, reference_distance: reference, scene_distance: unit }) {
+  return normalizer === "scene" && reference ? reference / unit : 1;
 }
 
 /** Extinction scales s*, descending: a Gaussian is kept iff s < s*. In closed form by Lambert's W. */

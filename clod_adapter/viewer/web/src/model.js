@@ -48,7 +48,7 @@ function upload(gl, gaussians) {
   throw new Error(`this graphics device has too little memory for ${integer(gaussians.count)} Gaussians; export it at a larger dial value (--sv)`);
 }
 
-function fillRecords(target, { count, means, quats, logScales, opacityLogits, sh0, sigmaD }) {
+function fillRecords(target, { count, means, quats, logScales, opacityLogits, sh0, sigmaD, growthD }) {
   for (let i = 0, at = 0; i < count; i++, at += 16) {
     for (let k = 0; k < 3; k++) {
       target[at + k] = means[3 * i + k];
@@ -59,6 +59,7 @@ function fillRecords(target, { count, means, quats, logScales, opacityLogits, sh
     const norm = Math.hypot(quats[4 * i], quats[4 * i + 1], quats[4 * i + 2], quats[4 * i + 3]);
     for (let k = 0; k < 4; k++) target[at + 4 + k] = quats[4 * i + k] / norm;
     target[at + 11] = sigmaD ? sigmaD[i] : 0;
+    target[at + 15] = growthD ? growthD[i] : 0;
   }
 }
 

@@ -1,4 +1,5 @@
 // The page's configuration, and the splats that it names: in the page or on its server.
+import { DIAL } from "./formats/gaussians.js";
 import { readFile } from "./formats/index.js";
 import { inflate } from "./formats/zip.js";
 
@@ -11,9 +12,11 @@ export function readConfig() {
 /** {gaussians, metadata} of the configuration's `model` or `base`; calls `onProgress(fraction)` during the transfer. */
 export async function fetchModel(entry, onProgress) {
   const { gaussians, metadata } = await readFile(await bytesOf(entry, onProgress), entry.name);
-  if (entry.sigma) gaussians.sigmaD = new Float32Array(await bytesOf(entry.sigma));
-  if (gaussians.sigmaD && gaussians.sigmaD.length !== gaussians.count) {
-    throw new Error(`it has ${gaussians.count} Gaussians and ${gaussians.sigmaD.length} values of sigma_d; export the page again`);
+  for (const [name, place] of Object.entries(entry.columns)) {
+    const values = gaussians[DIAL[name]] = new Float32Array(await bytesOf(place));
+    if (values.length !== gaussians.count) {
+      throw new Error(`it has ${gaussians.count} Gaussians and ${values.length} values of ${name}; export the page again`);
+    }
   }
   const attenuation = gaussians.sigmaD ? entry.attenuation ?? null : null;
   return {

@@ -1,6 +1,7 @@
 // Draws models. A first pass projects each Gaussian to one texel; a second one draws a quad each, farthest first, into a
 // half-float image, so that blending hundreds of layers does not round to 8 bits.
 import { WIDTH, bindTextures, framebuffer, heightOf, program, quads, texture } from "./gpu.js";
+import { growthDistance } from "./equation.js";
 import { copyVertex, copyFragment, projectFragment, splatFragment, splatVertex } from "./shaders.js";
 
 export function createRenderer(canvas) {
@@ -57,6 +58,7 @@ export function createRenderer(canvas) {
     if (side.attenuated) {
       gl.uniform1f(u.dial, side.dial);
       gl.uniform1f(u.distance_unit, side.distance);
+      gl.uniform1f(u.reach, growthDistance(model.attenuation));
       gl.uniform1f(u.eps, model.attenuation.eps);
       gl.uniform1f(u.tau, model.attenuation.tau);
       gl.uniform1i(u.soft, model.attenuation.cut === "soft");

@@ -44,14 +44,14 @@ export const projectFragment = (degree) => `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
 uniform usampler2D order;    // row of the file of each pixel
 uniform int drawn;
-uniform sampler2D records;   // per Gaussian: mean, opacity; unit quaternion wxyz; scales, sigma_d; colour of degree 0
+uniform sampler2D records;   // per Gaussian: mean, opacity; unit quaternion wxyz; scales, sigma_d; colour of degree 0, growth_d
 uniform usampler2D sh;       // coefficients of degrees 1 and up
 uniform mat3 view;           // world to camera, OpenCV axes
 uniform vec3 eye;
 uniform vec4 pinhole;        // fx, fy, cx, cy
 uniform vec3 size;           // width, height, near
 uniform bool attenuated, soft;
-uniform float dial, distance_unit, eps, tau;
+uniform float dial, distance_unit, reach, eps, tau;
 uniform float blur;          // px^2 that the screen-space filter adds to covariances
 uniform bool compensate;     // whether opacities are scaled by the ratio of the areas without and with the filter
 // Bits of floats, because every WebGL2 device renders to integers. footprint: centre, major half-axis; conic: conic, length
@@ -75,9 +75,11 @@ void main() {
   vec4 mean = texelFetch(records, texelAt(record), 0), shape = texelFetch(records, texelAt(record + 2), 0);
   vec3 ray = mean.xyz - eye, point = view * ray;
   if (!(point.z >= size.z)) return;
-  float opacity = mean.w;
-  if (attenuated) opacity = clodOpacity(opacity, shape.w, length(ray) / distance_unit, dial, eps, tau, soft);
+  float opacity = mean.w, distance = length(ray) / distance_unit;
+  if (attenuated) opacity = clodOpacity(opacity, shape.w, distance, dial, eps, tau, soft);
   if (opacity < 1.0 / 255.0) return;
+  vec4 tint = texelFetch(records, texelAt(record + 3), 0);
+  if (attenuated) shape.xyz *= clodScale(tint.a, distance, dial, reach);
 
   vec2 margin = 0.15 * size.xy / pinhole.xy;
   vec2 slope = clamp(point.xy / point.z, -pinhole.zw / pinhole.xy - margin, (size.xy - pinhole.zw) / pinhole.xy + margin);
@@ -101,10 +103,11 @@ void main() {
   vec2 centre = pinhole.xy * point.xy / point.z + pinhole.zw;
   vec2 extent = radius * sqrt(vec2(xx, yy));
   if (any(lessThan(centre + extent, vec2(0.0))) || any(greaterThan(centre - extent, size.xy))) return;
-  vec3 rgb = texelFetch(records, texelAt(record + 3), 0).rgb;
+  vec3 rgb = tint.rgb;
   ${degree ? "rgb += shColor(row, normalize(ray));" : ""}
-  footprint = floatBitsToUint(vec4(centre, radius * sqrt(major) * normalize(direction)));
-  conic = floatBitsToUint(vec4(vec3(yy, -xy, xx) / det, radius * sqrt(minor)));
+  float far = length(abs(centre - 0.5 * size.xy) + 0.5 * size.xy);   // to the farthest corner: no quad need be longer
+  footprint = floatBitsToUint(vec4(centre, min(radius * sqrt(major), far) * normalize(direction)));
+  conic = floatBitsToUint(vec4(vec3(yy, -xy, xx) / det, min(radius * sqrt(minor), far)));
   color = floatBitsToUint(vec4(max(rgb, 0.0), opacity));
 }`;
 

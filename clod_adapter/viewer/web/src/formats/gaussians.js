@@ -1,10 +1,13 @@
 // The result of every reader: float32 values as in Inria's PLY (logits of opacities, logarithms of scales, wxyz quaternions).
 
-/** Arrays for `count` Gaussians; shN is [count, coefficients, 3] of SH degrees 1 and up. sigmaD: null without a dial. */
+/** The dial's columns of a file, and the arrays with their values; a file without sigma_d has no dial. */
+export const DIAL = { sigma_d: "sigmaD", growth_d: "growthD" };
+
+/** Arrays for `count` Gaussians; shN is [count, coefficients, 3] of SH degrees 1 and up. Those of DIAL: null if absent. */
 export function allocate(count, degree) {
   const coefficients = (degree + 1) ** 2 - 1;
   return {
-    count, degree, coefficients, sigmaD: null, comments: [], notes: [],
+    count, degree, coefficients, sigmaD: null, growthD: null, comments: [], notes: [],
     means: new Float32Array(3 * count), quats: new Float32Array(4 * count), logScales: new Float32Array(3 * count),
     opacityLogits: new Float32Array(count), sh0: new Float32Array(3 * count),
     shN: new Float32Array(3 * coefficients * count),
@@ -24,17 +27,17 @@ export function smallestThree(largest, three) {
 
 /** Removes the rows that cannot be drawn: with a non-finite value, or a zero quaternion (io/ply/rows.py). */
 export function removeInvalid(gaussians) {
-  const { count, means, quats, logScales, opacityLogits, sh0, shN, coefficients, sigmaD } = gaussians;
+  const { count, means, quats, logScales, opacityLogits, sh0, shN, coefficients } = gaussians;
   const finite = (array, size, i) => {
     for (let k = size * i; k < size * (i + 1); k++) if (!Number.isFinite(array[k])) return false;
     return true;
   };
-  const keep = [];
+  const keep = [], dial = Object.values(DIAL).filter((name) => gaussians[name]);
   for (let i = 0; i < count; i++) {
     const rotated = quats[4 * i] || quats[4 * i + 1] || quats[4 * i + 2] || quats[4 * i + 3];
     const opaque = Number.isFinite(opacityLogits[i]) || opacityLogits[i] === Infinity;
     if (rotated && opaque && finite(means, 3, i) && finite(quats, 4, i) && finite(logScales, 3, i) && finite(sh0, 3, i)
-      && finite(shN, 3 * coefficients, i) && (!sigmaD || Number.isFinite(sigmaD[i]))) keep.push(i);
+      && finite(shN, 3 * coefficients, i) && dial.every((name) => Number.isFinite(gaussians[name][i]))) keep.push(i);
   }
   if (!keep.length) throw new Error("no Gaussian in it can be drawn: values are not finite or rotations are 0; export it again");
   if (keep.length === count) return gaussians;
@@ -46,7 +49,7 @@ export function removeInvalid(gaussians) {
   return {
     ...gaussians, count: keep.length, means: pick(means, 3), quats: pick(quats, 4), logScales: pick(logScales, 3),
     opacityLogits: pick(opacityLogits, 1), sh0: pick(sh0, 3), shN: pick(shN, 3 * coefficients),
-    sigmaD: sigmaD && pick(sigmaD, 1),
+    ...Object.fromEntries(dial.map((name) => [name, pick(gaussians[name], 1)])),
     notes: [...gaussians.notes, `${count - keep.length} of ${count} Gaussians cannot be drawn and were removed`],
   };
 }

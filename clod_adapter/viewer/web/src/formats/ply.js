@@ -1,5 +1,5 @@
 // PLY: the header, and plain Gaussians with columns of any order and type, ascii or binary (io/ply).
-import { allocate } from "./gaussians.js";
+import { DIAL, allocate } from "./gaussians.js";
 
 const TYPES = {
   char: ["Int8", 1], int8: ["Int8", 1], uchar: ["Uint8", 1], uint8: ["Uint8", 1], short: ["Int16", 2], int16: ["Int16", 2],
@@ -37,7 +37,7 @@ export function readHeader(bytes) {
   return header;
 }
 
-/** Gaussians with or without sigma_d. */
+/** Gaussians with or without a dial. */
 export function readPly(bytes, header) {
   const vertex = header.elements.find((element) => element.name === "vertex");
   if (!vertex) throw new Error("it has no vertex element; open a splat in Inria's 3DGS layout");
@@ -52,9 +52,12 @@ export function readPly(bytes, header) {
   read(gaussians.opacityLogits, 1, 0, "opacity");
   const terms = gaussians.coefficients; // of a channel
   for (let k = 0; k < terms; k++) for (let c = 0; c < 3; c++) read(gaussians.shN, 3 * terms, 3 * k + c, `f_rest_${c * terms + k}`);
-  if (vertex.properties.some((property) => property.name === "sigma_d")) {
-    gaussians.sigmaD = new Float32Array(vertex.count);
-    read(gaussians.sigmaD, 1, 0, "sigma_d");
+  const has = (name) => vertex.properties.some((property) => property.name === name);
+  if (has("sigma_d")) {
+    for (const name of Object.keys(DIAL).filter(has)) {
+      gaussians[DIAL[name]] = new Float32Array(vertex.count);
+      read(gaussians[DIAL[name]], 1, 0, name);
+    }
     gaussians.constants = constantsOf(vertex, columns);
   }
   return gaussians;

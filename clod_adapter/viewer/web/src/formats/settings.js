@@ -24,13 +24,14 @@ export function readSettings(comments, constants = {}) {
   return { ...DEFAULTS, ...(written.length ? FORMER : {}), ...stored };
 }
 
-function ofColumns({ clod_tau, clod_eps, clod_hard_cut, clod_quantile, clod_max }) {
+function ofColumns({ clod_tau, clod_eps, clod_hard_cut, clod_quantile, clod_max, clod_reference_distance }) {
   const found = {};
   if (clod_tau !== undefined) found.tau = shortest(clod_tau);
   if (clod_eps !== undefined) found.eps = shortest(clod_eps);
   if (clod_hard_cut) found.cut = "hard";
   if (clod_quantile !== undefined) Object.assign(found, { normalizer: "quantile", quantile: shortest(clod_quantile) });
   if (clod_max) found.normalizer = "max";
+  if (clod_reference_distance !== undefined) found.reference_distance = shortest(clod_reference_distance);
   return found;
 }
 

@@ -1,5 +1,5 @@
 // PlayCanvas's .sog: a ZIP of WebP images, one pixel per Gaussian, and meta.json. Reading keeps the order of rows, so
-// that sigma_d can be stored separately.
+// that the dial's columns can be stored separately.
 import { allocate, logit, smallestThree } from "./gaussians.js";
 import { unzip } from "./zip.js";
 

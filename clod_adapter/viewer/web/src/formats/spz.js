@@ -1,6 +1,6 @@
-// Niantic's .spz, versions 2 and 3: gzip of one block per attribute and then vendor records, of which ours has sigma_d
-// (io/formats/spz.py). Axes are not converted: converters keep those of the PLY.
-import { allocate, logit, smallestThree } from "./gaussians.js";
+// Niantic's .spz, versions 2 and 3: gzip of one block per attribute and then vendor records, of which ours has the
+// dial's columns (io/formats/spz.py). Axes are not converted: converters keep those of the PLY.
+import { DIAL, allocate, logit, smallestThree } from "./gaussians.js";
 
 const MAGIC = 0x5053474e, HEADER = 16;
 const COLOR = 0.15; // colours are stored as 0.15 f_dc + 0.5
@@ -33,7 +33,7 @@ export function readSpz(bytes) {
   return bytes[14] & EXTENDED ? readRecord(gaussians, bytes, view, starts[6]) : gaussians;
 }
 
-/** Adds the data of our record: the length of a JSON text, the text, sigma_d as float16. */
+/** Adds the data of our record: the length of a JSON text, the text, its columns as float16. */
 function readRecord(gaussians, bytes, view, at) {
   while (at + 8 <= bytes.length) {
     const type = view.getUint32(at, true), length = view.getUint32(at + 4, true), start = at + 12;
@@ -42,9 +42,13 @@ function readRecord(gaussians, bytes, view, at) {
     const end = start + view.getUint32(start - 4, true);
     const metadata = JSON.parse(new TextDecoder().decode(bytes.subarray(start, end)));
     if (metadata.screen_filter) gaussians.screenFilter = metadata.screen_filter;
-    if (at - end !== 2 * gaussians.count || !metadata.attenuation) continue;
-    const sigmaD = Float32Array.from({ length: gaussians.count }, (_, i) => floatOfHalf(view.getUint16(end + 2 * i, true)));
-    return { ...gaussians, sigmaD, settings: metadata.attenuation };
+    const { columns = ["sigma_d"] } = metadata, { count } = gaussians;
+    if (at - end !== 2 * count * columns.length || !metadata.attenuation) continue;
+    columns.forEach((name, k) => {
+      const first = end + 2 * count * k, value = (_, i) => floatOfHalf(view.getUint16(first + 2 * i, true));
+      gaussians[DIAL[name]] = Float32Array.from({ length: count }, value);
+    });
+    return { ...gaussians, settings: metadata.attenuation };
   }
   return gaussians;
 }

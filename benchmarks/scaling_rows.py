@@ -1,4 +1,4 @@
-"""Exponents of time and bytes per Gaussian from the rows of growth.py, and their tables for docs/growth.md."""
+"""Exponents of time and bytes per Gaussian from the rows of scaling.py, and their tables for docs/scaling.md."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from common import Row, stored, table
 
 import numpy as np
 
-FILE = "growth.jsonl"
+FILE = "scaling.jsonl"
 COMMANDS = ("adapt", "eval", "export", "inspect", "view")
 FLOOR, SIZES = 1000, (10_000, 100_000, 1_000_000, 5_000_000)
 FROM = 100_000  # Gaussians from which exponents are fitted: below, start-up dominates
@@ -85,7 +85,7 @@ def megapixels(row: Row) -> float:
 
 
 def tables(rows: Sequence[Row]) -> str:
-    """Markdown for docs/growth.md."""
+    """Markdown for docs/scaling.md."""
     return "\n\n".join([times_table(rows), *memory_tables(rows), *(series_table(rows, *each) for each in X)])
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import growth_rows as measured
 import pytest
+import scaling_rows as measured
 
 SIZES = (measured.FLOOR, *measured.SIZES)
 

@@ -7,7 +7,7 @@ import torch
 
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.distances import normalized_distances, normalizing_distance, typical_distance, viewpoint_of
+from clod_adapter.equation.distances import normalized_distances, normalizing_distance, typical_distance, viewpoint_of
 from exact import config
 from scenes import camera, gaussians, ring
 

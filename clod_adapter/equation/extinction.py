@@ -9,8 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from clod_adapter.attenuation import SIGMA_MAX, conform, culling_threshold, log_threshold, twice_variance
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import SIGMA_MAX, conform, culling_threshold, log_threshold
+from clod_adapter.equation.autograd import twice_variance
 
 _LOG_HUGE = 1e4  # above the logarithms that float64 products here can have
 

@@ -13,8 +13,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from clod_adapter.attenuation import SIGMA_MAX, twice_variance
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import SIGMA_MAX
+from clod_adapter.equation.autograd import twice_variance
 from clod_adapter.gaussians import Gaussians
 
 # Quantile of the distances from the centre of a scene that estimates the typical distance. In three captures it is
@@ -32,12 +33,15 @@ def with_distance(gaussians: Gaussians, distance: float) -> Gaussians:
     stay. Where D / D' is below SMALL, eps would hide sigma': there it becomes ``(D / D')^2 eps``, to six
     digits; where D / D' is above 1 / SMALL, eps grows back so, to four digits, but not beyond the default. The
     normalisers ``max`` and ``quantile`` do not use D, and keep their sigma_d. The result's ``reference_distance`` is
-    ``known_distance`` of the input.
+    ``known_distance`` of the input. Where that is unknown and there is a ``growth_d``, it is D: growth begins there.
     """
     config, sigma = gaussians.attenuation, gaussians.sigma_d
     if config is None or sigma is None or config.scene_distance == distance:
         return gaussians
-    changed = replace(config, scene_distance=distance, reference_distance=known_distance(config))
+    known = known_distance(config)
+    if gaussians.growth_d is not None:
+        known = known or config.scene_distance
+    changed = replace(config, scene_distance=distance, reference_distance=known)
     if config.normalizer == "scene":
         ratio = config.scene_distance / distance
         if ratio < SMALL:

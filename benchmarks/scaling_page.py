@@ -1,4 +1,4 @@
-"""The picture of docs/growth.md, and its estimate for a city of 100 million Gaussians."""
+"""The picture of docs/scaling.md, and its estimate for a city of 100 million Gaussians."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from operator import itemgetter
 from typing import Any
 
-import growth_rows as fit
+import scaling_rows as fit
 from clod_adapter.report.style import QUIET, SERIES, label_log, new_figure, save_figure, tidy
 from common import ROOT, Row, table
 
 import numpy as np
 from PIL import Image
 
-PICTURE, PAGE = ROOT / "docs" / "images" / "growth.png", ROOT / "docs" / "growth.md"
+PICTURE, PAGE = ROOT / "docs" / "images" / "scaling.png", ROOT / "docs" / "scaling.md"
 # What is assumed of the city on paper, and of machines; the rest is fit.
 CITY, PHOTOGRAPHS, SIZE = 100_000_000, 20_000, 1600 * 1000 / 1e6  # Gaussians; how many, of so many megapixels
 BORDER = 0.2  # Gaussians around a block that go along frozen, of its own
@@ -131,7 +131,7 @@ def finish(axes: Any, title: str, x: str, y: str) -> None:
 
 def fill_in(name: str, text: str) -> None:
     """Puts the text between the page's comments of this name, and prints it."""
-    begin, end = f"<!-- {name}: written by benchmarks/growth.py -->", f"<!-- end of {name} -->"
+    begin, end = f"<!-- {name}: written by benchmarks/scaling.py -->", f"<!-- end of {name} -->"
     before, _, rest = PAGE.read_text(encoding="utf-8").partition(begin)
     PAGE.write_text(f"{before}{begin}\n\n{text}\n\n{end}{rest.partition(end)[2]}", encoding="utf-8")
     print(text)

@@ -10,11 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clod_adapter.adapter import attach
-from clod_adapter.attenuation import SIGMA_MAX, attenuate
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.distances import normalized_distances
+from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
+from clod_adapter.equation.distances import normalized_distances
+from clod_adapter.equation.units import (
+    estimated_distance,
+    in_world_units,
+    known_distance,
+    nominal_distance,
+    with_distance,
+)
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.units import estimated_distance, in_world_units, known_distance, nominal_distance, with_distance
 from scenes import camera, gaussians
 
 

@@ -1,10 +1,10 @@
 """Time and memory of the commands by the number of Gaussians, and of adapting by the photographs.
 
-    python benchmarks/growth.py            # some 15 minutes, 12 GB of memory, 8 GB of disk; --plot runs nothing
+    python benchmarks/scaling.py            # some 15 minutes, 12 GB of memory, 8 GB of disk; --plot runs nothing
 
 Runs each command in its own process on synthetic cities, which are kept in benchmarks/cache. Measures wall and CPU
-seconds and resident memory by phase. A city of 1000 Gaussians gives the start-up cost. Rows go to results/growth.jsonl;
-the last row of a kind counts. Writes docs/images/growth.png and the tables of docs/growth.md.
+seconds and resident memory by phase. A city of 1000 Gaussians gives the start-up cost. Rows go to
+results/scaling.jsonl; the last row of a kind counts. Writes docs/images/scaling.png and the tables of docs/scaling.md.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-import growth_page
+import scaling_page
 from city import write_city
 from common import CACHE, COMMAND, Process, Row, append, arguments
-from growth_rows import FEW, FILE, FLOOR, SERIES_COUNT, SIZES, latest, tables
+from scaling_rows import FEW, FILE, FLOOR, SERIES_COUNT, SIZES, latest, tables
 
-CITIES = CACHE / "growth"
+CITIES = CACHE / "scaling"
 IMAGES, WIDTH, HEIGHT, STEPS, MAX_SV = 10, 640, 400, 8, 3
 MANY, SMALL = (16, 64, 256), (320, 200)  # photographs, of this size
 SHAPES = ((320, 200), (640, 400), (1280, 800), (1600, 1000))  # sizes, of FEW photographs
@@ -53,9 +53,9 @@ def main() -> None:
     if not args.plot:
         measure()
     rows = latest()
-    growth_page.draw(rows)
-    growth_page.fill_in("figures", tables(rows))
-    growth_page.fill_in("paper", growth_page.on_paper(rows))
+    scaling_page.draw(rows)
+    scaling_page.fill_in("figures", tables(rows))
+    scaling_page.fill_in("paper", scaling_page.on_paper(rows))
 
 
 def measure() -> None:

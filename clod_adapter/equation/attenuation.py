@@ -1,12 +1,15 @@
-"""The dial's equation, and the one function that turns Gaussians, a camera and a dial value into opacities to draw.
+"""The dial's equation, and the one function that turns Gaussians, a camera and a dial value into what is drawn.
 
-Source: "CLoD-GS: Continuous Level-of-Detail via 3D Gaussian Splatting", ICLR 2026: the attenuated opacity is its Eq. 2
-(section 3.2), the culling rule is the mask M_i of the same section. For activated opacity ``a``, decay ``sigma``,
-normalised distance ``d`` and dial ``s`` (the paper's virtual distance scale)::
+For activated opacity ``a``, decay ``sigma``, growth exponent ``h``, normalised distance ``d`` (``distances.py``) and
+dial ``s`` (the paper's virtual distance scale)::
 
     v   = relu(sigma)^2 + eps/2                     the variance of the decay
     a'' = a exp(-(d s)^2 / (2 v))                   attenuated opacity
     kept iff a'' > tau s                            compared as logarithms, which do not underflow
+    g   = max(1, d s / r)^h                         factor of the scales of what is kept (``growth.py``)
+
+Sources: a'' is Eq. 2 (section 3.2) of "CLoD-GS: Continuous Level-of-Detail via 3D Gaussian Splatting", ICLR 2026, and
+the culling rule is the mask M_i of the same section. g is this project's.
 
 With the ``hard`` cut (the paper's) a kept Gaussian is drawn with opacity a'' and is culled at opacity ``tau s``, which
 pops. With the ``soft`` cut it is drawn with ``a'' min(1, 2 (a'' / (tau s) - 1))``: the opacity is a'' above 1.5 tau s
@@ -33,43 +36,45 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.autograd import Function
-from torch.autograd.function import once_differentiable
 
 from clod_adapter._support.fusing import Fused, Number
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, require
-from clod_adapter.distances import euclidean, normalized_distances, normalizing_distance
+from clod_adapter.equation.autograd import Attenuate, Fade
+from clod_adapter.equation.distances import euclidean, normalized_distances, normalizing_distance
+from clod_adapter.equation.growth import growth_distance, growth_factors
 from clod_adapter.errors import ClodError
 
 SIGMA_MAX = 1e9
 """Stands for an infinite sigma_d. The factor is exactly 1 for d s < 2e5 in float32, d s < 10 in float64."""
 
 Scale = TypeVar("Scale", float, Tensor)
-Fields = tuple[Tensor, Tensor, Tensor, Tensor]
+Fields = tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]
 
 
 class Attenuated(NamedTuple):
-    """The opacities at one dial value.
+    """The opacities at one dial value, and the growth of the scales.
 
     Attributes:
         opacities: ``[N]`` a'', in [0, 1].
         log_opacities: ``[N]`` log a'', in [-inf, 0]; meaningful where a'' underflows.
         keep: ``[N]`` bool, ``log a'' > log(tau s)``.
         drawn: ``[N]`` the rasterizer's input, in [0, 1]: a'' after the cut, above 0 exactly for kept Gaussians.
+        growth: ``[N]`` factor of the scales (``growth.growth_factors``); None without a ``growth_d``.
     """
 
     opacities: Tensor
     log_opacities: Tensor
     keep: Tensor
     drawn: Tensor
+    growth: Tensor | None = None
 
 
 def attenuate(
     opacities: Tensor, sigma_d: Tensor | None, seen_from: Tensor | tuple[Tensor, Camera], virtual_scale: float,
-    config: AttenuationConfig | None, *, activated: bool = False,
+    config: AttenuationConfig | None, *, activated: bool = False, growth_d: Tensor | None = None,
 ) -> Attenuated:  # fmt: skip
-    """The opacities of Gaussians at one dial value. Rendering, training, baking and renderers' hooks all call this.
+    """What is drawn of Gaussians at one dial value. Rendering, training, baking and renderers' hooks all call this.
 
     ``a'' = a exp(log_attenuation)``, then the cut, differentiable, once, in ``opacities`` and ``sigma_d``; distances
     are constants. Where the factor is exactly 1, a'' equals a bit for bit: with the hard cut a dial without effect
@@ -78,6 +83,7 @@ def attenuate(
 
     From logits and centres, on a GPU, of many Gaussians, this is compiled to one pass (``fusing``) that reads 20 bytes
     of a float32 Gaussian (centre, logit, sigma) and writes the 13 of the results. The plain passes move 340 to 370.
+    Growth reads and writes 4 bytes more.
 
     Args:
         opacities: ``[N]`` logits. At a logit of +inf, a is 1 and its gradient 0.
@@ -87,6 +93,7 @@ def attenuate(
         activated: ``opacities`` are a itself, in [0, 1], as rasterizers take them. The gradient is finite: at a = 1
             it is that of the factor and the cut, as anywhere; at a = 0 that of a'' is the factor, and those of
             ``log_opacities`` (-inf) and ``drawn`` are 0.
+        growth_d: ``[N]`` exponents h of the growth of the scales, finite; None for no growth.
 
     Raises:
         ClodError: the dial is below 1 or not finite, or the shapes differ.
@@ -98,6 +105,10 @@ def attenuate(
         return Attenuated(shown, opacities.log() if activated else F.logsigmoid(opacities), keep, shown)
     numbers = float(virtual_scale), log_threshold(config.tau, virtual_scale)
     named = {"opacities" if activated else "opacity_logits": opacities, "sigma_d": sigma_d}
+    more: Any = {"eps": config.eps, "cut": config.cut}
+    if growth_d is not None:
+        more["growth_d"] = conform(sigma_d=sigma_d, growth_d=growth_d)[1]
+        more["reach"] = growth_distance(config)
     if isinstance(seen_from, Tensor):
         d = seen_from
     elif activated or not _from_centres.compiles(seen_from[0]):
@@ -105,9 +116,9 @@ def attenuate(
     else:
         means, position, unit = _centres(*seen_from, config)
         rows = conform(**named, x=means[:, 0])[:2]
-        return Attenuated(*_from_centres(means, position, unit, *rows, *numbers, eps=config.eps, cut=config.cut))
+        return Attenuated(*_from_centres(means, position, unit, *rows, *numbers, **more))
     form = _from_opacities if activated else _from_logits
-    return Attenuated(*form(*conform(**named, d=d.detach()), *numbers, eps=config.eps, cut=config.cut))
+    return Attenuated(*form(*conform(**named, d=d.detach()), *numbers, **more))
 
 
 def log_attenuation(sigma_d: Tensor, d: Tensor, virtual_scale: float, eps: float) -> Tensor:
@@ -127,7 +138,7 @@ def log_attenuation(sigma_d: Tensor, d: Tensor, virtual_scale: float, eps: float
     check_dial(virtual_scale)
     sigma_d, d = conform(sigma_d=sigma_d, d=d)
     opaque = torch.full_like(sigma_d, math.inf)  # log a'' of a Gaussian with log a = 0
-    return _Attenuate.apply(opaque, sigma_d, d.detach(), float(virtual_scale), eps)[1]
+    return Attenuate.apply(opaque, sigma_d, d.detach(), float(virtual_scale), eps)[1]
 
 
 def culling_threshold(tau: float, virtual_scale: Scale) -> Scale:
@@ -153,108 +164,53 @@ def _centres(means: Tensor, camera: Camera, config: AttenuationConfig) -> tuple[
 
 @Fused
 def _from_logits(
-    logits: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, threshold: Number, *, eps: float, cut: str
-) -> Fields:
-    opacities, log_opacities = _Attenuate.apply(logits, sigma, d, virtual_scale, eps)
-    return _cut(opacities, log_opacities, threshold, cut)
+    logits: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, threshold: Number, *, eps: float, cut: str,
+    growth_d: Tensor | None = None, reach: float = 1.0,
+) -> Fields:  # fmt: skip
+    opacities, log_opacities = Attenuate.apply(logits, sigma, d, virtual_scale, eps)
+    return *_cut(opacities, log_opacities, threshold, cut), _growth(growth_d, d, virtual_scale, reach)
 
 
 @Fused
 def _from_centres(
     means: Tensor, position: Tensor, unit: Number, logits: Tensor, sigma: Tensor, virtual_scale: Number,
-    threshold: Number, *, eps: float, cut: str,
+    threshold: Number, *, eps: float, cut: str, growth_d: Tensor | None = None, reach: float = 1.0,
 ) -> Fields:  # fmt: skip
     d = euclidean(means, position).div_(unit)
-    opacities, log_opacities = _Attenuate.apply(logits, sigma, d, virtual_scale, eps)
-    return _cut(opacities, log_opacities, threshold, cut)
+    opacities, log_opacities = Attenuate.apply(logits, sigma, d, virtual_scale, eps)
+    return *_cut(opacities, log_opacities, threshold, cut), _growth(growth_d, d, virtual_scale, reach)
 
 
 @Fused
 def _from_opacities(
-    opacities: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, threshold: Number, *, eps: float, cut: str
-) -> Fields:
+    opacities: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, threshold: Number, *, eps: float, cut: str,
+    growth_d: Tensor | None = None, reach: float = 1.0,
+) -> Fields:  # fmt: skip
     opaque = torch.full_like(opacities, math.inf)
-    factor, log_factor = _Attenuate.apply(opaque, sigma, d, virtual_scale, eps)
+    factor, log_factor = Attenuate.apply(opaque, sigma, d, virtual_scale, eps)
     nothing = opacities <= 0
     logs = opacities.masked_fill(nothing, 1).log().masked_fill(nothing, -math.inf)  # no slope, rather than 1 / 0
-    return _cut(opacities * factor, logs + log_factor, threshold, cut)
+    drawn = _cut(opacities * factor, logs + log_factor, threshold, cut)
+    return *drawn, _growth(growth_d, d, virtual_scale, reach)
 
 
-def _cut(opacities: Tensor, log_opacities: Tensor, threshold: Number, cut: str) -> Fields:
-    """The fields of ``Attenuated`` from a'' and log a''."""
+def _growth(growth_d: Tensor | None, d: Tensor, virtual_scale: Number, reach: float) -> Tensor | None:
+    return None if growth_d is None else growth_factors(growth_d, d, virtual_scale, reach)
+
+
+def _cut(
+    opacities: Tensor, log_opacities: Tensor, threshold: Number, cut: str
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The opacities of ``Attenuated`` from a'' and log a''."""
     keep = log_opacities.detach() > threshold
     # The hard cut's product is five times as fast as where.
-    drawn = opacities * keep.to(opacities) if cut == "hard" else _Fade.apply(opacities, log_opacities, threshold)
+    drawn = opacities * keep.to(opacities) if cut == "hard" else Fade.apply(opacities, log_opacities, threshold)
     return opacities, log_opacities, keep, drawn
-
-
-class _Attenuate(Function):
-    """``(sigmoid(l) e^-u, logsigmoid(l) - u)`` for logit l and ``u = (d s)^2 / (2 v)``; with w = g1 a'' + g2, the
-    gradient is ``w sigmoid(-l)`` for l and ``2 u relu(sigma) / v w`` for sigma.
-
-    u is float64's until it is rounded: float32's exponential would multiply its rounding by u.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, logits: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, eps: float) -> Any:
-        dtype, variance = logits.dtype, twice_variance(sigma, eps)
-        u = d.double().mul(virtual_scale).square_().div_(variance)
-        if eps == 0:  # then the variance may be 0, and 0/0 is to be 0
-            u.masked_fill_(d == 0, 0)
-        factor = u.neg().exp_()
-        if dtype == torch.float64:  # some processors' exp gives 1 - 2^-53 here; float32's rounding gives 1
-            factor.masked_fill_(u < 2**-54, 1)
-        opacities = factor.to(dtype).mul_(logits.sigmoid())
-        ctx.save_for_backward(logits, sigma, variance, u, opacities)
-        ctx.set_materialize_grads(False)
-        return opacities, F.logsigmoid(logits).sub_(u.to(dtype))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor | None, grad_log: Tensor | None) -> Any:
-        logits, sigma, variance, u, opacities = ctx.saved_tensors
-        if grad is None:
-            total = grad_log
-        else:
-            total = grad * opacities if grad_log is None else torch.addcmul(grad_log, grad, opacities)
-        by_logit = by_sigma = None
-        if total is not None and ctx.needs_input_grad[0]:
-            by_logit = logits.neg().sigmoid_().mul_(total)
-        if total is not None and ctx.needs_input_grad[1]:
-            slope = sigma.relu().double().div_(variance).mul_(u).mul_(4).to(sigma.dtype)
-            by_sigma = slope.nan_to_num_(0.0, 0.0, 0.0).mul_(total)
-        return by_logit, by_sigma, None, None, None
-
-
-class _Fade(Function):
-    """``a'' f`` with ``f = min(1, 2 (e^x - 1))`` and ``x = log a'' - log(tau s)``, 0 where x <= 0.
-
-    Uses the same difference as ``keep``, so that exactly the kept Gaussians are drawn. f's slope by x is ``f + 2``
-    where it is defined.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, opacities: Tensor, log_opacities: Tensor, threshold: Number) -> Tensor:
-        share = (log_opacities - threshold).clamp_(max=1).expm1_().mul_(2).clamp_(0, 1)
-        ctx.save_for_backward(opacities, share)
-        return opacities * share
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
-        opacities, share = ctx.saved_tensors
-        fading = share.ceil() - share.floor()  # 1 strictly between 0 and 1; several times as fast as comparing
-        return grad * share, fading.mul_(share + 2).mul_(opacities).mul_(grad), None
 
 
 def check_dial(virtual_scale: float) -> None:
     """Raises ClodError for a dial below 1 or not finite."""
     require(1 <= virtual_scale < math.inf, "virtual_scale", virtual_scale, "at least 1 and finite")
-
-
-def twice_variance(sigma: Tensor, eps: float) -> Tensor:
-    """``2 v = 2 relu(sigma)^2 + eps`` in float64, where squares of float32's numbers neither underflow nor overflow."""
-    return sigma.relu().double().square_().mul_(2).add_(eps)
 
 
 def conform(**tensors: Tensor) -> list[Tensor]:

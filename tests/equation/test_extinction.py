@@ -8,8 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from clod_adapter.attenuation import SIGMA_MAX, attenuate
-from clod_adapter.extinction import extinction_scale, sigma_for_extinction
+from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
+from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
 from exact import (
     DISTANCES,
     DTYPES,

@@ -1,0 +1,185 @@
+"""Growth against mpmath and finite differences, its properties, and that nothing but the scales depends on it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import mpmath
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from clod_adapter.adapter import attach
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import Attenuated, attenuate
+from clod_adapter.equation.distances import normalized_distances
+from clod_adapter.equation.growth import GROWTH_RANGE, LOG_GROWTH_MAX, growth_distance, growth_factors
+from clod_adapter.equation.units import in_world_units, with_distance
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.render import dial as at_dial
+from exact import DISTANCES, DTYPES, SCALES, ZERO, assert_close, config, dial, grid, quick, reference_growth
+from scenes import camera, gaussians
+
+EXPONENTS = [-300.0, -1.0, -0.3, 0.0, 1e-6, 0.5, 0.75, 1.0, 3.0, 17.0]
+REACHES = [1e-3, 0.3, 1.0, 4.2]
+exponent = st.floats(*GROWTH_RANGE, width=32)
+distance = st.floats(0, 100, width=32)
+
+
+def bound(h: float, log_m: mpmath.mpf) -> float:
+    """Of the docstring of ``growth``, in finfo.eps."""
+    return 4 + 2 * abs(h) * (1 + float(log_m))
+
+
+def growth(attenuated: Attenuated) -> Tensor:
+    assert attenuated.growth is not None
+    return attenuated.growth
+
+
+@pytest.mark.parametrize(
+    ("h", "d", "s", "r", "want"),
+    [(0.75, 2.0, 8.0, 1.0, 8.0), (-1.0, 1.0, 4.0, 2.0, 0.5), (0.5, 0.5, 9.0, 0.5, 3.0), (1.0, 0.25, 2.0, 1.0, 1.0),
+     (2.0, 30.0, 1.0, 3.0, 100.0), (3.0, 1e4, 1e4, 1.0, math.exp(20)), (-3.0, 1e4, 1e4, 1.0, math.exp(-20))],
+)  # fmt: skip
+def test_golden_values(h: float, d: float, s: float, r: float, want: float) -> None:
+    assert growth_factors(torch.tensor([h]), torch.tensor([d]), s, r).item() == pytest.approx(want, rel=1e-5)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("scale", "reach"), [*zip(SCALES, REACHES, strict=True), (7.0, 1e-3)])
+def test_factors_and_their_slopes_match_mpmath(dtype: torch.dtype, scale: float, reach: float) -> None:
+    h, d = (column.to(dtype) for column in grid(EXPONENTS, [*DISTANCES, 1.0000001, 5e3]))
+    h.requires_grad_()
+    out = growth_factors(h, d, scale, reach)
+    (slope,) = torch.autograd.grad(out.sum(), h)
+    want, slopes, allowed, of_slopes = [], [], [], []
+    for a, b in zip(h.tolist(), d.tolist(), strict=True):
+        log_g, log_m = reference_growth(a, b, scale, reach)
+        clamped = min(max(log_g, -LOG_GROWTH_MAX), LOG_GROWTH_MAX)
+        want.append(mpmath.exp(clamped))
+        slopes.append(mpmath.exp(log_g) * log_m if clamped == log_g else ZERO)
+        allowed.append(bound(a, log_m))
+        of_slopes.append(bound(a, log_m) + 2 / max(float(log_m), 1e-9))
+    assert_close(out.detach(), want, allowed)
+    assert_close(slope, slopes, of_slopes)
+    assert sum(g > 1 for g in want) > 5
+
+
+def test_the_gradient_matches_finite_differences() -> None:
+    h = torch.tensor([-0.9, -0.1, 0.0, 0.4, 2.9, 1.0], dtype=torch.float64, requires_grad=True)
+    d = torch.tensor([0.7, 1.3, 0.9, 0.2, 4.0, 0.01], dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda x: growth_factors(x, d, 3.0, 0.5), (h,))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_edges_are_finite(dtype: torch.dtype) -> None:
+    """At any finite exponent, at the centre, at distances and dial values whose product overflows."""
+    largest = torch.finfo(dtype).max
+    edges = itertools.product([0.0, -0.0, 1e-30, 1.0, -1.0, largest, -largest], [0.0, 1e-40, 1.0, 1e30, largest])
+    h, d = torch.tensor([*edges], dtype=dtype).unbind(1)
+    h.requires_grad_()
+    for s, r in itertools.product([1.0, 5.0, 1e39, 1e300], [1e-300, 1e-3, 1.0, 1e300]):
+        out = growth_factors(h, d, s, r)
+        (slope,) = torch.autograd.grad(out.sum(), h)
+        assert out.isfinite().all() and slope.isfinite().all()
+        assert (out >= 0.99 * math.exp(-20)).all() and (out <= 1.01 * math.exp(20)).all()
+        assert (out[(h == 0) | (d == 0)] == 1).all()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_nothing_grows_within_the_typical_distance(dtype: torch.dtype) -> None:
+    """Not even in the last bit where d s equals r."""
+    h = torch.tensor([-300.0, -1.0, 0.5, 3.0, 1e6], dtype=dtype)
+    for d in torch.rand(200, generator=torch.Generator().manual_seed(0), dtype=dtype):
+        for s in (1.0, 1.7, 3.3):
+            assert (growth_factors(h, d.expand(5), s, float(d) * s) == 1).all()
+    nearer = torch.linspace(0, 0.3, 5, dtype=dtype)
+    assert (growth_factors(h, nearer, 2.0, 0.6000001) == 1).all()
+    assert (growth_factors(h, nearer[-1:].expand(5), 2.0, 0.59) != 1).all()
+
+
+@given(st.lists(st.tuples(exponent, distance), min_size=1, max_size=20), dial, dial, st.sampled_from(REACHES))
+@quick
+def test_factors_are_monotone_and_multiply(rows: list[tuple[float, float]], a: float, b: float, reach: float) -> None:
+    h, d = torch.tensor(rows, dtype=torch.float64).unbind(1)
+    smaller, larger = (growth_factors(h, d, s, reach) for s in sorted((a, b)))
+    up = h.sign() * (larger / smaller - 1)
+    assert (up >= -1e-12).all()
+    grown = d * min(a, b) >= reach
+    product = (smaller * (max(a, b) / min(a, b)) ** h).clamp(math.exp(-20), math.exp(20))
+    torch.testing.assert_close(larger[grown], product[grown], rtol=1e-10, atol=0)
+    assert torch.equal(growth_factors(h, 2 * d, a, reach), growth_factors(h, d, 2 * a, reach))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
+    logits, sigma, h, d = (torch.linspace(a, b, 50).to(dtype) for a, b in ((-4, 4), (0.1, 1), (-1, 3), (0, 2)))
+    h.requires_grad_()
+    found = growth(attenuate(logits, sigma, d, 3.0, config(), growth_d=h))
+    floats = [x.detach().float() for x in (logits, sigma, d, h)]
+    want = growth(attenuate(*floats[:3], 3.0, config(), growth_d=floats[3]))
+    assert found.dtype == torch.float32 and torch.equal(found, want)
+    (slope,) = torch.autograd.grad(found.sum(), h)
+    assert slope.dtype == dtype and slope.isfinite().all() and (slope[40:] > 0).all()
+
+
+@pytest.mark.parametrize("cut", ["hard", "soft"])
+@pytest.mark.parametrize("form", ["logits", "centres", "opacities"])
+def test_opacities_and_kept_sets_do_not_depend_on_growth(form: str, cut: str) -> None:
+    some, view = gaussians(300, 0, 1), camera()
+    settings = config(0.02, cut=cut, scene_distance=2.0, reference_distance=3.0, max_sv=5.0)
+    sigma, h = torch.linspace(0.1, 3, 300).requires_grad_(), torch.linspace(-1, 3, 300)
+    d = normalized_distances(some.means, view, settings)
+    shown = some.opacities if form == "opacities" else some.opacity_logits
+    given = shown, sigma, (some.means, view) if form == "centres" else d
+    for s in (1.0, 2.7, 5.0):
+        without, grown = (
+            attenuate(*given, s, settings, activated=form == "opacities", growth_d=growth_d) for growth_d in (None, h)
+        )
+        assert without.growth is None and 0 < int(without.keep.sum()) < 300
+        assert all(torch.equal(a, b) for a, b in zip(without[:4], grown[:4], strict=True))
+        slopes = [torch.autograd.grad(out.drawn.sum(), sigma)[0] for out in (without, grown)]
+        assert torch.equal(*slopes)
+        assert torch.equal(growth(grown), growth_factors(h, d, s, 1.5))
+    assert growth(grown).max() > 2
+
+
+def test_growth_needs_a_dial_and_one_shape() -> None:
+    three = torch.ones(3)
+    assert attenuate(three, None, three, 2.0, None, growth_d=three).growth is None
+    with pytest.raises(ClodError, match=r"growth_d \(4,\)"):
+        attenuate(three, three, three, 2.0, config(), growth_d=torch.ones(4))
+    with pytest.raises(ClodError, match=r"growth_d \(1,\)"):
+        attenuate(three, three, (torch.ones(3, 3), camera()), 2.0, config(), growth_d=torch.ones(1))
+
+
+def test_growth_begins_at_the_typical_distance() -> None:
+    assert growth_distance(AttenuationConfig()) == 1.0
+    assert growth_distance(AttenuationConfig(reference_distance=3.0)) == 3.0
+    assert growth_distance(AttenuationConfig(scene_distance=4.0, reference_distance=3.0)) == 0.75
+    assert growth_distance(AttenuationConfig(scene_distance=4.0)) == 1.0
+    for normalizer in ("max", "quantile"):
+        assert growth_distance(AttenuationConfig(normalizer=normalizer, reference_distance=3.0)) == 1.0
+
+
+@pytest.mark.parametrize("normalizer", ["scene", "max", "quantile"])
+@pytest.mark.parametrize(("unit", "known"), [(1.0, 0.0), (1.0, 2.5), (3.7, 0.0), (3.7, 2.5)])
+def test_changing_the_unit_keeps_growth(normalizer: str, unit: float, known: float) -> None:
+    settings = AttenuationConfig(normalizer=normalizer, scene_distance=unit, reference_distance=known)
+    some = attach(gaussians(200, 0, 1), torch.linspace(0.1, 3, 200), settings)
+    some = some.replace(growth_d=torch.linspace(-1, 3, 200))
+
+    def factors(given: Gaussians) -> Tensor:
+        return growth(at_dial(given, camera(), 4.0))
+
+    want = factors(some)
+    assert want.max() > 2
+    for other in (
+        with_distance(some, 9.1), in_world_units(some), in_world_units(with_distance(some, 9.1)),
+        with_distance(with_distance(some, 0.02), unit),
+    ):  # fmt: skip
+        torch.testing.assert_close(factors(other), want, rtol=3e-5, atol=0)
