@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 FROZEN = {f"lr_{name}": 0.0 for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
-CONFIG = clod.AdaptConfig(**FROZEN)
+CONFIG = clod.AdaptConfig(growth="off", **FROZEN)
 PAPER = clod.AdaptConfig.paper(tau=CONFIG.tau, cut=CONFIG.cut, normalizer=CONFIG.normalizer, **FROZEN)
 STUCK_STEPS, TRAINING_STEPS = 100, 600
 TINY = 1e-38  # 0 to the equation, whose eps is 1e-8, but not to a division

@@ -55,7 +55,7 @@ class AttenuationConfig:
     quantile: float = option(0.95, "quantile of the distances in the frustum that is D (normalizer quantile)")
     scene_distance: float = option(1.0, "D in world units (normalizer scene); files have 1, sigma_d in world units")
     reference_distance: float = option(
-        0.0, "typical distance in the training views, world units, for uses without a camera; 0 if unknown"
+        0.0, "typical distance in the training views, world units, from which on scales grow; 0 if unknown"
     )
     max_sv: float = option(5.0, "largest dial value of training")
 

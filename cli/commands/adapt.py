@@ -102,15 +102,16 @@ ADAPT = Command(
     description="""\
 Give a trained 3D Gaussian splat a quality dial: one file for every budget.
 
-Learns one number per Gaussian, sigma_d, by which a renderer fades detail out
-with distance, and fine-tunes the other attributes. The dial s is set when
-rendering: s = 1 is full quality; at s about s^-1.5 of the Gaussians are drawn.
+Learns two numbers per Gaussian: sigma_d, by which a renderer fades detail out
+with distance, and growth_d, by which the others grow into the gaps. Fine-tunes
+the other attributes. The dial s is set when rendering: s = 1 is full quality;
+at s about s^-1.5 of the Gaussians are drawn.
 """,
     usage="PLY [--images DIR] [--max-sv S] [--out OUT.ply] [options]",
     epilog="""\
 outputs (existing files are replaced):
-  OUT.ply          the splat with sigma_d, and a calibration in its header: dial
-                   value, count, PSNR, SSIM and frame time
+  OUT.ply          the splat with sigma_d and growth_d, and a calibration in its
+                   header: dial value, count, PSNR, SSIM and frame time
   OUT.safetensors  the adapter: "clod-adapt apply" rebuilds OUT.ply from it
   OUT.json         the report: settings, machine, times, and quality on held-out
                    photographs (every 8th by name) per dial value

@@ -193,5 +193,5 @@ def output_line(output: dict[str, Any], total: int) -> str:
 def baking_line(target: Target, growth: bool) -> str:
     """The cameras that a baked file is for, and what it lacks."""
     cameras = f"exact at the camera of {target.camera.name} only" if target.camera else f"baked for {target.about}"
-    scales = "; the scales have grown to it" if growth else ""
+    scales = "; the scales include growth" if growth else ""
     return f"{cameras}; lossy: without the dial and the Gaussians culled at this dial value{scales}"

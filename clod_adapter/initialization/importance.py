@@ -54,7 +54,8 @@ def initialize(
         error: ``[N]`` from ``removal_error`` of these views and seed, where it is known.
     """
     if base.attenuation is not None and has_dial(base):
-        own = dataclasses.replace(base.attenuation, max_sv=config.max_sv)
+        known = _reference_distance(base, views, config)
+        own = dataclasses.replace(base.attenuation, max_sv=config.max_sv, reference_distance=known)
         return in_world_units(with_growth(base.replace(attenuation=own), config, base.growth_d))
     views = spread(views, MOST_VIEWS)
     attenuation = config.attenuation(scene_distance(base, views, config.quantile))
@@ -87,15 +88,26 @@ def with_growth(initial: Gaussians, config: AdaptConfig, growth_d: Tensor | None
 
 def for_training(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> Gaussians:
     """``initial`` with sigma_d in units of the scene's typical distance, measured in the views where it is unknown."""
+    known = _reference_distance(initial, views, config)
     assert initial.attenuation is not None
-    known = known_distance(initial.attenuation) or scene_distance(initial, spread(views, MOST_VIEWS), config.quantile)
     own = dataclasses.replace(initial.attenuation, reference_distance=known)
     return with_distance(initial.replace(attenuation=own), known)
 
 
+def _reference_distance(dialled: Gaussians, views: Sequence[View], config: AdaptConfig) -> float:
+    """The typical distance, world units; where it is unknown, the unit of growth, else the distance in the views."""
+    assert dialled.attenuation is not None
+    if known := known_distance(dialled.attenuation):
+        return known
+    if dialled.growth_d is not None and bool(dialled.growth_d.any()):
+        return dialled.attenuation.scene_distance
+    return scene_distance(dialled, spread(views, MOST_VIEWS), config.quantile)
+
+
 def has_dial(base: Gaussians) -> bool:
-    """Whether there is a sigma_d with any effect."""
-    return base.sigma_d is not None and bool((base.sigma_d < SIGMA_MAX).any())
+    """Whether there is a dial with any effect."""
+    grows = base.growth_d is not None and bool(base.growth_d.any())
+    return base.sigma_d is not None and (grows or bool((base.sigma_d < SIGMA_MAX).any()))
 
 
 def usable_views(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:

@@ -75,7 +75,8 @@ def rasterization(
         virtual_scale: the dial s >= 1.
         attenuation: settings of the equation, ``Gaussians.attenuation`` of the file; by default
             ``AttenuationConfig()``, with distances in world units.
-        growth_d: ``[..., N]`` exponents of the growth of the scales; None for no growth.
+        growth_d: ``[..., N]`` exponents of the growth of the scales, which begins at ``reference_distance`` of the
+            attenuation or, where that is 0, at 1 world unit; None for no growth.
 
     Returns:
         ``render_colors [..., C, H, W, X]``, ``render_alphas [..., C, H, W, 1]`` and ``meta``.

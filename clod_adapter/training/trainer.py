@@ -29,7 +29,7 @@ BETA1, BETA2 = 0.9, 0.999
 
 
 class Trainer:
-    """Holds everything that training steps change.
+    """Holds everything that training steps change. The start has a growth_d if the config has growth.
 
     Attributes:
         parameters: tensors by name; the first ``objective.trained`` rows of those in ``stepped`` are trained.

@@ -8,14 +8,16 @@ import pytest
 import torch
 from torch import Tensor
 
+from clod_adapter.adapter import attach
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.equation.growth import growth_factors
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization import growth_start, importance
 from clod_adapter.initialization.growth_start import MOST, SHARE, initial_growth
-from clod_adapter.initialization.importance import initialize
+from clod_adapter.initialization.importance import for_training, has_dial, initialize, scene_distance
 from clod_adapter.initialization.pruning_order import PruningOrder, pruning_order
+from clod_adapter.render import dial
 from scenes import gaussians, photograph, ring
 
 MAX_SV = 5.0
@@ -99,3 +101,21 @@ def test_a_dial_of_the_base_keeps_its_growth(monkeypatch: pytest.MonkeyPatch) ->
     assert initialize(grown, views, AdaptConfig()).growth_d is grown.growth_d
     assert not initialize(plain, views, AdaptConfig()).growth_d.any()
     assert initialize(grown, views, AdaptConfig(growth="off")).growth_d is None and fitted == []
+
+
+def test_unit_of_growth_is_kept_or_measured_once() -> None:
+    """Without a known distance growth is in units of D; without growth the distance is measured in the views."""
+    some = gaussians(60, 0, 0)
+    views = photograph(some, ring(2, 16, 12))
+    plain = attach(some, torch.full((60,), 3.0))
+    grown = attach(some, torch.full((60,), 3.0), None, torch.full((60,), 0.5))
+    for base, distance in ((grown, 1.0), (plain, scene_distance(some, views, 0.95))):
+        initial = initialize(base, views, AdaptConfig())
+        assert initial.attenuation is not None and initial.attenuation.reference_distance == distance
+        before, after = (
+            dial(one, views[0].camera, 2.0).growth for one in (base, for_training(initial, views, AdaptConfig()))
+        )
+        if base is grown:
+            assert before is not None and after is not None
+            torch.testing.assert_close(after, before)
+    assert has_dial(attach(some, None, None, torch.full((60,), 0.5))) and not has_dial(attach(some))
