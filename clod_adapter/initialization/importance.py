@@ -95,13 +95,9 @@ def for_training(initial: Gaussians, views: Sequence[View], config: AdaptConfig)
 
 
 def _reference_distance(dialled: Gaussians, views: Sequence[View], config: AdaptConfig) -> float:
-    """The typical distance, world units; where it is unknown, the unit of growth, else the distance in the views."""
+    """The typical distance, world units, measured in the views where it is unknown; growth begins there."""
     assert dialled.attenuation is not None
-    if known := known_distance(dialled.attenuation):
-        return known
-    if dialled.growth_d is not None and bool(dialled.growth_d.any()):
-        return dialled.attenuation.scene_distance
-    return scene_distance(dialled, spread(views, MOST_VIEWS), config.quantile)
+    return known_distance(dialled.attenuation) or scene_distance(dialled, spread(views, MOST_VIEWS), config.quantile)
 
 
 def has_dial(base: Gaussians) -> bool:
