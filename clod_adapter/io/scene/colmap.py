@@ -32,7 +32,7 @@ def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
         for image in images:
             name_parts(image.name, model)
         posed = [_posed_image(model, image) for image in images if image.has_pose]
-    except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
+    except (ValueError, OverflowError, IndexError, KeyError, RuntimeError, MemoryError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ClodError(f"{model}: COLMAP cannot read this model ({reason}); copy or export it again") from error
     if not posed:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from clod_adapter.errors import ClodError
@@ -57,6 +57,7 @@ def test_lenses_match_pycolmap(kind: str) -> None:
 
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.text("0123456789 .-#\nnaPINHOLE", max_size=60), st.sampled_from(["cameras", "images", "points3D"]))
+@example("1 0 0 1 -1 0 0 0.5\n", "points3D")  # a colour that is no uint8
 @pytest.mark.parametrize("library", ["plain"], indirect=True)
 @pytest.mark.usefixtures("library")
 def test_damaged_text_raises_only_clod_error(tmp_path: Path, text: str, file: str) -> None:
