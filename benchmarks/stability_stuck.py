@@ -134,7 +134,7 @@ def stuck(run: Trainer) -> int:
         seen = seen | (torch.autograd.grad(now.drawn.sum(), x, retain_graph=True)[0] != 0)
         if s == 1:
             out = ~now.keep
-        if run.objective.has_target_count:
+        if run.config.has_target_count:
             none, all_ = (
                 count_gradient(now._replace(keep=kept), p["opacity_logits"], s, reading.tau, 1.0, config)
                 for kept in (torch.zeros_like(now.keep), torch.ones_like(now.keep))

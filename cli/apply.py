@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from clod_adapter._support.version import package_version
-from clod_adapter.adapter import dial_columns
+from clod_adapter.adapter import dial_tensors
 from clod_adapter.errors import ClodError
 from clod_adapter.io.adapter_file import load_adapter
 from clod_adapter.io.checkpoint import save, trimmed
@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         raise ClodError(f"{args.base}: {error}") from error
     rows = trimmed(base, adapter.kept, adapter.sh_degree)
     save(args.out, adapted, rows, version=adapter.version, calibration=adapter.calibration)
-    dial = " and ".join(dial_columns(adapted))
+    dial = " and ".join(dial_tensors(adapted))
     print(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with {dial}")
     return {
         "command": "apply", "version": package_version(), "base": args.base, "adapter": args.adapter,

@@ -66,7 +66,7 @@ class Adapter:
 
     def __post_init__(self) -> None:
         count = self.sigma_d.numel()
-        for name, column in dial_columns(self).items():
+        for name, column in dial_tensors(self).items():
             if column.shape != (count,) or column.dtype != torch.float32:
                 raise ClodError(f"Adapter.{name} is {_kind(column)}, it must be float32 [{count}]")
             if not column.isfinite().all():
@@ -129,11 +129,11 @@ class Adapter:
             if update.dtype == torch.float16:  # old, not old + 0, where nothing changed: that would turn -0 into 0
                 update = torch.where(update == 0, old, old + update.float())
             changes[name] = update
-        changes |= {name: column.to(base.means.device) for name, column in dial_columns(self).items()}
+        changes |= {name: column.to(base.means.device) for name, column in dial_tensors(self).items()}
         return detach(base).replace(**changes, attenuation=self.attenuation, screen_filter=self.screen_filter)
 
 
-def dial_columns(owner: Adapter | Gaussians) -> dict[str, Tensor]:
+def dial_tensors(owner: Adapter | Gaussians) -> dict[str, Tensor]:
     """The columns of DIAL that it has, by name."""
     return {name: column for name in DIAL if (column := getattr(owner, name)) is not None}
 
@@ -171,7 +171,7 @@ def extract(
             raise ClodError(f"{name} is {_kind(new)}, in the base {_kind(old)}; give the Gaussians that were adapted")
         if not torch.equal(old, new):
             updates[name] = _update(name, old, new).cpu()
-    for name, column in dial_columns(adapted).items():
+    for name, column in dial_tensors(adapted).items():
         columns[name] = column.detach().float().cpu().clone()
     assert adapted.attenuation is not None
     return Adapter(

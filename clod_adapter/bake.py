@@ -67,9 +67,10 @@ def bake(
         raise ClodError(f"no Gaussian is kept at s = {virtual_scale:g}; bake a smaller s")
     shown = dialled if camera else dial(gaussians, distances, virtual_scale**FADED)
     baked = {"opacity_logits": _logits_drawn(shown, gaussians.opacity_logits)}
-    grown = dialled if camera else dial(gaussians, distances, virtual_scale**GROWN)
-    if grown.growth is not None:
-        baked["log_scales"] = gaussians.log_scales + grown.growth.log()[:, None]
+    if gaussians.growth_d is not None:
+        growth = (dialled if camera else dial(gaussians, distances, virtual_scale**GROWN)).growth
+        assert growth is not None
+        baked["log_scales"] = gaussians.log_scales + growth.log()[:, None]
     return detach(gaussians.replace(**baked)).select(dialled.keep)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from clod_adapter.adapter import DIAL, attach, dial_columns
+from clod_adapter.adapter import DIAL, attach, dial_tensors
 from clod_adapter.blocks.divide import DIALS, Division
 from clod_adapter.blocks.file import checked, load_block, refused_if_damaged, save_block
 from clod_adapter.blocks.train import Learned
@@ -58,7 +58,7 @@ class BlockFiles:
             return
         tensors = {"block": division.block, "seen": division.seen, "kept": division.kept}
         about = {"extent": division.extent, "attenuation": division.initial.attenuation}
-        save_block(self.start, dial_columns(division.initial) | tensors, about, self.run_of)
+        save_block(self.start, dial_tensors(division.initial) | tensors, about, self.run_of)
 
     def load_start(self, base: Gaussians, views: Sequence[View]) -> tuple[Division, BlockFiles]:
         """The division of the file, and the files of the blocks that it makes.

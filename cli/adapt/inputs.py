@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from clod_adapter.adapter import dial_columns
+from clod_adapter.adapter import dial_tensors
 from clod_adapter.blocks.memory import MemoryPlan
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
@@ -80,7 +80,7 @@ def with_base_rows(setup: Setup, inputs: Inputs) -> Inputs:
         Stopped: Ctrl-C.
     """
     args, console, scene, notes = setup.args, setup.console, inputs.scene, list[str]()
-    if columns := tuple(dial_columns(inputs.base.gaussians)):
+    if columns := tuple(dial_tensors(inputs.base.gaussians)):
         used = columns if inputs.config.growth == "on" else columns[:1]
         dropped = "; its growth_d is dropped, as growth is off" if used < columns else ""
         notes.append(f"{args.ply} has a dial already: continuing from its {' and '.join(used)}{dropped}")

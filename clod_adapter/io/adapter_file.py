@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from safetensors.torch import save
 
-from clod_adapter.adapter import Adapter, dial_columns
+from clod_adapter.adapter import Adapter, dial_tensors
 from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
@@ -49,7 +49,7 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
         about["trimmed"] = {"base_count": adapter.base_count, "sh_degree": adapter.sh_degree}
     check_config(adapter.config)
     metadata = {KEY: json.dumps(about, sort_keys=True, allow_nan=False)}
-    tensors = {**dial_columns(adapter), **adapter.updates}
+    tensors = {**dial_tensors(adapter), **adapter.updates}
     if adapter.kept is not None:
         tensors["kept"] = torch.from_numpy(np.packbits(adapter.kept.cpu().numpy()))
     with atomic_path(path) as temporary:

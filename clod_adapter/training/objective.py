@@ -138,7 +138,8 @@ class Objective:
         total, count = decay.new_zeros(()), torch.zeros_like(decay[first])
         kept = torch.zeros_like(count, dtype=torch.bool)
         losses = []
-        for s, dialled, image in self._rendered(leaves, view.camera, dials):
+        distances = normalized_distances(parameters["means"], view.camera, self.attenuation)  # for all dial values
+        for s, dialled, image in self._rendered(leaves, view.camera, distances, dials):
             loss = photometric_loss(image, photograph, config.ssim_weight)
             losses.append(float(loss.detach()))
             weight = self._weight(s, alone=len(dials) == 1)
@@ -150,14 +151,14 @@ class Objective:
                 count += self._count_gradient(dialled, logits, view, s, weight * losses[-1])
             kept |= dialled.keep[first]
         if counted is not None:
-            count += self._counted(parameters, view, counted, losses[-1])
+            count += self._counted(parameters, view, distances[first], counted, losses[-1])
         found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
         gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}
         count = count if config.parameter == "log" else count / decay.detach()[first]
         return GradientSum(gradients | {self.decay: gradients[self.decay] + count}, kept, losses[0])
 
     def _rendered(
-        self, leaves: dict[str, Tensor], camera: Camera, dials: list[float]
+        self, leaves: dict[str, Tensor], camera: Camera, distances: Tensor, dials: list[float]
     ) -> Iterator[tuple[float, Attenuated, Tensor]]:
         """Each dial value, the opacities of the rows that have a dial, and the image."""
         rows = slice(self.trained) if self.part.full_context else slice(None)
@@ -165,7 +166,6 @@ class Objective:
         shown = Gaussians(**attributes, screen_filter=self.screen_filter)
         logits, sigma = leaves["opacity_logits"][rows], self.sigma(leaves[self.decay][rows])
         growth_d = leaves["growth_d"][rows] if "growth_d" in leaves else None
-        distances = normalized_distances(leaves["means"], camera, self.attenuation)  # once for all dial values
         for s in dials:
             dialled = attenuate(logits, sigma, distances[rows], s, self.attenuation, growth_d=growth_d)
             drawn, growth = dialled.drawn, dialled.growth
@@ -177,14 +177,13 @@ class Objective:
             yield s, dialled, splat(shown, drawn, camera, growth=growth)[0]
 
     @torch.no_grad()
-    def _counted(self, parameters: dict[str, Tensor], view: View, s: float, loss: float) -> Tensor:
+    def _counted(self, parameters: dict[str, Tensor], view: View, d: Tensor, s: float, loss: float) -> Tensor:
         """``_count_gradient`` at a dial value that is not rendered, at most halfway from max_sv to 1/tau.
 
         Its weight is 1, not w_s: with half of w_s, counts at the far end were 1.25 times the target, at a gain of 0.05
         to 0.1 dB at equal counts.
         """
         s, first = min(s, (self.config.max_sv + 1 / self.attenuation.tau) / 2), slice(self.trained)
-        d = normalized_distances(parameters["means"][first], view.camera, self.attenuation)
         logits, sigma = parameters["opacity_logits"][first], self.sigma(parameters[self.decay][first])
         dialled = attenuate(logits, sigma, d, s, self.attenuation)
         return self._count_gradient(dialled, logits, view, s, loss)
