@@ -151,9 +151,11 @@ class AdaptConfig:
         None, "share of Gaussians to keep at s = 1 (default: as the plan measures; 0.62 without a plan)"
     )
     parameter: str = option("log", "trained parameter: log (of sigma_d) or linear (sigma_d itself, the paper's)")
-    sampling: str = option("pair", "dial values per step: pair (1 and a log-uniform one), log or uniform (the paper's)")
+    sampling: str = option(
+        "pair", "dial values per step: pair (1 and a log-uniform one, or two of these), log or uniform (the paper's)"
+    )
     full_weight: float = option(
-        1.75, "weight of the loss at s = 1 relative to that at the other dial value (sampling pair)"
+        2.5, "weight of the loss at s = 1 relative to that at the other dial value (sampling pair)"
     )
     full_share: float = option(0.0, "share of steps at s = 1 (samplings log and uniform)")
     exponent: float = option(1.5, "target-count curve: the target share of Gaussians at s is s^-exponent")

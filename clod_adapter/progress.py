@@ -26,7 +26,6 @@ class Phase(StrEnum):
     COVERAGE = "block coverage"
     CONTEXT = "context Gaussians"
     TARGET_IMAGES = "target images"
-    TARGET_COUNTS = "target counts"
     TRAINING = "training"
     EVALUATION = "evaluation"
     FRAME_TIMES = "frame times"

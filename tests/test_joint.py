@@ -18,10 +18,11 @@ import inria_forks
 from clod_adapter.adapter import ATTRIBUTES, attach, detach
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.blocks.divide import divide
-from clod_adapter.blocks.targets import context_rows, with_target_shares
+from clod_adapter.blocks.targets import block_target, context_rows
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation import attenuation, growth
+from clod_adapter.equation.distances import typical_distance
 from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.evaluation.budget import dial_for
 from clod_adapter.evaluation.evaluate import evaluate
@@ -63,7 +64,8 @@ def evaluation(model: Gaussians) -> list[Any]:
 def objective(config: AdaptConfig, trained: int = N, **part: Any) -> Callable[[Gaussians], list[Any]]:
     def gradients(model: Gaussians) -> list[Any]:
         assert model.attenuation is not None and model.sigma_d is not None
-        asked = Objective(config, model.attenuation, ("means", "sh0"), TrainableSubset(trained, **part))
+        typical = typical_distance(model.means, CAMERAS, model.attenuation)[:trained]
+        asked = Objective(config, model.attenuation, ("means", "sh0"), TrainableSubset(trained, **part), typical)
         names = ("growth_d",) if config.growth == "on" else ()
         parameters = {name: getattr(model, name) for name in (*ATTRIBUTES, *names)}
         parameters[asked.decay] = asked.parameter(model.sigma_d)
@@ -136,12 +138,12 @@ def inria(model: Gaussians) -> list[Tensor]:
 
 
 def blocks(model: Gaussians) -> list[Any]:
-    """A block's context, and its target shares."""
+    """A block's context, and its target share."""
     views, config = views_of(model), AdaptConfig(max_sv=4.0)
     division = divide(model, views, config, 2)
-    shares = with_target_shares(division, 0, [views[k] for k in division.views(0)], config, first=False)
+    target = block_target(division, 0, CAMERAS, config, first=False)
     context = [context_rows(division, 0, views, after) for after in (None, model)]
-    return [division.kept, *context, *(share.target_share(DIAL) for share in shares)]
+    return [*context, target(DIAL)]
 
 
 def popping(model: Gaussians) -> list[Any]:

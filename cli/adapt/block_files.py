@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import DIAL, attach, dial_tensors
-from clod_adapter.blocks.divide import DIALS, Division
+from clod_adapter.blocks.divide import Division
 from clod_adapter.blocks.file import checked, load_block, refused_if_damaged, save_block
 from clod_adapter.blocks.train import Learned
 from clod_adapter.cameras import View
@@ -56,7 +56,7 @@ class BlockFiles:
         """Writes a division, unless another job has written one."""
         if self.start.exists():
             return
-        tensors = {"block": division.block, "seen": division.seen, "kept": division.kept}
+        tensors = {"block": division.block, "seen": division.seen}
         about = {"extent": division.extent, "attenuation": division.initial.attenuation}
         save_block(self.start, dial_tensors(division.initial) | tensors, about, self.run_of)
 
@@ -72,7 +72,7 @@ class BlockFiles:
         names = DIAL if self.run_of["settings"]["growth"] == "on" else DIAL[:1]
         shapes = {name: (torch.float32, (len(base),)) for name in names} | {
             "block": (torch.int16, (len(base),)),
-            "seen": (torch.float32, (len(views), count)), "kept": (torch.float32, (len(views), DIALS)),
+            "seen": (torch.float32, (len(views), count)),
         }  # fmt: skip
         checked(self.start, tensors, shapes)
         if tensors["block"].unique().tolist() != list(range(count)):
@@ -81,7 +81,7 @@ class BlockFiles:
             settings, extent = AttenuationConfig(**about["attenuation"]), float(about["extent"])
         dial = {name: tensors[name].to(device) for name in names}
         begun = attach(base, attenuation=settings, **dial)
-        division = Division(begun, tensors["block"].to(device), tensors["seen"], tensors["kept"], extent)
+        division = Division(begun, tensors["block"].to(device), tensors["seen"], extent)
         return division, replace(self, run_of=self.run_of | {"start": _digest(tensors)}, count=count)
 
     def save_learned(self, learned: Learned, block: int, number: int) -> None:

@@ -13,16 +13,14 @@ from torch import Tensor
 from clod_adapter.adapter import attach
 from clod_adapter.cameras import Camera, View, camera_extent
 from clod_adapter.config import AdaptConfig
-from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.importance import initialize
 from clod_adapter.progress import Listener, Phase, tell
-from clod_adapter.render import dial, splat
+from clod_adapter.render import splat
 
 UNSEEN = 0.005  # of a block's coverage over all views, the share that the views it is not trained on may have
 SMALLER = 4  # downscaling of the images that coverage is measured in
-DIALS = 9  # dial values at which the Gaussians kept by the initialization are counted
 
 
 @dataclass(frozen=True)
@@ -33,14 +31,12 @@ class Division:
         initial: the Gaussians with the initial dial.
         block: ``[N]`` int16, the block of each Gaussian.
         seen: ``[V, B]`` float32, the share of each view's image that each block covers.
-        kept: ``[V, DIALS]`` float32, Gaussians that the initialization keeps in each view, at even steps of log s.
         extent: of all cameras, world units.
     """
 
     initial: Gaussians
     block: Tensor
     seen: Tensor
-    kept: Tensor
     extent: float
 
     @property
@@ -130,15 +126,14 @@ def divide(
             f"the checkpoint's dial has the normaliser {initial.attenuation.normalizer}, whose distances depend on all "
             "Gaussians in view: it cannot be trained in blocks; adapt it whole"
         )
-    seen, kept = torch.empty(len(views), count), torch.empty(len(views), DIALS)
+    seen = torch.empty(len(views), count)
     for k, view in enumerate(views):
         shown = coverage(initial, initial.opacities, _smaller(view.camera)).double()
         seen[k] = (shown.new_zeros(count).index_add_(0, block.long(), shown) / shown.sum().clamp(min=1e-9)).float()
-        kept[k] = torch.tensor(kept_counts(initial, view, dial_grid(config)))
         tell(progress, Phase.COVERAGE, k + 1, len(views))
     initial = attach(base, initial.sigma_d, initial.attenuation, initial.growth_d)
     extent = camera_extent([view.camera for view in views]) or initial.attenuation.reference_distance  # type: ignore[union-attr]
-    return Division(initial, block, seen, kept, extent)
+    return Division(initial, block, seen, extent)
 
 
 def check_divisible(config: AdaptConfig) -> None:
@@ -148,19 +143,6 @@ def check_divisible(config: AdaptConfig) -> None:
             "the paper's form cannot be trained in blocks: its count and its distances are of all Gaussians at once; "
             "leave out --form paper, or --memory"
         )
-
-
-def dial_grid(config: AdaptConfig) -> list[float]:
-    """DIALS dial values from 1 to ``max_sv`` in even steps of their logarithm."""
-    return [config.max_sv ** (k / (DIALS - 1)) for k in range(DIALS)]
-
-
-@torch.no_grad()
-def kept_counts(gaussians: Gaussians, view: View, dials: Sequence[float]) -> list[float]:
-    """The number of Gaussians kept in a view at some dial values."""
-    assert gaussians.attenuation is not None
-    distances = normalized_distances(gaussians.means, view.camera, gaussians.attenuation)
-    return [float(dial(gaussians, distances, s).keep.sum()) for s in dials]
 
 
 def coverage(gaussians: Gaussians, opacities: Tensor, camera: Camera, growth: Tensor | None = None) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -12,21 +12,21 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import detach
-from clod_adapter.blocks.divide import DIALS, Division, coverage, dial_grid, kept_counts
-from clod_adapter.cameras import View
+from clod_adapter.blocks.divide import Division, coverage
+from clod_adapter.cameras import Camera, View
 from clod_adapter.config import AdaptConfig
-from clod_adapter.equation.distances import normalized_distances
+from clod_adapter.equation.distances import normalized_distances, typical_distance
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.importance import spread
 from clod_adapter.losses import unit
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import dial, splat
-from clod_adapter.training.objective import TargetView
 from clod_adapter.training.target_count import TargetShare, target_curve
 
 LEFT_OUT = 1e-3  # of an image, the share that the Gaussians left out of a block's context may cover
 CONTEXT_VIEWS = 32  # most views that the context is chosen in
 BARE = 0.01  # of a pixel: where Gaussians cover less, blocks share the error by their sizes too
+DIALS = 9  # dial values at which the Gaussians kept by the initialization are counted
 SECOND = 0.25  # of the steps, those of the second pass
 LEAST_SEEN = 0.02  # of an image: a block that covers less has too small a part of the whole loss
 
@@ -71,42 +71,41 @@ def _least_covered(covered: Tensor) -> Tensor:
     return ordered[few - 1] if few else covered.new_zeros(())
 
 
-def with_target_shares(
-    division: Division,
-    block: int,
-    views: Sequence[View],
-    config: AdaptConfig,
-    *,
-    first: bool,
-    progress: Listener | None = None,
-) -> list[TargetView]:
-    """A block's views, each with the block's target share in it.
+def block_target(
+    division: Division, block: int, cameras: Sequence[Camera], config: AdaptConfig, *, first: bool
+) -> Callable[[float], TargetShare]:
+    """The block's target in the count term, by dial value.
 
     In an undivided run the count term's gradient on each of all N Gaussians is ``loss (eta / target - 1) / (target
     N)``. For a block, ``eta / target`` is the number that the block keeps divided by the number that it should keep:
-    ``target N`` times its part of the Gaussians that the initialization keeps in this view at this s. So after
-    initialization each block is penalised like the whole scene, and an allocation found between blocks stays. The loss
-    is that of the whole image; in the first pass the block's is the part of the image it covers. Views that do not
-    show the block would penalise it too: each of its own views also counts for some of those.
+    ``target N`` times its part of the Gaussians that the initialization keeps at this s. So after initialization each
+    block is penalised like the whole scene, and an allocation found between blocks stays. The loss is that of the whole
+    image; in the first pass the block's is the part of the image it covers. Views that do not show the block would
+    penalise it too: each of its own views also counts for some of those.
 
     Args:
-        views: those of ``division.views(block)``, in that order.
+        cameras: the whole scene's, which Gaussians are counted at typical distances from.
     """
-    numbers, dials, own = division.views(block), dial_grid(config), division.initial.select(division.rows(block))
-    each, found = len(division.seen) / len(numbers), list[TargetView]()
-    for view, k in zip(views, numbers, strict=True):
-        parts = np.array(kept_counts(own, view, dials)) / division.kept[k].clamp(min=1).numpy()
-        stands_for = each / max(float(division.seen[k, block]), LEAST_SEEN) if first else each
-        share = partial(_target_share, config, parts, stands_for, len(own), len(division.initial))
-        found.append(TargetView(view, share))
-        tell(progress, Phase.TARGET_COUNTS, len(found), len(numbers))
-    return found
+    initial, numbers = division.initial, division.views(block)
+    assert initial.attenuation is not None
+    distances, own = typical_distance(initial.means, cameras, initial.attenuation), division.block == block
+    kept = [dial(initial, distances, s).keep for s in _dial_grid(config)]
+    parts = np.array([float((rows & own).sum() / rows.sum().clamp(min=1)) for rows in kept])
+    stands_for = len(division.seen) / len(numbers)
+    if first:
+        stands_for /= max(float(division.seen[numbers, block].mean()), LEAST_SEEN)
+    return partial(_target_share, config, parts, stands_for, int(own.sum()), len(initial))
+
+
+def _dial_grid(config: AdaptConfig) -> list[float]:
+    """DIALS dial values from 1 to ``max_sv`` in even steps of their logarithm."""
+    return [config.max_sv ** (k / (DIALS - 1)) for k in range(DIALS)]
 
 
 def _target_share(
     config: AdaptConfig, parts: np.ndarray, stands_for: float, count: int, total: int, virtual_scale: float
 ) -> TargetShare:
-    """The target of ``count`` of ``total`` Gaussians, which are ``parts [DIALS]`` of the kept ones in a view."""
+    """The target of ``count`` of ``total`` Gaussians, which are ``parts [DIALS]`` of the kept ones."""
     at = math.log(virtual_scale) / math.log(config.max_sv) * (DIALS - 1)
     part = float(np.interp(at, np.arange(DIALS), parts))
     whole = target_curve(virtual_scale, config.share, config.exponent)

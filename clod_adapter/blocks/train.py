@@ -15,7 +15,7 @@ Each block has its share of an undivided run:
 - A block takes as many steps as the undivided run takes of the views that see it, so that each Gaussian is stepped as
   often. All blocks together take more, as a view may see several.
 - The target-count curve counts all Gaussians. A block's target is its share of the Gaussians that the initialization
-  keeps in the same view at the same dial value, scaled to the curve (``with_target_shares``).
+  keeps at the same dial value, scaled to the curve (``block_target``).
 """
 
 from __future__ import annotations
@@ -28,11 +28,12 @@ import torch
 from torch import Tensor
 
 from clod_adapter.blocks.divide import Division
-from clod_adapter.blocks.targets import block_config, context_rows, target_image, with_target_shares
+from clod_adapter.blocks.targets import block_config, block_target, context_rows, target_image
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.importance import MOST_VIEWS, spread
 from clod_adapter.io.scene.image_cache import ImageCache
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.training.loop import adapt
@@ -92,10 +93,11 @@ def adapt_block(
     gaussians = scene.select(torch.cat([rows, context]))
     if after is None:
         own = _with_target_images(gaussians, len(rows), own, cache, progress)
-    targets = with_target_shares(division, block, own, config, first=after is None, progress=progress)
-    part = TrainableSubset(len(rows), division.extent, full_context=after is None)
+    cameras = [view.camera for view in spread(views, MOST_VIEWS)]
+    target = block_target(division, block, cameras, config, first=after is None)
+    part = TrainableSubset(len(rows), division.extent, after is None, target=target, cameras=cameras)
     settings = block_config(division, block, config, first=after is None)
-    adapted = adapt(gaussians, Scene(tuple(targets), ()), settings, progress, resume, subset=part)
+    adapted = adapt(gaussians, Scene(tuple(own), ()), settings, progress, resume, subset=part)
     return _learned(division, rows, adapted)
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.cameras import Camera, StoredView, View
+from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, AdaptConfig, AttenuationConfig, ScreenFilter
 from clod_adapter.equation.attenuation import SIGMA_MAX, Attenuated, attenuate
 from clod_adapter.equation.distances import normalized_distances
@@ -36,27 +36,16 @@ class TrainableSubset:
         full_context: draw the context without a dial, instead of at the dial value of the trained rows.
         total: number of Gaussians that the target-count curve is a share of, where that is more than ``trained``
             (``target_count.target_share``).
+        target: returns the count term's target at a dial value, in place of the target-count curve's.
+        cameras: the whole scene's, which typical distances are from. By default those of the views.
     """
 
     trained: int
     extent: float | None = None
     full_context: bool = False
     total: int | None = None
-
-
-class TargetView(StoredView):
-    """A view with a target share of its own, in place of the target-count curve's.
-
-    Args:
-        view: camera and photograph.
-        target_share: returns the target share of the trained rows at a dial value.
-    """
-
-    target_share: Callable[[float], TargetShare]
-
-    def __init__(self, view: View, target_share: Callable[[float], TargetShare]) -> None:
-        super().__init__(view.camera, lambda: view.image)
-        object.__setattr__(self, "target_share", target_share)
+    target: Callable[[float], TargetShare] | None = None
+    cameras: Sequence[Camera] | None = None
 
 
 @dataclass
@@ -66,7 +55,7 @@ class GradientSum:
     Attributes:
         gradients: by name of the trained parameter, of its first ``trained`` rows.
         kept: ``[trained]`` bool, the rows that at least one rendering kept.
-        loss: photometric loss at the first dial value of each view, summed.
+        loss: photometric loss at the smallest dial value of each view, summed.
     """
 
     gradients: dict[str, Tensor]
@@ -85,6 +74,8 @@ class Objective:
     Attributes:
         tuned: the trained attributes, besides ``opacity_logits`` and the decay, which are always trained.
         part: the trained rows.
+        typical: ``[trained]`` normalised distances that Gaussians are counted at; no view's own, whose counts differ
+            from the mean's: gradients that correct such differences cancel out, and only add noise.
         screen_filter: the filter that images are rendered with.
     """
 
@@ -92,6 +83,7 @@ class Objective:
     attenuation: AttenuationConfig
     tuned: tuple[str, ...]
     part: TrainableSubset
+    typical: Tensor
     screen_filter: ScreenFilter = CLASSIC
 
     @property
@@ -137,7 +129,7 @@ class Objective:
         photograph = view.image.to(decay.device)
         total, count = decay.new_zeros(()), torch.zeros_like(decay[first])
         kept = torch.zeros_like(count, dtype=torch.bool)
-        losses = []
+        losses, counts = [], []
         distances = normalized_distances(parameters["means"], view.camera, self.attenuation)  # for all dial values
         for s, dialled, image in self._rendered(leaves, view.camera, distances, dials):
             loss = photometric_loss(image, photograph, config.ssim_weight)
@@ -146,12 +138,15 @@ class Objective:
             if config.count_term == "paper" and config.reg_weight > 0:
                 loss = loss + paper_count(dialled, s, self.attenuation.tau, config, self.part.total)
             total = total + weight * loss
-            if config.has_target_count:
-                logits = parameters["opacity_logits"][first]
-                count += self._count_gradient(dialled, logits, view, s, weight * losses[-1])
+            counts.append((s, weight * losses[-1]))
             kept |= dialled.keep[first]
         if counted is not None:
-            count += self._counted(parameters, view, distances[first], counted, losses[-1])
+            # Halfway to 1/tau at most. Its weight is 1: with half of w_s, counts at the far end were 1.25 times the
+            # target, at a gain of 0.05 to 0.1 dB at equal counts.
+            counts.append((min(counted, (config.max_sv + 1 / self.attenuation.tau) / 2), losses[-1]))
+        if config.has_target_count:
+            for s, weighted in counts:
+                count += self._count_gradient(parameters, s, weighted)
         found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
         gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}
         count = count if config.parameter == "log" else count / decay.detach()[first]
@@ -177,25 +172,15 @@ class Objective:
             yield s, dialled, splat(shown, drawn, camera, growth=growth)[0]
 
     @torch.no_grad()
-    def _counted(self, parameters: dict[str, Tensor], view: View, d: Tensor, s: float, loss: float) -> Tensor:
-        """``_count_gradient`` at a dial value that is not rendered, at most halfway from max_sv to 1/tau.
-
-        Its weight is 1, not w_s: with half of w_s, counts at the far end were 1.25 times the target, at a gain of 0.05
-        to 0.1 dB at equal counts.
-        """
-        s, first = min(s, (self.config.max_sv + 1 / self.attenuation.tau) / 2), slice(self.trained)
-        logits, sigma = parameters["opacity_logits"][first], self.sigma(parameters[self.decay][first])
-        dialled = attenuate(logits, sigma, d, s, self.attenuation)
-        return self._count_gradient(dialled, logits, view, s, loss)
-
-    def _count_gradient(self, dialled: Attenuated, logits: Tensor, view: View, s: float, loss: float) -> Tensor:
+    def _count_gradient(self, parameters: dict[str, Tensor], s: float, loss: float) -> Tensor:
         """``[trained]`` the count term's gradient of log sigma_d at one dial value."""
-        if isinstance(view, TargetView):
-            target = view.target_share(s)
+        logits, decay = (parameters[name][: self.trained] for name in ("opacity_logits", self.decay))
+        dialled = attenuate(logits, self.sigma(decay), self.typical, s, self.attenuation)
+        if self.part.target is not None:
+            target = self.part.target(s)
         else:
             target = target_share(s, self.trained, self.config, self.part.total)
-        own = Attenuated(*(tensor[: self.trained] for tensor in dialled[:4]))
-        return count_gradient(own, logits, s, self.attenuation.tau, loss, self.config, target)
+        return count_gradient(dialled, logits, s, self.attenuation.tau, loss, self.config, target)
 
     def _weight(self, s: float, *, alone: bool) -> float:
         """w_s, times ``full_weight`` at the s = 1 that is drawn together with another dial value."""

@@ -12,11 +12,13 @@ from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.cameras import View, camera_extent
 from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.distances import typical_distance
 from clod_adapter.equation.growth import GROWTH_RANGE
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.finite import LossNotFinite, require_finite, spoilt_rows
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.importance import MOST_VIEWS, spread
 from clod_adapter.training.distributed import ProcessGroup
 from clod_adapter.training.objective import GradientSum, Objective, TrainableSubset
 from clod_adapter.training.optimizer import RowAdam, add_to_mean
@@ -49,7 +51,9 @@ class Trainer:
         rates = _learning_rates(config, _extent(start, views, subset))
         # A frozen attribute requests no gradient from the rasterizer.
         tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
-        self.objective = Objective(config, start.attenuation, tuple(tuned), subset, start.screen_filter)
+        cameras = subset.cameras or [view.camera for view in spread(views, MOST_VIEWS)]
+        typical = typical_distance(start.means, cameras, start.attenuation)[: subset.trained]
+        self.objective = Objective(config, start.attenuation, tuple(tuned), subset, typical, start.screen_filter)
         self.decay, self.stepped = self.objective.decay, self.objective.stepped
         self.decay_range = self.objective.decay_range
         self.rates = rates | {self.decay: config.lr_sigma * math.sqrt(config.batch)}
@@ -77,7 +81,7 @@ class Trainer:
         Raises:
             LossNotFinite, or any error of the rasterizer: nothing has changed.
         """
-        found = self._gradients()
+        found = self._gradients(share_done)
         self._updating = True
         finite = ~spoilt_rows(found.gradients)
         self.held |= ~finite
@@ -97,13 +101,13 @@ class Trainer:
         self.done += 1
         self._updating = False
 
-    def _gradients(self) -> GradientSum:
+    def _gradients(self, share_done: float) -> GradientSum:
         """Of the losses of the next views; each process of a group computes those of its share of the batch.
 
         If that fails, the next step samples the same views again.
         """
         before = self.sampler.state()
-        samples = [self.sampler.draw() for _ in range(self.config.batch)]
+        samples = [self.sampler.draw(share_done) for _ in range(self.config.batch)]
         try:
             found = self.objective.gradient_sum(self.parameters, self.group.share(samples) if self.group else samples)
             found = self.group.sum(found) if self.group else found

@@ -12,6 +12,9 @@ from clod_adapter.errors import ClodError
 from clod_adapter.training.state import OTHER_RUN
 
 COUNTED_BEYOND = 1.5  # times max_sv: counts at the end of the dial follow the curve as they do within it
+# Until this share of the steps every second view is rendered at two dial values in place of 1 and one other: what
+# remains at the far end has the longest way to go, and s = 1, where a checkpoint begins, the shortest.
+FAR_FIRST = 0.5
 
 
 class Sample(NamedTuple):
@@ -40,8 +43,12 @@ class ViewSampler:
         self.random = np.random.default_rng(config.seed)
         self.order: list[int] = []
 
-    def draw(self) -> Sample:
-        """The next view, each one once per round, and its dial values."""
+    def draw(self, share_done: float) -> Sample:
+        """The next view, each one once per round, and its dial values, the smallest first.
+
+        Args:
+            share_done: of the steps or the time budget, in [0, 1].
+        """
         if not self.order:
             self.order = self.random.permutation(len(self.views)).tolist()
         view, config = self.views[self.order.pop()], self.config
@@ -49,8 +56,12 @@ class ViewSampler:
         drawn = 1 + (config.max_sv - 1) * uniform if config.sampling == "uniform" else config.max_sv**uniform
         if config.sampling != "pair":
             rendered = [1.0 if full else drawn]
+        elif config.max_sv == 1:
+            rendered = [1.0]
+        elif self.random.random() < 0.5 and share_done < FAR_FIRST:
+            rendered = sorted([drawn, config.max_sv ** ((uniform + 0.5) % 1)])
         else:
-            rendered = [1.0, drawn] if config.max_sv > 1 else [1.0]
+            rendered = [1.0, drawn]
         if not config.has_target_count:
             return Sample(view, rendered)
         return Sample(view, rendered, (COUNTED_BEYOND * config.max_sv) ** self.random.random())

@@ -154,6 +154,22 @@ def test_steps_use_the_sampled_views_and_dial_values(
     config = config_of(iters=14, max_sv=4.0, sampling=sampling)
     adapt(attach(gaussians(5, 0, 0), torch.ones(5)), captured[1], config)
     sampler = ViewSampler(captured[1].train, config)
-    draws = [sampler.draw() for _ in range(14)]
+    draws = [sampler.draw(k / 14) for k in range(14)]
     rendered = [x for view, dials, _ in draws for s in dials for x in (s, id(view.image))]
-    assert sorted(map(str, taken)) == sorted(map(str, [*rendered, *(counted for *_, counted in draws)]))
+    counted = [s for _, dials, beyond in draws for s in (*dials, beyond)]
+    assert sorted(map(str, taken)) == sorted(map(str, [*rendered, *counted]))
+
+
+def test_counts_are_at_typical_distances(captured: Pair) -> None:
+    """Times the loss, the count term has the same gradient in all views, however near their cameras are."""
+    base, scene = captured
+    config = config_of(sampling="log", reg_weight=1e3)
+    run = Trainer(initialize(base, scene.train, config), scene.train, config)
+    plain = replace(run.objective, config=replace(config, reg_weight=0.0))
+    terms = []
+    for view in scene.train[:3]:
+        one, other = (each.gradient_sum(run.parameters, [Sample(view, [2.0])]) for each in (run.objective, plain))
+        terms.append((one.gradients["log_sigma"] - other.gradients["log_sigma"]) / one.loss)
+    assert (terms[0].abs() > 1e-5).sum() > 20
+    for term in terms[1:]:
+        torch.testing.assert_close(term, terms[0], rtol=1e-3, atol=1e-6)

@@ -18,7 +18,7 @@ VIEWS = capture(n=20)[1].train
 
 
 def nine(draws: ViewSampler) -> list[tuple[str, list[float]]]:
-    return [(view.camera.name, dials) for view, dials, _ in (draws.draw() for _ in range(9))]
+    return [(view.camera.name, dials) for view, dials, _ in (draws.draw(k / 9) for k in range(9))]
 
 
 @pytest.mark.parametrize("sampling", ["pair", "log", "uniform"])
@@ -51,15 +51,23 @@ def assert_uniform(values: torch.Tensor) -> None:
 
 
 def test_dial_values_follow_the_configured_distribution() -> None:
-    """Pair: 1 and a log-uniform value in [1, max_sv]. Others: 1 with ``full_share``, or log-uniform, or uniform."""
+    """Pair: 1 and a log-uniform value in [1, max_sv]; in the first half of training half of the pairs are two values,
+    half the dial apart. Others: 1 with ``full_share``, or log-uniform, or uniform."""
 
-    def drawn(**changes: Any) -> torch.Tensor:
+    def drawn(share_done: float = 0.9, **changes: Any) -> torch.Tensor:
         sampler = ViewSampler(VIEWS, AdaptConfig(max_sv=4.0, **changes))
-        return torch.tensor([sampler.draw()[1] for _ in range(480)])
+        return torch.tensor([sampler.draw(share_done)[1] for _ in range(480)])
 
     pairs = drawn(sampling="pair")
     assert (pairs[:, 0] == 1).all() and pairs.shape == (480, 2)
     assert_uniform(pairs[:, 1].log() / math.log(4))
+    early = drawn(0.4, sampling="pair").log() / math.log(4)
+    apart = early[early[:, 0] > 0]
+    assert 0.4 < len(apart) / len(early) < 0.6
+    torch.testing.assert_close(apart[:, 1] - apart[:, 0], torch.full_like(apart[:, 0], 0.5))
+    assert_uniform(apart.flatten())
+    assert_uniform(early[early[:, 0] == 0, 1])
+    assert ViewSampler(VIEWS, AdaptConfig(max_sv=1.0)).draw(0.0)[1:] == ([1.0], None)
     ones = drawn(sampling="log", full_share=0.25).log() / math.log(4)
     assert 0.19 < (ones == 0).double().mean() < 0.31  # 3 standard deviations
     assert_uniform(ones[ones > 0])

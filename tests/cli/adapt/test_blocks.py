@@ -196,7 +196,7 @@ def test_files_of_another_run_are_refused(
         ("block", tensors["block"].clamp(max=1), "a block has no Gaussians"),
         ("sigma_d", tensors["sigma_d"][:-1], "its sigma_d is not that of this scene"),
         ("growth_d", tensors["growth_d"].double(), "its growth_d is not that of this scene"),
-        ("kept", tensors["kept"] * float("nan"), "not finite"),
+        ("seen", tensors["seen"] * float("nan"), "not finite"),
     ):
         save_block(start, tensors | {name: worse}, about, belongs)
         refused(message, "--block", 1)
@@ -210,7 +210,7 @@ def test_files_of_another_run_are_refused(
 def test_blocks_without_growth(adapt: Callable[..., Any], tmp_path: Path) -> None:
     assert adapt("a.ply", "--block", "start", "--growth", "off").code == 0
     with safe_open(tmp_path / "a.start.safetensors", "pt") as file:
-        assert set(file.keys()) == {"sigma_d", "block", "seen", "kept"}
+        assert set(file.keys()) == {"sigma_d", "block", "seen"}
     assert adapt("a.ply", "--growth", "off").code == 0
     assert set(clod_adapter.load(tmp_path / "a.ply").gaussians.tensors()) == {*ATTRIBUTES, "sigma_d"}
 
