@@ -162,7 +162,7 @@ class AdaptConfig:
     count_term: str = option(
         "law", "count loss: law (both directions, through sigma_d alone) or paper (the paper's L_reg)"
     )
-    reg_weight: float = option(0.5, "weight of the count loss (the paper's lambda_reg)")
+    reg_weight: float = option(0.75, "weight of the count loss (the paper's lambda_reg)")
     weight_slope: float = option(
         0.25, "k of the loss weight w_s = (1 - k s/max_sv)^2; the paper has 0.5, 0 gives equal weights"
     )
