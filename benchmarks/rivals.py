@@ -22,9 +22,8 @@ from typing import Any
 
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
-from clod_adapter.gaussians import SH_C0
+from clod_adapter.initialization.coverage import coverage
 from clod_adapter.initialization.importance import removal_error
-from clod_adapter.render import splat
 from common import append, arguments, checkpoint, falling, head, photographs, stored, table
 from tuning import MERGINGS, Tuning, find_tool, merge, tune
 
@@ -122,25 +121,10 @@ class Contest:
         if order == "opacity":
             worth = gaussians.opacity_logits
         elif order == "contribution":
-            worth = contribution(gaussians, views)
+            worth = sum((coverage(gaussians, gaussians.opacities, view.camera) for view in views), torch.zeros(()))
         else:
             worth = removal_error(gaussians, views, seed=seed)
         return falling(worth)
-
-
-def contribution(gaussians: clod.Gaussians, views: tuple[clod.View, ...]) -> Tensor:
-    """``[N]`` sum of a Gaussian's blending weights over all pixels of the views.
-
-    The picture is linear in the colours, so this is the slope of its sum to a colour, with all of them grey: a dark
-    one would be clamped at 0 and have none.
-    """
-    grey, total = gaussians.replace(shN=gaussians.shN[:, :0]), torch.zeros(len(gaussians))
-    for view in views:
-        sh0 = torch.zeros_like(gaussians.sh0, requires_grad=True)
-        image, _ = splat(grey.replace(sh0=sh0), gaussians.opacities, view.camera)
-        (slope,) = torch.autograd.grad(image.sum(), sh0)
-        total += slope[:, 0, 0] / SH_C0
-    return total
 
 
 def print_table() -> None:

@@ -27,9 +27,11 @@ from clod_adapter.io.formats.splat_transform import VARIABLE
 from clod_adapter.io.ply.columns import rows_of
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import render
+from clod_adapter.training import pseudo_views
 from scenes import looking
 
 fake_gpu.register()
+pseudo_views.MANY = 8  # the tests' captures of eight show too little by the measure of real ones
 
 
 @pytest.fixture

@@ -33,6 +33,8 @@ from clod_adapter.cli.adapt import processes, saver
 from clod_adapter.cli.adapt import run as adapt
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.kernels import prepare_kernels
+from clod_adapter.training import pseudo_views
+pseudo_views.MANY = 8  # as in conftest
 prepare_kernels(Console(quiet=True))
 print("ready", flush=True)
 for line in sys.stdin:

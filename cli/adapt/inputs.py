@@ -65,7 +65,7 @@ def read_inputs(setup: Setup) -> Inputs:
     config, alignment, notes = setup.config, None, list[str]()
     if photographs is None:
         with watch.time("place"):
-            scene = place_scene(base.gaussians, config.seed, console)
+            scene, config = place_scene(base.gaussians, config, console)
     else:
         with watch.time("evaluate"):
             alignment, notes = require_alignment(base, photographs, args, console)

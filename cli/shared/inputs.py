@@ -15,7 +15,7 @@ from clod_adapter.io.scene.load import load_scene
 from clod_adapter.origin import Origin
 from clod_adapter.progress import Phase
 from clod_adapter.training.camera_placement import place_cameras
-from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
+from clod_adapter.training.pseudo_views import LIGHTER, add_pseudo_views, render_pseudo_views
 
 from .console import Console
 from .files import size
@@ -54,19 +54,19 @@ def with_pseudo_views(
     gaussians: Gaussians, scene: Scene, config: AdaptConfig, console: Console
 ) -> tuple[Scene, AdaptConfig]:
     """``pseudo_views.add_pseudo_views``, with its notes."""
-    with console.status("placing cameras ..."):
-        more, lighter = add_pseudo_views(gaussians, scene, config)
+    with console.meter(Phase.CAMERAS) as meter:
+        more, lighter = add_pseudo_views(gaussians, scene, config, meter)
     for note in more.notes[len(scene.notes) :]:
         console.note(note)
     return more, lighter
 
 
-def place_scene(gaussians: Gaussians, seed: int, console: Console) -> Scene:
-    """A scene of pseudo views, with its notes."""
+def place_scene(gaussians: Gaussians, config: AdaptConfig, console: Console) -> tuple[Scene, AdaptConfig]:
+    """A scene of pseudo views, with its notes, and the settings to train on it."""
     with console.meter(Phase.CAMERAS) as meter:
-        cameras = place_cameras(gaussians, seed=seed, progress=meter)
+        cameras = place_cameras(gaussians, seed=config.seed, progress=meter)
     with console.meter(Phase.PSEUDO_VIEWS) as meter:
         scene = render_pseudo_views(gaussians, cameras, progress=meter)
     for note in scene.notes:
         console.say(note)
-    return scene
+    return scene, config.lighter(LIGHTER)

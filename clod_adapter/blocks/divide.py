@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from clod_adapter.adapter import attach
-from clod_adapter.cameras import Camera, View, camera_extent
+from clod_adapter.cameras import View, camera_extent
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.coverage import coverage, reduced
 from clod_adapter.initialization.importance import initialize
 from clod_adapter.progress import Listener, Phase, tell
-from clod_adapter.render import splat
 
 UNSEEN = 0.005  # of a block's coverage over all views, the share that the views it is not trained on may have
-SMALLER = 4  # downscaling of the images that coverage is measured in
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,7 @@ def divide(
         )
     seen = torch.empty(len(views), count)
     for k, view in enumerate(views):
-        shown = coverage(initial, initial.opacities, _smaller(view.camera)).double()
+        shown = coverage(initial, initial.opacities, reduced(view.camera)).double()
         seen[k] = (shown.new_zeros(count).index_add_(0, block.long(), shown) / shown.sum().clamp(min=1e-9)).float()
         tell(progress, Phase.COVERAGE, k + 1, len(views))
     initial = attach(base, initial.sigma_d, initial.attenuation, initial.growth_d)
@@ -143,25 +142,3 @@ def check_divisible(config: AdaptConfig) -> None:
             "the paper's form cannot be trained in blocks: its count and its distances are of all Gaussians at once; "
             "leave out --form paper, or --memory"
         )
-
-
-def coverage(gaussians: Gaussians, opacities: Tensor, camera: Camera, growth: Tensor | None = None) -> Tensor:
-    """``[N]`` pixels that each Gaussian covers: the sum over the image of its transmittance times its alpha.
-
-    This is the gradient of the image by the Gaussians' colours.
-
-    Args:
-        growth: ``[N]`` factor of the scales; None for 1.
-    """
-    grey = gaussians.sh0.new_zeros(gaussians.sh0.shape).requires_grad_()
-    plain = gaussians.replace(sh0=grey, shN=gaussians.shN[:, :0])
-    image, _ = splat(plain, opacities, camera, growth=growth)
-    (gradient,) = torch.autograd.grad(image[..., 0].sum(), grey)
-    return gradient[:, 0, 0] / SH_C0
-
-
-def _smaller(camera: Camera) -> Camera:
-    """The same view with fewer pixels."""
-    width, height = (max(size // SMALLER, 1) for size in (camera.width, camera.height))
-    shrink = camera.K.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
-    return replace(camera, K=camera.K * shrink, width=width, height=height)

@@ -3,34 +3,90 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial, reduce
 
+import numpy as np
 import torch
+from torch import Tensor
 
-from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.adapter import detach
+from clod_adapter.cameras import Camera, Scene, StoredView, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.coverage import SMALLER, coverage, reduced
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import render
-from clod_adapter.training.camera_placement import place_cameras
+from clod_adapter.training.camera_placement import place_cameras, typical_reach
 
-FEW, OWN = 8, 16  # with fewer than FEW training photographs, OWN pseudo views are added
+OWN = 96  # pseudo views that are added where photographs do not show enough of the scene:
+SHOWN, TIMES = 0.95, 4  # this share of it, each part this often,
+CHECKED, MANY = 24, 64  # as far as so many placed cameras see it; so many photographs are always enough
+DRAWN = 0.5  # pixels that a Gaussian covers in a photograph that shows it
 TEST_EVERY = 8  # as with photographs
+LIGHTER = 0.5  # of the learning rates of all but the dial: what pseudo views show is the checkpoint, errors included
+# Standard deviations of the random offset of a camera, of its distance to the scene, and of its direction, radians; and
+# the largest change of log focal length.
+MOVED, TURNED, ZOOMED = 0.1, 0.05, 0.15
+
+
+class PseudoView(View):
+    """A view whose photograph is a rendering of ``teacher``, which can be rendered from nearby as well.
+
+    With a fixed set of renderings Gaussians drift towards what only these cameras see.
+
+    Args:
+        camera: the placed camera.
+        image: ``[H, W, 3]`` uint8, what the teacher shows from there.
+        teacher: the checkpoint, rendered at s = 1.
+        reach: distance of camera and scene, world units.
+    """
+
+    teacher: Gaussians
+    reach: float
+
+    def __init__(self, camera: Camera, image: Tensor, teacher: Gaussians, reach: float) -> None:
+        super().__init__(camera, image)
+        object.__setattr__(self, "teacher", teacher)
+        object.__setattr__(self, "reach", reach)
+
+    def moved(self, random: np.random.Generator) -> View:
+        """A view from a random camera near this one; rendered when its image is read."""
+        camera = moved(self.camera, self.reach, random)
+        return StoredView(camera, lambda: render(self.teacher, camera).pixels.cpu())
+
+
+def moved(camera: Camera, reach: float, random: np.random.Generator) -> Camera:
+    """The camera with a normal offset of position and direction and a uniform one of log focal length.
+
+    Args:
+        reach: unit of the position's offset, world units.
+    """
+    x, y, z = TURNED * random.standard_normal(3)
+    step = torch.eye(4, dtype=torch.float64)
+    step[:3, :3] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64).matrix_exp()
+    step[:3, 3] = torch.from_numpy(MOVED * reach * random.standard_normal(3))
+    zoom = math.exp(ZOOMED * (2 * random.random() - 1))
+    viewmat = (step @ camera.viewmat.double()).to(camera.viewmat)
+    return replace(camera, viewmat=viewmat, K=camera.K * camera.K.new_tensor([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]]))
 
 
 @torch.no_grad()
 def render_pseudo_views(gaussians: Gaussians, cameras: list[Camera], *, progress: Listener | None = None) -> Scene:
     """A scene of ``cameras`` with the checkpoint's own renderings as photographs; every 8th is held out.
 
+    Training renders each from a camera near it instead (``PseudoView.moved``).
+
     Args:
         gaussians: the teacher, rendered at s = 1.
         progress: called in ``Phase.PSEUDO_VIEWS`` after each view.
     """
     teacher = gaussians.without_empty_bands()
-    views = []
+    views, reach = list[View](), typical_reach(detach(teacher), _field(cameras[0])) if cameras else 0.0
     for camera in cameras:
-        views.append(View(camera, render(teacher, camera).pixels.cpu()))
+        views.append(PseudoView(camera, render(teacher, camera).pixels.cpu(), teacher, reach))
         tell(progress, Phase.PSEUDO_VIEWS, len(views), len(cameras))
     held_out = range(0, len(views), TEST_EVERY) if len(views) > 1 else range(0)
     train = tuple(view for k, view in enumerate(views) if k not in held_out)
@@ -42,25 +98,50 @@ def render_pseudo_views(gaussians: Gaussians, cameras: list[Camera], *, progress
     return Scene(train, test, (note,))
 
 
-def add_pseudo_views(gaussians: Gaussians, scene: Scene, config: AdaptConfig) -> tuple[Scene, AdaptConfig]:
-    """Adds OWN pseudo views, and halves all learning rates but the dial's, with fewer than FEW photographs.
+def add_pseudo_views(
+    gaussians: Gaussians, scene: Scene, config: AdaptConfig, progress: Listener | None = None
+) -> tuple[Scene, AdaptConfig]:
+    """Adds OWN pseudo views, and halves all learning rates but the dial's, if photographs show too little of the scene.
 
-    So few photographs do not show the whole scene, and training would damage the rest. Pseudo views have the field of
-    view of the first photograph. With more photographs they harm more than they help, as they contain the errors of
-    the checkpoint and have other distances (docs/method.md). If no camera can be placed, a note says so.
+    Training on such photographs alone would damage what they do not show. Where they show enough, pseudo views harm
+    more than they help, as they contain the errors of the checkpoint and have other distances (docs/method.md). Pseudo
+    views have the field of view of the first photograph. If no camera can be placed, a note says so.
+
+    Args:
+        progress: called in ``Phase.CAMERAS``.
     """
-    if not 0 < len(scene.train) < FEW:
+    photographs = scene.train
+    if not 0 < len(photographs) < MANY:
         return scene, config
+    place = partial(place_cameras, gaussians, seed=config.seed, field=_field(photographs[0].camera), progress=progress)
+    few, own = f"only {len(photographs)} photographs to train on", tuple[View, ...]()
     try:
-        placed = render_pseudo_views(
-            gaussians, place_cameras(gaussians, views=OWN, seed=config.seed, field=_field(scene.train[0].camera))
-        )
+        if len(photographs) >= TIMES:
+            share = shown(gaussians, photographs, place(views=CHECKED))
+            if share >= SHOWN:
+                return scene, config
+            few = f"the {len(photographs)} photographs to train on show only {share:.0%} of the scene {TIMES} times"
+        placed = render_pseudo_views(gaussians, place(views=OWN))
         own = (*placed.train, *placed.test)
         added = f"{len(own)} pseudo views, the checkpoint's own renderings from placed cameras, are added"
     except ClodError as error:
-        own, added = (), f"no pseudo views can be added ({error})"
-    note = f"only {len(scene.train)} photographs to train on: {added}, and all learning rates but the dial's are halved"
-    return replace(scene, train=(*scene.train, *own), notes=(*scene.notes, note)), config.lighter(0.5)
+        added = f"no pseudo views can be added ({error})"
+    note = f"{few}: {added}, and all learning rates but the dial's are halved"
+    return replace(scene, train=(*photographs, *own), notes=(*scene.notes, note)), config.lighter(LIGHTER)
+
+
+def shown(gaussians: Gaussians, photographs: Sequence[View], cameras: Sequence[Camera]) -> float:
+    """The share of what ``cameras`` see, by covered pixels, that at least TIMES of the photographs show."""
+
+    def covered(camera: Camera) -> Tensor:
+        return coverage(plain, plain.opacities, reduced(camera)).double()
+
+    plain, least = detach(gaussians), DRAWN / SMALLER**2
+    times = torch.zeros_like(gaussians.opacity_logits, dtype=torch.int32)
+    for view in photographs:
+        times += covered(view.camera) > least
+    seen = reduce(torch.add, map(covered, cameras))
+    return float(seen[times >= TIMES].sum() / seen.sum().clamp(min=1e-9))
 
 
 def _describe(cameras: list[Camera]) -> str:

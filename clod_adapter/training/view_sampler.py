@@ -9,6 +9,7 @@ import numpy as np
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
+from clod_adapter.training.pseudo_views import PseudoView
 from clod_adapter.training.state import OTHER_RUN
 
 COUNTED_BEYOND = 1.5  # times max_sv: counts at the end of the dial follow the curve as they do within it
@@ -52,6 +53,8 @@ class ViewSampler:
         if not self.order:
             self.order = self.random.permutation(len(self.views)).tolist()
         view, config = self.views[self.order.pop()], self.config
+        if isinstance(view, PseudoView):
+            view = view.moved(self.random)
         uniform, full = self.random.random(), self.random.random() < config.full_share
         drawn = 1 + (config.max_sv - 1) * uniform if config.sampling == "uniform" else config.max_sv**uniform
         if config.sampling != "pair":

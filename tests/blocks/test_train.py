@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clod_adapter.blocks.divide import Division, coverage, divide, split
+from clod_adapter.blocks.divide import Division, divide, split
 from clod_adapter.blocks.targets import LEFT_OUT, block_config, block_target, context_rows, target_image
 from clod_adapter.blocks.train import Learned, adapt_block, merge
 from clod_adapter.cameras import Scene, camera_extent
@@ -85,16 +85,6 @@ def test_blocks_are_boxes() -> None:
     assert means[10:, 0][block == 0].max() <= means[10:, 0][block == 1].min() + 0.1
     with pytest.raises(ClodError, match="3 Gaussians cannot be split into 4"):
         split(torch.zeros(3, 3), 4)
-
-
-def test_coverage_sums_to_alpha(captured: tuple[Gaussians, Scene]) -> None:
-    """Coverage is 0 for Gaussians that no pixel shows."""
-    base, scene = captured
-    camera = scene.train[0].camera
-    shown = coverage(base, base.opacities, camera)
-    torch.testing.assert_close(shown.sum(), render(base, camera).alpha.sum(), rtol=1e-4, atol=0)
-    behind = replace(camera, viewmat=torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ camera.viewmat)
-    assert bool((shown >= 0).all()) and float(coverage(base, base.opacities, behind).sum()) < 0.2 * float(shown.sum())
 
 
 def test_a_block_has_the_views_that_see_it(divided: Division, captured: tuple[Gaussians, Scene]) -> None:

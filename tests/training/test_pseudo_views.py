@@ -4,14 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 
 import clod_adapter as clod
 import scenes
 from clod_adapter.evaluation.baselines import matching_dial
+from clod_adapter.training import pseudo_views
 from clod_adapter.training.camera_placement import place_cameras
-from clod_adapter.training.pseudo_views import FEW, OWN, add_pseudo_views, render_pseudo_views
+from clod_adapter.training.pseudo_views import (
+    MOVED,
+    TIMES,
+    TURNED,
+    ZOOMED,
+    PseudoView,
+    add_pseudo_views,
+    moved,
+    render_pseudo_views,
+    shown,
+)
+from clod_adapter.training.view_sampler import ViewSampler
 
 
 @pytest.mark.parametrize("with_dial", [False, True])
@@ -28,6 +41,43 @@ def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians, with_dial: b
     assert render_pseudo_views(own, cameras[:1]).test == ()
 
 
+def test_each_step_renders_the_checkpoint_from_another_camera(blob: clod.Gaussians) -> None:
+    """Near the placed ones; reproducible from a state; a photograph stays where it is."""
+    cameras = scenes.ring(3, 40, 30)
+    placed = render_pseudo_views(blob, cameras).train
+    photograph = scenes.photograph(blob, cameras[:1])[0]
+    sampler = ViewSampler((*placed, photograph), clod.AdaptConfig())
+    state = sampler.state()
+    drawn = [sampler.draw(0.0).view for _ in range(9)]
+    assert sum(view is photograph for view in drawn) == 3
+    for view in drawn:
+        if view is not photograph:
+            assert torch.equal(view.image, clod.render(blob, view.camera).pixels)
+            (own,) = (v for v in placed if v.camera.name == view.camera.name)
+            assert isinstance(own, PseudoView)
+            assert 0 < (view.camera.position - own.camera.position).norm() < 6 * MOVED * own.reach
+            assert not torch.equal(view.image, own.image)
+    sampler.restore(*state)
+    again = [sampler.draw(0.0).view for _ in range(9)]
+    assert all(torch.equal(a.camera.viewmat, b.camera.viewmat) for a, b in zip(drawn, again, strict=True))
+
+
+def test_moved_cameras_have_the_documented_offsets() -> None:
+    camera, random, reach = scenes.ring(1, 40, 30)[0], np.random.default_rng(0), 3.0
+    found = [moved(camera, reach, random) for _ in range(2000)]
+    own = camera.viewmat.double()
+    steps = torch.stack([each.viewmat.double() @ own.inverse() for each in found])
+    turns, shifts = steps[:, :3, :3], steps[:, :3, 3]
+    torch.testing.assert_close(turns @ turns.mT, torch.eye(3).double().expand(2000, 3, 3), rtol=0, atol=1e-5)
+    assert shifts.std(0).tolist() == pytest.approx([MOVED * reach] * 3, rel=0.1)
+    angles = ((turns.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1).acos()
+    assert angles.square().mean().sqrt() == pytest.approx(TURNED * 3**0.5, rel=0.1)
+    zooms = torch.stack([each.K / camera.K for each in found])[:, [0, 1], [0, 1]].log()
+    assert torch.equal(zooms[:, 0], zooms[:, 1]) and 0.9 * ZOOMED < zooms.abs().max() <= 1.001 * ZOOMED
+    for each in found[:9]:
+        assert torch.equal(each.K[:, 2], camera.K[:, 2]) and (each.width, each.name) == (camera.width, camera.name)
+
+
 def test_training_on_pseudo_views_improves_held_out_views() -> None:
     """At the same count, PSNR on other cameras exceeds that of the initialization."""
     base, scene = scenes.capture(300, views=8, seed=2)
@@ -41,15 +91,37 @@ def test_training_on_pseudo_views_improves_held_out_views() -> None:
     assert before.kept == pytest.approx(after.kept, abs=1) and after.psnr > before.psnr + 0.5
 
 
-def test_few_photographs_get_pseudo_views(blob: clod.Gaussians) -> None:
-    views, config = scenes.photograph(blob, scenes.ring(FEW, 24, 18)), clod.AdaptConfig(iters=1)
-    enough = clod.Scene(views, ())
-    assert add_pseudo_views(blob, enough, config) == (enough, config)
-    scene, lighter = add_pseudo_views(blob, clod.Scene(views[:1], views[1:]), config)
-    assert scene.train[0] is views[0] and len(scene.train) == 1 + OWN and scene.test == views[1:]
-    assert "only 1 photographs" in scene.notes[-1]
+def test_photographs_that_show_too_little_get_pseudo_views(
+    blob: clod.Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pseudo_views, "OWN", 9)
+    monkeypatch.setattr(pseudo_views, "MANY", 64)
+    around, config = scenes.photograph(blob, scenes.ring(40, 80, 60)), clod.AdaptConfig(iters=1)
+    for enough in (clod.Scene(around, ()), clod.Scene(around[:1] * 64, ())):
+        assert add_pseudo_views(blob, enough, config) == (enough, config)
+    scene, lighter = add_pseudo_views(blob, clod.Scene(around[:1], around[1:]), config)
+    assert scene.train[0] is around[0] and len(scene.train) == 1 + 9 and scene.test == around[1:]
+    assert "only 1 photographs to train on: 9 pseudo views" in scene.notes[-1]
     assert lighter.lr_means == config.lr_means / 2 and lighter.lr_sigma == config.lr_sigma
+    # As many photographs as before, of one part of a scene that has another one.
+    apart = {name: torch.zeros_like(value) for name, value in blob.tensors().items()}
+    apart["means"] += torch.tensor([40.0, 0, 0])
+    two = blob.replace(**{name: torch.cat([value, value + apart[name]]) for name, value in blob.tensors().items()})
+    scene, _ = add_pseudo_views(two, clod.Scene(around, ()), config)
+    assert len(scene.train) == 40 + 9 and "the 40 photographs to train on show only" in scene.notes[-1]
     faint = blob.replace(opacity_logits=torch.full((len(blob),), -4.6))  # too faint to place a camera by
-    scene, lighter = add_pseudo_views(faint, clod.Scene(views[:2], ()), config)
-    assert scene.train == views[:2] and "no pseudo views can be added" in scene.notes[-1]
+    scene, lighter = add_pseudo_views(faint, clod.Scene(around[:2], ()), config)
+    assert scene.train == around[:2] and "no pseudo views can be added" in scene.notes[-1]
     assert clod.adapt(faint, scene, lighter).steps == 1
+
+
+def test_share_shown_often_enough(blob: clod.Gaussians) -> None:
+    """Of what the cameras see; photographs from elsewhere do not count."""
+    cameras = scenes.ring(40, 80, 60)
+    views = scenes.photograph(blob, cameras)
+    behind = torch.eye(4)
+    behind[2, 3] = -50.0
+    away = clod.View(dataclasses.replace(cameras[0], viewmat=behind @ cameras[0].viewmat), views[0].image)
+    assert shown(blob, views, cameras) > 0.95
+    assert shown(blob, views[: TIMES - 1], cameras) == 0 == shown(blob, [away] * 8, cameras)
+    assert 0 < shown(blob, [*views[:TIMES], away], cameras) < 0.95

@@ -92,7 +92,7 @@ def test_trimming_without_photographs_warns(
     clod: Any, capture: Any, wasteful: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = clod_adapter.load_scene(capture.scene)
-    monkeypatch.setattr("clod_adapter.cli.adapt.inputs.place_scene", lambda *_: scene)
+    monkeypatch.setattr("clod_adapter.cli.adapt.inputs.place_scene", lambda _, config, __: (scene, config))
     words = ("--iters", 2, "--with", "bands", "--trim")
     assert "no placed camera sees them, but" in clod(wasteful, *words, "--out", "dial.ply").err
     assert "no placed camera" not in clod(wasteful, *words, "--images", capture.scene, "--out", "dial.ply").err

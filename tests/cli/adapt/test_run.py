@@ -303,7 +303,7 @@ def test_few_photographs_get_pseudo_views(clod: Any, capture: Any, tmp_path: Pat
     assert done.code == 0, done
     report = json.loads(done.out)
     (note,) = [note for note in report["notes"] if "photographs to train on" in note]
-    assert note in done.err and "16 pseudo views" in note
+    assert note in done.err and "96 pseudo views" in note
     assert report["config"]["lr_means"] == AdaptConfig().lr_means / 2
     assert report["config"]["lr_sigma"] == AdaptConfig().lr_sigma
 
