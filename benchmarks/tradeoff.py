@@ -1,25 +1,28 @@
-"""Held-out error against seconds of training: ours, the paper's form, and a specialist for each dial value.
+"""Held-out error against seconds of training: ours, the paper's form, prefixes, a specialist for each dial value.
 
     python benchmarks/tradeoff.py plush_half --iters 150 400 1200
     python benchmarks/tradeoff.py plush_half --plot     # docs/error_vs_time.html and its PNG, from the stored rows
 
 Each number of steps is a separate run with its own schedule. A specialist is the base merged to the count that ours
-keeps at that dial value, then tuned for as many steps; at s = 1 the whole base, tuned. Each run adds a row to
-``results/tradeoff.jsonl``.
+keeps at that dial value, by the better of splat-transform's methods, then tuned for as many steps; at s = 1 the whole
+base, tuned. Prefixes are one file, ordered by removal error and tuned with random prefixes, of which the same counts
+are measured. Each run adds a row to ``results/tradeoff.jsonl``.
 """
 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Sequence
 from statistics import fmean
 
 import clod_adapter as clod
 from clod_adapter.cli.shared.console import Console
+from clod_adapter.initialization.importance import removal_error
 from clod_adapter.report import page
 from clod_adapter.report.charts import draw_training, error, inline_svg, training_chart
 from clod_adapter.report.style import new_figure, save_figure
-from common import RESULTS, ROOT, Row, append, arguments, checkpoint, photographs, stored
+from common import RESULTS, ROOT, Row, append, arguments, checkpoint, falling, head, photographs, stored
 from tuning import Tuning, merge, tune
 
 FILE = "tradeoff.jsonl"
@@ -33,15 +36,18 @@ CAPTION = (
 )
 READING = (
     (
-        "One checkpoint ({given}) was given to three methods, each for several lengths of training. Ours and the "
-        "paper's form make one file for all dial values, so their seconds are paid once. A specialist is a file for "
-        "one dial value alone, the base merged to the count that ours keeps there and then tuned: its seconds are paid "
-        "for each.",
+        "One checkpoint ({given}) was given to four methods, each for several lengths of training. Ours, the paper's "
+        "form and prefixes make one file for all dial values, so their seconds are paid once. A prefix is the count "
+        "that ours keeps of a file in order of removal error, tuned with random prefixes. A specialist is a file for "
+        "one dial value alone, the base merged to that count and then tuned: its seconds are paid for each.",
         "lead",
     ),
     ("Down and to the left is better: less error after less time. Both axes are logarithmic.", ""),
 )
-LABELS = {"ours": "ours, one file", "paper": "the paper's form, one file", "specialist": "specialists, a file each"}
+LABELS = {
+    "ours": "ours, one file", "paper": "the paper's form, one file", "prefix": "prefixes, one file",
+    "specialist": "specialists, a file each",
+}  # fmt: skip
 
 
 def main() -> None:
@@ -58,8 +64,9 @@ def main() -> None:
     for method in LABELS:
         for iters in args.iters:
             with Console().meter(f"{args.scene}, {method}, {iters} steps") as meter:
-                if method == "specialist":
-                    seconds, rows = specialists(base, views, counts(args.scene), iters, meter.update)
+                if method in ("specialist", "prefix"):
+                    made = specialists if method == "specialist" else prefixes
+                    seconds, rows = made(base, views, counts(args.scene), iters, meter.update)
                 else:
                     seconds, rows = dial(method, base, views, iters, meter.update)
             append(FILE, {
@@ -84,12 +91,27 @@ def specialists(
     """Seconds and row of the specialist for each dial value; merging is within its time."""
     seconds, rows = [], []
     for s, count in zip(DIALS, counts, strict=True):
-        start, merging = merge(base, count) if s > 1 else (base.gaussians, 0.0)
+        start, merging = merge(base, count, "--decimate") if s > 1 else (base.gaussians, 0.0)
         tuned = tune(start, views.train, Tuning(iters=iters), lambda share, text: follow(share))
         row = clod.evaluate(tuned.gaussians, views.test, [1.0])[0].as_dict()
         rows.append(row | {"virtual_scale": s, "kept_share": row["kept"] / len(base.gaussians)})
         seconds.append(merging + tuned.seconds)
     return seconds, rows
+
+
+def prefixes(
+    base: clod.Checkpoint, views: clod.Scene, counts: list[int], iters: int, follow: Callable[[float], None]
+) -> tuple[list[float], list[Row]]:
+    """Seconds of the one run and the row of each count; ordering is within its time."""
+    began = time.perf_counter()
+    start = base.gaussians.select(falling(removal_error(base.gaussians, views.train)))
+    ordering = time.perf_counter() - began
+    tuned = tune(start, views.train, Tuning(iters=iters, draw="log"), lambda share, text: follow(share))
+    rows = []
+    for s, count in zip(DIALS, counts, strict=True):
+        row = clod.evaluate(head(tuned.gaussians, count), views.test, [1.0])[0].as_dict()
+        rows.append(row | {"virtual_scale": s, "kept_share": count / len(base.gaussians)})
+    return [ordering + tuned.seconds] * len(rows), rows
 
 
 def counts(scene: str) -> list[int]:
