@@ -85,7 +85,7 @@ class BlockFiles:
         return division, replace(self, run_of=self.run_of | {"start": _digest(tensors)}, count=count)
 
     def save_learned(self, learned: Learned, block: int, number: int) -> None:
-        about = {"steps": learned.steps, "seconds": learned.seconds, "failed": learned.failed}
+        about = {name: getattr(learned, name) for name in ("steps", "seconds", "failed", "held")}
         save_block(self.block(block, number), learned.values, about, self._of(block, number))
 
     def load_learned(self, division: Division, block: int, number: int) -> Learned:
@@ -99,10 +99,11 @@ class BlockFiles:
         shapes = {name: (t.dtype, (len(rows), *t.shape[1:])) for name, t in division.initial.tensors().items()}
         checked(path, values, {n: shape for n, shape in shapes.items() if n in values or n == "sigma_d"})
         with refused_if_damaged(path):
-            steps, seconds, failed = int(about["steps"]), float(about["seconds"]), about.get("failed")
+            steps, seconds, held = int(about["steps"]), float(about["seconds"]), int(about["held"])
+            failed = about["failed"]
         return Learned(
             rows, {name: value.to(rows.device) for name, value in values.items()}, steps, seconds,
-            None if failed is None else str(failed),
+            None if failed is None else str(failed), held,
         )  # fmt: skip
 
     def _of(self, block: int, number: int) -> dict[str, Any]:

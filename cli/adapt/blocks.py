@@ -91,7 +91,7 @@ class Blocks:
             Stopped: Ctrl-C; finished blocks are in their files.
         """
         began = time.perf_counter()
-        divided, failed, merged, steps, seconds = self.divided(inputs), list[str](), None, 0, 0.0
+        divided, failed, merged, steps, seconds, held = self.divided(inputs), list[str](), None, 0, 0.0, 0
         start_seconds, division = time.perf_counter() - began, divided.division
         for number in range(1, division.passes + 1):
             jobs = [Pass(block, number, merged) for block in range(division.count)]
@@ -99,10 +99,13 @@ class Blocks:
             merged = merge(division, results)
             steps += sum(result.steps for result in results)
             seconds += sum(result.seconds for result in results)
+            held = max(held, sum(result.held for result in results))  # mostly the same rows in both passes
             ended = zip(jobs, results, strict=True)
             failed += [f"{job.name(division)}: {result.failed}" for job, result in ended if result.failed]
         assert merged is not None
-        return Adapted(merged, steps, seconds, start_seconds, interrupted=False, failed="; ".join(failed) or None)
+        return Adapted(
+            merged, steps, seconds, start_seconds, interrupted=False, failed="; ".join(failed) or None, held=held
+        )
 
     def run_job(self, inputs: Inputs) -> dict[str, Any]:
         """Does the job of ``--block``, the initialization or the next pass of one block; returns the report."""

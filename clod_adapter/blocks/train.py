@@ -50,6 +50,7 @@ class Learned:
         values: ``sigma_d`` and what else training changed, by name.
         steps, seconds: of the training.
         failed: which step's loss was not finite, so that training ended early.
+        held: as ``Adapted.held``.
     """
 
     rows: Tensor
@@ -57,6 +58,7 @@ class Learned:
     steps: int
     seconds: float
     failed: str | None = None
+    held: int = 0
 
 
 def adapt_block(
@@ -107,7 +109,7 @@ def _learned(division: Division, rows: Tensor, adapted: Adapted) -> tuple[Learne
         name: value.clone() for name, value in values.items()
         if name == "sigma_d" or not torch.equal(value, getattr(division.initial, name)[rows])
     }  # fmt: skip
-    return Learned(rows, changed, adapted.steps, adapted.seconds, adapted.failed), adapted
+    return Learned(rows, changed, adapted.steps, adapted.seconds, adapted.failed, adapted.held), adapted
 
 
 def _with_target_images(

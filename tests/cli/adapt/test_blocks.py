@@ -260,6 +260,19 @@ def test_block_files_hold_infinite_opacities(
     assert torch.equal(found.isinf(), logits.isinf()) and not found.isnan().any()
 
 
+def test_non_finite_gradients_of_a_job_are_reported_by_the_merge(
+    adapt: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def spoil(found: Any) -> Any:
+        found.gradients["quats"][5] = float("nan")
+        return found
+
+    with monkeypatch.context() as patch:
+        change_step(patch, 3, spoil)
+        assert adapt("a.ply", "--block", 1).code == 0
+    assert "1 Gaussians were not moved by some steps" in adapt("a.ply").err
+
+
 def test_non_finite_loss_of_a_job_is_reported_by_the_merge(
     adapt: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
