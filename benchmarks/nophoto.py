@@ -47,7 +47,8 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
     views = photographs
     if kind == "teacher":
         # Of the views to train on alone; none is held out of them.
-        views = clod.Scene(tuple(render_pseudo_views(base, [view.camera]).train[0] for view in photographs.train), ())
+        rendered = render_pseudo_views(base, [view.camera for view in photographs.train])
+        views = clod.Scene(tuple(view.at(view.camera) for view in (*rendered.train, *rendered.test)), ())
     if kind == "placed":
         views = render_pseudo_views(base, clod.place_cameras(base, seed=config.seed))
         config = config.lighter(LIGHTER)

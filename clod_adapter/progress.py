@@ -40,7 +40,8 @@ class Progress:
         done, total: steps of the phase: views, Gaussians (pruning order), candidates (cameras) or training steps.
         seconds: of training, 0 in other phases.
         time_share: the share of the time budget that is used; 0 without one.
-        loss: running mean of the photometric loss, NaN in other phases.
+        loss: running mean of the photometric loss at the smaller dial value of each view, NaN in other phases. In the
+            first half of the steps that is above 1 in every second one.
         gaussians: in training, gives the result so far (within the last ``average`` of the steps the mean). It shares
             memory with the parameters, so use it within the listener.
         state: in training, gives the ``TrainingState`` to resume from, likewise.

@@ -28,7 +28,7 @@ class Inputs:
     """What is adapted, on which views, and how.
 
     Attributes:
-        scene, config: with few photographs, with pseudo views and lower learning rates.
+        scene, config: without photographs or with too few, with pseudo views and lower learning rates.
         alignment: the measurements of the alignment check, for the report; None without photographs.
         memory: the plan for ``--memory``; None without the option.
         notes: for the report.

@@ -26,6 +26,7 @@ from clod_adapter.training.distributed import PATIENCE, ProcessGroup, ProcessLos
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.objective import TrainableSubset
 from clod_adapter.training.plan import Plan
+from clod_adapter.training.pseudo_views import teachers_to
 from clod_adapter.training.state import Adapted, TrainingState
 
 from ..shared.interrupts import GracefulStop
@@ -137,7 +138,7 @@ def _train(number: int, launch: Launch, stop: GracefulStop) -> None:
         job: Any = group.broadcast(None)
         if job.device == "cuda":
             _take_gpu(launch)
-        base, scene = job.base.to(job.device), Scene(job.views, ())
+        base, scene = job.base.to(job.device), Scene(teachers_to(job.views, job.device), ())
         adapt(base, scene, job.config, stop.heeding(), job.state, subset=job.subset, group=group)
 
 

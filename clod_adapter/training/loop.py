@@ -38,8 +38,10 @@ def adapt(
 
     Each step samples ``batch`` views (1 by default) and follows the sum of their gradients. Each view is rendered at
     full detail and at one log-uniform dial value s in [1, max_sv], to minimise ``full_weight w_1 L_render(1) + w_s
-    L_render(s)``, where L_render is ``losses.photometric_loss`` and ``w_s = (1 - weight_slope s / max_sv)^2``.
-    ``target_count.count_gradient`` moves sigma_d so that the share of Gaussians kept follows the target-count curve.
+    L_render(s)``, where L_render is ``losses.photometric_loss`` and ``w_s = (1 - weight_slope s / max_sv)^2``. In the
+    first half of the steps every second view, at random, is rendered at two such values instead.
+    ``target_count.count_gradient`` moves sigma_d so that the share of Gaussians kept at their typical distances follows
+    the target-count curve.
     The result is the mean of the parameters over the last ``average`` of the steps, so learning rates can stay large
     to the end. A base that has a sigma_d is continued from. Training divides sigma_d by the typical distance; the
     result has it in world units.

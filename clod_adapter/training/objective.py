@@ -20,7 +20,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import splat
 from clod_adapter.training.target_count import TargetShare, count_gradient, paper_count, target_share
-from clod_adapter.training.view_sampler import Sample
+from clod_adapter.training.view_sampler import FAR_FIRST, Sample
 
 # Sigma stays where the equation still resolves it; below, a Gaussian would be culled for good.
 SIGMA_RANGE = (1e-4, SIGMA_MAX)
@@ -38,6 +38,7 @@ class TrainableSubset:
             (``target_count.target_share``).
         target: returns the count term's target at a dial value, in place of the target-count curve's.
         cameras: the whole scene's, which typical distances are from. By default those of the views.
+        far_first: as in ``view_sampler.ViewSampler``.
     """
 
     trained: int
@@ -46,6 +47,7 @@ class TrainableSubset:
     total: int | None = None
     target: Callable[[float], TargetShare] | None = None
     cameras: Sequence[Camera] | None = None
+    far_first: float = FAR_FIRST
 
 
 @dataclass

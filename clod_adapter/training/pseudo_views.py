@@ -21,10 +21,10 @@ from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import render
 from clod_adapter.training.camera_placement import place_cameras, typical_reach
 
-OWN = 96  # pseudo views that are added where photographs do not show enough of the scene:
-SHOWN, TIMES = 0.95, 4  # this share of it, each part this often,
-CHECKED, MANY = 24, 64  # as far as so many placed cameras see it; so many photographs are always enough
-DRAWN = 0.5  # pixels that a Gaussian covers in a photograph that shows it
+# Photographs are enough if there are MANY, or if TIMES of them show each part of at least SHOWN of the scene, as far as
+# CHECKED placed cameras see it. Otherwise ADDED pseudo views are added.
+MANY, SHOWN, TIMES, CHECKED, ADDED = 64, 0.95, 4, 24, 96
+COVERED = 0.5  # pixels that a Gaussian covers at least in a photograph that shows it
 TEST_EVERY = 8  # as with photographs
 LIGHTER = 0.5  # of the learning rates of all but the dial: what pseudo views show is the checkpoint, errors included
 # Standard deviations of the random offset of a camera, of its distance to the scene, and of its direction, radians; and
@@ -35,7 +35,7 @@ MOVED, TURNED, ZOOMED = 0.1, 0.05, 0.15
 class PseudoView(View):
     """A view whose photograph is a rendering of ``teacher``, which can be rendered from nearby as well.
 
-    With a fixed set of renderings Gaussians drift towards what only these cameras see.
+    With a fixed set of renderings Gaussians drift towards what only these cameras see. ``at`` returns a fixed one.
 
     Args:
         camera: the placed camera.
@@ -65,7 +65,7 @@ def moved(camera: Camera, reach: float, random: np.random.Generator) -> Camera:
         reach: unit of the position's offset, world units.
     """
     x, y, z = TURNED * random.standard_normal(3)
-    step = torch.eye(4, dtype=torch.float64)
+    step = torch.eye(4, dtype=torch.float64)  # on the CPU, where cameras are placed
     step[:3, :3] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64).matrix_exp()
     step[:3, 3] = torch.from_numpy(MOVED * reach * random.standard_normal(3))
     zoom = math.exp(ZOOMED * (2 * random.random() - 1))
@@ -77,7 +77,8 @@ def moved(camera: Camera, reach: float, random: np.random.Generator) -> Camera:
 def render_pseudo_views(gaussians: Gaussians, cameras: list[Camera], *, progress: Listener | None = None) -> Scene:
     """A scene of ``cameras`` with the checkpoint's own renderings as photographs; every 8th is held out.
 
-    Training renders each from a camera near it instead (``PseudoView.moved``).
+    Training renders each from a camera near it instead (``PseudoView.moved``); ``view.at(view.camera)`` stays where it
+    is. ``clod-adapt`` also multiplies the learning rates of all but the dial by LIGHTER (``AdaptConfig.lighter``).
 
     Args:
         gaussians: the teacher, rendered at s = 1.
@@ -101,7 +102,7 @@ def render_pseudo_views(gaussians: Gaussians, cameras: list[Camera], *, progress
 def add_pseudo_views(
     gaussians: Gaussians, scene: Scene, config: AdaptConfig, progress: Listener | None = None
 ) -> tuple[Scene, AdaptConfig]:
-    """Adds OWN pseudo views, and halves all learning rates but the dial's, if photographs show too little of the scene.
+    """Adds ADDED pseudo views, and halves all learning rates but the dial's, if photographs show too little.
 
     Training on such photographs alone would damage what they do not show. Where they show enough, pseudo views harm
     more than they help, as they contain the errors of the checkpoint and have other distances (docs/method.md). Pseudo
@@ -114,20 +115,37 @@ def add_pseudo_views(
     if not 0 < len(photographs) < MANY:
         return scene, config
     place = partial(place_cameras, gaussians, seed=config.seed, field=_field(photographs[0].camera), progress=progress)
-    few, own = f"only {len(photographs)} photographs to train on", tuple[View, ...]()
+    few = f"only {len(photographs)} photographs to train on"
     try:
         if len(photographs) >= TIMES:
             share = shown(gaussians, photographs, place(views=CHECKED))
             if share >= SHOWN:
                 return scene, config
             few = f"the {len(photographs)} photographs to train on show only {share:.0%} of the scene {TIMES} times"
-        placed = render_pseudo_views(gaussians, place(views=OWN))
-        own = (*placed.train, *placed.test)
-        added = f"{len(own)} pseudo views, the checkpoint's own renderings from placed cameras, are added"
+        placed = render_pseudo_views(gaussians, place(views=ADDED))
     except ClodError as error:
-        added = f"no pseudo views can be added ({error})"
-    note = f"{few}: {added}, and all learning rates but the dial's are halved"
+        note = f"{len(photographs)} photographs to train on may be too few, and no pseudo views can be added: {error}"
+        return replace(scene, notes=(*scene.notes, note)), config
+    own = (*placed.train, *placed.test)
+    note = (
+        f"{few}: {len(own)} pseudo views, the checkpoint's own renderings from placed cameras, are added, and all "
+        "learning rates but the dial's are halved"
+    )
     return replace(scene, train=(*photographs, *own), notes=(*scene.notes, note)), config.lighter(LIGHTER)
+
+
+def teachers_to(views: Sequence[View], device: str) -> tuple[View, ...]:
+    """The views with their teachers on ``device``: equal ones once, as a checkpoint is large."""
+    there: dict[int, Gaussians] = {}
+    found = list[View]()
+    for view in views:
+        if isinstance(view, PseudoView):
+            if id(view.teacher) not in there:
+                there[id(view.teacher)] = view.teacher.to(device)
+            teacher = there[id(view.teacher)]
+            view = PseudoView(view.camera, view.image, teacher, view.reach)
+        found.append(view)
+    return tuple(found)
 
 
 def shown(gaussians: Gaussians, photographs: Sequence[View], cameras: Sequence[Camera]) -> float:
@@ -136,7 +154,7 @@ def shown(gaussians: Gaussians, photographs: Sequence[View], cameras: Sequence[C
     def covered(camera: Camera) -> Tensor:
         return coverage(plain, plain.opacities, reduced(camera)).double()
 
-    plain, least = detach(gaussians), DRAWN / SMALLER**2
+    plain, least = detach(gaussians), COVERED / SMALLER**2
     times = torch.zeros_like(gaussians.opacity_logits, dtype=torch.int32)
     for view in photographs:
         times += covered(view.camera) > least

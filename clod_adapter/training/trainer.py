@@ -47,7 +47,7 @@ class Trainer:
     ) -> None:  # fmt: skip
         subset = subset or TrainableSubset(len(start))
         assert start.sigma_d is not None and start.attenuation is not None
-        self.config, self.group, self.sampler = config, group, ViewSampler(views, config)
+        self.config, self.group, self.sampler = config, group, ViewSampler(views, config, subset.far_first)
         rates = _learning_rates(config, _extent(start, views, subset))
         # A frozen attribute requests no gradient from the rasterizer.
         tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]

@@ -13,7 +13,7 @@ from clod_adapter.training.pseudo_views import PseudoView
 from clod_adapter.training.state import OTHER_RUN
 
 COUNTED_BEYOND = 1.5  # times max_sv: counts at the end of the dial follow the curve as they do within it
-# Until this share of the steps every second view is rendered at two dial values in place of 1 and one other: what
+# Until this share of the steps half of the views are rendered at two dial values in place of 1 and one other: what
 # remains at the far end has the longest way to go, and s = 1, where a checkpoint begins, the shortest.
 FAR_FIRST = 0.5
 
@@ -35,12 +35,15 @@ class Sample(NamedTuple):
 class ViewSampler:
     """Samples views and dial values from ``config.seed``; the same in every process.
 
+    Args:
+        far_first: FAR_FIRST, or another share where ``config`` is of a part of the training.
+
     Attributes:
         order: the numbers of the remaining views of this round, the next one last.
     """
 
-    def __init__(self, views: tuple[View, ...], config: AdaptConfig) -> None:
-        self.views, self.config = views, config
+    def __init__(self, views: tuple[View, ...], config: AdaptConfig, far_first: float = FAR_FIRST) -> None:
+        self.views, self.config, self.far_first = views, config, far_first
         self.random = np.random.default_rng(config.seed)
         self.order: list[int] = []
 
@@ -61,7 +64,7 @@ class ViewSampler:
             rendered = [1.0 if full else drawn]
         elif config.max_sv == 1:
             rendered = [1.0]
-        elif self.random.random() < 0.5 and share_done < FAR_FIRST:
+        elif self.random.random() < 0.5 and share_done < self.far_first:
             rendered = sorted([drawn, config.max_sv ** ((uniform + 0.5) % 1)])
         else:
             rendered = [1.0, drawn]

@@ -23,6 +23,7 @@ from clod_adapter.training.pseudo_views import (
     moved,
     render_pseudo_views,
     shown,
+    teachers_to,
 )
 from clod_adapter.training.view_sampler import ViewSampler
 
@@ -62,6 +63,17 @@ def test_each_step_renders_the_checkpoint_from_another_camera(blob: clod.Gaussia
     assert all(torch.equal(a.camera.viewmat, b.camera.viewmat) for a, b in zip(drawn, again, strict=True))
 
 
+def test_views_of_one_teacher_share_it_on_another_device(blob: clod.Gaussians) -> None:
+    placed = render_pseudo_views(blob, scenes.ring(3, 16, 12)).train
+    photograph = scenes.photograph(blob, scenes.ring(1, 16, 12))[0]
+    *there, same = teachers_to((*placed, photograph), "meta")
+    assert same is photograph
+    for view, own in zip(there, placed, strict=True):
+        assert isinstance(view, PseudoView) and isinstance(there[0], PseudoView) and isinstance(own, PseudoView)
+        assert view.teacher is there[0].teacher and view.teacher.means.device.type == "meta"
+        assert view.camera is own.camera and torch.equal(view.image, own.image) and view.reach == own.reach
+
+
 def test_moved_cameras_have_the_documented_offsets() -> None:
     camera, random, reach = scenes.ring(1, 40, 30)[0], np.random.default_rng(0), 3.0
     found = [moved(camera, reach, random) for _ in range(2000)]
@@ -94,7 +106,7 @@ def test_training_on_pseudo_views_improves_held_out_views() -> None:
 def test_photographs_that_show_too_little_get_pseudo_views(
     blob: clod.Gaussians, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pseudo_views, "OWN", 9)
+    monkeypatch.setattr(pseudo_views, "ADDED", 9)
     monkeypatch.setattr(pseudo_views, "MANY", 64)
     around, config = scenes.photograph(blob, scenes.ring(40, 80, 60)), clod.AdaptConfig(iters=1)
     for enough in (clod.Scene(around, ()), clod.Scene(around[:1] * 64, ())):
