@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial, reduce
 
@@ -22,8 +22,9 @@ from clod_adapter.render import render
 from clod_adapter.training.camera_placement import place_cameras, typical_reach
 
 # Photographs are enough if there are MANY, or if TIMES of them show each part of at least SHOWN of the scene, as far as
-# CHECKED placed cameras see it. Otherwise ADDED pseudo views are added.
-MANY, SHOWN, TIMES, CHECKED, ADDED = 64, 0.95, 4, 24, 96
+# CHECKED placed cameras see it. Otherwise ADDED pseudo views are added: up to half of them at the cameras of the
+# photographs, at most NEAR at each, from where they are moved WIDER; the others at placed cameras.
+MANY, SHOWN, TIMES, CHECKED, ADDED, NEAR, WIDER = 64, 0.95, 4, 24, 96, 4, 2.0
 COVERED = 0.5  # pixels that a Gaussian covers at least in a photograph that shows it
 TEST_EVERY = 8  # as with photographs
 LIGHTER = 0.5  # of the learning rates of all but the dial: what pseudo views show is the checkpoint, errors included
@@ -41,7 +42,7 @@ class PseudoView(View):
         camera: the placed camera.
         image: ``[H, W, 3]`` uint8, what the teacher shows from there.
         teacher: the checkpoint, rendered at s = 1.
-        reach: distance of camera and scene, world units.
+        reach: unit of the offsets of moved cameras, world units: the distance of camera and scene.
     """
 
     teacher: Gaussians
@@ -74,7 +75,9 @@ def moved(camera: Camera, reach: float, random: np.random.Generator) -> Camera:
 
 
 @torch.no_grad()
-def render_pseudo_views(gaussians: Gaussians, cameras: list[Camera], *, progress: Listener | None = None) -> Scene:
+def render_pseudo_views(
+    gaussians: Gaussians, cameras: Sequence[Camera], *, wider: float = 1.0, progress: Listener | None = None
+) -> Scene:
     """A scene of ``cameras`` with the checkpoint's own renderings as photographs; every 8th is held out.
 
     Training renders each from a camera near it instead (``PseudoView.moved``); ``view.at(view.camera)`` stays where it
@@ -82,12 +85,13 @@ def render_pseudo_views(gaussians: Gaussians, cameras: list[Camera], *, progress
 
     Args:
         gaussians: the teacher, rendered at s = 1.
+        wider: factor of the offsets of moved cameras' positions.
         progress: called in ``Phase.PSEUDO_VIEWS`` after each view.
     """
     teacher = gaussians.without_empty_bands()
     views, reach = list[View](), typical_reach(detach(teacher), _field(cameras[0])) if cameras else 0.0
     for camera in cameras:
-        views.append(PseudoView(camera, render(teacher, camera).pixels.cpu(), teacher, reach))
+        views.append(PseudoView(camera, render(teacher, camera).pixels.cpu(), teacher, wider * reach))
         tell(progress, Phase.PSEUDO_VIEWS, len(views), len(cameras))
     held_out = range(0, len(views), TEST_EVERY) if len(views) > 1 else range(0)
     train = tuple(view for k, view in enumerate(views) if k not in held_out)
@@ -105,8 +109,8 @@ def add_pseudo_views(
     """Adds ADDED pseudo views, and halves all learning rates but the dial's, if photographs show too little.
 
     Training on such photographs alone would damage what they do not show. Where they show enough, pseudo views harm
-    more than they help, as they contain the errors of the checkpoint and have other distances (docs/method.md). Pseudo
-    views have the field of view of the first photograph. If no camera can be placed, a note says so.
+    more than they help, as they contain the errors of the checkpoint and have other distances (docs/method.md). Placed
+    cameras have the field of view of the first photograph. If no camera can be placed, a note says so.
 
     Args:
         progress: called in ``Phase.CAMERAS``.
@@ -122,16 +126,25 @@ def add_pseudo_views(
             if share >= SHOWN:
                 return scene, config
             few = f"the {len(photographs)} photographs to train on show only {share:.0%} of the scene {TIMES} times"
-        placed = render_pseudo_views(gaussians, place(views=ADDED))
+        own = _complementary(gaussians, photographs, place)
     except ClodError as error:
         note = f"{len(photographs)} photographs to train on may be too few, and no pseudo views can be added: {error}"
         return replace(scene, notes=(*scene.notes, note)), config
-    own = (*placed.train, *placed.test)
     note = (
-        f"{few}: {len(own)} pseudo views, the checkpoint's own renderings from placed cameras, are added, and all "
+        f"{few}: {len(own)} pseudo views, the checkpoint's own renderings, are added, and all "
         "learning rates but the dial's are halved"
     )
     return replace(scene, train=(*photographs, *own), notes=(*scene.notes, note)), config.lighter(LIGHTER)
+
+
+def _complementary(
+    gaussians: Gaussians, photographs: Sequence[View], place: Callable[..., list[Camera]]
+) -> tuple[View, ...]:
+    """ADDED pseudo views, at the cameras of the photographs and at placed ones."""
+    each = max(min(NEAR, ADDED // 2 // len(photographs)), 1)
+    near = render_pseudo_views(gaussians, [view.camera for view in photographs], wider=WIDER)
+    placed = render_pseudo_views(gaussians, place(views=max(ADDED - each * len(photographs), ADDED // 2)))
+    return *each * (*near.train, *near.test), *placed.train, *placed.test
 
 
 def teachers_to(views: Sequence[View], device: str) -> tuple[View, ...]:
@@ -162,7 +175,7 @@ def shown(gaussians: Gaussians, photographs: Sequence[View], cameras: Sequence[C
     return float(seen[times >= TIMES].sum() / seen.sum().clamp(min=1e-9))
 
 
-def _describe(cameras: list[Camera]) -> str:
+def _describe(cameras: Sequence[Camera]) -> str:
     if not cameras:
         return "no images"
     return f"{cameras[0].width}x{cameras[0].height}, {_field(cameras[0]):.0f} degrees wide"

@@ -114,13 +114,14 @@ def test_photographs_that_show_too_little_get_pseudo_views(
     scene, lighter = add_pseudo_views(blob, clod.Scene(around[:1], around[1:]), config)
     assert scene.train[0] is around[0] and len(scene.train) == 1 + 9 and scene.test == around[1:]
     assert "only 1 photographs to train on: 9 pseudo views" in scene.notes[-1]
+    assert [torch.equal(view.camera.viewmat, around[0].camera.viewmat) for view in scene.train].count(True) == 1 + 4
     assert lighter.lr_means == config.lr_means / 2 and lighter.lr_sigma == config.lr_sigma
     # As many photographs as before, of one part of a scene that has another one.
     apart = {name: torch.zeros_like(value) for name, value in blob.tensors().items()}
     apart["means"] += torch.tensor([40.0, 0, 0])
     two = blob.replace(**{name: torch.cat([value, value + apart[name]]) for name, value in blob.tensors().items()})
     scene, _ = add_pseudo_views(two, clod.Scene(around, ()), config)
-    assert len(scene.train) == 40 + 9 and "the 40 photographs to train on show only" in scene.notes[-1]
+    assert len(scene.train) == 40 + 40 + 4 and "the 40 photographs to train on show only" in scene.notes[-1]
     faint = blob.replace(opacity_logits=torch.full((len(blob),), -4.6))  # too faint to place a camera by
     scene, lighter = add_pseudo_views(faint, clod.Scene(around[:2], ()), config)
     assert scene.train == around[:2] and "no pseudo views can be added" in scene.notes[-1]
