@@ -54,6 +54,7 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("scene", help="a folder of the shared data")
     parser.add_argument("--iters", nargs="+", type=int, default=list(ITERS))
+    parser.add_argument("--only", nargs="+", choices=LABELS, default=list(LABELS), help="some of the methods")
     parser.add_argument("--plot", action="store_true", help="only draw the stored rows")
     args = parser.parse_args()
     if args.plot:
@@ -61,7 +62,7 @@ def main() -> None:
         return
     base, views = checkpoint(args.scene), photographs(args.scene)
     about = {"base": clod.evaluate(base.gaussians, views.test, [1.0])[0].as_dict()}
-    for method in LABELS:
+    for method in args.only:
         for iters in args.iters:
             with Console().meter(f"{args.scene}, {method}, {iters} steps") as meter:
                 if method in ("specialist", "prefix"):
