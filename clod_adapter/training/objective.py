@@ -132,8 +132,7 @@ class Objective:
         total, count = decay.new_zeros(()), torch.zeros_like(decay[first])
         kept = torch.zeros_like(count, dtype=torch.bool)
         losses, counts = [], []
-        distances = normalized_distances(parameters["means"], view.camera, self.attenuation)  # for all dial values
-        for s, dialled, image in self._rendered(leaves, view.camera, distances, dials):
+        for s, dialled, image in self._rendered(leaves, view.camera, dials):
             loss = photometric_loss(image, photograph, config.ssim_weight)
             losses.append(float(loss.detach()))
             weight = self._weight(s, alone=len(dials) == 1)
@@ -155,12 +154,13 @@ class Objective:
         return GradientSum(gradients | {self.decay: gradients[self.decay] + count}, kept, losses[0])
 
     def _rendered(
-        self, leaves: dict[str, Tensor], camera: Camera, distances: Tensor, dials: list[float]
+        self, leaves: dict[str, Tensor], camera: Camera, dials: list[float]
     ) -> Iterator[tuple[float, Attenuated, Tensor]]:
         """Each dial value, the opacities of the rows that have a dial, and the image."""
         rows = slice(self.trained) if self.part.full_context else slice(None)
         attributes: Any = {name: leaves[name] for name in ATTRIBUTES}
         shown = Gaussians(**attributes, screen_filter=self.screen_filter)
+        distances = normalized_distances(leaves["means"].detach(), camera, self.attenuation)  # for all dial values
         logits, sigma = leaves["opacity_logits"][rows], self.sigma(leaves[self.decay][rows])
         growth_d = leaves["growth_d"][rows] if "growth_d" in leaves else None
         for s in dials:

@@ -142,8 +142,9 @@ def _complementary(
 ) -> tuple[View, ...]:
     """ADDED pseudo views, at the cameras of the photographs and at placed ones."""
     each = max(min(NEAR, ADDED // 2 // len(photographs)), 1)
-    near = render_pseudo_views(gaussians, [view.camera for view in photographs], wider=WIDER)
-    placed = render_pseudo_views(gaussians, place(views=max(ADDED - each * len(photographs), ADDED // 2)))
+    teacher = gaussians.without_empty_bands()  # one for all: it may be a copy
+    near = render_pseudo_views(teacher, [view.camera for view in photographs], wider=WIDER)
+    placed = render_pseudo_views(teacher, place(views=max(ADDED - each * len(photographs), ADDED // 2)))
     return *each * (*near.train, *near.test), *placed.train, *placed.test
 
 
