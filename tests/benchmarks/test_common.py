@@ -14,10 +14,10 @@ def test_a_table_is_markdown() -> None:
 
 
 def test_a_process_is_timed_by_its_messages() -> None:
-    code = "import sys, time; print('half', file=sys.stderr, flush=True); time.sleep(0.3); print('done')"
+    code = "import sys, time; print('half', file=sys.stderr, flush=True); time.sleep(1.5); print('done')"
     run = common.Process([sys.executable, "-c", code], {"half": "^half"})
     assert (run.out, run.lines) == ("done\n", ["half"])
-    assert 0 < run.moments["half"] <= run.seconds and run.seconds >= 0.3  # a busy machine reads the message late
+    assert 0 < run.moments["half"] <= run.seconds - 0.3  # a busy machine reads the message up to a second late
     assert run.peak_bytes >= max(size for _, size, _ in run.memory) > 0
 
 
