@@ -68,7 +68,8 @@ class TargetCost:
         base: its dial is ignored; cameras: of views, at least one.
 
     Attributes:
-        measured: ``[1 + DIALS]`` float64, the share of the training from which on the next measurement is due, and the factors.
+        measured: ``[1 + DIALS]`` float64, the share of the training at which the next measurement is due, and the
+            factors.
     """
 
     def __init__(self, base: Gaussians, cameras: Sequence[Camera], config: AdaptConfig) -> None:
