@@ -64,7 +64,7 @@ def train(scene: str, target: str, iters: int) -> None:
     base, views, config = checkpoint(scene).gaussians, photographs(scene), settings(target, iters)
     plan = clod.make_plan(base, views, config)
     CACHE.mkdir(parents=True, exist_ok=True)
-    clod.save(plan.whole(base, plan.adapt(views).gaussians), file_of(scene, target, iters))
+    clod.save(file_of(scene, target, iters), plan.whole(base, plan.adapt(views).gaussians))
 
 
 def compared(scene: str, iters: int) -> Row:
