@@ -115,8 +115,9 @@ def test_it_does_not_oscillate_under_noise_of_20_percent() -> None:
         renderer = Renderer(exponent, fixed, start=3.0)
         dials = np.array(renderer.follow([1.0] * 400, noise(seed)))
         times = np.log([renderer.ms(dial) / BUDGET for dial in dials])
-        assert np.abs(np.diff(np.log(dials))).mean() <= 0.01, (exponent, fixed, seed)
-        assert np.log(dials).std() <= 0.16 and times.std() <= 0.1, (exponent, fixed, seed)
+        changes = np.abs(np.diff(np.log(dials)))
+        assert changes.mean() <= 0.015 and np.median(changes) <= 0.005, (exponent, fixed, seed)
+        assert np.log(dials).std() <= 0.2 and times.std() <= 0.1, (exponent, fixed, seed)
 
 
 @pytest.mark.parametrize(("load", "end"), [(50.0, MAX_SV), (0.01, 1.0)])
