@@ -13,7 +13,7 @@ import pytest
 
 import clod_adapter
 from clod_adapter.frame_rate import excess, next_dial
-from shown import Shown, serve
+from shown import Shown, serve, take
 
 LAW = Path(clod_adapter.__file__).parent / "viewer" / "web" / "src" / "frame_rate.js"
 BUDGET = 0.8 * 1000 / 60  # ms of a frame at 60 fps
@@ -156,8 +156,8 @@ HAND = """
 """
 
 
-def test_the_dial_by_hand_ends_it(simulated: Shown) -> None:
-    """So do the equation's switch and a link, which both change the dial."""
+def test_the_dial_by_hand_ends_it(simulated: Shown, model: Path) -> None:
+    """So do the equation's switch, a link, and another file."""
     shown = simulated
     for end in (line.strip() for line in HAND.strip().splitlines()):
         shown.run("(clod.setDial(1), clod.setEquation(true))")
@@ -167,7 +167,9 @@ def test_the_dial_by_hand_ends_it(simulated: Shown) -> None:
         shown.until("!document.getElementById('hold').checked")
         dial = dial_of(shown)
         assert turned(shown, 3) == [] and dial_of(shown) == dial, end
-    assert shown.errors == []
+    shown.page.evaluate("document.getElementById('hold').click()")
+    take(shown, model)
+    assert not shown.page.is_checked("#hold") and shown.errors == []
 
 
 def test_r_turns_it_on_and_off(simulated: Shown) -> None:
