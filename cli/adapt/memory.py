@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import math
+import tempfile
 from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
 
 from clod_adapter.blocks.memory import IMAGES, MemoryEstimate, MemoryPlan, in_words, parse_size, plan_for_limit
 from clod_adapter.cameras import Scene, StoredView
-from clod_adapter.errors import ClodError
-from clod_adapter.io.checkpoint import Checkpoint, load
+from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.image_cache import ImageCache
 
 from ..shared.console import Console
@@ -47,18 +50,21 @@ def plan_memory(args: argparse.Namespace, base: Checkpoint, scene: Scene, consol
     return plan
 
 
-def without_rows(base: Checkpoint) -> Checkpoint:
-    """The checkpoint without the rows of its file, which are needed for writing only."""
-    return replace(base, vertex=base.vertex[:0].copy())
+def rows_on_disk(base: Checkpoint, folder: Path) -> Checkpoint:
+    """The checkpoint with its file's rows, which only writing needs, in a mapped file without a name in ``folder``.
 
-
-def with_rows(base: Checkpoint, args: argparse.Namespace) -> Checkpoint:
-    """The inverse of ``without_rows``: reads the file again.
-
-    Raises:
-        ClodError: the file has changed.
+    A later change of the checkpoint's file does not reach them. Where they cannot be written they stay in memory.
     """
-    again = load(args.ply, activated=args.activated, origin=base.origin)
-    if again.fingerprint != base.fingerprint:
-        raise ClodError(f"{args.ply}: has changed since it was read; run the same command again")
-    return replace(again, gaussians=base.gaussians)
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            base.vertex.tofile(file)
+            file.flush()
+            mapped = np.memmap(file, base.vertex.dtype, "r", shape=base.vertex.shape)
+    except OSError:
+        return base
+    return replace(base, vertex=np.asarray(mapped))
+
+
+def without_rows(base: Checkpoint) -> Checkpoint:
+    """The checkpoint without the rows of its file, for jobs that write no output."""
+    return replace(base, vertex=base.vertex[:0].copy())

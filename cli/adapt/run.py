@@ -22,7 +22,6 @@ from ..shared.pages import AdaptPage
 from .blocks import Blocks
 from .display import ProgressDisplay
 from .inputs import Inputs, read_inputs, with_base_rows
-from .memory import without_rows
 from .plan import decide
 from .processes import TrainingJob, together
 from .report import finish
@@ -64,13 +63,13 @@ def adapt_whole(setup: Setup, inputs: Inputs) -> dict[str, Any]:
 
 
 def adapt_blocks(setup: Setup, inputs: Inputs, blocks: Blocks) -> dict[str, Any]:
-    """The same in blocks, without a plan, which would need all Gaussians at once."""
-    inputs = with_base_rows(setup, replace(inputs, base=without_rows(inputs.base)))
+    """The same in blocks."""
+    inputs = with_base_rows(setup, inputs)
     with setup.stop.listening():
         page = make_page(setup, inputs)
-        adapted = blocks.adapt(inputs)
+        plan, adapted = blocks.adapt(inputs)
         release_memory()
-        result = make_result(setup, inputs, None, adapted)
+        result = make_result(setup, inputs, plan, adapted)
     return finish(setup, inputs, result, page, lambda complete: blocks.remove() if complete else None)
 
 

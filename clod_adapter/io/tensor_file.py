@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from safetensors import safe_open
 
@@ -15,6 +16,31 @@ from clod_adapter.io.sniff import file_sha256, handle_name, read_start, refuse_k
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Writes the file that safetensors' own ``save`` makes, byte for byte, without copies of tensors on the CPU.
+
+    ``save`` holds the whole file in memory, and ``save_file`` makes files that only their owner can read.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    arrays = {name: tensor.detach().cpu().contiguous().numpy() for name, tensor in tensors.items()}
+    # As safetensors orders them: by size of a number, floats first, and by name.
+    names = sorted(arrays, key=lambda name: (-arrays[name].itemsize, arrays[name].dtype.kind, name))
+    header, at = dict[str, Any](__metadata__=dict(sorted(metadata.items()))), 0
+    for name in names:
+        array, end = arrays[name], at + arrays[name].nbytes
+        kind = "BOOL" if array.dtype == bool else f"{array.dtype.kind.upper()}{8 * array.itemsize}"
+        header[name] = {"dtype": kind, "shape": list(array.shape), "data_offsets": [at, end]}
+        at = end
+    head = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    head += b" " * (-len(head) % 8)
+    with open(path, "wb") as file:
+        file.write(len(head).to_bytes(8, "little") + head)
+        for name in names:
+            file.write(arrays[name].data)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
