@@ -18,6 +18,13 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+TYPES = {
+    "int64": "I64", "float64": "F64", "float32": "F32", "int32": "I32", "float16": "F16", "int16": "I16",
+    "uint8": "U8", "bool": "BOOL",
+}  # fmt: skip
+"""Names of types in a file, by numpy's name, in the order in which a file has its tensors."""
+
+
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
     """Writes the file that safetensors' own ``save`` makes, byte for byte, without copies of tensors on the CPU.
 
@@ -27,13 +34,11 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
         OSError: it cannot be written.
     """
     arrays = {name: tensor.detach().cpu().contiguous().numpy() for name, tensor in tensors.items()}
-    # As safetensors orders them: by size of a number, floats first, and by name.
-    names = sorted(arrays, key=lambda name: (-arrays[name].itemsize, arrays[name].dtype.kind, name))
-    header, at = dict[str, Any](__metadata__=dict(sorted(metadata.items()))), 0
+    header, at, types = dict[str, Any](__metadata__=dict(metadata)), 0, list(TYPES)
+    names = sorted(arrays, key=lambda name: (types.index(arrays[name].dtype.name), name))
     for name in names:
         array, end = arrays[name], at + arrays[name].nbytes
-        kind = "BOOL" if array.dtype == bool else f"{array.dtype.kind.upper()}{8 * array.itemsize}"
-        header[name] = {"dtype": kind, "shape": list(array.shape), "data_offsets": [at, end]}
+        header[name] = {"dtype": TYPES[array.dtype.name], "shape": list(array.shape), "data_offsets": [at, end]}
         at = end
     head = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     head += b" " * (-len(head) % 8)
