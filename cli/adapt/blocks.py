@@ -31,6 +31,7 @@ from ..shared.report import machine
 from .block_files import BlockFiles
 from .display import ProgressDisplay
 from .inputs import Inputs
+from .memory import move_to_disk
 from .plan import complete, override
 from .resume import check_resumed, find_state, settings_key
 from .saver import Saver
@@ -166,6 +167,8 @@ class Blocks:
             del plan, made
             release_memory()
         plan, division, files = self.files.load_start(base, views)
+        if plan.kept is not None:  # what is trained is a copy
+            move_to_disk(base, self.files.ply.parent)
         if division.count != self.plan.blocks:
             raise ClodError(
                 f"{path}: is of a run in {division.count} blocks, and --memory {self.setup.args.memory} makes "

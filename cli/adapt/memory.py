@@ -9,9 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from clod_adapter.blocks.memory import IMAGES, MemoryEstimate, MemoryPlan, in_words, parse_size, plan_for_limit
 from clod_adapter.cameras import Scene, StoredView
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.image_cache import ImageCache
 
@@ -51,18 +53,29 @@ def plan_memory(args: argparse.Namespace, base: Checkpoint, scene: Scene, consol
 
 
 def rows_on_disk(base: Checkpoint, folder: Path) -> Checkpoint:
-    """The checkpoint with its file's rows, which only writing needs, in a mapped file without a name in ``folder``.
+    """The checkpoint with its file's rows, which only writing needs, on disk (``_mapped``).
 
-    A later change of the checkpoint's file does not reach them. Where they cannot be written they stay in memory.
+    A later change of the checkpoint's file does not reach them.
     """
+    return replace(base, vertex=_mapped(base.vertex, folder))
+
+
+def move_to_disk(gaussians: Gaussians, folder: Path) -> None:
+    """Replaces, in place, the memory of all tensors on the CPU by a file (``_mapped``), whoever refers to them."""
+    for tensor in gaussians.tensors().values():
+        if tensor.device.type == "cpu" and tensor.numel():
+            tensor.data = torch.from_numpy(_mapped(tensor.numpy(), folder))
+
+
+def _mapped(array: np.ndarray, folder: Path) -> np.ndarray:
+    """The array in a mapped file without a name in ``folder``; itself where that cannot be written."""
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
-            base.vertex.tofile(file)
+            array.tofile(file)
             file.flush()
-            mapped = np.memmap(file, base.vertex.dtype, "r", shape=base.vertex.shape)
+            return np.asarray(np.memmap(file, array.dtype, "c", shape=array.shape))
     except OSError:
-        return base
-    return replace(base, vertex=np.asarray(mapped))
+        return array
 
 
 def without_rows(base: Checkpoint) -> Checkpoint:

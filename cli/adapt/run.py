@@ -22,6 +22,7 @@ from ..shared.pages import AdaptPage
 from .blocks import Blocks
 from .display import ProgressDisplay
 from .inputs import Inputs, read_inputs, with_base_rows
+from .memory import move_to_disk
 from .plan import decide
 from .processes import TrainingJob, together
 from .report import finish
@@ -53,6 +54,8 @@ def adapt_whole(setup: Setup, inputs: Inputs) -> dict[str, Any]:
     with setup.stop.listening():  # until training has ended, so that a Ctrl-C loses nothing
         display = show_progress(setup, inputs)
         plan = decide(setup, inputs, display)
+        if plan.kept is not None:  # what is trained is a copy
+            move_to_disk(inputs.base.gaussians, setup.outputs.ply.parent)
         page = make_page(setup, inputs)
         saver = Saver(setup.outputs.state, run_of, setup.resumed, setup.console, setup.stop)
         with saver.rescuing():

@@ -1,4 +1,4 @@
-"""The rows of the checkpoint's file while it is adapted."""
+"""What is on disk while a checkpoint is adapted."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 import clod_adapter
-from clod_adapter.cli.adapt.memory import rows_on_disk
+from clod_adapter.cli.adapt.memory import move_to_disk, rows_on_disk
 
 
 def test_rows_are_on_disk_until_they_are_written(capture: Any, tmp_path: Path) -> None:
@@ -18,7 +19,19 @@ def test_rows_are_on_disk_until_they_are_written(capture: Any, tmp_path: Path) -
     mapped = rows_on_disk(base, tmp_path)
     assert isinstance(mapped.vertex.base, np.memmap) and not list(tmp_path.iterdir())
     assert np.array_equal(mapped.vertex, base.vertex) and mapped.vertex.dtype == base.vertex.dtype
-    assert rows_on_disk(base, tmp_path / "absent") is base
+    assert rows_on_disk(base, tmp_path / "absent").vertex is base.vertex
     for name, each in (("a.ply", base), ("b.ply", mapped)):
         clod_adapter.save(tmp_path / name, base.gaussians, replace(each, gaussians=base.gaussians))
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_tensors_move_to_disk_for_all_that_refer_to_them(capture: Any, tmp_path: Path) -> None:
+    base, same = (clod_adapter.load(capture.ply).gaussians for _ in range(2))
+    other = base.replace(opacity_logits=base.opacity_logits.clone())
+    move_to_disk(base, tmp_path)
+    assert not list(tmp_path.iterdir())
+    for name, tensor in base.tensors().items():
+        assert torch.equal(tensor, getattr(same, name))
+        shared = getattr(other, name)
+        assert (shared.data_ptr() == tensor.data_ptr()) == (name != "opacity_logits"), name
+    base.means[0] = 1.0  # a private copy of the page
