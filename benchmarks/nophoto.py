@@ -2,7 +2,7 @@
 
     python benchmarks/nophoto.py plush_half --iters 600 --kinds photographs placed
     python benchmarks/nophoto.py --table                  # the rows as a Markdown table
-    python benchmarks/nophoto.py plush_half city:1000000 --cameras   # placing cameras, with and without sampling
+    python benchmarks/nophoto.py plush_half city:1000000 --cameras --sample 20000   # placing cameras alone
     python benchmarks/nophoto.py --city 4000000 --iters 200          # the whole command: time and memory
 
 The kinds of views: ``photographs`` (real cameras and photographs), ``teacher`` (real cameras, renders of the
@@ -47,15 +47,16 @@ def main() -> None:
     parser.add_argument("--iters", type=int, default=clod.AdaptConfig().iters)
     parser.add_argument("--max-sv", type=float, default=7.0)
     parser.add_argument("--cameras", action="store_true", help="place cameras only; a scene may be city:N")
-    parser.add_argument("--whole", action="store_true", help="with --cameras: also without sampling")
+    parser.add_argument("--sample", type=int, default=camera_score.SAMPLE, help="Gaussians that score a camera")
     parser.add_argument("--city", type=int, nargs="+", default=[], metavar="N", help="run the command on cities of N")
     parser.add_argument("--memory", default="8GB", help="of the command")
     args = parser.parse_args()
+    camera_score.SAMPLE = args.sample
     for count in args.city:
         run_command(count, args.iters, args.max_sv, args.memory)
     if args.cameras:
         for scene in args.scenes:
-            compare_cameras(scene, args.whole)
+            check_cameras(scene)
         return
     for scene in args.scenes:
         for kind in args.kinds:
@@ -86,6 +87,7 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
     rows = clod.evaluate(result, photographs.test, [s for s in DIALS if s <= config.max_sv])
     append(FILE, {
         "benchmark": "nophoto", "scene": scene, "kind": kind, "config": asdict(config), "views": len(views.train),
+        "sample": camera_score.SAMPLE,
         "photographs": len(photographs.train), "base": base_row.as_dict(), "rows": [row.as_dict() for row in rows],
         "at_shares": at_shares(result, photographs.test), "steps": adapted.steps,
         "views_seconds": round(seconds, 2), "train_seconds": round(adapted.seconds, 2),
@@ -109,8 +111,8 @@ def run_command(count: int, iters: int, max_sv: float, memory: str) -> None:
     })  # fmt: skip
 
 
-def compare_cameras(scene: str, whole: bool) -> None:
-    """Places cameras with a sample, and all Gaussians; scores them by all, and by what other cameras see.
+def check_cameras(scene: str) -> None:
+    """Places cameras by a sample of the Gaussians; scores them by all, and by what other cameras see.
 
     ``shown``: share of what the real cameras see (a city's: those of its photographs) that four placed ones show.
     """
@@ -119,21 +121,17 @@ def compare_cameras(scene: str, whole: bool) -> None:
         gaussians, real = perturb(city(int(count))), city_cameras(40, 496, 368, count=int(count))
     else:
         gaussians, real = checkpoint(scene).gaussians, [view.camera for view in photographs_of(scene).train]
-    usual = camera_score.SAMPLE
-    for limit in (usual, 10**9) if whole else (usual,):
-        camera_score.SAMPLE = limit
-        began, cpu = time.perf_counter(), time.process_time()
-        cameras = clod.place_cameras(gaussians)
-        seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
-        views = [clod.View(camera, torch.empty(0, dtype=torch.uint8)) for camera in cameras]
-        scores = [camera_score.score(gaussians, None, reduced(camera)) for camera in cameras[:SCORED]]
-        append(SIZES, {
-            "benchmark": "cameras", "scene": scene, "gaussians": len(gaussians), "sample": min(limit, len(gaussians)),
-            "seconds": round(seconds, 2), "cpu_seconds": round(cpu, 2), "cameras": len(cameras),
-            "score": fmean(filter(math.isfinite, scores)), "empty": sum(map(math.isinf, scores)),
-            "shown": shown(gaussians, views, real), "busy": round(os.getloadavg()[0], 2),
-        })  # fmt: skip
-    camera_score.SAMPLE = usual
+    began, cpu = time.perf_counter(), time.process_time()
+    cameras = clod.place_cameras(gaussians)
+    seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
+    views = [clod.View(camera, torch.empty(0, dtype=torch.uint8)) for camera in cameras]
+    scores = [camera_score.score(gaussians, None, reduced(camera)) for camera in cameras[:SCORED]]
+    append(SIZES, {
+        "benchmark": "cameras", "scene": scene, "gaussians": len(gaussians), "sample": camera_score.SAMPLE,
+        "seconds": round(seconds, 2), "cpu_seconds": round(cpu, 2), "cameras": len(cameras),
+        "score": fmean(filter(math.isfinite, scores)), "empty": sum(map(math.isinf, scores)),
+        "shown": shown(gaussians, views, real), "busy": round(os.getloadavg()[0], 2),
+    })  # fmt: skip
 
 
 def print_table() -> None:
