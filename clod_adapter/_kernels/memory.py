@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import math
 import weakref
 from collections import deque
 from typing import Any
@@ -31,7 +32,7 @@ def aligned(size: int, dtype: Any) -> np.ndarray:
 
 def recycled(shape: torch.Size | tuple[int, ...]) -> Tensor:
     """An uninitialised float32 tensor in memory of an earlier, freed one."""
-    size = int(np.prod(shape))
+    size = math.prod(shape)
     if size < _SMALL:
         return torch.empty(shape, dtype=torch.float32, device="cpu")
     step = 1 << max(size.bit_length() - 4, 0)
