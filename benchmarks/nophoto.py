@@ -124,7 +124,8 @@ def check_cameras(scene: str) -> None:
     began, cpu = time.perf_counter(), time.process_time()
     cameras = clod.place_cameras(gaussians)
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
-    views = [clod.View(camera, torch.empty(0, dtype=torch.uint8)) for camera in cameras]
+    none = torch.zeros(cameras[0].height, cameras[0].width, 3, dtype=torch.uint8)
+    views = [clod.View(camera, none) for camera in cameras]
     scores = [camera_score.score(gaussians, None, reduced(camera)) for camera in cameras[:SCORED]]
     append(SIZES, {
         "benchmark": "cameras", "scene": scene, "gaussians": len(gaussians), "sample": camera_score.SAMPLE,
