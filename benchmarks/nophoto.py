@@ -30,10 +30,12 @@ from clod_adapter.training import camera_score
 from clod_adapter.training.pseudo_views import LIGHTER, add_pseudo_views, render_pseudo_views, shown
 from common import COMMAND, Process, append, arguments, checkpoint, stored, table
 from common import photographs as photographs_of
+from scaling import by_phase
 
 import torch
 
 FILE, SIZES = "nophoto.jsonl", "sizes.jsonl"
+SAID = {"load": "Gaussians, SH degree", "cameras": "^no photographs", "plan": "^plan:", "train": "^trained "}
 SCORED = 24  # placed cameras that are scored by all Gaussians
 KINDS = ("photographs", "teacher", "placed", "complemented")
 DIALS = (1.0, 2.0, 3.0, 5.0, 7.0)
@@ -101,12 +103,13 @@ def run_command(count: int, iters: int, max_sv: float, memory: str) -> None:
         ply, out = Path(temporary) / "city.ply", Path(temporary) / "out.ply"
         clod.save(ply, perturb(city(count, sh_degree=0)))
         words = [ply, "--max-sv", max_sv, "--iters", iters, "--trim", "--memory", memory, "--out", out, "--json"]
-        run = Process([*COMMAND, *words])
+        run = Process([*COMMAND, *words], SAID)
         found = json.loads(run.out)
+    peaks, cpu = by_phase(run, [*run.moments.items(), ("measure and write", run.seconds)])
     append(SIZES, {
         "benchmark": "command", "gaussians": count, "sh_degree": 0, "steps": found["steps"], "max_sv": max_sv,
         "limit": memory, "blocks": found["memory"]["blocks"], **run.cost(), "busy": round(os.getloadavg()[0], 2),
-        "phases": found["seconds"], "plan": found["plan"]["decisions"], "base": found["base_rows"],
+        "phases": found["seconds"], "phase_peaks": peaks, "phase_cpu": cpu, "plan": found["plan"]["decisions"], "base": found["base_rows"],
         "rows": found["rows"],
     })  # fmt: skip
 
