@@ -109,8 +109,8 @@ def run_command(count: int, iters: int, max_sv: float, memory: str) -> None:
     append(SIZES, {
         "benchmark": "command", "gaussians": count, "sh_degree": 0, "steps": found["steps"], "max_sv": max_sv,
         "limit": memory, "blocks": found["memory"]["blocks"], **run.cost(), "busy": round(os.getloadavg()[0], 2),
-        "phases": found["seconds"], "phase_peaks": peaks, "phase_cpu": cpu, "plan": found["plan"]["decisions"], "base": found["base_rows"],
-        "rows": found["rows"],
+        "phases": found["seconds"], "phase_peaks": peaks, "phase_cpu": cpu, "plan": found["plan"]["decisions"],
+        "base": found["base_rows"], "rows": found["rows"],
     })  # fmt: skip
 
 
