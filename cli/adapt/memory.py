@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import shutil
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -68,8 +69,13 @@ def move_to_disk(gaussians: Gaussians, folder: Path) -> None:
 
 
 def _mapped(array: np.ndarray, folder: Path) -> np.ndarray:
-    """The array in a mapped file without a name in ``folder``; itself where that cannot be written."""
+    """The array in a mapped file without a name in ``folder``; itself where that cannot be written.
+
+    Room for the outputs remains: four times its size must be free.
+    """
     try:
+        if shutil.disk_usage(folder).free < 4 * array.nbytes:
+            return array
         with tempfile.TemporaryFile(dir=folder) as file:
             array.tofile(file)
             file.flush()
