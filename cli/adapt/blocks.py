@@ -117,7 +117,9 @@ class Blocks:
         divided = self.divided(inputs)
         division, files, block = divided.division, divided.files, args.block
         path = files.start
-        if block != "start":
+        if block == "start":
+            complete(divided.plan, self.setup, inputs)
+        else:
             self._require_block(block, division.count)
             block = int(block) - 1
             number = 1 if not files.block(block, 1).exists() else division.passes

@@ -87,6 +87,7 @@ def test_jobs_write_the_files_of_one_process(
     done = adapt("jobs.ply", "--block", "start", "--json")
     about = json.loads(done.out)
     assert done.code == 0 and about["blocks"] == BLOCKS and (about["pass"], about["missing"]) == (1, [1, 2, 3])
+    assert "unseen Gaussians" in done.err
     for number in (3, 1):
         done = adapt("jobs.ply", "--block", number)
         assert done.code == 0 and (tmp_path / f"jobs.block{number}.pass1.safetensors").exists()
