@@ -224,6 +224,24 @@ def _prepare_dialled(gaussians: Gaussians, camera: Camera, virtual_scale: float)
     return _prepare(dial.project_dialled, len(g), inputs, cam, size, g.screen_filter.compensate)
 
 
+@torch.no_grad()
+def work(gaussians: Gaussians, camera: Camera, virtual_scale: float = 1.0) -> tuple[Tensor, Tensor]:
+    """``[N]`` float32, what drawing each Gaussian takes: the tiles that list it, and the 4x4 blocks that blend it.
+
+    A block whose pixels are all opaque already blends no more, so work depends on what is in front.
+    """
+    frame = _prepare_dialled(gaussians, camera, virtual_scale)
+    _blend(frame, np.zeros(3, np.float32))
+    n, counted = len(gaussians), np.zeros((2, len(gaussians)), np.float32)
+    tiles.tally(frame.entries, frame.masks, blocks.WORDS, *counted)
+    found = np.zeros_like(counted)
+    for worker, count in enumerate(frame.counts.tolist()):
+        packed = slice(n * worker // frame.workers, n * worker // frame.workers + count)
+        found[:, frame.packed_ids[packed]] = counted[:, packed]
+    _give(frame.buffers)
+    return torch.from_numpy(found[0]), torch.from_numpy(found[1])
+
+
 def _dial_vector(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> np.ndarray:
     """The dial in the layout of the kernels."""
     out, config = np.zeros(conventions.DIAL, np.float32), gaussians.attenuation
