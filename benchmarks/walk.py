@@ -1,11 +1,12 @@
 """Near to far: from a doorstep in a made-up town to a hundred times as far and back, by the dial and by levels.
 
-    python benchmarks/walk.py --record     # benchmarks/results/walk.jsonl, docs/images/walk.png and the table
-    python benchmarks/walk.py --table      # the table of the last row
+    python benchmarks/walk.py --record     # adds a row to results/walk.jsonl; docs/images/walk.png, tables of the page
+    python benchmarks/walk.py --table      # the tables of the last row
 
-The town is ``city.py``'s. Its checkpoint is the perturbed town, trained on photographs from the streets and from the
-air; the adapted file is that checkpoint adapted to the same photographs. Both are kept in ``benchmarks/cache`` by
-their settings. Every frame is compared with the supersampled, unperturbed town. In turn, in each frame:
+The town is ``city.py``'s. Its checkpoint is the perturbed town, trained on photographs from the streets, from the air
+and from as far as the walk; the adapted file is that checkpoint adapted to the same photographs. Both are kept in
+``benchmarks/cache`` by their settings. Every frame is compared with the supersampled, unperturbed town. In each frame,
+in turn:
 
 - ``base``: the checkpoint;
 - ``dial, s = 1``: the adapted file; distance alone decides;
@@ -35,7 +36,7 @@ from clod_adapter.equation.distances import in_frustum
 from clod_adapter.evaluation import popping
 from clod_adapter.metrics import psnr
 from clod_adapter.render import dial, splat
-from common import Row, append, arguments, stored
+from common import Row, append, arguments, fill_in, stored
 from tuning import merge
 from walk_town import Levels, Town, adapted, checkpoint, choose, distances, held
 
@@ -58,10 +59,12 @@ def main() -> None:
     args = parser.parse_args()
     town = Town(count=args.count)
     row = measure(town, args.frames, args.repeats, args.budget)
-    print(page.summary(row))
     if args.record:
         append(page.FILE, row)
         page.draw(row, town)
+        fill_in(page.PAGE, "walk", page.summary(row))
+    else:
+        print(page.summary(row))
 
 
 def measure(town: Town, frames: int, repeats: int, budget: float) -> Row:
