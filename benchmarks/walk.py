@@ -55,7 +55,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=Town.count, help="Gaussians of the town")
     parser.add_argument("--frames", type=int, default=121, help="from near to far")
     parser.add_argument("--repeats", type=int, default=3, help="timed renderings of a frame, each way")
-    parser.add_argument("--budget", type=float, default=0.1, help="Gaussians in view, a share of all (dial, held)")
+    parser.add_argument("--budget", type=float, default=0.2, help="Gaussians in view, a share of all (dial, held)")
     args = parser.parse_args()
     town = Town(count=args.count)
     row = measure(town, args.frames, args.repeats, args.budget)
