@@ -18,6 +18,7 @@ PARAMETERS = ("log", "linear")
 SAMPLINGS = ("pair", "log", "uniform")
 COUNT_TERMS = ("law", "paper")
 GROWTHS = ("on", "off")
+TARGETS = ("count", "cost")
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
 
 
@@ -158,6 +159,9 @@ class AdaptConfig:
         2.5, "weight of the loss at s = 1 relative to that at the other dial value (sampling pair)"
     )
     full_share: float = option(0.0, "share of steps at s = 1 (samplings log and uniform)")
+    target: str = option(
+        "count", "what the dial reduces: count (of Gaussians, the paper's) or cost (of rendering, in time)"
+    )
     exponent: float = option(1.5, "target-count curve: the target share of Gaussians at s is s^-exponent")
     count_term: str = option(
         "law", "count loss: law (both directions, through sigma_d alone) or paper (the paper's L_reg)"
@@ -200,6 +204,8 @@ class AdaptConfig:
         }
         for name, allowed in choices.items():
             require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
+        known = TARGETS if self.count_term == "law" and self.parameter == "log" else TARGETS[:1]
+        require(self.target in known, "target", self.target, "count; or cost, with count_term law and parameter log")
         require(0 <= self.full_share <= 1, "full_share", self.full_share, "between 0 and 1")
         require(0 <= self.full_weight < math.inf, "full_weight", self.full_weight, "at least 0 and finite")
         require(0 < self.exponent < math.inf, "exponent", self.exponent, "positive and finite")

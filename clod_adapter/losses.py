@@ -68,39 +68,35 @@ def unit(photograph: Tensor, like: Tensor) -> Tensor:
     return photograph.to(like.device, non_blocking=True).to(like.dtype) / 255
 
 
-class _Fused:
-    """Fused comparison of a render with a photograph on the CPU; owns the kernels' scratch planes."""
+def _compare(image: Tensor, target: Tensor, l1: float, dssim: float) -> tuple[Tensor, float, float]:
+    """The gradient of ``l1 sum |x - y| - dssim sum SSIM`` with respect to the image, ``sum |x - y|``, and ``sum SSIM``.
 
-    def __init__(self, image: Tensor, target: Tensor) -> None:
-        from clod_adapter._kernels import ssim as kernels
-        from clod_adapter._kernels import threads
+    One fused pass on the CPU.
+    """
+    from clod_adapter._kernels import ssim as kernels
+    from clod_adapter._kernels import threads
+    from clod_adapter._kernels.memory import give_planes, take_planes
 
-        self.kernels, self.threads, self.workers = kernels, threads, threads.worker_count()
-        self.height, self.width, _ = image.shape
-        planes = np.zeros((6, 3, self.height, kernels.stride(self.width)), np.float32)
-        self.x, self.y, similarity, *self.slopes = planes
-        pixels, sums = image.detach().contiguous().numpy(), np.zeros(self.workers)
-        threads.run(kernels.to_planes, self.workers, pixels, target.contiguous().numpy(), self.x, self.y)
-        threads.run(kernels.ssim_map, self.workers, self.x, self.y, self.width, similarity, *self.slopes, sums)
-        self.ssim_sum = sums.sum()
-
-    def gradient(self, l1: float, dssim: float) -> tuple[Tensor, float]:
-        """The gradient of ``l1 sum |x - y| - dssim sum SSIM`` with respect to the image, and ``sum |x - y|``."""
-        out, sums = torch.empty(self.height, self.width, 3, dtype=torch.float32, device="cpu"), np.zeros(self.workers)
-        self.threads.run(
-            self.kernels.loss_gradient, self.workers, self.x, self.y, self.width, *self.slopes, l1, dssim, out.numpy(),
-            sums,
-        )  # fmt: skip
-        return out, float(sums.sum())
+    (height, width, _), workers = image.shape, threads.worker_count()
+    shape = (6, 3, height, kernels.stride(width))
+    planes = take_planes(shape)  # their margins are 0, and stay so
+    x, y, similarity, *slopes = planes
+    sums, differences = np.zeros(workers), np.zeros(workers)
+    out = torch.empty(height, width, 3, dtype=torch.float32, device="cpu")
+    threads.run(kernels.to_planes, workers, image.detach().contiguous().numpy(), target.contiguous().numpy(), x, y)
+    threads.run(kernels.ssim_map, workers, x, y, width, similarity, *slopes, sums)
+    threads.run(kernels.loss_gradient, workers, x, y, width, *slopes, l1, dssim, out.numpy(), differences)
+    give_planes(planes)
+    return out, float(differences.sum()), float(sums.sum())
 
 
 class _FusedLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-        fused, l1, dssim = _Fused(image, target), (1 - ssim_weight) / image.numel(), ssim_weight / image.numel()
-        gradient, difference = fused.gradient(l1, dssim)
+        l1, dssim = (1 - ssim_weight) / image.numel(), ssim_weight / image.numel()
+        gradient, difference, similarity = _compare(image, target, l1, dssim)
         ctx.save_for_backward(gradient)
-        return torch.tensor(l1 * difference + ssim_weight - dssim * fused.ssim_sum, dtype=torch.float32)
+        return torch.tensor(l1 * difference + ssim_weight - dssim * similarity, dtype=torch.float32)
 
     @staticmethod
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]

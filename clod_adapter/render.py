@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
-from clod_adapter.equation.attenuation import Attenuated, attenuate
+from clod_adapter.equation.attenuation import Attenuated, attenuate, check_dial
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import Rasterizer, for_device
@@ -21,12 +22,22 @@ class Rendering:
     Attributes:
         image: ``[H, W, 3]`` float, not clamped.
         alpha: ``[H, W]`` accumulated opacity.
-        kept: ``[N]`` bool, the Gaussians that the dial keeps; culled ones are neither sorted nor drawn.
+        gaussians, camera, virtual_scale: what was rendered.
     """
 
     image: Tensor
     alpha: Tensor
-    kept: Tensor
+    gaussians: Gaussians
+    camera: Camera
+    virtual_scale: float
+
+    @cached_property
+    def kept(self) -> Tensor:
+        """``[N]`` bool, the Gaussians that the dial keeps; culled ones are neither sorted nor drawn.
+
+        Computed where it is first asked for: a frame does not need it.
+        """
+        return dial(self.gaussians, self.camera, self.virtual_scale).keep
 
     @property
     def pixels(self) -> Tensor:
@@ -69,13 +80,10 @@ def splat(
     Raises:
         ClodError: the opacities or the background have the wrong shape.
     """
+    if opacities.shape != (len(gaussians),):
+        raise ClodError(f"opacities are {tuple(opacities.shape)} and must be ({len(gaussians)},)")
     rasterize = rasterizer or for_device(gaussians.means.device)
-    behind = torch.zeros(3, device=gaussians.means.device) if background is None else background
-    if behind.shape != (3,) or opacities.shape != (len(gaussians),):
-        raise ClodError(
-            f"background is {tuple(behind.shape)} and must be (3,), opacities {tuple(opacities.shape)} and must be "
-            f"({len(gaussians)},)"
-        )
+    behind = _behind(gaussians, background)
     scales = gaussians.scales if growth is None else gaussians.scales * growth[:, None]
     return rasterize(
         gaussians.means, gaussians.quats, scales, opacities, gaussians.sh0, gaussians.shN, camera, behind,
@@ -103,8 +111,29 @@ def render(
     Raises:
         ClodError: the dial is below 1 or not finite.
     """
-    attenuated = dial(gaussians, camera, virtual_scale)
-    image, alpha = splat(
-        gaussians, attenuated.drawn, camera, growth=attenuated.growth, background=background, rasterizer=rasterizer
-    )
-    return Rendering(image, alpha, attenuated.keep)
+    check_dial(virtual_scale)
+    if rasterizer is None and _drawn_at_once(gaussians, background):
+        from clod_adapter.rasterizers import cpu
+
+        image, alpha = cpu.draw(gaussians, camera, virtual_scale, _behind(gaussians, background))
+    else:
+        attenuated = dial(gaussians, camera, virtual_scale)
+        image, alpha = splat(
+            gaussians, attenuated.drawn, camera, growth=attenuated.growth, background=background,
+            rasterizer=rasterizer,
+        )  # fmt: skip
+    return Rendering(image, alpha, gaussians, camera, virtual_scale)
+
+
+def _behind(gaussians: Gaussians, background: Tensor | None) -> Tensor:
+    if background is None:
+        return torch.zeros(3, device=gaussians.means.device)
+    if background.shape != (3,):
+        raise ClodError(f"background is {tuple(background.shape)} and must be (3,)")
+    return background
+
+
+def _drawn_at_once(gaussians: Gaussians, background: Tensor | None) -> bool:
+    """Whether the CPU's rasterizer can apply the dial itself: nothing asks for a gradient."""
+    given = [*gaussians.tensors().values(), *([] if background is None else [background])]
+    return given[0].device.type == "cpu" and not (torch.is_grad_enabled() and any(x.requires_grad for x in given))

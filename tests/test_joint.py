@@ -198,6 +198,11 @@ WITHOUT_GROWTH = (
 )  # fmt: skip
 
 
+# Frames that nothing is differentiated through: the CPU's kernel has an equation of its own, which
+# tests/kernels/test_dial.py compares with this one. The threshold is this one's there too.
+COMPILED = ("render", "evaluate", "popping")
+
+
 def same(these: list[Any], those: list[Any]) -> bool:
     pairs = list(zip(these, those, strict=True))
     return all(torch.equal(a, b) if isinstance(a, Tensor) else a == b for a, b in pairs)
@@ -215,7 +220,7 @@ def test_everything_follows_the_culling_threshold(name: str, monkeypatch: pytest
     assert 10 * TAU == RAISED and same(consumer(model_of(TAU)), wanted)
 
 
-@pytest.mark.parametrize("name", [name for name in CONSUMERS if name not in CLOSED_FORMS])
+@pytest.mark.parametrize("name", [name for name in CONSUMERS if name not in (*CLOSED_FORMS, *COMPILED)])
 def test_everything_passes_through_the_cut(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A cut that keeps only what is nearly opaque changes whatever renders, counts or bakes."""
     consumer = CONSUMERS[name]
@@ -230,7 +235,7 @@ def test_everything_passes_through_the_cut(name: str, monkeypatch: pytest.Monkey
     assert not same(consumer(model_of(TAU)), before)
 
 
-@pytest.mark.parametrize("name", CONSUMERS)
+@pytest.mark.parametrize("name", [name for name in CONSUMERS if name not in COMPILED])
 def test_everything_grows_by_one_function(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Other factors change whatever draws, and nothing that counts or culls."""
     consumer = CONSUMERS[name]

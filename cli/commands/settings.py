@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 OPTIONS: dict[str, Any] = {
     "max_sv": ("S", float), "iters": ("N", int), "batch": ("N", int), "time_budget": ("SEC", float),
-    "seed": ("N", int), "growth": ("on|off", str),
+    "seed": ("N", int), "target": ("count|cost", str), "growth": ("on|off", str),
 }  # fmt: skip
 # Defaults that depend on another option: the number of views seen stays the same for every batch.
 DEFAULTS = {"iters": "1500 divided by the batch", "batch": "1 per process", "growth": "on, with --form paper off"}
@@ -30,7 +30,9 @@ def add_settings(options: _ActionsContainer, without: Sequence[str] = ()) -> Non
             continue
         default = None if name in DEFAULTS else getattr(defaults, name)
         shown = f" (default: {DEFAULTS[name]})" if name in DEFAULTS else ""
-        shown = shown if default is None else f" (default: {default:g})"
+        shown = (
+            shown if default is None else f" (default: {default if isinstance(default, str) else format(default, 'g')})"
+        )
         options.add_argument(
             f"--{name.replace('_', '-')}", metavar=metavar, type=kind, default=default, help=helps[name] + shown
         )

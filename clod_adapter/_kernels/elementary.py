@@ -31,6 +31,9 @@ vsqrt, vfloor, vceil, vabs = (_unary(f"llvm.{name}.v16f32") for name in ("sqrt",
 # Minimax polynomial of 2^f on [-0.5, 0.5] with p(0) = 1: relative error 9e-8, in float32 arithmetic 2e-7.
 _EXP2 = (1.32646524e-3, 9.67151132e-3, 5.55073396e-2, 2.40222421e-1, 6.93146978e-1, 1.0)
 
+# Added to a small number, it leaves the nearest integer in the low bits of the sum.
+_ROUNDING = 1.5 * 2**23
+
 
 @intrinsic
 def exp2(typingctx, x):  # type: ignore[no-untyped-def]
@@ -39,12 +42,12 @@ def exp2(typingctx, x):  # type: ignore[no-untyped-def]
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         low = _constant(-126.0)
         x = builder.select(builder.fcmp_ordered(">", args[0], low), args[0], low)
-        whole = call_llvm(builder, "llvm.rint.v16f32", VECTOR, [x])
-        f = builder.fsub(x, whole)
+        shifted = builder.fadd(x, _constant(_ROUNDING))
+        f = builder.fsub(x, builder.fsub(shifted, _constant(_ROUNDING)))
         p = _constant(_EXP2[0])
         for c in _EXP2[1:]:
             p = call_llvm(builder, "llvm.fmuladd.v16f32", VECTOR, [p, f, _constant(c)])
-        exponent = builder.shl(builder.fptosi(whole, INTEGERS), ir.Constant(INTEGERS, [23] * LANES))
+        exponent = builder.shl(builder.bitcast(shifted, INTEGERS), ir.Constant(INTEGERS, [23] * LANES))
         return builder.bitcast(builder.add(builder.bitcast(p, INTEGERS), exponent), VECTOR)
 
     return f32x16(f32x16), codegen

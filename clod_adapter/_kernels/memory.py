@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import math
 import weakref
 from collections import deque
 from typing import Any
@@ -17,6 +18,7 @@ IDLE = 24
 _SMALL = 16384
 _idle: dict[int, list[np.ndarray]] = {}
 _recent: deque[int] = deque()
+_planes: dict[tuple[int, ...], np.ndarray] = {}
 
 
 def aligned(size: int, dtype: Any) -> np.ndarray:
@@ -29,7 +31,7 @@ def aligned(size: int, dtype: Any) -> np.ndarray:
 
 def recycled(shape: torch.Size | tuple[int, ...]) -> Tensor:
     """An uninitialised float32 tensor in memory of an earlier, freed one."""
-    size = int(np.prod(shape))
+    size = math.prod(shape)
     if size < _SMALL:
         return torch.empty(shape, dtype=torch.float32, device="cpu")
     step = 1 << max(size.bit_length() - 4, 0)
@@ -55,8 +57,23 @@ def _give_back(whole: np.ndarray) -> None:
             _idle[_recent.popleft()].pop(0)
 
 
+def take_planes(shape: tuple[int, ...]) -> np.ndarray:
+    """Zeros, or what ``give_planes`` got of that shape: zeroing fresh pages takes as long as the work on them."""
+    try:
+        return _planes.pop(shape)
+    except KeyError:
+        return np.zeros(shape, np.float32)
+
+
+def give_planes(planes: np.ndarray) -> None:
+    """Keeps one array of float32 for the next ``take_planes``; images of a scene have few sizes."""
+    _planes.clear()
+    _planes[planes.shape] = planes
+
+
 def release() -> None:
     """Returns the memory of idle arrays to the system."""
+    _planes.clear()
     _recent.clear()
     _idle.clear()
     with contextlib.suppress(

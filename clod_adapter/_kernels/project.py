@@ -74,11 +74,16 @@ from clod_adapter._kernels.simd import both, f32x16, ge, gt, load, splat, vmax, 
 
 
 @part
-def covariance(means, quats, scales, rows, cam, w):  # type: ignore[no-untyped-def]
-    """Fills the workspace ``w`` for sixteen rows; returns which are in front of the near plane and have a rotation."""
+def load_stored(means, quats, scales, rows, w):  # type: ignore[no-untyped-def]
+    """Loads what is stored of sixteen rows into the workspace ``w``."""
     load_rows(means, rows, 3, 0, 3, w, MEAN)
     load_rows(quats, rows, 4, 0, 4, w, STORED)
     load_rows(scales, rows, 3, 0, 3, w, SCALE)
+
+
+@part
+def covariance(cam, w):  # type: ignore[no-untyped-def]
+    """Fills the rest of the workspace ``w``; returns which are in front of the near plane and have a rotation."""
     for d in range(3):
         row = 4 * d
         w[POINT + d] = cam[row] * w[MEAN] + cam[row + 1] * w[MEAN + 1] + cam[row + 2] * w[MEAN + 2] + cam[row + 3]
@@ -170,6 +175,29 @@ def make_records(w, centre, opacity, cam, record):  # type: ignore[no-untyped-de
     return both(drawn, both(ge(record[X1], record[X0]), ge(record[Y1], record[Y0])))
 
 
+@part
+def add_records(rows, filled, packed, spare, means, opacity, cam, w, records, depths, ids):  # type: ignore[no-untyped-def]
+    """Packs those of the first ``filled`` of sixteen ``rows`` that reach a pixel centre, from the record ``packed`` on.
+
+    ``w`` holds what is stored of the rows. Returns the number of the next record.
+    """
+    record, centre, targets = scratch(f32x16, RECORD), scratch(float32, 48), scratch(int64, 16)
+    valid = covariance(cam, w)
+    centres(means, rows, cam, centre)
+    valid = both(valid, ge(load(centre, 32), splat(cam[NEAR])))  # in float32 too, not only in float64
+    bits = bits_of(both(valid, make_records(w, centre, opacity, cam, record)))
+    bits &= (uint64(1) << uint64(filled)) - uint64(1)
+    if bits == uint64(0):
+        return packed
+    for lane in range(16):
+        targets[lane] = spare
+        if (bits >> uint64(lane)) & uint64(1):
+            depths[packed], ids[packed], targets[lane] = centre[32 + lane], rows[lane], packed
+            packed += 1
+    store_rows(records, targets, RECORD, 0, RECORD, record, 0)
+    return packed
+
+
 @kernel
 def project(worker, workers, means, quats, scales, opacities, sh0, shN, degree, cam, records, depths, ids, counts):  # type: ignore[no-untyped-def]
     """Writes records, depths and row numbers of this worker's visible Gaussians, packed from its first row.
@@ -188,8 +216,7 @@ def project(worker, workers, means, quats, scales, opacities, sh0, shN, degree, 
 @part
 def find_visible(first, last, spare, means, quats, scales, opacities, cam, records, depths, ids):  # type: ignore[no-untyped-def]
     """Packs the Gaussians that reach a pixel centre, from ``first`` on; returns how many there are."""
-    w, record, opacity = scratch(f32x16, WORKSPACE), scratch(f32x16, RECORD), scratch(float32, 16)
-    rows, targets, centre = scratch(int64, 16), scratch(int64, 16), scratch(float32, 48)
+    w, opacity, rows = scratch(f32x16, WORKSPACE), scratch(float32, 16), scratch(int64, 16)
     i = packed = first
     while i < last:
         filled = 0
@@ -199,17 +226,6 @@ def find_visible(first, last, spare, means, quats, scales, opacities, cam, recor
             i += 1
         for lane in range(filled, 16):
             rows[lane], opacity[lane] = rows[0], ONE
-        valid = covariance(means, quats, scales, rows, cam, w)
-        centres(means, rows, cam, centre)
-        valid = both(valid, ge(load(centre, 32), splat(cam[NEAR])))  # in float32 too, not only in float64
-        bits = bits_of(both(valid, make_records(w, centre, load(opacity, 0), cam, record)))
-        bits &= (uint64(1) << uint64(filled)) - uint64(1)
-        if bits == uint64(0):
-            continue
-        for lane in range(16):
-            targets[lane] = spare
-            if (bits >> uint64(lane)) & uint64(1):
-                depths[packed], ids[packed], targets[lane] = centre[32 + lane], rows[lane], packed
-                packed += 1
-        store_rows(records, targets, RECORD, 0, RECORD, record, 0)
+        load_stored(means, quats, scales, rows, w)
+        packed = add_records(rows, filled, packed, spare, means, load(opacity, 0), cam, w, records, depths, ids)
     return packed - first

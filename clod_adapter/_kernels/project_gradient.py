@@ -34,7 +34,7 @@ from clod_adapter._kernels.conventions import (
     ZERO,
 )
 from clod_adapter._kernels.pointers import pointer, scratch
-from clod_adapter._kernels.project import covariance
+from clod_adapter._kernels.project import covariance, load_stored
 from clod_adapter._kernels.rows import load_rows, store_rows
 from clod_adapter._kernels.sh import C0, sh_basis, sh_basis_gradient
 from clod_adapter._kernels.simd import eq, f32x16, gt, load, select, splat, store, vmax, vmin
@@ -209,7 +209,8 @@ def project_gradient(  # type: ignore[no-untyped-def]
             load_rows(means, rows, 3, 0, 3, w, MEAN)
             color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN)
         if shaped:
-            covariance(means, quats, scales, rows, cam, w)
+            load_stored(means, quats, scales, rows, w)
+            covariance(cam, w)
             covariance_gradient(w, g, cam, compensated)
             quat_gradient(w, g)
             store_rows(v_means, rows, 3, 0, 3, g, V_MEAN)

@@ -57,6 +57,26 @@ def load_rows(typingctx, source, rows, width, first, count, lanes, at):  # type:
 
 
 @intrinsic
+def load_triples(typingctx, source, index, lanes):  # type: ignore[no-untyped-def]
+    """``lanes[k]`` = column k of sixteen consecutive rows of ``source [*, 3]``, whose first element is ``index``."""
+    offsets = [[3 * lane + k for lane in range(LANES)] for k in range(3)]
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        i64 = ir.IntType(64)
+        at = [builder.gep(args[0], [builder.add(args[1], ir.Constant(i64, LANES * k))]) for k in range(3)]
+        a, b, c = (builder.load(builder.bitcast(x, VECTOR.as_pointer()), align=4) for x in at)
+        for k, order in enumerate(offsets):
+            # Lanes of a and b first; those of c, from 32 on, take the places that are left.
+            two = builder.shuffle_vector(a, b, ir.Constant(INTEGERS, [min(o, 2 * LANES - 1) for o in order]))
+            rest = [lane if o < 2 * LANES else o - LANES for lane, o in enumerate(order)]
+            column = builder.shuffle_vector(two, c, ir.Constant(INTEGERS, rest))
+            builder.store(column, builder.gep(args[2], [ir.Constant(i64, k)]), align=4)
+        return context.get_dummy_value()
+
+    return types.none(source, types.int64, types.CPointer(f32x16)), codegen
+
+
+@intrinsic
 def store_rows(typingctx, destination, rows, width, first, count, lanes, at):  # type: ignore[no-untyped-def]
     """The inverse of ``load_rows``; of rows that are listed twice the last is stored."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import float32
+from numba import float32, uint64
 
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.conventions import (
@@ -61,21 +61,32 @@ def extent(records, r, first, last):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def radix_sort(keys, order, keys_other, order_other, n):  # type: ignore[no-untyped-def]
-    """Stable ascending sort of uint32 ``keys[:n]`` with ``order`` carried along; returns the sorted order."""
-    counts = np.empty(2048, np.int64)
-    for shift in (0, 11, 22):
-        counts[:] = 0
-        for i in range(n):
-            counts[(keys[i] >> np.uint32(shift)) & np.uint32(2047)] += 1
+def depth_order(depths, counts, keys, order, keys_other, order_other):  # type: ignore[no-untyped-def]
+    """The packed records, near ones first; equal ones stay in order. ``keys`` and ``order`` are scratch, twice.
+
+    A radix sort of positive floats by their bits, 11 at a time.
+
+    Args:
+        depths: ``[N]`` as uint32; worker w packed the first ``counts[w]`` of its part.
+    """
+    digits, n = np.zeros((3, 2048), np.int64), 0
+    for worker in range(len(counts)):
+        first = len(depths) * worker // len(counts)
+        for k in range(first, first + counts[worker]):
+            key = depths[k]
+            keys[n], order[n] = key, k
+            n += 1
+            for place in range(3):
+                digits[place, (key >> np.uint32(11 * place)) & np.uint32(2047)] += 1
+    for place in range(3):
         total = 0
         for digit in range(2048):
-            total, counts[digit] = total + counts[digit], total
+            total, digits[place, digit] = total + digits[place, digit], total
         for i in range(n):
-            digit = (keys[i] >> np.uint32(shift)) & np.uint32(2047)
-            keys_other[counts[digit]] = keys[i]
-            order_other[counts[digit]] = order[i]
-            counts[digit] += 1
+            digit = (keys[i] >> np.uint32(11 * place)) & np.uint32(2047)
+            keys_other[digits[place, digit]] = keys[i]
+            order_other[digits[place, digit]] = order[i]
+            digits[place, digit] += 1
         keys, keys_other = keys_other, keys
         order, order_other = order_other, order
     return order
@@ -150,3 +161,16 @@ def fill_tiles(worker, workers, records, order, across, histogram, totals, slots
                 entry_slots[at] = slot
                 slot += 1
         slots[2 * p + 1] = slot
+
+
+@kernel
+def tally(entries, masks, words, tiles, blocks):  # type: ignore[no-untyped-def]
+    """Adds up for each record the tiles that list it, and their blocks that blended it."""
+    for entry in range(len(entries)):
+        p = entries[entry]
+        tiles[p] += 1
+        for word in range(words):
+            bits = masks[entry * words + word]
+            while bits != uint64(0):
+                bits &= bits - uint64(1)
+                blocks[p] += 1

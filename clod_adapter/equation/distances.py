@@ -84,6 +84,8 @@ def in_frustum(means: Tensor, camera: Camera) -> Tensor:
 @torch.no_grad()
 def camera_unit(means: Tensor, camera: Camera, config: AttenuationConfig) -> float:
     """``normalizing_distance`` of one camera and centres ``means [N, 3]``, world units, as a number to store."""
+    if config.normalizer == "scene":
+        return config.scene_distance
     distances = (means - camera.position.to(means)).norm(dim=1)
     return float(normalizing_distance(distances, means, camera, config))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import weakref
 from dataclasses import dataclass
 from typing import Any
@@ -11,10 +12,14 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from clod_adapter._kernels import blend, blocks, conventions, project, project_gradient, threads, tiles
+from clod_adapter._kernels import blend, blocks, conventions, dial, project, project_gradient, threads, tiles
 from clod_adapter._kernels.memory import aligned, recycled, release
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
+from clod_adapter.equation.attenuation import culling_threshold, log_threshold
+from clod_adapter.equation.distances import camera_unit
+from clod_adapter.equation.growth import growth_distance
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers.protocol import require_float32
 
 
@@ -25,7 +30,7 @@ class _Buffers:
         self._arrays: dict[str, np.ndarray] = {}
 
     def get(self, name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-        size = int(np.prod(shape))
+        size = math.prod(shape)
         flat = self._arrays.get(name)
         if flat is None or flat.size < size:
             flat = self._arrays[name] = aligned(size + size // 4, dtype)
@@ -83,47 +88,43 @@ class _Frame:
 def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.ndarray:
     """Camera and screen-space filter in the layout of the kernels (``_kernels/conventions.py``)."""
     out = np.empty(conventions.CAMERA, np.float32)
-    K = camera.K.detach().cpu().double()
+    viewmat, K = (x.detach().cpu().double().numpy() for x in (camera.viewmat, camera.K))
     fx, fy, cx, cy = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-    out[:16] = camera.viewmat.detach().cpu().numpy().reshape(-1)
+    out[:16] = viewmat.reshape(-1)
     out[16:22] = fx, fy, cx, cy, camera.width, camera.height
     margin_x, margin_y = 0.15 * camera.width / fx, 0.15 * camera.height / fy
     out[22:24] = -(cx / fx + margin_x), (camera.width - cx) / fx + margin_x
     out[24:26] = -(cy / fy + margin_y), (camera.height - cy) / fy + margin_y
-    out[26:29] = camera.position.detach().cpu().numpy()
+    out[26:29] = -viewmat[:3, 3] @ viewmat[:3, :3]
     out[conventions.NEAR] = camera.near
     out[conventions.BLUR], out[conventions.COMPENSATE] = screen_filter.variance, screen_filter.compensate
     return out
 
 
-def _project(buffers: _Buffers, arrays: list[np.ndarray], degree: int, cam: np.ndarray, workers: int) -> Any:
-    """Packed records of the visible Gaussians, their row numbers, the count of each worker, and the depth order."""
-    n = len(arrays[0])
+def _sorted(
+    buffers: _Buffers, kernel: Any, n: int, inputs: tuple[Any, ...], workers: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Runs a projection. Packed records of the visible of n Gaussians, their row numbers, the count of each worker, and
+    the depth order."""
     records = buffers.get("records", ((n + workers) * conventions.RECORD,), np.float32)
     depths, packed_ids = buffers.get("depths", (n,), np.float32), buffers.get("packed_ids", (n,), np.int32)
     counts = np.zeros(workers, np.int64)
-    threads.run(project.project, workers, *arrays, degree, cam, records, depths, packed_ids, counts)
+    threads.run(kernel, workers, *inputs, records, depths, packed_ids, counts)
     visible = int(counts.sum())
     keys, order = buffers.get("keys", (visible,), np.uint32), buffers.get("order", (visible,), np.int32)
     other = buffers.get("keys2", (visible,), np.uint32), buffers.get("order2", (visible,), np.int32)
-    at = 0
-    for worker, count in enumerate(counts.tolist()):
-        first = n * worker // workers
-        keys[at : at + count] = depths[first : first + count].view(np.uint32)
-        order[at : at + count] = np.arange(first, first + count, dtype=np.int32)
-        at += count
-    return records, packed_ids, counts, tiles.radix_sort(keys, order, *other, visible)
+    return records, packed_ids, counts, tiles.depth_order(depths.view(np.uint32), counts, keys, order, *other)
 
 
 def _prepare(
-    arrays: list[np.ndarray], degree: int, camera: Camera, screen_filter: ScreenFilter, workers: int
+    kernel: Any, n: int, inputs: tuple[Any, ...], cam: np.ndarray, size: tuple[int, int], compensate: bool
 ) -> _Frame:
     """Projection, depth order and tile lists."""
-    buffers, cam = _take(), camera_vector(camera, screen_filter)
-    records, packed_ids, counts, order = _project(buffers, arrays, degree, cam, workers)
-    across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
+    buffers, workers, (width, height) = _take(), threads.worker_count(), size
+    records, packed_ids, counts, order = _sorted(buffers, kernel, n, inputs, workers)
+    across, down = -(-width // conventions.TILE), -(-height // conventions.TILE)
     histogram, totals = np.empty((workers, across * down), np.int64), np.empty(workers, np.int64)
-    offsets, slots = np.empty(across * down + 1, np.int64), buffers.get("slots", (2 * len(arrays[0]),), np.int64)
+    offsets, slots = np.empty(across * down + 1, np.int64), buffers.get("slots", (2 * n,), np.int64)
     threads.run(tiles.count_tiles, workers, records, order, across, histogram, totals)
     total = tiles.tile_offsets(histogram, offsets, totals)
     entries, entry_slots = buffers.get("entries", (total,), np.int32), buffers.get("entry_slots", (total,), np.int32)
@@ -131,10 +132,21 @@ def _prepare(
     # Longest lists first: no thread starts a long tile when the others are done.
     longest_first = np.argsort(-np.diff(offsets), kind="stable")
     return _Frame(
-        buffers, cam, camera.width, camera.height, across, records, packed_ids, counts, slots, entries,
+        buffers, cam, width, height, across, records, packed_ids, counts, slots, entries,
         entry_slots, buffers.get("masks", (total * blocks.WORDS,), np.uint64), offsets, longest_first,
-        screen_filter.compensate or None, workers,
+        compensate or None, workers,
     )  # fmt: skip
+
+
+def _blend(frame: _Frame, background: np.ndarray) -> tuple[Tensor, Tensor]:
+    """The image and its alpha."""
+    image, alpha = recycled((frame.height, frame.width, 3)), recycled((frame.height, frame.width))
+    threads.run(
+        blend.blend, frame.workers, frame.records, frame.entries, frame.offsets, frame.across, frame.width,
+        frame.height, background, frame.tiles, np.zeros(1, np.int64), frame.room(blocks.FORWARD_STATE), frame.masks,
+        image.numpy(), alpha.numpy(),
+    )  # fmt: skip
+    return image, alpha
 
 
 def _arrays(tensors: Any) -> list[np.ndarray]:
@@ -146,14 +158,10 @@ def _arrays(tensors: Any) -> list[np.ndarray]:
 class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means, quats, scales, opacities, sh0, shN, background, camera, screen_filter, degree):  # type: ignore[no-untyped-def]
-        arrays = _arrays((means, quats, scales, opacities, sh0, shN))
-        frame = _prepare(arrays, degree, camera, screen_filter, threads.worker_count())
-        image, alpha = recycled((frame.height, frame.width, 3)), recycled((frame.height, frame.width))
-        threads.run(
-            blend.blend, frame.workers, frame.records, frame.entries, frame.offsets, frame.across, frame.width,
-            frame.height, background.detach().contiguous().numpy(), frame.tiles, np.zeros(1, np.int64),
-            frame.room(blocks.FORWARD_STATE), frame.masks, image.numpy(), alpha.numpy(),
-        )  # fmt: skip
+        arrays, cam = _arrays((means, quats, scales, opacities, sh0, shN)), camera_vector(camera, screen_filter)
+        size = camera.width, camera.height
+        frame = _prepare(project.project, len(means), (*arrays, degree, cam), cam, size, screen_filter.compensate)
+        image, alpha = _blend(frame, background.detach().contiguous().numpy())
         ctx.frame, ctx.degree = frame, degree
         ctx.save_for_backward(means, quats, scales, opacities, sh0, shN, background, image, alpha)
         weakref.finalize(frame, _give, frame.buffers)
@@ -185,6 +193,65 @@ class _Splat(torch.autograd.Function):
         v_background = ((1 - alpha)[..., None] * gradients[0]).sum((0, 1)) if ctx.needs_input_grad[6] else None
         wanted = [g if need else None for g, need in zip(grads, ctx.needs_input_grad, strict=False)]
         return *wanted, v_background, None, None, None
+
+
+@torch.no_grad()
+def draw(gaussians: Gaussians, camera: Camera, virtual_scale: float, background: Tensor) -> tuple[Tensor, Tensor]:
+    """Image and alpha at one dial value, as ``attenuate`` and ``rasterize`` give them, without gradients.
+
+    The dial is the first part of the projection: what it culls is not touched again, and nothing is copied.
+
+    Raises:
+        ClodError: a tensor is not float32.
+    """
+    require_float32("CPU", **gaussians.tensors(), background=background)
+    frame = _prepare_dialled(gaussians, camera, virtual_scale)
+    found = _blend(frame, background.detach().contiguous().numpy())
+    _give(frame.buffers)
+    return found
+
+
+def _prepare_dialled(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> _Frame:
+    """``_prepare`` of Gaussians as they are stored, at one dial value."""
+    g, nothing = gaussians, torch.empty(0)
+    learned = (nothing if x is None else x for x in (g.sigma_d, g.growth_d))
+    stored = (g.means, g.quats, g.log_scales, g.opacity_logits, *learned)
+    arrays = [x.detach().contiguous().numpy() for x in stored]
+    arrays += [x.detach().contiguous().numpy().reshape(-1) for x in (g.sh0, g.shN)]
+    cam = camera_vector(camera, g.screen_filter)
+    inputs = (*arrays, g.sh_degree, cam, _dial_vector(g, camera, virtual_scale))
+    size = camera.width, camera.height
+    return _prepare(dial.project_dialled, len(g), inputs, cam, size, g.screen_filter.compensate)
+
+
+@torch.no_grad()
+def work(gaussians: Gaussians, camera: Camera, virtual_scale: float = 1.0) -> tuple[Tensor, Tensor]:
+    """``[N]`` float32, what drawing each Gaussian takes: the tiles that list it, and the 4x4 blocks that blend it.
+
+    A block whose pixels are all opaque already blends no more, so work depends on what is in front.
+    """
+    frame = _prepare_dialled(gaussians, camera, virtual_scale)
+    _blend(frame, np.zeros(3, np.float32))
+    n, counted = len(gaussians), np.zeros((2, len(gaussians)), np.float32)
+    tiles.tally(frame.entries, frame.masks, blocks.WORDS, *counted)
+    found = np.zeros_like(counted)
+    for worker, count in enumerate(frame.counts.tolist()):
+        packed = slice(n * worker // frame.workers, n * worker // frame.workers + count)
+        found[:, frame.packed_ids[packed]] = counted[:, packed]
+    _give(frame.buffers)
+    return torch.from_numpy(found[0]), torch.from_numpy(found[1])
+
+
+def _dial_vector(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> np.ndarray:
+    """The dial in the layout of the kernels."""
+    out, config = np.zeros(conventions.DIAL, np.float32), gaussians.attenuation
+    if config is not None:
+        rate = virtual_scale / camera_unit(gaussians.means, camera, config)
+        out[conventions.RATE], out[conventions.GROWTH_RATE] = rate, rate / growth_distance(config)
+        out[conventions.HALF_EPS], out[conventions.SOFT] = config.eps / 2, config.cut == "soft"
+        out[conventions.THRESHOLD] = culling_threshold(config.tau, virtual_scale)
+        out[conventions.LOG_THRESHOLD] = log_threshold(config.tau, virtual_scale)
+    return out
 
 
 def rasterize(

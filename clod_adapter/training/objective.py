@@ -19,6 +19,7 @@ from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import splat
+from clod_adapter.training.target_cost import TargetCost
 from clod_adapter.training.target_count import TargetShare, count_gradient, paper_count, target_share
 from clod_adapter.training.view_sampler import FAR_FIRST, Sample
 
@@ -79,6 +80,7 @@ class Objective:
         typical: ``[trained]`` normalised distances that Gaussians are counted at; no view's own, whose counts differ
             from the mean's: gradients that correct such differences cancel out, and only add noise.
         screen_filter: the filter that images are rendered with.
+        cost: the cost term, in place of the count term; None for the latter.
     """
 
     config: AdaptConfig
@@ -87,6 +89,7 @@ class Objective:
     part: TrainableSubset
     typical: Tensor
     screen_filter: ScreenFilter = CLASSIC
+    cost: TargetCost | None = None
 
     @property
     def trained(self) -> int:
@@ -129,8 +132,7 @@ class Objective:
         leaves = {name: parameters[name].detach().requires_grad_(name in self.stepped) for name in parameters}
         decay = leaves[self.decay]
         photograph = view.image.to(decay.device)
-        total, count = decay.new_zeros(()), torch.zeros_like(decay[first])
-        kept = torch.zeros_like(count, dtype=torch.bool)
+        total, kept = decay.new_zeros(()), torch.zeros_like(decay[first], dtype=torch.bool)
         losses, counts = [], []
         for s, dialled, image in self._rendered(leaves, view.camera, dials):
             loss = photometric_loss(image, photograph, config.ssim_weight)
@@ -145,13 +147,13 @@ class Objective:
             # Halfway to 1/tau at most. Its weight is 1: with half of w_s, counts at the far end were 1.25 times the
             # target, at a gain of 0.05 to 0.1 dB at equal counts.
             counts.append((min(counted, (config.max_sv + 1 / self.attenuation.tau) / 2), losses[-1]))
-        if config.has_target_count:
-            for s, weighted in counts:
-                count += self._count_gradient(parameters, s, weighted)
         found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
         gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}
-        count = count if config.parameter == "log" else count / decay.detach()[first]
-        return GradientSum(gradients | {self.decay: gradients[self.decay] + count}, kept, losses[0])
+        if config.has_target_count:
+            for s, weighted in counts:
+                for name, gradient in self._target_gradients(parameters, s, weighted).items():
+                    gradients[name] = gradients[name] + gradient
+        return GradientSum(gradients, kept, losses[0])
 
     def _rendered(
         self, leaves: dict[str, Tensor], camera: Camera, dials: list[float]
@@ -173,16 +175,20 @@ class Objective:
             # Culled rows have opacity 0: the rasterizer skips them, and they get no gradient.
             yield s, dialled, splat(shown, drawn, camera, growth=growth)[0]
 
-    @torch.no_grad()
-    def _count_gradient(self, parameters: dict[str, Tensor], s: float, loss: float) -> Tensor:
-        """``[trained]`` the count term's gradient of log sigma_d at one dial value."""
-        logits, decay = (parameters[name][: self.trained] for name in ("opacity_logits", self.decay))
-        dialled = attenuate(logits, self.sigma(decay), self.typical, s, self.attenuation)
-        if self.part.target is not None:
-            target = self.part.target(s)
-        else:
-            target = target_share(s, self.trained, self.config, self.part.total)
-        return count_gradient(dialled, logits, s, self.attenuation.tau, loss, self.config, target)
+    def _target_gradients(self, parameters: dict[str, Tensor], s: float, loss: float) -> dict[str, Tensor]:
+        """``[trained]`` the gradients of the count term or the cost term at one dial value, by parameter."""
+        rows = {name: parameters[name][: self.trained].detach() for name in (*self.stepped, "log_scales")}
+        if self.cost is not None:
+            return self.cost.gradients(rows, self.typical, s, loss, self.attenuation, self.config)
+        decay, logits = rows[self.decay], rows["opacity_logits"]
+        with torch.no_grad():
+            dialled = attenuate(logits, self.sigma(decay), self.typical, s, self.attenuation)
+            if self.part.target is not None:
+                target = self.part.target(s)
+            else:
+                target = target_share(s, self.trained, self.config, self.part.total)
+            found = count_gradient(dialled, logits, s, self.attenuation.tau, loss, self.config, target)
+        return {self.decay: found if self.config.parameter == "log" else found / decay}
 
     def _weight(self, s: float, *, alone: bool) -> float:
         """w_s, times ``full_weight`` at the s = 1 that is drawn together with another dial value."""

@@ -23,6 +23,7 @@ from clod_adapter.training.distributed import ProcessGroup
 from clod_adapter.training.objective import GradientSum, Objective, TrainableSubset
 from clod_adapter.training.optimizer import RowAdam, add_to_mean
 from clod_adapter.training.state import TrainingState
+from clod_adapter.training.target_cost import TargetCost
 from clod_adapter.training.view_sampler import ViewSampler
 
 # Adam's decay rates per view. A batch takes their powers and multiplies learning rates by its square root, so that
@@ -53,7 +54,8 @@ class Trainer:
         tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
         cameras = subset.cameras or [view.camera for view in spread(views, MOST_VIEWS)]
         typical = typical_distance(start.means, cameras, start.attenuation)[: subset.trained]
-        self.objective = Objective(config, start.attenuation, tuple(tuned), subset, typical, start.screen_filter)
+        cost = TargetCost(start, cameras, config) if config.target == "cost" and config.has_target_count else None
+        self.objective = Objective(config, start.attenuation, tuple(tuned), subset, typical, start.screen_filter, cost)
         self.decay, self.stepped = self.objective.decay, self.objective.stepped
         self.decay_range = self.objective.decay_range
         self.rates = rates | {self.decay: config.lr_sigma * math.sqrt(config.batch)}
@@ -81,6 +83,8 @@ class Trainer:
         Raises:
             LossNotFinite, or any error of the rasterizer: nothing has changed.
         """
+        if self.objective.cost is not None:
+            self.objective.cost.measure(self._assembled(self.parameters), self.objective.typical, share_done)
         found = self._gradients(share_done)
         self._updating = True
         finite = ~spoilt_rows(found.gradients)
@@ -156,15 +160,17 @@ class Trainer:
         rest = slice(self.objective.trained, None)
         whole = all(len(self.parameters[name][rest]) == 0 for name in self.mean)
         mean = self.mean if whole else {n: torch.cat([m, self.parameters[n][rest]]) for n, m in self.mean.items()}
-        parameters = self.parameters | mean
-        values = {name: parameters[name] for name in ATTRIBUTES}
-        if self.empty_sh is not None:
-            values["shN"] = self.empty_sh
+        found = self._assembled(self.parameters | mean)
+        return in_world_units(found if self.empty_sh is None else found.replace(shN=self.empty_sh))
+
+    def _assembled(self, parameters: dict[str, Tensor]) -> Gaussians:
+        """Gaussians of these parameters."""
+        values: Any = {name: parameters[name] for name in ATTRIBUTES}
         dial: Any = {
             "sigma_d": self.objective.sigma(parameters[self.decay]), "attenuation": self.objective.attenuation,
             "growth_d": parameters.get("growth_d"),
         }  # fmt: skip
-        return in_world_units(Gaussians(**values, **dial, screen_filter=self.objective.screen_filter))
+        return Gaussians(**values, **dial, screen_filter=self.objective.screen_filter)
 
     def _trained(self) -> dict[str, Tensor]:
         """Views of the rows of the parameters that steps change."""
@@ -173,7 +179,8 @@ class Trainer:
     def _changing(self) -> dict[str, Tensor]:
         """All tensors that steps change, named as in ``TrainingState``."""
         kinds = {"parameter": self._trained(), **self.optimizer.state(), "mean": self.mean}
-        return {
+        cost = {} if self.objective.cost is None else {"cost.measured": self.objective.cost.measured}
+        return cost | {
             f"{kind}.{name}": values[name] for kind, values in kinds.items() for name in self.stepped if name in values
         }
 

@@ -15,7 +15,7 @@ Start = Callable[..., subprocess.Popen[str]]
 
 
 def test_kernels_are_cached() -> None:
-    code = "from clod_adapter._kernels import tiles; print(type(tiles.radix_sort._cache).__name__)"
+    code = "from clod_adapter._kernels import tiles; print(type(tiles.depth_order._cache).__name__)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "_Cache", done.stderr
 
