@@ -89,7 +89,7 @@ def test_a_sample_is_as_solid_as_the_whole_and_scored_like_it(monkeypatch: pytes
     assert float(few.log_scales.max()) == float(whole.log_scales.max()) and float(growth.min()) == 1
     for camera in cameras:
         shown = [splat(each, each.opacities, camera, growth=grown)[1] for each, grown in ((whole, None), (few, growth))]
-        assert float((shown[0] - shown[1]).abs().mean()) < 0.08
+        assert float((shown[0] - shown[1]).abs().mean()) < 0.1
     scores = torch.tensor([[camera_score.score(*each, c) for c in cameras] for each in ((whole, None), (few, growth))])
     seen = scores.isfinite().all(0)  # the others are too empty
     assert int(seen.sum()) > 5 and float(torch.corrcoef(scores[:, seen])[0, 1]) > 0.8
