@@ -14,6 +14,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from clod_adapter.rasterizers import cpu
+
 
 @dataclass(frozen=True)
 class Backend:
