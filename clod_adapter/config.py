@@ -160,9 +160,11 @@ class AdaptConfig:
     )
     full_share: float = option(0.0, "share of steps at s = 1 (samplings log and uniform)")
     target: str = option(
-        "count", "what the dial reduces: count (of Gaussians, the paper's) or cost (of rendering, in time)"
+        "count", "what the dial reduces: count (of Gaussians, the paper's) or cost (the work of rendering them)"
     )
-    exponent: float = option(1.5, "target-count curve: the target share of Gaussians at s is s^-exponent")
+    exponent: float = option(
+        1.5, "target-count curve: the target share of Gaussians at s is s^-exponent (of cost: s^-1)"
+    )
     count_term: str = option(
         "law", "count loss: law (both directions, through sigma_d alone) or paper (the paper's L_reg)"
     )

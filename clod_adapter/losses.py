@@ -79,7 +79,8 @@ def _compare(image: Tensor, target: Tensor, l1: float, dssim: float) -> tuple[Te
 
     (height, width, _), workers = image.shape, threads.worker_count()
     shape = (6, 3, height, kernels.stride(width))
-    planes = take_planes(shape)  # their margins are 0, and stay so
+    planes = take_planes(shape)
+    planes[:2, :, :, kernels.PAD + width :] = 0  # of a wider image
     x, y, similarity, *slopes = planes
     sums, differences = np.zeros(workers), np.zeros(workers)
     out = torch.empty(height, width, 3, dtype=torch.float32, device="cpu")

@@ -35,7 +35,7 @@ class Rendering:
     def kept(self) -> Tensor:
         """``[N]`` bool, the Gaussians that the dial keeps; culled ones are neither sorted nor drawn.
 
-        Computed where it is first asked for: a frame does not need it.
+        Computed where it is first asked for, from the Gaussians as they are then: a frame does not need it.
         """
         return dial(self.gaussians, self.camera, self.virtual_scale).keep
 
@@ -136,4 +136,5 @@ def _behind(gaussians: Gaussians, background: Tensor | None) -> Tensor:
 def _drawn_at_once(gaussians: Gaussians, background: Tensor | None) -> bool:
     """Whether the CPU's rasterizer can apply the dial itself: nothing asks for a gradient."""
     given = [*gaussians.tensors().values(), *([] if background is None else [background])]
-    return given[0].device.type == "cpu" and not (torch.is_grad_enabled() and any(x.requires_grad for x in given))
+    single = all(x.device.type == "cpu" and x.dtype == torch.float32 for x in given)
+    return single and not (torch.is_grad_enabled() and any(x.requires_grad for x in given))

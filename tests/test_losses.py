@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from backends import torch_threads
+from clod_adapter._kernels.memory import release
 from clod_adapter.losses import photometric_loss, photometric_loss_plain, ssim_plain
 
 # Smaller than the window of 11, one larger, multiples of 16 and not.
@@ -78,3 +79,19 @@ def test_ssim_pads_with_zeros() -> None:
     vx, vy, cov = w * x * x - mx * mx, w * y * y - my * my, w * x * y - mx * my
     want = ((2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))).mean()
     assert ssim_plain(torch.tensor(x), torch.tensor(y)).item() == pytest.approx(want, abs=1e-12)
+
+
+def test_images_of_several_widths_in_turn() -> None:
+    """Planes that a wider image left behind do not change the loss of a narrower one."""
+
+    def loss(width: int) -> tuple[Tensor, Tensor]:
+        generator = torch.Generator().manual_seed(width)
+        image = torch.rand(20, width, 3, generator=generator).requires_grad_()
+        target = torch.randint(0, 256, (20, width, 3), generator=generator, dtype=torch.uint8)
+        value = photometric_loss(image, target)
+        return value.detach(), torch.autograd.grad(value, image)[0]
+
+    release()
+    first = loss(81)
+    loss(96)
+    assert all(torch.equal(a, b) for a, b in zip(first, loss(81), strict=True))

@@ -98,7 +98,7 @@ def drawn(rows, logits, sigma, growth, cam, dial, dialled, grows, w):  # type: i
             for lane in range(16):
                 values[32 + lane] = growth[rows[lane]]
             size = load(values, 32) * log2(vmax(d * dial[GROWTH_RATE], splat(ONE)))
-            size = vmin(vmax(size, splat(-LOG2_GROWTH_MAX)), splat(LOG2_GROWTH_MAX))
+            size = vmin(splat(LOG2_GROWTH_MAX), vmax(splat(-LOG2_GROWTH_MAX), size))  # NaN stays, and is not drawn
     for k in range(SCALE, SCALE + 3):
         w[k] = exp2(vmin(w[k] * LOG2E + size, splat(FARTHEST_EXPONENT)))
     return opacity

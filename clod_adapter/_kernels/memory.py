@@ -62,7 +62,7 @@ def _give_back(whole: np.ndarray) -> None:
 
 
 def take_planes(shape: tuple[int, ...]) -> np.ndarray:
-    """Zeros, or what ``give_planes`` got of that shape: zeroing fresh pages takes as long as the work on them."""
+    """Zeros, or what ``give_planes`` got, as it is: zeroing fresh pages takes as long as the work on them."""
     try:
         return _planes.pop(shape)
     except KeyError:

@@ -208,12 +208,9 @@ class _Splat(torch.autograd.Function):
 def draw(gaussians: Gaussians, camera: Camera, virtual_scale: float, background: Tensor) -> tuple[Tensor, Tensor]:
     """Image and alpha at one dial value, as ``attenuate`` and ``rasterize`` give them, without gradients.
 
-    The dial is the first part of the projection: what it culls is not touched again, and nothing is copied.
-
-    Raises:
-        ClodError: a tensor is not float32.
+    The dial is the first part of the projection: what it culls is not touched again, and nothing is copied. All tensors
+    are float32.
     """
-    require_float32("CPU", **gaussians.tensors(), background=background)
     frame = _prepare_dialled(gaussians, camera, virtual_scale)
     found = _blend(frame, background.detach().contiguous().numpy())
     _give(frame.buffers)

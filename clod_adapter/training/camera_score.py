@@ -29,7 +29,7 @@ def sample(gaussians: Gaussians, rows: Tensor, seed: int) -> tuple[Gaussians, Te
     """
     if len(rows) <= SAMPLE:
         return gaussians.select(rows).without_empty_bands(), None
-    size = largest_scale(gaussians)[rows].double()
+    size = largest_scale(gaussians)[rows].double().nan_to_num(0.0, 0.0)  # infinite ones are not drawn
     share = size * (SAMPLE / size.sum())
     for _ in range(ROUNDS):
         share = (share * (SAMPLE / share.sum())).clamp_(max=1)

@@ -41,7 +41,7 @@ def adapt(
     L_render(s)``, where L_render is ``losses.photometric_loss`` and ``w_s = (1 - weight_slope s / max_sv)^2``. In the
     first half of the steps every second view, at random, is rendered at two such values instead.
     ``target_count.count_gradient`` moves sigma_d so that the share of Gaussians kept at their typical distances follows
-    the target-count curve.
+    the target-count curve; with the target ``cost``, ``target_cost.TargetCost`` does so for the cost of rendering.
     The result is the mean of the parameters over the last ``average`` of the steps, so learning rates can stay large
     to the end. A base that has a sigma_d is continued from. Training divides sigma_d by the typical distance; the
     result has it in world units.

@@ -179,7 +179,8 @@ class Objective:
         """``[trained]`` the gradients of the count term or the cost term at one dial value, by parameter."""
         rows = {name: parameters[name][: self.trained].detach() for name in (*self.stepped, "log_scales")}
         if self.cost is not None:
-            return self.cost.gradients(rows, self.typical, s, loss, self.attenuation, self.config)
+            found = self.cost.gradients(rows, self.typical, s, loss, self.attenuation, self.config)
+            return {name: gradient for name, gradient in found.items() if name in self.stepped}
         decay, logits = rows[self.decay], rows["opacity_logits"]
         with torch.no_grad():
             dialled = attenuate(logits, self.sigma(decay), self.typical, s, self.attenuation)
@@ -187,8 +188,8 @@ class Objective:
                 target = self.part.target(s)
             else:
                 target = target_share(s, self.trained, self.config, self.part.total)
-            found = count_gradient(dialled, logits, s, self.attenuation.tau, loss, self.config, target)
-        return {self.decay: found if self.config.parameter == "log" else found / decay}
+            counted = count_gradient(dialled, logits, s, self.attenuation.tau, loss, self.config, target)
+        return {self.decay: counted if self.config.parameter == "log" else counted / decay}
 
     def _weight(self, s: float, *, alone: bool) -> float:
         """w_s, times ``full_weight`` at the s = 1 that is drawn together with another dial value."""

@@ -70,7 +70,7 @@ class TrainingState:
             kind, _, attribute = name.partition(".")
             if kind == "steps":  # an index in compiled code, which does not check it
                 sound = (values >= 0) & (values <= self.steps)
-            elif kind == "second":
+            elif kind in ("second", "cost"):
                 sound = values >= 0  # and not NaN
             elif kind == "first":  # Adam's is at most 7.3 times the root of the second
                 sound = values.abs() <= 10 * self.tensors[f"second.{attribute}"].sqrt() + 1e-15

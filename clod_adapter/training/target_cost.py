@@ -44,12 +44,11 @@ def view_cost(gaussians: Gaussians, camera: Camera, virtual_scale: float = 1.0) 
 
 
 def _costs(gaussians: Gaussians, camera: Camera, virtual_scale: float = 1.0) -> tuple[Tensor, Tensor]:
-    """``[N]`` the cost of each Gaussian without its blocks, and these."""
+    """``[N]`` the cost of each Gaussian, on the CPU, without its blocks; and these."""
     from clod_adapter.rasterizers import cpu
 
-    tiles, blocks = cpu.work(gaussians.to("cpu"), camera, virtual_scale)
-    drawn = blocks > 0
-    return ((TILE * tiles + DRAWN) * drawn).to(gaussians.means.device), blocks.to(gaussians.means.device)
+    tiles, blocks = cpu.work(gaussians, camera, virtual_scale)
+    return (TILE * tiles + DRAWN) * (blocks > 0), blocks
 
 
 class TargetCost:
@@ -60,26 +59,35 @@ class TargetCost:
         cost_i(s) = fixed_i + blocks_i g^2 e^(2/3 t) log(255 a_d) / log(255 a)
 
     with a its opacity and b the sum of its log_scales in the base, a_d the drawn opacity and g the growth at the
-    typical distance, t the sum of the log_scales less b: an ellipse ends where alpha is 1/255. What the model lacks is
-    mostly that fewer Gaussians hide less. So the share is measured in renderings, MEASURED times in a training, and
+    typical distance, t the sum of the log_scales less b: an ellipse ends where alpha is 1/255. The model
+    ignores that fewer Gaussians hide less. So the share is measured in renderings, MEASURED times in a training, and
     corrected by one factor for each of some dial values.
 
     Args:
         base: its dial is ignored; cameras: of views, at least one.
 
     Attributes:
+        fixed, blocks: ``[N]`` mean costs in the base; total: their sum, at least 1.
+        log_scales, reach: ``[N]`` b, and log(255 a), at least FAINTEST.
+        cameras: that shares are measured from; whole: the base's mean cost there.
+        dials: the dial values that are measured.
+        share: of the base's cost at s = 1, where the curve begins: the plan's share of the Gaussians, of which the
+            small ones are left out first; so it is a little less than these cost.
         measured: ``[1 + DIALS]`` float64, the share of the training at which the next measurement is due, and the
             factors.
     """
 
     def __init__(self, base: Gaussians, cameras: Sequence[Camera], config: AdaptConfig) -> None:
-        plain = base.replace(sigma_d=None, attenuation=None, growth_d=None)
-        found = [_costs(plain, camera) for camera in cameras]
-        self.fixed, self.blocks = (torch.stack(each).mean(0) for each in zip(*found, strict=True))
-        self.total = float(self.fixed.double().sum() + self.blocks.double().sum())
+        plain = base.replace(sigma_d=None, attenuation=None, growth_d=None).to("cpu")
+        self.fixed, self.blocks = torch.zeros_like(plain.opacity_logits), torch.zeros_like(plain.opacity_logits)
+        for camera in cameras:
+            for mean, cost in zip((self.fixed, self.blocks), _costs(plain, camera), strict=True):
+                mean += cost / len(cameras)
+        self.fixed, self.blocks = self.fixed.to(base.means.device), self.blocks.to(base.means.device)
+        self.total = max(float(self.fixed.double().sum() + self.blocks.double().sum()), 1.0)
         self.log_scales, self.reach = base.log_scales.sum(1), _reach(base.opacities).clamp(min=FAINTEST)
         self.cameras = cameras[:: -(-len(cameras) // VIEWS)]
-        self.whole = fmean(view_cost(plain, camera) for camera in self.cameras)
+        self.whole = max(fmean(view_cost(plain, camera) for camera in self.cameras), 1.0)
         self.dials = [config.max_sv ** (k / (DIALS - 1)) for k in range(DIALS)]
         self.measured = torch.tensor([0.0] + [1.0] * DIALS, dtype=torch.float64)
         self.share = config.share
@@ -90,8 +98,9 @@ class TargetCost:
         if share_done < float(self.measured[0]):
             return
         assert gaussians.sigma_d is not None and gaussians.attenuation is not None
+        here = gaussians.to("cpu")
         for k, s in enumerate(self.dials):
-            cost = fmean(view_cost(gaussians, camera, s) for camera in self.cameras)
+            cost = fmean(view_cost(here, camera, s) for camera in self.cameras)
             dialled = attenuate(
                 gaussians.opacity_logits, gaussians.sigma_d, typical, s, gaussians.attenuation,
                 growth_d=gaussians.growth_d,

@@ -55,6 +55,8 @@ class Trainer:
         cameras = subset.cameras or [view.camera for view in spread(views, MOST_VIEWS)]
         typical = typical_distance(start.means, cameras, start.attenuation)[: subset.trained]
         cost = TargetCost(start, cameras, config) if config.target == "cost" and config.has_target_count else None
+        if cost is not None and subset.trained < len(start):
+            raise ClodError("the target cost needs all Gaussians trained: leave out the subset, or target cost")
         self.objective = Objective(config, start.attenuation, tuple(tuned), subset, typical, start.screen_filter, cost)
         self.decay, self.stepped = self.objective.decay, self.objective.stepped
         self.decay_range = self.objective.decay_range

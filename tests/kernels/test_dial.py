@@ -128,7 +128,16 @@ def test_gradients_take_the_other_way() -> None:
         assert not render(model.replace(sigma_d=sigma_d), VIEW, 2.0).image.requires_grad
 
 
-def test_only_float32() -> None:
-    model = dialled(5, 0, 1)
-    with pytest.raises(ClodError, match="float32 only, and sigma_d is"):
-        render(model.replace(sigma_d=model.sigma_d.double()), VIEW, 2.0)  # type: ignore[union-attr]
+def test_other_types_take_the_other_way() -> None:
+    model = dialled(50, 0, 1)
+    assert model.sigma_d is not None
+    half = model.replace(sigma_d=model.sigma_d.half())
+    apart = render(half, VIEW, 2.0, rasterizer=cpu.rasterize)
+    assert torch.equal(render(half, VIEW, 2.0).image, apart.image)
+    with pytest.raises(ClodError, match="float32 only, and opacities is"):
+        render(model.replace(sigma_d=model.sigma_d.double()), VIEW, 2.0)
+
+
+def test_a_growth_that_is_not_finite_is_not_drawn() -> None:
+    model = dialled(50, 0, 1).replace(growth_d=torch.full((50,), math.nan))
+    assert cpu.draw(model, VIEW, 2.0, torch.zeros(3))[1].sum() == 0

@@ -95,6 +95,15 @@ def test_a_sample_is_as_solid_as_the_whole_and_scored_like_it(monkeypatch: pytes
     assert int(seen.sum()) > 5 and float(torch.corrcoef(scores[:, seen])[0, 1]) > 0.8
 
 
+def test_a_sample_leaves_out_what_is_infinite(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = ball(1000, torch.eye(3)[2])
+    whole.log_scales[3] = 100.0
+    monkeypatch.setattr(camera_score, "SAMPLE", 100)
+    few, growth = camera_score.sample(whole, torch.arange(len(whole)), 0)
+    assert 50 < len(few) < 200 and growth is not None and bool(growth.isfinite().all())
+    assert float(few.log_scales.max()) < 50
+
+
 @pytest.mark.parametrize("unit", [1e-4, 1e4])
 def test_placement_is_independent_of_the_unit(blob: clod.Gaussians, unit: float) -> None:
     other = blob.replace(means=blob.means * unit, log_scales=blob.log_scales + math.log(unit))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import pytest
@@ -15,8 +16,10 @@ from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Phase, Progress
 from clod_adapter.rasterizers import cpu
 from clod_adapter.training.loop import adapt
+from clod_adapter.training.objective import TrainableSubset
 from clod_adapter.training.target_cost import EXPONENT, TargetCost, view_cost
 from clod_adapter.training.target_count import target_curve
 from scenes import gaussians, photograph, ring
@@ -138,6 +141,43 @@ def test_training_lowers_the_cost_of_frames(model: Gaussians) -> None:
         shares[target] = [sum(view_cost(found, camera, s) for camera in CAMERAS) for s in (1.0, 4.0)]
     assert shares["cost"][1] < 0.9 * shares["count"][1]
     assert shares["cost"][1] < 0.6 * shares["cost"][0]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene(photograph(gaussians(N, 0, 0, size=0.15), CAMERAS), ())
+
+
+def test_resumed_training_has_the_same_bits(scene: Scene) -> None:
+    """Also between two measurements, whose factors the state has."""
+    base, states = gaussians(N, 0, 0, size=0.15), []
+
+    def listen(now: Progress) -> bool:
+        if now.phase == Phase.TRAINING and now.done == 9 and now.state:
+            states.append(copy.deepcopy(now.state()))
+        return True
+
+    whole = adapt(base, scene, CONFIG, listen).gaussians
+    assert float(states[0].tensors["cost.measured"][0]) == pytest.approx(0.4)
+    resumed = adapt(base, scene, CONFIG, resume=states[0]).gaussians
+    assert all(torch.equal(value, resumed.tensors()[name]) for name, value in whole.tensors().items())
+
+
+def test_what_is_frozen_stays(scene: Scene) -> None:
+    base = gaussians(N, 0, 0, size=0.15)
+    found = adapt(base, scene, replace(CONFIG, lr_scales=0.0, growth="off")).gaussians
+    assert torch.equal(found.log_scales, base.log_scales) and found.growth_d is None
+
+
+def test_views_in_which_nothing_is_drawn() -> None:
+    """Costs of 0 are no error: the term has no effect then."""
+    faint = gaussians(N, 0, 0).replace(opacity_logits=torch.full((N,), -9.0))
+    assert adapt(faint, Scene(photograph(faint, CAMERAS), ()), replace(CONFIG, iters=2)).steps == 2
+
+
+def test_a_subset_is_refused(scene: Scene) -> None:
+    with pytest.raises(ClodError, match="needs all Gaussians trained"):
+        adapt(gaussians(N, 0, 0), scene, CONFIG, subset=TrainableSubset(N // 2))
 
 
 def test_settings_that_it_needs() -> None:

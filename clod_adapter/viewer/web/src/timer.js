@@ -1,9 +1,10 @@
 // The time of a frame's work. The interval between two frames would not do: a display rounds it up to whole refreshes.
 
 const PATIENCE = 1000; // ms until the result of a query
+const FAILURES = 5; // of queries that the GPU could not time, after which it is not asked again
 
 export function createTimer(gl) {
-  let query = gl.getExtension("EXT_disjoint_timer_query_webgl2");
+  let query = gl.getExtension("EXT_disjoint_timer_query_webgl2"), failures = 0;
 
   /** Resolves after the first check that returns true. */
   const until = (check) => new Promise((resolve) => {
@@ -14,6 +15,7 @@ export function createTimer(gl) {
   /** The GPU's own time; null, and no further queries, if a result never comes or the GPU cannot tell it ("disjoint"). */
   async function byQuery(draw) {
     const { TIME_ELAPSED_EXT, GPU_DISJOINT_EXT } = query, handle = gl.createQuery(), late = performance.now() + PATIENCE;
+    gl.getParameter(GPU_DISJOINT_EXT); // clears it
     gl.beginQuery(TIME_ELAPSED_EXT, handle);
     draw();
     gl.endQuery(TIME_ELAPSED_EXT);
@@ -25,7 +27,7 @@ export function createTimer(gl) {
     });
     const ms = ready && !gl.getParameter(GPU_DISJOINT_EXT) ? gl.getQueryParameter(handle, gl.QUERY_RESULT) / 1e6 : null;
     gl.deleteQuery(handle);
-    if (ms === null) query = null;
+    if (ms === null && (!ready || ++failures === FAILURES)) query = null;
     return ms;
   }
 
