@@ -107,7 +107,7 @@ def level_errors(
     counts = np.array([errors_by_count(leaf, len(levels)) for leaf in leaves])
     errors += FLOOR * errors.sum() / max(counts.sum(), 1e-12) * counts
     has = [[level in leaf.levels for level in range(len(levels))] for leaf in leaves]
-    return np.where(has, errors, 0.0)  # type: ignore[no-any-return]
+    return np.where(has, np.maximum.accumulate(errors, 1), 0.0)  # type: ignore[no-any-return]
 
 
 class _Scene:
