@@ -24,7 +24,7 @@ from city import write_city
 from clod_adapter.blocks.divide import Division, divide
 from clod_adapter.blocks.targets import target_image
 from clod_adapter.blocks.train import adapt_block, merge
-from clod_adapter.initialization.importance import usable_views
+from clod_adapter.initialization.importance import initialize, usable_views
 from common import COMMAND, Process, append, arguments, checkpoint, photographs
 
 import torch
@@ -91,7 +91,7 @@ def seams(args: Namespace) -> None:
         seconds = time.perf_counter() - began
         again = clod.adapt(base.gaussians, scene, replace(config, seed=1)).gaussians
         for count in args.blocks:
-            division = divide(base.gaussians, views, config, count)
+            division = divide(initialize(base.gaussians, views, config), views, config, count)
             masks = borders(division, scene.test)
             share = float(torch.stack([mask.float().mean() for mask in masks]).mean())
             about = {"what": "seams", "scene": name, "iters": args.iters, "blocks": count, "border_pixels": share}

@@ -90,7 +90,7 @@ def surround(count: int, whole: int, random: np.random.Generator) -> Points:
     fields = 4 * count // 5
     k = np.arange(count)
     spot = np.stack([k * 0.7548776662466927 + 0.5, k * 0.5698402909980532 + 0.5], 1) % 1.0
-    near = float(np.hypot(*extent(whole))) / 2 * 0.7
+    near = float(extent(whole).min()) / 2  # they begin below the city, which leaves no gap
     away, turn = near * (reach / near) ** spot[:fields, 0], 2 * np.pi * spot[:fields, 1]
     at = np.stack([away * np.cos(turn), np.full(fields, 1.2), away * np.sin(turn)], 1)
     up = np.broadcast_to([0.0, -1.0, 0.0], at.shape)

@@ -119,6 +119,14 @@ def print_rows(file: str, *columns: str) -> None:
     print(table(list(found), [[row.get(key, "") for key in found] for row in rows]))
 
 
+def fill_in(page: Path, name: str, text: str) -> None:
+    """Puts the text between the page's comments of this name, and prints it."""
+    between = rf"(<!-- {name}: [^>]*-->\n).*(\n<!-- end of {name} -->)"
+    filled = re.sub(between, lambda ends: f"{ends[1]}\n{text}\n{ends[2]}", page.read_text("utf-8"), flags=re.S)
+    page.write_text(filled, encoding="utf-8")
+    print(text)
+
+
 def falling(values: Any) -> Any:
     """``[N]`` rows by falling value, equal ones in their order."""
     return values.argsort(descending=True, stable=True)

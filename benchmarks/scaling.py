@@ -22,7 +22,7 @@ from pathlib import Path
 
 import scaling_page
 from city import write_city
-from common import CACHE, COMMAND, Process, Row, append, arguments
+from common import CACHE, COMMAND, Process, Row, append, arguments, fill_in
 from scaling_rows import FEW, FILE, FLOOR, SERIES_COUNT, SIZES, latest, tables
 
 CITIES = CACHE / "scaling"
@@ -54,8 +54,8 @@ def main() -> None:
         measure()
     rows = latest()
     scaling_page.draw(rows)
-    scaling_page.fill_in("figures", tables(rows))
-    scaling_page.fill_in("paper", scaling_page.on_paper(rows))
+    fill_in(scaling_page.PAGE, "figures", tables(rows))
+    fill_in(scaling_page.PAGE, "paper", scaling_page.on_paper(rows))
 
 
 def measure() -> None:

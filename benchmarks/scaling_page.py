@@ -127,11 +127,3 @@ def finish(axes: Any, title: str, x: str, y: str) -> None:
     label_log(axes.yaxis, "{:,.10g}", subs=(1,))
     if axes.get_legend_handles_labels()[0]:
         axes.legend(frameon=False, fontsize=7.5)
-
-
-def fill_in(name: str, text: str) -> None:
-    """Puts the text between the page's comments of this name, and prints it."""
-    begin, end = f"<!-- {name}: written by benchmarks/scaling.py -->", f"<!-- end of {name} -->"
-    before, _, rest = PAGE.read_text(encoding="utf-8").partition(begin)
-    PAGE.write_text(f"{before}{begin}\n\n{text}\n\n{end}{rest.partition(end)[2]}", encoding="utf-8")
-    print(text)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from clod_adapter.evaluation.budget import DialValue, dial_for
     from clod_adapter.evaluation.evaluate import evaluate
     from clod_adapter.gaussians import Gaussians
-    from clod_adapter.hook import Hook
+    from clod_adapter.hook import Hold, Hook
     from clod_adapter.io.adapter_file import load_adapter, save_adapter
     from clod_adapter.io.checkpoint import Checkpoint, load, save
     from clod_adapter.io.scene.load import load_scene
@@ -55,7 +55,7 @@ on_first_use(__name__, {
     "evaluation.evaluate": ("evaluate",),
     "bake": ("bake", "order_by_extinction"),
     "gaussians": ("Gaussians",),
-    "hook": ("Hook",),
+    "hook": ("Hold", "Hook"),
     "io.adapter_file": ("load_adapter", "save_adapter"),
     "io.scene.load": ("load_scene",),
     "io.checkpoint": ("Checkpoint", "load", "save"),
@@ -71,7 +71,7 @@ on_first_use(__name__, {
 
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
-    "Decision", "DialValue", "Gaussians", "Hook", "Override", "Phase", "Plan", "Progress", "Rendering", "Scene",
+    "Decision", "DialValue", "Gaussians", "Hold", "Hook", "Override", "Phase", "Plan", "Progress", "Rendering", "Scene",
     "ScreenFilter", "Stopped", "TrainableSubset", "View", "adapt", "attach", "bake", "detach", "dial_for", "evaluate",
     "extract", "load", "load_adapter", "load_scene", "make_plan", "order_by_extinction", "place_cameras", "render",
     "render_pseudo_views", "save", "save_adapter",

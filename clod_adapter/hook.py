@@ -3,11 +3,16 @@
 hook = clod_adapter.load("model.ply").hook(virtual_scale=3)
 opacities, keep, growth = hook(means, opacities, viewmat, K, width, height, growth=True)
 scales = scales * growth[:, None]
+
+``Hook.hold`` moves the dial so that frames take a given time.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeVar, overload
 
 import numpy as np
@@ -15,9 +20,10 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import NEAR, Camera
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import AttenuationConfig, require
 from clod_adapter.equation.attenuation import Attenuated, attenuate, check_dial
 from clod_adapter.errors import ClodError
+from clod_adapter.frame_rate import DEAD_BAND, FRAMES, NEWEST, Frame, excess, next_dial
 
 Array = TypeVar("Array", Tensor, np.ndarray[Any, Any])
 
@@ -101,6 +107,77 @@ class Hook:
             opacities.reshape(n), sigma_d, (means, camera), self.virtual_scale, self.attenuation, activated=True,
             growth_d=growth_d,
         )  # fmt: skip
+
+    def hold(self, milliseconds: float) -> Hold:
+        """A dial that starts at this value and follows the measured time of a frame (``Hold``)."""
+        return Hold(self, milliseconds)
+
+
+@dataclass
+class Hold:
+    """A hook whose dial value holds the time of a frame, in any renderer, by the law of ``frame_rate``.
+
+        hold = hook.hold(milliseconds=16.7)
+        for viewmat in path:
+            with hold.frame() as hook:
+                drawn, keep, growth = hook(means, opacities, viewmat, K, width, height, growth=True)
+                ...  # rasterize
+
+    The drop-ins for gsplat and Inria's rasterizer take ``virtual_scale=hook.virtual_scale`` inside the block.
+
+    The budget is for the work of a frame, not for the interval between frames, which a display with vertical
+    synchronisation rounds up to whole refreshes. Half of the frames take longer than the median that is held: leave
+    room for the noise, for example 13 ms for 60 frames per second. A frame is fastest at ``max_sv``; see
+    ``out_of_reach``.
+
+    Attributes:
+        hook: the hook of the next frame. The dial stays in [1, max_sv] and changes by at most 10 % per frame.
+        milliseconds: the budget, above 0.
+
+    Raises:
+        ClodError: the budget is not above 0 and finite.
+    """
+
+    hook: Hook
+    milliseconds: float
+    _frames: list[Frame] = field(default_factory=list, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        require(0 < self.milliseconds < np.inf, "milliseconds", self.milliseconds, "above 0 and finite")
+        max_sv = self.hook.attenuation.max_sv
+        self.hook = replace(self.hook, virtual_scale=min(self.hook.virtual_scale, max_sv))
+
+    @contextmanager
+    def frame(self) -> Iterator[Hook]:
+        """The hook of this frame; the duration of the block, CUDA's work included, is passed to ``took``."""
+        _synchronize()
+        start = time.perf_counter()
+        yield self.hook
+        _synchronize()
+        self.took(1000 * (time.perf_counter() - start))
+
+    def took(self, milliseconds: float) -> None:
+        """Takes the time of the frame that ``hook`` drew, from a GPU's timer for example, and moves the dial.
+
+        Raises:
+            ClodError: the time is below 0 or not finite.
+        """
+        require(0 <= milliseconds < np.inf, "the time of a frame", milliseconds, "at least 0 ms and finite")
+        self._frames = [*self._frames, (self.hook.virtual_scale, milliseconds)][-FRAMES:]
+        dial = next_dial(self._frames, self.milliseconds, self.hook.attenuation.max_sv)
+        self.hook = replace(self.hook, virtual_scale=dial)
+
+    @property
+    def out_of_reach(self) -> bool:
+        """True while frames at ``max_sv``, at least 3 so far, take longer than the budget; the dial stays there."""
+        at_max = [dial == self.hook.attenuation.max_sv for dial, _ in self._frames[-NEWEST:]]
+        return at_max == [True] * NEWEST and excess(self._frames, self.milliseconds) > DEAD_BAND
+
+
+def _synchronize() -> None:
+    """Waits for CUDA's work, which is asynchronous, where the process uses CUDA."""
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
 
 
 def _tensor(values: Any) -> Tensor:

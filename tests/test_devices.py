@@ -146,7 +146,7 @@ def test_placed_cameras_match_the_cpu(setup: Setup) -> None:
 
 def test_training_a_block(setup: Setup) -> None:
     views, config = setup.scene.train[:2], replace(CONFIG, iters=2)
-    division = divide(detach(setup.there), views, config, 2)
+    division = divide(initialize(detach(setup.there), views, config), views, config, 2)
     aimed = target_image(division.initial, 25, views[0])
     assert aimed.device.type == "cpu" and aimed.dtype == torch.uint8  # photographs of a whole block
     merged = merge(division, [adapt_block(division, views, config, block)[0] for block in range(2)])

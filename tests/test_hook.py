@@ -14,7 +14,7 @@ import clod_adapter
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.hook import Hook
+from clod_adapter.hook import Hold, Hook
 from clod_adapter.render import dial
 from scenes import camera, gaussians
 
@@ -143,3 +143,48 @@ def test_bad_arguments_are_refused(tmp_path: Path) -> None:
     clod_adapter.save(tmp_path / "plain.ply", gaussians(5, 0, 0))
     with pytest.raises(ClodError, match="plain.ply: it has no sigma_d, so there is no dial"):
         clod_adapter.load(tmp_path / "plain.ply").hook(virtual_scale=3)
+
+
+def test_hold_moves_the_dial_by_the_times_it_takes() -> None:
+    start = hook_of(adapted(), 2.0)
+    hold = start.hold(milliseconds=10)
+    for _ in range(8):
+        hold.took(30)
+    assert hold.hook.virtual_scale == pytest.approx(2 * 1.1**6) and start.virtual_scale == 2  # from the third frame on
+    assert torch.equal(hold.hook.sigma_d, start.sigma_d) and not hold.out_of_reach
+    for _ in range(10):
+        hold.took(30)
+    assert hold.hook.virtual_scale == 5 and hold.out_of_reach
+    for _ in range(4):
+        hold.took(2)
+    assert hold.hook.virtual_scale < 5 and not hold.out_of_reach
+    assert replace(start, virtual_scale=9.0).hold(10).hook.virtual_scale == 5
+
+
+def test_hold_measures_the_block_and_the_work_on_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock counts CUDA's work at the end of the block, and not the work from before it."""
+    clock = {"now": 0.0, "queued": 99.0}
+
+    def synchronize() -> None:
+        clock["now"] += clock.pop("queued", 0.0)
+
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.cuda, "synchronize", synchronize)
+    monkeypatch.setattr("clod_adapter.hook.time.perf_counter", lambda: clock["now"])
+    hold, times = hook_of(adapted(), 2.0).hold(10), []
+    monkeypatch.setattr(Hold, "took", lambda self, milliseconds: times.append(milliseconds))
+    with hold.frame() as hook:
+        assert hook is hold.hook
+        clock.update(now=clock["now"] + 0.002, queued=0.005)
+    with pytest.raises(KeyError), hold.frame():
+        raise KeyError  # a frame that was not finished has no time
+    assert times == [pytest.approx(7.0)]
+
+
+@pytest.mark.parametrize("milliseconds", [0, -1, float("nan"), float("inf")])
+def test_hold_refuses_times_that_are_none(milliseconds: float) -> None:
+    with pytest.raises(ClodError, match="milliseconds is .*, it must be above 0 and finite"):
+        hook_of(adapted()).hold(milliseconds)
+    if milliseconds:
+        with pytest.raises(ClodError, match="the time of a frame is .*, it must be at least 0 ms and finite"):
+            hook_of(adapted()).hold(10).took(milliseconds)

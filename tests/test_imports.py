@@ -22,7 +22,7 @@ ORDER: list[set[str]] = [
     {"_support", "origin"},
     {"errors"},
     {"_kernels", "cameras", "config"},
-    {"calibration", "gaussians", "losses"},
+    {"calibration", "frame_rate", "gaussians", "losses"},
     {"equation"},
     {"finite", "hook", "metrics", "progress", "rasterizers"},
     {"adapter", "integrations", "render"},

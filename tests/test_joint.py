@@ -29,7 +29,7 @@ from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.evaluation.popping import dial_popping, path_popping
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
-from clod_adapter.initialization.importance import sigma_from_importance
+from clod_adapter.initialization.importance import initialize, sigma_from_importance
 from clod_adapter.render import render
 from clod_adapter.training.objective import Objective, TrainableSubset
 from clod_adapter.training.view_sampler import Sample
@@ -140,7 +140,7 @@ def inria(model: Gaussians) -> list[Tensor]:
 def blocks(model: Gaussians) -> list[Any]:
     """A block's context, and its target share."""
     views, config = views_of(model), AdaptConfig(max_sv=4.0)
-    division = divide(model, views, config, 2)
+    division = divide(initialize(model, views, config), views, config, 2)
     target = block_target(division, 0, CAMERAS, config, first=False)
     context = [context_rows(division, 0, views, after) for after in (None, model)]
     return [*context, target(DIAL)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,11 @@ from clod_adapter.blocks.divide import Division
 from clod_adapter.blocks.file import checked, load_block, refused_if_damaged, save_block
 from clod_adapter.blocks.train import Learned
 from clod_adapter.cameras import View
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import remove_leftovers
+from clod_adapter.training.plan import Decision, Plan
 
 
 @dataclass(frozen=True)
@@ -52,37 +53,47 @@ class BlockFiles:
         """The numbers, from 1, of the blocks whose pass is not done."""
         return [block + 1 for block in range(self.count) if not self.block(block, number).exists()]
 
-    def save_start(self, division: Division) -> None:
-        """Writes a division, unless another job has written one."""
+    def save_start(self, plan: Plan, division: Division) -> None:
+        """Writes a plan and a division of what it trains, unless another job has written them."""
         if self.start.exists():
             return
-        tensors = {"block": division.block, "seen": division.seen}
-        about = {"extent": division.extent, "attenuation": division.initial.attenuation}
-        save_block(self.start, dial_tensors(division.initial) | tensors, about, self.run_of)
+        tensors = dial_tensors(plan.start) | {"block": division.block, "seen": division.seen}
+        if plan.kept is not None:
+            tensors["kept"] = plan.kept
+        about = {
+            "extent": division.extent, "attenuation": plan.start.attenuation, "sh_degree": plan.sh_degree,
+            "config": asdict(plan.config), "decisions": [asdict(decision) for decision in plan.decisions],
+        }  # fmt: skip
+        save_block(self.start, tensors, about, self.run_of)
 
-    def load_start(self, base: Gaussians, views: Sequence[View]) -> tuple[Division, BlockFiles]:
-        """The division of the file, and the files of the blocks that it makes.
+    def load_start(self, base: Gaussians, views: Sequence[View]) -> tuple[Plan, Division, BlockFiles]:
+        """The plan and the division of the file, and the files of the blocks that it makes.
 
         Raises:
             ClodError: it cannot be read, is damaged, or of another run.
         """
         tensors, about = load_block(self.start, self.run_of)
-        device = base.means.device
+        device, kept = base.means.device, tensors.get("kept")
         count = tensors["seen"].shape[-1] if "seen" in tensors and tensors["seen"].dim() else 0
         names = DIAL if self.run_of["settings"]["growth"] == "on" else DIAL[:1]
-        shapes = {name: (torch.float32, (len(base),)) for name in names} | {
-            "block": (torch.int16, (len(base),)),
-            "seen": (torch.float32, (len(views), count)),
-        }  # fmt: skip
+        shapes: dict[str, tuple[torch.dtype, tuple[int, ...]]] = dict.fromkeys(names, (torch.float32, (len(base),)))
+        if kept is not None:
+            shapes["kept"] = (torch.bool, (len(base),))
+        trained = len(base) if kept is None else int(kept.sum())
+        shapes |= {"block": (torch.int16, (trained,)), "seen": (torch.float32, (len(views), count))}
         checked(self.start, tensors, shapes)
         if tensors["block"].unique().tolist() != list(range(count)):
             raise ClodError(f"{self.start}: a block has no Gaussians; delete it to make it again")
         with refused_if_damaged(self.start):
             settings, extent = AttenuationConfig(**about["attenuation"]), float(about["extent"])
+            config, degree = AdaptConfig(**about["config"]), int(about["sh_degree"])
+            decisions = tuple(Decision(**each) for each in about["decisions"])
+            few = base.without_bands(degree)
         dial = {name: tensors[name].to(device) for name in names}
-        begun = attach(base, attenuation=settings, **dial)
-        division = Division(begun, tensors["block"].to(device), tensors["seen"], extent)
-        return division, replace(self, run_of=self.run_of | {"start": _digest(tensors)}, count=count)
+        begun = attach(few, attenuation=settings, **dial)
+        plan = Plan(decisions, begun, None if kept is None else kept.to(device), degree, config, {"start": 0.0})
+        division = Division(plan.lean, tensors["block"].to(device), tensors["seen"], extent, len(base))
+        return plan, division, replace(self, run_of=self.run_of | {"start": _digest(tensors)}, count=count)
 
     def save_learned(self, learned: Learned, block: int, number: int) -> None:
         about = {name: getattr(learned, name) for name in ("steps", "seconds", "failed", "held")}

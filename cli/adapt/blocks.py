@@ -21,6 +21,8 @@ from clod_adapter.initialization.importance import usable_views
 from clod_adapter.io.scene.image_cache import ImageCache
 from clod_adapter.progress import Phase, Stopped
 from clod_adapter.rasterizers.cpu import release_memory
+from clod_adapter.training.plan import Plan
+from clod_adapter.training.planner import make_plan
 from clod_adapter.training.state import Adapted
 
 from ..shared.console import duration
@@ -29,6 +31,8 @@ from ..shared.report import machine
 from .block_files import BlockFiles
 from .display import ProgressDisplay
 from .inputs import Inputs
+from .memory import move_to_disk
+from .plan import complete, override
 from .resume import check_resumed, find_state, settings_key
 from .saver import Saver
 from .setup import Setup
@@ -48,8 +52,9 @@ class Pass:
 
 @dataclass(frozen=True)
 class Divided:
-    """The scene in blocks, its views, and the files of the blocks."""
+    """The plan, what it trains in blocks, their views, and their files."""
 
+    plan: Plan
     division: Division
     views: Sequence[View]
     files: BlockFiles
@@ -70,29 +75,25 @@ class Blocks:
         if plan is None or (plan.blocks == 1 and not args.block and not files.start.exists()):
             return None
         check_divisible(inputs.config)
-        if args.trim or args.keep_in or args.leave_out:
-            raise ClodError(
-                "--trim, --with and --without are of a plan, which needs all Gaussians at once; leave them out, or "
-                "give more --memory"
-            )
-        setup.console.say("plan: none in blocks; all SH degrees and Gaussians are kept, and every attribute is trained")
         with setup.console.meter(Phase.FINGERPRINT) as meter:
             photographs = scene_fingerprint(inputs.scene, meter)
         run_of = {
             "version": package_version(), "settings": asdict(inputs.config), "checkpoint": inputs.base.fingerprint,
             "photographs": photographs, "screen_filter": asdict(inputs.base.gaussians.screen_filter),
+            "--with or --without": [sorted(args.keep_in), sorted(args.leave_out)],
         }  # fmt: skip
         return cls(setup, plan, BlockFiles(setup.outputs.ply, run_of))
 
-    def adapt(self, inputs: Inputs) -> Adapted:
-        """Trains the blocks that are not done yet, and merges all.
+    def adapt(self, inputs: Inputs) -> tuple[Plan, Adapted]:
+        """Trains the blocks that are not done yet, and merges all; the result is of all Gaussians.
 
         Raises:
             Stopped: Ctrl-C; finished blocks are in their files.
         """
         began = time.perf_counter()
         divided, failed, merged, steps, seconds, held = self.divided(inputs), list[str](), None, 0, 0.0, 0
-        start_seconds, division = time.perf_counter() - began, divided.division
+        start_seconds, division, plan = time.perf_counter() - began, divided.division, divided.plan
+        plan = complete(plan, self.setup, inputs)
         for number in range(1, division.passes + 1):
             jobs = [Pass(block, number, merged) for block in range(division.count)]
             results = [self.train(inputs, divided, job) for job in jobs]
@@ -103,9 +104,10 @@ class Blocks:
             ended = zip(jobs, results, strict=True)
             failed += [f"{job.name(division)}: {result.failed}" for job, result in ended if result.failed]
         assert merged is not None
-        return Adapted(
-            merged, steps, seconds, start_seconds, interrupted=False, failed="; ".join(failed) or None, held=held
-        )
+        return plan, Adapted(
+            plan.whole(inputs.base.gaussians, merged), steps, seconds, start_seconds, interrupted=False,
+            failed="; ".join(failed) or None, held=held,
+        )  # fmt: skip
 
     def run_job(self, inputs: Inputs) -> dict[str, Any]:
         """Does the job of ``--block``, the initialization or the next pass of one block; returns the report."""
@@ -115,7 +117,9 @@ class Blocks:
         divided = self.divided(inputs)
         division, files, block = divided.division, divided.files, args.block
         path = files.start
-        if block != "start":
+        if block == "start":
+            complete(divided.plan, self.setup, inputs)
+        else:
             self._require_block(block, division.count)
             block = int(block) - 1
             number = 1 if not files.block(block, 1).exists() else division.passes
@@ -149,7 +153,7 @@ class Blocks:
         return merge(division, [files.load_learned(division, block, 1) for block in range(division.count)])
 
     def divided(self, inputs: Inputs) -> Divided:
-        """The division in the file, which is made if it does not exist.
+        """The plan and the division in the file, which is made if it does not exist.
 
         Raises:
             ClodError: the file is of another run, or of one with another number of blocks.
@@ -159,23 +163,26 @@ class Blocks:
         views, exists = usable_views(base, inputs.scene.train), path.exists()
         if not exists:
             with self._display(Phase.TRAINING) as display:
-                made = divide(base, views, inputs.config, self.plan.blocks, display)
-            self.files.save_start(made)
-            del made
+                plan = make_plan(base, inputs.scene, inputs.config, override(self.setup.args), display)
+                made = divide(plan.lean, views, plan.config, self.plan.blocks, total=len(plan.start), progress=display)
+            self.files.save_start(plan, made)
+            del plan, made
             release_memory()
-        division, files = self.files.load_start(base, views)
+        plan, division, files = self.files.load_start(base, views)
+        if plan.kept is not None:  # what is trained is a copy
+            move_to_disk(base, self.files.ply.parent)
         if division.count != self.plan.blocks:
             raise ClodError(
                 f"{path}: is of a run in {division.count} blocks, and --memory {self.setup.args.memory} makes "
                 f"{self.plan.blocks}; use the original --memory, or delete it to start over"
             )
-        steps = [division.steps(block, inputs.config) for block in range(division.count)]
+        steps = [division.steps(block, plan.config) for block in range(division.count)]
         console.say(
             f"{path}: the initialization of {division.count} blocks exists" if exists else
             f"wrote {path}: {division.count} blocks of {min(steps)} to {max(steps)} steps, {sum(steps)} in "
             f"all (each takes {inputs.config.iters} times its share of the views)"
         )  # fmt: skip
-        return Divided(division, views, files)
+        return Divided(plan, division, views, files)
 
     def train(self, inputs: Inputs, divided: Divided, job: Pass) -> Learned:
         """Trains one block in one pass, unless its file exists.
@@ -187,7 +194,8 @@ class Blocks:
         if files.block(job.block, job.number).exists():
             return files.load_learned(division, job.block, job.number)
         name = job.name(division)
-        own = block_config(division, job.block, inputs.config, first=job.number == 1)
+        config = divided.plan.config
+        own = block_config(division, job.block, config, first=job.number == 1)
         path = files.state(job.block, job.number)
         resumed = find_state(path, path.exists(), own, console)
         of = f"{files.run_of['checkpoint']}, {files.run_of['start']}, {name}"
@@ -197,7 +205,7 @@ class Blocks:
         with saver.rescuing("the same command"):
             with self._display(name) as display:
                 learned, adapted = adapt_block(
-                    division, divided.views, inputs.config, job.block, after=job.before,
+                    division, divided.views, config, job.block, after=job.before,
                     progress=saver.saving(display), resume=resumed.state if resumed else None,
                     cache=ImageCache(self.plan.cache),
                 )  # fmt: skip

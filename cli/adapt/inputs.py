@@ -19,7 +19,7 @@ from ..shared.devices import on_device, pick_device
 from ..shared.inputs import place_scene, read_checkpoint, read_scene, with_pseudo_views
 from ..shared.kernels import prepare_kernels
 from ..shared.measure import measure
-from .memory import image_cache, plan_memory
+from .memory import image_cache, plan_memory, rows_on_disk, without_rows
 from .setup import Setup
 
 
@@ -53,6 +53,7 @@ def read_inputs(setup: Setup) -> Inputs:
     args, console, watch = setup.args, setup.console, setup.watch
     with watch.time("load"):
         base = on_device(read_checkpoint(args.ply, console, args.activated), pick_device(args.device, console))
+        base = without_rows(base) if args.block else rows_on_disk(base, setup.outputs.ply.parent)
         photographs = read_scene(args.images, console, base.origin, image_cache(args)) if args.images else None
     with watch.time("kernels"):
         prepare_kernels(console, base.gaussians.means.device)

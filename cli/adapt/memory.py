@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import argparse
 import math
+import shutil
+import tempfile
 from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
 
 from clod_adapter.blocks.memory import IMAGES, MemoryEstimate, MemoryPlan, in_words, parse_size, plan_for_limit
 from clod_adapter.cameras import Scene, StoredView
-from clod_adapter.errors import ClodError
-from clod_adapter.io.checkpoint import Checkpoint, load
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.image_cache import ImageCache
 
 from ..shared.console import Console
@@ -47,18 +53,37 @@ def plan_memory(args: argparse.Namespace, base: Checkpoint, scene: Scene, consol
     return plan
 
 
-def without_rows(base: Checkpoint) -> Checkpoint:
-    """The checkpoint without the rows of its file, which are needed for writing only."""
-    return replace(base, vertex=base.vertex[:0].copy())
+def rows_on_disk(base: Checkpoint, folder: Path) -> Checkpoint:
+    """The checkpoint with its file's rows, which only writing needs, on disk (``_mapped``).
 
-
-def with_rows(base: Checkpoint, args: argparse.Namespace) -> Checkpoint:
-    """The inverse of ``without_rows``: reads the file again.
-
-    Raises:
-        ClodError: the file has changed.
+    A later change of the checkpoint's file does not reach them.
     """
-    again = load(args.ply, activated=args.activated, origin=base.origin)
-    if again.fingerprint != base.fingerprint:
-        raise ClodError(f"{args.ply}: has changed since it was read; run the same command again")
-    return replace(again, gaussians=base.gaussians)
+    return replace(base, vertex=_mapped(base.vertex, folder))
+
+
+def move_to_disk(gaussians: Gaussians, folder: Path) -> None:
+    """Replaces, in place, the memory of all tensors on the CPU by a file (``_mapped``), whoever refers to them."""
+    for tensor in gaussians.tensors().values():
+        if tensor.device.type == "cpu" and tensor.numel():
+            tensor.data = torch.from_numpy(_mapped(tensor.numpy(), folder))
+
+
+def _mapped(array: np.ndarray, folder: Path) -> np.ndarray:
+    """The array in a mapped file without a name in ``folder``; itself where that cannot be written.
+
+    Room for the outputs remains: four times its size must be free.
+    """
+    try:
+        if shutil.disk_usage(folder).free < 4 * array.nbytes:
+            return array
+        with tempfile.TemporaryFile(dir=folder) as file:
+            array.tofile(file)
+            file.flush()
+            return np.asarray(np.memmap(file, array.dtype, "c", shape=array.shape))
+    except OSError:
+        return array
+
+
+def without_rows(base: Checkpoint) -> Checkpoint:
+    """The checkpoint without the rows of its file, for jobs that write no output."""
+    return replace(base, vertex=base.vertex[:0].copy())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,11 +24,20 @@ def decide(setup: Setup, inputs: Inputs, display: ProgressDisplay) -> Plan:
     Raises:
         Stopped: Ctrl-C.
     """
-    args, base = setup.args, inputs.base.gaussians
-    override = Override(frozenset(args.keep_in), frozenset(args.leave_out))
-    plan = make_plan(base, inputs.scene, inputs.config, override, display)
+    plan = make_plan(inputs.base.gaussians, inputs.scene, inputs.config, override(setup.args), display)
     display.close()
     release_memory()  # of looking at all Gaussians, before only those that are kept are trained
+    return complete(plan, setup, inputs)
+
+
+def override(args: argparse.Namespace) -> Override:
+    """Of ``--with`` and ``--without``."""
+    return Override(frozenset(args.keep_in), frozenset(args.leave_out))
+
+
+def complete(plan: Plan, setup: Setup, inputs: Inputs) -> Plan:
+    """The plan, which is printed, with the effect of ``--trim``."""
+    args, base = setup.args, inputs.base.gaussians
     if args.trim and plan.trims(base):
         plan = _with_trimming_effect(plan, inputs, setup.console)
     show_plan(plan.decisions, setup.console)

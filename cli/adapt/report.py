@@ -23,7 +23,6 @@ from ..shared.interrupts import GracefulStop
 from ..shared.pages import AdaptPage
 from ..shared.report import Stopwatch, machine, table, write_report
 from .inputs import Inputs
-from .memory import with_rows
 from .processes import describe_processes
 from .result import Measurements, Result, measure_result
 from .setup import Setup
@@ -57,17 +56,16 @@ def finish(
 def write_result(setup: Setup, inputs: Inputs, result: Result, measured: Measurements) -> dict[str, Any]:
     """Writes the three files, and returns the report."""
     outputs, adapter = setup.outputs, result.adapter
-    base = with_rows(result.base, setup.args) if result.plan is None else result.base
     if measured.rows and not measured.interrupted:
         against = teacher(setup.args)
         try:
-            table_of = calibrate(measured.rows, result.gaussians, inputs.scene, against, base.origin)
+            table_of = calibrate(measured.rows, result.gaussians, inputs.scene, against, result.base.origin)
             adapter = replace(adapter, calibration=table_of)
         except ClodError as error:
             setup.console.say(f"the files have no calibration, so --fps and --psnr-drop will not work: {error}")
     report = describe_run(setup, inputs, result, measured)
     with setup.console.status(f"writing {outputs.ply} ..."):
-        report = write_files(base, adapter, result.gaussians, outputs, report)
+        report = write_files(result.base, adapter, result.gaussians, outputs, report)
     setup.console.say(f"wrote {outputs.adapter} and {outputs.ply}")
     return report
 
@@ -108,7 +106,7 @@ def describe_run(setup: Setup, inputs: Inputs, result: Result, measured: Measure
         "alignment": inputs.alignment, "notes": notes, "base_rows": [row.as_dict() for row in inputs.base_rows],
         "rows": [row.as_dict() for row in measured.rows],
         "detached_row": measured.plain[0].as_dict() if measured.plain else None,
-        "plan": plan and plan.as_dict(), "memory": inputs.memory and asdict(inputs.memory),
+        "plan": plan.as_dict(), "memory": inputs.memory and asdict(inputs.memory),
     }  # fmt: skip
     return report | ({"exit_code": 1} if adapted.failed else {})
 
@@ -116,8 +114,10 @@ def describe_run(setup: Setup, inputs: Inputs, result: Result, measured: Measure
 def seconds(setup: Setup, result: Result) -> dict[str, float]:
     """Wall times by phase."""
     plan, adapted = result.plan, result.adapted
-    times = {"plan": sum(plan.seconds.values()) - plan.seconds["start"]} if plan else {}
-    times |= {"start": adapted.start_seconds, "train": adapted.seconds}
+    times = {
+        "plan": sum(plan.seconds.values()) - plan.seconds["start"], "start": adapted.start_seconds,
+        "train": adapted.seconds,
+    }  # fmt: skip
     return {name: round(value, 3) for name, value in times.items()} | setup.watch.report()
 
 

@@ -24,13 +24,12 @@ class Result:
     """What is written.
 
     Attributes:
-        plan: None in blocks.
         base: the checkpoint with the rows and SH degrees that are written; with ``--trim`` not all of them.
         gaussians: ``adapter`` applied to ``base``.
         notes: for the report.
     """
 
-    plan: Plan | None
+    plan: Plan
     adapted: Adapted
     base: Checkpoint
     adapter: Adapter
@@ -47,12 +46,12 @@ class Measurements:
     interrupted: bool = False
 
 
-def make_result(setup: Setup, inputs: Inputs, plan: Plan | None, adapted: Adapted) -> Result:
+def make_result(setup: Setup, inputs: Inputs, plan: Plan, adapted: Adapted) -> Result:
     """Extracts the adapter, and applies it to the base."""
     if hurried(adapted):
         listen_no_more()
     gaussians, kept, degree = inputs.base.gaussians, None, None
-    if plan and setup.args.trim and plan.trims(gaussians):
+    if setup.args.trim and plan.trims(gaussians):
         kept, degree = plan.kept, plan.sh_degree
     base = trimmed(inputs.base, kept, degree)
     adapter = extract(

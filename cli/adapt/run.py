@@ -22,7 +22,7 @@ from ..shared.pages import AdaptPage
 from .blocks import Blocks
 from .display import ProgressDisplay
 from .inputs import Inputs, read_inputs, with_base_rows
-from .memory import without_rows
+from .memory import move_to_disk
 from .plan import decide
 from .processes import TrainingJob, together
 from .report import finish
@@ -54,6 +54,8 @@ def adapt_whole(setup: Setup, inputs: Inputs) -> dict[str, Any]:
     with setup.stop.listening():  # until training has ended, so that a Ctrl-C loses nothing
         display = show_progress(setup, inputs)
         plan = decide(setup, inputs, display)
+        if plan.kept is not None:  # what is trained is a copy
+            move_to_disk(inputs.base.gaussians, setup.outputs.ply.parent)
         page = make_page(setup, inputs)
         saver = Saver(setup.outputs.state, run_of, setup.resumed, setup.console, setup.stop)
         with saver.rescuing():
@@ -64,13 +66,13 @@ def adapt_whole(setup: Setup, inputs: Inputs) -> dict[str, Any]:
 
 
 def adapt_blocks(setup: Setup, inputs: Inputs, blocks: Blocks) -> dict[str, Any]:
-    """The same in blocks, without a plan, which would need all Gaussians at once."""
-    inputs = with_base_rows(setup, replace(inputs, base=without_rows(inputs.base)))
+    """The same in blocks."""
+    inputs = with_base_rows(setup, inputs)
     with setup.stop.listening():
         page = make_page(setup, inputs)
-        adapted = blocks.adapt(inputs)
+        plan, adapted = blocks.adapt(inputs)
         release_memory()
-        result = make_result(setup, inputs, None, adapted)
+        result = make_result(setup, inputs, plan, adapted)
     return finish(setup, inputs, result, page, lambda complete: blocks.remove() if complete else None)
 
 

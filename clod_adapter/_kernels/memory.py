@@ -16,6 +16,8 @@ from torch import Tensor
 # Most idle arrays; beyond it the oldest is freed.
 IDLE = 24
 _SMALL = 16384
+# Bytes beyond which an array is freed: numpy asks for huge pages for it, so a new one takes little time.
+_LARGE = 16_000_000
 _idle: dict[int, list[np.ndarray]] = {}
 _recent: deque[int] = deque()
 _planes: dict[tuple[int, ...], np.ndarray] = {}
@@ -49,6 +51,8 @@ def recycled(shape: torch.Size | tuple[int, ...]) -> Tensor:
 
 
 def _give_back(whole: np.ndarray) -> None:
+    if whole.nbytes > _LARGE:
+        return
     # No lock: this runs where the last tensor is freed, perhaps within ``recycled``. Each operation is atomic.
     _idle.setdefault(len(whole), []).append(whole)
     _recent.append(len(whole))

@@ -10,13 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from clod_adapter.adapter import attach
 from clod_adapter.cameras import View, camera_extent
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.coverage import coverage, reduced
-from clod_adapter.initialization.importance import initialize
 from clod_adapter.progress import Listener, Phase, tell
 
 UNSEEN = 0.005  # of a block's coverage over all views, the share that the views it is not trained on may have
@@ -27,16 +25,18 @@ class Division:
     """A scene divided into blocks, with its initialization.
 
     Attributes:
-        initial: the Gaussians with the initial dial.
+        initial: the Gaussians that are trained, N, with the initial dial.
         block: ``[N]`` int16, the block of each Gaussian.
         seen: ``[V, B]`` float32, the share of each view's image that each block covers.
         extent: of all cameras, world units.
+        total: number of Gaussians that target counts are shares of: N and those that a plan leaves out.
     """
 
     initial: Gaussians
     block: Tensor
     seen: Tensor
     extent: float
+    total: int
 
     @property
     def count(self) -> int:
@@ -101,38 +101,39 @@ def first_size(total: int, parts: int, fewer: int) -> int:
 
 
 def divide(
-    base: Gaussians,
+    initial: Gaussians,
     views: Sequence[View],
     config: AdaptConfig,
     count: int,
+    *,
+    total: int | None = None,
     progress: Listener | None = None,
 ) -> Division:
-    """Splits a scene into ``count`` blocks and initializes the dial on the whole scene.
+    """Splits a scene into ``count`` blocks.
 
     Args:
+        initial: the whole scene, from ``importance.initialize``, or as much of it as a plan trains.
         views: ``importance.usable_views`` of the training views.
-        progress: called in the phases of ``importance.initialize``, then in ``Phase.COVERAGE`` after each view.
+        total: ``Division.total``; by default the number of Gaussians in ``initial``.
+        progress: called in ``Phase.COVERAGE`` after each view.
 
     Raises:
         ClodError: blocks cannot be trained with these settings, or there are fewer Gaussians than blocks.
     """
     check_divisible(config)
-    block = split(base.means, count)
-    initial = initialize(base.without_empty_bands(), views, config, progress)
     assert initial.attenuation is not None
     if initial.attenuation.normalizer != "scene":
         raise ClodError(
             f"the checkpoint's dial has the normaliser {initial.attenuation.normalizer}, whose distances depend on all "
             "Gaussians in view: it cannot be trained in blocks; adapt it whole"
         )
-    seen = torch.empty(len(views), count)
+    block, seen = split(initial.means, count), torch.empty(len(views), count)
     for k, view in enumerate(views):
         shown = coverage(initial, initial.opacities, reduced(view.camera)).double()
         seen[k] = (shown.new_zeros(count).index_add_(0, block.long(), shown) / shown.sum().clamp(min=1e-9)).float()
         tell(progress, Phase.COVERAGE, k + 1, len(views))
-    initial = attach(base, initial.sigma_d, initial.attenuation, initial.growth_d)
-    extent = camera_extent([view.camera for view in views]) or initial.attenuation.reference_distance  # type: ignore[union-attr]
-    return Division(initial, block, seen, extent)
+    extent = camera_extent([view.camera for view in views]) or initial.attenuation.reference_distance
+    return Division(initial, block, seen, extent, total or len(initial))
 
 
 def check_divisible(config: AdaptConfig) -> None:

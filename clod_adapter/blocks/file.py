@@ -14,14 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save
 from torch import Tensor
 
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.sniff import refuse_irregular
-from clod_adapter.io.tensor_file import read_tensors
+from clod_adapter.io.tensor_file import read_tensors, write_tensors
 
 KEY = "clod_adapter_block"
 
@@ -39,7 +38,7 @@ def save_block(path: Path, tensors: dict[str, Tensor], about: dict[str, Any], be
     plain = {name: asdict(value) if isinstance(value, AttenuationConfig) else value for name, value in about.items()}
     metadata = {KEY: json.dumps({"about": plain, "belongs": belongs}, sort_keys=True)}
     with atomic_path(path) as temporary:
-        temporary.write_bytes(save({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, metadata))
+        write_tensors(temporary, tensors, metadata)
 
 
 def load_block(path: Path, belongs: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:

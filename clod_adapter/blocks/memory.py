@@ -96,8 +96,8 @@ def _plan(needs: MemoryEstimate, limit: int, blocks: int) -> MemoryPlan:
     if blocks > 1:  # a block has target images of its own
         cache = min(needs.images + needs.pictures, int(IMAGES * limit))
         always += cache
-    if blocks == 1:  # the file's rows stay in memory
-        held = needs.row + needs.attributes
+    if blocks == 1:
+        held = needs.attributes
         train = always + count * (held + DRAWN + TRAINED)
     else:
         held = needs.attributes + 8

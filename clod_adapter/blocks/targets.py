@@ -96,7 +96,7 @@ def block_target(
     stands_for = len(division.seen) / len(numbers)
     if first:
         stands_for /= max(float(division.seen[numbers, block].mean()), LEAST_SEEN)
-    return partial(_target_share, config, parts, stands_for, int(own.sum()), len(initial))
+    return partial(_target_share, config, parts, stands_for, int(own.sum()), division.total)
 
 
 def _dial_grid(config: AdaptConfig) -> list[float]:

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save
 
 from clod_adapter.adapter import Adapter, dial_tensors
 from clod_adapter.config import CLASSIC
@@ -22,7 +21,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.formats.metadata import FORMAT as MODEL
 from clod_adapter.io.settings import DAMAGE, damaged, document, read_metadata, stored_values
-from clod_adapter.io.tensor_file import load_tensors
+from clod_adapter.io.tensor_file import load_tensors, write_tensors
 
 KEY = "clod_adapter"
 FORMAT = "clod-adapter"
@@ -53,8 +52,7 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
     if adapter.kept is not None:
         tensors["kept"] = torch.from_numpy(np.packbits(adapter.kept.cpu().numpy()))
     with atomic_path(path) as temporary:
-        # Not save_file, which makes files that only their owner can read.
-        temporary.write_bytes(save({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, metadata))
+        write_tensors(temporary, tensors, metadata)
 
 
 def check_config(config: dict[str, Any]) -> None:

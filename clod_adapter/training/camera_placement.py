@@ -8,8 +8,8 @@ A checkpoint is accurate only where its photographs looked. Two properties of th
   in the directions from which a Gaussian was photographed and weak in others.
 
 Candidate cameras look at random Gaussians, preferably small opaque ones, from random directions. Each is scored by two
-small renderings (``_score``), and as many again are tried near the best. Of the good ones, cameras far from each other
-are chosen. The method needs no up direction, scene type or unit.
+small renderings (``camera_score``), and as many again are tried near the best. Of the good ones, cameras far from each
+other are chosen. The method needs no up direction, scene type or unit.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from clod_adapter.adapter import detach
 from clod_adapter.cameras import Camera, near_plane
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Listener, Phase, tell
-from clod_adapter.render import splat
+from clod_adapter.training.camera_score import WIDTH, largest_scale, sample, score
 
 VIEWS = 96
-WIDTH, HEIGHT = 496, 368
+HEIGHT = 368
 FIELD = 55.0  # horizontal, degrees: between a phone's 65 and the 35 of a portrait lens
 TRIES = 3  # candidates for each view, first anywhere, then as many near the best of those
 BEST = 0.2  # share of the first candidates that are good; later ones must score as high
@@ -74,13 +74,16 @@ def place_cameras(
         Stopped: ``progress`` returned False.
     """
     require(views >= 1, "views", views, "at least 1")
-    seen, generator = _usable(gaussians), torch.Generator().manual_seed(seed)
+    plain, generator = detach(gaussians), torch.Generator().manual_seed(seed)
+    usable = _usable(plain)
+    seen = plain.replace(shN=plain.shN[:, :0]).select(usable)
     reach, tries, zoom = typical_reach(seen, field), TRIES * views, _zoom(field)
+    few, growth = sample(plain, usable, seed)
     judged: list[Candidate] = []
 
     def judge(cameras: Iterable[Camera]) -> None:
         for camera in cameras:
-            judged.append(Candidate(camera, _score(seen, camera)))
+            judged.append(Candidate(camera, score(few, growth, camera)))
             tell(progress, Phase.CAMERAS, len(judged), 2 * tries)
 
     judge(_anywhere(seen, tries, reach, zoom, generator))
@@ -98,26 +101,25 @@ def typical_reach(gaussians: Gaussians, field: float = FIELD) -> float:
     The distance at which the smallest tenth of the visible Gaussians is at most SMALL_PIXELS pixels large; at most FAR
     times the median distance of the Gaussians from their centre. ``field`` is the horizontal field of view, degrees.
     """
-    footprint = _quantile(_size(gaussians), SMALL) * WIDTH * _zoom(field) / SMALL_PIXELS
+    footprint = _quantile(largest_scale(gaussians), SMALL) * WIDTH * _zoom(field) / SMALL_PIXELS
     from_centre = (gaussians.means - gaussians.means.median(0).values).norm(dim=1)
     return min(footprint, FAR * _quantile(from_centre, 0.5)) or footprint
 
 
-def _usable(gaussians: Gaussians) -> Gaussians:
-    """The visible and finite Gaussians, without a dial. An infinite opacity logit is a fully opaque Gaussian."""
-    plain = detach(gaussians)
-    rows = plain.opacities > VISIBLE
-    for values in plain.tensors().values():
-        if values.shape[1:].numel() and values is not plain.opacity_logits:
+def _usable(gaussians: Gaussians) -> Tensor:
+    """``[n]`` int64, the visible and finite Gaussians. An infinite opacity logit is a fully opaque Gaussian."""
+    rows = gaussians.opacities > VISIBLE
+    for values in gaussians.tensors().values():
+        if values.shape[1:].numel() and values is not gaussians.opacity_logits:
             rows &= values.reshape(len(values), -1).isfinite().all(1)
     if not rows.any():
         raise ClodError("no camera can be placed: the checkpoint has no Gaussian that is visible and finite")
-    return plain.select(rows).without_empty_bands()
+    return rows.nonzero()[:, 0]
 
 
 def _anywhere(gaussians: Gaussians, count: int, reach: float, zoom: float, generator: torch.Generator) -> list[Camera]:
     """Cameras towards Gaussians sampled by opacity over size, from uniform directions, at half to twice the reach."""
-    interest = gaussians.opacities / _size(gaussians).clamp(min=1e-12)
+    interest = gaussians.opacities / largest_scale(gaussians).clamp(min=1e-12)
     # torch.multinomial has a limit of 2^24 weights.
     ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
     drawn = torch.searchsorted(ends, torch.rand(count, generator=generator, dtype=torch.float64) * ends[-1])
@@ -145,30 +147,6 @@ def _best(judged: list[Candidate], least: float, count: int) -> list[Candidate]:
     """By score: those of at least ``least``, or the first ``count`` if that is more, but no empty ones."""
     ranked = sorted((c for c in judged if c.score > -math.inf), key=lambda c: -c.score)
     return ranked[: max(count, sum(c.score >= least for c in ranked))]
-
-
-def _score(gaussians: Gaussians, camera: Camera) -> float:
-    """How likely a photograph was taken from here; -inf if the rendering is empty.
-
-    ``log h - 0.5 p - 2 e`` with h the mean magnitude of the higher SH degrees' colour, p the mean log size in pixels
-    (both weighted by alpha), e the share of pixels that are not covered.
-    """
-    higher = torch.zeros_like(gaussians.sh0)  # the colour is then 0.5 + that of the higher degrees
-    bands, alpha = splat(gaussians.replace(sh0=higher), gaussians.opacities, camera)
-    covered = float(alpha.sum())
-    if covered < 0.1 * alpha.numel():
-        return -math.inf
-    row = camera.viewmat[2].to(gaussians.means)
-    depths = gaussians.means @ row[:3] + row[3]
-    pixels = _size(gaussians) * WIDTH / camera.width * camera.K[0, 0] / depths.clamp(min=1e-6)
-    shade = (pixels.clamp(1e-3, 1e4).log() + 7)[:, None, None].expand(-1, 1, 3)  # positive, as colours are
-    sizes, _ = splat(
-        gaussians.replace(sh0=(shade - 0.5) / SH_C0, shN=gaussians.shN[:, :0]), gaussians.opacities, camera
-    )
-    size = float(sizes[..., 0].sum()) / covered - 7
-    empty = float((alpha < 0.9).float().mean())
-    strength = float((bands - 0.5 * alpha[..., None]).abs().mean(2).sum()) / covered if gaussians.sh_degree else 1.0
-    return math.log(strength + 1e-4) - 0.5 * size - 2 * empty
 
 
 def _spread(candidates: list[Candidate], count: int, reach: float) -> list[Candidate]:
@@ -204,11 +182,6 @@ def _resized(camera: Camera, width: int, height: int, number: int) -> Camera:
 def _zoom(field: float) -> float:
     """The focal length in image widths, of a horizontal field of view in degrees."""
     return 0.5 / math.tan(math.radians(field) / 2)
-
-
-def _size(gaussians: Gaussians) -> Tensor:
-    """``[N]`` the largest standard deviation, world units."""
-    return gaussians.scales.amax(1)
 
 
 def _quantile(values: Tensor, share: float) -> float:

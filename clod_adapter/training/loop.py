@@ -94,7 +94,7 @@ def adapt(
             trainer.restore(resume)
         except ClodError as error:
             raise StateRefused(str(error)) from error
-    del resume, begun  # the trainer has copies
+    del resume, begun, base, lean  # the trainer has copies
     return _train(trainer, progress)
 
 

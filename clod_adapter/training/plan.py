@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from typing import Any
 
 from torch import Tensor
@@ -93,9 +92,9 @@ class Plan:
     config: AdaptConfig
     seconds: dict[str, float]
 
-    @cached_property
+    @property
     def lean(self) -> Gaussians:
-        """The Gaussians that are trained."""
+        """The Gaussians that are trained; a copy where rows are left out."""
         return trim(self.start, self.kept, None)
 
     @property

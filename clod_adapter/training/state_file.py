@@ -7,13 +7,11 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from safetensors.torch import save
-
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.sniff import refuse_irregular
-from clod_adapter.io.tensor_file import read_tensors
+from clod_adapter.io.tensor_file import read_tensors, write_tensors
 from clod_adapter.training.state import TrainingState
 
 KEY = "clod_adapter_state"  # of the JSON document in the metadata
@@ -32,9 +30,7 @@ def save_state(path: str | Path, state: TrainingState, belongs: dict[str, Any]) 
     about = {f.name: getattr(state, f.name) for f in fields(state) if f.name != "tensors"}
     metadata = {KEY: json.dumps({**about, "attenuation": asdict(state.attenuation), "belongs": belongs})}
     with atomic_path(path) as temporary:
-        temporary.write_bytes(
-            save({name: t.detach().cpu().contiguous() for name, t in state.tensors.items()}, metadata)
-        )
+        write_tensors(temporary, state.tensors, metadata)
 
 
 def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:

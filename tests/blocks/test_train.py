@@ -39,7 +39,7 @@ def captured() -> tuple[Gaussians, Scene]:
 @pytest.fixture(scope="module")
 def divided(captured: tuple[Gaussians, Scene]) -> Division:
     base, scene = captured
-    return divide(base, scene.train, CONFIG, BLOCKS)
+    return divide(initialize(base, scene.train, CONFIG), scene.train, CONFIG, BLOCKS)
 
 
 @pytest.fixture(scope="module")
@@ -104,11 +104,7 @@ def test_a_block_has_the_views_that_see_it(divided: Division, captured: tuple[Ga
     # In the capture, whose cameras stand around it, all see everything.
     assert all(divided.views(k) == list(range(len(captured[1].train))) for k in range(BLOCKS))
     torch.testing.assert_close(divided.seen.sum(1), torch.ones(len(divided.seen)))
-    base, scene = captured
-    begun = initialize(base, scene.train, CONFIG)  # that of the whole scene
-    assert torch.equal(divided.initial.sigma_d, begun.sigma_d) and divided.initial.attenuation == begun.attenuation
-    assert torch.equal(divided.initial.growth_d, begun.growth_d)
-    assert divided.extent == camera_extent([view.camera for view in scene.train])
+    assert divided.extent == camera_extent([view.camera for view in captured[1].train])
 
 
 def test_rows_left_out_of_the_context_are_not_needed(captured: tuple[Gaussians, Scene]) -> None:
@@ -118,7 +114,7 @@ def test_rows_left_out_of_the_context_are_not_needed(captured: tuple[Gaussians, 
     hidden = hidden.replace(means=hidden.means * 0.2)  # within the cloud
     both = base.replace(**{n: torch.cat([t, hidden.tensors()[n]]) for n, t in base.tensors().items()})
     both = both.replace(opacity_logits=torch.cat([base.opacity_logits + 3, hidden.opacity_logits - 4]))
-    division = divide(both, scene.train, CONFIG, BLOCKS)
+    division = divide(initialize(both, scene.train, CONFIG), scene.train, CONFIG, BLOCKS)
     for block in range(BLOCKS):
         rows = torch.cat([division.rows(block), context_rows(division, block, scene.train)])
         assert len(rows) < len(both)
@@ -135,11 +131,16 @@ def test_both_passes_render_far_pairs_in_the_first_half_of_the_steps(divided: Di
     assert last == 0 and far_first_of(replace(divided, seen=divided.seen[:, :1]), first=True) == 0.5
 
 
-def test_target_shares_add_up_to_the_curve(divided: Division, captured: tuple[Gaussians, Scene]) -> None:
-    """Weighted with its mean share of the loss, each Gaussian is penalised as in an undivided run."""
-    cameras, count = [view.camera for view in captured[1].train], len(captured[0])
+@pytest.mark.parametrize("left_out", [0, 100])
+def test_target_shares_add_up_to_the_curve(divided: Division, captured: tuple[Gaussians, Scene], left_out: int) -> None:
+    """Weighted with its mean share of the loss, each Gaussian is penalised as in an undivided run.
+
+    The curve is of all Gaussians, also of those that a plan leaves out.
+    """
+    cameras, count = [view.camera for view in captured[1].train], len(captured[0]) + left_out
+    division = replace(divided, total=count)
     for first in (True, False):
-        targets = [block_target(divided, block, cameras, CONFIG, first=first) for block in range(BLOCKS)]
+        targets = [block_target(division, block, cameras, CONFIG, first=first) for block in range(BLOCKS)]
         for s in (1.0, 1.7, 3.0, CONFIG.max_sv):
             asked = [target(s) for target in targets]
             share = target_curve(s, CONFIG.share, CONFIG.exponent)
@@ -241,7 +242,7 @@ def test_a_block_without_views_is_unchanged(captured: tuple[Gaussians, Scene], d
     ahead, right = view.camera.viewmat[2, :3], view.camera.viewmat[0, :3]
     means = base.means * 0.001 + view.camera.position + 3 * ahead + (0 if drawn else 30) * right
     means[:100] -= 50 * ahead
-    division = divide(base.replace(means=means), [view], CONFIG, 3)
+    division = divide(initialize(base.replace(means=means), [view], CONFIG), [view], CONFIG, 3)
     behind = int(division.block[0])
     assert division.views(behind) == [] and division.steps(behind, CONFIG) == 0
     part, outcome = adapt_block(division, [view], CONFIG, behind)
@@ -251,9 +252,9 @@ def test_a_block_without_views_is_unchanged(captured: tuple[Gaussians, Scene], d
 
 def test_settings_that_need_all_gaussians_are_refused(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
-    with pytest.raises(ClodError, match="the paper's form cannot be trained in blocks"):
-        divide(base, scene.train, AdaptConfig.paper(), 2)
     begun = initialize(base, scene.train, CONFIG)
+    with pytest.raises(ClodError, match="the paper's form cannot be trained in blocks"):
+        divide(begun, scene.train, AdaptConfig.paper(), 2)
     dialled = begun.replace(attenuation=replace(begun.attenuation, normalizer="max"))
     with pytest.raises(ClodError, match="normaliser max"):
         divide(dialled, scene.train, CONFIG, 2)

@@ -85,6 +85,15 @@ def test_table_of_long_dials_matches_the_results() -> None:
         assert written == [column.get(name, "") for column in columns], name
 
 
+def test_table_of_placed_cameras_matches_the_results() -> None:
+    rows = [json.loads(line) for line in (RESULTS / "sizes.jsonl").read_text(encoding="utf-8").splitlines()]
+    found = [row for row in rows if row["benchmark"] == "cameras"]
+    (page,) = [table for table in tables(DOCS / "performance.md") if table[0][-1] == "shown"]
+    assert [written[3:] for written in page[1:]] == [
+        [f"{row['cpu_seconds']:.1f}", f"{row['score']:.2f}", f"{100 * row['shown']:.1f} %"] for row in found
+    ]
+
+
 def test_target_counts_match_training() -> None:
     config = AdaptConfig()
     (dials, shares) = next(rows for rows in tables(DOCS / "equation.md") if rows[0][0] == "s")

@@ -78,6 +78,18 @@ def test_hook_code_of_the_page_runs(adapted: clod_adapter.Gaussians) -> None:
     assert torch.equal(names["scales"], adapted.scales * want[2][:, None]) and want[2].max() > 1.1
 
 
+def test_hold_code_of_the_page_runs(adapted: clod_adapter.Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With 20 ms a frame."""
+    monkeypatch.setattr("clod_adapter.hook.time.perf_counter", iter(0.02 * k for k in range(99)).__next__)
+    names: dict[str, Any] = {"hook": Hook(adapted.sigma_d, adapted.attenuation, 3.0, adapted.growth_d)}
+    names |= {"means": adapted.means, "a": adapted.opacities, "path": [torch.eye(4)] * 4}
+    exec(block(".hold("), names | {"K": torch.eye(3), "width": 2, "height": 2}, names)
+    dial = names["hook"].virtual_scale
+    assert dial == pytest.approx(3.3) and names["hold"].hook.virtual_scale == pytest.approx(3.63)
+    want = Hook(adapted.sigma_d, adapted.attenuation, dial)(adapted.means, adapted.opacities, torch.eye(4))
+    assert torch.equal(names["opacities"], want[0]) and torch.equal(names["keep"], want[1])
+
+
 def test_defaults_of_the_page_match_the_reader() -> None:
     told = dict(re.findall(r"`(\w+)`\s+\(`?(?:default )?([\w./-]+)`?\)", PAGE.split("2. **Activate**")[0]))
     assert set(told) == {field.name for field in fields(AttenuationConfig)}

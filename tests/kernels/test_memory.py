@@ -193,3 +193,16 @@ def test_idle_memory_can_be_freed() -> None:
     assert memory._idle and memory._recent
     memory.release()
     assert not memory._idle and not memory._recent
+
+
+def test_large_arrays_are_freed(fresh: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Smaller ones are kept for reuse."""
+    size = 4 * recycled(SHAPE).numel()
+    fresh.clear()
+    for limit, allocated in ((2 * size, 0), (size // 2, 1)):  # the first of these is the one that was kept
+        monkeypatch.setattr(memory, "_LARGE", limit)
+        for _ in range(2):
+            tensor = recycled(SHAPE)
+            del tensor
+            gc.collect()
+        assert len(fresh) == allocated

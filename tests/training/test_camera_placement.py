@@ -10,6 +10,9 @@ from torch import Tensor
 
 import clod_adapter as clod
 import scenes
+from clod_adapter.initialization.coverage import reduced
+from clod_adapter.render import splat
+from clod_adapter.training import camera_score
 from clod_adapter.training.camera_placement import FIELD, HEIGHT, WIDTH, place_cameras, typical_reach
 from clod_adapter.training.pseudo_views import render_pseudo_views
 
@@ -50,10 +53,13 @@ def test_placed_cameras_are_valid_and_see_the_scene(blob: clod.Gaussians) -> Non
     assert len(one) == 4 and torch.equal(one, two) and not torch.equal(one, other)
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_cameras_face_the_side_where_sh_was_trained(axis: int) -> None:
+@pytest.mark.parametrize(("axis", "few"), [(0, False), (1, False), (2, False), (2, True)])
+def test_cameras_face_the_side_where_sh_was_trained(axis: int, few: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a sample of the Gaussians decides."""
     side = torch.eye(3)[axis]
     truth = ball(1500, side)
+    if few:
+        monkeypatch.setattr(camera_score, "SAMPLE", 500)
     positions = torch.stack([c.position for c in place_cameras(truth, views=12)])
     assert (torch.nn.functional.normalize(positions, dim=1) @ side).mean() > 0.4
     assert torch.cdist(positions, truth.means[:-1]).min() > 3 * 0.05 and positions.norm(dim=1).min() > 1
@@ -67,6 +73,26 @@ def test_gaussians_that_are_not_finite_or_not_visible_are_ignored(blob: clod.Gau
     assert one == other
     with pytest.raises(clod.ClodError, match="no Gaussian that is visible and finite"):
         place_cameras(bad)
+
+
+def test_a_sample_is_as_solid_as_the_whole_and_scored_like_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tenth of the discs of a sphere, enlarged, covers what all cover; few and large ones are all drawn."""
+    whole = ball(8000, torch.eye(3)[2])
+    whole = whole.replace(log_scales=whole.log_scales - math.log(2.0))
+    rows = torch.arange(len(whole))
+    every, growth = camera_score.sample(whole, rows, 0)
+    assert growth is None and torch.equal(every.means, whole.means)
+    cameras = [reduced(camera) for camera in place_cameras(whole, views=16)]
+    monkeypatch.setattr(camera_score, "SAMPLE", 800)
+    few, growth = camera_score.sample(whole, rows, 0)
+    assert growth is not None and 700 < len(few) < 900
+    assert float(few.log_scales.max()) == float(whole.log_scales.max()) and float(growth.min()) == 1
+    for camera in cameras:
+        shown = [splat(each, each.opacities, camera, growth=grown)[1] for each, grown in ((whole, None), (few, growth))]
+        assert float((shown[0] - shown[1]).abs().mean()) < 0.1
+    scores = torch.tensor([[camera_score.score(*each, c) for c in cameras] for each in ((whole, None), (few, growth))])
+    seen = scores.isfinite().all(0)  # the others are too empty
+    assert int(seen.sum()) > 5 and float(torch.corrcoef(scores[:, seen])[0, 1]) > 0.8
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1e4])

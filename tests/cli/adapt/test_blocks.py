@@ -21,6 +21,7 @@ from clod_adapter.blocks.memory import MemoryPlan, plan_for_limit
 from clod_adapter.cli.adapt import memory as memory_option
 from clod_adapter.cli.adapt import saver
 from clod_adapter.cli.adapt.display import ProgressDisplay
+from clod_adapter.io.adapter_file import load_adapter
 from clod_adapter.progress import Phase, Progress
 from runs import change_step, fail, names
 from scenes import stripped
@@ -65,7 +66,10 @@ def whole(adapt: Callable[..., Any], tmp_path: Path, kept: dict[str, bytes]) -> 
     assert done.code == 0, done
     report = json.loads(done.out)
     assert report["memory"]["blocks"] == BLOCKS and report["steps"] == 27 and len(report["rows"]) > 2
-    assert "in 3 blocks" in done.err and "block 3 of 3, pass 1 of 2: 100 Gaussians, 7 steps" in done.err
+    left_out = next(each for each in report["plan"]["decisions"] if each["name"] == "unseen")["number"]
+    trained = (300 - int(left_out)) // BLOCKS
+    assert 0 < left_out < 100 and f"of 3, pass 1 of 2: {trained} Gaussians, 7 steps" in done.err
+    assert "in 3 blocks" in done.err and "unseen Gaussians" in done.err
     assert report["seconds"]["start"] > 0
     assert names(tmp_path) == ["one.blocks.safetensors", "one.json", "one.ply", "one.safetensors"]
     (tmp_path / "one.blocks.safetensors").unlink()
@@ -83,6 +87,7 @@ def test_jobs_write_the_files_of_one_process(
     done = adapt("jobs.ply", "--block", "start", "--json")
     about = json.loads(done.out)
     assert done.code == 0 and about["blocks"] == BLOCKS and (about["pass"], about["missing"]) == (1, [1, 2, 3])
+    assert "unseen Gaussians" in done.err
     for number in (3, 1):
         done = adapt("jobs.ply", "--block", number)
         assert done.code == 0 and (tmp_path / f"jobs.block{number}.pass1.safetensors").exists()
@@ -175,6 +180,7 @@ def test_files_of_another_run_are_refused(
     start, first, second = (tmp_path / f"a.{name}.safetensors" for name in ("start", "block1.pass1", "block2.pass1"))
     assert adapt("a.ply", "--block", 1).code == 0
     refused("a.start.safetensors: is of a run with another settings; remove it", "--seed", 1)
+    refused("a.start.safetensors: is of a run with another --with or --without; remove it", "--with", "unseen")
     for blocks in (1, BLOCKS + 1):  # fewer would take more than the limit
         with monkeypatch.context() as patch:
             patch.setattr(memory_option, "plan_for_limit", lambda *a, n=blocks: replace(plan_for_limit(*a), blocks=n))
@@ -194,6 +200,8 @@ def test_files_of_another_run_are_refused(
     refused("damaged (KeyError('extent'))", "--block", 1)
     for name, worse, message in (
         ("block", tensors["block"].clamp(max=1), "a block has no Gaussians"),
+        ("kept", tensors["kept"].float(), "its kept is not that of this scene"),
+        ("kept", ~tensors["kept"], "its block is not that of this scene"),
         ("sigma_d", tensors["sigma_d"][:-1], "its sigma_d is not that of this scene"),
         ("growth_d", tensors["growth_d"].double(), "its growth_d is not that of this scene"),
         ("seen", tensors["seen"] * float("nan"), "not finite"),
@@ -207,10 +215,27 @@ def test_files_of_another_run_are_refused(
     assert memory.MOST_BLOCKS > BLOCKS
 
 
+def test_blocks_follow_the_plan_of_the_whole(
+    clod: Callable[..., Any], adapt: Callable[..., Any], capture: Any, tmp_path: Path
+) -> None:
+    """The same decisions; with --trim what is left out is not written, else it is the base's; frozen is not tuned."""
+    frozen = ["--without", "means", "--json"]
+    given = ["--images", capture.scene, "--iters", 9, "--max-sv", 3, "--out", "a.ply"]
+    runs = [clod(capture.ply, *given, *frozen), adapt("b.ply", *frozen), adapt("c.ply", *frozen, "--trim")]
+    plans = [json.loads(done.out)["plan"]["decisions"] for done in runs]
+    assert plans[1] == plans[0] and any((each["what"], each["verdict"]) == ("means", "frozen") for each in plans[0])
+    assert plans[2][:-1] == plans[1] and plans[2][-1]["verdict"] == "trimmed"
+    whole, few = (clod_adapter.load(tmp_path / f"{name}.ply").gaussians for name in "bc")
+    base, adapter = clod_adapter.load(capture.ply).gaussians, load_adapter(tmp_path / "c.safetensors")
+    assert adapter.kept is not None and len(few) == int(adapter.kept.sum()) < len(whole) == len(base)
+    assert torch.equal(whole.means, base.means) and torch.equal(whole.sh0[~adapter.kept], base.sh0[~adapter.kept])
+    assert all(torch.equal(getattr(few, name), getattr(whole, name)[adapter.kept]) for name in ATTRIBUTES[:5])
+
+
 def test_blocks_without_growth(adapt: Callable[..., Any], tmp_path: Path) -> None:
     assert adapt("a.ply", "--block", "start", "--growth", "off").code == 0
     with safe_open(tmp_path / "a.start.safetensors", "pt") as file:
-        assert set(file.keys()) == {"sigma_d", "block", "seen"}
+        assert set(file.keys()) == {"sigma_d", "kept", "block", "seen"}
     assert adapt("a.ply", "--growth", "off").code == 0
     assert set(clod_adapter.load(tmp_path / "a.ply").gaussians.tensors()) == {*ATTRIBUTES, "sigma_d"}
 

@@ -24,6 +24,10 @@ async function start() {
   viewer = { renderer, camera, stage, controls, wipe, cameraNumber: 0, cameras: config.cameras };
   viewer.ui = createUi(elements, stage, actions);
   stage.listeners.frame = viewer.ui.updateFrame;
+  stage.listeners.held = (outOfReach) => {
+    viewer.ui.update();
+    viewer.ui.showNote(outOfReach ? `s = ${stage.model.max_sv}, the largest trained value, is too slow for this frame rate` : "");
+  };
   stage.listeners.error = (error) => viewer.ui.showMessage(error.message);
   new ResizeObserver(() => stage.change()).observe(elements.canvas);
   elements.canvas.addEventListener("webglcontextlost", () => viewer.ui.showMessage("The graphics device was lost; reload the page."));
@@ -46,6 +50,7 @@ function show(model, base, cameras, dial) {
   const upload = ({ gaussians, metadata }) => createModel(renderer.gl, gaussians, metadata);
   const [uploaded, uploadedBase] = [upload(model), base && upload(base)];
   Object.assign(stage.state, { dial: 1, equation: true, wipe: null, other: "base" });
+  stage.setHold(null);
   stage.show(uploaded, uploadedBase);
   viewer.cameras = cameras;
   ui.listCameras(cameras);
@@ -73,6 +78,7 @@ function applyLink({ eye, rotation, fov, distance, dial, equation, wipe, other }
   }
   camera.fov = fov ?? camera.fov;
   camera.distance = distance ?? camera.distance;
+  stage.setHold(null);
   const { attenuation } = stage.model, comparable = wipe !== null && (attenuation || stage.base);
   Object.assign(stage.state, {
     dial: clampDial(dial ?? stage.state.dial), equation, wipe: comparable ? Math.min(Math.max(wipe, 0), 1) : null,
@@ -86,11 +92,19 @@ const actions = {
   setDial(dial) {
     if (!(dial >= 1)) throw new Error(`the dial value is ${dial}; it must be at least 1`);
     viewer.stage.state.dial = dial;
-    viewer.ui.showNote("");
-    update();
+    actions.setHold(null);
   },
   setEquation(on) {
     viewer.stage.state.equation = Boolean(on);
+    if (on) update();
+    else actions.setHold(null); // no dial value changes a frame's time then
+  },
+  /** Holds a frame rate by the dial, frames per second; null ends that. */
+  setHold(fps) {
+    const { stage, ui } = viewer;
+    if (fps) stage.state.equation = true;
+    stage.setHold(fps);
+    ui.showNote("");
     update();
   },
   setWipe(position, other = viewer.stage.state.other) {
@@ -202,7 +216,7 @@ ready.catch(() => {}); // shown on the page; awaiting `ready` throws it too
 
 window.clod = {
   ready, load,
-  setDial: actions.setDial, setEquation: actions.setEquation, setWipe: actions.setWipe,
+  setDial: actions.setDial, setEquation: actions.setEquation, setHold: actions.setHold, setWipe: actions.setWipe,
   setCamera(camera) {
     viewer.camera.set(camera);
     viewer.stage.change();

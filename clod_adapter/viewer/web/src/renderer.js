@@ -3,6 +3,7 @@
 import { WIDTH, bindTextures, framebuffer, heightOf, program, quads, texture } from "./gpu.js";
 import { growthDistance } from "./equation.js";
 import { copyVertex, copyFragment, projectFragment, splatFragment, splatVertex } from "./shaders.js";
+import { createTimer } from "./timer.js";
 
 export function createRenderer(canvas) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
@@ -86,7 +87,7 @@ export function createRenderer(canvas) {
   }
 
   return {
-    gl,
+    gl, measure: createTimer(gl).measure,
     /** Uploads the order of a side: its first `drawn` rows, rounded up to a multiple of WIDTH. */
     upload(side, rows, drawn) {
       const lines = heightOf(side.model.count);
@@ -116,20 +117,6 @@ export function createRenderer(canvas) {
       bindTextures(gl, copy.uniforms, { image: image.texture });
       gl.bindVertexArray(empty);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
-    },
-    /** Resolves with the milliseconds since `start` once the GPU has executed all commands so far. */
-    whenFinished(start) {
-      const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
-      gl.flush();
-      return new Promise((resolve) => {
-        const poll = () => {
-          const state = gl.clientWaitSync(fence, 0, 0);
-          if (state === gl.TIMEOUT_EXPIRED) return setTimeout(poll, 1);
-          gl.deleteSync(fence);
-          resolve(performance.now() - start);
-        };
-        setTimeout(poll, 0);
-      });
     },
   };
 }

@@ -1,4 +1,6 @@
-// The displayed state: one model at one dial value, or two images divided by a wipe. A frame is drawn only after a change.
+// The displayed state: one model at one dial value, or two images divided by a wipe. A frame is drawn only after a
+// change, and while a held frame rate settles.
+import { createHold } from "./frame_rate.js";
 
 const MIN_RESOLUTION = 0.5; // of the canvas's pixels per side, during motion on a slow device
 const SLOW = 50, FAST = 25; // ms per frame, above and below which the resolution during motion falls and rises
@@ -6,10 +8,10 @@ const IDLE = 180; // ms without motion, until a frame at full resolution
 
 export function createStage(renderer, canvas, camera) {
   const state = { dial: 1, equation: true, wipe: null, other: "base" };
-  const listeners = { frame: () => {}, error: () => {} };
+  const listeners = { frame: () => {}, held: () => {}, error: () => {} };
   let main = makeSide(), second = makeSide(), model = null, base = null;
   let version = 0, drawnVersion = -1, resolution = 1, lastMotion = -Infinity, idleTimer = 0, frame = 0, frameMs = null;
-  let timing = false, warmedUp = false, newOrder = false, skipped = false;
+  let timing = false, warmedUp = false, newOrder = false, skipped = false, hold = null;
   const callbacks = []; // of whenDrawn
 
   function makeSide() {
@@ -35,6 +37,7 @@ export function createStage(renderer, canvas, camera) {
 
   function change({ moving = false } = {}) {
     version++;
+    hold?.wake();
     if (moving) {
       lastMotion = performance.now();
       clearTimeout(idleTimer);
@@ -42,6 +45,8 @@ export function createStage(renderer, canvas, camera) {
     }
     schedule();
   }
+
+  const isDrawn = () => drawnVersion === version && (!hold || hold.settled);
 
   function schedule(sorted = false) {
     newOrder ||= sorted;
@@ -66,31 +71,54 @@ export function createStage(renderer, canvas, camera) {
       side.from = k === 0 ? 0 : state.wipe;
       side.to = shown.length === 1 || k === 1 ? 1 : state.wipe;
     });
-    const start = performance.now();
-    renderer.draw(shown.map(({ side }) => side), view);
-    if (!timing) {
-      timing = true;
-      renderer.whenFinished(start).then(adjustResolution);
-    }
+    const render = () => renderer.draw(shown.map(({ side }) => side), view);
+    if (timing) render();
+    else measure(render);
     if (complete) {
       drawnVersion = current;
-      for (const resolve of callbacks.splice(0)) resolve();
+      if (isDrawn()) for (const resolve of callbacks.splice(0)) resolve();
     }
     listeners.frame();
   }
 
-  /** Takes the milliseconds of the last frame. */
-  function adjustResolution(ms) {
+  async function measure(render) {
+    const { dial } = state, holding = hold;
+    timing = true;
+    try {
+      finish(await renderer.measure(render, holding !== null), dial, holding);
+    } catch (error) {
+      listeners.error(error);
+    }
     timing = false;
     if (skipped) schedule();
-    if (!warmedUp) { // the first frame includes the compilation of the shaders
+  }
+
+  /** Takes the milliseconds of the last frame, null if unknown, with the dial value and the hold that it was drawn with. */
+  function finish(ms, dial, holding) {
+    if (!warmedUp || ms === null) { // the first frame includes the compilation of the shaders
       warmedUp = true;
       return schedule();
     }
     frameMs = ms;
+    if (!hold) adjustResolution(ms);
+    else if (hold === holding) follow(ms, dial);
+    else schedule(); // the first frame to follow
+    listeners.frame();
+  }
+
+  function adjustResolution(ms) {
     if (ms > SLOW) resolution = Math.max(resolution * 0.8, MIN_RESOLUTION);
     else if (ms < FAST) resolution = Math.min(resolution * 1.1, 1);
-    listeners.frame();
+  }
+
+  /** Moves the dial, and draws another frame for measuring until it has settled. */
+  function follow(ms, dial) {
+    if (hold.settled) return;
+    const next = hold.took(dial, ms, model.max_sv);
+    if (next !== dial) version++;
+    state.dial = next;
+    schedule();
+    listeners.held(hold.outOfReach(model.max_sv));
   }
 
   /** Requests the order for the current state from the worker, one at a time for each side. */
@@ -121,14 +149,21 @@ export function createStage(renderer, canvas, camera) {
       [main, second] = [makeSide(), makeSide()]; // the old ones may wait for a worker that has ended
       change();
     },
+    /** Holds so many frames per second by the dial, at full resolution; null ends that. */
+    setHold(fps) {
+      hold = fps ? createHold(fps) : null;
+      if (fps) resolution = 1;
+      change();
+    },
+    get holds() { return hold !== null; },
     get model() { return model; },
     get base() { return base; },
     get frameMs() { return frameMs; },
     view: () => camera.view(...size()),
     counts: () => ({ total: model?.count ?? 0, kept: main.kept, drawn: main.drawn }),
     otherCounts: () => (state.wipe === null ? null : { total: second.model?.count ?? 0, kept: second.kept }),
-    /** Resolves once the current state is drawn. */
-    whenDrawn: () => (drawnVersion === version || !model ? Promise.resolve() : new Promise((resolve) => { callbacks.push(resolve); schedule(); })),
+    /** Resolves once the current state is drawn, and a held frame rate has settled. */
+    whenDrawn: () => (isDrawn() || !model ? Promise.resolve() : new Promise((resolve) => { callbacks.push(resolve); schedule(); })),
     /** Ends the lower resolution during motion at once. */
     endMotion() {
       if (performance.now() - lastMotion >= IDLE) return;

@@ -27,7 +27,7 @@ export function createUi(elements, stage, actions) {
   /** Shows the present state on the controls. */
   function update() {
     const { model } = stage, hasDial = Boolean(model?.attenuation), mode = comparison();
-    for (const control of [elements.dial, elements.target, elements.equation]) control.disabled = !hasDial;
+    for (const control of [elements.dial, elements.rate, elements.hold, elements.target, elements.equation]) control.disabled = !hasDial;
     for (const control of [elements.reset, elements.link, elements.move]) control.disabled = !model;
     elements.compare.disabled = !hasDial && !stage.base;
     elements.compare.options[1].textContent = stage.base ? "with the base" : "without the equation";
@@ -35,6 +35,7 @@ export function createUi(elements, stage, actions) {
     elements.noDial.textContent = model?.no_dial ?? "";
     setSlider(elements.dial, elements.dialValue, hasDial ? state.dial : null);
     elements.equation.checked = state.equation && hasDial;
+    elements.hold.checked = stage.holds;
     elements.compare.value = mode;
     for (const option of elements.compare.options) option.disabled = option.value === "dial" && !hasDial;
     elements.otherRow.hidden = mode !== "dial";
@@ -69,6 +70,9 @@ export function createUi(elements, stage, actions) {
 
   elements.dial.addEventListener("input", () => actions.setDial(toDial(elements.dial.value, maxDial())));
   elements.other.addEventListener("input", () => actions.setWipe(state.wipe ?? 0.5, toDial(elements.other.value, maxDial())));
+  const holdRate = (on) => actions.setHold(on ? Number(elements.rate.value) : null);
+  elements.hold.addEventListener("change", () => holdRate(elements.hold.checked));
+  elements.rate.addEventListener("change", () => holdRate(true));
   elements.equation.addEventListener("change", () => actions.setEquation(elements.equation.checked));
   elements.compare.addEventListener("change", () => actions.compare(elements.compare.value));
   elements.target.addEventListener("change", () => actions.setTarget(elements.target.value));
@@ -96,6 +100,7 @@ export function createUi(elements, stage, actions) {
   if (window.matchMedia("(max-width: 34rem), (max-height: 28rem)").matches) toggleControls();
 
   const keys = {
+    r: () => elements.hold.disabled || holdRate(!stage.holds),
     e: () => elements.equation.disabled || actions.setEquation(!state.equation),
     c: () => elements.compare.disabled || actions.compare({ off: "base", base: stage.model?.attenuation ? "dial" : "off", dial: "off" }[comparison()]),
     v: () => elements.move.disabled || actions.toggleFlying(), l: () => elements.link.disabled || actions.copyLink(), f: actions.fullScreen, m: toggleControls, 0: () => elements.reset.disabled || actions.reset(),

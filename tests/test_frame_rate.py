@@ -1,0 +1,148 @@
+"""The control law on simulated renderers: a fixed part plus a power of the dial value, with noise and outliers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise, product
+
+import numpy as np
+import pytest
+
+from clod_adapter.frame_rate import excess, next_dial
+
+BUDGET = 10.0  # ms
+MAX_SV = 7.0
+EXPONENTS = (0.2, 0.35, 0.5, 0.75, 1.0, 1.25, 1.5)
+FIXED = (0.0, 0.2, 0.5)  # of the time at the start
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """``ms(s) = load BUDGET (fixed + (1 - fixed) (s / start)^-exponent)``, which is the budget at ``start``."""
+
+    exponent: float
+    fixed: float
+    start: float
+    max_sv: float = MAX_SV
+
+    def ms(self, dial: float, load: float = 1.0) -> float:
+        return load * BUDGET * (self.fixed + (1 - self.fixed) * (dial / self.start) ** -self.exponent)
+
+    def best(self, load: float) -> float:
+        """The dial value in [1, max_sv] whose time is the budget, or the nearest to it."""
+        rest = (1 / load - self.fixed) / (1 - self.fixed)
+        wanted = self.start * rest ** (-1 / self.exponent) if rest > 0 else math.inf
+        return min(max(wanted, 1.0), self.max_sv)
+
+    def off(self, dial: float, load: float) -> float:
+        """Distance of the noiseless log time from the best in range."""
+        return abs(math.log(self.ms(dial, load) / self.ms(self.best(load), load)))
+
+    def frames_needed(self, dial: float, load: float, within: float) -> int:
+        """Frames with steps of 10 %."""
+        count, best = 0, self.best(load)
+        while self.off(dial, load) > within:
+            dial = min(dial * 1.1, best) if best > dial else max(dial / 1.1, best)
+            count += 1
+        return count
+
+    def follow(self, loads: list[float], measured: Callable[[int], float]) -> list[float]:
+        """Dial values of frames with these loads, whose times are multiplied by ``measured``."""
+        frames: list[tuple[float, float]] = []
+        dial = self.start
+        for number, load in enumerate(loads):
+            frames.append((dial, self.ms(dial, load) * measured(number)))
+            dial = next_dial(frames, BUDGET, self.max_sv)
+        dials = [dial for dial, _ in frames]
+        assert all(max(a, b) <= 1.1 * min(a, b) * (1 + 1e-9) for a, b in pairwise(dials))
+        assert all(1 <= dial <= self.max_sv for dial in dials)
+        return dials
+
+
+def exact(frame: int) -> float:
+    return 1.0
+
+
+def outlier(frame: int) -> float:
+    return 5.0 if frame % 20 == 7 else 1.0
+
+
+RENDERERS = list(product(EXPONENTS, FIXED))
+BEFORE, AFTER = 25, 100  # frames before and after a change of the load
+
+
+def noise(seed: int, share: float = 0.2) -> Callable[[int], float]:
+    values = np.random.default_rng(seed).lognormal(0.0, share, BEFORE + 400)
+    return lambda frame: float(values[frame])
+
+
+@pytest.mark.parametrize("load", [2.0, 4.0, 1 / 3, 0.5, 1.3])
+@pytest.mark.parametrize("measured", [exact, outlier])
+def test_the_time_is_within_10_percent_after_15_frames(load: float, measured: Callable[[int], float]) -> None:
+    """Later only where steps of 10 % per frame need more. It stays there; without outliers, it never turns back."""
+    for exponent, fixed in RENDERERS:
+        renderer = Renderer(exponent, fixed, start=2.0 if load > 1 else 5.0)
+        dials = renderer.follow([1.0] * BEFORE + [load] * AFTER, measured)[BEFORE:]
+        needed = renderer.frames_needed(dials[0], load, 0.1)
+        settled = dials[max(15, needed + 4) :]
+        assert all(renderer.off(dial, load) <= 0.1 for dial in settled), (exponent, fixed)
+        if measured is exact:
+            assert sorted(settled) in (settled, settled[::-1]), (exponent, fixed)
+
+
+@pytest.mark.parametrize("load", [2.0, 1 / 3, 1.3])
+def test_it_settles_under_noise_of_20_percent(load: float) -> None:
+    for (exponent, fixed), seed in product(RENDERERS, range(3)):
+        renderer = Renderer(exponent, fixed, start=2.0 if load > 1 else 5.0)
+        dials = renderer.follow([1.0] * BEFORE + [load] * AFTER, noise(seed))[BEFORE:]
+        first = max(15, renderer.frames_needed(dials[0], load, 0.1) + 6)
+        off = [renderer.off(dial, load) for dial in dials[first : first + 20]]
+        assert sum(off) / len(off) <= 0.25, (exponent, fixed, seed)
+
+
+def test_a_large_change_is_followed_within_5_frames_under_noise() -> None:
+    """The frames from before the change, most of the 20, do not delay it."""
+    for exponent, seed in product(EXPONENTS, range(3)):
+        dials = Renderer(exponent, 0.0, start=2.0).follow([1.0] * BEFORE + [4.0] * 10, noise(seed))[BEFORE:]
+        assert dials[5] > 1.1 * dials[0] and dials[9] > 1.5 * dials[0], (exponent, seed)
+
+
+def test_it_does_not_oscillate_under_noise_of_20_percent() -> None:
+    """Over 400 frames of one load: the dial's changes are small, and the time stays near the budget."""
+    for (exponent, fixed), seed in product(RENDERERS, range(3)):
+        renderer = Renderer(exponent, fixed, start=3.0)
+        dials = np.array(renderer.follow([1.0] * 400, noise(seed)))
+        times = np.log([renderer.ms(dial) / BUDGET for dial in dials])
+        changes = np.abs(np.diff(np.log(dials)))
+        assert changes.mean() <= 0.015 and np.median(changes) <= 0.005, (exponent, fixed, seed)
+        assert np.log(dials).std() <= 0.2 and times.std() <= 0.1, (exponent, fixed, seed)
+
+
+@pytest.mark.parametrize(("load", "end"), [(50.0, MAX_SV), (0.01, 1.0)])
+def test_a_budget_out_of_reach_ends_at_the_nearest_dial_value(load: float, end: float) -> None:
+    dials = Renderer(1.0, 0.0, start=2.0).follow([1.0] * BEFORE + [load] * 40, exact)
+    assert dials[-20:] == [end] * 20
+
+
+def test_max_sv_1_has_one_dial_value() -> None:
+    assert set(Renderer(1.0, 0.0, start=1.0, max_sv=1.0).follow([1.0, 4.0, 0.2] * 10, noise(0))) == {1.0}
+
+
+def test_the_first_frames_and_single_outliers_do_not_move_it() -> None:
+    """A first frame includes compilation; a frame of 0 ms is below a timer's resolution."""
+    assert next_dial([(2.0, 900.0)], BUDGET, MAX_SV) == next_dial([(2.0, 900.0)] * 2, BUDGET, MAX_SV) == 2.0
+    calm = [(2.0, BUDGET)] * 5
+    for time in (900.0, 0.0):
+        assert next_dial([*calm, (2.0, time)], BUDGET, MAX_SV) == 2.0
+    assert next_dial([*calm, *[(2.0, 0.0)] * 3], BUDGET, MAX_SV) == pytest.approx(2.0 / 1.1)
+
+
+def test_excess_is_the_predicted_log_time_over_the_budget() -> None:
+    """Frames of other dial values are read at the newest one, and those more than 15 % away are ignored."""
+    assert excess([(2.0, 30.0)], BUDGET) == pytest.approx(math.log(3))
+    assert excess([(2.2, 11.0), (2.0, 11.0), (2.0, 11.0)], BUDGET) == pytest.approx(math.log(1.1))
+    assert excess([(2.2, 11.0)], BUDGET) < excess([(2.2, 11.0), (2.0, 11.0)], BUDGET)
+    far = [(3.0, 99.0)] * 10
+    assert excess([*far, *[(2.0, 10.1)] * 3], BUDGET) == pytest.approx(math.log(1.01))
