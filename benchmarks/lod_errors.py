@@ -2,7 +2,7 @@
 
     clod-adapt plush_half/pretrained.ply --images plush_half --max-sv 7 --iters 200 -o plush7.ply
     python benchmarks/lod_errors.py plush7.ply plush_half     # needs splat-transform
-    python benchmarks/lod_errors.py --city 1000000            # seconds only
+    python benchmarks/lod_errors.py --city 1000000            # seconds only, without splat-transform
     python benchmarks/lod_errors.py --table                   # the rows as a Markdown table
 
 The levels are baked for the viewpoints in the model, and packed without their harmonics, since only the index is read.
@@ -24,9 +24,9 @@ from typing import Any
 
 import clod_adapter as clod
 from city import city, city_cameras
-from clod_adapter.evaluation.level_errors import coverage, errors_by_count, level_errors, looking
+from clod_adapter.evaluation.level_errors import VIEWS, coverage, errors_by_count, level_errors, looking
 from clod_adapter.io.file_formats import write
-from clod_adapter.io.formats.lod_meta import Leaf, cutting_options, read_leaves
+from clod_adapter.io.formats.lod_meta import Leaf, cut_tree, cutting_options, read_leaves
 from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
 from clod_adapter.metrics import psnr
 from common import append, arguments, photographs, print_rows
@@ -51,8 +51,13 @@ def main() -> None:
         town = city(args.city, sh_degree=0)
         order = (town.opacities * town.scales.amax(1)).argsort(descending=True)
         levels = [town.select(order[: int(share * len(town))]) for share in SHARES]
-        row, *_ = measure(levels, city_cameras(8, 988, 740, count=args.city))
-        append(FILE, {"benchmark": "lod_errors", "scene": "city", **row})
+        leaves, began = cut(levels), time.perf_counter()
+        level_errors(levels, leaves, city_cameras(VIEWS, 988, 740, count=args.city))
+        append(FILE, {
+            "benchmark": "lod_errors", "scene": "city", "finest": len(town), "counts": [len(level) for level in levels],
+            "leaves": len(leaves), "threads": torch.get_num_threads(),
+            "seconds": round(time.perf_counter() - began, 1),
+        })  # fmt: skip
     else:
         model = clod.load(args.model)
         levels = [clod.bake(model.gaussians, s, cameras=model.viewpoints) for s in DIALS]
@@ -85,6 +90,25 @@ def measure(
         "finest": counts[0], "counts": counts, "leaves": len(leaves), "threads": torch.get_num_threads(),
         "seconds": round(time.perf_counter() - began, 1), "packing_seconds": round(packing, 1),
     }, leaves, errors  # fmt: skip
+
+
+def cut(levels: Sequence[clod.Gaussians]) -> list[Leaf]:
+    """The leaves that splat-transform cuts, without packing."""
+    centres = [level.means.numpy() for level in levels]
+    largest = 1024 * int(cutting_options(sum(map(len, centres)))[-1])
+
+    def node(count: int) -> dict[str, Any]:
+        return {"lods": {}} if count <= largest else {"children": [node(count // 2), node(count - count // 2)]}
+
+    tree, levels_of = node(sum(map(len, centres))), np.repeat(np.arange(len(centres)), [*map(len, centres)])
+    points, starts = np.concatenate(centres), np.cumsum([0, *map(len, centres)])
+    leaves = []
+    for each, rows in cut_tree(tree, points, np.arange(len(points))):
+        parts = tuple(rows[levels_of[rows] == level] - starts[level] for level in range(len(centres)))
+        each["lods"] = {str(level): {"count": len(part)} for level, part in enumerate(parts) if len(part)}
+        each["bound"] = {"min": points[rows].min(0).tolist(), "max": points[rows].max(0).tolist()}
+        leaves.append(Leaf(each, parts))
+    return leaves
 
 
 def budgets(

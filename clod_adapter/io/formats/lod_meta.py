@@ -65,7 +65,7 @@ def read_leaves(path: Path, centres: Sequence[np.ndarray]) -> tuple[dict[str, An
         raise ClodError(f"{path.name}: has no tree of leaves")
     points, starts = np.concatenate(centres), np.cumsum([0, *map(len, centres)])
     leaves = []
-    for node, rows in _cut(meta["tree"], points, np.arange(len(points))):
+    for node, rows in cut_tree(meta["tree"], points, np.arange(len(points))):
         ordered = np.sort(rows)
         at = np.searchsorted(ordered, starts)
         parts = zip(starts, at, at[1:], strict=False)
@@ -80,7 +80,7 @@ def read_leaves(path: Path, centres: Sequence[np.ndarray]) -> tuple[dict[str, An
     return meta, leaves
 
 
-def _cut(node: dict[str, Any], points: np.ndarray, rows: np.ndarray) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+def cut_tree(node: dict[str, Any], points: np.ndarray, rows: np.ndarray) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     """Each leaf below a node and the rows of ``points [N, 3]`` in it: halves by count across the longest side."""
     if "lods" in node:
         yield node, rows
@@ -89,7 +89,7 @@ def _cut(node: dict[str, Any], points: np.ndarray, rows: np.ndarray) -> Iterator
     axis, middle = int(np.argmax(np.ptp(inside, 0))), len(rows) // 2
     order = np.argpartition(inside[:, axis], middle)
     for child, part in zip(node["children"], (order[:middle], order[middle:]), strict=True):
-        yield from _cut(child, points, rows[part])
+        yield from cut_tree(child, points, rows[part])
 
 
 def write_errors(path: Path, meta: dict[str, Any], leaves: Sequence[Leaf], errors: Sequence[Sequence[float]]) -> None:
