@@ -64,7 +64,7 @@ def train(scene: str, target: str, iters: int) -> None:
     base, views, config = checkpoint(scene).gaussians, photographs(scene), settings(target, iters)
     plan = clod.make_plan(base, views, config)
     CACHE.mkdir(parents=True, exist_ok=True)
-    clod.save(plan.whole(base, plan.adapt(views).gaussians), file_of(scene, target, iters))
+    clod.save(file_of(scene, target, iters), plan.whole(base, plan.adapt(views).gaussians))
 
 
 def compared(scene: str, iters: int) -> Row:
@@ -87,7 +87,7 @@ def compared(scene: str, iters: int) -> Row:
         row = clod.evaluate(model, views, [s])[0]
         cost = fmean(view_cost(model, view.camera, s) for view in views) / whole
         found[name].append(
-            {"virtual_scale": s, "psnr": row.psnr, "kept": row.share, "cost": cost, "frame_ms": median(taken)}
+            {"virtual_scale": s, "psnr": row.psnr, "kept": row.kept_share, "cost": cost, "frame_ms": median(taken)}
         )
     return {
         "benchmark": "cost", "kind": "targets", "scene": scene, "threads": THREADS, "views": len(views),

@@ -14,6 +14,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from clod_adapter.rasterizers import cpu
+
 
 @dataclass(frozen=True)
 class Backend:
@@ -62,13 +64,15 @@ BACKENDS = {
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Sets the number of torch's threads, and restores it at the end."""
-    before = torch.get_num_threads()
+    """Sets the number of torch's threads, which kernels then use for few rows too, and restores it at the end."""
+    before, few = torch.get_num_threads(), cpu.FEW
     torch.set_num_threads(count)
+    cpu.FEW = 0
     try:
         yield
     finally:
         torch.set_num_threads(before)
+        cpu.FEW = few
 
 
 def fresh_copy(monkeypatch: pytest.MonkeyPatch, name: str, package: str, installed: ModuleType | None) -> ModuleType:

@@ -9,7 +9,7 @@ from clod_adapter._kernels.bits import set_spans
 from clod_adapter._kernels.compiling import part
 from clod_adapter._kernels.conventions import DET, HALF, MX, MY, QA, QB, QC, REACH, RX, SLACK, TILE, X0, X1, Y0, Y1
 from clod_adapter._kernels.elementary import vceil, vfloor, vsqrt
-from clod_adapter._kernels.simd import both, eq, ge, load, select, splat, vmax, vmin
+from clod_adapter._kernels.simd import both, eq, ge, load, select, splat, store, vmax, vmin
 
 BLOCK = 4
 ACROSS = TILE // BLOCK
@@ -34,9 +34,12 @@ def start_tile(ox, oy, width, height, state, stride, live):  # type: ignore[no-u
         x, y = ox + (block % ACROSS) * BLOCK, oy + (block // ACROSS) * BLOCK
         if x < width and y < height:
             live[block // 64] |= uint64(1) << uint64(block % 64)
-        for lane in range(16):
-            inside = x + lane % 4 < width and y + lane // 4 < height
-            state[block * stride + lane] = 1.0 if inside else -1.0
+        if x + BLOCK <= width and y + BLOCK <= height:
+            store(state, block * stride, splat(float32(1)))
+        else:
+            for lane in range(16):
+                inside = x + lane % 4 < width and y + lane // 4 < height
+                state[block * stride + lane] = 1.0 if inside else -1.0
 
 
 @part

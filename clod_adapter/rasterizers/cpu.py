@@ -22,6 +22,8 @@ from clod_adapter.equation.growth import growth_distance
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers.protocol import require_float32
 
+FEW = 4096  # rows that one thread projects or lists in about a tenth of a millisecond
+
 
 class _Buffers:
     """Scratch arrays kept between calls: page faults of a new large array cost more than the work on it."""
@@ -101,11 +103,17 @@ def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.n
     return out
 
 
+def _workers_for(rows: int) -> int:
+    """One for few rows, whose work takes less time than waking another thread."""
+    return threads.worker_count() if rows >= FEW else 1
+
+
 def _sorted(
-    buffers: _Buffers, kernel: Any, n: int, inputs: tuple[Any, ...], workers: int
+    buffers: _Buffers, kernel: Any, n: int, inputs: tuple[Any, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Runs a projection. Packed records of the visible of n Gaussians, their row numbers, the count of each worker, and
     the depth order."""
+    workers = _workers_for(n)
     records = buffers.get("records", ((n + workers) * conventions.RECORD,), np.float32)
     depths, packed_ids = buffers.get("depths", (n,), np.float32), buffers.get("packed_ids", (n,), np.int32)
     counts = np.zeros(workers, np.int64)
@@ -121,14 +129,15 @@ def _prepare(
 ) -> _Frame:
     """Projection, depth order and tile lists."""
     buffers, workers, (width, height) = _take(), threads.worker_count(), size
-    records, packed_ids, counts, order = _sorted(buffers, kernel, n, inputs, workers)
+    records, packed_ids, counts, order = _sorted(buffers, kernel, n, inputs)
     across, down = -(-width // conventions.TILE), -(-height // conventions.TILE)
-    histogram, totals = np.empty((workers, across * down), np.int64), np.empty(workers, np.int64)
+    listing = _workers_for(len(order))
+    histogram, totals = np.empty((listing, across * down), np.int64), np.empty(listing, np.int64)
     offsets, slots = np.empty(across * down + 1, np.int64), buffers.get("slots", (2 * n,), np.int64)
-    threads.run(tiles.count_tiles, workers, records, order, across, histogram, totals)
+    threads.run(tiles.count_tiles, listing, records, order, across, histogram, totals)
     total = tiles.tile_offsets(histogram, offsets, totals)
     entries, entry_slots = buffers.get("entries", (total,), np.int32), buffers.get("entry_slots", (total,), np.int32)
-    threads.run(tiles.fill_tiles, workers, records, order, across, histogram, totals, slots, entries, entry_slots)
+    threads.run(tiles.fill_tiles, listing, records, order, across, histogram, totals, slots, entries, entry_slots)
     # Longest lists first: no thread starts a long tile when the others are done.
     longest_first = np.argsort(-np.diff(offsets), kind="stable")
     return _Frame(
@@ -187,7 +196,7 @@ class _Splat(torch.autograd.Function):
         wanted = [shaped] * 3 + [True, ctx.needs_input_grad[4], ctx.needs_input_grad[5]]
         grads = [recycled(x.shape if want else (0, *x.shape[1:])) for x, want in zip(inputs, wanted, strict=True)]
         threads.run(
-            project_gradient.project_gradient, frame.workers, *arrays, shN, ctx.degree, frame.camera, frame.records,
+            project_gradient.project_gradient, len(frame.counts), *arrays, shN, ctx.degree, frame.camera, frame.records,
             frame.packed_ids, frame.counts, frame.slots, pair_sums, frame.compensated, *_arrays(grads),
         )  # fmt: skip
         v_background = ((1 - alpha)[..., None] * gradients[0]).sum((0, 1)) if ctx.needs_input_grad[6] else None
@@ -236,7 +245,8 @@ def work(gaussians: Gaussians, camera: Camera, virtual_scale: float = 1.0) -> tu
     tiles.tally(frame.entries, frame.masks, blocks.WORDS, *counted)
     found = np.zeros_like(counted)
     for worker, count in enumerate(frame.counts.tolist()):
-        packed = slice(n * worker // frame.workers, n * worker // frame.workers + count)
+        first = n * worker // len(frame.counts)
+        packed = slice(first, first + count)
         found[:, frame.packed_ids[packed]] = counted[:, packed]
     _give(frame.buffers)
     return torch.from_numpy(found[0]), torch.from_numpy(found[1])

@@ -30,7 +30,7 @@ EXPONENT = 1.0  # of the curve
 # Dial values and views at which shares are measured, and how often in a training.
 DIALS, VIEWS, MEASURED = 5, 6, 5
 # An opaque Gaussian hides what is behind it, where blocks end sooner: that saves more than its larger ellipse costs.
-HIDING = 4.0
+HIDING = 1.0
 CHANGING = ("opacity_logits", "log_scales", "log_sigma", "growth_d")  # what the cost is a function of
 FADING = 1.5  # times the culling threshold: the opacity up to which the soft cut reaches
 MOST = 4.0  # of a correction, or its inverse: with hardly any Gaussian left at a dial value, shares say nothing

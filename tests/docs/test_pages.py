@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import re
 from collections.abc import Iterator, Mapping
@@ -92,6 +93,19 @@ def test_table_of_placed_cameras_matches_the_results() -> None:
     assert [written[3:] for written in page[1:]] == [
         [f"{row['cpu_seconds']:.1f}", f"{row['score']:.2f}", f"{100 * row['shown']:.1f} %"] for row in found
     ]
+
+
+def test_table_of_frames_matches_the_results() -> None:
+    rows = [json.loads(line) for line in (RESULTS / "cost.jsonl").read_text(encoding="utf-8").splitlines()]
+    last = {row["scene"]: row for row in rows if row["kind"] == "targets"}
+    page = (DOCS / "performance.md").read_text(encoding="utf-8")
+    for s in (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0):
+        cells = [f"{s:g}"]
+        for row, target in itertools.product((last["plush_half"], last["bonsai146"]), ("count", "cost")):
+            at = next(found for found in row[target] if found["virtual_scale"] == s)
+            share = at["frame_ms"] / row["base"]["frame_ms"]
+            cells.append(f"{at['psnr']:.2f} dB, {at['kept']:.0%}, {share:.0%}")
+        assert f"| {' | '.join(cells)} |" in page
 
 
 def test_target_counts_match_training() -> None:

@@ -32,7 +32,7 @@ def records_of(frame: Any, n: int) -> Tensor:
     out = torch.full((n, RECORD), math.nan)
     packed = frame.records.reshape(-1, RECORD)
     for worker, count in enumerate(frame.counts.tolist()):
-        first = n * worker // frame.workers
+        first = n * worker // len(frame.counts)
         rows = frame.packed_ids[first : first + count].astype(np.int64)
         out[torch.from_numpy(rows)] = torch.from_numpy(packed[first : first + count].copy())
     cpu._give(frame.buffers)
