@@ -30,6 +30,7 @@ class Phase(StrEnum):
     EVALUATION = "evaluation"
     FRAME_TIMES = "frame times"
     POPPING = "popping"
+    LEVELS = "errors of levels"
 
 
 @dataclass(frozen=True)

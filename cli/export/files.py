@@ -11,10 +11,12 @@ from tempfile import TemporaryDirectory
 from clod_adapter.bake import bake
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
+from clod_adapter.evaluation.level_errors import level_errors, looking
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint, load
 from clod_adapter.io.file_formats import write
+from clod_adapter.io.formats.lod_meta import cutting_options, read_leaves, write_errors
 from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
 from clod_adapter.io.ply.header import PREFIX
 from clod_adapter.origin import NOWHERE
@@ -22,6 +24,7 @@ from clod_adapter.viewer.page import write_viewer_page
 
 from ..commands.export_formats import LOD_META, PACKED, PAGE, suffix_of
 from ..shared.console import Console, duration
+from ..shared.kernels import prepare_kernels
 from .baking import Target
 
 
@@ -91,16 +94,28 @@ class Export:
     def write_levels(self, folder: Path, levels: list[float]) -> tuple[list[int], tuple[str, ...]]:
         """Writes a streaming set to ``folder``; the number of Gaussians per level, and notes."""
         folder.mkdir()
+        contents = [self.content(level) for level in levels]
+        counts = [len(gaussians) for gaussians, _ in contents]
         with TemporaryDirectory(dir=folder) as temporary:
-            words, counts = list[str | Path](), list[int]()
-            for k, level in enumerate(levels):
-                gaussians, about = self.content(level)
+            words: list[str | Path] = [*cutting_options(sum(counts))]
+            for k, (gaussians, about) in enumerate(contents):
                 source = Path(temporary) / f"{k}.ply"
                 write(source, gaussians, about)
                 words += [source, "-l", str(k)]
-                counts.append(len(gaussians))
             notes = self._transform(words, folder / LOD_META, sum(counts))
-        return counts, notes
+        return counts, notes + self._add_errors(folder / LOD_META, [gaussians for gaussians, _ in contents])
+
+    def _add_errors(self, index: Path, levels: list[Gaussians]) -> tuple[str, ...]:
+        """Adds the leaves' errors at each level to a streaming set; a note if its leaves are unknown."""
+        try:
+            meta, leaves = read_leaves(index, [level.means.cpu().numpy() for level in levels])
+        except ClodError as error:
+            return (f"without tables of errors, viewers judge levels by their counts: {error}",)
+        prepare_kernels(self.console, levels[0].means.device, training=False)
+        with self.console.meter("errors of levels") as meter:
+            errors = level_errors(levels, leaves, looking(self.target.cameras, levels[-1]), progress=meter)
+        write_errors(index, meta, leaves, errors.tolist())
+        return ()
 
     def _write_page(self, path: Path, virtual_scale: float) -> tuple[str, ...]:
         """Writes the page; packs the splat where splat-transform is installed."""
