@@ -203,11 +203,13 @@ class AdaptConfig:
             "sampling": SAMPLINGS,
             "count_term": COUNT_TERMS,
             "growth": GROWTHS,
+            "target": TARGETS,
         }
         for name, allowed in choices.items():
             require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
-        known = TARGETS if self.count_term == "law" and self.parameter == "log" else TARGETS[:1]
-        require(self.target in known, "target", self.target, "count; or cost, with count_term law and parameter log")
+        following = self.count_term == "law" and self.parameter == "log"
+        need = "count, as cost needs count_term law and parameter log (not the paper's form)"
+        require(self.target == "count" or following, "target", self.target, need)
         require(0 <= self.full_share <= 1, "full_share", self.full_share, "between 0 and 1")
         require(0 <= self.full_weight < math.inf, "full_weight", self.full_weight, "at least 0 and finite")
         require(0 < self.exponent < math.inf, "exponent", self.exponent, "positive and finite")

@@ -182,7 +182,7 @@ def test_a_subset_is_refused(scene: Scene) -> None:
 
 def test_settings_that_it_needs() -> None:
     for changed in ({"count_term": "paper"}, {"parameter": "linear"}):
-        with pytest.raises(ClodError, match="target is cost, it must be count; or cost, with"):
+        with pytest.raises(ClodError, match="target is cost, it must be count, as cost needs"):
             AdaptConfig(target="cost", **changed)
     with pytest.raises(ClodError, match="target cost cannot be trained in blocks"):
         check_divisible(CONFIG)
