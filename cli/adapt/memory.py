@@ -74,10 +74,10 @@ def _mapped(array: np.ndarray, folder: Path) -> np.ndarray:
     Room for the outputs remains: four times its size must be free.
     """
     try:
-        if shutil.disk_usage(folder).free < 4 * array.nbytes:
+        if array.nbytes == 0 or shutil.disk_usage(folder).free < 4 * array.nbytes:
             return array
         with tempfile.TemporaryFile(dir=folder) as file:
-            array.tofile(file)
+            file.write(array.reshape(-1).view(np.uint8).data)  # not tofile, which loses the error of a full disk
             file.flush()
             return np.asarray(np.memmap(file, array.dtype, "c", shape=array.shape))
     except OSError:

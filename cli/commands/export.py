@@ -165,8 +165,9 @@ budgets:
 levels and order:
   --levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on, all or none. With
   --lod-meta OUT is a new folder with lod-meta.json, level 0 the finest, and the
-  chunks that a streaming viewer loads. Its leaves have tables of errors, measured
-  from the cameras above, by which the viewer spends its budget of Gaussians.
+  chunks that a streaming viewer loads. Its leaves have tables of errors,
+  measured from the cameras above, by which the viewer spends its budget of
+  Gaussians.
   --order extinction is for renderers that draw the first n rows: for any n
   these are the rows of --keep n, with the opacities and scales of the file.
   They pop where the dial fades.

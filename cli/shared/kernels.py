@@ -21,7 +21,7 @@ from .console import Console, Meter
 CPU = torch.device("cpu")
 OTHER = ""
 # Share of each kernel in the time to compile all of them; used only for the progress shown.
-SHARES = {"project": 0.2, "project_gradient": 0.42, OTHER: 0.035}
+SHARES = {"project": 0.15, "project_dialled": 0.17, "project_gradient": 0.35, OTHER: 0.03}
 
 
 def prepare_kernels(
@@ -41,7 +41,7 @@ def prepare_kernels(
     with announced_compiling(console, SHARES), one_thread():
         evaluate(one, [view], [1.0])
         if training:
-            adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0))
+            adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0, target="cost"))
             if adapted.interrupted:
                 raise Stopped("stopped while the kernels were compiled")
 

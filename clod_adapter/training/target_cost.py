@@ -25,6 +25,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers.protocol import ALPHA_MIN
 from clod_adapter.training.target_count import LIFT, count_slope, target_curve
 
+HERE = torch.device("cpu")
 DRAWN, TILE = 5.0, 6.0
 EXPONENT = 1.0  # of the curve
 # Dial values and views at which shares are measured, and how often in a training.
@@ -78,7 +79,7 @@ class TargetCost:
     """
 
     def __init__(self, base: Gaussians, cameras: Sequence[Camera], config: AdaptConfig) -> None:
-        plain = base.replace(sigma_d=None, attenuation=None, growth_d=None).to("cpu")
+        plain = base.replace(sigma_d=None, attenuation=None, growth_d=None).to(HERE)
         self.fixed, self.blocks = torch.zeros_like(plain.opacity_logits), torch.zeros_like(plain.opacity_logits)
         for camera in cameras:
             for mean, cost in zip((self.fixed, self.blocks), _costs(plain, camera), strict=True):
@@ -98,7 +99,7 @@ class TargetCost:
         if share_done < float(self.measured[0]):
             return
         assert gaussians.sigma_d is not None and gaussians.attenuation is not None
-        here = gaussians.to("cpu")
+        here = gaussians.to(HERE)
         for k, s in enumerate(self.dials):
             cost = fmean(view_cost(here, camera, s) for camera in self.cameras)
             dialled = attenuate(
