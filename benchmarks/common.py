@@ -96,6 +96,17 @@ def stored(file: str) -> list[Row]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
 
 
+def timed(jobs: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:
+    """Milliseconds of each job, the jobs in turn."""
+    times: dict[str, list[float]] = {name: [] for name in jobs}
+    for _ in range(repeats):
+        for name, job in jobs.items():
+            began = time.perf_counter()
+            job()
+            times[name].append(1e3 * (time.perf_counter() - began))
+    return times
+
+
 def table(heads: Sequence[str], rows: Iterable[Sequence[object]], numbers_from: int | None = None) -> str:
     """A Markdown table; columns from ``numbers_from`` on are aligned to the right."""
     marks = ["---:" if numbers_from is not None and k >= numbers_from else "---" for k in range(len(heads))]

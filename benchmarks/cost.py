@@ -14,16 +14,16 @@ linear between the dial values.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from statistics import fmean, median
 
 import clod_adapter as clod
 from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.rasterizers import cpu
 from clod_adapter.training.target_cost import DRAWN, TILE, view_cost
-from common import CACHE, Row, append, arguments, checkpoint, photographs, stored, table
+from common import CACHE, Row, append, arguments, checkpoint, photographs, stored, table, timed
 
 import numpy as np
 import torch
@@ -72,15 +72,12 @@ def compared(scene: str, iters: int) -> Row:
     base, views = checkpoint(scene).gaussians, photographs(scene).test
     models = {target: clod.load(file_of(scene, target, iters)).gaussians for target in TARGETS}
     cases = [("base", base, 1.0), ("idle", idle(base), 1.0), ("empty", empty(base), 1.0)]
-    cases += [*((target, models[target], s) for target in TARGETS for s in DIALS)]
+    cases += [(target, models[target], s) for target in TARGETS for s in DIALS]
     times: list[list[float]] = [[] for _ in cases]
-    with torch.no_grad():
-        for _ in range(REPEATS):
-            for view in views:
-                for taken, (_, model, s) in zip(times, cases, strict=True):  # in turn: clock rates drift
-                    began = time.perf_counter()
-                    clod.render(model, view.camera, s)
-                    taken.append((time.perf_counter() - began) * 1e3)
+    for view in views:
+        jobs = {str(k): partial(clod.render, model, view.camera, s) for k, (_, model, s) in enumerate(cases)}
+        for taken, more in zip(times, timed(jobs, REPEATS).values(), strict=True):
+            taken += more
     whole = fmean(view_cost(base, view.camera) for view in views)
     found: dict[str, list[Row]] = {name: [] for name, *_ in cases}
     for (name, model, s), taken in zip(cases, times, strict=True):
@@ -132,12 +129,7 @@ def fitted(scene: str) -> Row:
             for view in views:
                 tiles, blocks = cpu.work(model, view.camera, s)
                 counts.append([1.0, float((tiles > 0).sum()), float(tiles.sum()), float(blocks.sum())])
-                taken = []
-                for _ in range(REPEATS):
-                    began = time.perf_counter()
-                    clod.render(model, view.camera, s)
-                    taken.append((time.perf_counter() - began) * 1e6)
-                times.append(median(taken))
+                times.append(1e3 * median(timed({"": partial(clod.render, model, view.camera, s)}, REPEATS)[""]))
     weights, *_ = np.linalg.lstsq(np.array(counts), np.array(times), rcond=None)
     own = np.array(counts) @ [0, DRAWN, TILE, 1]
     named = dict(zip(("frame", "drawn", "tile", "block"), weights.tolist(), strict=True))

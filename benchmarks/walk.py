@@ -22,7 +22,6 @@ that is at most so many dB below the base.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import lru_cache, partial
@@ -36,7 +35,7 @@ from clod_adapter.equation.distances import in_frustum
 from clod_adapter.evaluation import popping
 from clod_adapter.metrics import psnr
 from clod_adapter.render import dial, splat
-from common import Row, append, arguments, fill_in, stored
+from common import Row, append, arguments, fill_in, stored, timed
 from tuning import merge
 from walk_town import Levels, Town, adapted, checkpoint, choose, distances, held
 
@@ -125,17 +124,6 @@ def compared(gaussians: clod.Gaussians, view: clod.View, s: float) -> dict[str, 
     rendering = clod.render(gaussians, view.camera, s)
     in_view = int((rendering.kept & in_frustum(gaussians.means, view.camera)).sum())
     return {"in_view": in_view, "psnr": round(psnr(rendering.image, view.image), 3)}
-
-
-def timed(jobs: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:
-    """Milliseconds of each job, the jobs in turn."""
-    times: dict[str, list[float]] = {name: [] for name in jobs}
-    for _ in range(repeats):
-        for name, job in jobs.items():
-            began = time.perf_counter()
-            job()
-            times[name].append(1e3 * (time.perf_counter() - began))
-    return times
 
 
 @torch.no_grad()

@@ -75,19 +75,18 @@ def _compare(image: Tensor, target: Tensor, l1: float, dssim: float) -> tuple[Te
     """
     from clod_adapter._kernels import ssim as kernels
     from clod_adapter._kernels import threads
-    from clod_adapter._kernels.memory import give_planes, take_planes
+    from clod_adapter._kernels.memory import recycled
 
     (height, width, _), workers = image.shape, threads.worker_count()
-    shape = (6, 3, height, kernels.stride(width))
-    planes = take_planes(shape)
-    planes[:2, :, :, kernels.PAD + width :] = 0  # of a wider image
-    x, y, similarity, *slopes = planes
+    shape = (3, height, kernels.stride(width))
+    x, y, similarity, *slopes = (recycled(shape).numpy() for _ in range(6))
+    for plane in (x, y):
+        plane[:, :, kernels.PAD + width :] = 0  # lanes beyond the image; the margins of the other planes are not read
     sums, differences = np.zeros(workers), np.zeros(workers)
     out = torch.empty(height, width, 3, dtype=torch.float32, device="cpu")
     threads.run(kernels.to_planes, workers, image.detach().contiguous().numpy(), target.contiguous().numpy(), x, y)
     threads.run(kernels.ssim_map, workers, x, y, width, similarity, *slopes, sums)
     threads.run(kernels.loss_gradient, workers, x, y, width, *slopes, l1, dssim, out.numpy(), differences)
-    give_planes(planes)
     return out, float(differences.sum()), float(sums.sum())
 
 

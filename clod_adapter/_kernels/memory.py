@@ -20,7 +20,6 @@ _SMALL = 16384
 _LARGE = 16_000_000
 _idle: dict[int, list[np.ndarray]] = {}
 _recent: deque[int] = deque()
-_planes: dict[tuple[int, ...], np.ndarray] = {}
 
 
 def aligned(size: int, dtype: Any) -> np.ndarray:
@@ -61,23 +60,8 @@ def _give_back(whole: np.ndarray) -> None:
             _idle[_recent.popleft()].pop(0)
 
 
-def take_planes(shape: tuple[int, ...]) -> np.ndarray:
-    """Zeros, or what ``give_planes`` got, as it is: zeroing fresh pages takes as long as the work on them."""
-    try:
-        return _planes.pop(shape)
-    except KeyError:
-        return np.zeros(shape, np.float32)
-
-
-def give_planes(planes: np.ndarray) -> None:
-    """Keeps one array of float32 for the next ``take_planes``; images of a scene have few sizes."""
-    _planes.clear()
-    _planes[planes.shape] = planes
-
-
 def release() -> None:
     """Returns the memory of idle arrays to the system."""
-    _planes.clear()
     _recent.clear()
     _idle.clear()
     with contextlib.suppress(

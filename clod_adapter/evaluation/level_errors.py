@@ -36,7 +36,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.lod_meta import Leaf
 from clod_adapter.progress import Listener, Phase, tell
-from clod_adapter.rasterizers import for_device
+from clod_adapter.render import splat
 from clod_adapter.training.camera_placement import FIELD, HEIGHT
 from clod_adapter.training.camera_score import WIDTH
 
@@ -134,12 +134,7 @@ class _Scene:
 
     def picture(self, opacities: Tensor, camera: Camera) -> Tensor:
         """``[H, W, 3]`` over black, in [0, 1]."""
-        g = self.gaussians
-        image, _ = for_device(g.means.device)(
-            g.means, g.quats, self.scales, opacities, g.sh0, g.shN, camera, torch.zeros(3, device=g.means.device),
-            g.screen_filter,
-        )  # fmt: skip
-        return image.clamp(0, 1)
+        return splat(self.gaussians, opacities, camera)[0].clamp(0, 1)
 
     def removed(self, leaf: Leaf, camera: Camera, images: Sequence[Tensor]) -> np.ndarray:
         """``[L]`` what the step to each level from the next finer one adds to the squared error from a camera.

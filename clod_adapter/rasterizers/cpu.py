@@ -125,12 +125,12 @@ def _sorted(
 
 
 def _prepare(
-    kernel: Any, n: int, inputs: tuple[Any, ...], cam: np.ndarray, size: tuple[int, int], compensate: bool
+    kernel: Any, arrays: list[np.ndarray], degree: int, camera: Camera, screen_filter: ScreenFilter, *more: np.ndarray
 ) -> _Frame:
-    """Projection, depth order and tile lists."""
-    buffers, workers, (width, height) = _take(), threads.worker_count(), size
-    records, packed_ids, counts, order = _sorted(buffers, kernel, n, inputs)
-    across, down = -(-width // conventions.TILE), -(-height // conventions.TILE)
+    """Projection, depth order and tile lists. The kernel takes ``arrays``, the SH degree, the camera and ``more``."""
+    buffers, cam, n = _take(), camera_vector(camera, screen_filter), len(arrays[0])
+    records, packed_ids, counts, order = _sorted(buffers, kernel, n, (*arrays, degree, cam, *more))
+    across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
     listing = _workers_for(len(order))
     histogram, totals = np.empty((listing, across * down), np.int64), np.empty(listing, np.int64)
     offsets, slots = np.empty(across * down + 1, np.int64), buffers.get("slots", (2 * n,), np.int64)
@@ -141,9 +141,9 @@ def _prepare(
     # Longest lists first: no thread starts a long tile when the others are done.
     longest_first = np.argsort(-np.diff(offsets), kind="stable")
     return _Frame(
-        buffers, cam, width, height, across, records, packed_ids, counts, slots, entries,
+        buffers, cam, camera.width, camera.height, across, records, packed_ids, counts, slots, entries,
         entry_slots, buffers.get("masks", (total * blocks.WORDS,), np.uint64), offsets, longest_first,
-        compensate or None, workers,
+        screen_filter.compensate or None, threads.worker_count(),
     )  # fmt: skip
 
 
@@ -167,9 +167,8 @@ def _arrays(tensors: Any) -> list[np.ndarray]:
 class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means, quats, scales, opacities, sh0, shN, background, camera, screen_filter, degree):  # type: ignore[no-untyped-def]
-        arrays, cam = _arrays((means, quats, scales, opacities, sh0, shN)), camera_vector(camera, screen_filter)
-        size = camera.width, camera.height
-        frame = _prepare(project.project, len(means), (*arrays, degree, cam), cam, size, screen_filter.compensate)
+        arrays = _arrays((means, quats, scales, opacities, sh0, shN))
+        frame = _prepare(project.project, arrays, degree, camera, screen_filter)
         image, alpha = _blend(frame, background.detach().contiguous().numpy())
         ctx.frame, ctx.degree = frame, degree
         ctx.save_for_backward(means, quats, scales, opacities, sh0, shN, background, image, alpha)
@@ -224,10 +223,8 @@ def _prepare_dialled(gaussians: Gaussians, camera: Camera, virtual_scale: float)
     stored = (g.means, g.quats, g.log_scales, g.opacity_logits, *learned)
     arrays = [x.detach().contiguous().numpy() for x in stored]
     arrays += [x.detach().contiguous().numpy().reshape(-1) for x in (g.sh0, g.shN)]
-    cam = camera_vector(camera, g.screen_filter)
-    inputs = (*arrays, g.sh_degree, cam, _dial_vector(g, camera, virtual_scale))
-    size = camera.width, camera.height
-    return _prepare(dial.project_dialled, len(g), inputs, cam, size, g.screen_filter.compensate)
+    dial_vector = _dial_vector(g, camera, virtual_scale)
+    return _prepare(dial.project_dialled, arrays, g.sh_degree, camera, g.screen_filter, dial_vector)
 
 
 @torch.no_grad()

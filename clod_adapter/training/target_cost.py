@@ -22,10 +22,11 @@ from clod_adapter.cameras import Camera
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import Attenuated, attenuate, culling_threshold
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.importance import FADING
 from clod_adapter.rasterizers.protocol import ALPHA_MIN
-from clod_adapter.training.target_count import LIFT, count_slope, target_curve
+from clod_adapter.training.target_count import lifted_slope, target_curve
 
-HERE = torch.device("cpu")
+CPU = torch.device("cpu")
 DRAWN, TILE = 5.0, 6.0
 EXPONENT = 1.0  # of the curve
 # Dial values and views at which shares are measured, and how often in a training.
@@ -33,7 +34,6 @@ DIALS, VIEWS, MEASURED = 5, 6, 5
 # An opaque Gaussian hides what is behind it, where blocks end sooner: that saves more than its larger ellipse costs.
 HIDING = 1.0
 CHANGING = ("opacity_logits", "log_scales", "log_sigma", "growth_d")  # what the cost is a function of
-FADING = 1.5  # times the culling threshold: the opacity up to which the soft cut reaches
 MOST = 4.0  # of a correction, or its inverse: with hardly any Gaussian left at a dial value, shares say nothing
 FAINTEST = 0.3  # lower bound of log(a / ALPHA_MIN), in which an ellipse's area is proportional
 
@@ -79,7 +79,7 @@ class TargetCost:
     """
 
     def __init__(self, base: Gaussians, cameras: Sequence[Camera], config: AdaptConfig) -> None:
-        plain = base.replace(sigma_d=None, attenuation=None, growth_d=None).to(HERE)
+        plain = base.replace(sigma_d=None, attenuation=None, growth_d=None).to(CPU)
         self.fixed, self.blocks = torch.zeros_like(plain.opacity_logits), torch.zeros_like(plain.opacity_logits)
         for camera in cameras:
             for mean, cost in zip((self.fixed, self.blocks), _costs(plain, camera), strict=True):
@@ -93,13 +93,15 @@ class TargetCost:
         self.measured = torch.tensor([0.0] + [1.0] * DIALS, dtype=torch.float64)
         self.share = config.share
 
+    def due(self, share_done: float) -> bool:
+        """Whether a measurement is due."""
+        return share_done >= float(self.measured[0])
+
     @torch.no_grad()
     def measure(self, gaussians: Gaussians, typical: Tensor, share_done: float) -> None:
-        """Where a measurement is due, compares the modelled share with that of renderings, at each dial value."""
-        if share_done < float(self.measured[0]):
-            return
+        """Compares the modelled share with that of renderings, at each dial value."""
         assert gaussians.sigma_d is not None and gaussians.attenuation is not None
-        here = gaussians.to(HERE)
+        here = gaussians.to(CPU)
         for k, s in enumerate(self.dials):
             cost = fmean(view_cost(here, camera, s) for camera in self.cameras)
             dialled = attenuate(
@@ -163,9 +165,7 @@ class TargetCost:
         config: AdaptConfig, lift: bool,
     ) -> Tensor:  # fmt: skip
         """``[N]`` the soft derivative of the share of the cost by log sigma_d, through the cull."""
-        slope = len(logits) * count_slope(logits, dialled.log_opacities, s, attenuation.tau, config.temperature)
-        if lift:
-            slope = torch.where(dialled.keep, slope, slope.clamp(min=LIFT / config.temperature))
+        slope = len(logits) * lifted_slope(dialled, logits, s, attenuation.tau, config.temperature, lift)
         fading = torch.full_like(logits, FADING * culling_threshold(attenuation.tau, s))
         there = self.fixed + self._blocks(dialled._replace(drawn=fading), log_scales)
         return slope * there / self.total

@@ -71,10 +71,17 @@ def count_gradient(
     target = target or target_share(virtual_scale, len(opacity_logits), config)
     eta = float(dialled.keep.sum()) / len(opacity_logits)
     penalty = 2 * loss * config.reg_weight * (eta / target.share - 1) * target.weight
-    slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, config.temperature)
-    if penalty < 0:
-        slope = torch.where(dialled.keep, slope, slope.clamp(min=LIFT / (config.temperature * len(slope))))
-    return slope.mul_(penalty)
+    return lifted_slope(dialled, opacity_logits, virtual_scale, tau, config.temperature, penalty < 0).mul_(penalty)
+
+
+def lifted_slope(
+    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, temperature: float, lift: bool
+) -> Tensor:
+    """``[N]`` ``count_slope``; with ``lift`` at least ``LIFT / (temperature N)`` for culled Gaussians."""
+    slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, temperature)
+    if not lift:
+        return slope
+    return torch.where(dialled.keep, slope, slope.clamp(min=LIFT / (temperature * len(slope))))
 
 
 def paper_count(

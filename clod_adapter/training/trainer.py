@@ -54,9 +54,11 @@ class Trainer:
         tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
         cameras = subset.cameras or [view.camera for view in spread(views, MOST_VIEWS)]
         typical = typical_distance(start.means, cameras, start.attenuation)[: subset.trained]
-        cost = TargetCost(start, cameras, config) if config.target == "cost" and config.has_target_count else None
-        if cost is not None and subset.trained < len(start):
-            raise ClodError("the target cost needs all Gaussians trained: leave out the subset, or target cost")
+        cost = None
+        if config.target == "cost" and config.has_target_count:
+            if subset.trained < len(start):
+                raise ClodError("the target cost needs all Gaussians trained: leave out the subset, or target cost")
+            cost = TargetCost(start, cameras, config)
         self.objective = Objective(config, start.attenuation, tuple(tuned), subset, typical, start.screen_filter, cost)
         self.decay, self.stepped = self.objective.decay, self.objective.stepped
         self.decay_range = self.objective.decay_range
@@ -85,8 +87,9 @@ class Trainer:
         Raises:
             LossNotFinite, or any error of the rasterizer: nothing has changed.
         """
-        if self.objective.cost is not None:
-            self.objective.cost.measure(self._assembled(self.parameters), self.objective.typical, share_done)
+        cost = self.objective.cost
+        if cost is not None and cost.due(share_done):
+            cost.measure(self._assembled(self.parameters), self.objective.typical, share_done)
         found = self._gradients(share_done)
         self._updating = True
         finite = ~spoilt_rows(found.gradients)

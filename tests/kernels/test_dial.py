@@ -45,13 +45,11 @@ def wanted(model: Gaussians, view: Camera, s: float) -> tuple[Tensor, Tensor]:
     found = dial(exact, view, s)
     scales = exact.scales if found.growth is None else exact.scales * found.growth[:, None]
     tensors = (model.means, model.quats, scales.float(), found.drawn.float(), model.sh0, model.shN)
-    cam, size = cpu.camera_vector(view, model.screen_filter), (view.width, view.height)
-    inputs = (*cpu._arrays(tensors), model.sh_degree, cam)
     close = (found.drawn - 1 / 255).abs() < 1e-6
     if model.attenuation is not None:
         logs = found.log_opacities
         close |= (logs - log_threshold(model.attenuation.tau, s)).abs() < 1e-5 * (1 + logs.abs())
-    frame = cpu._prepare(project.project, len(model), inputs, cam, size, model.screen_filter.compensate)
+    frame = cpu._prepare(project.project, cpu._arrays(tensors), model.sh_degree, view, model.screen_filter)
     return records_of(frame, len(model)), close
 
 
