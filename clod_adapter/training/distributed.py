@@ -13,16 +13,18 @@ import os
 import pickle
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import TYPE_CHECKING, Any, TypeVar
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
 from clod_adapter.errors import ClodError
+from clod_adapter.progress import Listener, Phase, Progress, Stopped
 from clod_adapter.training.objective import GradientSum
 
 if TYPE_CHECKING:
@@ -65,7 +67,7 @@ class ProcessGroup:
 
     def sum(self, own: GradientSum) -> GradientSum:
         """The sum over all processes; overwrites the gradients given."""
-        loss = torch.tensor([own.loss], dtype=torch.float64)
+        loss = torch.tensor([float(own.loss)], dtype=torch.float64)
         self._meet(loss)
         gradients = {name: gradient.contiguous() for name, gradient in own.gradients.items()}
         kept = own.kept.to(torch.uint8)
@@ -78,7 +80,50 @@ class ProcessGroup:
                 work.wait()
             if kept.is_cuda:
                 torch.cuda.synchronize()  # NCCL's own wait returns at once
-        return GradientSum(gradients, kept.bool(), float(loss))
+        return GradientSum(gradients, kept.bool(), loss[0])
+
+    def once(self, compute: Callable[[Listener], T], progress: Listener | None = None) -> T:
+        """What ``compute`` returns in the first process, which alone calls it; in the others with tensors on the CPU.
+
+        The listener that ``compute`` is given calls ``progress`` in all processes. The others wait as long as it takes,
+        if no two of these calls are PATIENCE apart.
+
+        Raises:
+            Stopped: ``progress`` returned False in one of the processes.
+            ClodError: that of ``compute``, and in the other processes any error of it.
+        """
+        found, failure = None, None
+        if self.rank == 0:
+            try:
+                found = compute(partial(self._relay, progress))
+            except ProcessLost:
+                raise
+            except Exception as error:
+                failure = error
+            self._exchange_progress(None, True)
+        else:
+            now, going = self._exchange_progress(None, True)
+            while now:
+                going = progress is None or progress(now) is not False
+                now, _ = self._exchange_progress(None, going)
+        known = failure is None or isinstance(failure, (ClodError, Stopped))
+        found, told = self.broadcast((found, failure if known else ClodError(str(failure) or type(failure).__name__)))
+        if failure := failure or told:
+            raise failure
+        return cast(T, found)
+
+    def _relay(self, progress: Listener | None, now: Progress) -> bool:
+        """Calls the listeners of all processes; whether all go on, the other processes as of the call before."""
+        going = progress is None or progress(now) is not False
+        return self._exchange_progress(now, going)[1]
+
+    def _exchange_progress(self, now: Progress | None, going: bool) -> tuple[Progress | None, bool]:
+        """The first process's progress, None at the end, and whether all processes go on."""
+        place = [-1.0] * 3 if now is None else [list(Phase).index(now.phase), now.done, now.total]
+        said = torch.tensor([*place, 0.0 if going else 1.0], dtype=torch.float64)
+        self._meet(said, "MAX")
+        phase, done, total = map(int, said[:3])
+        return (None if phase < 0 else Progress(list(Phase)[phase], done, total)), not said[3]
 
     def broadcast(self, value: T) -> T:
         """The first process's value, with its tensors on the CPU; the argument of the others is ignored."""

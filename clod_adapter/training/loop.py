@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import Any
 
 import torch
 
@@ -113,12 +114,14 @@ def _initialized(
     lean: Gaussians, views: tuple[View, ...], config: AdaptConfig, progress: Listener | None,
     group: ProcessGroup | None,
 ) -> Gaussians:  # fmt: skip
-    """The Gaussians with the initial dial, the same bits in all processes."""
-    begun = for_training(initialize(lean, views, config, progress), views, config)
-    if group:
-        own = {"sigma_d": begun.sigma_d, "growth_d": begun.growth_d, "attenuation": begun.attenuation}
-        begun = begun.replace(**group.broadcast(own)).to(begun.means.device)
-    return begun
+    """The Gaussians with the initial dial; of a group, the first process computes it."""
+
+    def initial(listener: Listener | None) -> dict[str, Any]:
+        begun = for_training(initialize(lean, views, config, listener), views, config)
+        return {name: getattr(begun, name) for name in ("sigma_d", "growth_d", "attenuation")}
+
+    found = group.once(initial, progress) if group else initial(progress)
+    return lean.replace(**found).to(lean.means.device)
 
 
 def _initialized_from(lean: Gaussians, resume: TrainingState, config: AdaptConfig) -> Gaussians:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ import torch.distributed as dist
 
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
+from clod_adapter.progress import Listener, Phase, Progress, Stopped, tell
 from clod_adapter.training import distributed
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost, joined
 from clod_adapter.training.loop import adapt
@@ -47,6 +49,37 @@ def test_a_group_of_one_changes_no_bit(peers: ProcessGroup, growth: str) -> None
     peers.size = 3
     with pytest.raises(ClodError, match="batch is 2, it must be at least 3, a view for each of the processes"):
         adapt(base, scene, config, group=peers)
+
+
+def test_the_first_process_computes_and_tells_all(peers: ProcessGroup, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its value, its progress, its errors; here the two sides of the exchange are one after the other."""
+    told: list[tuple[int, int]] = []
+
+    def heard(now: Progress) -> bool:
+        told.append((now.done, now.total))
+        return now.done < 3
+
+    def compute(steps: int, listener: Listener) -> str:
+        for done in range(1, steps + 1):
+            tell(listener, Phase.PRUNING_ORDER, done, 5)
+        return "done"
+
+    assert peers.once(partial(compute, 2), heard) == "done" and told == [(1, 5), (2, 5)]
+    assert peers.once(partial(compute, 5)) == "done"
+    with pytest.raises(Stopped, match="stopped at pruning order 3/5"):
+        peers.once(partial(compute, 5), heard)
+    with pytest.raises(ZeroDivisionError):
+        peers.once(lambda _: 1 / 0)
+
+    said = [Progress(Phase.PRUNING_ORDER, 1, 5), Progress(Phase.PRUNING_ORDER, 3, 5), None]
+    answers: list[bool] = []
+    monkeypatch.setattr(peers, "rank", 1)
+    monkeypatch.setattr(peers, "_exchange_progress", lambda _, going: (answers.append(going), (said.pop(0), True))[1])
+    monkeypatch.setattr(peers, "broadcast", lambda _: (None, ClodError("no start")))
+    told.clear()
+    with pytest.raises(ClodError, match="no start"):
+        peers.once(pytest.fail, heard)
+    assert told == [(1, 5), (3, 5)] and answers == [True, True, False]
 
 
 def test_objects_survive_being_sent() -> None:

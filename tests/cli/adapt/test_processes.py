@@ -101,6 +101,35 @@ def test_two_give_the_result_of_one(server: Server, words: list[Any], alone: Pat
     assert run.log(1) == "" and not (run.folder / STATE).exists()
 
 
+def test_the_first_process_initializes(server: Server, words: list[Any], tmp_path: Path) -> None:
+    """The second one computes nothing, and is told the progress of the first; so is it told an error."""
+    start = "import clod_adapter.training.loop as t; from clod_adapter.progress import Phase, Progress\n"
+    steps = start + (
+        "real = t.initialize\n"
+        "def initialize(base, views, config, progress):\n"
+        "    if progress is None: return real(base, views, config)  # to compile the kernels\n"
+        "    for done in (1, 2): assert progress(Progress(Phase.IMPORTANCE, done, 2))\n"
+        "    return real(base, views, config)\n"
+        "t.initialize = initialize"
+    )
+    heard = start + (
+        "def nothing(*_): raise ZeroDivisionError('computed')\n"
+        "t.initialize, real, told = nothing, processes.adapt, open('../told', 'w')\n"
+        "def adapt(base, scene, config, progress, *rest, **more):\n"
+        "    def listen(now):\n"
+        "        if now.phase != Phase.TRAINING: print(now.phase, now.done, now.total, file=told, flush=True)\n"
+        "        return progress(now)\n"
+        "    return real(base, scene, config, listen, *rest, **more)\n"
+        "processes.adapt = adapt"
+    )
+    run = launch(server, tmp_path / "run", *words, *TINY, before={0: steps, 1: heard})
+    assert run.wait() == [0, 0] and run.report()["steps"] == 12, run.log(0) + run.log(1)
+    assert (tmp_path / "told").read_text() == "importance 1 2\nimportance 2 2\n"
+    failing = steps.replace("    return real(base, views, config)\nt.", "    raise t.ClodError('no start here')\nt.")
+    run = launch(server, tmp_path / "failing", *words, *TINY, before={0: failing, 1: heard})
+    assert run.wait() == [2, 2] and run.log(1) == "" and run.log(0).count("error: no start here\n") == 1, run.log(0)
+
+
 def test_three_with_uneven_shares(server: Server, words: list[Any], tmp_path: Path) -> None:
     settings = (*TINY[:-2], "--iters", 6, "--batch", 4, "--form", "paper")
     one = launch(server, tmp_path / "one", *words, *settings, size=1)
