@@ -28,11 +28,11 @@ def spoilt_rows(gradients: dict[str, Tensor]) -> Tensor:
     """``[N]`` bool, the rows that are bad in any of the gradients ``[N, ...]``."""
     tensors = list(gradients.values())
     spoilt = torch.zeros(len(tensors[0]), dtype=torch.bool, device=tensors[0].device)
-    if bool(torch.stack([tensor.sum() for tensor in tensors]).isfinite().all()):  # one synchronization on a GPU
+    # A GPU is not asked: the host would wait for its answer.
+    if spoilt.device.type == "cpu" and all(bool(tensor.sum().isfinite()) for tensor in tensors):
         return spoilt
     for tensor in tensors:
-        if (bad := bad_rows(tensor)) is not None:
-            spoilt |= bad
+        spoilt |= ~tensor.isfinite().reshape(len(tensor), -1).all(1)
     return spoilt
 
 

@@ -30,7 +30,8 @@ def ssim_plain(image: Tensor, target: Tensor) -> Tensor:
     Gaussian window of 11 taps with sigma 1.5, zero padding, data range 1: the form of 3DGS and its descendants (Wang et
     al. 2004).
     """
-    taps = torch.exp(-((torch.arange(WINDOW).to(image) - WINDOW // 2) ** 2) / (2 * SIGMA**2))
+    places = torch.arange(WINDOW, dtype=image.dtype, device=image.device)
+    taps = torch.exp(-((places - WINDOW // 2) ** 2) / (2 * SIGMA**2))
     taps = taps / taps.sum()
 
     def blur(planes: Tensor) -> Tensor:

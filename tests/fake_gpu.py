@@ -2,10 +2,12 @@
 
 Mixing its tensors with the CPU's in one operation, ``.numpy()``, and indexing the CPU's with its own are refused; 0-d
 CPU tensors mix, as on CUDA. It is torch's private backend under the name ``gpu``, which is neither "cpu" nor "cuda".
+``waits`` tells where the host would wait for the device.
 """
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -19,6 +21,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 MOVES = ("aten._to_copy.default", "aten.copy_.default")  # what may see tensors of both
+# Operations whose result, or its size, the host reads.
+READS = ("_local_scalar_dense", "nonzero", "equal", "masked_select", "_unique2", "unique_consecutive", "unique_dim")
+_log: list[str] = []
 
 
 class Walled(Tensor):
@@ -50,6 +55,8 @@ def _run(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     outside = [x for x in tensors if not isinstance(x, Walled) and x.dim()]
     if walled and outside and str(function) not in MOVES:
         raise RuntimeError(f"{function}: tensors of the fake GPU and of the CPU, {[tuple(x.shape) for x in outside]}")
+    if _waits(function, args, kwargs, walled):
+        _log.append(_place())
     device = kwargs.get("device")
     inside = bool(walled) if device is None else torch.device(device).type == "gpu"
     if device is not None:
@@ -58,6 +65,34 @@ def _run(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     own = {id(x.inner): x for x in walled}  # an operation in place returns what it was given
     out = function(*args, **kwargs)
     return tree_map(lambda x: own[id(x)] if id(x) in own else _wall(x), out) if inside else out
+
+
+def _waits(function: Any, args: Any, kwargs: dict[str, Any], walled: list[Any]) -> bool:
+    """Whether the host waits for the device: it reads a value or a size, or copies and is not told to go on."""
+    name = str(function)
+    if name in MOVES:
+        to = torch.device(kwargs.get("device") or args[0].device)
+        going_on = kwargs.get("non_blocking") or (name == MOVES[1] and args[2:] == (True,))
+        return (to.type == "gpu") != bool(walled if name == MOVES[0] else isinstance(args[1], Walled)) and not going_on
+    masks = args[1] if name.startswith("aten.index") and isinstance(args[1], (list, tuple)) else ()
+    masked = any(isinstance(rows, Walled) and rows.dtype == torch.bool for rows in masks)
+    return bool(walled) and (masked or name.split(".")[1] in READS)
+
+
+def _place() -> str:
+    """The innermost function of the package, as ``training/trainer.py:step``."""
+    for frame in reversed(traceback.extract_stack()):
+        _, inside, file = frame.filename.rpartition("/clod_adapter/")
+        if inside:
+            return f"{file}:{frame.name}"
+    return "outside"
+
+
+@contextmanager
+def waits() -> Iterator[list[str]]:
+    """The places at which the host waits for the device within the context, once for each time."""
+    _log.clear()
+    yield _log
 
 
 def _wall(value: Any) -> Any:

@@ -27,7 +27,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.baselines import matching_dial, mean_kept, rankings
 from clod_adapter.evaluation.budget import dial_for, frame_times
 from clod_adapter.evaluation.popping import dial_popping, path_popping
-from clod_adapter.initialization.importance import initialize, usable_views
+from clod_adapter.initialization.importance import for_training, initialize, usable_views
 from clod_adapter.losses import photometric_loss
 from clod_adapter.metrics import psnr_ssim
 from clod_adapter.rasterizers import cpu, cuda
@@ -36,9 +36,10 @@ from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.planner import make_plan
-from clod_adapter.training.pseudo_views import render_pseudo_views
+from clod_adapter.training.pseudo_views import PseudoView, render_pseudo_views
 from clod_adapter.training.target_count import count_gradient, paper_count
-from fake_gpu import fake_gpu
+from clod_adapter.training.trainer import Trainer
+from fake_gpu import fake_gpu, waits
 from scenes import capture, gaussians, ring
 
 CONFIG = AdaptConfig(iters=2, max_sv=4.0)
@@ -194,6 +195,28 @@ def test_frozen_tensors_get_no_gradient(setup: Setup, monkeypatch: pytest.Monkey
     sh0 = setup.there.sh0.clone().requires_grad_()
     render(setup.there.replace(sh0=sh0), setup.cameras[0]).image.sum().backward()
     assert sh0.grad is not None and setup.there.sh0.shape in made and setup.there.shN.shape not in made
+
+
+@pytest.mark.parametrize("target", ["count", "cost"])
+def test_a_step_waits_for_the_device_once(setup: Setup, target: str) -> None:
+    """At its end, for the loss; the rasterizer aside: gsplat itself asks how many rows and tiles there are."""
+    if setup.device.type == "cuda":
+        pytest.skip("the simulated device tells where the host waits")
+    views = setup.scene.train[:2]
+    moving = [PseudoView(view.camera, view.image, setup.there, 1.0) for view in views]
+    config = replace(CONFIG, target=target, batch=4)
+    start = for_training(setup.there, views, config)
+    trainer = Trainer(start, (*views, *moving), config)
+    for share_done in (0.1, 0.9):
+        trainer.step(share_done - 0.05)  # measures costs, which is due at some steps only
+        with waits() as found:
+            trainer.step(share_done)
+        ours = [place for place in found if not place.startswith("rasterizers/")]
+        assert ours == ["training/trainer.py:step"]
+    with waits() as found:
+        assert float(setup.there.means.sum()) and not bool(setup.there.means[setup.there.means > 1e9].any())
+        setup.there.means.cpu(), setup.own.means.to(setup.device), setup.own.means.to(setup.device, non_blocking=True)
+    assert len(found) == 5
 
 
 def test_dial_and_adam_do_not_synchronize_with_the_device(monkeypatch: pytest.MonkeyPatch) -> None:

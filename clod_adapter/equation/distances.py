@@ -37,7 +37,7 @@ def normalized_distances(means: Tensor, camera: Camera, config: AttenuationConfi
     """
     means = means.to(torch.promote_types(means.dtype, torch.float32))  # float16's square overflows from 256 on
     with torch.autocast(means.device.type, enabled=False):  # it would round the camera's position to 3 digits
-        distances = euclidean(means, camera.position.to(means))
+        distances = euclidean(means, camera.position.to(means, non_blocking=True))
         return distances.div_(normalizing_distance(distances, means, camera, config))
 
 
@@ -63,12 +63,11 @@ def normalizing_distance(distances: Tensor, means: Tensor, camera: Camera, confi
     if config.normalizer == "scene" or len(distances) == 0:
         value = config.scene_distance if config.normalizer == "scene" else 1.0
         return torch.full((), value, dtype=distances.dtype, device=distances.device)
-    visible = distances[in_frustum(means, camera)]
-    if len(visible) == 0:
-        visible = distances
-    if config.normalizer == "max":
-        found = visible.max()
+    inside = in_frustum(means, camera)
+    if config.normalizer == "max":  # without a selection, for whose size the host would wait for a GPU
+        found = distances.where(inside | ~inside.any(), 0).max()
     else:
+        visible = distances[inside] if bool(inside.any()) else distances
         # Not torch.quantile: it sorts, and refuses more than 16M elements.
         found = visible.kthvalue(min(max(math.ceil(config.quantile * len(visible)), 1), len(visible))).values
     return found.clamp(min=torch.finfo(found.dtype).tiny)
@@ -76,7 +75,7 @@ def normalizing_distance(distances: Tensor, means: Tensor, camera: Camera, confi
 
 def in_frustum(means: Tensor, camera: Camera) -> Tensor:
     """``[N]`` bool: the centre projects into the image, from beyond the near plane."""
-    projection = (camera.K @ camera.viewmat[:3].to(camera.K)).to(means)
+    projection = (camera.K @ camera.viewmat[:3].to(camera.K)).to(means, non_blocking=True)
     x, y, z = projection[:, :3] @ means.T + projection[:, 3:]
     return (z > camera.near) & (x >= 0) & (x < camera.width * z) & (y >= 0) & (y < camera.height * z)
 

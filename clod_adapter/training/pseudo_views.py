@@ -56,7 +56,7 @@ class PseudoView(View):
     def moved(self, random: np.random.Generator) -> View:
         """A view from a random camera near this one; rendered when its image is read."""
         camera = moved(self.camera, self.reach, random)
-        return StoredView(camera, lambda: render(self.teacher, camera).pixels.cpu())
+        return StoredView(camera, lambda: render(self.teacher, camera).pixels)
 
 
 def moved(camera: Camera, reach: float, random: np.random.Generator) -> Camera:

@@ -18,6 +18,7 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
+from clod_adapter._support.fusing import Number
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import Attenuated, attenuate, culling_threshold
@@ -129,7 +130,7 @@ class TargetCost:
         return self.blocks * growth * size.exp() * (_reach(dialled.drawn) / self.reach)
 
     def gradients(
-        self, parameters: dict[str, Tensor], typical: Tensor, s: float, loss: float, attenuation: AttenuationConfig,
+        self, parameters: dict[str, Tensor], typical: Tensor, s: float, loss: Number, attenuation: AttenuationConfig,
         config: AdaptConfig,
     ) -> dict[str, Tensor]:  # fmt: skip
         """The term's gradients at the dial value s, by parameter.
@@ -153,7 +154,7 @@ class TargetCost:
         found = dict(zip(names, torch.autograd.grad(cost, list(leaves.values())), strict=True))
         found["opacity_logits"] = found["opacity_logits"] * -HIDING
         target = target_curve(s, self.share, EXPONENT)
-        penalty = 2 * loss * config.reg_weight * (float(cost.detach()) * self.factor(s) / target - 1) / target
+        penalty = 2 * loss * config.reg_weight * (cost.detach().double() * self.factor(s) / target - 1) / target
         found["log_sigma"] = found["log_sigma"] + self._cull(
             dialled, logits, scales, s, attenuation, config, penalty < 0
         )
@@ -162,7 +163,7 @@ class TargetCost:
     @torch.no_grad()
     def _cull(
         self, dialled: Attenuated, logits: Tensor, log_scales: Tensor, s: float, attenuation: AttenuationConfig,
-        config: AdaptConfig, lift: bool,
+        config: AdaptConfig, lift: Tensor,
     ) -> Tensor:  # fmt: skip
         """``[N]`` the soft derivative of the share of the cost by log sigma_d, through the cull."""
         slope = len(logits) * lifted_slope(dialled, logits, s, attenuation.tau, config.temperature, lift)

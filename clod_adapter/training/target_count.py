@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+from clod_adapter._support.fusing import Number
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.attenuation import Attenuated, conform, log_threshold
 
@@ -53,7 +54,7 @@ def target_share(virtual_scale: float, count: int, config: AdaptConfig, total: i
 
 
 def count_gradient(
-    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, loss: float, config: AdaptConfig,
+    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, loss: Number, config: AdaptConfig,
     target: TargetShare | None = None,
 ) -> Tensor:  # fmt: skip
     """``[N]`` the count term's gradient of log sigma_d at one dial value; opacities are constants.
@@ -69,19 +70,17 @@ def count_gradient(
         target: of these Gaussians, where they are not the whole scene; by default ``target_share``.
     """
     target = target or target_share(virtual_scale, len(opacity_logits), config)
-    eta = float(dialled.keep.sum()) / len(opacity_logits)
+    eta = dialled.keep.sum().double() / len(opacity_logits)  # a tensor: a float would wait for a GPU
     penalty = 2 * loss * config.reg_weight * (eta / target.share - 1) * target.weight
     return lifted_slope(dialled, opacity_logits, virtual_scale, tau, config.temperature, penalty < 0).mul_(penalty)
 
 
 def lifted_slope(
-    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, temperature: float, lift: bool
+    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, temperature: float, lift: Tensor
 ) -> Tensor:
-    """``[N]`` ``count_slope``; with ``lift`` at least ``LIFT / (temperature N)`` for culled Gaussians."""
+    """``[N]`` ``count_slope``; if ``lift`` (0-d bool) at least ``LIFT / (temperature N)`` for culled Gaussians."""
     slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, temperature)
-    if not lift:
-        return slope
-    return torch.where(dialled.keep, slope, slope.clamp(min=LIFT / (temperature * len(slope))))
+    return slope.clamp_(min=(lift & ~dialled.keep) * (LIFT / (temperature * len(slope))))
 
 
 def paper_count(

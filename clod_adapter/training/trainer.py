@@ -90,12 +90,33 @@ class Trainer:
         cost = self.objective.cost
         if cost is not None and cost.due(share_done):
             cost.measure(self._assembled(self.parameters), self.objective.typical, share_done)
-        found = self._gradients(share_done)
-        self._updating = True
-        finite = ~spoilt_rows(found.gradients)
-        self.held |= ~finite
-        loss = found.loss / self.config.batch
+        before = self.sampler.state()
+        samples = [self.sampler.draw(share_done) for _ in range(self.config.batch)]
+        try:  # if it fails, the next step samples the same views again
+            found = self.objective.gradient_sum(self.parameters, self.group.share(samples) if self.group else samples)
+            found = self.group.sum(found) if self.group else found
+            self._updating = True
+            self._update(found, share_done)
+            loss = float(found.loss) / self.config.batch  # the one time in a step that the host waits for a GPU
+            if not math.isfinite(loss):
+                self._updating = False
+                names = ", ".join(view.camera.name or "a view without a name" for view, *_ in samples)
+                raise LossNotFinite(f"the loss of step {self.done + 1} is not finite ({names})")
+        except Exception:
+            self.sampler.restore(*before)
+            raise
         self.loss = loss if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * loss
+        if share_done >= 1 - self.config.average:  # the optimizer continues from the parameters, not from the mean
+            self.averaged += 1
+            add_to_mean(self.mean, self._trained(), self.averaged)
+        self.done += 1
+        self._updating = False
+
+    def _update(self, found: GradientSum, share_done: float) -> None:
+        """Moves the rows whose gradients are finite; none if the loss is not, without asking which."""
+        learned, spoilt = torch.as_tensor(found.loss).isfinite(), spoilt_rows(found.gradients)
+        finite = learned & ~spoilt
+        self.held |= learned & spoilt
         rates = {name: rate * self.config.lr_final**share_done for name, rate in self.rates.items()}
         # The paper's count term has a gradient for opacities too, also of culled Gaussians.
         everywhere = {self.decay} | ({"opacity_logits"} if self.config.count_term == "paper" else set())
@@ -104,29 +125,6 @@ class Trainer:
         self.parameters[self.decay].clamp_(*self.decay_range)
         if self.config.growth == "on":
             self.parameters["growth_d"].clamp_(*GROWTH_RANGE)
-        if share_done >= 1 - self.config.average:  # the optimizer continues from the parameters, not from the mean
-            self.averaged += 1
-            add_to_mean(self.mean, self._trained(), self.averaged)
-        self.done += 1
-        self._updating = False
-
-    def _gradients(self, share_done: float) -> GradientSum:
-        """Of the losses of the next views; each process of a group computes those of its share of the batch.
-
-        If that fails, the next step samples the same views again.
-        """
-        before = self.sampler.state()
-        samples = [self.sampler.draw(share_done) for _ in range(self.config.batch)]
-        try:
-            found = self.objective.gradient_sum(self.parameters, self.group.share(samples) if self.group else samples)
-            found = self.group.sum(found) if self.group else found
-            if not math.isfinite(found.loss):
-                names = ", ".join(view.camera.name or "a view without a name" for view, *_ in samples)
-                raise LossNotFinite(f"the loss of step {self.done + 1} is not finite ({names})")
-            return found
-        except Exception:
-            self.sampler.restore(*before)
-            raise
 
     def state(self) -> TrainingState:
         """Everything that later steps depend on; its tensors are the trainer's own.
