@@ -163,7 +163,7 @@ class TargetCost:
     @torch.no_grad()
     def _cull(
         self, dialled: Attenuated, logits: Tensor, log_scales: Tensor, s: float, attenuation: AttenuationConfig,
-        config: AdaptConfig, lift: Tensor,
+        config: AdaptConfig, lift: bool | Tensor,
     ) -> Tensor:  # fmt: skip
         """``[N]`` the soft derivative of the share of the cost by log sigma_d, through the cull."""
         slope = len(logits) * lifted_slope(dialled, logits, s, attenuation.tau, config.temperature, lift)

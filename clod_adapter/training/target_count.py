@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -11,8 +12,8 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
 from clod_adapter._support.fusing import Number
-from clod_adapter.config import AdaptConfig
-from clod_adapter.equation.attenuation import Attenuated, conform, log_threshold
+from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.equation.attenuation import Attenuated, attenuate, conform, log_threshold
 
 # Lower bound of the sigmoid's slope, which is at most 1/4, for culled Gaussians while too few are kept. Some widths
 # below the culling threshold it is exactly 0, and so is the image's gradient: no step would bring such a sigma back.
@@ -71,14 +72,45 @@ def count_gradient(
     """
     target = target or target_share(virtual_scale, len(opacity_logits), config)
     eta = dialled.keep.sum().double() / len(opacity_logits)  # a tensor: a float would wait for a GPU
-    penalty = 2 * loss * config.reg_weight * (eta / target.share - 1) * target.weight
+    penalty = _penalty(eta, target, loss, config)
     return lifted_slope(dialled, opacity_logits, virtual_scale, tau, config.temperature, penalty < 0).mul_(penalty)
 
 
+def count_gradient_at(
+    distances: Tensor, opacity_logits: Tensor, sigma_d: Tensor, virtual_scale: float, attenuation: AttenuationConfig,
+    loss: Number, config: AdaptConfig, target: TargetShare,
+) -> Tensor:  # fmt: skip
+    """``count_gradient`` at given ``distances [N]``; on the CPU in float32 two compiled passes."""
+    given = opacity_logits, sigma_d, distances
+    if any(x.device.type != "cpu" or x.dtype != torch.float32 for x in given):
+        dialled = attenuate(*given, virtual_scale, attenuation)
+        return count_gradient(dialled, opacity_logits, virtual_scale, attenuation.tau, loss, config, target)
+    from clod_adapter._kernels import count, threads
+    from clod_adapter.rasterizers.frame import dial_vector, workers_for
+
+    out = torch.empty_like(opacity_logits, memory_format=torch.contiguous_format)
+    n, workers = len(out), workers_for(len(out))
+    arrays = [x.detach().contiguous().numpy() for x in given]
+    dial, counts = dial_vector(attenuation, virtual_scale), np.zeros(workers, np.int64)
+    threads.run(count.count_kept, workers, *arrays, dial, counts)
+    penalty = float(_penalty(float(counts.sum()) / n, target, loss, config))
+    lift = LIFT if penalty < 0 else 0.0
+    threads.run(
+        count.count_slope, workers, *arrays, dial, config.temperature, lift, penalty / (config.temperature * n),
+        out.numpy(),
+    )  # fmt: skip
+    return out
+
+
+def _penalty(eta: Number, target: TargetShare, loss: Number, config: AdaptConfig) -> Number:
+    """The derivative of ``loss reg_weight (eta / target - 1)^2`` by the share eta."""
+    return 2 * loss * config.reg_weight * (eta / target.share - 1) * target.weight
+
+
 def lifted_slope(
-    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, temperature: float, lift: Tensor
+    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, temperature: float, lift: bool | Tensor
 ) -> Tensor:
-    """``[N]`` ``count_slope``; if ``lift`` (0-d bool) at least ``LIFT / (temperature N)`` for culled Gaussians."""
+    """``[N]`` ``count_slope``; with ``lift`` (0-d) at least ``LIFT / (temperature N)`` for culled Gaussians."""
     slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, temperature)
     return slope.clamp_(min=(lift & ~dialled.keep) * (LIFT / (temperature * len(slope))))
 
