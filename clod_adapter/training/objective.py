@@ -60,12 +60,12 @@ class GradientSum:
     Attributes:
         gradients: by name of the trained parameter, of its first ``trained`` rows.
         kept: ``[trained]`` bool, the rows that at least one rendering kept.
-        loss: photometric loss at the smallest dial value of each view, summed.
+        loss: 0-d float64, photometric loss at the smallest dial value of each view, summed.
     """
 
     gradients: dict[str, Tensor]
     kept: Tensor
-    loss: float
+    loss: Tensor
 
     def __add__(self, other: GradientSum) -> GradientSum:
         gradients = {name: mine + other.gradients[name] for name, mine in self.gradients.items()}
@@ -133,13 +133,13 @@ class Objective:
         (view, dials, counted), config, first = sample, self.config, slice(self.trained)
         leaves = {name: parameters[name].detach().requires_grad_(name in self.stepped) for name in parameters}
         decay = leaves[self.decay]
-        photograph = view.image.to(decay.device)
+        photograph = view.image.to(decay.device, non_blocking=True)
         total, kept = decay.new_zeros(()), torch.zeros_like(decay[first], dtype=torch.bool)
         losses, counts = [], []
         rendered = self._rendered_by_kernels if self._compiled(decay) else self._rendered
         for s, image, keep, term in rendered(leaves, view.camera, dials):
             loss = photometric_loss(image, photograph, config.ssim_weight)
-            losses.append(float(loss.detach()))
+            losses.append(loss.detach().double())
             weight = self._weight(s, alone=len(dials) == 1)
             total = total + weight * (loss if term is None else loss + term)
             counts.append((s, weight * losses[-1]))
@@ -198,7 +198,7 @@ class Objective:
                 term = paper_count(dialled, s, self.attenuation.tau, self.config, self.part.total)
             yield s, splat(shown, drawn, camera, growth=growth)[0], dialled.keep[: self.trained], term
 
-    def _target_gradients(self, parameters: dict[str, Tensor], s: float, loss: float) -> dict[str, Tensor]:
+    def _target_gradients(self, parameters: dict[str, Tensor], s: float, loss: Tensor) -> dict[str, Tensor]:
         """``[trained]`` the gradients of the count term or the cost term at one dial value, by parameter."""
         rows = {name: parameters[name][: self.trained].detach() for name in (*self.stepped, "log_scales")}
         if self.cost is not None:
