@@ -108,8 +108,9 @@ def _penalty(eta: Number, target: TargetShare, loss: Number, config: AdaptConfig
 
 
 def lifted_slope(
-    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, temperature: float, lift: bool | Tensor
-) -> Tensor:
+    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, temperature: float,
+    lift: bool | Tensor,
+) -> Tensor:  # fmt: skip
     """``[N]`` ``count_slope``; with ``lift`` (0-d) at least ``LIFT / (temperature N)`` for culled Gaussians."""
     slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, temperature)
     return slope.clamp_(min=(lift & ~dialled.keep) * (LIFT / (temperature * len(slope))))
