@@ -32,17 +32,24 @@ SHAPES = ((320, 200), (640, 400), (1280, 800), (1600, 1000))  # sizes, of FEW ph
 SAID = {
     "load": r": \d+ photographs to train on", "base": r"^base: ", "train": r"^trained ", "write": r"^wrote ",
 }  # fmt: skip
-# The pruning order by itself, on the Gaussians of the file: the report counts it in "start".
-ORDER = """
+# Importance and the pruning order by themselves, on the Gaussians of the file: the report has all of "start".
+PARTS = """
 import sys, time, torch
-from clod_adapter import load
+from pathlib import Path
+from clod_adapter import load, load_scene
+from clod_adapter.initialization.importance import removal_error
 from clod_adapter.initialization.pruning_order import pruning_order
-g = load(sys.argv[1]).gaussians
-worth = torch.rand(len(g), generator=torch.Generator().manual_seed(0)) ** 4
-pruning_order(g.select(torch.arange(min(len(g), 1000))), worth[:1000])
-began, cpu = time.perf_counter(), time.process_time()
-pruning_order(g, worth)
-print(time.perf_counter() - began, time.process_time() - cpu)
+g, views = load(Path(sys.argv[1]) / "city.ply").gaussians, load_scene(sys.argv[1]).train
+few = g.select(torch.arange(min(len(g), 1000)))
+worth = removal_error(few, views[:1])
+pruning_order(few, worth)
+def timed(run, *given):
+    began, cpu = time.perf_counter(), time.process_time()
+    found = run(*given)
+    print(time.perf_counter() - began, time.process_time() - cpu)
+    return found
+error = timed(removal_error, g, views)
+timed(pruning_order, g, error.sqrt() * g.opacities)
 """
 
 
@@ -129,10 +136,11 @@ def by_phase(run: Process, ends: Iterable[tuple[str, float]]) -> tuple[dict[str,
     return peaks, seconds
 
 
-def order_seconds(folder: Path) -> Row:
-    printed = Process([sys.executable, "-c", ORDER, folder / "city.ply"]).out.split()
-    wall, cpu = (round(float(word), 3) for word in printed)
-    return {"order_seconds": wall, "order_cpu": cpu}
+def parts_of_start(folder: Path) -> Row:
+    """Wall and CPU seconds of importance and of the pruning order."""
+    words = Process([sys.executable, "-c", PARTS, folder]).out.split()
+    names = [f"{part}_{clock}" for part in ("importance", "order") for clock in ("seconds", "cpu")]
+    return {name: round(float(word), 3) for name, word in zip(names, words, strict=True)}
 
 
 def run_export(folder: Path) -> Row:
@@ -154,7 +162,7 @@ def run_view(folder: Path) -> Row:
 
 
 RUNS = {
-    "adapt": lambda folder: run_adapt(folder) | order_seconds(folder),
+    "adapt": lambda folder: run_adapt(folder) | parts_of_start(folder),
     "eval": lambda folder: Process([*COMMAND, "eval", dial_of(folder), "--images", folder, "--sv", 1, MAX_SV]).cost(),
     "export": run_export,
     "inspect": lambda folder: Process([*COMMAND, "inspect", dial_of(folder)]).cost(),

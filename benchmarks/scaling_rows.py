@@ -36,24 +36,23 @@ def over_count(rows: Sequence[Row], command: str) -> list[Row]:
     return [row for row in rows if row["series"] == "count" and row["command"] == command]
 
 
-PHASES = ("load", "importance", "order", "step", "evaluate", "write")
+PHASES, PARTS = ("load", "importance", "order", "step", "evaluate", "write"), ("importance", "order")
 
 
 def wall(row: Row, phase: str) -> float:
     """Seconds of a command, or of a phase of adapting."""
-    phases = row.get("phases", {})
-    if phase == "importance":
-        return phases["start"] - row["order_seconds"]
-    return row["order_seconds"] if phase == "order" else phases[phase] if phase else row["seconds"]
+    if phase in PARTS:
+        return row[f"{phase}_seconds"]
+    return row["phases"][phase] if phase else row["seconds"]
 
 
 def cpu(row: Row, phase: str) -> float:
     """The same in CPU seconds: less affected by other work on the machine."""
-    if not phase or phase == "order":
-        return row["order_cpu"] if phase else row["cpu_seconds"]
+    if not phase or phase in PARTS:
+        return row[f"{phase}_cpu"] if phase else row["cpu_seconds"]
     of = row["phase_cpu"]
     return {
-        "load": of["load"], "importance": of["start"] - row["order_cpu"], "step": of["train"] / row["steps"],
+        "load": of["load"], "step": of["train"] / row["steps"],
         "evaluate": of["base"] + of["measure and write again"] - of["write"], "write": of["write"],
     }[phase]  # fmt: skip
 
