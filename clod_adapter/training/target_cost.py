@@ -32,6 +32,7 @@ DRAWN, TILE = 5.0, 6.0
 EXPONENT = 1.0  # of the curve
 # Dial values and views at which shares are measured, and how often in a training.
 DIALS, VIEWS, MEASURED = 5, 6, 5
+SHARES = 0.5, 1.0  # of the cost at s = 1, where the curve may begin; below a half it would rise from there
 # An opaque Gaussian hides what is behind it, where blocks end sooner: that saves more than its larger ellipse costs.
 HIDING = 1.0
 CHANGING = ("opacity_logits", "log_scales", "log_sigma", "growth_d")  # what the cost is a function of
@@ -63,7 +64,8 @@ class TargetCost:
     with a its opacity and b the sum of its log_scales in the base, a_d the drawn opacity and g the growth at the
     typical distance, t the sum of the log_scales less b: an ellipse ends where alpha is 1/255. The model
     ignores that fewer Gaussians hide less. So the share is measured in renderings, MEASURED times in a training, and
-    corrected by one factor for each of some dial values.
+    corrected by one factor for each of some dial values. The curve begins at the share that the first measurement finds
+    at s = 1, the cost of the Gaussians that the initial dial keeps there; within SHARES, as for counts.
 
     Args:
         base: its dial is ignored; cameras: of views, at least one.
@@ -73,10 +75,8 @@ class TargetCost:
         log_scales, reach: ``[N]`` b, and log(255 a), at least FAINTEST.
         cameras: that shares are measured from; whole: the base's mean cost there.
         dials: the dial values that are measured.
-        share: of the base's cost at s = 1, where the curve begins: the plan's share of the Gaussians, of which the
-            small ones are left out first; so it is a little less than these cost.
-        measured: ``[1 + DIALS]`` float64, the share of the training at which the next measurement is due, and the
-            factors.
+        measured: ``[2 + DIALS]`` float64, the share of the training at which the next measurement is due; the share of
+            the base's cost at s = 1, where the curve begins; and the factors.
     """
 
     def __init__(self, base: Gaussians, cameras: Sequence[Camera], config: AdaptConfig) -> None:
@@ -91,8 +91,7 @@ class TargetCost:
         self.cameras = cameras[:: -(-len(cameras) // VIEWS)]
         self.whole = max(fmean(view_cost(plain, camera) for camera in self.cameras), 1.0)
         self.dials = [config.max_sv ** (k / (DIALS - 1)) for k in range(DIALS)]
-        self.measured = torch.tensor([0.0] + [1.0] * DIALS, dtype=torch.float64)
-        self.share = config.share
+        self.measured = torch.tensor([0.0, config.share] + [1.0] * DIALS, dtype=torch.float64)
 
     def due(self, share_done: float) -> bool:
         """Whether a measurement is due."""
@@ -102,7 +101,7 @@ class TargetCost:
     def measure(self, gaussians: Gaussians, typical: Tensor, share_done: float) -> None:
         """Compares the modelled share with that of renderings, at each dial value."""
         assert gaussians.sigma_d is not None and gaussians.attenuation is not None
-        here = gaussians.to(CPU)
+        here, first = gaussians.to(CPU), float(self.measured[0]) == 0
         for k, s in enumerate(self.dials):
             cost = fmean(view_cost(here, camera, s) for camera in self.cameras)
             dialled = attenuate(
@@ -110,14 +109,16 @@ class TargetCost:
                 growth_d=gaussians.growth_d,
             )  # fmt: skip
             modelled = float(self.modelled(dialled, gaussians.log_scales).sum()) / self.total
-            self.measured[1 + k] = min(max(cost / self.whole / max(modelled, 1e-9), 1 / MOST), MOST)
+            if first and s == 1:
+                self.measured[1] = min(max(cost / self.whole, SHARES[0]), SHARES[1])
+            self.measured[2 + k] = min(max(cost / self.whole / max(modelled, 1e-9), 1 / MOST), MOST)
         self.measured[0] = math.floor(share_done * MEASURED + 1) / MEASURED
 
     def factor(self, virtual_scale: float) -> float:
         """The measured share over the modelled one, between the dial values linear in log s."""
         place = min(math.log(virtual_scale) / max(math.log(self.dials[-1]), 1e-9), 1.0) * (DIALS - 1)
         left = min(int(place), DIALS - 2)
-        low, high = self.measured[1 + left : 3 + left].tolist()
+        low, high = self.measured[2 + left : 4 + left].tolist()
         return low + (high - low) * (place - left)
 
     def modelled(self, dialled: Attenuated, log_scales: Tensor) -> Tensor:
@@ -153,7 +154,7 @@ class TargetCost:
         cost = self.modelled(dialled, scales).sum() / self.total
         found = dict(zip(names, torch.autograd.grad(cost, list(leaves.values())), strict=True))
         found["opacity_logits"] = found["opacity_logits"] * -HIDING
-        target = target_curve(s, self.share, EXPONENT)
+        target = target_curve(s, float(self.measured[1]), EXPONENT)
         penalty = 2 * loss * config.reg_weight * (cost.detach().double() * self.factor(s) / target - 1) / target
         found["log_sigma"] = found["log_sigma"] + self._cull(
             dialled, logits, scales, s, attenuation, config, penalty < 0

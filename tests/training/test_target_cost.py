@@ -93,9 +93,34 @@ def test_a_measurement_corrects_the_model(model: Gaussians) -> None:
     assert not torch.equal(cost.measured, factors)
 
 
+def test_the_curve_begins_at_the_cost_of_the_initial_dial(model: Gaussians) -> None:
+    """At s = 1 nothing is penalised then, whatever the share of the Gaussians; later measurements leave it there."""
+    cost, settings = TargetCost(model, CAMERAS, CONFIG), model.attenuation
+    assert settings is not None
+    typical, rows = typical_distance(model.means, CAMERAS, settings), parameters_of(model)
+    cost.measure(model, typical, 0.0)
+    whole = sum(view_cost(detach(model), camera) for camera in CAMERAS)
+    share = sum(view_cost(model, camera, 1.0) for camera in CAMERAS) / whole
+    assert 0.5 < share < 1 and abs(share - CONFIG.share) > 0.02, "the test needs another share than the config's"
+    assert float(cost.measured[1]) == pytest.approx(share)
+    at_one, far = (cost.gradients(rows, typical, s, 1.0, settings, CONFIG) for s in (1.0, 4.0))
+    assert all(float(at_one[name].abs().max()) < 1e-3 * float(far[name].abs().max()) for name in far)
+    cost.measure(model.replace(log_scales=model.log_scales - 1), typical, 0.2)
+    assert float(cost.measured[1]) == pytest.approx(share)
+
+
+@pytest.mark.parametrize(("opacity", "share"), [(-9.0, 0.5), (9.0, 1.0)])
+def test_where_the_curve_may_begin(model: Gaussians, opacity: float, share: float) -> None:
+    """Of an initial dial that keeps nothing, or nearly everything."""
+    cost = TargetCost(model, CAMERAS, CONFIG)
+    typical = typical_distance(model.means, CAMERAS, model.attenuation)  # type: ignore[arg-type]
+    cost.measure(model.replace(opacity_logits=torch.full((N,), opacity), sigma_d=torch.full((N,), 1e4)), typical, 0.0)
+    assert float(cost.measured[1]) == share
+
+
 def test_factors_between_dial_values(model: Gaussians) -> None:
     cost = TargetCost(model, CAMERAS, CONFIG)
-    cost.measured[1:] = torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0])
+    cost.measured[2:] = torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0])
     assert [cost.factor(4.0**k) for k in (0, 0.125, 0.25, 1.0)] == pytest.approx([1.0, 1.5, 2.0, 5.0])
     assert cost.factor(6.0) == pytest.approx(5.0)  # counted beyond max_sv
 
@@ -117,7 +142,7 @@ def test_gradients(model: Gaussians, above: bool) -> None:
         return cost.modelled(dialled, model.log_scales).sum() / cost.total
 
     now = float(share(rows["growth_d"]))
-    cost.measured[1:] = target_curve(s, CONFIG.share, EXPONENT) / now * (1.5 if above else 0.5)
+    cost.measured[2:] = target_curve(s, CONFIG.share, EXPONENT) / now * (1.5 if above else 0.5)
     found = cost.gradients(rows, typical, s, 1.0, assumed, CONFIG)
     sign = 1 if above else -1
     kept = attenuate(model.opacity_logits, model.sigma_d, typical, s, assumed).keep
