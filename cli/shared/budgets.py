@@ -77,12 +77,12 @@ def _calibration_for(name: str, option: str, model: Checkpoint) -> Calibration |
 def time_frames(
     model: Checkpoint, cameras: Sequence[Camera], console: Console
 ) -> tuple[list[tuple[float, float]], list[str]]:
-    """``budget.frame_times`` with a progress bar, and a note on the result."""
+    """``budget.frame_times`` with a progress bar, and notes on the result."""
     prepare_kernels(console, model.gaussians.means.device, training=False)
     with console.meter("timing") as meter:
-        times = frame_times(model.gaussians, cameras, progress=meter)
+        times, notes = frame_times(model.gaussians, cameras, progress=meter)
     (first, slow), (last, fast) = times[0], times[-1]
-    return times, [f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}"]
+    return times, [f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}", *notes]
 
 
 def calibrate(rows: Sequence[Row], measured: Gaussians, scene: Scene, against: str, origin: Origin) -> Calibration:

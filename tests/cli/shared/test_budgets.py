@@ -68,15 +68,16 @@ def test_eval_times_frames_for_a_frame_rate(
 ) -> None:
     seen: list[int] = []
 
-    def times(gaussians: Any, cameras: Any, progress: Any) -> list[tuple[float, float]]:
+    def times(gaussians: Any, cameras: Any, progress: Any) -> tuple[list[tuple[float, float]], list[str]]:
         seen.append(len(cameras))
-        return [(1.0, 8.0), (2.0, 4.0), (4.0, 2.0)]
+        return [(1.0, 8.0), (2.0, 4.0), (4.0, 2.0)], ["rough"]
 
     monkeypatch.setattr(budgets, "frame_times", times)
     report = json.loads(clod("eval", dialled, "--images", capture.scene, "--fps", 250, 10, "--json").out)
     assert [row["virtual_scale"] for row in report["rows"]] == [2, 1] and seen == [2]
     assert notes_of(report) == [
         "frames timed here: 8.0 ms at s = 1, 2.0 ms at s = 4",
+        "rough",
         "--fps 250: s = 2",
         "--fps 10: s = 1 (s = 1 draws 125 frames a second already)",
     ]
