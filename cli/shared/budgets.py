@@ -52,6 +52,7 @@ def solve_dials(
         machine = f" (frame times of {calibration.machine} at {calibration.width}x{calibration.height})"
     dials = []
     for value in values:
+        asked = f"{option} {value}" if isinstance(value, int) else f"{option} {value:g}"
         try:
             if times:
                 solved = dial_for_times(times, value)
@@ -59,10 +60,10 @@ def solve_dials(
                 budgets = {name: value}
                 solved = dial_for(model.gaussians, **budgets, cameras=cameras, calibration=calibration, baked=baked)
         except ClodError as error:
-            raise ClodError(f"{option} {value:g}: {error}{machine}") from error
+            raise ClodError(f"{asked}: {error}{machine}") from error
         dials.append(solved.virtual_scale)
         note = solved.note and f" ({solved.note})"
-        notes.append(f"{option} {value:g}: s = {solved.virtual_scale:.5g}{note}{machine}")
+        notes.append(f"{asked}: s = {solved.virtual_scale:.5g}{note}{machine}")
     return dials, notes
 
 
