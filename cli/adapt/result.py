@@ -97,8 +97,8 @@ def measure_result(setup: Setup, inputs: Inputs, result: Result, stop: GracefulS
             return Measurements(inputs.base_rows, tuple(rows), interrupted=True)
         detached = detach(result.gaussians)
         plain, interrupted = measure(detached, views, [1.0], console, "plain", stop=stop)
-        notes, found = list[str](), [inputs.base_rows, rows, plain]
+        base, notes = list(inputs.base_rows), list[str]()
         if not interrupted:
-            models = zip((inputs.base.gaussians, result.gaussians, detached), found, strict=True)
-            found, notes, interrupted = with_frame_times([*models], views, console, stop)
-    return Measurements(*map(tuple, found), tuple(notes), interrupted)
+            measured = [(inputs.base.gaussians, base), (result.gaussians, rows), (detached, plain)]
+            (base, rows, plain), notes, interrupted = with_frame_times(measured, views, console, stop)
+    return Measurements(tuple(base), tuple(rows), tuple(plain), tuple(notes), interrupted)

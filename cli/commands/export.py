@@ -163,11 +163,12 @@ baking:
   0.5 dB lower). With --camera the file is exact at that camera.
 
 budgets:
-  --keep is exact: OUT has N Gaussians. --device-preset is --keep with the number
-  that viewers allow a device; a file with fewer is baked at s = 1. With --images, --psnr-drop finds the
-  smallest file that measures at most DB below MODEL at s = 1 on the held-out
-  photographs (splat-transform's rounding is measured afterwards), and --fps
-  times frames of MODEL. Without --images both use the calibration in MODEL.
+  --keep is exact: OUT has N Gaussians. --device-preset is --keep with the
+  number that viewers allow a device; a file with fewer is baked at s = 1. With
+  --images, --psnr-drop finds the smallest file that measures at most DB below
+  MODEL at s = 1 on the held-out photographs (splat-transform's rounding is
+  measured afterwards), and --fps times frames of MODEL. Without --images both
+  use the calibration in MODEL.
 
 levels and order:
   --levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on, all or none. With
