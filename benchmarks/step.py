@@ -25,7 +25,7 @@ import torch
 
 FILE = "step.jsonl"
 THREADS = 2
-SECTIONS = {"attenuate": "attenuate", "count_gradient": "count", "splat": "splat forward", "photometric_loss": "loss"}
+SECTIONS = {"count_gradient_at": "count", "photometric_loss": "loss"}
 
 
 class Clock:
@@ -59,7 +59,8 @@ def main() -> None:
     for name, section in SECTIONS.items():
         clock.wrap(objective, name, section)
     clock.wrap(torch.autograd, "grad", "backward")
-    clock.wrap(cpu._Splat, "backward", "splat backward")
+    clock.wrap(cpu, "draw", "splat forward")
+    clock.wrap(cpu._Drawn, "backward", "splat backward")
     clock.wrap(optimizer.RowAdam, "step", "optimiser")
     for scene in args.scenes:
         row = {"benchmark": "step", "scene": scene, "threads": THREADS, **profile(scene, 120, clock)}

@@ -134,7 +134,6 @@ def _behind(gaussians: Gaussians, background: Tensor | None) -> Tensor:
 
 
 def _drawn_at_once(gaussians: Gaussians, background: Tensor | None) -> bool:
-    """Whether the CPU's rasterizer can apply the dial itself: nothing asks for a gradient."""
+    """Whether the CPU's rasterizer can apply the dial itself."""
     given = [*gaussians.tensors().values(), *([] if background is None else [background])]
-    single = all(x.device.type == "cpu" and x.dtype == torch.float32 for x in given)
-    return single and not (torch.is_grad_enabled() and any(x.requires_grad for x in given))
+    return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in given)

@@ -198,9 +198,9 @@ WITHOUT_GROWTH = (
 )  # fmt: skip
 
 
-# Frames that nothing is differentiated through: the CPU's kernel has an equation of its own, which
-# tests/kernels/test_dial.py compares with this one. The threshold is this one's there too.
-COMPILED = ("render", "evaluate", "popping")
+# The CPU's kernels have an equation of their own, which tests/kernels compares with this one. The threshold is this
+# one's there too.
+COMPILED = ("render", "evaluate", "popping", "objective", "objective of a block")
 
 
 def same(these: list[Any], those: list[Any]) -> bool:

@@ -20,7 +20,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import usable_views
 from clod_adapter.io.scene.image_cache import ImageCache
 from clod_adapter.progress import Phase, Stopped
-from clod_adapter.rasterizers.cpu import release_memory
+from clod_adapter.rasterizers.frame import release_memory
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.planner import make_plan
 from clod_adapter.training.state import Adapted

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from clod_adapter.progress import Phase
-from clod_adapter.rasterizers.cpu import release_memory
+from clod_adapter.rasterizers.frame import release_memory
 from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from clod_adapter.io.lock import output_lock
 from clod_adapter.progress import Progress
-from clod_adapter.rasterizers.cpu import release_memory
+from clod_adapter.rasterizers.frame import release_memory
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 

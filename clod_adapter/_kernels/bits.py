@@ -54,3 +54,15 @@ def lowest(typingctx, bits):  # type: ignore[no-untyped-def]
         return builder.call(function, [args[0], ir.Constant(ir.IntType(1), 1)])
 
     return types.int64(types.uint64), codegen
+
+
+@intrinsic
+def ones(typingctx, bits):  # type: ignore[no-untyped-def]
+    """How many bits of a uint64 are set."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        i64 = ir.IntType(64)
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(i64, [i64]), "llvm.ctpop.i64")
+        return builder.call(function, args)
+
+    return types.int64(types.uint64), codegen

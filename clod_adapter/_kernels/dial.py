@@ -3,7 +3,7 @@
 ``kept`` reads the 20 bytes of a Gaussian that decide whether it is culled, sixteen consecutive ones at a time; what is
 culled costs nothing after that. What is kept gets its drawn opacity and its scales where these are projected. All in
 float32: of a few hundred thousand Gaussians, one at the culling threshold may be judged otherwise than by the equation,
-with an opacity of 0 there (soft cut).
+with an opacity of 0 there (soft cut). A row whose sigma is infinite has no dial and no cut.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from clod_adapter._kernels.conventions import (
     GROWTH_RATE,
     HALF,
     HALF_EPS,
+    HUGE,
     LOG2E,
     LOG_THRESHOLD,
     MEAN,
@@ -34,7 +35,7 @@ from clod_adapter._kernels.conventions import (
 from clod_adapter._kernels.elementary import exp2, log2, vsqrt
 from clod_adapter._kernels.pointers import pointer, scratch
 from clod_adapter._kernels.project import add_records, load_stored
-from clod_adapter._kernels.rows import load_triples
+from clod_adapter._kernels.rows import load_rows, load_triples
 from clod_adapter._kernels.simd import both, f32x16, ge, gt, load, select, splat, vmax, vmin
 
 LN2 = float32(0.6931471805599453)
@@ -65,17 +66,40 @@ def reciprocal_opacity(logit):  # type: ignore[no-untyped-def]
 
 
 @part
+def survives(w, logit, decay, cam, dial):  # type: ignore[no-untyped-def]
+    """Which of sixteen rows with centres ``w[:3]`` the dial keeps."""
+    u = exponent(distance(w[0], w[1], w[2], cam), decay, dial)
+    log_opacity = -(LN2 * log2(reciprocal_opacity(logit))) - u
+    return gt(select(gt(splat(HUGE), decay), log_opacity, splat(ZERO)), splat(dial[LOG_THRESHOLD]))
+
+
+@part
 def kept(at, many, means, logits, sigma, cam, dial, dialled):  # type: ignore[no-untyped-def]
     """The bits of those of ``many`` rows from ``at`` on that are in front of the camera and not culled."""
     w = scratch(f32x16, 3)
     load_triples(means, 3 * at, w)
     depth = cam[8] * w[0] + cam[9] * w[1] + cam[10] * w[2] + cam[11]
     shown = ge(depth, splat(NEARLY * cam[NEAR]))
-    logit = load(logits, at)
     if dialled:
-        u = exponent(distance(w[0], w[1], w[2], cam), load(sigma, at), dial)
-        shown = both(shown, gt(-(LN2 * log2(reciprocal_opacity(logit))) - u, splat(dial[LOG_THRESHOLD])))
+        shown = both(shown, survives(w, load(logits, at), load(sigma, at), cam, dial))
     return bits_of(shown) & ((uint64(1) << uint64(many)) - uint64(1))
+
+
+@kernel
+def mark_kept(worker, workers, means, logits, sigma, cam, dial, out):  # type: ignore[no-untyped-def]
+    """``out [N]`` uint8: 1 for rows that the dial keeps, in front of the camera or not."""
+    first, last = len(logits) * worker // workers, len(logits) * (worker + 1) // workers
+    means, logits, sigma, out = pointer(means), pointer(logits), pointer(sigma), pointer(out)
+    cam, dial = pointer(cam), pointer(dial)
+    w, rows, values = scratch(f32x16, 16), scratch(int64, 16), scratch(float32, 32)
+    for i in range(first, last, 16):
+        for lane in range(16):
+            rows[lane] = min(i + lane, last - 1)
+            values[lane], values[16 + lane] = logits[rows[lane]], sigma[rows[lane]]
+        load_rows(means, rows, 3, 0, 3, w, 0)
+        bits = bits_of(survives(w, load(values, 0), load(values, 16), cam, dial))
+        for lane in range(min(last - i, 16)):
+            out[i + lane] = (bits >> uint64(lane)) & uint64(1)
 
 
 @part
@@ -90,10 +114,12 @@ def drawn(rows, logits, sigma, growth, cam, dial, dialled, grows, w):  # type: i
         for lane in range(16):
             values[16 + lane] = sigma[rows[lane]]
         d = distance(w[MEAN], w[MEAN + 1], w[MEAN + 2], cam)
-        opacity = opacity * exp2(-(LOG2E * exponent(d, load(values, 16), dial)))
+        decay = load(values, 16)
+        opacity = opacity * exp2(-(LOG2E * exponent(d, decay, dial)))
         if dial[SOFT] > ZERO:
             fade = TWO * (opacity / splat(dial[THRESHOLD])) - TWO
-            opacity = opacity * vmin(vmax(fade, splat(ZERO)), splat(ONE))
+            fade = select(gt(splat(HUGE), decay), vmin(vmax(fade, splat(ZERO)), splat(ONE)), splat(ONE))
+            opacity = opacity * fade
         if grows:
             for lane in range(16):
                 values[32 + lane] = growth[rows[lane]]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import weakref
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,219 +10,134 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from clod_adapter._kernels import blend, blocks, conventions, dial, project, project_gradient, threads, tiles
-from clod_adapter._kernels.memory import aligned, recycled, release
+from clod_adapter._kernels import blocks, conventions, dial, dial_gradient, project, project_gradient, threads, tiles
+from clod_adapter._kernels.memory import recycled
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
-from clod_adapter.equation.attenuation import culling_threshold, log_threshold
 from clod_adapter.equation.distances import camera_unit
-from clod_adapter.equation.growth import growth_distance
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.rasterizers.frame import Frame, camera_vector, dial_vector, give, prepare, workers_for
 from clod_adapter.rasterizers.protocol import require_float32
-
-FEW = 4096  # rows that one thread projects or lists in about a tenth of a millisecond
-
-
-class _Buffers:
-    """Scratch arrays kept between calls: page faults of a new large array cost more than the work on it."""
-
-    def __init__(self) -> None:
-        self._arrays: dict[str, np.ndarray] = {}
-
-    def get(self, name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-        size = math.prod(shape)
-        flat = self._arrays.get(name)
-        if flat is None or flat.size < size:
-            flat = self._arrays[name] = aligned(size + size // 4, dtype)
-        return flat[:size].reshape(shape)
-
-
-_idle: list[_Buffers] = []
-
-
-def _take() -> _Buffers:
-    try:
-        return _idle.pop()
-    except IndexError:
-        return _Buffers()
-
-
-def _give(buffers: _Buffers) -> None:
-    # No lock: this runs as a finalizer, perhaps within _take of the same thread. List operations are atomic.
-    if len(_idle) < 4:
-        _idle.append(buffers)
-
-
-def release_memory() -> None:
-    """Frees the scratch memory of earlier renders."""
-    _idle.clear()
-    release()
-
-
-@dataclass
-class _Frame:
-    """State of the forward pass for the backward pass. The arrays are views of pooled buffers."""
-
-    buffers: _Buffers
-    camera: np.ndarray
-    width: int
-    height: int
-    across: int
-    records: np.ndarray
-    packed_ids: np.ndarray
-    counts: np.ndarray
-    slots: np.ndarray
-    entries: np.ndarray
-    entry_slots: np.ndarray
-    masks: np.ndarray
-    offsets: np.ndarray
-    tiles: np.ndarray
-    compensated: bool | None
-    workers: int
-
-    def room(self, size: int) -> np.ndarray:
-        """Scratch floats for each worker."""
-        return self.buffers.get("room", (self.workers, size), np.float32)
-
-
-def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.ndarray:
-    """Camera and screen-space filter in the layout of the kernels (``_kernels/conventions.py``)."""
-    out = np.empty(conventions.CAMERA, np.float32)
-    viewmat, K = (x.detach().cpu().double().numpy() for x in (camera.viewmat, camera.K))
-    fx, fy, cx, cy = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-    out[:16] = viewmat.reshape(-1)
-    out[16:22] = fx, fy, cx, cy, camera.width, camera.height
-    margin_x, margin_y = 0.15 * camera.width / fx, 0.15 * camera.height / fy
-    out[22:24] = -(cx / fx + margin_x), (camera.width - cx) / fx + margin_x
-    out[24:26] = -(cy / fy + margin_y), (camera.height - cy) / fy + margin_y
-    out[26:29] = -viewmat[:3, 3] @ viewmat[:3, :3]
-    out[conventions.NEAR] = camera.near
-    out[conventions.BLUR], out[conventions.COMPENSATE] = screen_filter.variance, screen_filter.compensate
-    return out
-
-
-def _workers_for(rows: int) -> int:
-    """One for few rows, whose work takes less time than waking another thread."""
-    return threads.worker_count() if rows >= FEW else 1
-
-
-def _sorted(
-    buffers: _Buffers, kernel: Any, n: int, inputs: tuple[Any, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Runs a projection. Packed records of the visible of n Gaussians, their row numbers, the count of each worker, and
-    the depth order."""
-    workers = _workers_for(n)
-    records = buffers.get("records", ((n + workers) * conventions.RECORD,), np.float32)
-    depths, packed_ids = buffers.get("depths", (n,), np.float32), buffers.get("packed_ids", (n,), np.int32)
-    counts = np.zeros(workers, np.int64)
-    threads.run(kernel, workers, *inputs, records, depths, packed_ids, counts)
-    visible = int(counts.sum())
-    keys, order = buffers.get("keys", (visible,), np.uint32), buffers.get("order", (visible,), np.int32)
-    other = buffers.get("keys2", (visible,), np.uint32), buffers.get("order2", (visible,), np.int32)
-    return records, packed_ids, counts, tiles.depth_order(depths.view(np.uint32), counts, keys, order, *other)
-
-
-def _prepare(
-    kernel: Any, arrays: list[np.ndarray], degree: int, camera: Camera, screen_filter: ScreenFilter, *more: np.ndarray
-) -> _Frame:
-    """Projection, depth order and tile lists. The kernel takes ``arrays``, the SH degree, the camera and ``more``."""
-    buffers, cam, n = _take(), camera_vector(camera, screen_filter), len(arrays[0])
-    records, packed_ids, counts, order = _sorted(buffers, kernel, n, (*arrays, degree, cam, *more))
-    across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
-    listing = _workers_for(len(order))
-    histogram, totals = np.empty((listing, across * down), np.int64), np.empty(listing, np.int64)
-    offsets, slots = np.empty(across * down + 1, np.int64), buffers.get("slots", (2 * n,), np.int64)
-    threads.run(tiles.count_tiles, listing, records, order, across, histogram, totals)
-    total = tiles.tile_offsets(histogram, offsets, totals)
-    entries, entry_slots = buffers.get("entries", (total,), np.int32), buffers.get("entry_slots", (total,), np.int32)
-    threads.run(tiles.fill_tiles, listing, records, order, across, histogram, totals, slots, entries, entry_slots)
-    # Longest lists first: no thread starts a long tile when the others are done.
-    longest_first = np.argsort(-np.diff(offsets), kind="stable")
-    return _Frame(
-        buffers, cam, camera.width, camera.height, across, records, packed_ids, counts, slots, entries,
-        entry_slots, buffers.get("masks", (total * blocks.WORDS,), np.uint64), offsets, longest_first,
-        screen_filter.compensate or None, threads.worker_count(),
-    )  # fmt: skip
-
-
-def _blend(frame: _Frame, background: np.ndarray) -> tuple[Tensor, Tensor]:
-    """The image and its alpha."""
-    image, alpha = recycled((frame.height, frame.width, 3)), recycled((frame.height, frame.width))
-    threads.run(
-        blend.blend, frame.workers, frame.records, frame.entries, frame.offsets, frame.across, frame.width,
-        frame.height, background, frame.tiles, np.zeros(1, np.int64), frame.room(blocks.FORWARD_STATE), frame.masks,
-        image.numpy(), alpha.numpy(),
-    )  # fmt: skip
-    return image, alpha
 
 
 def _arrays(tensors: Any) -> list[np.ndarray]:
-    """Contiguous float32 arrays of means, quats, scales, opacities, sh0 and shN; the SH flat."""
+    """Contiguous float32 arrays; those of harmonics flat."""
     arrays = [x.detach().contiguous().numpy() for x in tensors]
-    return [*arrays[:4], arrays[4].reshape(-1), arrays[5].reshape(-1)]
+    return [array.reshape(-1) if array.ndim == 3 else array for array in arrays]
+
+
+def _gradients(kernel: Any, frame: Frame, inputs: list[Tensor], wanted: list[bool], *given: Any) -> list[Tensor]:
+    """Runs the gradient of a projection; the gradients of its inputs, empty for those that are not wanted."""
+    found = [recycled(x.shape if want else (0, *x.shape[1:])) for x, want in zip(inputs, wanted, strict=True)]
+    threads.run(kernel, len(frame.counts), *given, *_arrays(found))
+    return found
 
 
 class _Splat(torch.autograd.Function):
+    """Of activated opacities and scales."""
+
     @staticmethod
     def forward(ctx: Any, means, quats, scales, opacities, sh0, shN, background, camera, screen_filter, degree):  # type: ignore[no-untyped-def]
         arrays = _arrays((means, quats, scales, opacities, sh0, shN))
-        frame = _prepare(project.project, arrays, degree, camera, screen_filter)
-        image, alpha = _blend(frame, background.detach().contiguous().numpy())
+        frame = prepare(project.project, arrays, degree, camera, screen_filter)
+        image, alpha = frame.blend(background.detach().contiguous().numpy())
         ctx.frame, ctx.degree = frame, degree
         ctx.save_for_backward(means, quats, scales, opacities, sh0, shN, background, image, alpha)
-        weakref.finalize(frame, _give, frame.buffers)
+        weakref.finalize(frame, give, frame.buffers)
         return image, alpha
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor):  # type: ignore[no-untyped-def, override]
-        *inputs, background, image, alpha = ctx.saved_tensors
-        frame: _Frame = ctx.frame
-        v_image, v_alpha = (g.contiguous().numpy() for g in gradients)
-        *arrays, _sh0, shN = _arrays(inputs)
+        *inputs, _background, image, alpha = ctx.saved_tensors
+        frame, need = ctx.frame, ctx.needs_input_grad
         # Unused sums are skipped. Above SH degree 0, a mean changes the colour too.
-        shaped = any(ctx.needs_input_grad[:3])
-        colored = any(ctx.needs_input_grad[4:6]) or (shaped and ctx.degree > 0)
-        # Reads of the last pair are sixteen floats wide too.
-        pair_sums = frame.buffers.get("pair_sums", (len(frame.entries) * conventions.PAIR + 16,), np.float32)
-        threads.run(
-            blend.blend_gradient, frame.workers, frame.records, frame.entries, frame.entry_slots, frame.offsets,
-            frame.across, frame.width, frame.height, image.numpy(), alpha.numpy(), v_image, v_alpha, frame.tiles,
-            np.zeros(1, np.int64), frame.room(blocks.BACKWARD_STATE), frame.masks, shaped, colored, pair_sums,
+        shaped = any(need[:3])
+        colored = any(need[4:6]) or (shaped and ctx.degree > 0)
+        pair_sums = frame.blend_gradient(image, alpha, *gradients, shaped, colored)
+        *arrays, _sh0, shN = _arrays(inputs)
+        found = _gradients(
+            project_gradient.project_gradient, frame, inputs, [shaped] * 3 + [True, need[4], need[5]], *arrays, shN,
+            ctx.degree, frame.camera, frame.records, frame.packed_ids, frame.counts, frame.slots, pair_sums,
+            frame.compensated,
         )  # fmt: skip
-        wanted = [shaped] * 3 + [True, ctx.needs_input_grad[4], ctx.needs_input_grad[5]]
-        grads = [recycled(x.shape if want else (0, *x.shape[1:])) for x, want in zip(inputs, wanted, strict=True)]
-        threads.run(
-            project_gradient.project_gradient, len(frame.counts), *arrays, shN, ctx.degree, frame.camera, frame.records,
-            frame.packed_ids, frame.counts, frame.slots, pair_sums, frame.compensated, *_arrays(grads),
+        wanted = [g if asked else None for g, asked in zip(found, need, strict=False)]
+        return *wanted, _of_background(need[6], alpha, gradients[0]), None, None, None
+
+
+class _Drawn(torch.autograd.Function):
+    """Of Gaussians as they are stored, at one dial value. Without a dial, ``sigma_d`` is empty, without growth its."""
+
+    @staticmethod
+    def forward(  # type: ignore[no-untyped-def]
+        ctx: Any, means, quats, log_scales, logits, sigma_d, growth_d, sh0, shN, background, camera, screen_filter,
+        degree, dialling, trained,
+    ):  # fmt: skip
+        inputs = (means, quats, log_scales, logits, sigma_d, growth_d, sh0, shN)
+        frame = prepare(dial.project_dialled, _arrays(inputs), degree, camera, screen_filter, dialling)
+        image, alpha = frame.blend(background.detach().contiguous().numpy())
+        ctx.frame, ctx.degree, ctx.dialling, ctx.trained = frame, degree, dialling, trained
+        ctx.save_for_backward(*inputs, background, image, alpha)
+        weakref.finalize(frame, give, frame.buffers)
+        return image, alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor):  # type: ignore[no-untyped-def, override]
+        *inputs, _background, image, alpha = ctx.saved_tensors
+        frame, need = ctx.frame, ctx.needs_input_grad
+        shaped = any(need[:3]) or need[5]
+        colored = any(need[6:8]) or (shaped and ctx.degree > 0)
+        pair_sums = frame.blend_gradient(image, alpha, *gradients, shaped, colored)
+        *arrays, _sh0, shN = _arrays(inputs)
+        found = _gradients(
+            dial_gradient.project_dialled_gradient, frame, inputs, [shaped] * 3 + [True] * 3 + [need[6], need[7]],
+            *arrays, shN, ctx.degree, frame.camera, ctx.dialling, frame.records, frame.packed_ids, frame.counts,
+            frame.slots, pair_sums, frame.compensated, ctx.trained,
         )  # fmt: skip
-        v_background = ((1 - alpha)[..., None] * gradients[0]).sum((0, 1)) if ctx.needs_input_grad[6] else None
-        wanted = [g if need else None for g, need in zip(grads, ctx.needs_input_grad, strict=False)]
-        return *wanted, v_background, None, None, None
+        wanted = [g if asked else None for g, asked in zip(found, need, strict=False)]
+        return *wanted, _of_background(need[8], alpha, gradients[0]), None, None, None, None, None
+
+
+def _of_background(needed: bool, alpha: Tensor, v_image: Tensor) -> Tensor | None:
+    return ((1 - alpha)[..., None] * v_image).sum((0, 1)) if needed else None
+
+
+def draw(
+    gaussians: Gaussians, camera: Camera, virtual_scale: float, background: Tensor, trained: int | None = None
+) -> tuple[Tensor, Tensor]:
+    """Image and alpha at one dial value, as ``attenuate`` and ``rasterize`` give them, differentiable.
+
+    The dial is the first part of the projection, and the last of its gradient: what it culls is not touched again,
+    and nothing is copied. All tensors are float32. A row whose sigma_d is infinite has no dial and no cut. Gradients
+    are those of the first ``trained`` rows, and 0 for the others.
+    """
+    return _Drawn.apply(  # type: ignore[no-any-return, no-untyped-call]
+        *_stored(gaussians), background, camera, gaussians.screen_filter, gaussians.sh_degree,
+        _dial_vector(gaussians, camera, virtual_scale), len(gaussians) if trained is None else trained,
+    )  # fmt: skip
+
+
+def _stored(g: Gaussians) -> tuple[Tensor, ...]:
+    """What the kernels of the dial read, in their order."""
+    nothing = torch.empty(0, dtype=torch.float32, device="cpu")
+    sigma_d, growth_d = (nothing if x is None else x for x in (g.sigma_d, g.growth_d))
+    return g.means, g.quats, g.log_scales, g.opacity_logits, sigma_d, growth_d, g.sh0, g.shN
+
+
+def _prepare_dialled(g: Gaussians, camera: Camera, virtual_scale: float) -> Frame:
+    dialling = _dial_vector(g, camera, virtual_scale)
+    return prepare(dial.project_dialled, _arrays(_stored(g)), g.sh_degree, camera, g.screen_filter, dialling)
 
 
 @torch.no_grad()
-def draw(gaussians: Gaussians, camera: Camera, virtual_scale: float, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Image and alpha at one dial value, as ``attenuate`` and ``rasterize`` give them, without gradients.
-
-    The dial is the first part of the projection: what it culls is not touched again, and nothing is copied. All tensors
-    are float32.
-    """
-    frame = _prepare_dialled(gaussians, camera, virtual_scale)
-    found = _blend(frame, background.detach().contiguous().numpy())
-    _give(frame.buffers)
-    return found
-
-
-def _prepare_dialled(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> _Frame:
-    """``_prepare`` of Gaussians as they are stored, at one dial value."""
-    g, nothing = gaussians, torch.empty(0)
-    learned = (nothing if x is None else x for x in (g.sigma_d, g.growth_d))
-    stored = (g.means, g.quats, g.log_scales, g.opacity_logits, *learned)
-    arrays = [x.detach().contiguous().numpy() for x in stored]
-    arrays += [x.detach().contiguous().numpy().reshape(-1) for x in (g.sh0, g.shN)]
-    dial_vector = _dial_vector(g, camera, virtual_scale)
-    return _prepare(dial.project_dialled, arrays, g.sh_degree, camera, g.screen_filter, dial_vector)
+def kept(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
+    """``[N]`` bool, the Gaussians that ``draw`` keeps at this dial value, in the image or not. They have a dial."""
+    found = np.empty(len(gaussians), np.uint8)
+    means, _, _, logits, sigma_d, *_ = _arrays(_stored(gaussians))
+    given = camera_vector(camera, gaussians.screen_filter), _dial_vector(gaussians, camera, virtual_scale)
+    threads.run(dial.mark_kept, workers_for(len(found)), means, logits, sigma_d, *given, found)
+    return torch.from_numpy(found).bool()
 
 
 @torch.no_grad()
@@ -234,7 +147,7 @@ def work(gaussians: Gaussians, camera: Camera, virtual_scale: float = 1.0) -> tu
     A block whose pixels are all opaque already blends no more, so work depends on what is in front.
     """
     frame = _prepare_dialled(gaussians, camera, virtual_scale)
-    _blend(frame, np.zeros(3, np.float32))
+    frame.blend(np.zeros(3, np.float32))
     n, counted = len(gaussians), np.zeros((2, len(gaussians)), np.float32)
     tiles.tally(frame.entries, frame.masks, blocks.WORDS, *counted)
     found = np.zeros_like(counted)
@@ -242,20 +155,15 @@ def work(gaussians: Gaussians, camera: Camera, virtual_scale: float = 1.0) -> tu
         first = n * worker // len(frame.counts)
         packed = slice(first, first + count)
         found[:, frame.packed_ids[packed]] = counted[:, packed]
-    _give(frame.buffers)
+    give(frame.buffers)
     return torch.from_numpy(found[0]), torch.from_numpy(found[1])
 
 
 def _dial_vector(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> np.ndarray:
-    """The dial in the layout of the kernels."""
-    out, config = np.zeros(conventions.DIAL, np.float32), gaussians.attenuation
-    if config is not None:
-        rate = virtual_scale / camera_unit(gaussians.means, camera, config)
-        out[conventions.RATE], out[conventions.GROWTH_RATE] = rate, rate / growth_distance(config)
-        out[conventions.HALF_EPS], out[conventions.SOFT] = config.eps / 2, config.cut == "soft"
-        out[conventions.THRESHOLD] = culling_threshold(config.tau, virtual_scale)
-        out[conventions.LOG_THRESHOLD] = log_threshold(config.tau, virtual_scale)
-    return out
+    config = gaussians.attenuation
+    if config is None:
+        return np.zeros(conventions.DIAL, np.float32)
+    return dial_vector(config, virtual_scale, camera_unit(gaussians.means, camera, config))
 
 
 def rasterize(

@@ -14,17 +14,19 @@ from torch import Tensor
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, AdaptConfig, AttenuationConfig, ScreenFilter
-from clod_adapter.equation.attenuation import SIGMA_MAX, Attenuated, attenuate
+from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
 from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import splat
 from clod_adapter.training.target_cost import TargetCost
-from clod_adapter.training.target_count import TargetShare, count_gradient, paper_count, target_share
+from clod_adapter.training.target_count import TargetShare, count_gradient_at, paper_count, target_share
 from clod_adapter.training.view_sampler import FAR_FIRST, Sample
 
 # Sigma stays where the equation still resolves it; below, a Gaussian would be culled for good.
 SIGMA_RANGE = (1e-4, SIGMA_MAX)
+
+Rendered = tuple[float, Tensor, Tensor, Tensor | None]
 
 
 @dataclass(frozen=True)
@@ -134,15 +136,14 @@ class Objective:
         photograph = view.image.to(decay.device)
         total, kept = decay.new_zeros(()), torch.zeros_like(decay[first], dtype=torch.bool)
         losses, counts = [], []
-        for s, dialled, image in self._rendered(leaves, view.camera, dials):
+        rendered = self._rendered_by_kernels if self._compiled(decay) else self._rendered
+        for s, image, keep, term in rendered(leaves, view.camera, dials):
             loss = photometric_loss(image, photograph, config.ssim_weight)
             losses.append(float(loss.detach()))
             weight = self._weight(s, alone=len(dials) == 1)
-            if config.count_term == "paper" and config.reg_weight > 0:
-                loss = loss + paper_count(dialled, s, self.attenuation.tau, config, self.part.total)
-            total = total + weight * loss
+            total = total + weight * (loss if term is None else loss + term)
             counts.append((s, weight * losses[-1]))
-            kept |= dialled.keep[first]
+            kept = kept | keep
         if counted is not None:
             # Halfway to 1/tau at most. Its weight is 1: with half of w_s, counts at the far end were 1.25 times the
             # target, at a gain of 0.05 to 0.1 dB at equal counts.
@@ -155,10 +156,29 @@ class Objective:
                     gradients[name] = gradients[name] + gradient
         return GradientSum(gradients, kept, losses[0])
 
-    def _rendered(
-        self, leaves: dict[str, Tensor], camera: Camera, dials: list[float]
-    ) -> Iterator[tuple[float, Attenuated, Tensor]]:
-        """Each dial value, the opacities of the rows that have a dial, and the image."""
+    def _compiled(self, like: Tensor) -> bool:
+        """Whether the rasterizer of the CPU applies the dial itself: the paper's term needs the opacities."""
+        return like.device.type == "cpu" and like.dtype == torch.float32 and self.config.count_term != "paper"
+
+    def _rendered_by_kernels(self, leaves: dict[str, Tensor], camera: Camera, dials: list[float]) -> Iterator[Rendered]:
+        """``_rendered`` with the dial in the kernels."""
+        from clod_adapter.rasterizers import cpu
+
+        sigma, growth_d = self.sigma(leaves[self.decay]), leaves.get("growth_d")
+        if self.part.full_context:
+            sigma = _ending_in(math.inf, sigma, self.trained)
+            growth_d = None if growth_d is None else _ending_in(0.0, growth_d, self.trained)
+        attributes: Any = {name: leaves[name] for name in ATTRIBUTES}
+        shown = Gaussians(
+            **attributes, sigma_d=sigma, attenuation=self.attenuation, growth_d=growth_d,
+            screen_filter=self.screen_filter,
+        )  # fmt: skip
+        keep = cpu.kept(shown, camera, dials[0])[: self.trained]  # of the smallest dial value: kept sets are nested
+        for s in dials:
+            yield s, cpu.draw(shown, camera, s, torch.zeros(3), trained=self.trained)[0], keep, None
+
+    def _rendered(self, leaves: dict[str, Tensor], camera: Camera, dials: list[float]) -> Iterator[Rendered]:
+        """Each dial value with the image, the trained rows that are kept, and the paper's count term."""
         rows = slice(self.trained) if self.part.full_context else slice(None)
         attributes: Any = {name: leaves[name] for name in ATTRIBUTES}
         shown = Gaussians(**attributes, screen_filter=self.screen_filter)
@@ -173,7 +193,10 @@ class Objective:
                 drawn = torch.cat([drawn, attenuate(context, None, distances[self.trained :], s, None).drawn])
                 growth = None if growth is None else torch.cat([growth, torch.ones_like(context)])
             # Culled rows have opacity 0: the rasterizer skips them, and they get no gradient.
-            yield s, dialled, splat(shown, drawn, camera, growth=growth)[0]
+            term = None
+            if self.config.count_term == "paper" and self.config.reg_weight > 0:
+                term = paper_count(dialled, s, self.attenuation.tau, self.config, self.part.total)
+            yield s, splat(shown, drawn, camera, growth=growth)[0], dialled.keep[: self.trained], term
 
     def _target_gradients(self, parameters: dict[str, Tensor], s: float, loss: float) -> dict[str, Tensor]:
         """``[trained]`` the gradients of the count term or the cost term at one dial value, by parameter."""
@@ -183,15 +206,20 @@ class Objective:
             return {name: gradient for name, gradient in found.items() if name in self.stepped}
         decay, logits = rows[self.decay], rows["opacity_logits"]
         with torch.no_grad():
-            dialled = attenuate(logits, self.sigma(decay), self.typical, s, self.attenuation)
             if self.part.target is not None:
                 target = self.part.target(s)
             else:
                 target = target_share(s, self.trained, self.config, self.part.total)
-            counted = count_gradient(dialled, logits, s, self.attenuation.tau, loss, self.config, target)
+            sigma = self.sigma(decay)
+            counted = count_gradient_at(self.typical, logits, sigma, s, self.attenuation, loss, self.config, target)
         return {self.decay: counted if self.config.parameter == "log" else counted / decay}
 
     def _weight(self, s: float, *, alone: bool) -> float:
         """w_s, times ``full_weight`` at the s = 1 that is drawn together with another dial value."""
         weight = (1 - self.config.weight_slope * s / self.config.max_sv) ** 2
         return weight if alone or s > 1 else weight * self.config.full_weight
+
+
+def _ending_in(value: float, tensor: Tensor, trained: int) -> Tensor:
+    """``[N]`` with this value in the rows from ``trained`` on."""
+    return torch.cat([tensor[:trained], torch.full_like(tensor[trained:], value)])

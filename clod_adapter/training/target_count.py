@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from clod_adapter.config import AdaptConfig
-from clod_adapter.equation.attenuation import Attenuated, conform, log_threshold
+from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.equation.attenuation import Attenuated, attenuate, conform, log_threshold
 
 # Lower bound of the sigmoid's slope, which is at most 1/4, for culled Gaussians while too few are kept. Some widths
 # below the culling threshold it is exactly 0, and so is the image's gradient: no step would bring such a sigma back.
@@ -69,9 +70,39 @@ def count_gradient(
         target: of these Gaussians, where they are not the whole scene; by default ``target_share``.
     """
     target = target or target_share(virtual_scale, len(opacity_logits), config)
-    eta = float(dialled.keep.sum()) / len(opacity_logits)
-    penalty = 2 * loss * config.reg_weight * (eta / target.share - 1) * target.weight
+    penalty = _penalty(float(dialled.keep.sum()) / len(opacity_logits), target, loss, config)
     return lifted_slope(dialled, opacity_logits, virtual_scale, tau, config.temperature, penalty < 0).mul_(penalty)
+
+
+def count_gradient_at(
+    distances: Tensor, opacity_logits: Tensor, sigma_d: Tensor, virtual_scale: float, attenuation: AttenuationConfig,
+    loss: float, config: AdaptConfig, target: TargetShare,
+) -> Tensor:  # fmt: skip
+    """``count_gradient`` at given ``distances [N]``; on the CPU in float32 two compiled passes."""
+    given = opacity_logits, sigma_d, distances
+    if any(x.device.type != "cpu" or x.dtype != torch.float32 for x in given):
+        dialled = attenuate(*given, virtual_scale, attenuation)
+        return count_gradient(dialled, opacity_logits, virtual_scale, attenuation.tau, loss, config, target)
+    from clod_adapter._kernels import count, threads
+    from clod_adapter.rasterizers.frame import dial_vector, workers_for
+
+    out = torch.empty_like(opacity_logits, memory_format=torch.contiguous_format)
+    n, workers = len(out), workers_for(len(out))
+    arrays = [x.detach().contiguous().numpy() for x in given]
+    dial, counts = dial_vector(attenuation, virtual_scale), np.zeros(workers, np.int64)
+    threads.run(count.count_kept, workers, *arrays, dial, counts)
+    penalty = _penalty(float(counts.sum()) / n, target, loss, config)
+    lift = LIFT if penalty < 0 else 0.0
+    threads.run(
+        count.count_slope, workers, *arrays, dial, config.temperature, lift, penalty / (config.temperature * n),
+        out.numpy(),
+    )  # fmt: skip
+    return out
+
+
+def _penalty(eta: float, target: TargetShare, loss: float, config: AdaptConfig) -> float:
+    """The derivative of ``loss reg_weight (eta / target - 1)^2`` by the share eta."""
+    return 2 * loss * config.reg_weight * (eta / target.share - 1) * target.weight
 
 
 def lifted_slope(

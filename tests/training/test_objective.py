@@ -13,14 +13,13 @@ from torch import Tensor
 from clod_adapter.adapter import attach
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import FILTERS
-from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.growth import GROWTH_RANGE
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization import importance
 from clod_adapter.initialization.importance import initialize
 from clod_adapter.losses import photometric_loss
 from clod_adapter.progress import Progress
-from clod_adapter.rasterizers import reference
+from clod_adapter.rasterizers import cpu, reference
 from clod_adapter.render import render, splat
 from clod_adapter.training import objective
 from clod_adapter.training.loop import TrainingState, adapt
@@ -41,9 +40,10 @@ def test_screen_filter_is_used_and_empty_harmonics_are_skipped(
     mip = FILTERS["mip"]
     base = captured[0].replace(shN=torch.zeros_like(captured[0].shN), screen_filter=mip)
     seen, shown = set(), set()
-    for module in (objective, importance):
+    for module, name in ((cpu, "draw"), (importance, "splat")):
+        real = getattr(module, name)
         monkeypatch.setattr(
-            module, "splat", lambda g, *a, **k: seen.add((g.shN.shape[1], g.screen_filter)) or splat(g, *a, **k)
+            module, name, lambda g, *a, to=real, **k: seen.add((g.shN.shape[1], g.screen_filter)) or to(g, *a, **k)
         )
 
     def look(now: Progress) -> None:
@@ -114,6 +114,25 @@ def test_only_the_first_rows_are_trained(captured: Pair) -> None:
     assert not torch.equal(without.sh0, found.sh0[:few])
 
 
+@pytest.mark.parametrize("parameter", ["log", "linear"])
+@pytest.mark.parametrize("part", [{}, {"full_context": True}, {"total": 900}], ids=str)
+def test_compiled_steps_have_the_gradients_of_plain_ones(
+    captured: Pair, monkeypatch: pytest.MonkeyPatch, part: dict[str, Any], parameter: str
+) -> None:
+    base, scene = captured
+    config = config_of(max_sv=4.0, parameter=parameter, lr_shN=1e-3)
+    run = Trainer(initialize(base, scene.train, config), scene.train, config, TrainableSubset(len(base) - 20, **part))
+    run.parameters["growth_d"] = torch.linspace(-0.5, 1, len(base))
+    sample = Sample(scene.train[0], [1.0, 2.0], 3.0)
+    compiled = run.objective.gradient_sum(run.parameters, [sample])
+    monkeypatch.setattr(run.objective.__class__, "_compiled", lambda *_: False)
+    plain = run.objective.gradient_sum(run.parameters, [sample])
+    assert compiled.loss == pytest.approx(plain.loss, rel=1e-3)
+    assert int((compiled.kept != plain.kept).sum()) <= 1
+    for name, want in plain.gradients.items():  # an alpha of 1/255 more or less changes a few
+        assert float((compiled.gradients[name] - want).norm()) < 0.02 * float(want.norm()), name
+
+
 @pytest.mark.parametrize("context", [0, 5], ids=["all rows", "rows of a block"])
 def test_gradient_of_growth_equals_finite_differences(monkeypatch: pytest.MonkeyPatch, context: int) -> None:
     """In float64, at a dial value of its own; the context of a block does not grow."""
@@ -149,7 +168,9 @@ def test_steps_use_the_sampled_views_and_dial_values(
     captured: Pair, monkeypatch: pytest.MonkeyPatch, sampling: str
 ) -> None:
     taken: list[Any] = []
-    monkeypatch.setattr(objective, "attenuate", lambda *a, **k: taken.append(a[3]) or attenuate(*a, **k))
+    draw, count = cpu.draw, objective.count_gradient_at
+    monkeypatch.setattr(cpu, "draw", lambda *a, **k: taken.append(a[2]) or draw(*a, **k))
+    monkeypatch.setattr(objective, "count_gradient_at", lambda *a: taken.append(a[3]) or count(*a))
     monkeypatch.setattr(objective, "photometric_loss", lambda *a: taken.append(id(a[1])) or photometric_loss(*a))
     config = config_of(iters=14, max_sv=4.0, sampling=sampling)
     adapt(attach(gaussians(5, 0, 0), torch.ones(5)), captured[1], config)

@@ -1,0 +1,50 @@
+"""The compiled count term, compared with the plain one in float64."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from backends import torch_threads
+from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.training.target_count import TargetShare, count_gradient_at
+
+CONFIG = AdaptConfig(max_sv=7.0)
+
+
+@settings(deadline=None)
+@given(
+    n=st.sampled_from([1, 15, 16, 17, 33, 400]), s=st.sampled_from([1.0, 2.5, 10.0]), seed=st.integers(0, 99),
+    share=st.sampled_from([0.02, 0.4, 1.0]), eps=st.sampled_from([0.0, 1e-8]), workers=st.sampled_from([1, 3]),
+)  # fmt: skip
+def test_both_forms_agree(n: int, s: float, seed: int, share: float, eps: float, workers: int) -> None:
+    random = torch.Generator().manual_seed(seed)
+    logits, d = 4 * torch.randn(n, generator=random), 2 * torch.rand(n, generator=random)
+    sigma = 2 * torch.rand(n, generator=random) + 1e-3
+    dial, target = AttenuationConfig(eps=eps, max_sv=10.0), TargetShare(share, 1 / share)
+    with torch_threads(workers):
+        got = count_gradient_at(d, logits, sigma, s, dial, 0.1, CONFIG, target)
+    exact = (x.double() for x in (d, logits, sigma))
+    want = count_gradient_at(*exact, s, dial, 0.1, CONFIG, target)
+    torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-6 * max(float(want.abs().max()), 1e-9))
+
+
+def test_culled_rows_are_brought_back_where_too_few_are_kept() -> None:
+    d, logits, sigma = torch.ones(40), torch.zeros(40), torch.full((40,), 0.05)
+    few = count_gradient_at(d, logits, sigma, 5.0, AttenuationConfig(), 0.1, CONFIG, TargetShare(0.3, 1 / 0.3))
+    assert bool((few < 0).all())
+    none = count_gradient_at(d, logits, sigma, 5.0, AttenuationConfig(), 0.0, CONFIG, TargetShare(0.3, 1 / 0.3))
+    assert not none.any()
+
+
+@pytest.mark.parametrize("logit", [-math.inf, -200.0, 200.0, math.inf])
+def test_extreme_opacities_are_finite(logit: float) -> None:
+    d, sigma = torch.tensor([0.0, 1e-6, 1.0, 1e6]).repeat(8), torch.tensor([1e-4, 1.0, 1e9, 1e-4]).repeat_interleave(8)
+    logits = torch.full_like(d, logit)
+    for target in (0.01, 1.0):
+        given = count_gradient_at(d, logits, sigma, 3.0, AttenuationConfig(), 0.1, CONFIG, TargetShare(target, 1.0))
+        assert given.isfinite().all()
