@@ -12,7 +12,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.adapter_file import load_adapter
 from clod_adapter.io.checkpoint import save, trimmed
 
-from .shared.console import Console
+from .shared.console import Console, put
 from .shared.files import size
 from .shared.inputs import read_checkpoint
 
@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     rows = trimmed(base, adapter.kept, adapter.sh_degree)
     save(args.out, adapted, rows, version=adapter.version, calibration=adapter.calibration)
     dial = " and ".join(dial_tensors(adapted))
-    print(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with {dial}")
+    put(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with {dial}")
     return {
         "command": "apply", "version": package_version(), "base": args.base, "adapter": args.adapter,
         "base_count": adapter.base_count, "changed": sorted(adapter.updates), "notes": [*adapter.notes, *base.notes],

@@ -49,9 +49,18 @@ class Comparisons:
     notes: tuple[str, ...] = ()
     interrupted: bool = False
 
+    def _others(self) -> list[str]:
+        return list(dict.fromkeys(path for path, *_ in self.against))
+
+    def _table_against(self, path: str) -> str:
+        marked = list[tuple[str, Row]]()
+        for other, theirs, ours in self.against:
+            marked += [("theirs", theirs), (f"s={ours.virtual_scale:.4g}", ours)] if other == path else []
+        return f"{path}\n{rows_table(marked)}"
+
     def report(self) -> dict[str, Any]:
         """For --json."""
-        paths = list(dict.fromkeys(path for path, *_ in self.against))
+        paths = self._others()
         names = dict(zip(paths, labels(paths), strict=True))
         return {
             "base_row": self.base_row.as_dict() if self.base_row else None,
@@ -77,10 +86,8 @@ class Comparisons:
             title = "the unadapted base, pruned to the same counts by two rankings:"
             parts.append(f"{title}\n{rows_table(marked)}")
         if self.against:
-            marked = []
-            for path, theirs, ours in self.against:
-                marked += [(path, theirs), (f"s={ours.virtual_scale:.4g}", ours)]
-            parts.append(f"other files, each followed by the dial value with the same count:\n{rows_table(marked)}")
+            title = "other files, each row followed by the dial value with the same count:"
+            parts.append("\n".join([title, *(self._table_against(path) for path in self._others())]))
         if self.popping:
             parts.append(popping_table(self.popping))
         return "".join(f"\n{part}\n" for part in parts)

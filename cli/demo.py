@@ -12,6 +12,7 @@ import torch
 from clod_adapter.demo.pictures import Panel, dial_strip, quality_curve
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
+from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.lock import output_lock
 from clod_adapter.io.scene.load import load_scene
@@ -20,7 +21,7 @@ from clod_adapter.render import render
 from .adapt import run as adapt
 from .commands.adapt import ADAPT
 from .commands.parser import make_parser
-from .shared.console import Console, duration
+from .shared.console import Console, duration, put
 from .shared.files import Outputs, make_folder
 from .shared.kernels import announced_compiling, prepare_kernels
 from .shared.outputs import check_outputs
@@ -67,7 +68,7 @@ def check_extra() -> None:
     """Raises the ClodError of a missing package before minutes are spent."""
     for module, package in EXTRA.items():
         if importlib.util.find_spec(module) is None:
-            raise ClodError(f"the demo needs {package}: pip install 'clod-adapter[demo]'")
+            raise ClodError(f"the demo needs {package}: pip install {package}")
 
 
 def adapt_arguments(args: argparse.Namespace, base: Path, capture: Path, model: Path) -> argparse.Namespace:
@@ -79,11 +80,11 @@ def adapt_arguments(args: argparse.Namespace, base: Path, capture: Path, model: 
 
 
 def print_next(folder: Path, pictures: dict[str, Path], watch: Stopwatch) -> None:
-    print(f"\n{duration(watch.total())} for the demo; everything is in {folder.resolve()}")
+    put(f"\n{duration(watch.total())} for the demo; everything is in {folder.resolve()}")
     if pictures:
-        print("see dial.png, a view at several dial values, and curve.png, quality against the number of Gaussians")
+        put("dial.png shows a view at several dial values, curve.png quality against count")
     else:
-        print("no figures: the measurements were interrupted")
+        put("no figures: the measurements were interrupted")
     print("next, a splat of your own:\n  clod-adapt YOURS.ply --images YOUR_SCENE")
 
 
@@ -114,9 +115,10 @@ def draw(capture: Path, model: Path, report: dict[str, Any], pictures: dict[str,
     """Draws a held-out view at several dial values, and the quality curve of all held-out views."""
     view, gaussians = load_scene(capture).test[VIEW], load(model).gaussians
     panels = [Panel(view.image.numpy())]
-    for row in evaluate(gaussians, [view], DIALS, repeats=5):
+    (times,) = time_frames([(gaussians, DIALS)], [view.camera]).milliseconds
+    for row, taken in zip(evaluate(gaussians, [view], DIALS), times, strict=True):
         image = render(gaussians, view.camera, row.virtual_scale).image.numpy()
-        panels.append(Panel(image, row.virtual_scale, row.kept, row.kept_share, row.psnr, row.frame_ms))
+        panels.append(Panel(image, row.virtual_scale, row.kept, row.kept_share, row.psnr, taken))
     dial_strip(pictures["dial"], panels, "One file, one dial: a held-out view", crop=CROP)
     title = "Quality against Gaussians, mean over the held-out views"
     quality_curve(pictures["curve"], report["rows"], report["base_rows"][0], title)

@@ -17,9 +17,9 @@ from clod_adapter.progress import Stopped
 from .comparisons import Comparisons, compare
 from .shared.antialiasing import with_filter
 from .shared.budgets import solve_dials
-from .shared.console import Console
+from .shared.console import Console, put
 from .shared.kernels import prepare_kernels
-from .shared.measure import choose_dials, measure
+from .shared.measure import choose_dials, measure, with_frame_times
 from .shared.models import read_model_and_scene
 from .shared.pages import write_eval_page
 from .shared.report import Stopwatch, machine, table
@@ -37,16 +37,19 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         console.say(note)
     with watch.time("evaluate"):
         rows, interrupted = measure(model.gaussians, scene.test, dials, console, metrics=metrics)
-    if interrupted and not rows:
-        raise Stopped("stopped before the first row")
-    print(table(rows))
+        if interrupted and not rows:
+            raise Stopped("stopped before the first row")
+        if not interrupted:
+            (rows,), rough, interrupted = with_frame_times([(model.gaussians, rows)], scene.test, console)
+            notes += rough
+    put(table(rows))
     base = others[args.base] if args.base else None
     against, comparisons = {path: others[path] for path in args.against}, Comparisons()
     if not interrupted:
         with watch.time("comparisons"):
             comparisons = compare(model.gaussians, rows, base, against, scene, metrics, console, args.popping)
         interrupted = comparisons.interrupted
-    print(comparisons.text(), end="")
+    put(comparisons.text(), end="")
     report: dict[str, Any] = {
         "command": "eval", "version": package_version(), "model": args.model, "scene": args.images,
         "base_count": len(model.gaussians), "sh_degree": model.gaussians.sh_degree, "views": len(scene.test),

@@ -14,7 +14,7 @@ from clod_adapter.inspection.splat import Splat
 from clod_adapter.inspection.statistics import Spread
 from clod_adapter.io.settings import WARNING
 
-from .shared.console import duration
+from .shared.console import duration, put
 from .shared.files import size
 
 WIDTH = 13  # of the labels
@@ -25,7 +25,7 @@ LONGEST = 100  # characters of a comment
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     found = inspect(args.file)
-    print("\n".join(lines_of(found)))
+    put("\n".join(lines_of(found)), hang=WIDTH)
     return {"command": "inspect", "version": package_version(), **found.as_dict()}
 
 

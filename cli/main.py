@@ -10,9 +10,11 @@ import os
 import sys
 import traceback
 from contextlib import nullcontext, redirect_stdout
+from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
 
+from clod_adapter._support.text import as_text
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Stopped
@@ -34,6 +36,8 @@ from .shared.launch import launched, silence_but_first
 from .shared.shortages import check_addresses, shortage
 
 PROG = "clod-adapt"
+INTERRUPTED = 130  # exit code
+NEAR = 0.75  # similarity of a misspelt command: two neighbouring letters exchanged in "view" have it
 REPORT = "please report it, with the lines above, as an issue of this program's repository"
 
 # Adapting is the main command and has no name.
@@ -49,16 +53,34 @@ def main(argv: list[str] | None = None) -> int:
     A report may have its own exit_code. An unexpected error prints its traceback and returns 1.
     """
     print_any_name()
+    words = sys.argv[1:] if argv is None else argv
     try:
         with silence_but_first():
-            return _main(argv)
+            return _main(words)
     except Exception:
         traceback.print_exc()
-        print(
-            f"{PROG}: error: this is a bug in {PROG} {package_version()}, not in the input: {REPORT}",
-            file=sys.stderr,
-        )
-        return 1
+        return refuse(f"this is a bug in {PROG} {package_version()}, not in the input: {REPORT}", 1, words)
+
+
+def refuse(why: str, code: int, words: list[str]) -> int:
+    """Prints why a command failed, with --json also as the one object on stdout; returns the exit code."""
+    line = f"{PROG}: {why}" if code == INTERRUPTED else f"{PROG}: error: {why}"
+    if sys.stderr.isatty():
+        from .shared.console import folded
+
+        line = folded(line, sys.stderr)
+    print(line, file=sys.stderr)
+    if "--json" in words:
+        try:
+            print(json.dumps({"error": as_text(why), "code": code}), flush=True)
+        except BrokenPipeError:
+            forget_stdout()
+    return code
+
+
+def forget_stdout() -> None:
+    """After the reader of a pipe has ended; without this Python reports it again when it flushes at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def print_any_name() -> None:
@@ -68,34 +90,36 @@ def print_any_name() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def _main(argv: list[str] | None) -> int:
-    words = sys.argv[1:] if argv is None else argv
+def _main(words: list[str]) -> int:
     name = words[0] if words and words[0] in COMMANDS else ""
     try:
         with interrupt_as_stopped():
+            if not name:
+                check_command(words)
             args = build_parser(name).parse_args(words[1:] if name else words)
             code = run_here(COMMANDS.get(name, ADAPT), args)
             sys.stdout.flush()
     except ClodError as error:
-        print(f"{PROG}: error: {' '.join(str(error).splitlines())}", file=sys.stderr)
-        return 2
+        return refuse(" ".join(str(error).splitlines()), 2, words)
     except Stopped:
-        print(f"{PROG}: interrupted", file=sys.stderr)
-        return 130
+        return refuse("interrupted", INTERRUPTED, words)
     except BrokenPipeError:
-        # The reader of a pipe has ended; without this Python reports it again when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        forget_stdout()
         return 1
     except (MemoryError, RuntimeError, ImportError, OSError) as error:
         if (line := shortage(error)) is not None:
-            print(f"{PROG}: error: {line}", file=sys.stderr)
-            return 2
+            return refuse(line, 2, words)
         if not isinstance(error, OSError):
             raise
         name = f"{error.filename}: " if error.filename is not None else ""
-        print(f"{PROG}: error: {name}{error.strerror or error}; check the path and its permissions", file=sys.stderr)
-        return 2
+        return refuse(f"{name}{error.strerror or error}; check the path and its permissions", 2, words)
     return code
+
+
+def check_command(words: list[str]) -> None:
+    """Refuses a first word that is no file and nearly the name of a command."""
+    if words and not os.path.exists(words[0]) and (near := get_close_matches(words[0], COMMANDS, 1, NEAR)):
+        raise ClodError(f"{words[0]}: no such file or command; did you mean {PROG} {near[0]}?")
 
 
 def run_here(command: Command, args: argparse.Namespace) -> int:

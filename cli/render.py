@@ -24,7 +24,7 @@ from clod_adapter.render import render
 
 from .shared.antialiasing import with_filter
 from .shared.budgets import solve_dials
-from .shared.console import Console
+from .shared.console import Console, put
 from .shared.files import make_folder
 from .shared.interrupts import GracefulStop
 from .shared.kernels import prepare_kernels
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     gaussians = model.gaussians.without_empty_bands()
     make_folder(out)
     pictures, interrupted = write_all(write_images(gaussians, views, dials, out, args.beside), len(views), out, console)
-    print(summary(pictures, dials, len(gaussians), out))
+    put(summary(pictures, dials, len(gaussians), out))
     return {
         "command": "render", "version": package_version(), "model": args.model, "scene": args.images,
         "base_count": len(gaussians), "virtual_scales": dials, "pictures": [vars(picture) for picture in pictures],

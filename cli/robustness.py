@@ -24,7 +24,7 @@ from .commands.settings import make_configs
 from .robustness_cells import Cell, cells_of
 from .shared.alignment import require_alignment
 from .shared.antialiasing import with_filter
-from .shared.console import Console, Meter, duration
+from .shared.console import Console, Meter, clipped, duration, put
 from .shared.devices import on_device, pick_device
 from .shared.files import labels, make_folder
 from .shared.inputs import read_checkpoint, read_scene
@@ -36,6 +36,7 @@ from .shared.report import Stopwatch, machine, report_dials, write_report
 COLUMNS = (
     "checkpoint", "max_sv", "within_range", "virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"
 )  # fmt: skip
+LONGEST = 16  # characters of a checkpoint's name in the table
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
@@ -191,14 +192,15 @@ def write_outputs(report: dict[str, Any], outputs: dict[str, Path], scene: str) 
 
 def print_cells(report: dict[str, Any], outputs: dict[str, Path], watch: Stopwatch) -> None:
     """One line per cell: its first and last row."""
-    width = max(len(cell["checkpoint"]) for cell in report["cells"])
-    print(f"\n{'checkpoint':<{max(width, 10)}}  range     at the first              at the last")
-    for cell in report["cells"]:
+    names = [clipped(cell["checkpoint"], LONGEST) for cell in report["cells"]]
+    width = max(map(len, ["checkpoint", *names]))
+    put(f"\n{'checkpoint':<{width}}  range     at the first              at the last")
+    for checkpoint, cell in zip(names, report["cells"], strict=True):
         ends = [f"{row['psnr'] or 0:6.2f} dB @ {row['kept']:9,.0f}" for row in (cell["rows"][0], cell["rows"][-1])]
         name = "base" if cell["max_sv"] is None else f"[1, {cell['max_sv']:g}]"
-        print(f"{cell['checkpoint']:<{max(width, 10)}}  {name:<8}  {ends[0]}    {ends[1]}")
+        put(f"{checkpoint:<{width}}  {name:<8}  {ends[0]}    {ends[1]}")
     if report["missing"]:
-        print(f"\nmissing: {', '.join(report['missing'])}; the same command continues")
+        put(f"\nmissing: {', '.join(report['missing'])}; the same command continues")
     print()
     for path in outputs.values():
         print(path)

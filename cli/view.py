@@ -18,6 +18,7 @@ from clod_adapter.viewer.server import Response, Server
 
 from .shared.antialiasing import with_filter, with_filter_of
 from .shared.browsers import open_browser
+from .shared.budgets import solve_dials
 from .shared.console import Console
 from .shared.dials import initial_dial
 from .shared.inputs import read_checkpoint
@@ -52,8 +53,10 @@ def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Res
         base = with_filter_of(base, model, args)
     cameras, notes = load_cameras(args.images, model.origin) if args.images else (list[Camera](), list[str]())
     attenuation = model.gaussians.attenuation
-    opening, more = initial_dial(args.sv, attenuation.max_sv if attenuation else None)
-    notes += more
+    solved, asked = solve_dials(args, model, cameras or model.viewpoints, console)
+    opening = solved[0] if args.device_preset and solved else args.sv
+    opening, more = initial_dial(opening, attenuation.max_sv if attenuation else None)
+    notes += [*asked, *more]
     for note in notes:
         console.note(note)
     payloads = {MODEL: Payload.of(model)} | ({BASE: Payload.of(base)} if base else {})

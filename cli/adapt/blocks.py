@@ -238,6 +238,6 @@ class Blocks:
 
     @contextmanager
     def _display(self, training: str) -> Iterator[ProgressDisplay]:
-        display = ProgressDisplay(self.setup.console, self.setup.stop, None, (), 1.0, None, training)
+        display = ProgressDisplay(self.setup.console, self.setup.stop, None, (), None, training)
         with self.setup.stop.listening(), closing(display):
             yield display

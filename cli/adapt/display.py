@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from statistics import fmean
 
@@ -26,10 +27,9 @@ class ProgressDisplay:
     """A listener that shows progress, and stops on Ctrl-C.
 
     Args:
-        base: the error so far is compared with its error; None without views.
+        base: the PSNR so far at dial value 1 is shown against its PSNR; None if its own renders are the views.
         views: held out; at most four of them, evenly spread, are measured.
-        max_sv: the error is shown at dial value 1 and here.
-        base_row: the base's row: the error shown first, and an estimate of the time of a frame.
+        base_row: the base's row, for an estimate of the time of a frame.
         training: the label of ``Phase.TRAINING``.
     """
 
@@ -39,17 +39,14 @@ class ProgressDisplay:
         stop: GracefulStop,
         base: Gaussians | None,
         views: tuple[View, ...],
-        max_sv: float,
         base_row: Row | None,
         training: str = Phase.TRAINING,
     ) -> None:
         self.console, self.stop, self.training = console, stop, training
         self.views = views[:: -(-len(views) // CHECK_VIEWS)] if views else ()
-        self.dials = [1.0, max_sv] if max_sv > 1 else [1.0]
         seconds_a_frame = base_row.frame_ms / 1e3 if base_row else 0.0
-        self.check_due, self.check_cost = CHECK_EVERY, seconds_a_frame * len(self.views) * len(self.dials)
-        self.error = f"base {base_row.psnr:.2f} dB" if base_row else ""
-        self.base, self.base_error = base, ""
+        self.check_due, self.check_cost = CHECK_EVERY, seconds_a_frame * len(self.views)
+        self.base, self.base_error, self.error = base, math.nan, ""
         self.phase: Phase | None = None
         self.meter: Meter | None = None
 
@@ -64,8 +61,7 @@ class ProgressDisplay:
             self._check(progress)
         by_time = progress.share > progress.done / max(progress.total, 1)
         steps = f"step {progress.done}" if by_time else f"{progress.done}/{progress.total}"
-        error = self.error if training else ""
-        self.meter.update(progress.share, f"{steps}, {error}".removesuffix(", "))
+        self.meter.update(progress.share, (self.error if training else "") or steps)
         if not progress.error and not self.stop.requests:
             return True
         self.close()
@@ -86,17 +82,19 @@ class ProgressDisplay:
         if self.check_cost > CHECK_COST * progress.seconds / progress.share:
             return  # even one measurement is too many for so short a run
         began = time.perf_counter()
-        if not self.base_error and self.base is not None:  # of the same views
-            self.base_error = f"base {self._measure(self.base, 1.0)[0]:.2f} dB on these {len(self.views)} views"
+        if self.base is not None and math.isnan(self.base_error):
+            self.base_error = self._measure(self.base)  # of the same views
         assert progress.gaussians is not None
-        measured = [(dial, *self._measure(progress.gaussians(), dial)) for dial in self.dials]
-        shown = [f"s={dial:g} {error:.2f} dB {share:.0%}" for dial, error, share in measured]
-        self.error = ", ".join([*shown, self.base_error])
+        self.error = self._text(self._measure(progress.gaussians()))
         self.check_cost = time.perf_counter() - began
         self.check_due = progress.seconds + max(CHECK_EVERY, self.check_cost / CHECK_COST)
 
-    def _measure(self, gaussians: Gaussians, dial: float) -> tuple[float, float]:
-        """PSNR and share kept, means over the views."""
-        pictures = [render(gaussians, view.camera, dial) for view in self.views]
-        error = fmean(psnr(picture.image, view.image) for picture, view in zip(pictures, self.views, strict=True))
-        return error, fmean(float(picture.kept.float().mean()) for picture in pictures)
+    def _text(self, found: float) -> str:
+        if self.base is None:
+            return f"{found:.2f} dB at s=1"
+        gain = found - self.base_error
+        return f"{abs(gain):.2f} dB {'below' if gain < 0 else 'above'} the base at s=1"
+
+    def _measure(self, gaussians: Gaussians) -> float:
+        """PSNR at full quality, mean over the views, dB."""
+        return fmean(psnr(render(gaussians, view.camera, 1.0).image, view.image) for view in self.views)

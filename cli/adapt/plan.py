@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from clod_adapter.progress import Phase
 from clod_adapter.rasterizers.frame import release_memory
-from clod_adapter.training.plan import Decision, Override, Plan
+from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
 
 from ..shared.console import Console
@@ -55,14 +55,15 @@ def _with_trimming_effect(plan: Plan, inputs: Inputs, console: Console) -> Plan:
 
 
 def show_plan(decisions: Sequence[Decision], console: Console) -> None:
-    """One aligned line per decision: part, action, measured effect, reason, and the option that overrides it."""
-    lines = [(d.what, d.verdict, d.measured, d.why, _option(d)) for d in decisions]
-    widths = [max(map(len, column)) for column in zip(*(line[:3] for line in lines), strict=True)]
-    widths.append(max((len(why) for *_, why, option in lines if option), default=0))  # others may be longer
-    console.say("plan: action, measured effect, option that overrides it")
-    for what, verdict, number, why, option in lines:
-        cells = (what.ljust(widths[0]), verdict.ljust(widths[1]), number.rjust(widths[2]), why.ljust(widths[3]), option)
-        console.say(f"  {'  '.join(cells)}".rstrip())
+    """One aligned line per decision, and one line with the names of what this scene does not need."""
+    made = [decision for decision in decisions if decision.verdict != NOT_NEEDED]
+    rows = [(decision.what, decision.verdict, decision.measured) for decision in made]
+    a, b, c = (max(map(len, column)) for column in zip(*rows, strict=True)) if rows else (0, 0, 0)
+    console.say("plan: action, measured effect, option that overrides it; reasons in the report")
+    for decision, (what, verdict, effect) in zip(made, rows, strict=True):
+        console.say(f"  {what:<{a}}  {verdict:<{b}}  {effect:>{c}}  {_option(decision)}".rstrip())
+    if others := [decision.what for decision in decisions if decision.verdict == NOT_NEEDED]:
+        console.say(f"  does not apply: {', '.join(others)}")
 
 
 def _option(decision: Decision) -> str:

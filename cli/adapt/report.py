@@ -17,7 +17,7 @@ from clod_adapter.io.atomic import atomic_paths
 from clod_adapter.io.checkpoint import Checkpoint, save
 
 from ..shared.budgets import calibrate
-from ..shared.console import duration
+from ..shared.console import command_line, duration, put
 from ..shared.files import Outputs, size
 from ..shared.interrupts import GracefulStop
 from ..shared.pages import AdaptPage
@@ -48,7 +48,7 @@ def finish(
         setup.console.say("interrupted: the page of --report was not written")
     elif page:  # after the report
         report = add_page(setup, result, page, report)
-    shown = table(measured.rows, inputs.base_rows, measured.plain) if measured.rows else ""
+    shown = table(measured.rows, measured.base, measured.plain) if measured.rows else ""
     print_summary(setup.outputs, shown, setup.args, setup.watch)
     return report
 
@@ -91,7 +91,7 @@ def describe_run(setup: Setup, inputs: Inputs, result: Result, measured: Measure
     """The report, except the sizes of the files."""
     args, adapted, adapter, plan = setup.args, result.adapted, result.adapter, result.plan
     late = "the measurements were interrupted: only the dial values that were finished are reported"
-    notes = [*result.base.notes, *inputs.scene.notes, *inputs.notes, *result.notes]
+    notes = [*result.base.notes, *inputs.scene.notes, *inputs.notes, *result.notes, *measured.notes]
     if measured.interrupted:
         setup.console.say(late)
         notes.append(late)
@@ -103,7 +103,7 @@ def describe_run(setup: Setup, inputs: Inputs, result: Result, measured: Measure
         "processes": describe_processes(adapted, inputs.config.batch), "outputs": setup.outputs.names(),
         "sh_degree": result.gaussians.sh_degree, "device": str(result.gaussians.means.device),
         "seconds": seconds(setup, result), "resumed_from": setup.resumed and setup.resumed.state.steps,
-        "alignment": inputs.alignment, "notes": notes, "base_rows": [row.as_dict() for row in inputs.base_rows],
+        "alignment": inputs.alignment, "notes": notes, "base_rows": [row.as_dict() for row in measured.base],
         "rows": [row.as_dict() for row in measured.rows],
         "detached_row": measured.plain[0].as_dict() if measured.plain else None,
         "plan": plan.as_dict(), "memory": inputs.memory and asdict(inputs.memory),
@@ -136,14 +136,17 @@ def add_page(setup: Setup, result: Result, page: AdaptPage, report: dict[str, An
 
 
 def print_summary(outputs: Outputs, measured: str, args: argparse.Namespace, watch: Stopwatch) -> None:
+    """Prints the measurements, the files, and what to do next."""
     if measured:
-        print(f"\n{measured}\n")
+        put(f"\n{measured}\n")
         if "plain" in measured:
-            print(f"plain: {outputs.ply} in a viewer that does not know the dial\n")
+            put(f"plain: {outputs.ply} in a viewer that does not know the dial\n")
     for path in vars(outputs).values():
-        print(f"{size(path):>9}  {path}")
-    following = "other dial values:" if args.images is not None else "against photographs, if there are any:"
-    print(f"\n{duration(watch.total())} in all; next, {following}")
-    sv = " ".join(f"{s:g}" for s in sorted({1.0, args.max_sv}))
-    images = "DIR" if args.images is None else shlex.quote(args.images)
-    print(f"  clod-adapt eval {shlex.quote(str(outputs.ply))} --images {images} --sv {sv}")
+        put(f"{size(path):>9}  {path}")
+    put(f"\n{duration(watch.total())} in all; next:")
+    model = shlex.quote(str(outputs.ply))
+    images = [] if args.images is None else [f"--images {shlex.quote(args.images)}"]
+    print(command_line(f"clod-adapt view {model}", f"--base {shlex.quote(args.ply)}", *images))
+    if images:
+        sv = " ".join(f"{s:g}" for s in sorted({1.0, args.max_sv}))
+        print(command_line(f"clod-adapt eval {model}", *images, f"--sv {sv}"))

@@ -12,7 +12,7 @@ from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 
 from ..shared.interrupts import GracefulStop, listen_no_more
-from ..shared.measure import measure
+from ..shared.measure import measure, with_frame_times
 from ..shared.report import report_dials
 from .inputs import Inputs
 from .processes import explain, hurried
@@ -39,10 +39,12 @@ class Result:
 
 @dataclass(frozen=True)
 class Measurements:
-    """The result's rows: over the dial, and without the dial, as a viewer shows it that does not know it."""
+    """The rows of the base; of the result over the dial, and without it, as a viewer shows it that does not know it."""
 
+    base: tuple[Row, ...] = ()
     rows: tuple[Row, ...] = ()
     plain: tuple[Row, ...] = ()
+    notes: tuple[str, ...] = ()
     interrupted: bool = False
 
 
@@ -87,11 +89,16 @@ def measure_result(setup: Setup, inputs: Inputs, result: Result, stop: GracefulS
         stop: as in ``measure``.
     """
     if setup.stop.requests > 0 and not result.adapted.interrupted or hurried(result.adapted):
-        return Measurements(interrupted=True)
+        return Measurements(inputs.base_rows, interrupted=True)
     views, console = inputs.scene.test, setup.console
     with setup.watch.time("evaluate"):
         rows, interrupted = measure(result.gaussians, views, report_dials(inputs.config.max_sv), console, stop=stop)
         if interrupted:
-            return Measurements(tuple(rows), (), True)
-        plain, interrupted = measure(detach(result.gaussians), views, [1.0], console, "plain", stop=stop)
-    return Measurements(tuple(rows), tuple(plain), interrupted)
+            return Measurements(inputs.base_rows, tuple(rows), interrupted=True)
+        detached = detach(result.gaussians)
+        plain, interrupted = measure(detached, views, [1.0], console, "plain", stop=stop)
+        base, notes = list(inputs.base_rows), list[str]()
+        if not interrupted:
+            measured = [(inputs.base.gaussians, base), (result.gaussians, rows), (detached, plain)]
+            (base, rows, plain), notes, interrupted = with_frame_times(measured, views, console, stop)
+    return Measurements(tuple(base), tuple(rows), tuple(plain), tuple(notes), interrupted)

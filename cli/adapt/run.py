@@ -77,8 +77,9 @@ def adapt_blocks(setup: Setup, inputs: Inputs, blocks: Blocks) -> dict[str, Any]
 
 
 def show_progress(setup: Setup, inputs: Inputs) -> ProgressDisplay:
-    base, row = inputs.base.gaussians, inputs.base_rows[0] if inputs.base_rows else None
-    return ProgressDisplay(setup.console, setup.stop, base, inputs.scene.test, inputs.config.max_sv, row)
+    base = inputs.base.gaussians if setup.args.images is not None else None
+    row = inputs.base_rows[0] if inputs.base_rows else None
+    return ProgressDisplay(setup.console, setup.stop, base, inputs.scene.test, row)
 
 
 def make_page(setup: Setup, inputs: Inputs) -> AdaptPage | None:

@@ -117,7 +117,7 @@ outputs (existing files are replaced):
                    photographs (every 8th by name) per dial value
   OUT.html, OUT_rendering.png, OUT_adapting.png
                    with --report: a self-contained page and its charts; needs
-                   pip install 'clod-adapter[plots]'
+                   matplotlib (pip install matplotlib)
 The same seed gives the same Gaussians, bit for bit.
 
 without --images:

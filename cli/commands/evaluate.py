@@ -70,8 +70,8 @@ columns, over the held-out photographs (every 8th by name):
   kept        Gaussians kept, and their share of all
   in view     of these, the ones with their centre in the image
   frame ms    median time to render an image
-  LPIPS, FLIP LPIPS (AlexNet) and mean FLIP, with the packages of
-              pip install 'clod-adapter[eval]' and LPIPS's network weights
+  LPIPS, FLIP LPIPS (AlexNet) and mean FLIP; they need the packages lpips and
+              flip-evaluator (pip install), and LPIPS's network weights
 
 --base adds two rows per dial value: the base without tuning, reduced to as many
 Gaussians by opacity, and by removal error (the error in the training views when

@@ -56,6 +56,10 @@ def export_options(parser: ArgumentParser) -> None:
         "--order", choices=["extinction"],
         help="sort the Gaussians by the dial value at which they are culled, latest first, for prefix rendering",
     )  # fmt: skip
+    output.add_argument(
+        "--pack", action="store_true",
+        help="pack the splat in an .html page by splat-transform: a fifth of the size, with rounded values",
+    )  # fmt: skip
     add_device(output, "measure for --fps and --psnr-drop with --images")
 
 
@@ -74,7 +78,7 @@ def check_export(args: Namespace) -> None:
         raise ClodError(f"{args.model}: has no sigma_d to order its Gaussians by; adapt it first")
     if not args.lod_meta:
         check_format(args, bakes, dial)
-    if args.lod_meta or suffix_of(Path(args.out)) in PACKED:
+    if args.lod_meta or args.pack or suffix_of(Path(args.out)) in PACKED:
         SplatTransform.find()
 
 
@@ -99,6 +103,8 @@ def check_together(args: Namespace, bakes: bool) -> None:
     page = Path(args.out).suffix.lower() == PAGE
     if page and (args.levels or args.camera is not None or args.order):
         raise ClodError(f"a {PAGE} page contains the whole dial; remove --levels, --camera and --order")
+    if args.pack and not page:
+        raise ClodError(f"--pack is for {PAGE} pages; .sog and .compressed.ply are packed by themselves: remove it")
     if args.camera is not None and not bakes:
         raise ClodError("--camera needs a dial value to bake; give one, as in --sv 2")
     if args.images is not None and not (bakes or args.order or page):
@@ -157,10 +163,12 @@ baking:
   0.5 dB lower). With --camera the file is exact at that camera.
 
 budgets:
-  --keep is exact: OUT has N Gaussians. With --images, --psnr-drop finds the
-  smallest file that measures at most DB below MODEL at s = 1 on the held-out
-  photographs (splat-transform's rounding is measured afterwards), and --fps
-  times frames of MODEL. Without --images both use the calibration in MODEL.
+  --keep is exact: OUT has N Gaussians. --device-preset is --keep with the
+  number that viewers allow a device; a file with fewer is baked at s = 1. With
+  --images, --psnr-drop finds the smallest file that measures at most DB below
+  MODEL at s = 1 on the held-out photographs (splat-transform's rounding is
+  measured afterwards), and --fps times frames of MODEL. Without --images both
+  use the calibration in MODEL.
 
 levels and order:
   --levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on, all or none. With
@@ -176,14 +184,16 @@ other tools:
   SIBR reads a baked .ply of SH degree 1 to 3, and takes the degree from
   sh_degree in cfg_args next to the file.
   .html is the page of "clod-adapt view" in one file; --sv or a budget sets its
-  initial dial value.
-  .sog, .compressed.ply and --lod-meta need splat-transform 3.7 with Node 22, on
-  the PATH or in CLOD_SPLAT_TRANSFORM; "clod-adapt doctor" prints how to install
-  it. Without a GPU, 100,000 Gaussians take minutes for .sog.
+  initial dial value. With --pack its splat is rounded as in .sog; the loss is
+  measured and printed.
+  .sog, .compressed.ply, --pack and --lod-meta need splat-transform 3.7 with
+  Node 22, on the PATH or in CLOD_SPLAT_TRANSFORM; "clod-adapt doctor" prints
+  how to install it. Without a GPU, 100,000 Gaussians take minutes for .sog.
 
 examples:
   clod-adapt export garden_clod.ply --sv 2 -o garden_s2.ply
   clod-adapt export garden_clod.ply --keep 200000 -o garden_200k.ply
+  clod-adapt export garden_clod.ply --device-preset quest3 -o garden.sog
   clod-adapt export garden_clod.ply --psnr-drop 0.2 --images garden -o small.ply
   clod-adapt export garden_clod.ply -o garden.glb
   clod-adapt export garden_clod.ply --images garden -o garden.html

@@ -42,7 +42,7 @@ FORMATS = {
     ".splat": ExportFormat(("8 bits, SH degree 0",), ordered=False, sigma=False),
     **PACKED,
     PAGE: ExportFormat(
-        ("the viewer with the splat, in one file;", "exact, or 8 to 16 bits by splat-transform"),
+        ("the viewer with the splat, in one file;", "exact, or with --pack 8 to 16 bits"),
         ordered=False,
     ),
 }

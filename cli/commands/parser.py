@@ -7,6 +7,7 @@ from typing import Any, NoReturn
 
 from clod_adapter.errors import ClodError
 
+from ..shared.manual import manual
 from .command import Command
 
 
@@ -21,6 +22,10 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise ClodError(f"{message} (see {self.prog} --help)")
+
+    def format_help(self) -> str:
+        page = manual()
+        return f"{super().format_help()}\nmanual: {page}\n" if page else super().format_help()
 
 
 def make_parser(command: Command, prog: str) -> Parser:

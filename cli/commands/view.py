@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from argparse import ArgumentParser, Namespace
+from typing import Any
 
 from clod_adapter.errors import ClodError
 
-from .checks import check_checkpoint, check_scene
+from ..shared.dials import add_device_preset
+from .checks import check_checkpoint, check_scene, model_has_dial
 from .command import Command
 from .options import add_activated, add_antialiasing
 
@@ -20,7 +22,9 @@ def view_options(parser: ArgumentParser) -> None:
     add_activated(given)
     add_antialiasing(given, photographs=False)
     page = parser.add_argument_group("page")
-    page.add_argument("--sv", metavar="S", type=float, default=1.0, help="initial dial value (default: 1)")
+    initial: Any = page.add_mutually_exclusive_group()
+    initial.add_argument("--sv", metavar="S", type=float, default=1.0, help="initial dial value (default: 1)")
+    add_device_preset(initial)
     page.add_argument("--port", metavar="P", type=int, default=0, help="port of the server (default: a free one)")
     page.add_argument("--no-browser", action="store_true", help="print the address only")
 
@@ -32,6 +36,8 @@ def check_view(args: Namespace) -> None:
         raise ClodError(f"--sv is {args.sv:g}, it must be at least 1 (1 is full quality)")
     for path in (args.model, *([args.base] if args.base else [])):
         check_checkpoint(path)
+    if args.device_preset and not model_has_dial(args.model):
+        raise ClodError(f"{args.model}: has no sigma_d, which --device-preset needs; adapt it first")
     if args.images is not None:
         check_scene(args.images)
 
@@ -57,6 +63,8 @@ see it from another machine, forward the port (-t passes Ctrl-C on):
   ssh -t -L 8000:127.0.0.1:8000 HOST \\
       clod-adapt view MODEL.ply --no-browser --port 8000
 "clod-adapt export MODEL.ply -o page.html" writes the page to a file.
+--device-preset opens it at the dial value whose count suits a device, by the
+cameras of --images or those stored in MODEL.ply.
 
 --json prints its object at the start: {"url": ..., ...}.
 
@@ -65,6 +73,7 @@ exit codes: 0 ended by Ctrl-C or SIGTERM; 2 bad input, or the port is in use
 examples:
   clod-adapt view garden_clod.ply
   clod-adapt view garden_clod.ply --base garden.ply --images garden --sv 3
+  clod-adapt view garden_clod.ply --device-preset phone
 """,
     add_arguments=view_options,
     check=check_view,

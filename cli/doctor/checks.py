@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 from clod_adapter._support.text import first_line
 
+from ..shared.console import WIDTH
+
 Probe = Callable[[], str]
 """Runs one thing and returns a line about it; raises CheckFailed, or any other error, where it does not work."""
 
@@ -58,6 +60,9 @@ class Check:
             return cls(name, False, f"failed with {type(error).__name__}: {first_line(error)}")
 
     def line(self, width: int) -> str:
-        """``name  ok/off  found  -> fix``; the name takes ``width`` characters."""
-        fix = f"  -> {self.fix}" if self.fix else ""
-        return f"{self.name:<{width}}{'ok' if self.ok else 'off':<5}{self.found}{fix}"
+        """``name  ok/off  found  -> fix``; the name takes ``width`` characters. A long line has the fix below it."""
+        line, fix = f"{self.name:<{width}}{'ok' if self.ok else 'off':<5}{self.found}", f"-> {self.fix}"
+        if not self.fix:
+            return line
+        beside = f"{line}  {fix}"
+        return beside if len(beside) <= WIDTH else f"{line}\n    {fix}"

@@ -17,7 +17,7 @@ from .reference_scene import INRIA_TOLERANCE, ReferenceScene
 
 TORCH = "pip install --force-reinstall torch"
 TORCH_CUDA = f"{TORCH} --index-url https://download.pytorch.org/whl/cu128"
-GPU = "pip install 'clod-adapter[gpu]'"
+GPU = "pip install gsplat==1.5.3 setuptools"
 DRIVER = "install NVIDIA's driver: https://www.nvidia.com/drivers (a container needs --gpus all)"
 COMPILE = 'python -c "from gsplat.cuda._backend import _C"'
 GSPLAT = (1, 5, 3)  # the oldest supported version

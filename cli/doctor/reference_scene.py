@@ -78,5 +78,5 @@ class ReferenceScene:
         what = f"RMS {error:.2g}" if error is not None else f"shape {list(shape)}"
         raise CheckFailed(
             f"renders another image than the reference ({what})",
-            "pip install --upgrade clod-adapter; if that does not help, report it with clod-adapt doctor --json",
+            "pip install --force-reinstall numba; if that does not help, report it with clod-adapt doctor --json",
         )

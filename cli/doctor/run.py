@@ -9,7 +9,7 @@ from typing import Any
 
 from clod_adapter._support.version import package_version
 
-from ..shared.console import Console
+from ..shared.console import Console, put
 from .backends import BACKENDS
 from .checks import Check, Probe
 from .tools import TOOLS
@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             seconds[name] = round(time.perf_counter() - began, 3)
     width = max(map(len, PROBES)) + 2
     draws = [check.name for check in checks if check.ok and check.name in RENDERERS]
-    print("\n".join(check.line(width) for check in checks))
+    put("\n".join(check.line(width) for check in checks))
     failed = "no rendering backend works: fix torch first, then the CPU backend"
     print(f"rendering and training backends: {', '.join(draws)}" if draws else failed)
     return {

@@ -52,9 +52,9 @@ def glb() -> str:
             write(Path(folder) / "a.glb", gaussians)
             again = load(Path(folder) / "a.glb").gaussians
     except ClodError as error:
-        raise CheckFailed("pygltflib is not installed", "pip install 'clod-adapter[export]'") from error
+        raise CheckFailed("pygltflib is not installed", "pip install pygltflib") from error
     if not again.means.equal(gaussians.means):
-        raise CheckFailed("the file read differs from the file written", "pip install --upgrade 'clod-adapter[export]'")
+        raise CheckFailed("the file read differs from the file written", "pip install --upgrade pygltflib")
     return "writes and reads .glb"
 
 
@@ -80,7 +80,7 @@ def demo() -> str:
     try:
         photograph("coffee.png")
     except ClodError as error:
-        raise CheckFailed(first_line(error).partition(": pip")[0], "pip install 'clod-adapter[demo]'") from error
+        raise CheckFailed(first_line(error).partition(": pip")[0], "pip install scikit-image") from error
     return "its photographs are installed"
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,6 +24,7 @@ from ..commands.export_formats import LOD_META, PACKED, PAGE, suffix_of
 from ..shared.console import Console, duration
 from ..shared.kernels import prepare_kernels
 from .baking import Target
+from .packing import packing_bar, packing_loss
 
 
 @dataclass(frozen=True)
@@ -38,6 +37,7 @@ class Export:
         target: the cameras to bake for.
         cameras: of the scene, for the views of a page.
         ordered: whether the rows are sorted by extinction.
+        pack: whether a page has a packed splat.
         console: for splat-transform's progress.
     """
 
@@ -46,6 +46,7 @@ class Export:
     target: Target
     cameras: list[Camera]
     ordered: bool
+    pack: bool
     console: Console
 
     def content(self, virtual_scale: float | None) -> tuple[Gaussians, tuple[str, ...]]:
@@ -118,17 +119,18 @@ class Export:
         return ()
 
     def _write_page(self, path: Path, virtual_scale: float) -> tuple[str, ...]:
-        """Writes the page; packs the splat where splat-transform is installed."""
-        try:
-            tool = SplatTransform.find()
-        except ClodError as error:
+        """Writes the page, with a packed splat if that was asked for; then a note on its loss."""
+        if not self.pack:
             write_viewer_page(path, self.model, cameras=self.cameras, virtual_scale=virtual_scale)
-            return (f"the splat in the page is not packed, which would make the page five times smaller: {error}",)
-        with ticking(self.console, f"splat-transform {tool.version}, {len(self.gaussians):,} Gaussians") as tick:
-            write_viewer_page(
+            return ()
+        tool = SplatTransform.find()
+        with packing_bar(self.console, len(self.gaussians)) as tick:
+            packed = write_viewer_page(
                 path, self.model, cameras=self.cameras, virtual_scale=virtual_scale, tool=tool, progress=tick
-            )  # fmt: skip
-        return ("the splat in the page is packed: values are rounded",)
+            )
+        assert packed is not None
+        loss = packing_loss(packed, self.gaussians, self.cameras, self.console)
+        return (f"the splat in the page is packed: its renders have a PSNR of {loss:.1f} dB against the exact ones",)
 
     def _pack(self, path: Path, suffix: str, gaussians: Gaussians, about: tuple[str, ...]) -> tuple[str, ...]:
         with TemporaryDirectory(dir=path.parent, prefix=".tmp-") as folder:
@@ -144,9 +146,9 @@ class Export:
 
     def _transform(self, words: list[str | Path], out: Path, count: int) -> tuple[str, ...]:
         tool = SplatTransform.find()
-        with ticking(self.console, f"splat-transform {tool.version}, {count:,} Gaussians") as tick:
+        with packing_bar(self.console, count) as tick:
             seconds = tool.run(*words, out, timeout=time_limit(count), progress=tick)
-        self.console.say(f"splat-transform took {duration(seconds)}")
+        self.console.say(f"splat-transform {tool.version} took {duration(seconds)}")
         notes = ["splat-transform rounds values and sorts the Gaussians"]
         if any(self.model.origin):
             notes.append("coordinates are relative to the model's origin, which is dropped")
@@ -157,10 +159,3 @@ class Export:
     def _position(self, camera: Camera) -> str:
         place = camera.position.double().tolist()
         return f"({', '.join(f'{x + by:.9g}' for x, by in zip(place, self.model.origin, strict=True))})"
-
-
-@contextmanager
-def ticking(console: Console, text: str) -> Iterator[Callable[[float], None]]:
-    """Shows the elapsed seconds of a part of unknown length."""
-    with console.status(f"{text} ...") as show:
-        yield lambda seconds: show(f"{text}, {duration(seconds)} so far")

@@ -21,7 +21,7 @@ from clod_adapter.io.scene.poses import load_cameras
 from ..commands.export_formats import LOD_META, PAGE, level_paths, suffix_of
 from ..shared.antialiasing import with_filter
 from ..shared.budgets import solve_dials
-from ..shared.console import Console
+from ..shared.console import Console, put
 from ..shared.devices import on_device, pick_device
 from ..shared.dials import given_budget, initial_dial
 from ..shared.files import size
@@ -54,9 +54,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     losses = list(dict.fromkeys(losses))
     for note in losses:
         console.note(note)
-    print("\n".join(output_line(output, len(export.gaussians)) for output in outputs))
+    put("\n".join(output_line(output, len(export.gaussians)) for output in outputs))
     if dials is not None and not page:
-        print(baking_line(export.target, model.gaussians.growth_d is not None))
+        put(baking_line(export.target, model.gaussians.growth_d is not None))
     camera = export.target.camera
     return {
         "command": "export", "version": package_version(), "model": args.model, "base_count": len(export.gaussians),
@@ -78,7 +78,7 @@ def prepare_export(
     gaussians = model.gaussians
     if args.order:
         gaussians = gaussians.select(order_by_extinction(gaussians, target.cameras))
-    return Export(model, gaussians, target, cameras, bool(args.order), console), notes
+    return Export(model, gaussians, target, cameras, bool(args.order), args.pack, console), notes
 
 
 def dial_values(

@@ -52,6 +52,7 @@ def solve_dials(
         machine = f" (frame times of {calibration.machine} at {calibration.width}x{calibration.height})"
     dials = []
     for value in values:
+        asked = f"{option} {value}" if isinstance(value, int) else f"{option} {value:g}"
         try:
             if times:
                 solved = dial_for_times(times, value)
@@ -59,10 +60,10 @@ def solve_dials(
                 budgets = {name: value}
                 solved = dial_for(model.gaussians, **budgets, cameras=cameras, calibration=calibration, baked=baked)
         except ClodError as error:
-            raise ClodError(f"{option} {value:g}: {error}{machine}") from error
+            raise ClodError(f"{asked}: {error}{machine}") from error
         dials.append(solved.virtual_scale)
         note = solved.note and f" ({solved.note})"
-        notes.append(f"{option} {value:g}: s = {solved.virtual_scale:.5g}{note}{machine}")
+        notes.append(f"{asked}: s = {solved.virtual_scale:.5g}{note}{machine}")
     return dials, notes
 
 
@@ -77,12 +78,12 @@ def _calibration_for(name: str, option: str, model: Checkpoint) -> Calibration |
 def time_frames(
     model: Checkpoint, cameras: Sequence[Camera], console: Console
 ) -> tuple[list[tuple[float, float]], list[str]]:
-    """``budget.frame_times`` with a progress bar, and a note on the result."""
+    """``budget.frame_times`` with a progress bar, and notes on the result."""
     prepare_kernels(console, model.gaussians.means.device, training=False)
     with console.meter("timing") as meter:
-        times = frame_times(model.gaussians, cameras, progress=meter)
+        times, notes = frame_times(model.gaussians, cameras, progress=meter)
     (first, slow), (last, fast) = times[0], times[-1]
-    return times, [f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}"]
+    return times, [f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}", *notes]
 
 
 def calibrate(rows: Sequence[Row], measured: Gaussians, scene: Scene, against: str, origin: Origin) -> Calibration:

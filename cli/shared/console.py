@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TextIO
 
 from tqdm import tqdm
 
@@ -17,6 +18,8 @@ from clod_adapter.progress import Listener, Progress
 
 tqdm.monitor_interval = 0  # bars are updated at every step anyway, and its thread may fail to start
 LINE_EVERY = 10.0  # seconds between progress lines if stderr is not a terminal
+WIDTH = 80  # of progress lines and tables, and of a terminal whose size is unknown
+TEXT = 36  # most characters of the text beside a bar, so that 80 columns have room for label, time and bar
 BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 
 
@@ -29,7 +32,7 @@ class Console:
     def say(self, text: str) -> None:
         if not self.quiet:
             with _unbreakable():
-                tqdm.write(text, file=sys.stderr)  # print would overwrite a bar on this line
+                tqdm.write(folded(text, sys.stderr), file=sys.stderr)  # print would overwrite a bar on this line
                 sys.stderr.flush()
 
     def note(self, text: str) -> None:
@@ -100,7 +103,7 @@ class Meter:
 
     def update(self, share: float, text: str = "") -> None:
         """Shows the ``share`` that is done, in [0, 1], followed by ``text``."""
-        now = time.perf_counter()
+        now, text = time.perf_counter(), clipped(text, TEXT)
         if self.bar is not None:
             with _unbreakable():
                 self.bar.set_postfix_str(text, refresh=False)
@@ -122,6 +125,53 @@ class Meter:
             with _unbreakable():
                 self.bar.close()
             self.bar = None
+
+
+def put(text: str, hang: int = 4, end: str = "\n") -> None:
+    """Prints a result on stdout, as ``folded``."""
+    print(folded(text, sys.stdout, hang), end=end)
+
+
+def folded(text: str, stream: TextIO, hang: int = 4) -> str:
+    """``text`` as ``stream`` shows it: on a terminal, long lines are broken between words; elsewhere it is unchanged.
+
+    Args:
+        hang: further indentation of the lines that continue another.
+    """
+    if not stream.isatty():
+        return text
+    try:
+        width = os.get_terminal_size(stream.fileno()).columns or WIDTH
+    except (OSError, ValueError):
+        width = WIDTH
+    return "\n".join(_broken(line, width, hang) for line in text.split("\n"))
+
+
+def _broken(line: str, width: int, hang: int) -> str:
+    if len(line) <= width:
+        return line
+    indent = " " * (len(line) - len(line.lstrip()) + hang)
+    return textwrap.fill(
+        line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False,
+        expand_tabs=False, replace_whitespace=False,
+    )  # fmt: skip
+
+
+def command_line(*parts: str) -> str:
+    """An indented command; one that is too long is continued in the way of shells, between its parts."""
+    lines = [f"  {parts[0]}"]
+    for part in parts[1:]:
+        if len(lines[-1]) + 1 + len(part) + 2 > WIDTH:  # with a space, and a backslash after it
+            lines[-1] += " \\"
+            lines.append(f"      {part}")
+        else:
+            lines[-1] += f" {part}"
+    return "\n".join(lines)
+
+
+def clipped(text: str, most: int) -> str:
+    """``text`` with at most this many characters."""
+    return text if len(text) <= most else f"{text[: most - 3].rstrip()}..."
 
 
 def duration(seconds: float) -> str:

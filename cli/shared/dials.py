@@ -14,6 +14,8 @@ OPTIONS: tuple[tuple[str, str, type, str], ...] = (
     ("fps", "F", float, "the dial value that renders F frames per second, by frame times {times}"),
     ("psnr_drop", "DB", float, "the dial value that loses DB decibels against s = 1, {decibels}"),
 )  # fmt: skip
+# Gaussians that viewers draw at most on a device, by their makers; docs/formats.md has the sources.
+DEVICES = {"quest3": 500_000, "phone": 1_000_000, "laptop": 2_000_000, "desktop": 4_000_000}
 BUDGETS = """\
 budgets, each solved for a dial value:
   --keep       exact; s = 1 keeps fewer Gaussians than the file has
@@ -35,6 +37,15 @@ def add_dial_options(options: _ActionsContainer, sv_help: str, where: str, *, se
         option = f"--{name.replace('_', '-')}"
         shown = text.format(where=where, times=times, decibels=decibels)
         group.add_argument(option, metavar=metavar, type=kind, nargs=count, help=shown)
+    if not several:
+        add_device_preset(group)
+
+
+def add_device_preset(options: _ActionsContainer) -> None:
+    counts = ", ".join(f"{count:,}" for count in DEVICES.values())
+    options.add_argument(
+        "--device-preset", choices=[*DEVICES], help=f"--keep with the number that viewers allow a device: {counts}"
+    )
 
 
 def initial_dial(virtual_scale: float, max_sv: float | None) -> tuple[float, list[str]]:
@@ -52,7 +63,9 @@ def initial_dial(virtual_scale: float, max_sv: float | None) -> tuple[float, lis
 
 def given_budget(args: Namespace) -> tuple[str, str, list[float]] | None:
     """Name, option and values of the budget, or None without one."""
+    if device := getattr(args, "device_preset", None):
+        return "keep", f"--device-preset {device}, --keep", [DEVICES[device]]
     for name, *_ in OPTIONS:
-        if getattr(args, name) is not None:
+        if getattr(args, name, None) is not None:
             return name, f"--{name.replace('_', '-')}", getattr(args, name)
     return None

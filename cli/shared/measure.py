@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from clod_adapter.cameras import View
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.evaluation.evaluate import Row, evaluate
+from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.evaluation.perceptual import Metric
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.progress import Progress
+from clod_adapter.progress import Phase, Progress, Stopped
 
 from .console import Console
 from .interrupts import GracefulStop
@@ -54,3 +56,37 @@ def measure(
 
         rows = evaluate(gaussians, views, virtual_scales, metrics=metrics, progress=show)
     return rows, stop.requests > before
+
+
+def with_frame_times(
+    measured: Sequence[tuple[Gaussians, Sequence[Row]]],
+    views: Sequence[View],
+    console: Console,
+    stop: GracefulStop | None = None,
+) -> tuple[list[list[Row]], list[str], bool]:
+    """The rows of each model with frame times that can be compared, notes, and whether Ctrl-C ended the timing.
+
+    Then and without rows they are returned unchanged.
+    """
+    stop = stop or GracefulStop(aborts=launched().size == 1)
+    before, rows = stop.requests, [list(each) for _, each in measured]
+    dials = [sorted({row.virtual_scale for row in each}) for each in rows]
+    if not any(rows):
+        return rows, [], False
+    try:
+        with console.meter(Phase.FRAME_TIMES) as meter, stop.listening():
+
+            def show(now: Progress) -> bool:
+                meter(now)
+                return stop.requests == before
+
+            models = [(some, each) for (some, _), each in zip(measured, dials, strict=True)]
+            times = time_frames(models, [view.camera for view in views], show)
+    except Stopped:
+        return rows, [], True
+    for note in times.notes:
+        console.say(note)
+    for each, scales, found in zip(rows, dials, times.milliseconds, strict=True):
+        taken = dict(zip(scales, found, strict=True))
+        each[:] = [replace(row, frame_ms=taken[row.virtual_scale]) for row in each]
+    return rows, times.notes, False

@@ -115,25 +115,26 @@ def rows_table(marked: Sequence[tuple[str, Row]]) -> str:
     width = max(6, *(len(label) for label, _ in marked))
     more = [name for name in ("lpips", "flip") if any(getattr(row, name) is not None for _, row in marked)]
     heads = "".join(f"  {name.upper():>6}" for name in more)
-    lines = [f"{'dial':>{width}}  PSNR dB    SSIM{heads}        kept              in view  frame ms"]
+    lines = [f"{'dial':>{width}}  PSNR dB    SSIM{heads}        kept            in view  frame ms"]
     for label, row in marked:
         extra = "".join(f"  {getattr(row, name):6.4f}" for name in more)
-        kept = f"{row.kept:10,.0f}  {row.kept_share:7.1%}  {row.in_view:10,.0f}  {row.frame_ms:8.1f}"
+        kept = f"{row.kept:10,.0f}  {row.kept_share:6.1%}  {row.in_view:9,.0f}  {row.frame_ms:8.1f}"
         lines.append(f"{label:>{width}}  {row.psnr:7.2f}  {row.ssim:.4f}{extra}  {kept}")
     return "\n".join(lines)
 
 
 def popping_table(results: Sequence[tuple[str, Popping]]) -> str:
-    """A table of popping measurements, with an explanation."""
-    width = max(len(moved) for moved, _ in results)
+    """A table of popping measurements, with an explanation; what moves is above its numbers."""
     lines = [
-        "popping: change of the image per step, in levels of 255 (RMS over the image, largest change of a pixel).",
-        "Halving the step halves the largest change of a fade (0.5), but not that of a jump (1.0):",
-        f"{'what moves':>{width}}  steps     mean  largest     at  / mean  halved   pixel  halved",
+        "popping: change of the image per step, in levels of 255 (RMS over the image,",
+        "largest change of a pixel). Halving the step halves the largest change of a",
+        "fade (0.5), but not that of a jump (1.0):",
+        "  steps     mean  largest     at  / mean  halved   pixel  halved",
     ]
     for moved, p in results:
+        lines.append(moved)
         lines.append(
-            f"{moved:>{width}}  {p.steps:5}  {p.mean:7.4f}  {p.largest:7.4f}  {p.at:5.2f}  {p.ratio:6.1f}"
+            f"  {p.steps:5}  {p.mean:7.4f}  {p.largest:7.4f}  {p.at:5.2f}  {p.ratio:6.1f}"
             f"  {p.persistence:6.2f}  {p.pixel:6.1f}  {p.pixel_persistence:6.2f}"
         )
     return "\n".join(lines)

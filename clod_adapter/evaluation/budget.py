@@ -8,7 +8,7 @@
   (normalizers ``max`` and ``quantile``) is culled in all views at once.
 - PSNR is read from the calibration table that is stored with the file (``calibration.py``).
 - Frame rates depend on the machine, the image size and the load. With cameras some frames are timed
-  (``frame_times``, a second or two): under load the times of one machine differ by a factor of ten. The table's times
+  (``frame_times``, some seconds): under load the times of one machine differ by a factor of ten. The table's times
   are used only where they are passed in, or (``clod-adapt export``) where nothing can be timed.
 
 A budget that s = 1 already meets is no error: the dial is 1, and a note says so. s = 1 keeps fewer Gaussians than the
@@ -18,8 +18,6 @@ file has. No budget is met beyond ``max_sv``: the equation is defined there, but
 from __future__ import annotations
 
 import math
-import statistics
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -32,12 +30,12 @@ from clod_adapter.config import AttenuationConfig, require
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.equation.extinction import extinction_scale
 from clod_adapter.errors import ClodError
+from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.progress import Listener, Phase, tell
-from clod_adapter.rasterizers import wait_for
-from clod_adapter.render import dial, render
+from clod_adapter.progress import Listener
+from clod_adapter.render import dial
 
-TIMED_VIEWS, TIMED_DIALS, TIMED_REPEATS = 4, 6, 2
+TIMED_DIALS = 6
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,7 @@ def dial_for(
         return _for_psnr_drop(calibration, value)
     stored = [(row.virtual_scale, row.frame_ms) for row in calibration.rows] if calibration else None
     whole = [camera for camera in cameras if isinstance(camera, Camera)]
-    return dial_for_times(stored or frame_times(gaussians, whole), value)
+    return dial_for_times(stored or frame_times(gaussians, whole)[0], value)
 
 
 def dial_for_times(times: Sequence[tuple[float, float]], fps: float) -> DialValue:
@@ -118,22 +116,16 @@ def dial_for_times(times: Sequence[tuple[float, float]], fps: float) -> DialValu
     return DialValue(found)
 
 
-@torch.no_grad()
 def frame_times(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    *,
-    progress: Listener | None = None,
-) -> list[tuple[float, float]]:
+    gaussians: Gaussians, cameras: Sequence[Camera], *, progress: Listener | None = None
+) -> tuple[list[tuple[float, float]], list[str]]:
     """Measures milliseconds per frame at six dial values from 1 to max_sv, in even steps of log s.
 
-    Medians over at most four of the cameras, evenly spread.
-
     Args:
-        progress: called in ``Phase.FRAME_TIMES`` with the frames timed so far.
+        progress: as for ``frame_times.time_frames``.
 
     Returns:
-        The dial values, each with its milliseconds.
+        The dial values, each with its milliseconds; and notes on the measurement.
 
     Raises:
         ClodError: there are no cameras, or the Gaussians have no dial.
@@ -142,20 +134,10 @@ def frame_times(
         raise ClodError("the Gaussians have no sigma_d, so there are no dial values to time")
     if not cameras:
         raise ClodError("frames a second need a calibration or cameras to time frames from")
-    seen = cameras[:: -(-len(cameras) // TIMED_VIEWS)]
-    max_sv, gaussians = gaussians.attenuation.max_sv, gaussians.without_empty_bands()
+    max_sv = gaussians.attenuation.max_sv
     virtual_scales = [max_sv ** (k / (TIMED_DIALS - 1)) for k in range(TIMED_DIALS)] if max_sv > 1 else [1.0]
-    times: list[list[float]] = [[] for _ in virtual_scales]
-    render(gaussians, seen[0], max_sv)  # compiles and warms up before timing
-    for done in range(TIMED_REPEATS * len(seen)):
-        for taken, virtual_scale in zip(times, virtual_scales, strict=True):  # interleaved: clock rates drift
-            wait_for(gaussians.means.device)
-            began = time.perf_counter()
-            render(gaussians, seen[done % len(seen)], virtual_scale)
-            wait_for(gaussians.means.device)
-            taken.append((time.perf_counter() - began) * 1e3)
-        tell(progress, Phase.FRAME_TIMES, (done + 1) * len(times), TIMED_REPEATS * len(seen) * len(times))
-    return [(s, statistics.median(taken)) for s, taken in zip(virtual_scales, times, strict=True)]
+    found = time_frames([(gaussians, virtual_scales)], cameras, progress)
+    return list(zip(virtual_scales, found.milliseconds[0], strict=True)), found.notes
 
 
 def _for_psnr_drop(calibration: Calibration | None, drop: float) -> DialValue:

@@ -31,7 +31,7 @@ class Row:
         psnr: dB; ssim: in [-1, 1] (``metrics.psnr_ssim``).
         kept: Gaussians the dial leaves in, of all; kept_share: that divided by all.
         in_view: kept Gaussians that also take part in the picture (their centre is in the image).
-        frame_ms: median time of a frame, milliseconds.
+        frame_ms: median time of a frame, milliseconds; one frame a view, so compare with ``frame_times.time_frames``.
         lpips, flip: where they were asked for (``perceptual.available_metrics``), else None.
     """
 
@@ -56,7 +56,6 @@ def evaluate(
     views: Sequence[View],
     virtual_scales: Sequence[float],
     *,
-    repeats: int = 1,
     metrics: Mapping[str, Metric] | None = None,
     progress: Listener | None = None,
 ) -> list[Row]:
@@ -64,13 +63,12 @@ def evaluate(
 
     Args:
         gaussians: adapted or not; without ``sigma_d`` every dial value shows the base.
-        repeats: frames timed per view and dial value; all renders of one view are the same.
         metrics: more to measure, from ``perceptual.available_metrics``: any of ``lpips`` and ``flip``.
         progress: called in ``Phase.EVALUATION`` after each view of each dial value. If it returns False, the rows of
             the dial values that are complete are returned.
 
     Raises:
-        ClodError: no views, no dial values, a dial value below 1 or not finite, or repeats below 1.
+        ClodError: no views, no dial values, or one below 1 or not finite.
     """
     if not views:
         raise ClodError("there are no held-out views to evaluate on")
@@ -78,7 +76,6 @@ def evaluate(
         raise ClodError("there are no dial values to evaluate at")
     for virtual_scale in virtual_scales:
         require(1 <= virtual_scale < math.inf, "virtual_scale", virtual_scale, "at least 1 and finite")
-    require(repeats >= 1, "repeats", repeats, "at least 1")
     gaussians, device = gaussians.without_empty_bands(), gaussians.means.device
     render(gaussians, views[0].camera, max(virtual_scales))  # compiled and warm before the clock starts
     rows = list[Row]()
@@ -86,12 +83,11 @@ def evaluate(
         results, times = [], []
         more: dict[str, list[float]] = {name: [] for name in metrics or {}}
         for j, view in enumerate(views):
-            for _ in range(repeats):
-                wait_for(device)
-                began = time.perf_counter()
-                rendering = render(gaussians, view.camera, virtual_scale)
-                wait_for(device)
-                times.append((time.perf_counter() - began) * 1e3)
+            wait_for(device)
+            began = time.perf_counter()
+            rendering = render(gaussians, view.camera, virtual_scale)
+            wait_for(device)
+            times.append((time.perf_counter() - began) * 1e3)
             results.append((*psnr_ssim(rendering.image, view.image), *_counts(gaussians, view, rendering)))
             for name, metric in (metrics or {}).items():
                 more[name].append(metric(rendering.image, view.image))

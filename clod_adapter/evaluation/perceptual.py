@@ -13,7 +13,7 @@ from torch import Tensor
 
 from clod_adapter.losses import unit
 
-INSTALL = "pip install 'clod-adapter[eval]'"
+INSTALL = "pip install lpips flip-evaluator"
 WEIGHTS = """python -c "import torchvision; torchvision.models.alexnet(weights='DEFAULT')\""""
 
 Metric = Callable[[Tensor, Tensor], float]

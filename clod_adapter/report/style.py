@@ -19,7 +19,7 @@ INK, QUIET, GRID, PAPER = "#1c1c1e", "#6b6b70", "#e4e4e7", "#ffffff"
 BLUE, ORANGE, GREEN, PURPLE = "#1f5fa8", "#c2571a", "#2d7d5a", "#7a4fa3"
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, QUIET)  # in the order that lines are drawn
 DPI = 200
-INSTALL = "pip install 'clod-adapter[plots]'"
+INSTALL = "pip install matplotlib"
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",  # included in matplotlib, so text has the same size everywhere
     "text.color": INK,

@@ -23,6 +23,7 @@ RATES = {
     "means": "lr_means", "quats": "lr_quats", "scales": "lr_scales", "opacities": "lr_opacities", "sh0": "lr_sh0",
 }  # fmt: skip
 NAMES = ("bands", "unseen", *RATES)
+NOT_NEEDED = "not needed"  # the verdict on a step that does not apply to the scene
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Decision:
 
     Attributes:
         what: the part of the checkpoint.
-        verdict: "kept", "left out", or of an attribute "frozen".
+        verdict: "kept", "left out", of an attribute "frozen", or NOT_NEEDED.
         number: the measured effect, in ``unit``; None if nothing was measured.
         why: what the number is, or the reason if there is none.
         name: the name in NAMES by which ``Override`` changes it; empty if there is nothing to change.

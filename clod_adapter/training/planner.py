@@ -17,7 +17,7 @@ from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, initial
 from clod_adapter.progress import Listener, Phase, tell, within
 from clod_adapter.training.ablation import needed_share, seen, sh_degree_losses
 from clod_adapter.training.loop import require_trainable
-from clod_adapter.training.plan import RATES, Decision, Override, Plan
+from clod_adapter.training.plan import NOT_NEEDED, RATES, Decision, Override, Plan
 
 SHARE_LIMIT = 0.01  # dB: the share kept at s = 1 loses less on these views
 LIMIT = 0.02  # dB: SH degrees and Gaussians are left out if the PSNR of the training views changes by less without them
@@ -69,7 +69,7 @@ class _Planner:
             initial = initialize(few, self.views, config, self.progress, error=error)
         config = self._freeze(config)
         for item, reason in self.scene.left_out:
-            self._decide(item, "left out", reason)
+            self._decide(item, NOT_NEEDED, reason)
         return Plan(tuple(self.decisions), initial, kept, degree, config, self.seconds)
 
     def _sh_degree(self) -> int:
@@ -77,7 +77,7 @@ class _Planner:
         base, views = self.base, spread(self.views, VIEWS)
         degree = base.sh_degree
         if degree == 0:
-            self._decide("SH degrees", "left out", "there are none")
+            self._decide("SH degrees", NOT_NEEDED, "there are none")
             return 0
         if "bands" in self.override.keep | self.override.leave_out:
             kept = "bands" in self.override.keep

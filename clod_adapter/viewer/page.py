@@ -41,8 +41,10 @@ def write_viewer_page(
     virtual_scale: float = 1.0,
     tool: SplatTransform | None = None,
     progress: Callable[[float], None] | None = None,
-) -> None:
+) -> PackedSplat | None:
     """Writes the page as one file that includes the splats, for opening without a server or network.
+
+    The same arguments give the same bytes; what is installed has no influence.
 
     Args:
         model: with or without a dial.
@@ -52,21 +54,26 @@ def write_viewer_page(
         tool: packs the splats to a fifth of their size, with rounded values (``pack_sog``, which calls
             ``progress``); None stores them unpacked.
 
+    Returns:
+        The packed model; None without ``tool``.
+
     Raises:
         ClodError: the file cannot be written, or packing fails.
     """
-    entries, data = list[dict[str, Any]](), dict[str, Iterable[bytes]]()
+    entries, data, packs = list[dict[str, Any]](), dict[str, Iterable[bytes]](), list[PackedSplat | None]()
     for element, checkpoint in (("clod-model", model), ("clod-base", base)):
         if checkpoint is not None:
             payload = Payload.of(checkpoint)
             packed = pack_sog(payload, tool, Path(path).absolute().parent, progress) if tool else None
             entry, added = _embed(element, payload, packed)
             entries.append(entry)
+            packs.append(packed)
             data |= added
     config = page_config(entries[0], entries[1] if base else None, cameras, virtual_scale)
     meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.writelines(_document(config, _elements(data), meta))
+    return packs[0]
 
 
 def _embed(

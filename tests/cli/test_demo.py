@@ -65,7 +65,7 @@ def test_missing_package_is_named_at_the_start(clod: Any, tmp_path: Path, monkey
             patch.setattr(demo, "EXTRA", {module: package})
             patch.setitem(sys.modules, module, None)
             done = clod("demo")
-        assert done.code == 2 and f"the demo needs {package}: pip install 'clod-adapter[demo]'" in done.err
+        assert done.code == 2 and f"the demo needs {package}: pip install {package}" in done.err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -119,7 +119,7 @@ def test_popping(clod: Any, capture: Any, dialled: Path) -> None:
         assert entry["largest"] == max(entry["changes"]) and 1 < entry["ratio"] < 200
         assert 0.3 < entry["persistence"] <= 1 and entry["largest"] < entry["pixel"] < 255
     assert 1 < dial["at"] <= 3 and 0 < walk["at"] <= 1
-    assert re.search(r"^ +what moves +steps +mean", done.err, re.M) and "camera, 002.png to 006.png" in done.err
+    assert re.search(r"^ +steps +mean", done.err, re.M) and "\ncamera, 002.png to 006.png, s = 3\n" in done.err
 
 
 def test_interrupt_keeps_finished_comparisons(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -68,7 +69,42 @@ def test_unexpected_error_prints_a_traceback_and_where_to_report_it(
     monkeypatch.setattr("clod_adapter.cli.shared.models.read_checkpoint", fail)
     done = clod("eval", capture.ply, "--images", capture.scene, "--json", "--quiet")
     lines = done.err.splitlines()
-    assert done.code == 1 and done.out == "" and lines[0] == "Traceback (most recent call last):", done
+    assert done.code == 1 and lines[0] == "Traceback (most recent call last):", done
     assert lines[-2] == "ZeroDivisionError: of ours" and 'raise ZeroDivisionError("of ours")' in done.err
     assert lines[-1].startswith(f"clod-adapt: error: this is a bug in clod-adapt {package_version()}, not in the input")
     assert "please report it, with the lines above" in lines[-1]
+
+
+def test_errors_are_one_json_object(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bad input, an interrupt and a fault of ours; on stdout, beside the line on stderr."""
+    words = ("eval", capture.ply, "--images", capture.scene, "--json")
+    done = clod(*words, "--sv", 0)
+    assert json.loads(done.out) == {
+        "error": "--sv has 0, dial values must be at least 1 (1 is full quality)",
+        "code": 2,
+    }
+    for error, code, said in ((KeyboardInterrupt(), 130, "interrupted"), (ZeroDivisionError(), 1, "this is a bug in")):
+
+        def read(*_: object, error: BaseException = error) -> None:
+            raise error
+
+        monkeypatch.setattr("clod_adapter.cli.shared.models.read_scene", read)
+        done = clod(*words)
+        found = json.loads(done.out)
+        assert done.code == found["code"] == code and found["error"].startswith(said), done
+        assert done.err.splitlines()[-1].endswith(found["error"])
+
+
+@pytest.mark.parametrize(("word", "command"), [("veiw", "view"), ("Eval", "eval"), ("robustnes", "robustness")])
+def test_a_misspelt_command_is_suggested(clod: Any, tmp_path: Path, word: str, command: str) -> None:
+    done = clod(word, "some.ply")
+    assert done.code == 2 and f"{word}: no such file or command; did you mean clod-adapt {command}?\n" in done.err
+    (tmp_path / word).touch()
+    assert "did you mean" not in clod(word).err  # a file
+
+
+def test_a_pipe_that_is_closed_before_the_error(spawn: Any, tmp_path: Path) -> None:
+    process = spawn("inspect", "missing.ply", "--json", cwd=tmp_path)
+    process.stdout.close()
+    assert "Traceback" not in (said := process.stderr.read()) and "missing.ply" in said
+    assert process.wait(timeout=60) == 2

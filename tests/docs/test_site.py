@@ -96,6 +96,79 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+ITEM = re.compile(r"^ *(\d+\.|[-*]) +\S")
+WITHOUT_COUNT = {"api.md"}  # made from docstrings
+
+
+def written(page: Path) -> tuple[int, int, list[str]]:
+    """The ordered and the other list items of a page, and its code: fences and indented formulas, without blanks."""
+    text = page.read_text(encoding="utf-8")
+    code = [fence[3] for fence in FENCE.findall(text)]
+    ordered = others = 0
+    inside, block = False, list[str]()
+    for line in [*FENCE.sub("", text).splitlines(), ""]:
+        depth = 8 if inside else 4  # in a list item
+        if line.strip() and not line.startswith(" " * depth):
+            code += ["\n".join(block)] if block else []
+            block = []
+            item = ITEM.match(line)
+            inside = bool(item) or (inside and line.startswith(" "))
+            ordered += bool(item) and item[1][0].isdigit()
+            others += bool(item) and not item[1][0].isdigit()
+            starts = False
+        elif line.strip() and (block or starts):
+            block.append(line)
+        elif not line.strip():
+            starts = True  # a formula has a blank line above it
+    code += ["\n".join(block)] if block else []
+    return ordered, others, ["".join(each.split()) for each in code]
+
+
+class Shown(HTMLParser):
+    """The lists and code of a page's article: counts of list items by their list, and texts without blanks."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.lists, self.items, self.code, self.deep = list[str](), {"ol": 0, "ul": 0}, list[str](), 0
+        self.inside = False
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.inside = self.inside or tag == "article"
+        if not self.inside:
+            return
+        if tag in self.items:
+            self.lists.append(tag)
+        elif tag == "li":
+            self.items[self.lists[-1]] += 1
+        elif tag == "pre":
+            self.code.append("")
+            self.deep += 1
+
+    def handle_endtag(self, tag: str) -> None:
+        self.inside = self.inside and tag != "article"
+        if self.inside and tag in self.items:
+            self.lists.pop()
+        self.deep -= self.inside and tag == "pre"
+
+    def handle_data(self, data: str) -> None:
+        if self.deep:
+            self.code[-1] += "".join(data.split())
+
+
+def test_every_list_item_and_formula_is_shown(site: Path) -> None:
+    """Counted in the source, where indentation by three spaces ends a list for the site but not on GitHub."""
+    sources = [page for page in sorted(DOCS.glob("*.md")) if page.name not in WITHOUT_COUNT]
+    formulas = 0
+    for page in sources:
+        ordered, others, code = written(page)
+        shown = Shown((site / f"{page.stem}.html").read_text(encoding="utf-8"))
+        assert shown.items == {"ol": ordered, "ul": others}, page.name
+        assert sorted(shown.code) == sorted(code), page.name
+        formulas += len(code) - len(FENCE.findall(page.read_text(encoding="utf-8")))
+    assert len(sources) > 20 and formulas >= 3, formulas
+
+
 def test_the_built_site(site: Path) -> None:
     """The site loads nothing from other hosts, its search covers all pages, and it publishes pages only."""
     pages = sorted(site.glob("*.html"))

@@ -57,7 +57,7 @@ def test_rows_are_means_over_renders() -> None:
     some = attach(gaussians(200, 1, 0), sigma_d, AttenuationConfig(scene_distance=4.0))
     views = photograph(gaussians(200, 1, 0), ring(3, 32, 24))
     seen = []
-    rows = evaluate(some, views, [1.0, 2.0], progress=lambda now: seen.append((now.done, now.total)), repeats=2)
+    rows = evaluate(some, views, [1.0, 2.0], progress=lambda now: seen.append((now.done, now.total)))
     assert seen == [(k, 6) for k in range(1, 7)]
     (row,) = evaluate(some, views, [1.0], metrics={"flip": lambda image, _: float(image.requires_grad)})
     assert row.flip == 0  # no graph is left behind, whatever requires a gradient
@@ -90,13 +90,12 @@ def test_evaluating_no_gaussians() -> None:
 def test_bad_calls_are_named_before_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.modules[evaluate.__module__], "render", lambda *_: pytest.fail("rendered"))
     views = [View(camera(20, 16), torch.zeros(16, 20, 3, dtype=torch.uint8))]
-    for given, dials, repeats, message in (
-        ([], [1.0], 1, "no held-out views"),
-        (views, [], 1, "no dial values"),
-        (views, [1.0, 0.5], 1, "virtual_scale is 0.5"),
-        (views, [1.0, math.nan], 1, "virtual_scale is nan"),
-        (views, [1.0, math.inf], 1, "virtual_scale is inf"),
-        (views, [1.0], 0, "repeats is 0, it must be at least 1"),
+    for given, dials, message in (
+        ([], [1.0], "no held-out views"),
+        (views, [], "no dial values"),
+        (views, [1.0, 0.5], "virtual_scale is 0.5"),
+        (views, [1.0, math.nan], "virtual_scale is nan"),
+        (views, [1.0, math.inf], "virtual_scale is inf"),
     ):
         with pytest.raises(ClodError, match=message):
-            evaluate(row_of_four(), given, dials, repeats=repeats)
+            evaluate(row_of_four(), given, dials)

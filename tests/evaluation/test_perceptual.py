@@ -26,7 +26,7 @@ def test_missing_packages_give_one_note(monkeypatch: pytest.MonkeyPatch) -> None
     for name in ("lpips", "flip_evaluator"):
         monkeypatch.setitem(sys.modules, name, None)
     found, notes = available_metrics()
-    assert found == {} and notes == ["without LPIPS and FLIP (pip install 'clod-adapter[eval]')"]
+    assert found == {} and notes == ["without LPIPS and FLIP (pip install lpips flip-evaluator)"]
 
 
 def test_flip() -> None:

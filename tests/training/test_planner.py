@@ -16,7 +16,7 @@ from clod_adapter.progress import Phase, Stopped
 from clod_adapter.render import render
 from clod_adapter.training import planner
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.plan import NAMES, RATES, Decision, Override, Plan
+from clod_adapter.training.plan import NAMES, NOT_NEEDED, RATES, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
 from scenes import assert_equal, with_unseen
 
@@ -70,7 +70,7 @@ def test_empty_sh_degrees_are_one_line(visible: tuple[Gaussians, Scene]) -> None
 def test_absent_sh_degrees_cannot_be_overridden(visible: tuple[Gaussians, Scene], override: Override) -> None:
     base, scene = visible
     plan = make_plan(base.without_bands(0), scene, CONFIG, override)
-    assert plan.decisions[0] == Decision("SH degrees", "left out", None, "", "there are none")
+    assert plan.decisions[0] == Decision("SH degrees", NOT_NEEDED, None, "", "there are none")
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -124,7 +124,7 @@ def test_preparation_steps_that_were_skipped_are_listed(visible: tuple[Gaussians
     base, scene = visible
     read = replace(scene, left_out=(("undistortion", "the cameras are pinholes"),))
     plan = make_plan(base, read, CONFIG, Override(keep=ALL))
-    assert plan.decisions[-1] == Decision("undistortion", "left out", None, "", "the cameras are pinholes")
+    assert plan.decisions[-1] == Decision("undistortion", NOT_NEEDED, None, "", "the cameras are pinholes")
 
 
 @pytest.mark.parametrize("phase", [Phase.SH_DEGREES, Phase.IMPORTANCE, Phase.PRUNING_ORDER])

@@ -44,7 +44,7 @@ def write_glb(path: Path, gaussians: Gaussians, history: History) -> tuple[str, 
     try:
         import pygltflib
     except ModuleNotFoundError as error:
-        raise ClodError(f"{path}: .glb needs pygltflib; install it: pip install 'clod-adapter[export]'") from error
+        raise ClodError(f"{path}: .glb needs pygltflib: pip install pygltflib") from error
     columns, dropped = _columns(path, gaussians)
     size = sum(array.nbytes for array in columns.values())
     if size >= _LIMIT - (1 << 20):

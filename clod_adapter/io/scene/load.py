@@ -125,19 +125,15 @@ def _load(
 
 
 def _left_out(views: Sequence[View], sizes: Sequence[tuple[int, int]], pinhole: bool) -> tuple[tuple[str, str], ...]:
-    """Steps of reading, or pixels, that are left out, and why: ``Scene.left_out``.
+    """Steps of reading that are skipped, and why: ``Scene.left_out``.
 
     Args:
         sizes: of the photographs in their files.
         pinhole: whether all cameras are pinholes.
     """
-    whole, used = sum(3 * w * h for w, h in sizes), sum(3 * view.camera.width * view.camera.height for view in views)
+    whole, used = sum(w * h for w, h in sizes), sum(view.camera.width * view.camera.height for view in views)
     found = [("undistortion", f"all {len(views)} cameras are pinholes")] if pinhole else []
-    if used < whole:
-        kept = f"{used / 1e6:,.3g} MB of the {whole / 1e6:,.3g} MB in the files"
-        found.append(("pixels", f"kept are {kept}: photographs are scaled as they are decoded"))
-    else:
-        found.append(("scaling", f"all {len(views)} photographs are used at full resolution"))
+    found += [("scaling", f"all {len(views)} photographs are used at full resolution")] if used >= whole else []
     return tuple(found)
 
 

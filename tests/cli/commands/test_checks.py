@@ -83,6 +83,8 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("a.ckpt --out dial.ply", "ns-export"),
         ("PLY --images nowhere", "nowhere: is not a folder; give"),
         ("PLY --images empty", "empty: no COLMAP model.*give the folder"),
+        ("veiw PLY", "veiw: no such file or command; did you mean clod-adapt view"),
+        ("evla PLY --images SCENE --json", "did you mean clod-adapt eval"),
         ("PLY --images SCENE --max-sv 0.5", "--max-sv is 0.5, it must be at least 1"),
         ("PLY --images SCENE --max-sv nan", "--max-sv is nan"),
         ("PLY --images SCENE --max-sv 300", "--max-sv is 300, it must be below 50"),
@@ -165,13 +167,14 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
     ],
 )  # fmt: skip
 def test_bad_input(clod: Any, bad: dict[str, Path], tmp_path: Path, line: str, said: str) -> None:
-    """Exit code 2, empty stdout, the error as the last line of stderr, and unchanged files."""
+    """Exit code 2, the error as the last line of stderr, with --json in the one object on stdout, unchanged files."""
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     done = clod(*[bad.get(word, word) for word in line.split()])
-    assert (done.code, done.out) == (2, ""), done
     errors = [line for line in done.err.splitlines() if "error" in line]
-    assert len(errors) == 1 and errors[0] == done.err.splitlines()[-1], done
+    assert done.code == 2 and len(errors) == 1 and errors[0] == done.err.splitlines()[-1], done
     assert errors[0].startswith("clod-adapt: error: ") and re.search(said, errors[0]), done
+    why = errors[0].removeprefix("clod-adapt: error: ")
+    assert (json.loads(done.out) == {"error": why, "code": 2}) if "--json" in line else done.out == "", done
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 

@@ -16,7 +16,8 @@ def test_help(clod: Any, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     done = clod(*command.split(), "--help")
     assert done.code == 0 and done.out.startswith("usage: clod-adapt") and "--json" in done.out
-    assert max(map(len, done.out.splitlines())) <= 80
+    *lines, page = done.out.splitlines()
+    assert max(map(len, lines)) <= 80 and page.startswith("manual: ") and page.endswith("index.md")
     short = re.search(r"\n  -o[ ,]", done.out) is not None  # Python 3.13 writes "-o, --out X", 3.12 "-o X, --out X"
     assert ("--out " in done.out) == short == (command not in ("eval", "inspect", "view", "doctor"))
     if not command:

@@ -116,9 +116,9 @@ def test_baking_for_a_camera(clod: Any, capture: Any, dialled: Path, monkeypatch
     assert any("for the camera at (" in comment for comment in plain.comments)
     seen = []
 
-    def times(_: Any, cameras: Any, progress: Any) -> list[tuple[float, float]]:
+    def times(_: Any, cameras: Any, progress: Any) -> tuple[list[tuple[float, float]], list[str]]:
         seen.extend(cameras)
-        return [(1.0, 8.0), (2.0, 4.0), (4.0, 2.0)]
+        return [(1.0, 8.0), (2.0, 4.0), (4.0, 2.0)], []
 
     monkeypatch.setattr(budgets, "frame_times", times)
     report = json.loads(clod("export", dialled, "--fps", 250, *there, "-o", "fast.ply", "--json").out)
@@ -336,7 +336,7 @@ def test_packed_formats(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> 
     for suffix in PACKED:
         done = clod("export", dialled, "--levels", "1,4", "-o", f"x{suffix}", "--json")
         report = json.loads(done.out)
-        assert done.code == 0 and "splat-transform took" in done.err
+        assert done.code == 0 and " took " in done.err
         assert "splat-transform rounds values and sorts the Gaussians" in report["notes"]
         assert any("without a GPU" in note for note in report["notes"]) == (suffix == ".sog")
         for output in report["outputs"]:

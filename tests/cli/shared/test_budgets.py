@@ -11,7 +11,10 @@ from typing import Any
 import pytest
 
 import clod_adapter
+from clod_adapter.cli import view
+from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared import budgets
+from clod_adapter.cli.shared.dials import DEVICES
 from clod_adapter.io.checkpoint import load, save
 from runs import notes_of
 
@@ -68,15 +71,16 @@ def test_eval_times_frames_for_a_frame_rate(
 ) -> None:
     seen: list[int] = []
 
-    def times(gaussians: Any, cameras: Any, progress: Any) -> list[tuple[float, float]]:
+    def times(gaussians: Any, cameras: Any, progress: Any) -> tuple[list[tuple[float, float]], list[str]]:
         seen.append(len(cameras))
-        return [(1.0, 8.0), (2.0, 4.0), (4.0, 2.0)]
+        return [(1.0, 8.0), (2.0, 4.0), (4.0, 2.0)], ["rough"]
 
     monkeypatch.setattr(budgets, "frame_times", times)
     report = json.loads(clod("eval", dialled, "--images", capture.scene, "--fps", 250, 10, "--json").out)
     assert [row["virtual_scale"] for row in report["rows"]] == [2, 1] and seen == [2]
     assert notes_of(report) == [
         "frames timed here: 8.0 ms at s = 1, 2.0 ms at s = 4",
+        "rough",
         "--fps 250: s = 2",
         "--fps 10: s = 1 (s = 1 draws 125 frames a second already)",
     ]
@@ -109,3 +113,29 @@ def test_baking_to_a_budget(clod: Any, dialled: Path, tmp_path: Path) -> None:
     rows = stored(dialled).rows
     output = baked(dialled, "--psnr-drop", rows[0].psnr - rows[2].psnr, "-o", "p.ply")[1]
     assert output["virtual_scale"] == pytest.approx(rows[2].virtual_scale)
+
+
+def test_device_presets_are_counts(
+    clod: Any, capture: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For export the count of the file, for view and a page the dial value that they open at."""
+    assert [*DEVICES] == ["quest3", "phone", "laptop", "desktop"] and sorted(DEVICES.values()) == [*DEVICES.values()]
+    report = json.loads(clod("export", dialled, "--device-preset", "quest3", "-o", "all.ply", "--json").out)
+    assert report["outputs"][0]["virtual_scale"] == 1  # it has fewer
+    monkeypatch.setitem(DEVICES, "quest3", 200)
+    report = json.loads(clod("export", dialled, "--device-preset", "quest3", "-o", "few.ply", "--json").out)
+    assert report["outputs"][0]["count"] == 200 == len(clod_adapter.load(tmp_path / "few.ply").gaussians)
+    (note,) = [note for note in report["notes"] if "preset" in note]
+    assert note.startswith("--device-preset quest3, --keep 200: s = ")
+    words = [str(dialled), "--images", str(capture.scene), "--device-preset", "quest3"]
+    answers, report = view.make_page(build_parser("view").parse_args(words), view.Console(True))
+    page = b"".join(answers["/"].blocks()).decode()
+    opening = float(re.findall(r'"virtual_scale": ([\d.]+)}', page)[-1])
+    model = clod_adapter.load(dialled).gaussians
+    scene = clod_adapter.load_scene(capture.scene)
+    kept = [int(clod_adapter.render(model, each.camera, opening).kept.sum()) for each in scene.train + scene.test]
+    assert sum(kept) / len(kept) == pytest.approx(200, abs=1) and any("quest3" in note for note in report["notes"])
+    for refused in (("view", capture.ply), ("export", capture.ply, "-o", "x.ply")):
+        done = clod(*refused, "--device-preset", "phone")
+        assert done.code == 2 and "has no sigma_d, which --device-preset" in done.err, done
+    assert "not allowed with" in clod("view", dialled, "--sv", 2, "--device-preset", "phone").err

@@ -118,5 +118,5 @@ def test_unusable_page_is_refused_before_reading(
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     for words in ((capture.ply, *scene, *TINY, "--report"), ("eval", capture.ply, *scene, "--report", "page.html")):
         done = clod(*words)
-        assert done.code == 2 and "pip install 'clod-adapter[plots]'" in done.err
+        assert done.code == 2 and "pip install matplotlib" in done.err
     assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,130 @@
+"""Frame times of dial values, measured so that they can be compared: all of them in turn, several times.
+
+One pass renders every dial value of every model from every view, so a change of the clock rate or of the load meets all
+of them alike. The time of a dial value is the median over the passes, after a warm-up with the slowest one. Where it is
+above that of the dial value before it, which draws more, and the passes do not agree on that, both get their mean.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from clod_adapter.cameras import Camera
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Listener, Phase, tell
+from clod_adapter.rasterizers import wait_for
+from clod_adapter.render import render
+
+VIEWS, PASSES, FEWEST = 4, 7, 3
+SECONDS = 10.0  # after which no pass begins, once there are FEWEST; a pass that would take a third of it has one view
+WARM_FRAMES, WARM_SECONDS, STEADY = 8, 2.0, 0.1  # the warm-up ends with two frames whose times differ by a tenth
+RISE = 0.05  # an increase of the time in every pass is real if it is at least this large
+NOISY = 0.2  # a larger spread of the passes is reported
+
+
+Model = tuple[Gaussians, Sequence[float]]
+"""Gaussians and the dial values, ascending, to time them at."""
+
+
+@dataclass(frozen=True)
+class FrameTimes:
+    """Milliseconds per frame.
+
+    Attributes:
+        milliseconds: of each dial value of each model; each a mean over the views, the median over the passes.
+        spread: interquartile range of the passes over their median; the median over the dial values. 0 for equal times.
+    """
+
+    milliseconds: tuple[tuple[float, ...], ...]
+    spread: float
+
+    @property
+    def notes(self) -> list[str]:
+        """A note if the machine was too busy for these times."""
+        if self.spread <= NOISY:
+            return []
+        return [f"frame times are rough: they varied by {self.spread:.0%}, as this machine was busy with other work"]
+
+
+@torch.no_grad()
+def time_frames(models: Sequence[Model], cameras: Sequence[Camera], progress: Listener | None = None) -> FrameTimes:
+    """Times frames from at most four of the cameras, evenly spread.
+
+    Args:
+        models: the first at its first dial value is the slowest, for the warm-up.
+        progress: called in ``Phase.FRAME_TIMES`` with the passes so far; not all of PASSES are made of slow frames.
+
+    Raises:
+        ClodError: no cameras.
+        Stopped: ``progress`` returned False.
+    """
+    if not cameras:
+        raise ClodError("there are no cameras to time frames from")
+    jobs = [(lean, s) for some, dials in models for lean in [some.without_empty_bands()] for s in dials]
+    slowest = _warm_up(*jobs[0], cameras[0])
+    views = cameras[:: -(-len(cameras) // VIEWS)]
+    if slowest * len(views) * len(jobs) > SECONDS / FEWEST:
+        views = views[len(views) // 2 :][:1]
+    began, passes = time.perf_counter(), list[list[float]]()
+    while len(passes) < PASSES and (len(passes) < FEWEST or time.perf_counter() - began < SECONDS):
+        taken = [[_seconds(*job, view) for job in jobs] for view in views]
+        passes.append([1e3 * statistics.fmean(each) for each in zip(*taken, strict=True)])
+        tell(progress, Phase.FRAME_TIMES, len(passes), PASSES)
+    found, first = list[tuple[float, ...]](), 0
+    for _, dials in models:
+        found.append(tuple(settled([each[first : first + len(dials)] for each in passes])))
+        first += len(dials)
+    return FrameTimes(tuple(found), spread_of(passes))
+
+
+def settled(passes: Sequence[Sequence[float]]) -> list[float]:
+    """``[K]`` medians of ``[P, K]`` times; without increases from one to the next on which the passes do not agree."""
+    medians = [statistics.median(column) for column in zip(*passes, strict=True)]
+    found, run = list[float](), list[list[float]]()  # levels of the run since the last real increase
+    for k, value in enumerate(medians):
+        if k and all(each[k] > (1 + RISE) * each[k - 1] for each in passes):  # fewer Gaussians, which have grown
+            found += _levels(run)
+            run = []
+        run.append([value])
+        while len(run) > 1 and statistics.fmean(run[-1]) > statistics.fmean(run[-2]):
+            last = run.pop()
+            run[-1] += last
+    return found + _levels(run)
+
+
+def _levels(run: Sequence[Sequence[float]]) -> list[float]:
+    return [statistics.fmean(level) for level in run for _ in level]
+
+
+def spread_of(passes: Sequence[Sequence[float]]) -> float:
+    """``FrameTimes.spread`` of ``[P, K]`` times."""
+    shares = []
+    for column in zip(*passes, strict=True):
+        low, middle, high = statistics.quantiles(column, n=4, method="inclusive")
+        shares.append((high - low) / middle)
+    return statistics.median(shares)
+
+
+def _warm_up(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> float:
+    """Renders until the times are steady, with compiled functions and a raised clock rate; the last time, seconds."""
+    began, before = time.perf_counter(), 0.0
+    for _ in range(WARM_FRAMES):
+        taken = _seconds(gaussians, virtual_scale, camera)
+        if abs(taken - before) <= STEADY * taken or time.perf_counter() - began > WARM_SECONDS:
+            break
+        before = taken
+    return taken
+
+
+def _seconds(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> float:
+    wait_for(gaussians.means.device)
+    began = time.perf_counter()
+    render(gaussians, camera, virtual_scale)
+    wait_for(gaussians.means.device)
+    return time.perf_counter() - began

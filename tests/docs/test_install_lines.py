@@ -1,0 +1,52 @@
+"""Install lines work before a release too: they name other packages, or a checkout."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from clod_adapter.cli.commands.parser import make_parser
+from clod_adapter.cli.main import ADAPT
+from clod_adapter.cli.shared import manual
+from fences import ROOT
+
+SOURCES = [*(ROOT / "cli").rglob("*.py"), *(ROOT / "clod_adapter").rglob("*.py"), *(ROOT / "docs").glob("*.md")]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+def test_no_line_installs_clod_adapter_from_the_index() -> None:
+    lines = [
+        f"{path.relative_to(ROOT)}: {line.strip()}"
+        for path in SOURCES for line in path.read_text(encoding="utf-8").splitlines()
+        if re.search(r"pip install[^`\n]*clod-adapter", line)
+    ]  # fmt: skip
+    assert not lines
+
+
+def test_the_pages_are_installed_with_the_package() -> None:
+    ((folder, patterns),) = PROJECT["tool"]["setuptools"]["data-files"].items()
+    assert Path(folder).parts[-2:] == manual.INSTALLED[:2] and patterns == ["docs/*.md"]
+    assert all(url.startswith("https://") for url in PROJECT["project"]["urls"].values())
+
+
+def test_help_names_the_installed_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = tmp_path / "share" / "doc" / "clod-adapter" / "index.md"
+    page.parent.mkdir(parents=True)
+    page.touch()
+
+    class File:
+        parts = page.parts
+
+        def locate(self) -> Path:
+            return page
+
+    assert manual.manual() == ROOT / "docs" / "index.md"  # of the checkout
+    monkeypatch.setattr(manual, "__file__", str(tmp_path / "lib" / "cli" / "shared" / "manual.py"))
+    monkeypatch.setattr(metadata, "files", lambda name: [File()])
+    assert make_parser(ADAPT, "clod-adapt").format_help().endswith(f"\nmanual: {page}\n")
+    monkeypatch.setattr(metadata, "files", lambda name: None)
+    assert "manual:" not in make_parser(ADAPT, "clod-adapt").format_help()

@@ -1,0 +1,117 @@
+"""Frame times on a simulated clock: a machine that warms up, drifts, is interrupted, and one that is too busy."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from clod_adapter.adapter import attach
+from clod_adapter.cameras import Camera
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluation import frame_times
+from clod_adapter.evaluation.frame_times import PASSES, VIEWS, FrameTimes, settled, time_frames
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Progress, Stopped
+from scenes import gaussians, ring
+
+DIALS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0)
+Clock = Callable[[Callable[[int, float], float]], list[tuple[str, float]]]
+
+
+def adapted() -> Gaussians:
+    return attach(gaussians(20, 0, 0), torch.ones(20), AttenuationConfig(max_sv=7.0))
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Renders in no time; the clock advances by ``cost(frame, s)`` seconds. Returns the frames that are drawn."""
+
+    def install(cost: Callable[[int, float], float]) -> list[tuple[str, float]]:
+        drawn, now = list[tuple[str, float]](), [0.0]
+
+        def draw(some: Gaussians, camera: Camera, s: float) -> None:
+            now[0] += cost(len(drawn), s)
+            drawn.append((camera.name, s))
+
+        monkeypatch.setattr(frame_times, "render", draw)
+        monkeypatch.setattr(frame_times.time, "perf_counter", lambda: now[0])
+        return drawn
+
+    return install
+
+
+def of_one(**options: Any) -> FrameTimes:
+    return time_frames([(adapted(), DIALS)], ring(9, 48, 36), **options)
+
+
+def test_drift_and_interruptions_do_not_zigzag(clock: Clock) -> None:
+    """Frames take 20/s ms; 3 times that at first, a half more at the end, and one in twelve is interrupted."""
+    chance = random.Random(0)
+
+    def cost(frame: int, s: float) -> float:
+        slow = 3 if frame < 4 else 1 + frame / 500
+        return 0.02 / s * slow * chance.uniform(0.97, 1.03) + (0.05 if chance.random() < 1 / 12 else 0)
+
+    clock(cost)
+    found = of_one()
+    (times,) = found.milliseconds
+    assert all(a >= b for a, b in zip(times, times[1:], strict=False)), times
+    scaled = [taken * s for taken, s in zip(times, DIALS, strict=True)]
+    assert max(scaled) < 1.7 * min(scaled) and 20 < times[0] < 40
+
+
+def test_frames_are_interleaved_and_few_where_they_are_slow(clock: Clock) -> None:
+    drawn = clock(lambda frame, s: 0.01)
+    seen = list[tuple[int, int]]()
+    assert of_one(progress=lambda now: seen.append((now.done, now.total))).milliseconds == ((pytest.approx(10),) * 9,)
+    assert seen == [(k, PASSES) for k in range(1, PASSES + 1)]
+    timed = drawn[-PASSES * 9 * 3 :]  # nine cameras: every third is one of at most four
+    assert len({name for name, _ in drawn}) == 3 <= VIEWS and [s for _, s in timed] == [*DIALS] * (3 * PASSES)
+    assert {s for _, s in drawn[: -len(timed)]} == {1.0}  # the warm-up, with the slowest
+    drawn = clock(lambda frame, s: 1.0)
+    of_one()
+    assert len({name for name, _ in drawn[2:]}) == 1 and 3 * 9 <= len(drawn) <= 3 * 9 + 3
+
+
+def test_a_busy_machine_is_named(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frame_times, "NOISY", 0.2)
+    assert FrameTimes(((1.0,),), 0.1).notes == []
+    (note,) = FrameTimes(((1.0,),), 0.61).notes
+    assert "varied by 61%" in note and len(note) < 120
+    chance = random.Random(1)
+    clock(lambda frame, s: 0.01 * chance.choice([1, 4]))
+    assert of_one().spread > 0.2
+    clock(lambda frame, s: 0.01 * chance.uniform(0.98, 1.02))
+    assert of_one().spread < 0.04
+
+
+def test_noise_is_levelled_and_a_real_increase_is_not() -> None:
+    """The time of the third dial value is above that of the second in two passes of three."""
+    passes = [[9.0, 4.0, 5.0, 2.0], [9.0, 4.0, 3.5, 2.0], [9.0, 4.0, 5.0, 2.0]]
+    assert settled(passes) == [9.0, 4.5, 4.5, 2.0]
+    assert settled([[9.0, 4.0, 5.0, 2.0]] * 3) == [9.0, 4.0, 5.0, 2.0]
+    assert settled([[4.0, 4.1, 4.2, 4.0]] * 3) == pytest.approx([4.1, 4.1, 4.1, 4.0])  # by less than RISE
+    assert settled([[1.0]] * 3) == [1.0]
+
+
+def test_several_models_share_the_passes(clock: Clock) -> None:
+    drawn = clock(lambda frame, s: 0.01 / s)
+    plain = gaussians(20, 0, 0)
+    found = time_frames([(plain, [1.0]), (adapted(), [1.0, 2.0]), (plain, ())], ring(1, 48, 36))
+    assert found.milliseconds == ((pytest.approx(10),), (pytest.approx(10), pytest.approx(5)), ())
+    assert [s for _, s in drawn[-3 * PASSES :]] == [1.0, 1.0, 2.0] * PASSES
+
+
+def test_stopping_and_no_cameras() -> None:
+    def stop(now: Progress) -> bool:
+        return False
+
+    with pytest.raises(Stopped):
+        of_one(progress=stop)
+    with pytest.raises(ClodError, match="no cameras to time"):
+        time_frames([(adapted(), DIALS)], [])
