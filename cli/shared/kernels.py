@@ -10,7 +10,7 @@ from numba.core.caching import NullCache
 from numba.core.event import Event, Listener, install_listener
 
 from clod_adapter.cameras import Camera, Scene, View
-from clod_adapter.config import CLASSIC, AdaptConfig, ScreenFilter
+from clod_adapter.config import CLASSIC, TARGETS, AdaptConfig, ScreenFilter
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Stopped
@@ -21,7 +21,7 @@ from .console import Console, Meter
 CPU = torch.device("cpu")
 OTHER = ""
 # Share of each kernel in the time to compile all of them; used only for the progress shown.
-SHARES = {"project": 0.15, "project_dialled": 0.17, "project_gradient": 0.35, OTHER: 0.03}
+SHARES = {"project_dialled": 0.23, "project_gradient": 0.16, "adam_rows": 0.12, OTHER: 0.03}
 
 
 def prepare_kernels(
@@ -41,9 +41,10 @@ def prepare_kernels(
     with announced_compiling(console, SHARES), one_thread():
         evaluate(one, [view], [1.0])
         if training:
-            adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0, target="cost"))
-            if adapted.interrupted:
-                raise Stopped("stopped while the kernels were compiled")
+            for target in TARGETS:
+                adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0, target=target))
+                if adapted.interrupted:
+                    raise Stopped("stopped while the kernels were compiled")
 
 
 @contextmanager
