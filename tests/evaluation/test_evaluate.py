@@ -8,7 +8,7 @@ import sys
 import pytest
 import torch
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.cameras import View
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.distances import in_frustum
@@ -24,7 +24,7 @@ def row_of_four() -> Gaussians:
     """Four Gaussians at camera depths 1, 2, 4 and 8, the last far outside the image; sigma_d is 1."""
     means = in_front(camera(), torch.tensor([[0.0, 0, 1], [0, 0, 2], [0, 0, 4], [80, 0, 8]]))
     some = gaussians(4, 0, 0).replace(means=means, opacity_logits=torch.full((4,), 2.0))
-    return attach(some, torch.ones(4), AttenuationConfig(tau=0.01, eps=0.0))
+    return with_dial(some, torch.ones(4), AttenuationConfig(tau=0.01, eps=0.0))
 
 
 def test_metrics_of_a_black_image() -> None:
@@ -54,7 +54,7 @@ def test_counts_follow_the_culling_threshold() -> None:
 
 def test_rows_are_means_over_renders() -> None:
     sigma_d = torch.full((200,), 0.8, requires_grad=True)
-    some = attach(gaussians(200, 1, 0), sigma_d, AttenuationConfig(scene_distance=4.0))
+    some = with_dial(gaussians(200, 1, 0), sigma_d, AttenuationConfig(scene_distance=4.0))
     views = photograph(gaussians(200, 1, 0), ring(3, 32, 24))
     seen = []
     rows = evaluate(some, views, [1.0, 2.0], progress=lambda now: seen.append((now.done, now.total)))

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from clod_adapter.adapter import ATTRIBUTES, attach
+from clod_adapter.adapter import ATTRIBUTES, with_dial
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import SIGMA_MAX, log_attenuation
@@ -120,8 +120,8 @@ def test_zero_steps_return_the_initialization(captured: Pair) -> None:
         assert torch.equal(getattr(result.gaussians, name), getattr(base, name)), name
     torch.testing.assert_close(result.gaussians.sigma_d, want.sigma_d, rtol=1e-5, atol=0)  # by way of its logarithm
     assert result.gaussians.attenuation == want.attenuation and (want.sigma_d < SIGMA_MAX).all()
-    # At SIGMA_MAX no gradient reaches sigma_d, so a dial of attach is initialized, too.
-    assert_equal(adapt(attach(base), scene, config_of(iters=0)).gaussians, result.gaussians)
+    # At SIGMA_MAX no gradient reaches sigma_d, so a dial of with_dial is initialized, too.
+    assert_equal(adapt(with_dial(base), scene, config_of(iters=0)).gaussians, result.gaussians)
     base = base.replace(opacity_logits=base.opacity_logits.abs())  # so that all can last
     found = initialize(base, scene.train, config_of(start_share=0.7, exponent=1.5))
     assert found.attenuation.scene_distance == 1
@@ -167,7 +167,7 @@ def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Trained, l
     assert (result.growth_d - first.growth_d).abs().max() <= 1.01e-2 and first.growth_d.unique().numel() > 50
     # A sigma_d learned under one tau and normalizer means something else under others: the file's are kept.
     own = AttenuationConfig(tau=0.02, eps=1e-6, normalizer="max", scene_distance=2.0, max_sv=4.0)
-    dialled = attach(captured[0], torch.full((len(captured[0]),), 1.5), own)
+    dialled = with_dial(captured[0], torch.full((len(captured[0]),), 1.5), own)
     result = adapt(dialled, captured[1], config).gaussians
     assert result.attenuation == replace(own, max_sv=3.0, scene_distance=1.0, reference_distance=2.0)
 
@@ -187,7 +187,7 @@ def test_a_zero_sigma_recovers(captured: Pair) -> None:
     base, scene = captured
     config = config_of(iters=150, lr_sigma=0.3)
     settings = AttenuationConfig(tau=config.tau, cut="soft", scene_distance=4.0, max_sv=config.max_sv)
-    dead = attach(base, torch.zeros(len(base)), settings)
+    dead = with_dial(base, torch.zeros(len(base)), settings)
     assert evaluate(dead, scene.train, [1.0])[0].kept == 0
     result = adapt(dead, scene, config).gaussians
     assert (result.sigma_d > 1e-3).all() and result.sigma_d.isfinite().all()

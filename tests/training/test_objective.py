@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import FILTERS
 from clod_adapter.equation.growth import GROWTH_RANGE
@@ -173,7 +173,7 @@ def test_steps_use_the_sampled_views_and_dial_values(
     monkeypatch.setattr(objective, "count_gradient_at", lambda *a: taken.append(a[3]) or count(*a))
     monkeypatch.setattr(objective, "photometric_loss", lambda *a: taken.append(id(a[1])) or photometric_loss(*a))
     config = config_of(iters=14, max_sv=4.0, sampling=sampling)
-    adapt(attach(gaussians(5, 0, 0), torch.ones(5)), captured[1], config)
+    adapt(with_dial(gaussians(5, 0, 0), torch.ones(5)), captured[1], config)
     sampler = ViewSampler(captured[1].train, config)
     draws = [sampler.draw(k / 14) for k in range(14)]
     rendered = [x for view, dials, _ in draws for s in dials for x in (s, id(view.image))]
