@@ -52,6 +52,11 @@ class Camera:
     def __repr__(self) -> str:
         return f"Camera({self.name!r}, {self.width}x{self.height})"
 
+    def halved(self) -> Camera:
+        """The same view with half the width and height; the last column or row of an odd size is left out."""
+        K = self.K * self.K.new_tensor([[0.5], [0.5], [1.0]])
+        return replace(self, K=K, width=self.width // 2, height=self.height // 2)
+
     @property
     def position(self) -> Tensor:
         """``[3]`` the camera centre in world units, ``-R^T t``."""
@@ -80,6 +85,13 @@ class View:
     def at(self, camera: Camera) -> View:
         """The same photograph with another camera of its size."""
         return View(camera, self.image)
+
+    def halved(self) -> View:
+        """The photograph at half the size, by means of 2x2 pixels, with the camera for it."""
+        camera, image = self.camera.halved(), self.image
+        rows, columns = 2 * camera.height, 2 * camera.width
+        corners = [image[y:rows:2, x:columns:2].short() for y in (0, 1) for x in (0, 1)]
+        return View(camera, (sum(corners[1:], corners[0] + 2) >> 2).to(torch.uint8))
 
 
 class StoredView(View):

@@ -69,7 +69,7 @@ def objective(config: AdaptConfig, trained: int = N, **part: Any) -> Callable[[G
         names = ("growth_d",) if config.growth == "on" else ()
         parameters = {name: getattr(model, name) for name in (*ATTRIBUTES, *names)}
         parameters[asked.decay] = asked.parameter(model.sigma_d)
-        found = asked.gradient_sum(parameters, [Sample(views_of(model)[0], [1.0, DIAL])])
+        found = asked.gradient_sum(parameters, [Sample(views_of(model)[0], DIAL)])
         return [found.loss, found.kept, *found.gradients.values()]
 
     return gradients

@@ -44,7 +44,7 @@ def from_gsplat(splats: Mapping[str, Tensor | np.ndarray], *, screen_filter: Scr
     missing = [name for name in NAMES if name not in named and name != "shN"]
     if missing:
         more = "; with appearance optimisation there are no spherical harmonics" if "features" in named else ""
-        raise ClodError(f"splats has no {' and no '.join(map(repr, missing))}, but {', '.join(splats)}{more}")
+        raise ClodError(f"splats needs {', '.join(missing)} too, it has {', '.join(splats)}{more}")
     named.setdefault("shN", named["sh0"].new_zeros(len(named["sh0"]), 0, 3))
     if named["opacities"].dim() == 2 and named["opacities"].shape[1] == 1:
         named["opacities"] = named["opacities"].squeeze(1)

@@ -19,11 +19,11 @@ The splats are trained already, and their number is fixed: densify and prune bef
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -40,12 +40,11 @@ from clod_adapter.integrations.splats import NAMES, from_gsplat
 from clod_adapter.progress import Listener, shown
 from clod_adapter.render import dial as dialled_by
 from clod_adapter.training.loop import require_trainable
-from clod_adapter.training.objective import SIGMA_RANGE, TrainableSubset
+from clod_adapter.training.objective import SIGMA_RANGE, TrainableSubset, loss_weight, within_reach
 from clod_adapter.training.target_count import count_gradient, target_share
 from clod_adapter.training.trainer import learning_rates, position_unit
-from clod_adapter.training.view_sampler import COUNTED_BEYOND
+from clod_adapter.training.view_sampler import ViewSampler
 
-GOLDEN = (5**0.5 - 1) / 2
 ATTRIBUTE_OF = {**NAMES, "features_dc": "sh0", "features_rest": "shN"}
 
 Splats = Gaussians | Mapping[str, Tensor]
@@ -81,8 +80,7 @@ class Dial(nn.Module):
         cameras = [view.camera for view in spread(views, MOST_VIEWS)]
         self.register_buffer("typical", typical_distance(start.means, cameras, start.attenuation), persistent=False)
         self._rates = learning_rates(config, position_unit(start, views, TrainableSubset(len(start))))
-        self._random = np.random.default_rng(config.seed)
-        self._place = self._random.random()
+        self._sampler, self._sampled = ViewSampler((), config), 0
 
     def __repr__(self) -> str:
         return f"Dial({len(self.log_sigma):,} Gaussians, s from 1 to {self.config.max_sv:g}, {self.log_sigma.device})"
@@ -118,11 +116,8 @@ class Dial(nn.Module):
         Called once a step, it also keeps the parameters in the range in which the equation has a gradient.
         """
         self._clamp()
-        config, self._place = self.config, (self._place + GOLDEN) % 1
-        if self._place < config.full_share:
-            return 1.0
-        share = (self._place - config.full_share) / (1 - config.full_share)
-        return 1 + (config.max_sv - 1) * share if config.sampling == "uniform" else config.max_sv**share
+        self._sampled += 1
+        return self._sampler.dial(self._sampled - 1)
 
     def forward(self, camera: Camera, virtual_scale: float) -> Attenuated:
         """The opacities ``drawn [N]`` and the factor ``growth [N]`` of the scales, for one camera and dial value.
@@ -141,14 +136,12 @@ class Dial(nn.Module):
         Args:
             rendering_loss: 0-d, of an image rendered at s.
         """
-        config = self.config
-        weighted = (1 - config.weight_slope * virtual_scale / config.max_sv) ** 2 * rendering_loss
-        if not config.has_target_count:
+        weighted = loss_weight(virtual_scale, self.config) * rendering_loss
+        counted = self._sampler.counted()
+        if counted is None:
             return weighted
-        counted = (COUNTED_BEYOND * config.max_sv) ** self._random.random()
-        most = (config.max_sv + 1 / self.attenuation.tau) / 2  # above 1/tau nothing is kept
-        there = self.count_loss(min(counted, most), rendering_loss)
-        return weighted + self.count_loss(virtual_scale, weighted) + there
+        beyond = self.count_loss(within_reach(counted, self.attenuation), rendering_loss)
+        return weighted + self.count_loss(virtual_scale, weighted) + beyond
 
     def count_loss(self, virtual_scale: float, rendering_loss: Tensor) -> Tensor:
         """0-d, the target-count term ``L reg_weight (eta / target - 1)^2`` alone; eta is the share kept.
@@ -188,7 +181,7 @@ class Dial(nn.Module):
 
     @torch.no_grad()
     def _clamp(self) -> None:
-        low, high = (float(np.log(value)) for value in SIGMA_RANGE)
+        low, high = map(math.log, SIGMA_RANGE)
         self.log_sigma.clamp_(low, high)
         if self.growth_d is not None:
             self.growth_d.clamp_(*GROWTH_RANGE)

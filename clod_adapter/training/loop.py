@@ -39,9 +39,9 @@ def adapt(
     """Learns sigma_d for ``base`` on the training views of ``scene``, and tunes the other attributes lightly.
 
     Each step samples ``batch`` views (1 by default) and follows the sum of their gradients. Each view is rendered at
-    full detail and at one log-uniform dial value s in [1, max_sv], to minimise ``full_weight w_1 L_render(1) + w_s
+    one dial value, s = 1 in ``full_share`` of the steps and else log-uniform in [1, max_sv], to minimise ``w_s
     L_render(s)``, where L_render is ``losses.photometric_loss`` and ``w_s = (1 - weight_slope s / max_sv)^2``. In the
-    first half of the steps every second view, at random, is rendered at two such values instead.
+    first steps, a share ``coarse`` of all, photographs have half their size, unless that is below 128 pixels a side.
     ``target_count.count_gradient`` moves sigma_d so that the share of Gaussians kept at their typical distances follows
     the target-count curve; with the target ``cost``, ``target_cost.TargetCost`` does so for the cost of rendering.
     The result is the mean of the parameters over the last ``average`` of the steps, so learning rates can stay large

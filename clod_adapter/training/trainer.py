@@ -49,7 +49,7 @@ class Trainer:
     ) -> None:  # fmt: skip
         subset = subset or TrainableSubset(len(start))
         assert start.sigma_d is not None and start.attenuation is not None
-        self.config, self.group, self.sampler = config, group, ViewSampler(views, config, subset.far_first)
+        self.config, self.group, self.sampler = config, group, ViewSampler(views, config)
         rates = learning_rates(config, position_unit(start, views, subset))
         # A frozen attribute requests no gradient from the rasterizer.
         tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
@@ -92,7 +92,8 @@ class Trainer:
         if cost is not None and cost.due(share_done):
             cost.measure(self._assembled(self.parameters), self.objective.typical, share_done)
         before = self.sampler.state()
-        samples = [self.sampler.draw(share_done) for _ in range(self.config.batch)]
+        numbers = range(self.done * self.config.batch, (self.done + 1) * self.config.batch)
+        samples = [self.sampler.draw(number, share_done) for number in numbers]
         try:  # if it fails, the next step samples the same views again
             found = self.objective.gradient_sum(self.parameters, self.group.share(samples) if self.group else samples)
             found = self.group.sum(found) if self.group else found

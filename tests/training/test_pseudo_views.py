@@ -49,7 +49,7 @@ def test_each_step_renders_the_checkpoint_from_another_camera(blob: clod.Gaussia
     photograph = scenes.photograph(blob, cameras[:1])[0]
     sampler = ViewSampler((*placed, photograph), clod.AdaptConfig())
     state = sampler.state()
-    drawn = [sampler.draw(0.0).view for _ in range(9)]
+    drawn = [sampler.draw(k, 0.0).view for k in range(9)]
     assert sum(view is photograph for view in drawn) == 3
     for view in drawn:
         if view is not photograph:
@@ -59,7 +59,7 @@ def test_each_step_renders_the_checkpoint_from_another_camera(blob: clod.Gaussia
             assert 0 < (view.camera.position - own.camera.position).norm() < 6 * MOVED * own.reach
             assert not torch.equal(view.image, own.image)
     sampler.restore(*state)
-    again = [sampler.draw(0.0).view for _ in range(9)]
+    again = [sampler.draw(k, 0.0).view for k in range(9)]
     assert all(torch.equal(a.camera.viewmat, b.camera.viewmat) for a, b in zip(drawn, again, strict=True))
 
 
