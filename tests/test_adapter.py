@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -101,7 +102,7 @@ def test_unchanged_values_keep_their_bits() -> None:
     assert bits(result)["means"][:3] == bits(base)["means"][:3]
 
 
-def test_attach_and_detach() -> None:
+def test_with_dial_and_detach() -> None:
     """Without sigma_d the dial has no effect and can be removed exactly; with it, its tensor is used as it is."""
     base, sigma_d = gaussians(), torch.rand(6)
     on, chosen = with_dial(base), with_dial(base, sigma_d, CONFIG)
@@ -189,3 +190,12 @@ def test_a_trimmed_result(degree: int | None) -> None:
     if degree == 1:
         with pytest.raises(ClodError, match="it has SH degree 0, the adapter 1"):
             adapter.apply(base.without_bands(0))
+
+
+def test_arrays_become_tensors_and_repr_is_short() -> None:
+    base = gaussians()
+    columns = {"sigma_d": np.ones(6, np.float32), "growth_d": np.zeros(6, np.float32)}
+    update = {"means": np.full((6, 3), 0.5, np.float16)}
+    adapter = Adapter(**columns, attenuation=CONFIG, updates=update, base_fingerprint="", config={})
+    torch.testing.assert_close(adapter.apply(base).means, base.means + 0.5)
+    assert repr(adapter) == f"Adapter(6 Gaussians, dial to {CONFIG.max_sv:g} with growth, updates of means)"

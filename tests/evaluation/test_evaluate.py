@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import sys
+import warnings
 
+import numpy as np
 import pytest
 import torch
 
@@ -99,3 +101,18 @@ def test_bad_calls_are_named_before_rendering(monkeypatch: pytest.MonkeyPatch) -
     ):
         with pytest.raises(ClodError, match=message):
             evaluate(row_of_four(), given, dials)
+
+
+def test_one_view_and_one_dial_value() -> None:
+    view = View(camera(), torch.zeros(45, 61, 3, dtype=torch.uint8))
+    wanted = [row.kept for row in evaluate(row_of_four(), [view], [1.5])]
+    for dials in (1.5, np.float32(1.5), np.array([1.5]), (1.5,)):
+        assert [row.kept for row in evaluate(row_of_four(), view, dials)] == wanted
+
+
+def test_without_a_dial_every_dial_value_shows_the_base() -> None:
+    view = View(camera(), torch.zeros(45, 61, 3, dtype=torch.uint8))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rows = evaluate(gaussians(4, 0, 0), [view], [1, 3])
+    assert [(row.virtual_scale, row.kept) for row in rows] == [(1, 4), (3, 4)] and rows[0].psnr == rows[1].psnr

@@ -5,8 +5,10 @@ from __future__ import annotations
 import copy
 import math
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -22,7 +24,7 @@ from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize, scene_distance
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.progress import Phase, Progress, Stopped
+from clod_adapter.progress import Phase, Progress, Stopped, _Bar
 from clod_adapter.training.loop import Adapted, TrainingState, adapt
 from clod_adapter.training.planner import make_plan
 from runs import change_step, config_of, fail, states_of
@@ -364,3 +366,32 @@ def test_scene_distance_is_the_mean_over_views(captured: Pair) -> None:
     ]
     want = torch.stack([ratio.median() for ratio in ratios]).mean().item()
     assert scene_distance(base, scene.train, 0.5) == pytest.approx(want, rel=1e-5)
+
+
+def test_settings_as_keywords(captured: Pair) -> None:
+    adapted = adapt(*captured, config_of(iters=3), max_sv=7, growth="off")
+    assert adapted.steps == 3 and adapted.gaussians.attenuation.max_sv == 7 and adapted.gaussians.growth_d is None
+    assert repr(adapted).startswith("Adapted(Gaussians(300, SH degree 1, dial to 7, cpu), 3 steps, ")
+    with pytest.raises(TypeError, match="max_vs"):
+        adapt(*captured, max_vs=7)
+
+
+def test_a_bar_by_default(captured: Pair, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """On a terminal or in a notebook; not elsewhere, not with a listener of one's own, and not with False."""
+    adapt(*captured, iters=2)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))
+    adapt(*captured, iters=2)
+    shown = capsys.readouterr().err
+    assert all(phase in shown for phase in ("importance", "pruning order", "training: ", "/2 ["))
+    for progress in (False, lambda now: None):
+        adapt(*captured, iters=2, progress=progress)
+    assert capsys.readouterr().err == ""
+
+
+def test_the_bar_shows_the_loss_and_follows_a_time_budget(capsys: pytest.CaptureFixture[str]) -> None:
+    bar = _Bar()
+    bar(Progress(Phase.TRAINING, 3, 200, time_share=0.25, loss=0.125))
+    bar.bar.refresh()
+    assert bar.bar.n == 50 and "loss 0.1250" in capsys.readouterr().err
+    bar.close()
