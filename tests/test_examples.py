@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 import clod_adapter
+import gsplat_in_torch
 from clod_adapter.io.checkpoint import blank
 
 FOLDER = Path(__file__).resolve().parents[1] / "examples"
@@ -90,6 +91,22 @@ def test_adapter_is_applied_and_removed(run: Any, dialled: Path, capture: Any, t
     with pytest.raises(SystemExit, match="a different base was given"):
         run(6, other, dialled.with_suffix(".safetensors"), "other_again.ply")
     assert not (tmp_path / "other_again.ply").exists()
+
+
+def test_a_loop_of_gsplat_trains_a_dial(
+    capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With torch in place of its kernels; in at most 20 lines more than the loop has without a dial."""
+    pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
+    gsplat_in_torch.install(monkeypatch)
+    source = EXAMPLES[7].read_text(encoding="utf-8")
+    assert 0 < len(re.findall(r"# dial\b", source)) <= 20
+    runpy.run_path(str(EXAMPLES[7]))["main"](str(capture.ply), str(capture.scene), str(tmp_path / "d.ply"), "cpu", 40)
+    rows = re.findall(r"dial \S+: (.+) dB before, (.+) dB after, (\d+)% .*target (\d+)%", capsys.readouterr().out)
+    for before, after, kept, target in (map(float, row) for row in rows):
+        assert after > before + 2 and abs(kept - target) < 10
+    model = clod_adapter.load(tmp_path / "d.ply").gaussians
+    assert len(rows) == 2 and model.growth_d.abs().max() > 0.05 and len(model) == 300
 
 
 def test_bad_arguments_are_refused(run: Any) -> None:

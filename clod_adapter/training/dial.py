@@ -157,6 +157,10 @@ class Dial(nn.Module):
         value = loss * self.config.reg_weight * (eta / target.share - 1) ** 2
         return value.to(sigma) + ((self.log_sigma - self.log_sigma.detach()) * gradient).sum()
 
+    def target_share(self, virtual_scale: float) -> float:
+        """The share of the splats that the target-count curve keeps at s, in (0, 1]."""
+        return target_share(virtual_scale, len(self.log_sigma), self.config).share
+
     def differentiable(self) -> Gaussians:
         """The splats with this dial, for ``render`` and other rasterizers: gradients reach both.
 
