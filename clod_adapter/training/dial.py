@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -66,6 +66,9 @@ class Dial(nn.Module):
 
     typical: Tensor
     growth_d: Tensor | None
+    if TYPE_CHECKING:  # a module's call is untyped
+
+        def __call__(self, camera: Camera, virtual_scale: float) -> Attenuated: ...
 
     def __init__(self, splats: Splats, start: Gaussians, views: Sequence[View], config: AdaptConfig) -> None:
         super().__init__()
