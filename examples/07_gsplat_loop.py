@@ -25,7 +25,9 @@ def main(checkpoint: str, folder: str, out: str = "dial.ply", device: str = "cud
     base = clod.load(checkpoint)
     scene = clod.load_scene(folder, origin=base.origin)
     values = clod.to_gsplat(base.gaussians)
-    splats = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in values.items()}).to(device)
+    splats = torch.nn.ParameterDict({name: torch.nn.Parameter(value.clone()) for name, value in values.items()}).to(
+        device
+    )
     optimizers = {
         name: torch.optim.Adam([{"params": splats[name], "lr": rate, "name": name}], eps=1e-15)
         for name, rate in RATES.items()

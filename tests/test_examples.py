@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import runpy
 import shutil
@@ -109,6 +110,22 @@ def test_a_loop_of_gsplat_trains_a_dial(
     assert len(rows) == 2 and model.growth_d.abs().max() > 0.05 and len(model) == 300
 
 
+def test_the_notebook() -> None:
+    """Its cells run, with fewer steps, and what it stores is from one run of all of them, without errors."""
+    cells = json.loads((FOLDER / "notebook.ipynb").read_text(encoding="utf-8"))["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    outputs = [output for cell in code for output in cell["outputs"]]
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
+    assert all(output["output_type"] != "error" and output.get("name") != "stderr" for output in outputs)
+    assert [
+        len(output["data"]["image/jpeg"]) < 100_000 for output in outputs if "image/jpeg" in output.get("data", {})
+    ] == [True] * 2
+    source = "\n".join("".join(cell["source"]) for cell in code)
+    fewer = source.replace("= 40, 12_000", "= 8, 2500").replace("= 1000, 600, 200", "= 20, 5, 5")
+    assert fewer != source
+    exec(compile(fewer, "notebook.ipynb", "exec"), {})
+
+
 def test_bad_arguments_are_refused(run: Any) -> None:
     for number in (1, 2, 5, 6):
         with pytest.raises(SystemExit, match=f"python examples/{EXAMPLES[number].name}"):
@@ -119,5 +136,5 @@ def test_bad_arguments_are_refused(run: Any) -> None:
 
 def test_the_readme_lists_every_example() -> None:
     listed = re.findall(r"\]\((.+?)\)", (FOLDER / "README.md").read_text(encoding="utf-8"))
-    assert listed == [path.name for path in EXAMPLES.values()]
+    assert listed == [*(path.name for path in EXAMPLES.values()), "notebook.ipynb"]
     assert list(EXAMPLES) == list(range(1, len(EXAMPLES) + 1))
