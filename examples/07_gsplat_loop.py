@@ -15,7 +15,7 @@ import torch
 import clod_adapter as clod
 from clod_adapter.losses import photometric_loss
 
-STEPS = 1600
+STEPS = 2000
 RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
 
 
