@@ -125,6 +125,6 @@ def _warm_up(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> floa
 def _seconds(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> float:
     wait_for(gaussians.means.device)
     began = time.perf_counter()
-    render(gaussians, camera, virtual_scale)
+    render(gaussians, camera, 1.0 if gaussians.sigma_d is None else virtual_scale)
     wait_for(gaussians.means.device)
     return time.perf_counter() - began
