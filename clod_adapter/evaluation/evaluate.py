@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 
+import numpy as np
 import torch
 
 from clod_adapter.cameras import View
@@ -54,8 +55,8 @@ class Row:
 @torch.no_grad()
 def evaluate(
     gaussians: Gaussians,
-    views: Sequence[View],
-    virtual_scales: Sequence[float],
+    views: Sequence[View] | View,
+    virtual_scales: Sequence[float] | float,
     *,
     metrics: Mapping[str, Metric] | None = None,
     progress: Listener | None = None,
@@ -64,6 +65,7 @@ def evaluate(
 
     Args:
         gaussians: adapted or not; without ``sigma_d`` every dial value shows the base.
+        views: one or several; virtual_scales: one dial value or several.
         metrics: more to measure, from ``perceptual.available_metrics``: any of ``lpips`` and ``flip``.
         progress: called in ``Phase.EVALUATION`` after each view of each dial value. If it returns False, the rows of
             the dial values that are complete are returned.
@@ -71,19 +73,22 @@ def evaluate(
     Raises:
         ClodError: no views, no dial values, or one below 1 or not finite.
     """
-    if not views:
+    views = [views] if isinstance(views, View) else views
+    virtual_scales = [float(s) for s in np.atleast_1d(virtual_scales)]
+    if len(views) == 0:
         raise ClodError("there are no held-out views to evaluate on")
     if not virtual_scales:
         raise ClodError("there are no dial values to evaluate at")
     for virtual_scale in virtual_scales:
         require(1 <= virtual_scale < math.inf, "virtual_scale", virtual_scale, "at least 1 and finite")
     gaussians = gaussians.without_empty_bands()
-    render(gaussians, views[0].camera, max(virtual_scales))  # compiled and warm before the clock starts
+    dials = virtual_scales if gaussians.sigma_d is not None else [1.0] * len(virtual_scales)
+    render(gaussians, views[0].camera, max(dials))  # compiled and warm before the clock starts
     rows = list[Row]()
     for i, virtual_scale in enumerate(virtual_scales):
         results, times = [], []
         more: dict[str, list[float]] = {name: [] for name in metrics or {}}
-        for j, (view, rendering, seconds, scores) in enumerate(_compared(gaussians, views, virtual_scale)):
+        for j, (view, rendering, seconds, scores) in enumerate(_compared(gaussians, views, dials[i])):
             times.append(seconds * 1e3)
             results.append((*scores, *_counts(gaussians, view, rendering)))
             for name, metric in (metrics or {}).items():

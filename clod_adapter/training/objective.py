@@ -135,15 +135,15 @@ class Objective:
         rendered = self._rendered_by_kernels if self._compiled(decay) else self._rendered
         image, kept, term = rendered(leaves, view.camera, s, screen_filter)
         loss = photometric_loss(image, view.image.to(decay.device, non_blocking=True), config.ssim_weight)
-        plain, weight = loss.detach().double(), self._weight(s)
+        plain, weight = loss.detach().double(), loss_weight(s, config)
         total = weight * (loss if term is None else loss + term)
         found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
         gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}
         counts = [(s, weight * plain)]
         if counted is not None:
-            # Halfway to 1/tau at most. Its weight is 1: with half of w_s, counts at the far end were 1.25 times the
-            # target, at a gain of 0.05 to 0.1 dB at equal counts.
-            counts.append((min(counted, (config.max_sv + 1 / self.attenuation.tau) / 2), plain))
+            # Its weight is 1: with half of w_s, counts at the far end were 1.25 times the target, at a gain of 0.05 to
+            # 0.1 dB at equal counts.
+            counts.append((within_reach(counted, self.attenuation), plain))
         if config.has_target_count:
             for at, weighted in counts:
                 for name, gradient in self._target_gradients(parameters, at, weighted).items():
@@ -207,9 +207,15 @@ class Objective:
             counted = count_gradient_at(self.typical, logits, sigma, s, self.attenuation, loss, self.config, target)
         return {self.decay: counted if self.config.parameter == "log" else counted / decay}
 
-    def _weight(self, s: float) -> float:
-        """w_s, the weight of the loss at a dial value."""
-        return (1 - self.config.weight_slope * s / self.config.max_sv) ** 2
+
+def loss_weight(virtual_scale: float, config: AdaptConfig) -> float:
+    """``w_s = (1 - k s / max_sv)^2``, the weight of the loss at the dial value s."""
+    return (1 - config.weight_slope * virtual_scale / config.max_sv) ** 2
+
+
+def within_reach(virtual_scale: float, attenuation: AttenuationConfig) -> float:
+    """A dial value to count at, at most halfway from max_sv to 1/tau, where nothing is kept."""
+    return min(virtual_scale, (attenuation.max_sv + 1 / attenuation.tau) / 2)
 
 
 def _ending_in(value: float, tensor: Tensor, trained: int) -> Tensor:

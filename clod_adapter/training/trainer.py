@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -49,7 +50,7 @@ class Trainer:
         subset = subset or TrainableSubset(len(start))
         assert start.sigma_d is not None and start.attenuation is not None
         self.config, self.group, self.sampler = config, group, ViewSampler(views, config)
-        rates = _learning_rates(config, _extent(start, views, subset))
+        rates = learning_rates(config, position_unit(start, views, subset))
         # A frozen attribute requests no gradient from the rasterizer.
         tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
         cameras = subset.cameras or [view.camera for view in spread(views, MOST_VIEWS)]
@@ -189,7 +190,8 @@ class Trainer:
         }
 
 
-def _learning_rates(config: AdaptConfig, extent: float) -> dict[str, float]:
+def learning_rates(config: AdaptConfig, extent: float) -> dict[str, float]:
+    """By attribute, for a batch; ``extent`` is ``position_unit``."""
     rates = {
         "means": config.lr_means * extent, "quats": config.lr_quats, "log_scales": config.lr_scales,
         "opacity_logits": config.lr_opacities, "sh0": config.lr_sh0, "shN": config.lr_shN,
@@ -197,7 +199,7 @@ def _learning_rates(config: AdaptConfig, extent: float) -> dict[str, float]:
     return {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
 
 
-def _extent(start: Gaussians, views: tuple[View, ...], subset: TrainableSubset) -> float:
+def position_unit(start: Gaussians, views: Sequence[View], subset: TrainableSubset) -> float:
     """The unit of position steps, world units: the cameras' extent, or their typical distance if it is 0."""
     assert start.attenuation is not None
     return subset.extent or camera_extent([view.camera for view in views]) or start.attenuation.scene_distance

@@ -61,11 +61,15 @@ class ViewSampler:
             view = view.moved(self.random)
         halved = share_done < config.coarse and min(view.camera.width, view.camera.height) >= 2 * SMALLEST
         view = view.halved() if halved else view
-        if not config.has_target_count:
-            return Sample(view, self._dial(number), None, halved)
-        return Sample(view, self._dial(number), (COUNTED_BEYOND * config.max_sv) ** self.random.random(), halved)
+        return Sample(view, self.dial(number), self.counted(), halved)
 
-    def _dial(self, number: int) -> float:
+    def counted(self) -> float | None:
+        """A log-uniform dial value that Gaussians are only counted at; None if there is no target-count curve."""
+        if not self.config.has_target_count:
+            return None
+        return (COUNTED_BEYOND * self.config.max_sv) ** self.random.random()
+
+    def dial(self, number: int) -> float:
         """The dial value of a step: 1 with the probability ``full_share``, else (log-)uniform in [1, max_sv].
 
         Multiples of the golden ratio modulo 1 are spread more evenly than random numbers, in every stretch of a run:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import FILTERS
 from clod_adapter.equation.growth import GROWTH_RANGE
@@ -23,7 +23,7 @@ from clod_adapter.rasterizers import cpu, reference
 from clod_adapter.render import render, splat
 from clod_adapter.training import objective
 from clod_adapter.training.loop import TrainingState, adapt
-from clod_adapter.training.objective import GradientSum, TrainableSubset
+from clod_adapter.training.objective import GradientSum, TrainableSubset, loss_weight
 from clod_adapter.training.trainer import Trainer
 from clod_adapter.training.view_sampler import Sample, ViewSampler
 from runs import config_of, states_of
@@ -154,7 +154,7 @@ def test_gradient_of_growth_equals_finite_differences(monkeypatch: pytest.Monkey
     assert of(torch.zeros(count)).loss == ungrown != of(exact["growth_d"]).loss
     found, step = of(exact["growth_d"]), 1e-6 * torch.eye(count, dtype=torch.float64)
     slopes = [(of(exact["growth_d"] + row).loss - of(exact["growth_d"] - row).loss) / 2e-6 for row in step]
-    wanted = run.objective._weight(2.0) * torch.tensor(slopes, dtype=torch.float64)
+    wanted = loss_weight(2.0, config) * torch.tensor(slopes, dtype=torch.float64)
     assert (wanted[: count - context].abs() > 1e-5).sum() > 3 and not wanted[count - context :].any()
     torch.testing.assert_close(found.gradients["growth_d"], wanted[: count - context], rtol=1e-4, atol=1e-8)
 
@@ -171,7 +171,7 @@ def test_steps_use_the_sampled_views_and_dial_values(captured: Pair, monkeypatch
     monkeypatch.setattr(objective, "count_gradient_at", lambda *a: taken.append(a[3]) or count(*a))
     monkeypatch.setattr(objective, "photometric_loss", lambda *a: taken.append(id(a[1])) or photometric_loss(*a))
     config = config_of(iters=14, max_sv=4.0)
-    adapt(attach(gaussians(5, 0, 0), torch.ones(5)), captured[1], config)
+    adapt(with_dial(gaussians(5, 0, 0), torch.ones(5)), captured[1], config)
     sampler = ViewSampler(captured[1].train, config)
     draws = [sampler.draw(k, k / 14) for k in range(14)]
     rendered = [x for view, s, *_ in draws for x in (s, id(view.image))]

@@ -33,7 +33,7 @@ def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians, with_dial: b
     """Renders of a file with a dial are at s = 1."""
     own, cameras, told = blob, scenes.ring(9, 40, 30), []
     if with_dial:
-        own = clod.attach(blob, torch.full((len(blob),), 0.3), clod.AttenuationConfig(scene_distance=4.0))
+        own = clod.with_dial(blob, torch.full((len(blob),), 0.3), clod.AttenuationConfig(scene_distance=4.0))
     scene = render_pseudo_views(own, cameras, progress=lambda now: told.append((now.done, now.total)))
     assert [view.camera for view in scene.test] == [cameras[0], cameras[8]] and len(scene.train) == 7
     image, plain = ((clod.render(g, cameras[1]).image.clamp(0, 1) * 255).round().byte() for g in (own, blob))
