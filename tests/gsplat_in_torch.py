@@ -29,20 +29,21 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
     def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
         return _torch_impl._spherical_harmonics(degree, dirs, coeffs)
 
-    projection = fully_fused_projection if _has_opacities(gsplat) else projection_without_opacities
-    for module in (rendering, gsplat):
-        for function in (isect_tiles, rasterize_to_pixels, spherical_harmonics, projection_2dgs, pixels_2dgs):
-            monkeypatch.setattr(module, NAMES.get(function.__name__, function.__name__), function)
-        monkeypatch.setattr(module, "fully_fused_projection", projection)
-        monkeypatch.setattr(module, "isect_offset_encode", _torch_impl._isect_offset_encode)
+    by_opacity = "opacities" in inspect.signature(gsplat.fully_fused_projection).parameters
+    replaced: dict[str, Any] = {
+        "fully_fused_projection": fully_fused_projection if by_opacity else projection_without_opacities,
+        "fully_fused_projection_2dgs": projection_2dgs,
+        "isect_tiles": isect_tiles,
+        "isect_offset_encode": _torch_impl._isect_offset_encode,
+        "rasterize_to_pixels": rasterize_to_pixels,
+        "rasterize_to_pixels_2dgs": pixels_2dgs,
+        "spherical_harmonics": spherical_harmonics,
+    }
+    for name, function in replaced.items():
+        monkeypatch.setattr(function, "__signature__", inspect.signature(getattr(gsplat, name)), raising=False)
+        for module in (rendering, gsplat):
+            monkeypatch.setattr(module, name, function)
     monkeypatch.setattr(rendering, "torch", _OnCpu("torch"))
-
-
-NAMES = {"projection_2dgs": "fully_fused_projection_2dgs", "pixels_2dgs": "rasterize_to_pixels_2dgs"}
-
-
-def _has_opacities(gsplat: Any) -> bool:
-    return "opacities" in inspect.signature(gsplat.fully_fused_projection).parameters
 
 
 class _OnCpu(ModuleType):
