@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
@@ -25,6 +26,13 @@ from clod_adapter.nerfstudio.splatfacto import state_of, view_of, write_ply
 
 OWN = "_model.dial."
 EXPORTER = "nerfstudio.scripts.exporter"
+
+# Learning rates in nerfstudio's checkpoints are numpy's numbers, which torch 2.6 and newer refuse to read, in
+# nerfstudio's own commands too. These names run no code.
+SCALAR: Any = np.float64(0).__reduce__()[0]
+torch.serialization.add_safe_globals([
+    (SCALAR, "numpy._core.multiarray.scalar"), (SCALAR, "numpy.core.multiarray.scalar"), np.dtype, type(np.dtype("f8")),
+])  # fmt: skip
 
 
 class ClodPipeline(VanillaPipeline):  # type: ignore[misc]
@@ -82,7 +90,7 @@ class ClodTrainer(Trainer):  # type: ignore[misc]
 
     def _load_checkpoint(self) -> None:
         """Of splatfacto: its Gaussians, for a new dial from step 0. Of this method: everything, from the next step."""
-        state = torch.load(self._checkpoint(), map_location="cpu", weights_only=False)  # as nerfstudio 1.1 reads them
+        state = torch.load(self._checkpoint(), map_location="cpu", weights_only=True)
         resumed = any(name.startswith(OWN) for name in state["pipeline"])
         self._start_step = state["step"] + 1 if resumed else 0
         self.pipeline.load_pipeline(state["pipeline"], state["step"])

@@ -27,7 +27,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
 
 ROOT = Path(__file__).parents[2]
-N, WIDTH, HEIGHT, STEPS = 60, 32, 24, 24
+N, WIDTH, HEIGHT, STEPS = 60, 32, 24, 16
 
 
 @pytest.fixture
@@ -71,8 +71,10 @@ def configured(method: Any, folder: Path, load_dir: Path) -> Any:
         "none",
         False,
     )
-    config.pipeline.model.random_init, config.pipeline.model.num_random, config.pipeline.model.sh_degree = True, 10, 1
-    config.pipeline.model.background_color = "black"
+    model = config.pipeline.model
+    model.random_init, model.num_random, model.sh_degree = True, 10, 1
+    model.background_color = "black"
+    model.warmup_length, model.refine_every, model.stop_split_at, model.cull_alpha_thresh = 0, 2, 10**6, 0.5  # all off
     config.load_dir, config.output_dir, config.max_num_iterations = load_dir, folder / "outputs", STEPS
     config.vis, config.machine.device_type, config.experiment_name = "tensorboard", "cpu", "capture"
     config.steps_per_eval_image = config.steps_per_eval_all_images = 1000
@@ -140,7 +142,7 @@ def test_a_dial_is_trained_and_found_by_the_other_commands(
         "means", "scales", "quats", "features_dc", "opacities", "log_sigma", "growth_d"
     }  # fmt: skip
     assert not torch.equal(model.means, run.base.means) and torch.equal(model.features_rest, run.base.shN)
-    start = nerf_dial(run, run.folder / "splatfacto")
+    start = untrained(run, run.folder / "splatfacto")
     assert float((model.dial.log_sigma - start.log_sigma).abs().mean()) > 0.05
 
     written = run.config.get_base_dir() / "config.yml"
@@ -175,7 +177,7 @@ def test_a_dial_is_trained_and_found_by_the_other_commands(
     assert trainer.optimizers.optimizers["log_sigma"].state_dict()["state"][0]["step"] == STEPS
 
 
-def nerf_dial(run: SimpleNamespace, folder: Path) -> Any:
+def untrained(run: SimpleNamespace, folder: Path) -> Any:
     """The dial before the first step."""
     config = configured(run.method, run.folder, folder)
     config.timestamp = "start"
