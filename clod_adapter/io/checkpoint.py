@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -129,11 +130,11 @@ def save(
     *,
     version: str | None = None,
     calibration: Calibration | None = None,
-) -> tuple[str, ...]:
+) -> None:
     """Writes ``gaussians`` in the format of the path's suffix; a PLY if that is none of ``file_formats.FORMATS``.
 
     A PLY is an extended file: the base's columns, then ``sigma_d`` and ``growth_d``. Without a base the columns are
-    those of Inria's layout.
+    those of Inria's layout. What another format loses is a warning.
 
     Row ``i`` of ``gaussians`` is row ``i`` of ``base``. Columns keep name, order and type; a value is
     overwritten only where it differs from the base's float32 reading, so what was not tuned stays
@@ -144,9 +145,6 @@ def save(
     Args:
         version: of the package that made the values, for the header (``Adapter.version``); by default the running one.
         calibration: of these Gaussians, for the header. The base's is not passed on, which is of the base.
-
-    Returns:
-        One line for each loss of the format; none for a PLY.
 
     Raises:
         ClodError: there are no Gaussians, they do not match the base, a new value is not finite, the target is the
@@ -165,7 +163,9 @@ def save(
         )
     if format_of(path) is not PLY:
         about = tuple(comment for comment in base.comments if not comment.startswith(PREFIX))
-        return write(path, gaussians, about, origin=base.origin, calibration=calibration)
+        for note in write(path, gaussians, about, origin=base.origin, calibration=calibration):
+            warnings.warn(f"{path}: {note}", stacklevel=2)
+        return
     gaussians = in_world_units(gaussians)
     comments = write_comments(gaussians.attenuation, base.comments, version, calibration, gaussians.screen_filter)
     constants = dial_constants(gaussians.attenuation, gaussians.growth_d is not None)
@@ -173,7 +173,6 @@ def save(
         constants |= filter_constants(gaussians.screen_filter)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         write_rows(file, path, gaussians, base.vertex, base.origin, comments, constants)
-    return ()
 
 
 def blank(count: int, sh_degree: int, origin: Origin = NOWHERE) -> Checkpoint:

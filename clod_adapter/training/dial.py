@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -66,6 +66,9 @@ class Dial(nn.Module):
 
     typical: Tensor
     growth_d: Tensor | None
+    if TYPE_CHECKING:  # a module's call is untyped
+
+        def __call__(self, camera: Camera, virtual_scale: float) -> Attenuated: ...
 
     def __init__(self, splats: Splats, start: Gaussians, views: Sequence[View], config: AdaptConfig) -> None:
         super().__init__()
@@ -156,6 +159,10 @@ class Dial(nn.Module):
         eta = dialled.keep.sum() / len(logits)
         value = loss * self.config.reg_weight * (eta / target.share - 1) ** 2
         return value.to(sigma) + ((self.log_sigma - self.log_sigma.detach()) * gradient).sum()
+
+    def target_share(self, virtual_scale: float) -> float:
+        """The share of the splats that the target-count curve keeps at s, in (0, 1]."""
+        return target_share(virtual_scale, len(self.log_sigma), self.config).share
 
     def differentiable(self) -> Gaussians:
         """The splats with this dial, for ``render`` and other rasterizers: gradients reach both.
