@@ -3,12 +3,17 @@ import { createCamera } from "./camera.js";
 import { createControls } from "./controls.js";
 import { readFile } from "./formats/index.js";
 import { readLink, writeLink } from "./link.js";
+import { canRecord, download, record } from "./media.js";
+import { createMenu } from "./menu.js";
 import { createModel } from "./model.js";
+import { createMotion } from "./motion.js";
 import { fetchModel, readConfig } from "./payload.js";
 import { createRenderer } from "./renderer.js";
 import { createStage } from "./stage.js";
 import { createUi, elementsOf } from "./ui.js";
+import { upOfCameras } from "./up.js";
 import { createWipe } from "./wipe.js";
+import { startXr, xrModes } from "./xr.js";
 
 const elements = elementsOf(document), config = readConfig();
 let viewer;
@@ -16,20 +21,28 @@ let viewer;
 async function start() {
   const renderer = createRenderer(elements.canvas), camera = createCamera();
   const stage = createStage(renderer, elements.canvas, camera);
-  const controls = createControls(elements.canvas, camera, () => {
+  const moved = () => {
     stage.change({ moving: true });
+    viewer.ui.showNote(""); // it was of another view
+  };
+  const controls = createControls(elements.canvas, camera, () => {
+    viewer.motion.stop();
     viewer.ui.selectCamera(null);
-  });
+    moved();
+  }, actions.focus);
+  const motion = createMotion(camera, moved, () => viewer.menu.update());
   const wipe = createWipe(elements, stage);
-  viewer = { renderer, camera, stage, controls, wipe, cameraNumber: 0, cameras: config.cameras };
+  viewer = { renderer, camera, stage, controls, motion, wipe, cameraNumber: 0, cameras: config.cameras, up: "", recording: null };
   viewer.ui = createUi(elements, stage, actions);
+  viewer.menu = createMenu(elements, viewer, actions, canRecord());
+  xrModes().then(viewer.menu.showModes);
   stage.listeners.frame = viewer.ui.updateFrame;
   stage.listeners.held = (outOfReach) => {
     viewer.ui.update();
     viewer.ui.showNote(outOfReach ? `s = ${stage.model.max_sv}, the largest trained value, is too slow for this frame rate` : "");
   };
   stage.listeners.error = (error) => viewer.ui.showMessage(error.message);
-  new ResizeObserver(() => stage.change()).observe(elements.canvas);
+  new ResizeObserver(actions.layOut).observe(elements.canvas);
   elements.canvas.addEventListener("webglcontextlost", () => viewer.ui.showMessage("The graphics device was lost; reload the page."));
   listenForFiles();
   document.title = elements.title.textContent = config.title || "clod-adapter";
@@ -49,31 +62,38 @@ function show(model, base, cameras, dial) {
   const { renderer, stage, camera, ui } = viewer;
   const upload = ({ gaussians, metadata }) => createModel(renderer.gl, gaussians, metadata);
   const [uploaded, uploadedBase] = [upload(model), base && upload(base)];
-  Object.assign(stage.state, { dial: 1, equation: true, wipe: null, other: "base" });
+  Object.assign(stage.state, { dial: 1, equation: true, marks: false, wipe: null, other: "base" });
+  viewer.up = "";
   stage.setHold(null);
   stage.show(uploaded, uploadedBase);
   viewer.cameras = cameras;
   ui.listCameras(cameras);
+  ui.update(); // rows of the panel, before the picture is placed beside it
+  actions.layOut();
   actions.reset();
   stage.state.dial = clampDial(dial);
   ui.showProgress(null);
-  ui.showNote("");
   update();
 }
 
 const clampDial = (dial) => Math.min(Math.max(dial, 1), viewer.stage.model.max_sv);
 
+/** Shows a changed state, and removes the note, which was of the former one. */
 function update() {
+  viewer.ui.showNote("");
   viewer.stage.change();
   viewer.ui.update();
   viewer.ui.updateFrame();
+  viewer.menu.update();
   viewer.wipe.update();
 }
 
-function applyLink({ eye, rotation, fov, distance, dial, equation, wipe, other }) {
+function applyLink({ eye, rotation, fov, aspect, up, distance, dial, equation, wipe, other }) {
   const { camera, stage } = viewer;
+  viewer.motion.stop();
+  if (up) [viewer.up, camera.up] = [String(up), up];
   if (eye && rotation) {
-    Object.assign(camera, { eye, rotation, intrinsics: null });
+    Object.assign(camera, { eye, rotation, intrinsics: null, aspect });
     viewer.ui.selectCamera(null);
   }
   camera.fov = fov ?? camera.fov;
@@ -85,6 +105,13 @@ function applyLink({ eye, rotation, fov, distance, dial, equation, wipe, other }
     other: other === "base" || !attenuation ? "base" : clampDial(other),
   });
   update();
+}
+
+/** The last other dial value if it differs from the present one, else the end of the dial that is farther from it. */
+function otherDial({ dial, other }) {
+  const max = viewer.stage.model.max_sv;
+  if (other !== "base" && Math.abs(Math.log(other / dial)) > 0.05 * Math.log(max)) return other;
+  return dial * dial > max ? 1 : max;
 }
 
 const actions = {
@@ -101,10 +128,9 @@ const actions = {
   },
   /** Holds a frame rate by the dial, frames per second; null ends that. */
   setHold(fps) {
-    const { stage, ui } = viewer;
-    if (fps) stage.state.equation = true;
+    const { stage } = viewer;
+    if (fps) Object.assign(stage.state, { equation: true, marks: false });
     stage.setHold(fps);
-    ui.showNote("");
     update();
   },
   setWipe(position, other = viewer.stage.state.other) {
@@ -113,8 +139,9 @@ const actions = {
   },
   compare(mode) {
     const { state } = viewer.stage, position = state.wipe ?? 0.5;
-    if (mode === "off") actions.setWipe(null);
-    else actions.setWipe(position, mode === "base" ? "base" : state.other === "base" ? viewer.stage.model.max_sv : state.other);
+    if (mode === "off") return actions.setWipe(null);
+    if (mode === "dial" || !viewer.stage.base) state.equation = true; // else both sides would be the same
+    actions.setWipe(position, mode === "base" ? "base" : otherDial(state));
   },
   async setTarget(text) {
     const target = Number(text.replaceAll(/[\s,_.'](?=\d{3}(?!\d))/g, ""));
@@ -129,12 +156,21 @@ const actions = {
     else if (dial === 1) viewer.ui.showNote(`s = 1 already keeps no more than ${count} in this view`);
     else viewer.ui.showNote(`s = ${dial.toFixed(3)} keeps ${count} in this view`);
   },
+  /** Shows the Gaussians that the dial removes, in orange. */
+  setMarks(on) {
+    const { stage } = viewer;
+    stage.state.marks = Boolean(on);
+    if (!on) return update();
+    stage.state.equation = true;
+    actions.setHold(null); // it would measure the removed ones too
+  },
   toggleFlying() {
     viewer.controls.flying = !viewer.controls.flying;
     viewer.ui.update();
   },
   reset() {
-    viewer.camera.fit(viewer.stage.model.extent, viewer.cameras);
+    viewer.motion.stop();
+    viewer.camera.fit(viewer.stage.model.extent, viewer.cameras, axisOf(viewer.up));
     viewer.camera.intrinsics = null; // fills the window
     viewer.cameraNumber = 0;
     viewer.ui.selectCamera(0);
@@ -145,14 +181,77 @@ const actions = {
     if (length) actions.goTo((viewer.cameraNumber + step + length) % length);
   },
   goTo(number) {
+    viewer.motion.stop();
     viewer.camera.set(viewer.cameras[number]);
     viewer.camera.intrinsics = null;
     viewer.cameraNumber = number;
     viewer.ui.selectCamera(number);
     update();
   },
+  /** Turns to the point at a position of the canvas, in shares of its size, and orbits about it from now on. */
+  focus(x, y) {
+    const point = viewer.stage.pick(x, y);
+    if (!point) return;
+    viewer.ui.selectCamera(null);
+    viewer.motion.glide(viewer.camera.lookingAt(point));
+  },
+  /** `value`: "x,y,z" of an axis; "" for that of the cameras or the scene. */
+  setUp(value) {
+    viewer.motion.stop();
+    viewer.up = value;
+    viewer.camera.setUp(axisOf(value));
+    viewer.ui.selectCamera(null);
+    update();
+  },
+  /** Plays the path through the photographs or, without any, a turn about the pivot; stops what plays. */
+  play() {
+    if (viewer.motion.running) viewer.motion.stop();
+    else playOnce(actions.play); // again and again
+  },
+  turntable() {
+    if (viewer.motion.running) return viewer.motion.stop();
+    viewer.ui.selectCamera(null);
+    viewer.motion.turntable(Infinity);
+    viewer.menu.update();
+  },
+  async savePicture() {
+    const { stage, motion } = viewer;
+    if (!motion.running) await stage.whenDrawn();
+    stage.redraw();
+    elements.canvas.toBlob((blob) => download(blob, fileName("png")));
+  },
+  /** Records the path or the turn to its end, or what the camera does until the next call. */
+  async record() {
+    const { stage, motion, recording } = viewer;
+    if (recording) {
+      viewer.recording = null;
+      stage.state.steady = false;
+      motion.stop();
+      const { blob, suffix } = await recording.stop();
+      download(blob, fileName(suffix));
+      return update();
+    }
+    stage.state.steady = true;
+    viewer.recording = record(elements.canvas);
+    playOnce(() => viewer.recording && actions.record());
+    update();
+  },
+  async enter(mode) {
+    try {
+      viewer.motion.stop();
+      await startXr(mode, { ...viewer, turnDial: (factor) => { viewer.stage.state.dial = clampDial(viewer.stage.state.dial * factor); } }, update);
+    } catch (error) {
+      viewer.ui.showMessage(`the headset does not start (${error.message})`);
+    }
+  },
+  /** Tells the camera where the panel is. */
+  layOut() {
+    const box = elements.panel.getBoundingClientRect(), { innerWidth: width, innerHeight: height } = window;
+    viewer.camera.panel = box.width ? [box.right / width, Math.min(1 - box.top / height, 0.5)] : [0, 0];
+    viewer.stage.change();
+  },
   async copyLink() {
-    const link = writeLink(viewer.camera, viewer.stage.state);
+    const link = writeLink(viewer.camera, viewer.stage.state, viewer.up);
     history.replaceState(null, "", link);
     try {
       await navigator.clipboard.writeText(link);
@@ -167,6 +266,29 @@ const actions = {
     return load(file.arrayBuffer().catch(refuse), file.name).catch(() => {});
   },
 };
+
+const axisOf = (value) => (value ? value.split(",").map(Number) : upOfCameras(viewer.cameras) ?? viewer.stage.model.extent.up);
+
+const fileName = (suffix) => `${viewer.stage.model.name.replace(/\.[^.]*$/, "")}_s${viewer.stage.state.dial.toFixed(2)}.${suffix}`;
+
+function playOnce(ended) {
+  const { cameras, motion, camera, ui, menu } = viewer;
+  const select = (number) => {
+    viewer.cameraNumber = number;
+    ui.selectCamera(number);
+  };
+  if (cameras.length < 2) motion.turntable(1, ended);
+  else motion.path(posesOf(cameras, camera.distance), select, ended);
+  menu.update();
+}
+
+function posesOf(cameras, distance) {
+  const each = createCamera();
+  return cameras.map((entry) => {
+    each.set(entry);
+    return { ...each.pose, distance };
+  });
+}
 
 let loadCount = 0;
 
