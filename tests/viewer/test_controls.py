@@ -13,7 +13,7 @@ import clod_adapter
 import scenes
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.scene.colmap import write_model
-from shown import TALL, Shown, fold
+from shown import TALL, Shown, drop, fold
 
 
 def test_keys_move_the_dial(shown: Shown) -> None:
@@ -194,3 +194,40 @@ def test_another_dial_value_differs_from_the_present_one(shown: Shown) -> None:
     shown.page.select_option("#compare", "base")
     assert "dial off" in shown.text("#wipe-right") and shown.page.is_checked("#equation")
     assert "quation" not in shown.page.inner_text("body") + str(shown.page.text_content("#help"))
+
+
+def test_several_files_are_switched_in_the_same_view(
+    show: Any, save: Any, gaussians: Gaussians, tmp_path: Path
+) -> None:
+    """By the list, by their numbers and by a link; the dial value stays where the file has it. The base stays too."""
+    second = gaussians.replace(sh0=-gaussians.sh0, attenuation=replace(gaussians.attenuation, max_sv=2.0))
+    models = {"a.ply": gaussians, "b.ply": second, "c.ply": scenes.dialled(9, 1, 5)}
+    words = [*(save(model, name) for name, model in models.items()), "--base", tmp_path / "a.ply"]
+    shown = show(*words, "--sv", 3, viewport=TALL)
+    assert shown.page.locator("#files option").all_inner_texts() == list(models)
+    for _ in range(3):
+        shown.page.keyboard.press("ArrowRight")
+    first = shown.picture()
+    shown.page.keyboard.press("2")
+    shown.until("document.title === 'b.ply'")
+    assert not np.array_equal(shown.picture(), first) and shown.text("#dial-value") == "s = 2.00"
+    shown.page.keyboard.press("l")
+    hashed, of_second = shown.page.evaluate("location.hash"), shown.picture()
+    assert "file=2" in hashed
+    shown.page.select_option("#files", "c.ply")
+    shown.until("document.title === 'c.ply'")
+    assert shown.counts()["total"] == 9
+    shown.page.keyboard.press("1")
+    shown.until("document.title === 'a.ply'")
+    shown.run("clod.setDial(3)")
+    assert np.array_equal(shown.picture(), first)
+    drop(shown, "dropped.ply", (tmp_path / "c.ply").read_bytes())
+    shown.until("document.title === 'dropped.ply'")
+    assert shown.text("#title") == "dropped.ply" and shown.page.input_value("#files") == ""
+    shown.page.keyboard.press("2")
+    shown.until("document.title === 'b.ply'")
+    assert shown.page.inner_text("#compare option:nth-child(2)") == "with the base"
+    opened = show(*words, address=hashed, viewport=TALL)
+    assert opened.page.title() == "b.ply" and not differ(opened.picture(), of_second)
+    one = show(words[0], viewport=TALL)
+    assert one.page.is_hidden("#files") and one.text("#title") == "a.ply"

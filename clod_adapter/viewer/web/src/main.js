@@ -33,6 +33,7 @@ async function start() {
   const motion = createMotion(camera, moved, () => viewer.menu.update());
   const wipe = createWipe(elements, stage);
   viewer = { renderer, camera, stage, controls, motion, wipe, cameraNumber: 0, cameras: config.cameras, up: "", recording: null };
+  Object.assign(viewer, { files: config.model ? [config.model, ...config.others] : [], file: 0 });
   viewer.ui = createUi(elements, stage, actions);
   viewer.menu = createMenu(elements, viewer, actions, canRecord());
   xrModes().then(viewer.menu.showModes);
@@ -45,22 +46,23 @@ async function start() {
   new ResizeObserver(actions.layOut).observe(elements.canvas);
   elements.canvas.addEventListener("webglcontextlost", () => viewer.ui.showMessage("The graphics device was lost; reload the page."));
   listenForFiles();
-  document.title = elements.title.textContent = config.title || "clod-adapter";
+  viewer.ui.showName(config.title || "clod-adapter", 0, viewer.files.map(({ name }) => name));
   viewer.ui.update();
   if (!config.model) return viewer.ui.showProgress("Drop a splat here, or open one");
   const [model, base] = await Promise.all([config.model, config.base].map((entry) => entry && fetchNamed(entry)));
   if (loadCount) return; // another file was dropped meanwhile
   show(model, base, config.cameras, config.virtual_scale);
-  applyLink(readLink(location.hash));
+  await applyLink(readLink(location.hash));
   window.addEventListener("hashchange", () => applyLink(readLink(location.hash)));
   await stage.whenDrawn();
 }
 
 const fetchNamed = (entry) => fetchModel(entry, (fraction) => viewer.ui.showProgress(`Loading ${entry.name}: ${Math.floor(100 * fraction)} %`)).catch((error) => { throw new Error(`${entry.name}: ${error.message}`); });
 
+const upload = ({ gaussians, metadata }) => createModel(viewer.renderer.gl, gaussians, metadata);
+
 function show(model, base, cameras, dial) {
-  const { renderer, stage, camera, ui } = viewer;
-  const upload = ({ gaussians, metadata }) => createModel(renderer.gl, gaussians, metadata);
+  const { stage, ui } = viewer;
   const [uploaded, uploadedBase] = [upload(model), base && upload(base)];
   Object.assign(stage.state, { dial: 1, equation: true, marks: false, wipe: null, other: "base" });
   viewer.up = "";
@@ -88,8 +90,9 @@ function update() {
   viewer.wipe.update();
 }
 
-function applyLink({ eye, rotation, fov, aspect, up, distance, dial, equation, wipe, other }) {
+async function applyLink({ file, eye, rotation, fov, aspect, up, distance, dial, equation, wipe, other }) {
   const { camera, stage } = viewer;
+  if (viewer.file !== null && file !== viewer.file) await actions.showFile(file);
   viewer.motion.stop();
   if (up) [viewer.up, camera.up] = [String(up), up];
   if (eye && rotation) {
@@ -155,6 +158,27 @@ const actions = {
     if (kept > target) viewer.ui.showNote(`s = ${max}, the largest trained value, keeps ${count} in this view`);
     else if (dial === 1) viewer.ui.showNote(`s = 1 already keeps no more than ${count} in this view`);
     else viewer.ui.showNote(`s = ${dial.toFixed(3)} keeps ${count} in this view`);
+  },
+  /** Shows another of the files, from the same view and at the same dial value. */
+  async showFile(number) {
+    const entry = viewer.files[number], { stage, ui } = viewer, fromDropped = viewer.file === null;
+    if (!entry || !stage.model) return;
+    const count = ++loadCount;
+    try {
+      const [read, base] = await Promise.all([entry, fromDropped && config.base].map((each) => each && fetchNamed(each)));
+      if (count !== loadCount) return;
+      if (fromDropped) show(read, base, config.cameras, config.virtual_scale);
+      else stage.show(upload(read), stage.base);
+      viewer.file = number;
+      ui.showName(entry.name, number);
+      if (stage.model.attenuation) stage.state.dial = clampDial(stage.state.dial);
+      update();
+      await stage.whenDrawn();
+    } catch (error) {
+      ui.showMessage(error.message);
+    } finally {
+      if (count === loadCount) ui.showProgress(null);
+    }
   },
   /** Shows the Gaussians that the dial removes, in orange. */
   setMarks(on) {
@@ -251,7 +275,7 @@ const actions = {
     viewer.stage.change();
   },
   async copyLink() {
-    const link = writeLink(viewer.camera, viewer.stage.state, viewer.up);
+    const link = writeLink(viewer.camera, viewer.stage.state, viewer.up, viewer.file);
     history.replaceState(null, "", link);
     try {
       await navigator.clipboard.writeText(link);
@@ -303,7 +327,8 @@ async function load(buffer, name) {
     show(read, null, [], 1);
     viewer.dropped = true;
     ui.showNote(read.metadata.notes.join("; "));
-    document.title = elements.title.textContent = name;
+    viewer.file = null;
+    ui.showName(name, null);
     ui.showMessage(null);
     await stage.whenDrawn();
   } catch (error) {

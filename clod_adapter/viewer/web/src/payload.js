@@ -6,7 +6,7 @@ import { inflate } from "./formats/zip.js";
 /** The page's configuration; a page without one starts empty, as a viewer for dropped files. */
 export function readConfig() {
   const element = document.getElementById("clod-config");
-  return { title: "", model: null, base: null, cameras: [], virtual_scale: 1, ...(element ? JSON.parse(element.textContent) : {}) };
+  return { title: "", model: null, base: null, others: [], cameras: [], virtual_scale: 1, ...(element ? JSON.parse(element.textContent) : {}) };
 }
 
 /** {gaussians, metadata} of the configuration's `model` or `base`; calls `onProgress(fraction)` during the transfer. */

@@ -145,7 +145,7 @@ export function createStage(renderer, canvas, camera) {
   return {
     state, listeners, change,
     show(next, nextBase) {
-      for (const old of [model, base]) if (old) { old.destroyed = true; old.destroy(); }
+      for (const old of [model, base]) if (old && old !== nextBase) { old.destroyed = true; old.destroy(); }
       [model, base] = [next, nextBase];
       for (const side of [main, second]) renderer.release(side);
       [main, second] = [makeSide(), makeSide()]; // the old ones may wait for a worker that has ended

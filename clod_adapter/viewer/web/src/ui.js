@@ -78,6 +78,7 @@ export function createUi(elements, stage, actions) {
   elements.compare.addEventListener("change", () => actions.compare(elements.compare.value));
   elements.target.addEventListener("change", () => actions.setTarget(elements.target.value));
   elements.target.addEventListener("keydown", (event) => event.key === "Enter" && actions.setTarget(elements.target.value)); // change does not fire for the same text
+  elements.files.addEventListener("change", () => actions.showFile(elements.files.selectedIndex));
   elements.camera.addEventListener("change", () => actions.goTo(elements.camera.selectedIndex));
   elements.move.addEventListener("click", actions.toggleFlying);
   elements.reset.addEventListener("click", actions.reset);
@@ -122,7 +123,7 @@ export function createUi(elements, stage, actions) {
     if (event.ctrlKey || event.metaKey || event.altKey || elements.help.open) return;
     if (event.repeat && !"[]".includes(event.key)) return;
     if (event.target.matches("input[type=text], select") || (event.key === " " && event.target.matches("button, input"))) return;
-    const action = keys[event.key.toLowerCase()];
+    const action = keys[event.key.toLowerCase()] ?? (/^[1-9]$/.test(event.key) ? () => actions.showFile(event.key - 1) : null);
     if (!action) return;
     event.preventDefault();
     action();
@@ -134,6 +135,15 @@ export function createUi(elements, stage, actions) {
     showMessage(text) {
       elements.message.hidden = !text;
       elements.message.firstElementChild.textContent = text ?? "";
+    },
+    /** Shows the name of the file, or its number in the list where there are several; null for one that is not listed. */
+    showName(name, number, names = []) {
+      document.title = elements.title.textContent = name;
+      if (names.length) elements.files.replaceChildren(...names.map((each) => new Option(each)));
+      const listed = elements.files.length > 1;
+      [elements.files.hidden, elements.filesHelp.hidden] = [!listed, !listed];
+      elements.title.hidden = listed && number !== null;
+      elements.files.selectedIndex = number ?? -1;
     },
     /** Lists the cameras by name. */
     listCameras(cameras) {
