@@ -211,6 +211,9 @@ def test_several_files_are_switched_in_the_same_view(
     shown.page.keyboard.press("2")
     shown.until("document.title === 'b.ply'")
     assert not np.array_equal(shown.picture(), first) and shown.text("#dial-value") == "s = 2.00"
+    shown.run("clod.setWipe(0.5, 'base')")
+    assert shown.text("#wipe-right") == "base · 400"
+    shown.run("clod.setWipe(null)")
     shown.page.keyboard.press("l")
     hashed, of_second = shown.page.evaluate("location.hash"), shown.picture()
     assert "file=2" in hashed

@@ -133,9 +133,12 @@ def with_columns(path: Path, **columns: np.ndarray) -> Path:
 def test_masks_and_filters_of_other_trainers(
     shown: Shown, save: Any, plain: Gaussians, artefacts: Path, tmp_path: Path
 ) -> None:
-    """MaskGaussian's masks and Mip-Splatting's filter, as ``load`` reads them; each is named in a note."""
-    small = plain.replace(log_scales=plain.log_scales - 2.0)
-    filters = np.linspace(0, 0.1, 400, dtype=np.float32)
+    """MaskGaussian's masks and Mip-Splatting's filter, as ``load`` reads them; each is named in a note.
+
+    The Gaussians are smaller than a pixel, so that Mip-Splatting's screen-space filter differs from the classic one.
+    """
+    small = plain.replace(log_scales=plain.log_scales - 3.0)
+    filters = np.linspace(0, 0.005, 400, dtype=np.float32)
     filters[7] = np.nan
     masks = {"masks_0": np.linspace(-1, 1, 400, dtype=np.float32), "masks_1": np.zeros(400, np.float32)}
     masks["masks_0"][300] = np.inf
@@ -148,6 +151,8 @@ def test_masks_and_filters_of_other_trainers(
         assert len(found) == kept
         drop_file(shown, path, 1.0)
         assert_same(shown, render(found, CAMERA), artefacts / f"{name}.png")
+        with pytest.raises(AssertionError):
+            assert_same(shown, render(small, CAMERA), artefacts / "not_read.png")
         shown.page.reload()
         shown.run("clod.ready")
         drop(shown, path.name, path.read_bytes())
