@@ -56,13 +56,14 @@ QUESTIONS: dict[str, dict[str, dict[str, object]]] = {
         "the paper's L_reg, straight through": {"count_term": "paper", "reg_weight": 1.0},
     },
     "sampling": {
-        "one, log-uniform, 30 % at 1": {"sampling": "log", "full_share": 0.3},
-        "one, uniform": {"sampling": "uniform"},
+        "uniform": {"sampling": "uniform"},
+        "20 % at s = 1": {"full_share": 0.2},
+        "60 % at s = 1": {"full_share": 0.6},
+        "whole photographs": {"coarse": 0.0},
     },
     "weights": {
         "w_s = 1": {"weight_slope": 0.0},
         "w_s as the paper's": {"weight_slope": 0.5},
-        "s = 1 double": {"full_weight": 2.0},
     },
     "light update": {
         "frozen": FROZEN,

@@ -97,7 +97,7 @@ def compared(scene: str, iters: int) -> Row:
 def idle(base: clod.Gaussians) -> clod.Gaussians:
     """The base with a dial without effect: its frames take longer by what the dial itself takes."""
     zero = torch.zeros(len(base))
-    return clod.attach(base, zero + SIGMA_MAX, clod.AttenuationConfig(tau=1e-6, max_sv=MAX_SV), zero)
+    return clod.with_dial(base, zero + SIGMA_MAX, clod.AttenuationConfig(tau=1e-6, max_sv=MAX_SV), zero)
 
 
 def empty(base: clod.Gaussians) -> clod.Gaussians:

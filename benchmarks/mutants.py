@@ -98,7 +98,7 @@ def _plys(folder: Path) -> list[Input]:
 def _adapters(folder: Path) -> list[Input]:
     """Of sigma_d alone, and of all updates with a calibration, through a base and its adapted copy."""
     inputs, base = [], _base(folder)
-    gaussians = clod.attach(base.gaussians, torch.rand(6), clod.AttenuationConfig())
+    gaussians = clod.with_dial(base.gaussians, torch.rand(6), clod.AttenuationConfig())
     row = {"virtual_scale": 1.0, "kept": 6.0, "psnr": 30.0, "ssim": 0.9, "frame_ms": 1.0}
     tuned = gaussians.replace(**{name: value + 0.1 for name, value in gaussians.tensors().items()})
     for adapted in (gaussians, tuned):
@@ -192,7 +192,7 @@ def _pts(folder: Path) -> list[Input]:
 def _whole_models(folder: Path) -> list[Input]:
     """Each format that holds a whole model, without and, where it has room, with a dial; and a compressed PLY."""
     base = _base(folder).gaussians
-    dial = clod.attach(base, torch.rand(len(base)) + 0.1, clod.AttenuationConfig())
+    dial = clod.with_dial(base, torch.rand(len(base)) + 0.1, clod.AttenuationConfig())
     inputs = []
     for suffix in (suffix for suffix in WRITABLE if suffix != ".ply"):
         for gaussians in (base, dial)[: 1 + FILE_FORMATS[suffix].carries_sigma]:

@@ -82,7 +82,7 @@ def scene(normalizer: str, cut: str) -> tuple[Gaussians, dict[str, list[clod.Cam
     leave[OTHERS:-1] = 2.2
     distances = normalized_distances(means, start, settings)
     sigma = sigma_for_extinction(logits, distances, leave, settings).clamp(max=100.0)
-    return clod.attach(plain, sigma, settings), cameras
+    return clod.with_dial(plain, sigma, settings), cameras
 
 
 def _looking(eye: Tensor, at: Tensor, width: int = 48, height: int = 36) -> clod.Camera:

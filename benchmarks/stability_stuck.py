@@ -89,7 +89,7 @@ def scene(n: int = 192, seed: int = 0) -> tuple[clod.Gaussians, clod.Camera]:
     right = sigma_from_importance(some, rank, distances, settings, share=CONFIG.share, exponent=CONFIG.exponent).clamp(
         max=1e6
     )
-    return clod.attach(some, right, settings), camera
+    return clod.with_dial(some, right, settings), camera
 
 
 def trained(config: clod.AdaptConfig, start: Tensor, steps: int, *, floor: bool = True) -> Trainer:

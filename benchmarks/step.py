@@ -1,6 +1,7 @@
 """Time of a training step by section and kernel, on real checkpoints.
 
-Wall times are means over the steps after the first few, with the default settings at the start of training.
+Wall times are means over the steps after the first few, with the default settings at the start of training: steps with
+photographs of half the size, then as many with whole ones.
 ``splat_share`` is the rasterizer's share of a step. A row names the commit of the imported package: to measure another
 one, put it first on PYTHONPATH.
 """
@@ -10,7 +11,7 @@ from __future__ import annotations
 import json
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import clod_adapter as clod
@@ -19,6 +20,7 @@ from clod_adapter.initialization.importance import for_training, initialize
 from clod_adapter.rasterizers import cpu
 from clod_adapter.training import objective, optimizer
 from clod_adapter.training.trainer import Trainer
+from clod_adapter.training.view_sampler import ViewSampler
 from common import append, arguments, checkpoint, photographs
 
 import torch
@@ -26,6 +28,7 @@ import torch
 FILE = "step.jsonl"
 THREADS = 2
 SECTIONS = {"count_gradient_at": "count", "photometric_loss": "loss"}
+HALVED, WHOLE = 0.0, 0.99  # shares of the training
 
 
 class Clock:
@@ -59,32 +62,39 @@ def main() -> None:
     for name, section in SECTIONS.items():
         clock.wrap(objective, name, section)
     clock.wrap(torch.autograd, "grad", "backward")
+    clock.wrap(ViewSampler, "draw", "sample")
+    clock.wrap(cpu, "kept", "kept")
     clock.wrap(cpu, "draw", "splat forward")
     clock.wrap(cpu._Drawn, "backward", "splat backward")
     clock.wrap(optimizer.RowAdam, "step", "optimiser")
     for scene in args.scenes:
-        row = {"benchmark": "step", "scene": scene, "threads": THREADS, **profile(scene, 120, clock)}
-        print(json.dumps(row, indent=1), flush=True)
-        if args.record:
-            append(FILE, row)
+        for measured in profile(scene, 120, clock):
+            row = {"benchmark": "step", "scene": scene, "threads": THREADS, **measured}
+            print(json.dumps(row, indent=1), flush=True)
+            if args.record:
+                append(FILE, row)
 
 
-def profile(scene: str, steps: int, clock: Clock, warm: int = 5) -> dict[str, Any]:
-    """Milliseconds a step, in all and by section."""
+def profile(scene: str, steps: int, clock: Clock, warm: int = 5) -> Iterator[dict[str, Any]]:
+    """Milliseconds a step, in all and by section; of half-size and of whole photographs."""
     base, views = checkpoint(scene).gaussians, photographs(scene).train
     config = clod.AdaptConfig()
     begun = for_training(initialize(base, views, config), views, config)
     run = Trainer(begun, views, config)
-    for _ in range(warm):
-        run.step(0.0)
-    clock.seconds.clear()
-    began = time.perf_counter()
-    for _ in range(steps):
-        run.step(0.0)
-    total = (time.perf_counter() - began) / steps
-    sections = {name: round(seconds / steps * 1e3, 2) for name, seconds in clock.seconds.items()}
-    splat = (clock.seconds["splat forward"] + clock.seconds["splat backward"]) / steps
-    return {"steps": steps, "step_ms": round(total * 1e3, 2), "splat_share": round(splat / total, 3), "ms": sections}
+    for share_done in (HALVED, WHOLE):
+        for _ in range(warm):
+            run.step(share_done)
+        clock.seconds.clear()
+        began = time.perf_counter()
+        for _ in range(steps):
+            run.step(share_done)
+        total = (time.perf_counter() - began) / steps
+        sections = {name: round(seconds / steps * 1e3, 2) for name, seconds in clock.seconds.items()}
+        splat = (clock.seconds["splat forward"] + clock.seconds["splat backward"]) / steps
+        yield {
+            "halved": share_done == HALVED, "steps": steps, "step_ms": round(total * 1e3, 2),
+            "splat_share": round(splat / total, 3), "ms": sections,
+        }  # fmt: skip
 
 
 if __name__ == "__main__":

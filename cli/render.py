@@ -55,6 +55,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     solved, notes = solve_dials(args, model, [view.camera for view in views], console)
     dials, beyond = choose_dials(solved or [1.0], model.gaussians.attenuation)
     notes += beyond
+    if model.gaussians.sigma_d is None and max(dials) > 1:
+        notes.append(f"{args.model} has no sigma_d, so every dial value renders all of it")
     for note in notes:
         console.say(note)
     gaussians = model.gaussians.without_empty_bands()
@@ -100,7 +102,8 @@ def write_images(
 ) -> Iterator[Written]:
     """Writes an image per view: the dial values from left to right, after the photograph with ``beside``."""
     for view, name in zip(views, image_names(views), strict=True):
-        shown = [render(gaussians, view.camera, dial) for dial in dials]
+        plain = gaussians.sigma_d is None
+        shown = [render(gaussians, view.camera, 1.0 if plain else dial) for dial in dials]
         panels = [rendering.pixels.cpu() for rendering in shown]
         write_png(out / name, torch.cat([view.image, *panels] if beside else panels, dim=1))
         kept = [int(rendering.kept.sum()) for rendering in shown]

@@ -22,7 +22,7 @@ if "torch" not in sys.modules:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
-    from clod_adapter.adapter import Adapter, attach, detach, extract
+    from clod_adapter.adapter import Adapter, detach, extract, with_dial
     from clod_adapter.bake import bake, order_by_extinction
     from clod_adapter.calibration import Calibration
     from clod_adapter.cameras import Camera, Scene, View
@@ -32,12 +32,14 @@ if TYPE_CHECKING:
     from clod_adapter.evaluation.evaluate import evaluate
     from clod_adapter.gaussians import Gaussians
     from clod_adapter.hook import Hold, Hook
+    from clod_adapter.integrations.splats import from_gsplat, to_gsplat
     from clod_adapter.io.adapter_file import load_adapter, save_adapter
     from clod_adapter.io.checkpoint import Checkpoint, load, save
     from clod_adapter.io.scene.load import load_scene
     from clod_adapter.progress import Phase, Progress, Stopped
     from clod_adapter.render import Rendering, render
     from clod_adapter.training.camera_placement import place_cameras
+    from clod_adapter.training.dial import Dial, attach
     from clod_adapter.training.loop import Adapted, adapt
     from clod_adapter.training.objective import TrainableSubset
     from clod_adapter.training.plan import Decision, Override, Plan
@@ -46,7 +48,7 @@ if TYPE_CHECKING:
 
 # Imported on first use: torch takes a second or two, which the command's --help and most of its errors do without.
 on_first_use(__name__, {
-    "adapter": ("Adapter", "attach", "detach", "extract"),
+    "adapter": ("Adapter", "detach", "extract", "with_dial"),
     "evaluation.budget": ("DialValue", "dial_for"),
     "calibration": ("Calibration",),
     "cameras": ("Camera", "Scene", "View"),
@@ -56,6 +58,7 @@ on_first_use(__name__, {
     "bake": ("bake", "order_by_extinction"),
     "gaussians": ("Gaussians",),
     "hook": ("Hold", "Hook"),
+    "integrations.splats": ("from_gsplat", "to_gsplat"),
     "io.adapter_file": ("load_adapter", "save_adapter"),
     "io.scene.load": ("load_scene",),
     "io.checkpoint": ("Checkpoint", "load", "save"),
@@ -66,13 +69,14 @@ on_first_use(__name__, {
     "training.planner": ("make_plan",),
     "progress": ("Phase", "Progress", "Stopped"),
     "render": ("Rendering", "render"),
+    "training.dial": ("Dial", "attach"),
     "training.loop": ("Adapted", "adapt"),
 })  # fmt: skip
 
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
-    "Decision", "DialValue", "Gaussians", "Hold", "Hook", "Override", "Phase", "Plan", "Progress", "Rendering", "Scene",
-    "ScreenFilter", "Stopped", "TrainableSubset", "View", "adapt", "attach", "bake", "detach", "dial_for", "evaluate",
-    "extract", "load", "load_adapter", "load_scene", "make_plan", "order_by_extinction", "place_cameras", "render",
-    "render_pseudo_views", "save", "save_adapter",
+    "Decision", "Dial", "DialValue", "Gaussians", "Hold", "Hook", "Override", "Phase", "Plan", "Progress", "Rendering",
+    "Scene", "ScreenFilter", "Stopped", "TrainableSubset", "View", "adapt", "attach", "bake", "detach", "dial_for",
+    "evaluate", "extract", "from_gsplat", "load", "load_adapter", "load_scene", "make_plan", "order_by_extinction",
+    "place_cameras", "render", "render_pseudo_views", "save", "save_adapter", "to_gsplat", "with_dial",
 ]  # fmt: skip

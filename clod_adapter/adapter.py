@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from clod_adapter._support.arrays import tensor_of
 from clod_adapter._support.version import package_version
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter
@@ -65,6 +66,10 @@ class Adapter:
     notes: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
+        for name in ("sigma_d", "growth_d", "kept"):
+            if (column := getattr(self, name)) is not None:
+                object.__setattr__(self, name, tensor_of(column))
+        object.__setattr__(self, "updates", {name: tensor_of(update) for name, update in self.updates.items()})
         count = self.sigma_d.numel()
         for name, column in dial_tensors(self).items():
             if column.shape != (count,) or column.dtype != torch.float32:
@@ -87,6 +92,11 @@ class Adapter:
             raise ClodError(
                 f"Adapter.sh_degree is {self.sh_degree!r}, it must be one of {', '.join(map(str, SH_COUNTS))}"
             )
+
+    def __repr__(self) -> str:
+        """As in ``Adapter(120,000 Gaussians, dial to 5 with growth, updates of means, sh0)``."""
+        dial = f"dial to {self.attenuation.max_sv:g}{'' if self.growth_d is None else ' with growth'}"
+        return f"Adapter({len(self.sigma_d):,} Gaussians, {dial}, updates of {', '.join(self.updates) or 'nothing'})"
 
     @property
     def base_count(self) -> int:
@@ -162,7 +172,9 @@ def extract(
         ClodError: ``adapted`` has no dial, is not finite, or is not the same Gaussians as ``base``.
     """
     if adapted.sigma_d is None or adapted.attenuation is None:
-        raise ClodError("the adapted Gaussians have no sigma_d; attach a dial first")
+        raise ClodError(
+            "the adapted Gaussians have no sigma_d, so there is no dial to extract; give the result of adapt"
+        )
     adapted = in_world_units(adapted)
     updates, columns = dict[str, Tensor](), dict[str, Any]()
     for name in ATTRIBUTES:
@@ -180,13 +192,17 @@ def extract(
     )  # fmt: skip
 
 
-def attach(
+def with_dial(
     gaussians: Gaussians, sigma_d: Tensor | None = None, attenuation: AttenuationConfig | None = None,
     growth_d: Tensor | None = None,
 ) -> Gaussians:  # fmt: skip
     """The Gaussians with this dial alone, by the default settings; without ``sigma_d`` one that changes nothing.
 
-    That is SIGMA_MAX, and unless told otherwise a hard cut at 1/255, below which rasterizers draw nothing anyway.
+    That is SIGMA_MAX, and unless told otherwise a hard cut at 1/255, below which rasterizers draw nothing anyway. Its
+    gradient is 0: for a dial that a training loop learns, see ``attach``.
+
+    Args:
+        sigma_d: ``[N]`` world units; growth_d: ``[N]`` exponents, or None for no growth.
     """
     if sigma_d is None:
         sigma_d = torch.full_like(gaussians.opacity_logits, SIGMA_MAX, dtype=torch.float32)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from clod_adapter._support.arrays import float_tensor, tensor_of
 from clod_adapter.errors import ClodError
 
 NEAR = 0.01
@@ -19,6 +20,8 @@ ROUNDING = 1e-6  # of the distance from 0: float32 does not resolve cameras clos
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera in OpenCV axes (x right, y down, z forward).
+
+    The matrices may be given as numpy arrays, which become float32 tensors.
 
     Attributes:
         viewmat: ``[4, 4]`` world to camera.
@@ -39,10 +42,20 @@ class Camera:
     near: float = NEAR
 
     def __post_init__(self) -> None:
+        for name in ("viewmat", "K"):
+            object.__setattr__(self, name, float_tensor(getattr(self, name)))
         if tuple(self.viewmat.shape) != (4, 4) or tuple(self.K.shape) != (3, 3):
             raise ClodError(f"camera {self.name!r} needs viewmat [4, 4] and K [3, 3]")
         if self.width < 1 or self.height < 1:
             raise ClodError(f"camera {self.name!r} has size {self.width}x{self.height}")
+
+    def __repr__(self) -> str:
+        return f"Camera({self.name!r}, {self.width}x{self.height})"
+
+    def halved(self) -> Camera:
+        """The same view with half the width and height; the last column or row of an odd size is left out."""
+        K = self.K * self.K.new_tensor([[0.5], [0.5], [1.0]])
+        return replace(self, K=K, width=self.width // 2, height=self.height // 2)
 
     @property
     def position(self) -> Tensor:
@@ -56,18 +69,29 @@ class View:
 
     Attributes:
         camera: where it was taken from.
-        image: ``[H, W, 3]`` uint8, sRGB as stored in the file.
+        image: ``[H, W, 3]`` uint8, sRGB as stored in the file; a numpy array becomes a tensor.
     """
 
     camera: Camera
     image: Tensor
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "image", tensor_of(self.image))
         _check_image(self.camera, self.image)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.camera.name!r}, {self.camera.width}x{self.camera.height})"
 
     def at(self, camera: Camera) -> View:
         """The same photograph with another camera of its size."""
         return View(camera, self.image)
+
+    def halved(self) -> View:
+        """The photograph at half the size, by means of 2x2 pixels, with the camera for it."""
+        camera, image = self.camera.halved(), self.image
+        rows, columns = 2 * camera.height, 2 * camera.width
+        corners = [image[y:rows:2, x:columns:2].short() for y in (0, 1) for x in (0, 1)]
+        return View(camera, (sum(corners[1:], corners[0] + 2) >> 2).to(torch.uint8))
 
 
 class StoredView(View):
@@ -121,6 +145,12 @@ class Scene:
     test: tuple[View, ...]
     notes: tuple[str, ...] = ()
     left_out: tuple[tuple[str, str], ...] = ()
+
+    def __repr__(self) -> str:
+        views = [*self.train, *self.test]
+        sizes = {f"{view.camera.width}x{view.camera.height}" for view in views}
+        size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
+        return f"Scene({len(self.train)} training views, {len(self.test)} held out, {size})"
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:

@@ -15,7 +15,7 @@ NORMALIZERS = ("max", "quantile", "scene")
 CUTS = ("hard", "soft")
 STARTS = ("importance", "error", "constant", "identity")
 PARAMETERS = ("log", "linear")
-SAMPLINGS = ("pair", "log", "uniform")
+SAMPLINGS = ("log", "uniform")
 COUNT_TERMS = ("law", "paper")
 GROWTHS = ("on", "off")
 TARGETS = ("count", "cost")
@@ -103,6 +103,14 @@ class ScreenFilter:
         require(1e-3 <= self.variance <= 100, "variance", self.variance, "between 0.001 and 100 px^2")
         require(isinstance(self.compensate, bool), "compensate", self.compensate, "true or false")
 
+    def halved(self) -> ScreenFilter:
+        """The same filter in the px^2 of images of half the size: ``variance / 4``.
+
+        Such a render is within 44 to 46 dB of the mean of 2x2 pixels of the whole one (``cameras.View.halved``). The
+        variance that this mean adds would make images denser, as opacities are not compensated: 41 to 43 dB.
+        """
+        return replace(self, variance=max(self.variance / 4, 1e-3))
+
     @property
     def name(self) -> str | None:
         """Its name in FILTERS; None if it is not in there."""
@@ -132,7 +140,7 @@ class AdaptConfig:
     """
 
     max_sv: float = option(5.0, "largest dial value to train for")
-    iters: int = option(1500, "training steps")
+    iters: int = option(2000, "training steps")
     batch: int = option(1, "views per step; learning rates scale with its square root")
     time_budget: float | None = option(
         None, "stop training after this many seconds; schedules are scaled to it (default: no limit)"
@@ -152,13 +160,9 @@ class AdaptConfig:
         None, "share of Gaussians to keep at s = 1 (default: as the plan measures; 0.62 without a plan)"
     )
     parameter: str = option("log", "trained parameter: log (of sigma_d) or linear (sigma_d itself, the paper's)")
-    sampling: str = option(
-        "pair", "dial values per step: pair (1 and a log-uniform one, or two of these), log or uniform (the paper's)"
-    )
-    full_weight: float = option(
-        2.5, "weight of the loss at s = 1 relative to that at the other dial value (sampling pair)"
-    )
-    full_share: float = option(0.0, "share of steps at s = 1 (samplings log and uniform)")
+    sampling: str = option("log", "dial value of a step: log-uniform (log) or uniform (the paper's)")
+    full_share: float = option(0.5, "share of steps at s = 1 instead")
+    coarse: float = option(0.6, "share of steps, the first ones, with photographs of half the size (not of small ones)")
     target: str = option(
         "count", "what the dial reduces: count (of Gaussians, the paper's) or cost (the work of rendering them)"
     )
@@ -211,7 +215,7 @@ class AdaptConfig:
         need = "count, as cost needs count_term law and parameter log (not the paper's form)"
         require(self.target == "count" or following, "target", self.target, need)
         require(0 <= self.full_share <= 1, "full_share", self.full_share, "between 0 and 1")
-        require(0 <= self.full_weight < math.inf, "full_weight", self.full_weight, "at least 0 and finite")
+        require(0 <= self.coarse <= 1, "coarse", self.coarse, "between 0 and 1")
         require(0 < self.exponent < math.inf, "exponent", self.exponent, "positive and finite")
         require(0 <= self.reg_weight < math.inf, "reg_weight", self.reg_weight, "at least 0 and finite")
         require(0 <= self.weight_slope <= 1, "weight_slope", self.weight_slope, "between 0 and 1")
@@ -235,7 +239,8 @@ class AdaptConfig:
         """
         own: dict[str, Any] = {
             "tau": 1 / 255, "cut": "hard", "normalizer": "max", "start": "constant", "parameter": "linear",
-            "sampling": "uniform", "count_term": "paper", "reg_weight": 1.0, "weight_slope": 0.5, "lr_sigma": 1e-2,
+            "sampling": "uniform", "full_share": 0.0, "coarse": 0.0, "count_term": "paper", "reg_weight": 1.0,
+            "weight_slope": 0.5, "lr_sigma": 1e-2,
             "growth": "off", "temperature": 0.5, "average": 0.0, "lr_final": 0.05, "lr_means": 2.6e-4, "lr_quats": 8e-4,
             "lr_scales": 8e-3, "lr_opacities": 5e-2, "lr_sh0": 2e-3,
         }  # fmt: skip

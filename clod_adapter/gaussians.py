@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from clod_adapter._support.arrays import float_tensor
 from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 
@@ -21,6 +24,9 @@ OPAQUE = 20.0
 @dataclass(frozen=True)
 class Gaussians:
     """N Gaussians with the parameters that checkpoints store, and, once adapted, their distance decay.
+
+    Fields may be given as numpy arrays, which become float32 tensors. ``gaussians[:100]``, ``gaussians[mask]`` and
+    ``gaussians[indices]`` are the Gaussians of these rows.
 
     Attributes:
         means: ``[N, 3]`` centres, world units.
@@ -51,6 +57,9 @@ class Gaussians:
     screen_filter: ScreenFilter = CLASSIC
 
     def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            if isinstance(value := getattr(self, field.name), np.ndarray):
+                object.__setattr__(self, field.name, float_tensor(value))
         n = self.means.shape[0]
         expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,), "sh0": (n, 1, 3)}
         expected |= {name: (n,) for name in ("sigma_d", "growth_d") if getattr(self, name) is not None}
@@ -69,6 +78,35 @@ class Gaussians:
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    def __getitem__(self, rows: slice | Tensor | np.ndarray | Sequence[int]) -> Gaussians:
+        """The Gaussians at ``rows``: a slice, a boolean mask ``[N]``, or indices ``[M]``.
+
+        Raises:
+            ClodError: a single index, a mask of another length, or an index out of range.
+        """
+        if not isinstance(rows, slice):
+            rows = torch.as_tensor(rows, device=self.means.device)
+            if rows.dim() != 1 or (rows.dtype == torch.bool and len(rows) != len(self)):
+                raise ClodError(
+                    f"rows has shape {tuple(rows.shape)}; give a slice, indices [M] or a mask [{len(self)}]"
+                )
+        try:
+            return self.select(rows)
+        except IndexError as error:
+            raise ClodError(f"there are {len(self)} Gaussians, and {str(error).splitlines()[0]}") from error
+
+    def __repr__(self) -> str:
+        """Count, SH degree, dial and device, as in ``Gaussians(120,000, SH degree 3, dial to 5 with growth, cpu)``."""
+        return f"Gaussians({self.summary}, {self.means.device})"
+
+    @property
+    def summary(self) -> str:
+        """``120,000, SH degree 3, dial to 5 with growth``."""
+        dial = "no dial"
+        if self.attenuation is not None:
+            dial = f"dial to {self.attenuation.max_sv:g}{'' if self.growth_d is None else ' with growth'}"
+        return f"{len(self):,}, SH degree {self.sh_degree}, {dial}"
 
     @property
     def sh_degree(self) -> int:
@@ -93,8 +131,8 @@ class Gaussians:
         """A copy with the named fields replaced."""
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
 
-    def select(self, rows: Tensor) -> Gaussians:
-        """The Gaussians at ``rows`` (a boolean mask ``[N]`` or indices ``[M]``)."""
+    def select(self, rows: Tensor | slice) -> Gaussians:
+        """The Gaussians at ``rows`` (a boolean mask ``[N]``, indices ``[M]`` or a slice)."""
         return self.replace(**{name: value[rows] for name, value in self.tensors().items()})
 
     def without_empty_bands(self) -> Gaussians:
@@ -112,3 +150,11 @@ class Gaussians:
     def to(self, device: torch.device | str) -> Gaussians:
         """A copy on another device."""
         return self.replace(**{name: value.to(device) for name, value in self.tensors().items()})
+
+    def cuda(self) -> Gaussians:
+        """A copy on the current CUDA device."""
+        return self.to("cuda")
+
+    def cpu(self) -> Gaussians:
+        """A copy in main memory."""
+        return self.to("cpu")

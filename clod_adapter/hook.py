@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from clod_adapter._support.arrays import float_tensor, tensor_of
 from clod_adapter.cameras import NEAR, Camera
 from clod_adapter.config import AttenuationConfig, require
 from clod_adapter.equation.attenuation import Attenuated, attenuate, check_dial
@@ -48,6 +49,9 @@ class Hook:
     growth_d: Tensor | None = None
 
     def __post_init__(self) -> None:
+        for name in ("sigma_d", "growth_d"):
+            if (column := getattr(self, name)) is not None:
+                object.__setattr__(self, name, float_tensor(column))
         check_dial(self.virtual_scale)
 
     @overload
@@ -86,8 +90,8 @@ class Hook:
         if K is None and self.attenuation.normalizer != "scene":
             raise ClodError(f"normalizer {self.attenuation.normalizer} needs K, width and height in the hook's call")
         camera = Camera(_matrix(viewmat), _matrix(np.eye(3) if K is None else K), width, height, near=near)
-        shown = _tensor(opacities)
-        result = self.attenuate(_tensor(means), shown, camera)
+        shown = tensor_of(opacities)
+        result = self.attenuate(tensor_of(means), shown, camera)
         found = [result.drawn.reshape(shown.shape).to(shown.dtype), result.keep]
         if growth:
             found.append(torch.ones_like(result.opacities) if result.growth is None else result.growth)
@@ -180,15 +184,7 @@ def _synchronize() -> None:
         torch.cuda.synchronize()
 
 
-def _tensor(values: Any) -> Tensor:
-    """A tensor unchanged; an array as a copy, as torch accepts neither foreign byte order nor negative strides."""
-    if isinstance(values, Tensor):
-        return values
-    array = np.asarray(values)
-    return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), order="C"))
-
-
 def _matrix(values: Any) -> Tensor:
     """In float32 at least: integers and float16 are too coarse for a camera."""
-    matrix = _tensor(values)
+    matrix = tensor_of(values)
     return matrix.to(torch.promote_types(matrix.dtype, torch.float32))

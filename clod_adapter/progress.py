@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:  # the command reports an interrupt without importing torch
     from clod_adapter.gaussians import Gaussians
@@ -88,3 +90,39 @@ def within(listener: Listener | None, before: int, total: int, phase: Phase | No
     if listener is None:
         return None
     return lambda now: listener(replace(now, phase=phase or now.phase, done=before + now.done, total=total))
+
+
+@contextmanager
+def shown(progress: Listener | Literal[False] | None) -> Iterator[Listener | None]:
+    """The listener ``progress``. For None a bar, where stderr is a terminal or a notebook's; for False none."""
+    if progress is not None or not (sys.stderr.isatty() or "ipykernel" in sys.modules):
+        yield progress or None
+        return
+    bar = _Bar()
+    try:
+        yield bar
+    finally:
+        bar.close()
+
+
+class _Bar:
+    """A listener that shows each phase as a bar of tqdm."""
+
+    def __init__(self) -> None:
+        self.phase: Phase | None = None
+        self.bar: Any = None
+
+    def __call__(self, now: Progress) -> None:
+        from tqdm import tqdm
+
+        if now.phase != self.phase:
+            self.close()
+            self.phase = now.phase
+            self.bar = tqdm(total=now.total, desc=now.phase, file=sys.stderr, leave=False, dynamic_ncols=True)
+        if not math.isnan(now.loss):
+            self.bar.set_postfix_str(f"loss {now.loss:.4f}", refresh=False)
+        self.bar.update(round(now.share * now.total) - self.bar.n)
+
+    def close(self) -> None:
+        if self.bar is not None:
+            self.bar.close()

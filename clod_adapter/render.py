@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from clod_adapter._support.arrays import float_tensor
 from clod_adapter.cameras import Camera
 from clod_adapter.equation.attenuation import Attenuated, attenuate, check_dial
 from clod_adapter.errors import ClodError
@@ -96,30 +99,34 @@ def render(
     camera: Camera,
     virtual_scale: float = 1.0,
     *,
-    background: Tensor | None = None,
+    background: Tensor | np.ndarray | None = None,
     rasterizer: Rasterizer | None = None,
 ) -> Rendering:
     """Renders at one dial value, differentiably.
 
     Args:
-        gaussians: adapted or not; without ``sigma_d`` the dial has no effect.
+        gaussians: adapted or not; without ``sigma_d`` the dial has no effect, and above s = 1 a warning says so.
         camera: the view.
         virtual_scale: the dial s >= 1 (the paper's s_v).
-        background: ``[3]``, black by default.
+        background: ``[3]``, tensor or array; black by default.
         rasterizer: the fastest one for the Gaussians' device by default.
 
     Raises:
         ClodError: the dial is below 1 or not finite.
     """
     check_dial(virtual_scale)
-    if rasterizer is None and _drawn_at_once(gaussians, background):
+    if virtual_scale > 1 and gaussians.sigma_d is None:
+        much = f"virtual_scale is {virtual_scale:g}, but the Gaussians have no sigma_d: all are drawn as they are"
+        warnings.warn(f"{much}; give the result of clod_adapter.adapt", stacklevel=2)
+    behind = None if background is None else float_tensor(background)
+    if rasterizer is None and _drawn_at_once(gaussians, behind):
         from clod_adapter.rasterizers import cpu
 
-        image, alpha = cpu.draw(gaussians, camera, virtual_scale, _behind(gaussians, background))
+        image, alpha = cpu.draw(gaussians, camera, virtual_scale, _behind(gaussians, behind))
     else:
         attenuated = dial(gaussians, camera, virtual_scale)
         image, alpha = splat(
-            gaussians, attenuated.drawn, camera, growth=attenuated.growth, background=background,
+            gaussians, attenuated.drawn, camera, growth=attenuated.growth, background=behind,
             rasterizer=rasterizer,
         )  # fmt: skip
     return Rendering(image, alpha, gaussians, camera, virtual_scale)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clod_adapter.adapter import ATTRIBUTES, DIAL, SIGMA_MAX, Adapter, attach, detach, extract, trim
+from clod_adapter.adapter import ATTRIBUTES, DIAL, SIGMA_MAX, Adapter, detach, extract, trim, with_dial
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
@@ -34,7 +35,7 @@ def adapt(base: Gaussians, names: list[str], scale: float = 0.01, seed: int = 1,
         old = getattr(base, name)
         changes[name] = old + scale * torch.randn(old.shape, generator=g)
     sigma_d, growth_d = torch.rand(2, len(base), generator=g)
-    return attach(base.replace(**changes), sigma_d, CONFIG, growth_d if growth else None)
+    return with_dial(base.replace(**changes), sigma_d, CONFIG, growth_d if growth else None)
 
 
 @settings(deadline=None)
@@ -97,30 +98,30 @@ def test_unchanged_values_keep_their_bits() -> None:
     base.means[0] = torch.tensor([-0.0, 0.0, 1e-42])
     means = base.means.clone()
     means[1] += 1
-    result = extract(base, attach(base.replace(means=means)), fingerprint="f", config={}).apply(base)
+    result = extract(base, with_dial(base.replace(means=means)), fingerprint="f", config={}).apply(base)
     assert bits(result)["means"][:3] == bits(base)["means"][:3]
 
 
-def test_attach_and_detach() -> None:
+def test_with_dial_and_detach() -> None:
     """Without sigma_d the dial has no effect and can be removed exactly; with it, its tensor is used as it is."""
     base, sigma_d = gaussians(), torch.rand(6)
-    on, chosen = attach(base), attach(base, sigma_d, CONFIG)
+    on, chosen = with_dial(base), with_dial(base, sigma_d, CONFIG)
     assert on.attenuation == AttenuationConfig(tau=1 / 255, cut="hard") and bits(detach(on)) == bits(base)
     assert detach(on).sigma_d is None and detach(on).attenuation is None
-    grown = attach(base, sigma_d, CONFIG, torch.rand(6))
-    assert bits(detach(grown)) == bits(base) and bits(attach(grown, sigma_d, CONFIG)) == bits(chosen)
-    assert (on.sigma_d == SIGMA_MAX).all() and attach(base, sigma_d).attenuation == AttenuationConfig()
+    grown = with_dial(base, sigma_d, CONFIG, torch.rand(6))
+    assert bits(detach(grown)) == bits(base) and bits(with_dial(grown, sigma_d, CONFIG)) == bits(chosen)
+    assert (on.sigma_d == SIGMA_MAX).all() and with_dial(base, sigma_d).attenuation == AttenuationConfig()
     distance = torch.logspace(-6, 4, 1000)
     for sigma in (torch.tensor(SIGMA_MAX), torch.tensor(SIGMA_MAX, dtype=torch.float64)):
         assert (torch.exp(-(distance**2) / (2 * sigma**2 + 1e-8)).float() == 1).all()
     assert chosen.sigma_d is sigma_d and chosen.attenuation is CONFIG
     with pytest.raises(ClodError, match="sigma_d"):
-        attach(base, torch.rand(5), CONFIG)
+        with_dial(base, torch.rand(5), CONFIG)
 
 
 def test_extracting_ignores_a_dial_of_the_base_and_drops_graphs() -> None:
     base = gaussians()
-    old = attach(base, torch.ones(6), growth_d=torch.ones(6))
+    old = with_dial(base, torch.ones(6), growth_d=torch.ones(6))
     leaves = {name: torch.rand(6).requires_grad_() for name in DIAL}
     adapted = adapt(base, ["sh0"]).replace(sh0=(base.sh0 + 1).requires_grad_(), **leaves)
     for result in (adapted, adapted.replace(growth_d=None)):
@@ -146,14 +147,14 @@ def test_extract_refuses_other_results() -> None:
     with pytest.raises(ClodError, match="no sigma_d"):
         extract(base, base, fingerprint="f", config={})
     with pytest.raises(ClodError, match="means is float32"):
-        extract(base, attach(gaussians(5)), fingerprint="f", config={})
+        extract(base, with_dial(gaussians(5)), fingerprint="f", config={})
     with pytest.raises(ClodError, match="diverged"):
-        extract(base, attach(base, torch.full((6,), torch.nan)), fingerprint="f", config={})
+        extract(base, with_dial(base, torch.full((6,), torch.nan)), fingerprint="f", config={})
     with pytest.raises(ClodError, match="growth_d holds a value that is not finite"):
-        extract(base, attach(base, torch.ones(6), growth_d=torch.full((6,), torch.inf)), fingerprint="f", config={})
+        extract(base, with_dial(base, torch.ones(6), growth_d=torch.full((6,), torch.inf)), fingerprint="f", config={})
     for bad in (torch.nan, torch.inf):
         with pytest.raises(ClodError, match="sh0 holds a new value"):
-            extract(base, attach(base.replace(sh0=torch.full((6, 1, 3), bad))), fingerprint="f", config={})
+            extract(base, with_dial(base.replace(sh0=torch.full((6, 1, 3), bad))), fingerprint="f", config={})
 
 
 def test_an_adapter_checks_its_fields() -> None:
@@ -167,7 +168,7 @@ def test_an_adapter_checks_its_fields() -> None:
     for bad in ("1.0\nproperty float x", "1.0ä"):
         with pytest.raises(ClodError, match="version"):
             Adapter(torch.ones(3), CONFIG, {}, "f", {}, bad)
-    adapter = extract(gaussians(3), attach(gaussians(3)), fingerprint="f", config={})
+    adapter = extract(gaussians(3), with_dial(gaussians(3)), fingerprint="f", config={})
     for kept in (torch.ones(4, dtype=torch.bool), torch.ones(3), torch.ones(3, 1, dtype=torch.bool)):
         with pytest.raises(ClodError, match="Adapter.kept is .* it must be bool with 3 set"):
             replace(adapter, kept=kept)
@@ -189,3 +190,12 @@ def test_a_trimmed_result(degree: int | None) -> None:
     if degree == 1:
         with pytest.raises(ClodError, match="it has SH degree 0, the adapter 1"):
             adapter.apply(base.without_bands(0))
+
+
+def test_arrays_become_tensors_and_repr_is_short() -> None:
+    base = gaussians()
+    columns = {"sigma_d": np.ones(6, np.float32), "growth_d": np.zeros(6, np.float32)}
+    update = {"means": np.full((6, 3), 0.5, np.float16)}
+    adapter = Adapter(**columns, attenuation=CONFIG, updates=update, base_fingerprint="", config={})
+    torch.testing.assert_close(adapter.apply(base).means, base.means + 0.5)
+    assert repr(adapter) == f"Adapter(6 Gaussians, dial to {CONFIG.max_sv:g} with growth, updates of means)"

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
@@ -35,7 +35,7 @@ def test_opacities_are_those_drawn(cut: str) -> None:
     config = replace(CONFIG, cut=cut, tau=1 / 255)
     logits = torch.tensor([-3.0, 0, 8, 30, math.inf, math.inf, 2.0])
     sigma = torch.tensor([2.0, 2, 2, 2, 2, 1e9, 0.6765])  # the last between tau s and 1.5 tau s
-    some = attach(at_one_place(gaussians(7, 0, 0)).replace(opacity_logits=logits), sigma, config)
+    some = with_dial(at_one_place(gaussians(7, 0, 0)).replace(opacity_logits=logits), sigma, config)
     want = attenuate(logits, sigma, torch.ones(7), 2.0, config)
     baked = bake(some, 2.0, camera())
     assert len(baked) == 7 and baked.opacity_logits.isfinite().all()
@@ -49,7 +49,7 @@ def test_opacities_at_the_threshold_have_finite_logits(cut: str) -> None:
     logits, ones = torch.linspace(-2, 6, 5000), torch.ones(5000)
     for s in (1.0, 1.7, 3.3):
         sigma = sigma_for_extinction(logits, ones, s * ones, config)
-        some = attach(at_one_place(gaussians(5000, 0, 0)).replace(opacity_logits=logits), sigma, config)
+        some = with_dial(at_one_place(gaussians(5000, 0, 0)).replace(opacity_logits=logits), sigma, config)
         baked = bake(some, s, camera())
         assert 0 < len(baked) < 5000 and baked.opacity_logits.isfinite().all()
 
@@ -57,7 +57,7 @@ def test_opacities_at_the_threshold_have_finite_logits(cut: str) -> None:
 def test_a_dial_without_effect_changes_nothing() -> None:
     some = gaussians(50, 0, 1)
     some.opacity_logits[:2] = torch.tensor([22.0, math.inf])  # more than opaque is left, no number is not
-    baked = bake(attach(some), 1.0, cameras=[camera(), camera()])
+    baked = bake(with_dial(some), 1.0, cameras=[camera(), camera()])
     want = some.opacity_logits[some.opacities > 1 / 255]
     assert (float(baked.opacity_logits[1]), float(want[1])) == (20.0, math.inf)
     assert torch.equal(baked.opacity_logits[2:], want[2:]) and baked.opacity_logits[0] == 22
@@ -66,7 +66,7 @@ def test_a_dial_without_effect_changes_nothing() -> None:
 def spread(n: int = 300, normalizer: str = "scene", cut: str = "soft") -> Gaussians:
     """Gaussians at many distances from ``camera()``, some of which are culled, and most of which grow."""
     sigma, growth = torch.rand(2, n, generator=torch.Generator().manual_seed(2))
-    some = attach(gaussians(n, 1, 7), 2 * sigma + 0.1, replace(CONFIG, cut=cut, normalizer=normalizer))
+    some = with_dial(gaussians(n, 1, 7), 2 * sigma + 0.1, replace(CONFIG, cut=cut, normalizer=normalizer))
     return some.replace(growth_d=1.5 * growth - 0.25)
 
 
@@ -99,9 +99,9 @@ def test_prefixes_match_baked_rows(cameras: list[Camera]) -> None:
 
 def test_rows_with_equal_extinction_stay_in_order() -> None:
     some = at_one_place(gaussians(40, 0, 3))
-    same = attach(some.replace(opacity_logits=torch.zeros(40)), torch.ones(40), CONFIG)
+    same = with_dial(some.replace(opacity_logits=torch.zeros(40)), torch.ones(40), CONFIG)
     assert torch.equal(order_by_extinction(same, [camera()]), torch.arange(40))
-    some = attach(some, torch.linspace(0.1, 2, 40), CONFIG)
+    some = with_dial(some, torch.linspace(0.1, 2, 40), CONFIG)
     order = order_by_extinction(some, [camera()])
     scales = extinction_scale(some.opacity_logits, some.sigma_d, torch.ones(40), CONFIG)[order]
     assert (scales.diff() <= 0).all() and scales[0] > scales[-1]

@@ -13,7 +13,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from clod_adapter.adapter import attach, extract
+from clod_adapter.adapter import extract, with_dial
 from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import Row
@@ -43,7 +43,7 @@ def tables(draw: st.DrawFn, total: int = 4) -> Calibration:
 def test_round_trips(tmp_path: Path, calibration: Calibration) -> None:
     assert Calibration.from_dict(json.loads(json.dumps(calibration.as_dict(), allow_nan=False))) == calibration
     base = gaussians(4, 0, 0)
-    dialled = attach(base, torch.ones(4))
+    dialled = with_dial(base, torch.ones(4))
     save(tmp_path / "a.ply", dialled, calibration=calibration)
     assert load(tmp_path / "a.ply").calibration == calibration and load(tmp_path / "a.ply").notes == ()
     adapter = replace(extract(base, dialled, fingerprint="", config={}), calibration=calibration)
@@ -87,7 +87,7 @@ def test_bad_tables_are_refused(bad: dict[str, Any], said: str) -> None:
 
 def dialled(path: Path, **more: Any) -> Path:
     calibration = Calibration(**{**GOOD, "total": 4, **more})
-    save(path, attach(gaussians(4, 0, 0), torch.ones(4)), calibration=calibration)
+    save(path, with_dial(gaussians(4, 0, 0), torch.ones(4)), calibration=calibration)
     return path
 
 

@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from clod_adapter.cameras import NEAR, Camera, Scene, View, camera_extent, in_its_unit
+from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
-from scenes import camera, in_front, ring
+from clod_adapter.render import render
+from scenes import camera, gaussians, in_front, photograph, ring
 
 
 @pytest.mark.parametrize("view", [camera(), *ring(3, 20, 16)], ids=range(4))
@@ -70,3 +72,33 @@ def test_near_plane_of_small_scenes(radius: float, near: float) -> None:
     found = {view.camera.near for view in (*scene.train, *scene.test)}
     assert len(found) == 1 and found.pop() == pytest.approx(near, rel=0.25)
     assert in_its_unit(Scene(views[:1], ())).train[0].camera.near == NEAR  # one camera says nothing
+
+
+def test_halved_views_are_means_of_four_pixels() -> None:
+    """With the camera of the half size, and a filter with which renders are close to such means."""
+    some, whole = gaussians(300, 1, 0, size=0.2), ring(1, 121, 90)[0]
+    view = photograph(some, [whole])[0]
+    half, image = view.halved(), view.image[:90, :120].double()
+    assert (half.camera.width, half.camera.height) == (60, 45)
+    assert float((half.image - image.unflatten(0, (45, 2)).unflatten(2, (60, 2)).mean((1, 3))).abs().max()) <= 0.5
+    errors = []
+    for screen_filter in (CLASSIC, CLASSIC.halved()):
+        shown = render(some.replace(screen_filter=screen_filter), half.camera).image.clamp(0, 1)
+        errors.append(float((shown - half.image / 255).square().mean()))
+    assert errors[1] < errors[0] / 4
+
+
+def test_arrays_become_tensors() -> None:
+    view = photograph(gaussians(5, 0, 0), ring(1, 20, 16))[0]
+    arrays = view.camera.viewmat.double().numpy(), view.camera.K.double().numpy()
+    again = View(Camera(*arrays, 20, 16), view.image.numpy()[:, ::-1])
+    assert torch.equal(again.camera.viewmat, view.camera.viewmat) and again.camera.K.dtype == torch.float32
+    assert torch.equal(again.image, view.image.flip(1))
+
+
+def test_repr_is_short() -> None:
+    views = photograph(gaussians(5, 0, 0), [dataclasses.replace(each, name="a.png") for each in ring(3, 20, 16)])
+    assert repr(views[0].camera) == "Camera('a.png', 20x16)" and repr(views[0]) == "View('a.png', 20x16)"
+    assert repr(Scene(views[:2], views[2:])) == "Scene(2 training views, 1 held out, 20x16)"
+    other = photograph(gaussians(5, 0, 0), ring(1, 8, 6))
+    assert repr(Scene(views, other)) == "Scene(3 training views, 1 held out, 2 sizes)"

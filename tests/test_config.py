@@ -19,7 +19,7 @@ ADAPT = BOTH | {
     "full_share": [-0.1, 1.1, math.nan], "exponent": [0.0, -1.5, math.inf, math.nan], "reg_weight": [-1.0, math.nan],
     "weight_slope": [-0.1, 1.1, math.nan], "average": [-0.1, 1.1, math.nan],
     "temperature": [0.0, math.nan], "ssim_weight": [-0.1, 1.1],
-    "lr_final": [0.0, 1.1, math.nan], "full_weight": [-1.0, math.nan],
+    "lr_final": [0.0, 1.1, math.nan], "coarse": [-0.1, 1.1, math.nan],
     "start": ["random"], "parameter": ["sqrt"], "sampling": ["normal"],
     "count_term": ["none", "relative"],
     **{

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import runpy
 import shutil
@@ -14,6 +15,7 @@ import pytest
 from PIL import Image
 
 import clod_adapter
+import gsplat_in_torch
 from clod_adapter.io.checkpoint import blank
 
 FOLDER = Path(__file__).resolve().parents[1] / "examples"
@@ -92,6 +94,38 @@ def test_adapter_is_applied_and_removed(run: Any, dialled: Path, capture: Any, t
     assert not (tmp_path / "other_again.ply").exists()
 
 
+def test_a_loop_of_gsplat_trains_a_dial(
+    capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With torch in place of its kernels; in at most 20 lines more than the loop has without a dial."""
+    pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
+    gsplat_in_torch.install(monkeypatch)
+    source = EXAMPLES[7].read_text(encoding="utf-8")
+    assert 0 < len(re.findall(r"# dial\b", source)) <= 20
+    runpy.run_path(str(EXAMPLES[7]))["main"](str(capture.ply), str(capture.scene), str(tmp_path / "d.ply"), "cpu", 40)
+    rows = re.findall(r"dial \S+: (.+) dB before, (.+) dB after, (\d+)% .*target (\d+)%", capsys.readouterr().out)
+    for before, after, kept, target in (map(float, row) for row in rows):
+        assert after > before + 2 and abs(kept - target) < 10
+    model = clod_adapter.load(tmp_path / "d.ply").gaussians
+    assert len(rows) == 2 and model.growth_d.abs().max() > 0.05 and len(model) == 300
+
+
+def test_the_notebook() -> None:
+    """Its cells run, with fewer steps, and what it stores is from one run of all of them, without errors."""
+    cells = json.loads((FOLDER / "notebook.ipynb").read_text(encoding="utf-8"))["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    outputs = [output for cell in code for output in cell["outputs"]]
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
+    assert all(output["output_type"] != "error" and output.get("name") != "stderr" for output in outputs)
+    assert [
+        len(output["data"]["image/jpeg"]) < 100_000 for output in outputs if "image/jpeg" in output.get("data", {})
+    ] == [True] * 2
+    source = "\n".join("".join(cell["source"]) for cell in code)
+    fewer = source.replace("= 40, 12_000", "= 8, 2500").replace("= 1000, 600, 200", "= 20, 5, 5")
+    assert fewer != source
+    exec(compile(fewer, "notebook.ipynb", "exec"), {})
+
+
 def test_bad_arguments_are_refused(run: Any) -> None:
     for number in (1, 2, 5, 6):
         with pytest.raises(SystemExit, match=f"python examples/{EXAMPLES[number].name}"):
@@ -102,5 +136,5 @@ def test_bad_arguments_are_refused(run: Any) -> None:
 
 def test_the_readme_lists_every_example() -> None:
     listed = re.findall(r"\]\((.+?)\)", (FOLDER / "README.md").read_text(encoding="utf-8"))
-    assert listed == [path.name for path in EXAMPLES.values()]
+    assert listed == [*(path.name for path in EXAMPLES.values()), "notebook.ipynb"]
     assert list(EXAMPLES) == list(range(1, len(EXAMPLES) + 1))

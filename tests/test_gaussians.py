@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -82,3 +83,41 @@ def test_empty_sh_degrees_are_removed(degree: int, used: int) -> None:
     assert found.sh_degree == used and torch.equal(found.shN, some.shN[:, :bands])
     assert found is some if used == degree else torch.equal(found.means, some.means)
     assert some_gaussians(0, degree, 0).without_empty_bands().sh_degree == 0
+
+
+def test_rows_by_brackets() -> None:
+    some = adapted()
+    for rows, wanted in (
+        (slice(3), [0, 1, 2]), (slice(None, None, 2), [0, 2, 4]), ([3, 0], [3, 0]), (np.array([4, -1]), [4, 4]),
+        (np.array([0, 1, 1, 0, 0], bool), [1, 2]), (some.sigma_d > 2.5, [3, 4]),
+    ):  # fmt: skip
+        found = some[rows]
+        assert found.attenuation is CONFIG
+        for name, value in found.tensors().items():
+            assert torch.equal(value, getattr(some, name)[wanted]), name
+
+
+@pytest.mark.parametrize("rows", [2, torch.ones(4, dtype=torch.bool), [5], torch.zeros(2, 2, dtype=torch.long)])
+def test_other_rows_are_refused(rows: object) -> None:
+    with pytest.raises(ClodError, match="give a slice, indices .M. or a mask .5.|there are 5 Gaussians, and index 5"):
+        adapted()[rows]
+    with pytest.raises(ClodError, match="give a slice"):
+        list(adapted())
+
+
+def test_arrays_become_tensors() -> None:
+    some = adapted()
+    arrays = {name: value.double().numpy() for name, value in some.tensors().items()}
+    again = Gaussians(**arrays, attenuation=CONFIG)
+    for name, value in some.tensors().items():
+        assert torch.equal(getattr(again, name), value) and getattr(again, name).dtype == torch.float32
+
+
+def test_repr_is_short_and_devices_have_names() -> None:
+    some = adapted()
+    assert repr(gaussians()) == "Gaussians(5, SH degree 2, no dial, cpu)"
+    assert repr(some.replace(growth_d=torch.ones(5))) == "Gaussians(5, SH degree 2, dial to 5 with growth, cpu)"
+    assert repr(some.to("meta")) == "Gaussians(5, SH degree 2, dial to 5, meta)"
+    assert some.cpu().means.device.type == "cpu"
+    if torch.cuda.is_available():
+        assert some.cuda().means.device.type == "cuda"

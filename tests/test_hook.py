@@ -188,3 +188,11 @@ def test_hold_refuses_times_that_are_none(milliseconds: float) -> None:
     if milliseconds:
         with pytest.raises(ClodError, match="the time of a frame is .*, it must be at least 0 ms and finite"):
             hook_of(adapted()).hold(10).took(milliseconds)
+
+
+def test_a_hook_of_arrays() -> None:
+    model = adapted()
+    assert model.sigma_d is not None and model.growth_d is not None
+    arrays = replace(hook_of(model), sigma_d=model.sigma_d.numpy(), growth_d=model.growth_d.numpy())
+    given = model.means, model.opacities, camera().viewmat
+    assert all(map(torch.equal, arrays(*given, growth=True), hook_of(model)(*given, growth=True)))

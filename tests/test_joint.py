@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 import inria_forks
-from clod_adapter.adapter import ATTRIBUTES, attach, detach
+from clod_adapter.adapter import ATTRIBUTES, detach, with_dial
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.blocks.divide import divide
 from clod_adapter.blocks.targets import block_target, context_rows
@@ -45,7 +45,7 @@ def model_of(tau: float) -> Gaussians:
     sigma_d = 0.3 + 2 * torch.rand(N, generator=torch.Generator().manual_seed(1))
     settings = AttenuationConfig(tau=tau, scene_distance=4.0, reference_distance=4.0, max_sv=4.0)
     growth_d = torch.linspace(-0.5, 1, N)
-    return attach(gaussians(N, 1, 0, size=0.15), sigma_d, settings, growth_d)
+    return with_dial(gaussians(N, 1, 0, size=0.15), sigma_d, settings, growth_d)
 
 
 def views_of(model: Gaussians) -> tuple[View, ...]:
@@ -69,7 +69,7 @@ def objective(config: AdaptConfig, trained: int = N, **part: Any) -> Callable[[G
         names = ("growth_d",) if config.growth == "on" else ()
         parameters = {name: getattr(model, name) for name in (*ATTRIBUTES, *names)}
         parameters[asked.decay] = asked.parameter(model.sigma_d)
-        found = asked.gradient_sum(parameters, [Sample(views_of(model)[0], [1.0, DIAL])])
+        found = asked.gradient_sum(parameters, [Sample(views_of(model)[0], DIAL)])
         return [found.loss, found.kept, *found.gradients.values()]
 
     return gradients

@@ -66,7 +66,7 @@ def test_round_trip_of_distant_scenes_is_exact(tmp_path: Path, kind: str) -> Non
     assert "far from 0" in far.notes[-1]
     tuned = far.gaussians.means.clone()
     tuned[:50] += 1e-4
-    clod.save(tmp_path / "out.ply", clod.attach(far.gaussians.replace(means=tuned)), far)
+    clod.save(tmp_path / "out.ply", clod.with_dial(far.gaussians.replace(means=tuned)), far)
     out = PlyData.read(str(tmp_path / "out.ply"))["vertex"].data
     written = np.stack([out[axis] for axis in "xyz"], 1)
     assert written.dtype == np.float64 and (written[50:] == stored[50:]).all()
@@ -78,7 +78,7 @@ def test_round_trip_of_distant_scenes_is_exact(tmp_path: Path, kind: str) -> Non
 def test_an_adapter_stores_the_origin(tmp_path: Path) -> None:
     clod.save(tmp_path / "near.ply", gaussians(200, 1, 0))
     far = clod.load(moved(tmp_path / "near.ply", tmp_path / "far.ply", "f4"))
-    adapted = clod.attach(far.gaussians.replace(means=far.gaussians.means * 1e5))  # kept as values, not differences
+    adapted = clod.with_dial(far.gaussians.replace(means=far.gaussians.means * 1e5))  # kept as values, not differences
     about = {"fingerprint": far.fingerprint, "config": {}, "origin": far.origin}
     clod.save_adapter(tmp_path / "far.safetensors", clod.extract(far.gaussians, adapted, **about))
     adapter = clod.load_adapter(tmp_path / "far.safetensors")

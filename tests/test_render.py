@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import warnings
 
+import numpy as np
 import pytest
 import torch
 
-from clod_adapter.adapter import attach, detach
+from clod_adapter.adapter import detach, with_dial
 from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.distances import normalized_distances
@@ -25,9 +27,10 @@ CONFIG = AttenuationConfig(**FAINTEST, scene_distance=3.0)
 def adapted(n: int = 300, seed: int = 0, **config: object) -> Gaussians:
     g = torch.Generator().manual_seed(seed + 100)
     sigma = (0.8 * torch.randn(n, generator=g)).exp()
-    return attach(gaussians(n, 1, seed), sigma, AttenuationConfig(**(FAINTEST | {"scene_distance": 3.0} | config)))
+    return with_dial(gaussians(n, 1, seed), sigma, AttenuationConfig(**(FAINTEST | {"scene_distance": 3.0} | config)))
 
 
+@pytest.mark.filterwarnings("ignore:virtual_scale")
 @pytest.mark.parametrize("seed", range(3))
 def test_a_disabled_adapter_is_the_base(seed: int) -> None:
     """Bit for bit: without a dial at any s, and with a dial without decay at s = 1."""
@@ -42,7 +45,7 @@ def test_a_disabled_adapter_is_the_base(seed: int) -> None:
     torch.testing.assert_close(untouched.log_opacities.exp(), base.opacities)
     others = [AttenuationConfig(**FAINTEST, normalizer=normalizer) for normalizer in ("max", "quantile")]
     for config in (None, CONFIG, *others):
-        identity = render(attach(base, attenuation=config), view)
+        identity = render(with_dial(base, attenuation=config), view)
         assert torch.equal(identity.image, want.image) and torch.equal(identity.alpha, want.alpha), f"seed {seed}"
         assert torch.equal(identity.kept, base.opacities > 1 / 255)
 
@@ -132,8 +135,26 @@ def test_bad_arguments_are_refused() -> None:
         splat(base, base.opacities[:3], camera())
 
 
+@pytest.mark.filterwarnings("ignore:virtual_scale")
 def test_rendering_no_gaussians() -> None:
     none = gaussians(0, 1, 0)
-    for some in (none, attach(none), attach(none, attenuation=AttenuationConfig(normalizer="max"))):
+    for some in (none, with_dial(none), with_dial(none, attenuation=AttenuationConfig(normalizer="max"))):
         rendering = render(some, camera(), 2.0)
         assert rendering.kept.shape == (0,) and (rendering.image == 0).all() and (rendering.alpha == 0).all()
+
+
+def test_a_dial_value_without_a_dial_is_warned_of() -> None:
+    with pytest.warns(UserWarning, match="virtual_scale is 3, but the Gaussians have no sigma_d"):
+        render(gaussians(5, 0, 0), camera(), 3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        render(gaussians(5, 0, 0), camera())
+        render(adapted(), camera(), 3)
+
+
+def test_a_background_of_numpy() -> None:
+    some, grey = adapted(), [0.2, 0.4, 0.6]
+    assert torch.equal(
+        render(some, camera(), 2, background=np.array(grey)).image,
+        render(some, camera(), 2, background=torch.tensor(grey)).image,
+    )

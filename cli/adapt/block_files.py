@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from clod_adapter.adapter import DIAL, attach, dial_tensors
+from clod_adapter.adapter import DIAL, dial_tensors, with_dial
 from clod_adapter.blocks.divide import Division
 from clod_adapter.blocks.file import checked, load_block, refused_if_damaged, save_block
 from clod_adapter.blocks.train import Learned
@@ -90,7 +90,7 @@ class BlockFiles:
             decisions = tuple(Decision(**each) for each in about["decisions"])
             few = base.without_bands(degree)
         dial = {name: tensors[name].to(device) for name in names}
-        begun = attach(few, attenuation=settings, **dial)
+        begun = with_dial(few, attenuation=settings, **dial)
         plan = Plan(decisions, begun, None if kept is None else kept.to(device), degree, config, {"start": 0.0})
         division = Division(plan.lean, tensors["block"].to(device), tensors["seen"], extent, len(base))
         return plan, division, replace(self, run_of=self.run_of | {"start": _digest(tensors)}, count=count)

@@ -42,7 +42,8 @@ def prepare_kernels(
         evaluate(one, [view], [1.0])
         if training:
             for target in TARGETS:
-                adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0, target=target))
+                settings = AdaptConfig(iters=1, full_share=1.0, target=target)
+                adapted = adapt(one, Scene((view,), ()), settings, progress=False)
                 if adapted.interrupted:
                     raise Stopped("stopped while the kernels were compiled")
 

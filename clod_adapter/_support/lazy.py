@@ -31,4 +31,4 @@ class _Lazy(ModuleType):
             super().__setattr__(name, value)
 
     def __dir__(self) -> list[str]:
-        return sorted({*self.__dict__, *self._homes})
+        return sorted({*self._homes, *(name for name in self.__dict__ if name.startswith("__"))})

@@ -23,7 +23,6 @@ from clod_adapter.losses import unit
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import dial, splat
 from clod_adapter.training.target_count import TargetShare, target_curve
-from clod_adapter.training.view_sampler import FAR_FIRST
 
 LEFT_OUT = 1e-3  # of an image, the share that the Gaussians left out of a block's context may cover
 CONTEXT_VIEWS = 32  # most views that the context is chosen in
@@ -147,11 +146,7 @@ def block_config(division: Division, block: int, config: AdaptConfig, *, first: 
         config.lighter(middle), lr_sigma=middle * config.lr_sigma, lr_growth=middle * config.lr_growth,
         lr_final=config.lr_final / middle, average=min(config.average * steps / max(light, 1), 1.0),
     )  # fmt: skip
-    return replace(replace(config, lr_final=middle) if first else last, iters=own, time_budget=budget, seed=seed)
-
-
-def far_first_of(division: Division, *, first: bool) -> float:
-    """``ViewSampler.far_first`` of a pass: both passes together are a run, as for the learning rates."""
-    if division.passes == 1:
-        return FAR_FIRST
-    return FAR_FIRST / (1 - SECOND) if first else 0.0
+    settings = replace(config, lr_final=middle) if first else replace(last, coarse=0.0)
+    if first and light:
+        settings = replace(settings, coarse=min(config.coarse / (1 - SECOND), 1.0))
+    return replace(settings, iters=own, time_budget=budget, seed=seed)

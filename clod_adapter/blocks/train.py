@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.blocks.divide import Division
-from clod_adapter.blocks.targets import block_config, block_target, context_rows, far_first_of, target_image
+from clod_adapter.blocks.targets import block_config, block_target, context_rows, target_image
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
@@ -98,10 +98,7 @@ def adapt_block(
         own = _with_target_images(gaussians, len(rows), own, cache, progress)
     cameras = [view.camera for view in spread(views, MOST_VIEWS)]
     target = block_target(division, block, cameras, config, first=after is None)
-    far_first = far_first_of(division, first=after is None)
-    part = TrainableSubset(
-        len(rows), division.extent, after is None, target=target, cameras=cameras, far_first=far_first
-    )
+    part = TrainableSubset(len(rows), division.extent, after is None, target=target, cameras=cameras)
     settings = block_config(division, block, config, first=after is None)
     adapted = adapt(gaussians, Scene(tuple(own), ()), settings, progress, resume, subset=part)
     return _learned(division, rows, adapted)

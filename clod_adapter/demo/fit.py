@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from clod_adapter.adapter import attach, detach
+from clod_adapter.adapter import detach, with_dial
 from clod_adapter.cameras import Scene
 from clod_adapter.config import SH_COUNTS, AdaptConfig
 from clod_adapter.equation.attenuation import SIGMA_MAX
@@ -33,7 +33,7 @@ def fit_base(
     )  # fmt: skip
     initial = from_points(points, colors)
     frozen = torch.full((len(initial),), SIGMA_MAX / 10)  # no fading; SIGMA_MAX would be initialized
-    adapted = adapt(attach(initial, frozen), scene, config, progress)
+    adapted = adapt(with_dial(initial, frozen), scene, config, progress)
     if adapted.interrupted:
         raise Stopped(f"stopped at step {adapted.steps}")
     return detach(adapted.gaussians)

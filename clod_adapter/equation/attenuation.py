@@ -109,7 +109,7 @@ def attenuate(
     if growth_d is not None:
         more["growth_d"] = conform(sigma_d=sigma_d, growth_d=growth_d)[1]
         more["reach"] = growth_distance(config)
-    if isinstance(seen_from, Tensor):
+    if not isinstance(seen_from, tuple):
         d = seen_from
     elif activated or not _from_centres.compiles(seen_from[0]):
         d = normalized_distances(*seen_from, config)
@@ -118,7 +118,8 @@ def attenuate(
         rows = conform(**named, x=means[:, 0])[:2]
         return Attenuated(*_from_centres(means, position, unit, *rows, *numbers, **more))
     form = _from_opacities if activated else _from_logits
-    return Attenuated(*form(*conform(**named, d=d.detach()), *numbers, **more))
+    rows = conform(**named, d=d)
+    return Attenuated(*form(*rows[:2], rows[2].detach(), *numbers, **more))
 
 
 def log_attenuation(sigma_d: Tensor, d: Tensor, virtual_scale: float, eps: float) -> Tensor:
@@ -214,7 +215,10 @@ def check_dial(virtual_scale: float) -> None:
 
 
 def conform(**tensors: Tensor) -> list[Tensor]:
-    """The tensors in their common dtype, at least float32; raises ClodError unless they share one [N]."""
+    """The tensors in their common dtype, at least float32; raises ClodError unless they are tensors of one [N]."""
+    for name, tensor in tensors.items():
+        if not isinstance(tensor, Tensor):
+            raise ClodError(f"{name} is no tensor but {type(tensor).__name__}; pass torch.as_tensor of it")
     shapes = {name: tuple(t.shape) for name, t in tensors.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 1 for shape in shapes.values()):
         raise ClodError("expected one shape [N], got " + ", ".join(f"{name} {shape}" for name, shape in shapes.items()))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 
+import numpy as np
 import torch
 
 from clod_adapter.cameras import View
@@ -53,8 +55,8 @@ class Row:
 @torch.no_grad()
 def evaluate(
     gaussians: Gaussians,
-    views: Sequence[View],
-    virtual_scales: Sequence[float],
+    views: Sequence[View] | View,
+    virtual_scales: Sequence[float] | float,
     *,
     metrics: Mapping[str, Metric] | None = None,
     progress: Listener | None = None,
@@ -63,6 +65,7 @@ def evaluate(
 
     Args:
         gaussians: adapted or not; without ``sigma_d`` every dial value shows the base.
+        views: one or several; virtual_scales: one dial value or several.
         metrics: more to measure, from ``perceptual.available_metrics``: any of ``lpips`` and ``flip``.
         progress: called in ``Phase.EVALUATION`` after each view of each dial value. If it returns False, the rows of
             the dial values that are complete are returned.
@@ -70,25 +73,24 @@ def evaluate(
     Raises:
         ClodError: no views, no dial values, or one below 1 or not finite.
     """
-    if not views:
+    views = [views] if isinstance(views, View) else views
+    virtual_scales = [float(s) for s in np.atleast_1d(virtual_scales)]
+    if len(views) == 0:
         raise ClodError("there are no held-out views to evaluate on")
     if not virtual_scales:
         raise ClodError("there are no dial values to evaluate at")
     for virtual_scale in virtual_scales:
         require(1 <= virtual_scale < math.inf, "virtual_scale", virtual_scale, "at least 1 and finite")
-    gaussians, device = gaussians.without_empty_bands(), gaussians.means.device
-    render(gaussians, views[0].camera, max(virtual_scales))  # compiled and warm before the clock starts
+    gaussians = gaussians.without_empty_bands()
+    dials = virtual_scales if gaussians.sigma_d is not None else [1.0] * len(virtual_scales)
+    render(gaussians, views[0].camera, max(dials))  # compiled and warm before the clock starts
     rows = list[Row]()
     for i, virtual_scale in enumerate(virtual_scales):
         results, times = [], []
         more: dict[str, list[float]] = {name: [] for name in metrics or {}}
-        for j, view in enumerate(views):
-            wait_for(device)
-            began = time.perf_counter()
-            rendering = render(gaussians, view.camera, virtual_scale)
-            wait_for(device)
-            times.append((time.perf_counter() - began) * 1e3)
-            results.append((*psnr_ssim(rendering.image, view.image), *_counts(gaussians, view, rendering)))
+        for j, (view, rendering, seconds, scores) in enumerate(_compared(gaussians, views, dials[i])):
+            times.append(seconds * 1e3)
+            results.append((*scores, *_counts(gaussians, view, rendering)))
             for name, metric in (metrics or {}).items():
                 more[name].append(metric(rendering.image, view.image))
             done = Progress(Phase.EVALUATION, i * len(views) + j + 1, len(virtual_scales) * len(views))
@@ -103,6 +105,28 @@ def evaluate(
         if stopped:
             break
     return rows
+
+
+def _compared(
+    gaussians: Gaussians, views: Sequence[View], virtual_scale: float
+) -> Iterator[tuple[View, Rendering, float, tuple[float, float]]]:
+    """Each view with its rendering, the seconds that took, and its PSNR and SSIM; these of several views at a time."""
+    workers = torch.get_num_threads()
+    with ThreadPoolExecutor(workers) as pool:
+        for first in range(0, len(views), workers):
+            some = views[first : first + workers]
+            found = [_timed(gaussians, view, virtual_scale) for view in some]
+            scores = pool.map(psnr_ssim, [rendering.image for rendering, _ in found], [view.image for view in some])
+            for view, (rendering, seconds), score in zip(some, found, scores, strict=True):
+                yield view, rendering, seconds, score
+
+
+def _timed(gaussians: Gaussians, view: View, virtual_scale: float) -> tuple[Rendering, float]:
+    wait_for(gaussians.means.device)
+    began = time.perf_counter()
+    rendering = render(gaussians, view.camera, virtual_scale)
+    wait_for(gaussians.means.device)
+    return rendering, time.perf_counter() - began
 
 
 def _counts(gaussians: Gaussians, view: View, rendering: Rendering) -> tuple[int, int]:

@@ -21,7 +21,7 @@ from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.rasterizers import wait_for
 from clod_adapter.render import render
 
-VIEWS, PASSES, FEWEST = 4, 7, 3
+VIEWS, PASSES, FEWEST = 3, 5, 3
 SECONDS = 10.0  # after which no pass begins, once there are FEWEST; a pass that would take a third of it has one view
 WARM_FRAMES, WARM_SECONDS, STEADY = 8, 2.0, 0.1  # the warm-up ends with two frames whose times differ by a tenth
 RISE = 0.05  # an increase of the time in every pass is real if it is at least this large
@@ -54,7 +54,7 @@ class FrameTimes:
 
 @torch.no_grad()
 def time_frames(models: Sequence[Model], cameras: Sequence[Camera], progress: Listener | None = None) -> FrameTimes:
-    """Times frames from at most four of the cameras, evenly spread.
+    """Times frames from at most three of the cameras, evenly spread.
 
     Args:
         models: the first at its first dial value is the slowest, for the warm-up.

@@ -47,7 +47,7 @@ def initialize(
     """The Gaussians with an initial sigma_d and growth_d, from renderings of up to MOST_VIEWS evenly spread views.
 
     The sigma_d is in world units. A dial that ``base`` already has is kept, with its own settings except the config's
-    ``max_sv``; one without effect (``SIGMA_MAX`` throughout, as ``attach`` makes it) counts as none.
+    ``max_sv``; one without effect (``SIGMA_MAX`` throughout, as ``with_dial`` makes it) counts as none.
 
     Args:
         progress: called in ``Phase.IMPORTANCE`` after each view, and then in ``Phase.PRUNING_ORDER``.

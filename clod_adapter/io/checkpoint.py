@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,10 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.content import read_content
+from clod_adapter.io.file_formats import PLY, format_of, write
 from clod_adapter.io.ply.columns import SIGMA, column_map, in_shape, rows_of
 from clod_adapter.io.ply.constants import dial_constants, filter_constants
-from clod_adapter.io.ply.header import write_comments
+from clod_adapter.io.ply.header import PREFIX, write_comments
 from clod_adapter.io.ply.plausible import check_plausible
 from clod_adapter.io.ply.values import Activated
 from clod_adapter.io.ply.write import write_rows
@@ -59,6 +61,9 @@ class Checkpoint:
     calibration: Calibration | None = None
     origin: Origin = NOWHERE
     filter_known: bool = False
+
+    def __repr__(self) -> str:
+        return f"Checkpoint({str(self.path)!r}, {self.gaussians.summary})"
 
     @property
     def viewpoints(self) -> tuple[Viewpoint, ...]:
@@ -126,9 +131,10 @@ def save(
     version: str | None = None,
     calibration: Calibration | None = None,
 ) -> None:
-    """Writes ``gaussians`` as an extended file: the base's columns, then ``sigma_d`` and ``growth_d``.
+    """Writes ``gaussians`` in the format of the path's suffix; a PLY if that is none of ``file_formats.FORMATS``.
 
-    Without a base the columns are those of Inria's layout.
+    A PLY is an extended file: the base's columns, then ``sigma_d`` and ``growth_d``. Without a base the columns are
+    those of Inria's layout. What another format loses is a warning.
 
     Row ``i`` of ``gaussians`` is row ``i`` of ``base``. Columns keep name, order and type; a value is
     overwritten only where it differs from the base's float32 reading, so what was not tuned stays
@@ -142,7 +148,7 @@ def save(
 
     Raises:
         ClodError: there are no Gaussians, they do not match the base, a new value is not finite, the target is the
-            base itself or cannot be written.
+            base itself or cannot be written; or, for another format than PLY, as ``file_formats.write``.
     """
     path = Path(path)
     if len(gaussians) == 0:
@@ -155,6 +161,11 @@ def save(
             f"{path}: {len(gaussians)} Gaussians of SH degree {gaussians.sh_degree} do not fit their base {base.path} "
             f"({len(base.vertex)} of degree {base.gaussians.sh_degree}); save with the checkpoint they came from"
         )
+    if format_of(path) is not PLY:
+        about = tuple(comment for comment in base.comments if not comment.startswith(PREFIX))
+        for note in write(path, gaussians, about, origin=base.origin, calibration=calibration):
+            warnings.warn(f"{path}: {note}", stacklevel=2)
+        return
     gaussians = in_world_units(gaussians)
     comments = write_comments(gaussians.attenuation, base.comments, version, calibration, gaussians.screen_filter)
     constants = dial_constants(gaussians.attenuation, gaussians.growth_d is not None)

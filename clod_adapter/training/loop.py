@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -15,7 +15,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.finite import LossNotFinite, largest_colour, require_finite
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import for_training, initialize, usable_views, with_growth
-from clod_adapter.progress import Listener, Phase, Progress
+from clod_adapter.progress import Listener, Phase, Progress, shown
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost
 from clod_adapter.training.interrupts import DeferredInterrupt
 from clod_adapter.training.objective import TrainableSubset
@@ -29,18 +29,19 @@ def adapt(
     base: Gaussians,
     scene: Scene,
     config: AdaptConfig | None = None,
-    progress: Listener | None = None,
+    progress: Listener | Literal[False] | None = None,
     resume: TrainingState | None = None,
     *,
     subset: TrainableSubset | None = None,
     group: ProcessGroup | None = None,
+    **settings: Any,
 ) -> Adapted:
     """Learns sigma_d for ``base`` on the training views of ``scene``, and tunes the other attributes lightly.
 
     Each step samples ``batch`` views (1 by default) and follows the sum of their gradients. Each view is rendered at
-    full detail and at one log-uniform dial value s in [1, max_sv], to minimise ``full_weight w_1 L_render(1) + w_s
+    one dial value, s = 1 in ``full_share`` of the steps and else log-uniform in [1, max_sv], to minimise ``w_s
     L_render(s)``, where L_render is ``losses.photometric_loss`` and ``w_s = (1 - weight_slope s / max_sv)^2``. In the
-    first half of the steps every second view, at random, is rendered at two such values instead.
+    first steps, a share ``coarse`` of all, photographs have half their size, unless that is below 128 pixels a side.
     ``target_count.count_gradient`` moves sigma_d so that the share of Gaussians kept at their typical distances follows
     the target-count curve; with the target ``cost``, ``target_cost.TargetCost`` does so for the cost of rendering.
     The result is the mean of the parameters over the last ``average`` of the steps, so learning rates can stay large
@@ -63,12 +64,14 @@ def adapt(
     (an opacity logit of +-inf stays). A row whose gradient is not finite is not moved by that step (``Adapted.held``).
 
     Args:
-        progress: called after each step of each phase: ``Phase.IMPORTANCE``, ``PRUNING_ORDER``, ``TRAINING``.
+        progress: called after each step of each phase: ``Phase.IMPORTANCE``, ``PRUNING_ORDER``, ``TRAINING``. By
+            default a progress bar, where stderr is a terminal or a notebook's; False for none.
         resume: ``Progress.state`` of an earlier call with the same base, views and config. With as many threads and
             processes the result has the same bits as an uninterrupted run. A time budget includes the earlier call.
         subset: what is trained, if that is not all of ``base``, or ``base`` is not the whole scene.
         group: the processes that train together, given the same arguments except ``progress``. Each computes its
             share of a step's views. All have the same result: that of one process, except for rounding.
+        settings: fields of ``AdaptConfig`` that replace those of ``config``: ``adapt(base, scene, max_sv=7)``.
 
     Raises:
         ClodError: no training views, none with a Gaussian in front of it, no Gaussians, an attribute that is not
@@ -76,8 +79,17 @@ def adapt(
             views a step than processes, or a process was lost before the first step.
         Stopped: ``progress`` returned False before training.
     """
-    config = config or AdaptConfig()
+    config = replace(config or AdaptConfig(), **settings)
     require_trainable(base, scene, config, group)
+    with shown(False if progress is None and group and group.rank else progress) as listener:
+        return _adapt(base, scene, config, listener, resume, subset, group)
+
+
+def _adapt(
+    base: Gaussians, scene: Scene, config: AdaptConfig, progress: Listener | None, resume: TrainingState | None,
+    subset: TrainableSubset | None, group: ProcessGroup | None,
+) -> Adapted:  # fmt: skip
+    """``adapt`` with the listener that it has."""
     began = time.perf_counter()
     # Empty higher SH degrees that are not tuned stay empty, so they are not rendered.
     lean = base if config.lr_shN > 0 else base.without_empty_bands()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -21,12 +21,12 @@ from clod_adapter.losses import photometric_loss
 from clod_adapter.render import splat
 from clod_adapter.training.target_cost import TargetCost
 from clod_adapter.training.target_count import TargetShare, count_gradient_at, paper_count, target_share
-from clod_adapter.training.view_sampler import FAR_FIRST, Sample
+from clod_adapter.training.view_sampler import Sample
 
 # Sigma stays where the equation still resolves it; below, a Gaussian would be culled for good.
 SIGMA_RANGE = (1e-4, SIGMA_MAX)
 
-Rendered = tuple[float, Tensor, Tensor, Tensor | None]
+Rendered = tuple[Tensor, Tensor, Tensor | None]
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,6 @@ class TrainableSubset:
             (``target_count.target_share``).
         target: returns the count term's target at a dial value, in place of the target-count curve's.
         cameras: the whole scene's, which typical distances are from. By default those of the views.
-        far_first: as in ``view_sampler.ViewSampler``.
     """
 
     trained: int
@@ -50,7 +49,6 @@ class TrainableSubset:
     total: int | None = None
     target: Callable[[float], TargetShare] | None = None
     cameras: Sequence[Camera] | None = None
-    far_first: float = FAR_FIRST
 
 
 @dataclass
@@ -60,7 +58,7 @@ class GradientSum:
     Attributes:
         gradients: by name of the trained parameter, of its first ``trained`` rows.
         kept: ``[trained]`` bool, the rows that at least one rendering kept.
-        loss: 0-d float64, photometric loss at the smallest dial value of each view, summed.
+        loss: 0-d float64, photometric loss of each view, summed.
     """
 
     gradients: dict[str, Tensor]
@@ -129,38 +127,36 @@ class Objective:
         return reduce(GradientSum.__add__, (self._of_view(parameters, sample) for sample in samples))
 
     def _of_view(self, parameters: dict[str, Tensor], sample: Sample) -> GradientSum:
-        """Renders one view at its dial values, and differentiates the weighted sum of its losses."""
-        (view, dials, counted), config, first = sample, self.config, slice(self.trained)
+        """Renders one view at its dial value, and differentiates the weighted loss."""
+        (view, s, counted, halved), config, first = sample, self.config, slice(self.trained)
         leaves = {name: parameters[name].detach().requires_grad_(name in self.stepped) for name in parameters}
         decay = leaves[self.decay]
-        photograph = view.image.to(decay.device, non_blocking=True)
-        total, kept = decay.new_zeros(()), torch.zeros_like(decay[first], dtype=torch.bool)
-        losses, counts = [], []
+        screen_filter = self.screen_filter.halved() if halved else self.screen_filter
         rendered = self._rendered_by_kernels if self._compiled(decay) else self._rendered
-        for s, image, keep, term in rendered(leaves, view.camera, dials):
-            loss = photometric_loss(image, photograph, config.ssim_weight)
-            losses.append(loss.detach().double())
-            weight = self._weight(s, alone=len(dials) == 1)
-            total = total + weight * (loss if term is None else loss + term)
-            counts.append((s, weight * losses[-1]))
-            kept = kept | keep
-        if counted is not None:
-            # Halfway to 1/tau at most. Its weight is 1: with half of w_s, counts at the far end were 1.25 times the
-            # target, at a gain of 0.05 to 0.1 dB at equal counts.
-            counts.append((min(counted, (config.max_sv + 1 / self.attenuation.tau) / 2), losses[-1]))
+        image, kept, term = rendered(leaves, view.camera, s, screen_filter)
+        loss = photometric_loss(image, view.image.to(decay.device, non_blocking=True), config.ssim_weight)
+        plain, weight = loss.detach().double(), loss_weight(s, config)
+        total = weight * (loss if term is None else loss + term)
         found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
         gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}
+        counts = [(s, weight * plain)]
+        if counted is not None:
+            # Its weight is 1: with half of w_s, counts at the far end were 1.25 times the target, at a gain of 0.05 to
+            # 0.1 dB at equal counts.
+            counts.append((within_reach(counted, self.attenuation), plain))
         if config.has_target_count:
-            for s, weighted in counts:
-                for name, gradient in self._target_gradients(parameters, s, weighted).items():
+            for at, weighted in counts:
+                for name, gradient in self._target_gradients(parameters, at, weighted).items():
                     gradients[name] = gradients[name] + gradient
-        return GradientSum(gradients, kept, losses[0])
+        return GradientSum(gradients, kept, plain)
 
     def _compiled(self, like: Tensor) -> bool:
         """Whether the rasterizer of the CPU applies the dial itself: the paper's term needs the opacities."""
         return like.device.type == "cpu" and like.dtype == torch.float32 and self.config.count_term != "paper"
 
-    def _rendered_by_kernels(self, leaves: dict[str, Tensor], camera: Camera, dials: list[float]) -> Iterator[Rendered]:
+    def _rendered_by_kernels(
+        self, leaves: dict[str, Tensor], camera: Camera, s: float, screen_filter: ScreenFilter
+    ) -> Rendered:
         """``_rendered`` with the dial in the kernels."""
         from clod_adapter.rasterizers import cpu
 
@@ -170,33 +166,30 @@ class Objective:
             growth_d = None if growth_d is None else _ending_in(0.0, growth_d, self.trained)
         attributes: Any = {name: leaves[name] for name in ATTRIBUTES}
         shown = Gaussians(
-            **attributes, sigma_d=sigma, attenuation=self.attenuation, growth_d=growth_d,
-            screen_filter=self.screen_filter,
-        )  # fmt: skip
-        keep = cpu.kept(shown, camera, dials[0])[: self.trained]  # of the smallest dial value: kept sets are nested
-        for s in dials:
-            yield s, cpu.draw(shown, camera, s, torch.zeros(3), trained=self.trained)[0], keep, None
+            **attributes, sigma_d=sigma, attenuation=self.attenuation, growth_d=growth_d, screen_filter=screen_filter
+        )
+        kept = cpu.kept(shown, camera, s)[: self.trained]
+        return cpu.draw(shown, camera, s, torch.zeros(3), trained=self.trained)[0], kept, None
 
-    def _rendered(self, leaves: dict[str, Tensor], camera: Camera, dials: list[float]) -> Iterator[Rendered]:
-        """Each dial value with the image, the trained rows that are kept, and the paper's count term."""
+    def _rendered(self, leaves: dict[str, Tensor], camera: Camera, s: float, screen_filter: ScreenFilter) -> Rendered:
+        """The image, the trained rows that are kept, and the paper's count term."""
         rows = slice(self.trained) if self.part.full_context else slice(None)
         attributes: Any = {name: leaves[name] for name in ATTRIBUTES}
-        shown = Gaussians(**attributes, screen_filter=self.screen_filter)
-        distances = normalized_distances(leaves["means"].detach(), camera, self.attenuation)  # for all dial values
+        shown = Gaussians(**attributes, screen_filter=screen_filter)
+        distances = normalized_distances(leaves["means"].detach(), camera, self.attenuation)
         logits, sigma = leaves["opacity_logits"][rows], self.sigma(leaves[self.decay][rows])
         growth_d = leaves["growth_d"][rows] if "growth_d" in leaves else None
-        for s in dials:
-            dialled = attenuate(logits, sigma, distances[rows], s, self.attenuation, growth_d=growth_d)
-            drawn, growth = dialled.drawn, dialled.growth
-            if self.part.full_context:
-                context = leaves["opacity_logits"].detach()[self.trained :]
-                drawn = torch.cat([drawn, attenuate(context, None, distances[self.trained :], s, None).drawn])
-                growth = None if growth is None else torch.cat([growth, torch.ones_like(context)])
-            # Culled rows have opacity 0: the rasterizer skips them, and they get no gradient.
-            term = None
-            if self.config.count_term == "paper" and self.config.reg_weight > 0:
-                term = paper_count(dialled, s, self.attenuation.tau, self.config, self.part.total)
-            yield s, splat(shown, drawn, camera, growth=growth)[0], dialled.keep[: self.trained], term
+        dialled = attenuate(logits, sigma, distances[rows], s, self.attenuation, growth_d=growth_d)
+        drawn, growth = dialled.drawn, dialled.growth
+        if self.part.full_context:
+            context = leaves["opacity_logits"].detach()[self.trained :]
+            drawn = torch.cat([drawn, attenuate(context, None, distances[self.trained :], s, None).drawn])
+            growth = None if growth is None else torch.cat([growth, torch.ones_like(context)])
+        # Culled rows have opacity 0: the rasterizer skips them, and they get no gradient.
+        term = None
+        if self.config.count_term == "paper" and self.config.reg_weight > 0:
+            term = paper_count(dialled, s, self.attenuation.tau, self.config, self.part.total)
+        return splat(shown, drawn, camera, growth=growth)[0], dialled.keep[: self.trained], term
 
     def _target_gradients(self, parameters: dict[str, Tensor], s: float, loss: Tensor) -> dict[str, Tensor]:
         """``[trained]`` the gradients of the count term or the cost term at one dial value, by parameter."""
@@ -214,10 +207,15 @@ class Objective:
             counted = count_gradient_at(self.typical, logits, sigma, s, self.attenuation, loss, self.config, target)
         return {self.decay: counted if self.config.parameter == "log" else counted / decay}
 
-    def _weight(self, s: float, *, alone: bool) -> float:
-        """w_s, times ``full_weight`` at the s = 1 that is drawn together with another dial value."""
-        weight = (1 - self.config.weight_slope * s / self.config.max_sv) ** 2
-        return weight if alone or s > 1 else weight * self.config.full_weight
+
+def loss_weight(virtual_scale: float, config: AdaptConfig) -> float:
+    """``w_s = (1 - k s / max_sv)^2``, the weight of the loss at the dial value s."""
+    return (1 - config.weight_slope * virtual_scale / config.max_sv) ** 2
+
+
+def within_reach(virtual_scale: float, attenuation: AttenuationConfig) -> float:
+    """A dial value to count at, at most halfway from max_sv to 1/tau, where nothing is kept."""
+    return min(virtual_scale, (attenuation.max_sv + 1 / attenuation.tau) / 2)
 
 
 def _ending_in(value: float, tensor: Tensor, trained: int) -> Tensor:

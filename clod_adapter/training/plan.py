@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from clod_adapter.adapter import attach, trim
+from clod_adapter.adapter import trim, with_dial
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
@@ -122,7 +122,7 @@ class Plan:
         if not self.trims(base):
             return lean
         rows = slice(None) if self.kept is None else self.kept
-        values = attach(base, self.start.sigma_d, lean.attenuation, self.start.growth_d).tensors()
+        values = with_dial(base, self.start.sigma_d, lean.attenuation, self.start.growth_d).tensors()
         for name, new in lean.tensors().items():
             if name == "shN" and self.config.lr_shN == 0:
                 continue  # the base's, without a copy of the largest part

@@ -107,3 +107,7 @@ class Adapted:
     failed: str | None = None
     held: int = 0
     signalled: bool = False
+
+    def __repr__(self) -> str:
+        ended = ", interrupted" if self.interrupted else ""
+        return f"Adapted({self.gaussians!r}, {self.steps:,} steps, {self.seconds:.1f} s{ended})"

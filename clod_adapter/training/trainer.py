@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -48,8 +49,8 @@ class Trainer:
     ) -> None:  # fmt: skip
         subset = subset or TrainableSubset(len(start))
         assert start.sigma_d is not None and start.attenuation is not None
-        self.config, self.group, self.sampler = config, group, ViewSampler(views, config, subset.far_first)
-        rates = _learning_rates(config, _extent(start, views, subset))
+        self.config, self.group, self.sampler = config, group, ViewSampler(views, config)
+        rates = learning_rates(config, position_unit(start, views, subset))
         # A frozen attribute requests no gradient from the rasterizer.
         tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
         cameras = subset.cameras or [view.camera for view in spread(views, MOST_VIEWS)]
@@ -91,7 +92,8 @@ class Trainer:
         if cost is not None and cost.due(share_done):
             cost.measure(self._assembled(self.parameters), self.objective.typical, share_done)
         before = self.sampler.state()
-        samples = [self.sampler.draw(share_done) for _ in range(self.config.batch)]
+        numbers = range(self.done * self.config.batch, (self.done + 1) * self.config.batch)
+        samples = [self.sampler.draw(number, share_done) for number in numbers]
         try:  # if it fails, the next step samples the same views again
             found = self.objective.gradient_sum(self.parameters, self.group.share(samples) if self.group else samples)
             found = self.group.sum(found) if self.group else found
@@ -188,7 +190,8 @@ class Trainer:
         }
 
 
-def _learning_rates(config: AdaptConfig, extent: float) -> dict[str, float]:
+def learning_rates(config: AdaptConfig, extent: float) -> dict[str, float]:
+    """By attribute, for a batch; ``extent`` is ``position_unit``."""
     rates = {
         "means": config.lr_means * extent, "quats": config.lr_quats, "log_scales": config.lr_scales,
         "opacity_logits": config.lr_opacities, "sh0": config.lr_sh0, "shN": config.lr_shN,
@@ -196,7 +199,7 @@ def _learning_rates(config: AdaptConfig, extent: float) -> dict[str, float]:
     return {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
 
 
-def _extent(start: Gaussians, views: tuple[View, ...], subset: TrainableSubset) -> float:
+def position_unit(start: Gaussians, views: Sequence[View], subset: TrainableSubset) -> float:
     """The unit of position steps, world units: the cameras' extent, or their typical distance if it is 0."""
     assert start.attenuation is not None
     return subset.extent or camera_extent([view.camera for view in views]) or start.attenuation.scene_distance

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clod_adapter.blocks.divide import Division, divide, split
-from clod_adapter.blocks.targets import LEFT_OUT, block_config, block_target, context_rows, far_first_of, target_image
+from clod_adapter.blocks.targets import LEFT_OUT, block_config, block_target, context_rows, target_image
 from clod_adapter.blocks.train import Learned, adapt_block, merge
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import AdaptConfig
@@ -123,12 +123,11 @@ def test_rows_left_out_of_the_context_are_not_needed(captured: tuple[Gaussians, 
             assert float((whole - part).abs().mean()) <= 2 * LEFT_OUT
 
 
-def test_both_passes_render_far_pairs_in_the_first_half_of_the_steps(divided: Division) -> None:
-    """As an undivided run, of which the passes are the parts."""
-    first, last = (far_first_of(divided, first=first) for first in (True, False))
-    light = block_config(divided, 0, CONFIG, first=False).iters
-    assert first * (divided.steps(0, CONFIG) - light) + last * light == pytest.approx(0.5 * divided.steps(0, CONFIG))
-    assert last == 0 and far_first_of(replace(divided, seen=divided.seen[:, :1]), first=True) == 0.5
+def test_coarse_steps_of_both_passes_are_those_of_an_undivided_run(divided: Division) -> None:
+    first, last = (block_config(divided, 0, CONFIG, first=first) for first in (True, False))
+    coarse = first.coarse * first.iters + last.coarse * last.iters
+    assert coarse == pytest.approx(CONFIG.coarse * divided.steps(0, CONFIG), abs=1) and last.coarse == 0
+    assert block_config(replace(divided, seen=divided.seen[:, :1]), 0, CONFIG, first=True).coarse == CONFIG.coarse
 
 
 @pytest.mark.parametrize("left_out", [0, 100])

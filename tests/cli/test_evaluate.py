@@ -45,7 +45,7 @@ def test_eval_of_a_plain_file(clod: Any, capture: Any) -> None:
 def test_default_dial_values_are_within_the_trained_range(clod: Any, capture: Any) -> None:
     for max_sv, dials in ((2.5, [1, 2, 2.5]), (1, [1]), (7, [1, 2, 3, 5, 7])):
         sigma = torch.linspace(0.5, 5, 300)
-        model = clod_adapter.attach(capture.gaussians, sigma, clod_adapter.AttenuationConfig(max_sv=max_sv))
+        model = clod_adapter.with_dial(capture.gaussians, sigma, clod_adapter.AttenuationConfig(max_sv=max_sv))
         clod_adapter.save("dial.ply", model)
         report = json.loads(clod("eval", "dial.ply", "--images", capture.scene, "--json").out)
         assert [row["virtual_scale"] for row in report["rows"]] == dials and notes_of(report) == []

@@ -67,6 +67,13 @@ def test_notes_of_render(clod: Any, capture: Any, dialled: Path, tmp_path: Path)
     assert json.loads(clod("export", dialled, "-o", "x.ply", "--sv", 4.5, "--json").out)["notes"] == [beyond]
 
 
+def test_a_dial_value_of_a_plain_file_is_noted(clod: Any, capture: Any) -> None:
+    done = clod("render", capture.ply, "--images", capture.scene, "-o", "out", "--sv", 1, 3, "--json")
+    report = json.loads(done.out)
+    assert f"{capture.ply} has no sigma_d, so every dial value renders all of it" in report["notes"]
+    assert report["pictures"][0]["kept"] == [300, 300] and "Warning" not in done.err
+
+
 @pytest.mark.parametrize("presses", [1, 2])
 def test_interrupts_of_rendering(
     clod: Any, capture: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, presses: int

@@ -75,11 +75,11 @@ def test_table_of_long_dials_matches_the_results() -> None:
     titles = page[0][1:]
     columns = []
     for scene, max_sv in (title.split(", ") for title in titles):
-        label = "growth, defaults" if float(max_sv) == AdaptConfig().max_sv else f"growth, max_sv {max_sv}"
+        own = "defaults" if float(max_sv) == AdaptConfig().max_sv else f"max_sv {max_sv}"
         run = [
             row for row in rows
-            if (row["scene"], row["label"]) == (scene, label)
-            and row["config"]["iters"] == 1500 and row["config"]["seed"] == 0
+            if (row["scene"], row["label"]) == (scene, f"one dial value, {own}")
+            and row["config"]["iters"] == AdaptConfig().iters and row["config"]["seed"] == 0
         ][-1]  # fmt: skip
         columns.append({f"s = {row['virtual_scale']:g}": cell(row) for row in run["rows"]})
     for name, *written in page[1:]:

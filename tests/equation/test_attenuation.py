@@ -285,3 +285,11 @@ def test_gradients_of_activated_opacities(cut: str) -> None:
     slope_a, slope_sigma = (slope.tolist() for slope in torch.autograd.grad(found.sum(), [ends, reach]))
     factor = math.exp(-0.125)
     assert slope_a == pytest.approx([0, factor, 0, 1]) and slope_sigma == pytest.approx([0, factor / 4, 0, 0])
+
+
+@pytest.mark.parametrize("name", ["opacity_logits", "sigma_d", "d"])
+def test_arrays_are_refused_by_name(name: str) -> None:
+    values = {each: torch.ones(3) for each in ("opacity_logits", "sigma_d", "d")}
+    values[name] = values[name].numpy()
+    with pytest.raises(ClodError, match=f"{name} is no tensor but ndarray; pass torch.as_tensor of it"):
+        attenuate(*values.values(), 2.0, config())

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import Attenuated, attenuate
 from clod_adapter.equation.distances import normalized_distances
@@ -170,7 +170,7 @@ def test_growth_begins_at_the_typical_distance() -> None:
 @pytest.mark.parametrize(("unit", "known"), [(1.0, 0.0), (1.0, 2.5), (3.7, 0.0), (3.7, 2.5)])
 def test_changing_the_unit_keeps_growth(normalizer: str, unit: float, known: float) -> None:
     settings = AttenuationConfig(normalizer=normalizer, scene_distance=unit, reference_distance=known)
-    some = attach(gaussians(200, 0, 1), torch.linspace(0.1, 3, 200), settings)
+    some = with_dial(gaussians(200, 0, 1), torch.linspace(0.1, 3, 200), settings)
     some = some.replace(growth_d=torch.linspace(-1, 3, 200))
 
     def factors(given: Gaussians) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
 from clod_adapter.equation.distances import normalized_distances
@@ -27,7 +27,7 @@ from scenes import camera, gaussians
 def dialled(n: int = 400, **config: float | str) -> Gaussians:
     some = gaussians(n, 0, 3)
     sigma = torch.logspace(-2, 2, n)
-    return attach(some, sigma, AttenuationConfig(**({"scene_distance": 3.7} | config)))  # type: ignore[arg-type]
+    return with_dial(some, sigma, AttenuationConfig(**({"scene_distance": 3.7} | config)))  # type: ignore[arg-type]
 
 
 @settings(deadline=None, max_examples=30)
@@ -51,7 +51,7 @@ def test_changing_the_unit_keeps_the_dial(distance: float, eps: float, s: float)
 
 def test_special_values_and_other_normalizers_keep_sigma() -> None:
     sigma = torch.tensor([0.0, -1.0, SIGMA_MAX, 2.0])
-    some = attach(gaussians(4, 0, 0), sigma, AttenuationConfig(scene_distance=8.0))
+    some = with_dial(gaussians(4, 0, 0), sigma, AttenuationConfig(scene_distance=8.0))
     there = in_world_units(some)
     assert there.sigma_d is not None and there.sigma_d[:3].tolist() == [0.0, -1.0, SIGMA_MAX]
     assert there.sigma_d[3].item() == pytest.approx(16.0)

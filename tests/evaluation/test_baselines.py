@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.evaluation.baselines import matching_dial, mean_kept, rankings
 from clod_adapter.initialization.importance import removal_error
@@ -16,7 +16,7 @@ from scenes import capture, gaussians, ring
 def test_matching_dial_keeps_as_many() -> None:
     n = 5000
     some, cameras = gaussians(n, 0, 0), ring(3, 32, 24)
-    some = attach(some, torch.linspace(0.3, 8, n), AttenuationConfig(tau=1 / 255, scene_distance=4.0, max_sv=200))
+    some = with_dial(some, torch.linspace(0.3, 8, n), AttenuationConfig(tau=1 / 255, scene_distance=4.0, max_sv=200))
     at_one = mean_kept(some, cameras, 1.0)
     assert at_one == sum(int(render(some, camera).kept.sum()) for camera in cameras) / 3
     for count in (0.9 * at_one, 1000, 250.5, 30):

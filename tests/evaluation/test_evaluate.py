@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import sys
+import warnings
 
+import numpy as np
 import pytest
 import torch
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.cameras import View
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.distances import in_frustum
@@ -24,7 +26,7 @@ def row_of_four() -> Gaussians:
     """Four Gaussians at camera depths 1, 2, 4 and 8, the last far outside the image; sigma_d is 1."""
     means = in_front(camera(), torch.tensor([[0.0, 0, 1], [0, 0, 2], [0, 0, 4], [80, 0, 8]]))
     some = gaussians(4, 0, 0).replace(means=means, opacity_logits=torch.full((4,), 2.0))
-    return attach(some, torch.ones(4), AttenuationConfig(tau=0.01, eps=0.0))
+    return with_dial(some, torch.ones(4), AttenuationConfig(tau=0.01, eps=0.0))
 
 
 def test_metrics_of_a_black_image() -> None:
@@ -54,7 +56,7 @@ def test_counts_follow_the_culling_threshold() -> None:
 
 def test_rows_are_means_over_renders() -> None:
     sigma_d = torch.full((200,), 0.8, requires_grad=True)
-    some = attach(gaussians(200, 1, 0), sigma_d, AttenuationConfig(scene_distance=4.0))
+    some = with_dial(gaussians(200, 1, 0), sigma_d, AttenuationConfig(scene_distance=4.0))
     views = photograph(gaussians(200, 1, 0), ring(3, 32, 24))
     seen = []
     rows = evaluate(some, views, [1.0, 2.0], progress=lambda now: seen.append((now.done, now.total)))
@@ -99,3 +101,18 @@ def test_bad_calls_are_named_before_rendering(monkeypatch: pytest.MonkeyPatch) -
     ):
         with pytest.raises(ClodError, match=message):
             evaluate(row_of_four(), given, dials)
+
+
+def test_one_view_and_one_dial_value() -> None:
+    view = View(camera(), torch.zeros(45, 61, 3, dtype=torch.uint8))
+    wanted = [row.kept for row in evaluate(row_of_four(), [view], [1.5])]
+    for dials in (1.5, np.float32(1.5), np.array([1.5]), (1.5,)):
+        assert [row.kept for row in evaluate(row_of_four(), view, dials)] == wanted
+
+
+def test_without_a_dial_every_dial_value_shows_the_base() -> None:
+    view = View(camera(), torch.zeros(45, 61, 3, dtype=torch.uint8))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rows = evaluate(gaussians(4, 0, 0), [view], [1, 3])
+    assert [(row.virtual_scale, row.kept) for row in rows] == [(1, 4), (3, 4)] and rows[0].psnr == rows[1].psnr

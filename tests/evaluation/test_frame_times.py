@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
@@ -24,7 +24,7 @@ Clock = Callable[[Callable[[int, float], float]], list[tuple[str, float]]]
 
 
 def adapted() -> Gaussians:
-    return attach(gaussians(20, 0, 0), torch.ones(20), AttenuationConfig(max_sv=7.0))
+    return with_dial(gaussians(20, 0, 0), torch.ones(20), AttenuationConfig(max_sv=7.0))
 
 
 @pytest.fixture

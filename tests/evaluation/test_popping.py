@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, AdaptConfig, AttenuationConfig
 from clod_adapter.equation.distances import normalized_distances
@@ -24,7 +24,7 @@ def dialled(tau: float = 1 / 255, n: int = 200, **settings: object) -> Gaussians
     """Gaussians that fade at different dial values; scene distance 4, where the ring of cameras is."""
     sigma = torch.linspace(0.3, 4, n)[torch.randperm(n, generator=torch.Generator().manual_seed(3))]
     config = AttenuationConfig(**({"tau": tau, "cut": "hard", "scene_distance": 4.0} | settings))
-    return attach(gaussians(n, 1, 0, size=0.2), sigma, config)
+    return with_dial(gaussians(n, 1, 0, size=0.2), sigma, config)
 
 
 def test_popping_of_a_fade_and_of_a_switch() -> None:
@@ -132,7 +132,7 @@ def adversary(normalizer: str, cut: str) -> tuple[Gaussians, list[Camera]]:
     sigma = sigma_for_extinction(some.opacity_logits, normalized_distances(means, camera, config), leave, config)
     turn = torch.eye(4)
     turn[[0, 0, 2, 2], [0, 2, 0, 2]] = torch.tensor([0.8, -0.6, 0.6, 0.8])
-    return attach(some, sigma, config), [camera, dataclasses.replace(camera, viewmat=turn @ camera.viewmat)]
+    return with_dial(some, sigma, config), [camera, dataclasses.replace(camera, viewmat=turn @ camera.viewmat)]
 
 
 @pytest.mark.parametrize("growth", [0.0, 1.0])
@@ -157,7 +157,7 @@ def test_soft_culling_bounds_popping_and_hard_culling_does_not(growth: float) ->
 def test_growth_alone_changes_a_pixel_by_its_bound(growth: float, name: str) -> None:
     """One white opaque Gaussian that never fades. Its footprint changes by up to 2/e |growth_d| per unit of log s."""
     camera, size = ring(1, 64, 48)[0], math.log(0.3) - min(growth, 0) * math.log(5)
-    some = attach(gaussians(1, 0, 0), torch.tensor([1e9]), AttenuationConfig(scene_distance=4.0)).replace(
+    some = with_dial(gaussians(1, 0, 0), torch.tensor([1e9]), AttenuationConfig(scene_distance=4.0)).replace(
         means=torch.zeros(1, 3), log_scales=torch.full((1, 3), size), opacity_logits=torch.tensor([20.0]),
         sh0=torch.full((1, 1, 3), 1.75), growth_d=torch.tensor([growth]), screen_filter=FILTERS[name],
     )  # fmt: skip

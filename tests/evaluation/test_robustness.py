@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.evaluate import evaluate
@@ -44,7 +44,7 @@ def test_an_interrupted_adaptation_gives_no_cell(phase: Phase) -> None:
 def test_baseline_keeps_the_most_opaque() -> None:
     base, scene = capture()
     frames: list[tuple[int, int]] = []
-    outcome = baseline(attach(base, torch.full((300,), 0.1)), scene.test, (1.0, 0.5, 0.1),
+    outcome = baseline(with_dial(base, torch.full((300,), 0.1)), scene.test, (1.0, 0.5, 0.1),
                        progress=lambda now: frames.append((now.done, now.total)))  # fmt: skip
     assert [row["kept"] for row in outcome.rows] == [300, 150, 30]
     assert [row["kept_share"] for row in outcome.rows] == [1, 0.5, 0.1]
@@ -59,7 +59,7 @@ def test_baseline_keeps_the_most_opaque() -> None:
 def test_distribution() -> None:
     model = gaussians(4, 0, 0).replace(opacity_logits=torch.tensor([-9.0, 0.1, 9.0, float("inf")]))
     sigma = torch.tensor([0.0, 1e-2, 1.0, 1e9])
-    found = distribution(attach(model, sigma))
+    found = distribution(with_dial(model, sigma))
     opacity, log_sigma = found["opacity"], found["log10_sigma_d"]
     for histogram in (opacity, log_sigma):
         assert len(histogram["edges"]) == len(histogram["shares"]) + 1 and sum(histogram["shares"]) == pytest.approx(1)

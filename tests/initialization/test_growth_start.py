@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.equation.growth import growth_factors
@@ -107,11 +107,11 @@ def test_unknown_unit_of_growth_is_measured_once() -> None:
     """By the initialization, in all views; what follows finds it known, however few views it has."""
     some = gaussians(60, 0, 0)
     views = photograph(some, ring(2, 16, 12))
-    initial = initialize(attach(some, torch.full((60,), 3.0), None, torch.full((60,), 0.5)), views, AdaptConfig())
+    initial = initialize(with_dial(some, torch.full((60,), 3.0), None, torch.full((60,), 0.5)), views, AdaptConfig())
     assert initial.attenuation is not None
     assert initial.attenuation.reference_distance == scene_distance(some, views, 0.95)
     trained = for_training(initial, views[:1], AdaptConfig())
     before, after = (dial(one, views[0].camera, 2.0).growth for one in (initial, trained))
     assert before is not None and after is not None and (before > 1).any()
     torch.testing.assert_close(after, before)
-    assert has_dial(attach(some, None, None, torch.full((60,), 0.5))) and not has_dial(attach(some))
+    assert has_dial(with_dial(some, None, None, torch.full((60,), 0.5))) and not has_dial(with_dial(some))

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 import scenes
-from clod_adapter.adapter import attach, detach, extract
+from clod_adapter.adapter import detach, extract, with_dial
 from clod_adapter.cli.inspect import lines_of
 from clod_adapter.cli.shared.report import jsonable
 from clod_adapter.config import AttenuationConfig
@@ -54,7 +54,7 @@ def kinds(found: Inspection) -> dict[str, int]:
 
 def adapted(path: Path, growth: bool = False) -> Path:
     """A file with a dial and its calibration."""
-    g = attach(scenes.gaussians(40, 1, 0), attenuation=ATTENUATION)
+    g = with_dial(scenes.gaussians(40, 1, 0), attenuation=ATTENUATION)
     g = g.replace(growth_d=torch.linspace(-1, 3, 40)) if growth else g
     save(path, g, blank(40, 1), calibration=CALIBRATION)
     return path
@@ -62,7 +62,7 @@ def adapted(path: Path, growth: bool = False) -> Path:
 
 def adapter_of(path: Path, n: int = 40) -> Path:
     g = scenes.gaussians(n, 1, 0)
-    more = attach(g.replace(means=g.means + 0.01), torch.linspace(0.1, 2, n), ATTENUATION)
+    more = with_dial(g.replace(means=g.means + 0.01), torch.linspace(0.1, 2, n), ATTENUATION)
     save_adapter(path, extract(g, more, fingerprint="ab" * 32, config={"max_sv": 6.0, "iters": 3}))
     return path
 
@@ -289,7 +289,7 @@ def mutants(folder: Path) -> list[bytes]:
         adapter_of(folder / "e.safetensors", 5), state_of(folder / "f.safetensors"), gsplat_checkpoint(folder / "g.pt"),
     ]  # fmt: skip
     for suffix in (".glb", ".spz", ".safetensors", ".splat"):
-        g = attach(scenes.gaussians(5, 1, 0), attenuation=ATTENUATION)
+        g = with_dial(scenes.gaussians(5, 1, 0), attenuation=ATTENUATION)
         paths.append(folder / f"model{suffix}")
         save_as(paths[-1], detach(g) if suffix == ".splat" else g, ("made here",))
     return [path.suffix.encode() + b"\0" + path.read_bytes() for path in paths]

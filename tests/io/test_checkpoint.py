@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import os
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,9 +19,10 @@ from clod_adapter.adapter import detach, trim
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import load, save, trimmed
+from clod_adapter.io.checkpoint import blank, load, save, trimmed
 from clod_adapter.io.file_formats import write as save_as
 from clod_adapter.io.ply.columns import column_map
+from clod_adapter.io.ply.header import PREFIX
 from clod_adapter.io.sniff import handle_name
 from formats import model, write_elements, write_rows
 
@@ -308,3 +310,31 @@ def test_trimmed_checkpoint_keeps_its_other_columns(tmp_path: Path, rows: list[i
     assert list(found.vertex.dtype.names) == names  # in the order of the file
     assert less.fingerprint == checkpoint.fingerprint
     assert trimmed(checkpoint, None, None) is checkpoint
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".pt", ".safetensors", ".spz", ".PLY", ".other"])
+def test_the_suffix_decides_the_format(tmp_path: Path, suffix: str) -> None:
+    some = model(1, 9)
+    some = some.replace(opacity_logits=some.opacity_logits.clamp(max=20))
+    with warnings.catch_warnings(record=True) as losses:
+        save(tmp_path / f"out{suffix}", some)
+    again = load(tmp_path / f"out{suffix}")
+    start = (tmp_path / f"out{suffix}").read_bytes()[:4]
+    assert (start == b"ply\n") == (suffix in (".PLY", ".other")) and bool(losses) == (suffix == ".spz")
+    torch.testing.assert_close(again.gaussians.means, some.means, rtol=1e-3, atol=1e-3)
+    assert again.gaussians.attenuation == some.attenuation and again.gaussians.sigma_d is not None
+
+
+def test_other_formats_keep_what_the_base_says(tmp_path: Path) -> None:
+    """Its origin and its comments, but not its dial's; the input is not overwritten."""
+    some = model(1, 9)
+    base = dataclasses.replace(blank(len(some), 1, (10.0, 20.0, 3.0)), comments=("from a trainer", f"{PREFIX}tau 0.5"))
+    save(tmp_path / "out.pt", some, base)
+    again = load(tmp_path / "out.pt", origin=(10.0, 20.0, 3.0))
+    assert "from a trainer" in again.comments and not any("0.5" in line for line in again.comments)
+    torch.testing.assert_close(again.gaussians.means, some.means)
+    with pytest.raises(ClodError, match="never overwritten"):
+        save(tmp_path / "out.pt", again.gaussians, again)
+    with pytest.raises(ClodError, match="no room for a dial"):
+        save(tmp_path / "out.splat", some)
+    assert repr(again) == f"Checkpoint('{tmp_path}/out.pt', 9, SH degree 1, dial to 7 with growth)"

@@ -5,14 +5,16 @@ from __future__ import annotations
 import copy
 import math
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 import torch
 
-from clod_adapter.adapter import ATTRIBUTES, attach
+from clod_adapter.adapter import ATTRIBUTES, with_dial
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import SIGMA_MAX, log_attenuation
@@ -22,7 +24,7 @@ from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize, scene_distance
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.progress import Phase, Progress, Stopped
+from clod_adapter.progress import Phase, Progress, Stopped, _Bar
 from clod_adapter.training.loop import Adapted, TrainingState, adapt
 from clod_adapter.training.planner import make_plan
 from runs import change_step, config_of, fail, states_of
@@ -120,8 +122,8 @@ def test_zero_steps_return_the_initialization(captured: Pair) -> None:
         assert torch.equal(getattr(result.gaussians, name), getattr(base, name)), name
     torch.testing.assert_close(result.gaussians.sigma_d, want.sigma_d, rtol=1e-5, atol=0)  # by way of its logarithm
     assert result.gaussians.attenuation == want.attenuation and (want.sigma_d < SIGMA_MAX).all()
-    # At SIGMA_MAX no gradient reaches sigma_d, so a dial of attach is initialized, too.
-    assert_equal(adapt(attach(base), scene, config_of(iters=0)).gaussians, result.gaussians)
+    # At SIGMA_MAX no gradient reaches sigma_d, so a dial of with_dial is initialized, too.
+    assert_equal(adapt(with_dial(base), scene, config_of(iters=0)).gaussians, result.gaussians)
     base = base.replace(opacity_logits=base.opacity_logits.abs())  # so that all can last
     found = initialize(base, scene.train, config_of(start_share=0.7, exponent=1.5))
     assert found.attenuation.scene_distance == 1
@@ -167,7 +169,7 @@ def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Trained, l
     assert (result.growth_d - first.growth_d).abs().max() <= 1.01e-2 and first.growth_d.unique().numel() > 50
     # A sigma_d learned under one tau and normalizer means something else under others: the file's are kept.
     own = AttenuationConfig(tau=0.02, eps=1e-6, normalizer="max", scene_distance=2.0, max_sv=4.0)
-    dialled = attach(captured[0], torch.full((len(captured[0]),), 1.5), own)
+    dialled = with_dial(captured[0], torch.full((len(captured[0]),), 1.5), own)
     result = adapt(dialled, captured[1], config).gaussians
     assert result.attenuation == replace(own, max_sv=3.0, scene_distance=1.0, reference_distance=2.0)
 
@@ -187,7 +189,7 @@ def test_a_zero_sigma_recovers(captured: Pair) -> None:
     base, scene = captured
     config = config_of(iters=150, lr_sigma=0.3)
     settings = AttenuationConfig(tau=config.tau, cut="soft", scene_distance=4.0, max_sv=config.max_sv)
-    dead = attach(base, torch.zeros(len(base)), settings)
+    dead = with_dial(base, torch.zeros(len(base)), settings)
     assert evaluate(dead, scene.train, [1.0])[0].kept == 0
     result = adapt(dead, scene, config).gaussians
     assert (result.sigma_d > 1e-3).all() and result.sigma_d.isfinite().all()
@@ -364,3 +366,32 @@ def test_scene_distance_is_the_mean_over_views(captured: Pair) -> None:
     ]
     want = torch.stack([ratio.median() for ratio in ratios]).mean().item()
     assert scene_distance(base, scene.train, 0.5) == pytest.approx(want, rel=1e-5)
+
+
+def test_settings_as_keywords(captured: Pair) -> None:
+    adapted = adapt(*captured, config_of(iters=3), max_sv=7, growth="off")
+    assert adapted.steps == 3 and adapted.gaussians.attenuation.max_sv == 7 and adapted.gaussians.growth_d is None
+    assert repr(adapted).startswith("Adapted(Gaussians(300, SH degree 1, dial to 7, cpu), 3 steps, ")
+    with pytest.raises(TypeError, match="max_vs"):
+        adapt(*captured, max_vs=7)
+
+
+def test_a_bar_by_default(captured: Pair, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """On a terminal or in a notebook; not elsewhere, not with a listener of one's own, and not with False."""
+    adapt(*captured, iters=2)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))
+    adapt(*captured, iters=2)
+    shown = capsys.readouterr().err
+    assert all(phase in shown for phase in ("importance", "pruning order", "training: ", "/2 ["))
+    for progress in (False, lambda now: None):
+        adapt(*captured, iters=2, progress=progress)
+    assert capsys.readouterr().err == ""
+
+
+def test_the_bar_shows_the_loss_and_follows_a_time_budget(capsys: pytest.CaptureFixture[str]) -> None:
+    bar = _Bar()
+    bar(Progress(Phase.TRAINING, 3, 200, time_share=0.25, loss=0.125))
+    bar.bar.refresh()
+    assert bar.bar.n == 50 and "loss 0.1250" in capsys.readouterr().err
+    bar.close()

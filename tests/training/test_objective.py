@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import FILTERS
 from clod_adapter.equation.growth import GROWTH_RANGE
@@ -23,7 +23,7 @@ from clod_adapter.rasterizers import cpu, reference
 from clod_adapter.render import render, splat
 from clod_adapter.training import objective
 from clod_adapter.training.loop import TrainingState, adapt
-from clod_adapter.training.objective import GradientSum, TrainableSubset
+from clod_adapter.training.objective import GradientSum, TrainableSubset, loss_weight
 from clod_adapter.training.trainer import Trainer
 from clod_adapter.training.view_sampler import Sample, ViewSampler
 from runs import config_of, states_of
@@ -59,7 +59,7 @@ def test_one_step_moves_kept_rows_by_their_rates(captured: Pair) -> None:
     """At s = 1 on one view, the loss is the render's, and culled rows do not move."""
     base, scene = captured
     alone = Scene(scene.train[:2], ())
-    config = config_of(iters=1, sampling="log", full_share=1.0, reg_weight=0.0, seed=3)
+    config = config_of(iters=1, full_share=1.0, reg_weight=0.0, seed=3)
     before, seen = initialize(base, alone.train, config), []
     after = adapt(before, alone, config, seen.append).gaussians
     losses = [photometric_loss(render(before, view.camera).image, view.image).item() for view in alone.train]
@@ -84,9 +84,9 @@ def test_batch_gradient_is_the_sum_over_views(captured: Pair) -> None:
     """The first step is longer by the square root of the batch size."""
     base, scene = captured
     begun, views = initialize(base, scene.train, config_of()), scene.train[:2]
-    config = config_of(batch=2, sampling="pair")
+    config = config_of(batch=2)
     run = Trainer(begun, views, config)
-    draws = [Sample(view, [1.0, 2.0]) for view in views]
+    draws = [Sample(view, s) for view, s in zip(views, (1.0, 2.0), strict=True)]
     one, two = (run.objective.gradient_sum(run.parameters, [draw]) for draw in draws)
     both = run.objective.gradient_sum(run.parameters, draws)
     assert both.loss == one.loss + two.loss and torch.equal(both.kept, one.kept | two.kept)
@@ -114,16 +114,17 @@ def test_only_the_first_rows_are_trained(captured: Pair) -> None:
     assert not torch.equal(without.sh0, found.sh0[:few])
 
 
+@pytest.mark.parametrize("dial", [1.0, 2.0])
 @pytest.mark.parametrize("parameter", ["log", "linear"])
 @pytest.mark.parametrize("part", [{}, {"full_context": True}, {"total": 900}], ids=str)
 def test_compiled_steps_have_the_gradients_of_plain_ones(
-    captured: Pair, monkeypatch: pytest.MonkeyPatch, part: dict[str, Any], parameter: str
+    captured: Pair, monkeypatch: pytest.MonkeyPatch, part: dict[str, Any], parameter: str, dial: float
 ) -> None:
     base, scene = captured
     config = config_of(max_sv=4.0, parameter=parameter, lr_shN=1e-3)
     run = Trainer(initialize(base, scene.train, config), scene.train, config, TrainableSubset(len(base) - 20, **part))
     run.parameters["growth_d"] = torch.linspace(-0.5, 1, len(base))
-    sample = Sample(scene.train[0], [1.0, 2.0], 3.0)
+    sample = Sample(scene.train[0], dial, 3.0)
     compiled = run.objective.gradient_sum(run.parameters, [sample])
     monkeypatch.setattr(run.objective.__class__, "_compiled", lambda *_: False)
     plain = run.objective.gradient_sum(run.parameters, [sample])
@@ -137,7 +138,7 @@ def test_compiled_steps_have_the_gradients_of_plain_ones(
 def test_gradient_of_growth_equals_finite_differences(monkeypatch: pytest.MonkeyPatch, context: int) -> None:
     """In float64, at a dial value of its own; the context of a block does not grow."""
     monkeypatch.setattr(objective, "splat", partial(splat, rasterizer=reference.rasterize))
-    count, config = 12, config_of(sampling="log", start="identity", max_sv=4.0)
+    count, config = 12, config_of(start="identity", max_sv=4.0)
     some = gaussians(count, 1, 0, size=0.3)
     begun = initialize(some, views := photograph(some, ring(2, 16, 12)), config)
     run = Trainer(begun, views, config, TrainableSubset(count - context, full_context=context > 0))
@@ -145,15 +146,15 @@ def test_gradient_of_growth_equals_finite_differences(monkeypatch: pytest.Monkey
     exact["growth_d"] = torch.linspace(-0.5, 1.2, count, dtype=torch.float64)
 
     def of(growth_d: Tensor) -> GradientSum:
-        return run.objective.gradient_sum(exact | {"growth_d": growth_d}, [Sample(views[0], [2.0])])
+        return run.objective.gradient_sum(exact | {"growth_d": growth_d}, [Sample(views[0], 2.0)])
 
     plain = replace(run.objective, config=replace(config, growth="off"))
     none = {name: value for name, value in exact.items() if name != "growth_d"}
-    ungrown = plain.gradient_sum(none, [Sample(views[0], [2.0])]).loss
+    ungrown = plain.gradient_sum(none, [Sample(views[0], 2.0)]).loss
     assert of(torch.zeros(count)).loss == ungrown != of(exact["growth_d"]).loss
     found, step = of(exact["growth_d"]), 1e-6 * torch.eye(count, dtype=torch.float64)
     slopes = [(of(exact["growth_d"] + row).loss - of(exact["growth_d"] - row).loss) / 2e-6 for row in step]
-    wanted = run.objective._weight(2.0, alone=True) * torch.tensor(slopes, dtype=torch.float64)
+    wanted = loss_weight(2.0, config) * torch.tensor(slopes, dtype=torch.float64)
     assert (wanted[: count - context].abs() > 1e-5).sum() > 3 and not wanted[count - context :].any()
     torch.testing.assert_close(found.gradients["growth_d"], wanted[: count - context], rtol=1e-4, atol=1e-8)
 
@@ -163,33 +164,30 @@ def test_trained_growth_stays_in_its_range(captured: Pair) -> None:
     assert found is not None and (found.min(), found.max()) == GROWTH_RANGE
 
 
-@pytest.mark.parametrize("sampling", ["pair", "log"])
-def test_steps_use_the_sampled_views_and_dial_values(
-    captured: Pair, monkeypatch: pytest.MonkeyPatch, sampling: str
-) -> None:
+def test_steps_use_the_sampled_views_and_dial_values(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[Any] = []
     draw, count = cpu.draw, objective.count_gradient_at
     monkeypatch.setattr(cpu, "draw", lambda *a, **k: taken.append(a[2]) or draw(*a, **k))
     monkeypatch.setattr(objective, "count_gradient_at", lambda *a: taken.append(a[3]) or count(*a))
     monkeypatch.setattr(objective, "photometric_loss", lambda *a: taken.append(id(a[1])) or photometric_loss(*a))
-    config = config_of(iters=14, max_sv=4.0, sampling=sampling)
-    adapt(attach(gaussians(5, 0, 0), torch.ones(5)), captured[1], config)
+    config = config_of(iters=14, max_sv=4.0)
+    adapt(with_dial(gaussians(5, 0, 0), torch.ones(5)), captured[1], config)
     sampler = ViewSampler(captured[1].train, config)
-    draws = [sampler.draw(k / 14) for k in range(14)]
-    rendered = [x for view, dials, _ in draws for s in dials for x in (s, id(view.image))]
-    counted = [s for _, dials, beyond in draws for s in (*dials, beyond)]
+    draws = [sampler.draw(k, k / 14) for k in range(14)]
+    rendered = [x for view, s, *_ in draws for x in (s, id(view.image))]
+    counted = [x for _, s, beyond, _ in draws for x in (s, beyond)]
     assert sorted(map(str, taken)) == sorted(map(str, [*rendered, *counted]))
 
 
 def test_counts_are_at_typical_distances(captured: Pair) -> None:
     """Times the loss, the count term has the same gradient in all views, however near their cameras are."""
     base, scene = captured
-    config = config_of(sampling="log", reg_weight=1e3)
+    config = config_of(reg_weight=1e3)
     run = Trainer(initialize(base, scene.train, config), scene.train, config)
     plain = replace(run.objective, config=replace(config, reg_weight=0.0))
     terms = []
     for view in scene.train[:3]:
-        one, other = (each.gradient_sum(run.parameters, [Sample(view, [2.0])]) for each in (run.objective, plain))
+        one, other = (each.gradient_sum(run.parameters, [Sample(view, 2.0)]) for each in (run.objective, plain))
         terms.append((one.gradients["log_sigma"] - other.gradients["log_sigma"]) / one.loss)
     assert (terms[0].abs() > 1e-5).sum() > 20
     for term in terms[1:]:

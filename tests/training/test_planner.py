@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
@@ -98,7 +98,7 @@ def test_unseen_gaussians_of_a_base_with_a_dial_are_kept(visible: tuple[Gaussian
     base, scene = with_unseen(visible[0])[0], visible[1]
     adapted = adapt(base, scene, replace(CONFIG, iters=5)).gaussians
     assert make_plan(adapted, scene, CONFIG, Override(keep=ALL - {"unseen"})).kept is None
-    assert make_plan(attach(base), scene, CONFIG, Override(keep=ALL - {"unseen"})).kept is not None
+    assert make_plan(with_dial(base), scene, CONFIG, Override(keep=ALL - {"unseen"})).kept is not None
     assert make_plan(adapted, scene, CONFIG, Override(ALL - {"unseen"}, frozenset({"unseen"}))).kept is not None
 
 

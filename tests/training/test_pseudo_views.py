@@ -33,7 +33,7 @@ def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians, with_dial: b
     """Renders of a file with a dial are at s = 1."""
     own, cameras, told = blob, scenes.ring(9, 40, 30), []
     if with_dial:
-        own = clod.attach(blob, torch.full((len(blob),), 0.3), clod.AttenuationConfig(scene_distance=4.0))
+        own = clod.with_dial(blob, torch.full((len(blob),), 0.3), clod.AttenuationConfig(scene_distance=4.0))
     scene = render_pseudo_views(own, cameras, progress=lambda now: told.append((now.done, now.total)))
     assert [view.camera for view in scene.test] == [cameras[0], cameras[8]] and len(scene.train) == 7
     image, plain = ((clod.render(g, cameras[1]).image.clamp(0, 1) * 255).round().byte() for g in (own, blob))
@@ -49,7 +49,7 @@ def test_each_step_renders_the_checkpoint_from_another_camera(blob: clod.Gaussia
     photograph = scenes.photograph(blob, cameras[:1])[0]
     sampler = ViewSampler((*placed, photograph), clod.AdaptConfig())
     state = sampler.state()
-    drawn = [sampler.draw(0.0).view for _ in range(9)]
+    drawn = [sampler.draw(k, 0.0).view for k in range(9)]
     assert sum(view is photograph for view in drawn) == 3
     for view in drawn:
         if view is not photograph:
@@ -59,7 +59,7 @@ def test_each_step_renders_the_checkpoint_from_another_camera(blob: clod.Gaussia
             assert 0 < (view.camera.position - own.camera.position).norm() < 6 * MOVED * own.reach
             assert not torch.equal(view.image, own.image)
     sampler.restore(*state)
-    again = [sampler.draw(0.0).view for _ in range(9)]
+    again = [sampler.draw(k, 0.0).view for k in range(9)]
     assert all(torch.equal(a.camera.viewmat, b.camera.viewmat) for a, b in zip(drawn, again, strict=True))
 
 

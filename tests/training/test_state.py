@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clod_adapter.adapter import ATTRIBUTES, attach
+from clod_adapter.adapter import ATTRIBUTES, with_dial
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError
@@ -45,7 +45,7 @@ def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str, kind: 
     if kind == "empty":
         base = base.replace(shN=torch.zeros_like(base.shN))
     if kind == "with a dial":
-        base = attach(base, torch.full((len(base),), 1.5), AttenuationConfig(scene_distance=4.0, max_sv=3.0))
+        base = with_dial(base, torch.full((len(base),), 1.5), AttenuationConfig(scene_distance=4.0, max_sv=3.0))
     config, states = config_of(**{"iters": 12, **RESUMED[form]}), dict[int, TrainingState]()
     whole = adapt(base, scene, config, states_of({1, 6, 10, 11, 12}, states))
     if form == "sigma_d alone":
@@ -71,7 +71,7 @@ def test_untrained_rows_keep_their_units_when_resumed(captured: Pair, distance: 
     base, scene = captured
     settings = AttenuationConfig(scene_distance=distance, reference_distance=4.0)
     growth_d = torch.linspace(-0.5, 1, len(base)) if distance == 1 else None
-    base = attach(base, torch.linspace(0.3, 3, len(base)) * 4 / distance, settings, growth_d)
+    base = with_dial(base, torch.linspace(0.3, 3, len(base)) * 4 / distance, settings, growth_d)
     part, states = TrainableSubset(len(base) // 2), dict[int, TrainingState]()
     whole = adapt(base, scene, config_of(iters=4), states_of({2}, states), subset=part)
     again = adapt(base, scene, config_of(iters=4), None, states[2], subset=part)

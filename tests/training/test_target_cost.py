@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clod_adapter.adapter import ATTRIBUTES, attach, detach
+from clod_adapter.adapter import ATTRIBUTES, detach, with_dial
 from clod_adapter.blocks.divide import check_divisible
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig, AttenuationConfig
@@ -34,7 +34,7 @@ def model() -> Gaussians:
     """Gaussians with a dial, at which some are culled at every dial value."""
     sigma_d = 0.1 + 4.0 * torch.rand(N, generator=torch.Generator().manual_seed(1))
     settings = AttenuationConfig(scene_distance=4.0, reference_distance=4.0, max_sv=4.0)
-    return attach(gaussians(N, 0, 0, size=0.08), sigma_d, settings, torch.full((N,), 0.2))
+    return with_dial(gaussians(N, 0, 0, size=0.08), sigma_d, settings, torch.full((N,), 0.2))
 
 
 def parameters_of(model: Gaussians) -> dict[str, torch.Tensor]:

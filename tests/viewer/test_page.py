@@ -70,7 +70,7 @@ def test_a_name_cannot_end_its_element() -> None:
 
 def test_one_file_contains_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(payload, "BLOCK_ROWS", 7)  # blocks that base64 would pad
-    clod_adapter.save(tmp_path / "model.ply", clod_adapter.attach(scenes.gaussians(50, 1, 0)))
+    clod_adapter.save(tmp_path / "model.ply", clod_adapter.with_dial(scenes.gaussians(50, 1, 0)))
     saved, cameras = clod_adapter.load(tmp_path / "model.ply"), scenes.ring(2, 20, 10)
     page.write_viewer_page(tmp_path / "page.html", saved, base=saved, cameras=cameras, virtual_scale=2.0)
     text = (tmp_path / "page.html").read_text(encoding="utf-8")

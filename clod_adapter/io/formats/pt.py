@@ -24,11 +24,6 @@ from clod_adapter.io.ply.columns import GROWTH, SIGMA, dial_columns
 from clod_adapter.io.settings import damaged
 from clod_adapter.io.sniff import file_sha256, handle_name, read_start, refuse
 
-# As gsplat's trainer names its parameters, and as they are called here.
-NAMES = {
-    "means": "means", "quats": "quats", "scales": "log_scales", "opacities": "opacity_logits",
-    "sh0": "sh0", "shN": "shN",
-}  # fmt: skip
 FRAME = "gsplat's trainer may have normalised the coordinates; photographs must be in the same"
 _PICKLE_LIMIT = 1 << 20  # bytes; of a few tensors it has a few hundred
 _PLAIN = r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|torch \w+Storage"
@@ -86,6 +81,8 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], str | None, str]:
     Raises:
         ClodError: not such a checkpoint, damaged, or more than tensors.
     """
+    from clod_adapter.integrations.splats import NAMES  # here and not above, as check_pt does without torch
+
     checkpoint, sha256 = _load(path)
     splats = checkpoint.get("splats") if isinstance(checkpoint, dict) else None
     if not isinstance(splats, dict):
@@ -105,7 +102,7 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], str | None, str]:
 
 
 def _load(path: Path) -> tuple[Any, str]:
-    import torch  # here and not above, as check_pt does without
+    import torch
 
     check_pt(path)
     try:

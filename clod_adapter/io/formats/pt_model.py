@@ -8,11 +8,12 @@ from pathlib import Path
 import torch
 
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.integrations.splats import NAMES
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import History, Model
 from clod_adapter.io.formats.arrays import arrays_of, gaussians_of
 from clod_adapter.io.formats.metadata import KEY, metadata_text, parse_metadata, write_metadata
-from clod_adapter.io.formats.pt import FRAME, NAMES, read_splats
+from clod_adapter.io.formats.pt import FRAME, read_splats
 from clod_adapter.io.ply.columns import SIGMA, dial_columns
 
 

@@ -330,7 +330,7 @@ def test_rank_from_the_environment(monkeypatch: pytest.MonkeyPatch, environment:
 
 def test_default_steps_take_the_same_number_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
     for words, size, want in (
-        ((), 1, (1, 1500)), ((), 4, (4, 375)), (("--batch", "3"), 2, (3, 500)), (("--batch", "4000"), 1, (4000, 1)),
+        ((), 1, (1, 2000)), ((), 4, (4, 500)), (("--batch", "3"), 2, (3, 667)), (("--batch", "4000"), 1, (4000, 1)),
         (("--iters", "100"), 4, (4, 100)), (("--iters", "0"), 1, (1, 0)),
     ):  # fmt: skip
         for name, value in (AT | {"RANK": "0", "WORLD_SIZE": str(size)}).items():

@@ -66,7 +66,7 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
     (tmp_path / "cut.ply").write_bytes(capture.ply.read_bytes()[:-100])
     (tmp_path / "mine.ply").write_bytes(capture.ply.read_bytes())
     (tmp_path / "folder.ply").mkdir()
-    clod_adapter.save(tmp_path / "dialled.ply", clod_adapter.attach(capture.gaussians))
+    clod_adapter.save(tmp_path / "dialled.ply", clod_adapter.with_dial(capture.gaussians))
     scene = capture.scene
     return {"PLY": capture.ply, "SCENE": scene, "SCENE/images": scene / "images", "DIALLED": Path("dialled.ply")}
 

@@ -282,7 +282,9 @@ def saved(path: Path, degree: int, *, growth: bool = True) -> Any:
     from scenes import gaussians
 
     sigma = torch.linspace(0.9, 9, 50)
-    model = clod_adapter.attach(gaussians(50, degree, 4), sigma, clod_adapter.AttenuationConfig(reference_distance=3.0))
+    model = clod_adapter.with_dial(
+        gaussians(50, degree, 4), sigma, clod_adapter.AttenuationConfig(reference_distance=3.0)
+    )
     model = model.replace(growth_d=torch.linspace(-1, 3, 50) if growth else None)
     places = (Viewpoint(0.0, 0.0, -4.0, 1.0), Viewpoint(1.0, 0.0, 4.0, 1.0))
     row = CalibrationRow(1.0, 40.0, 30.0, 0.9, 5.0)

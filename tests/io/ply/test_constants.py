@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.errors import ClodError
@@ -35,7 +35,7 @@ EACH = {
 
 
 def model(config: AttenuationConfig, growth: bool = False) -> Gaussians:
-    some = attach(gaussians(400, 1, 2), torch.logspace(-1, 1.3, 400), config)
+    some = with_dial(gaussians(400, 1, 2), torch.logspace(-1, 1.3, 400), config)
     return some.replace(growth_d=torch.linspace(-1, 3, 400)) if growth else some
 
 

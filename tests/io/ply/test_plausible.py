@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from clod_adapter.adapter import attach
+from clod_adapter.adapter import with_dial
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.equation.units import estimated_distance
@@ -38,7 +38,7 @@ def test_file_without_settings_has_a_note(tmp_path: Path, factor: float, begin: 
     some = some.replace(means=10 * some.means, opacity_logits=some.opacity_logits.clamp(min=-2))
     d = torch.full((500,), estimated_distance(some.means))
     sigma = sigma_for_extinction(some.opacity_logits, d, torch.linspace(0.5, 1.75, 500), config)
-    save(path, attach(some, factor * sigma, config))
+    save(path, with_dial(some, factor * sigma, config))
     assert load(path).notes == () and inspect(path).notes == ()
     base = load(without_comments(path))
     assert base.gaussians.attenuation == config

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from clod_adapter.adapter import attach, extract
+from clod_adapter.adapter import extract, with_dial
 from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
@@ -111,7 +111,7 @@ def test_mip_splatting_is_fused(tmp_path: Path, kind: str) -> None:
     np.testing.assert_allclose(base.gaussians.scales, scales, rtol=2e-6)
     np.testing.assert_allclose(base.gaussians.opacities, opacities, rtol=2e-6)
     assert base.comments == base.notes and "filter_3D is fused" in base.notes[0]
-    save(tmp_path / "out.ply", attach(base.gaussians, torch.rand(len(vertex)), AttenuationConfig()), base)
+    save(tmp_path / "out.ply", with_dial(base.gaussians, torch.rand(len(vertex)), AttenuationConfig()), base)
     out = load(tmp_path / "out.ply")
     assert "filter_3D" not in out.vertex.dtype.names and out.notes == () and base.notes[0] in out.comments
     assert torch.equal(out.gaussians.log_scales, base.gaussians.log_scales)
@@ -140,7 +140,7 @@ def test_own_outputs_need_no_option(tmp_path: Path, kind: str) -> None:
     path = write_rows(tmp_path / "in.ply", activate(inria(40, kind=kind), "opacity", "scales"))
     base = load(path, activated="both")
     g = base.gaussians
-    tuned = attach(g.replace(opacity_logits=g.opacity_logits.abs()), torch.rand(40), AttenuationConfig())
+    tuned = with_dial(g.replace(opacity_logits=g.opacity_logits.abs()), torch.rand(40), AttenuationConfig())
     adapter = extract(g, tuned, fingerprint=base.fingerprint, config={})
     save(tmp_path / "out.ply", adapter.apply(g), base)
     save_adapter(tmp_path / "a.safetensors", adapter)

@@ -1,0 +1,185 @@
+"""The dial as a component of a loop of one's own."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import clod_adapter as clod
+from clod_adapter.cameras import Scene
+from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.losses import photometric_loss
+from clod_adapter.training.dial import Dial, attach
+from clod_adapter.training.objective import SIGMA_RANGE, Objective, TrainableSubset
+from clod_adapter.training.target_count import count_gradient_at, target_share
+from clod_adapter.training.view_sampler import COUNTED_BEYOND, Sample
+
+Pair = tuple[Gaussians, Scene]
+MAX_SV = 5.0
+
+
+def trainable(base: Gaussians, form: str = "gsplat") -> torch.nn.ParameterDict:
+    """Copies of the Gaussians' tensors as a trainer holds them."""
+    named = clod.to_gsplat(base)
+    if form == "splatfacto":
+        named["features_dc"], named["features_rest"] = named.pop("sh0")[:, 0], named.pop("shN")
+    if form != "gsplat":
+        named["opacities"] = named["opacities"][:, None]
+    return torch.nn.ParameterDict({name: torch.nn.Parameter(value.clone()) for name, value in named.items()})
+
+
+def loss_of(dial: Dial, scene: Scene, s: float, view: int = 0) -> Tensor:
+    image = clod.render(dial.differentiable(), scene.train[view].camera, s).image
+    return photometric_loss(image, scene.train[view].image, dial.config.ssim_weight)
+
+
+def test_a_loop_learns(captured: Pair) -> None:
+    """As far as adapt does in as many steps: quality at both ends, and counts near the target."""
+    base, scene = captured
+    splats, steps = trainable(base), 60
+    dial = attach(splats, scene)
+    optimizer = torch.optim.Adam(dial.param_groups(splats=True), eps=1e-15)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, dial.config.lr_final ** (1 / steps))
+    before = clod.evaluate(dial.gaussians(), scene.train, [1, MAX_SV])
+    for step in range(steps):
+        s = dial.sample()
+        dial.loss(s, loss_of(dial, scene, s, step % len(scene.train))).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        schedule.step()
+    after = clod.evaluate(dial.gaussians(), scene.train, [1, MAX_SV])
+    assert after[0].psnr > before[0].psnr + 3 and after[1].psnr > before[1].psnr + 3
+    assert after[0].kept_share == pytest.approx(0.62, abs=0.06) and 0.06 < after[1].kept_share < 0.2
+
+
+@pytest.mark.parametrize("s", [1.0, 2.7, 6.0])
+def test_the_count_term_has_the_gradient_of_training(captured: Pair, s: float) -> None:
+    base, scene = captured
+    dial = attach(base, scene)
+    with torch.no_grad():
+        dial.log_sigma += torch.linspace(-1, 1, len(base))
+    loss, config = torch.tensor(0.3, requires_grad=True), dial.config
+    term = dial.count_loss(s, loss)
+    found, none = torch.autograd.grad(term, [dial.log_sigma, loss], allow_unused=True)
+    given = dial.typical, base.opacity_logits, dial.sigma_d.detach()
+    target = target_share(s, len(base), config)
+    wanted = count_gradient_at(*given, s, dial.attenuation, loss.detach().double(), config, target)
+    assert none is None and wanted.abs().max() > 0
+    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-9)
+    share = attenuate(given[1], given[2], given[0], s, dial.attenuation).keep.double().mean()
+    assert term.item() == pytest.approx(0.3 * config.reg_weight * float(share / target.share - 1) ** 2, rel=1e-5)
+
+
+def test_the_loss_is_the_objective_of_adapt(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All gradients, of the splats too, at one view and dial value."""
+    base, scene = captured
+    splats, s = trainable(base), 2.3
+    dial = attach(splats, scene, seed=3)
+    counted = (COUNTED_BEYOND * MAX_SV) ** np.random.default_rng(3).random(2)[1]  # the first is of the dial values
+    dial.loss(s, loss_of(dial, scene, s)).backward()
+    tuned = ("means", "quats", "log_scales", "sh0")
+    objective = Objective(dial.config, dial.attenuation, tuned, TrainableSubset(len(base)), dial.typical)
+    parameters = {name: getattr(base, name) for name in (*tuned, "opacity_logits", "shN")}
+    parameters |= {"log_sigma": dial.log_sigma.detach(), "growth_d": dial.growth_d.detach()}
+    wanted = objective.gradient_sum(parameters, [Sample(scene.train[0], s, counted)]).gradients
+    names = {"log_scales": "scales", "opacity_logits": "opacities"}
+    for name, gradient in wanted.items():
+        own: Any = getattr(dial, name, None)
+        found = (splats[names.get(name, name)] if own is None else own).grad
+        assert gradient.abs().max() > 0, name
+        torch.testing.assert_close(found, gradient, rtol=1e-3, atol=1e-5 * float(gradient.abs().max()), msg=name)
+
+
+@pytest.mark.parametrize("form", ["gsplat", "columns", "splatfacto"])
+def test_trainers_tensors_are_used_as_they_are(captured: Pair, form: str) -> None:
+    base, scene = captured
+    splats = trainable(base, form)
+    dial = attach(splats, [view.camera for view in scene.train], growth="off")
+    assert torch.equal(dial.log_sigma, attach(base, scene, growth="off").log_sigma)
+    assert [name for name, _ in dial.named_parameters()] == ["log_sigma"] == list(dial.state_dict())
+    loss_of(dial, scene, 2.0).backward()
+    groups = {group["name"]: group["params"][0] for group in dial.param_groups(splats=True)}
+    assert set(groups) == {"log_sigma", *splats}
+    assert all(groups[name] is splats[name] and splats[name].grad is not None for name in splats)
+    for value in dial.gaussians().tensors().values():
+        assert not value.requires_grad
+    assert dial.gaussians().means.data_ptr() == splats["means"].data_ptr()
+    with torch.no_grad():
+        splats["sh0" if "sh0" in splats else "features_dc"] += 1
+    torch.testing.assert_close(dial.gaussians().sh0, base.sh0 + 1)
+
+
+def test_higher_degrees_may_be_missing(captured: Pair) -> None:
+    base, scene = captured
+    flat = base.without_bands(0)
+    named = clod.to_gsplat(flat)
+    del named["shN"]
+    assert torch.equal(attach(named, scene).log_sigma, attach(flat, scene).log_sigma)
+
+
+def test_learning_rates_are_those_of_the_settings(captured: Pair) -> None:
+    base, scene = captured
+    config = AdaptConfig(batch=4, lr_sh0=1.0)
+    rates = {group["name"]: group["lr"] for group in attach(trainable(base), scene, config).param_groups(splats=True)}
+    assert rates["sh0"] == 2 and rates["shN"] == 0 and rates["opacities"] == 2 * config.lr_opacities
+    assert rates["log_sigma"] == 2 * config.lr_sigma and rates["growth_d"] == 2 * config.lr_growth
+    assert len(attach(base, scene).param_groups(splats=True)) == 2  # none of the Gaussians' tensors has a gradient
+
+
+@pytest.mark.parametrize("sampling", ["log", "uniform"])
+def test_dial_values_follow_the_settings(captured: Pair, sampling: str) -> None:
+    dial = attach(*captured, max_sv=4, full_share=0.3, sampling=sampling)
+    drawn = np.array([dial.sample() for _ in range(1000)])
+    others = np.sort(drawn[drawn > 1])
+    assert (drawn == 1).sum() == pytest.approx(300, abs=5) and others[-1] <= 4
+    share = np.log(others) / math.log(4) if sampling == "log" else (others - 1) / 3
+    assert np.abs(share - np.linspace(0, 1, len(share))).max() < 0.02
+
+
+def test_parameters_stay_in_range(captured: Pair) -> None:
+    dial = attach(*captured)
+    with torch.no_grad():
+        dial.log_sigma[0], dial.log_sigma[1] = -100, 100
+        dial.growth_d[0] = 9
+    dial.sample()
+    torch.testing.assert_close(dial.sigma_d[:2], torch.tensor(SIGMA_RANGE))
+    assert dial.growth_d[0].item() == 3
+
+
+def test_the_result_is_saved_in_world_units(captured: Pair, tmp_path: Any) -> None:
+    base, scene = captured
+    dial = attach(base, scene)
+    clod.save(tmp_path / "dial.ply", dial.gaussians())
+    again, camera = clod.load(tmp_path / "dial.ply").gaussians, scene.test[0].camera
+    assert again.attenuation.scene_distance == 1 and again.attenuation.max_sv == MAX_SV
+    assert torch.equal(clod.render(again, camera, 3).kept, dial(camera, 3).keep)
+
+
+def test_one_dial_value_has_no_count_term(captured: Pair) -> None:
+    dial = attach(*captured, max_sv=1)
+    assert float(dial.loss(1.0, torch.tensor(0.5))) == pytest.approx(0.5 * 0.75**2)
+
+
+def test_what_does_not_fit_is_refused(captured: Pair) -> None:
+    base, scene = captured
+    for config in (AdaptConfig.paper(), AdaptConfig(target="cost")):
+        with pytest.raises(ClodError, match="call adapt"):
+            attach(base, scene, config)
+    with pytest.raises(ClodError, match="no training views"):
+        attach(base, [])
+    with pytest.raises(ClodError, match="splats needs quats, scales, opacities, sh0 too, it has means"):
+        attach({"means": base.means}, scene)
+    splats = trainable(base)
+    dial = attach(splats, scene)
+    for name, value in trainable(base[:5]).items():
+        splats[name] = value
+    with pytest.raises(ClodError, match="5 splats now, but the dial is for 300"):
+        dial.loss(1.0, torch.tensor(1.0))
