@@ -1,6 +1,7 @@
 """Time and memory of the commands by the number of Gaussians, and of adapting by the photographs.
 
     python benchmarks/scaling.py            # some 15 minutes, 12 GB of memory, 8 GB of disk; --plot runs nothing
+    python benchmarks/scaling.py --only adapt       # one command over the number of Gaussians, 6 minutes
 
 Runs each command in its own process on synthetic cities, which are kept in benchmarks/cache. Measures wall and CPU
 seconds and resident memory by phase. A city of 1000 Gaussians gives the start-up cost. Rows go to
@@ -56,23 +57,30 @@ timed(pruning_order, g, error.sqrt() * g.opacities)
 def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--plot", action="store_true", help="run nothing")
+    parser.add_argument("--only", choices=RUNS, help="one command, over the number of Gaussians")
     args = parser.parse_args()
     if not args.plot:
-        measure()
+        measure_counts([args.only] if args.only else RUNS)
+        if not args.only:
+            measure_photographs()
     rows = latest()
     scaling_page.draw(rows)
     fill_in(scaling_page.PAGE, "figures", tables(rows))
     fill_in(scaling_page.PAGE, "paper", scaling_page.on_paper(rows))
 
 
-def measure() -> None:
-    """Runs, and appends the rows."""
+def measure_counts(commands: Iterable[str]) -> None:
+    """Runs over the number of Gaussians, and appends the rows."""
     CITIES.mkdir(parents=True, exist_ok=True)
     run_adapt(scene(FLOOR, IMAGES, WIDTH, HEIGHT))  # compiles the kernels
     for count in (FLOOR, *SIZES):
         shape = count, IMAGES, WIDTH, HEIGHT
-        for command, run in RUNS.items():
-            record("count", command, *shape, run(scene(*shape)))
+        for command in commands:
+            record("count", command, *shape, RUNS[command](scene(*shape)))
+
+
+def measure_photographs() -> None:
+    """Runs over the number and the size of photographs, and appends the rows."""
     for images in MANY:
         shape = SERIES_COUNT, images, *SMALL
         record("images", "adapt", *shape, run_adapt(scene(*shape)))

@@ -63,7 +63,7 @@ def run(scene: str, iters: int | None, python: str) -> Row:
 
 
 def latest() -> list[Row]:
-    """The last row of each run, by scene, before ours, by steps."""
+    """The last row of each run, by scene, those before first, by steps."""
     rows = {(row["scene"], not row["before"], row["steps"]): row for row in stored(FILE)}
     return [rows[key] for key in sorted(rows)]
 

@@ -6,16 +6,21 @@ import argparse
 import json
 import sys
 from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+from clod_adapter._support.text import as_text
 from clod_adapter._support.version import package_version
 from clod_adapter.cameras import Camera
+from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.poses import load_cameras
 from clod_adapter.progress import Stopped
 from clod_adapter.viewer.page import policy, served_page
 from clod_adapter.viewer.payload import Payload, page_config
 from clod_adapter.viewer.server import Response, Server
 
+from .commands.view import view_files
 from .shared.antialiasing import with_filter, with_filter_of
 from .shared.browsers import open_browser
 from .shared.budgets import solve_dials
@@ -47,7 +52,11 @@ def run(args: argparse.Namespace) -> None:
 
 def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Response], dict[str, Any]]:
     """The answers of the server by path, and the report."""
-    model, base = with_filter(read_checkpoint(args.model, console, args.activated), args, console), None
+    files, base = view_files(args.models), None
+    model = with_filter(read_checkpoint(files[0], console, args.activated), args, console)
+    others = [
+        with_filter(read_checkpoint(file, console, args.activated, model.origin), args, console) for file in files[1:]
+    ]
     if args.base:
         base = with_filter(read_checkpoint(args.base, console, args.activated, model.origin), args, console)
         base = with_filter_of(base, model, args)
@@ -59,13 +68,24 @@ def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Res
     notes += [*asked, *more]
     for note in notes:
         console.note(note)
-    payloads = {MODEL: Payload.of(model)} | ({BASE: Payload.of(base)} if base else {})
-    entries = [payload.describe(href=path) for path, payload in payloads.items()]
-    page = served_page(page_config(entries[0], entries[1] if base else None, cameras, opening))
+    payloads = payloads_of([model, *others]) | ({BASE: Payload.of(base)} if base else {})
+    entries = {path: payload.describe(href=path) for path, payload in payloads.items()}
+    model_entry, base_entry = entries.pop(MODEL), entries.pop(BASE, None)
+    page = served_page(page_config(model_entry, base_entry, cameras, opening, tuple(entries.values())))
     answers = {"/": Response("text/html; charset=utf-8", len(page), lambda: (page,), policy("'self'"))}
     for path, payload in payloads.items():
         answers[path] = Response("application/octet-stream", payload.size, payload.blocks)
     return answers, {
-        "command": "view", "version": package_version(), "model": args.model, "base": args.base, "scene": args.images,
-        "base_count": len(model.gaussians), "cameras": len(cameras), "notes": [*model.notes, *notes],
+        "command": "view", "version": package_version(), "model": files[0], "files": files, "base": args.base,
+        "scene": args.images, "base_count": len(model.gaussians), "cameras": len(cameras),
+        "notes": [*model.notes, *notes],
     }  # fmt: skip
+
+
+def payloads_of(models: list[Checkpoint]) -> dict[str, Payload]:
+    """The models by path; of two files with the same name, the names have their folders."""
+    payloads = [Payload.of(model) for model in models]
+    if len({payload.name for payload in payloads}) < len(payloads):
+        names = [as_text("/".join(Path(model.path).absolute().parts[-2:])) for model in models]
+        payloads = [replace(payload, name=name) for payload, name in zip(payloads, names, strict=True)]
+    return {f"/files/{number}" if number else MODEL: payload for number, payload in enumerate(payloads)}

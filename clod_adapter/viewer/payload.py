@@ -83,7 +83,11 @@ class Payload:
 
 
 def page_config(
-    model: Mapping[str, Any], base: Mapping[str, Any] | None, cameras: Sequence[Camera], virtual_scale: float
+    model: Mapping[str, Any],
+    base: Mapping[str, Any] | None,
+    cameras: Sequence[Camera],
+    virtual_scale: float,
+    others: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
     """The page's configuration.
 
@@ -91,10 +95,11 @@ def page_config(
         model, base: from ``Payload.describe``.
         cameras: selectable viewpoints, in this order, in the frame of the Gaussians.
         virtual_scale: the initial dial value, >= 1.
+        others: further models to switch to, from ``Payload.describe``.
     """
     return {
         "version": package_version(), "title": model["name"], "model": model, "base": base,
-        "cameras": [_camera(camera) for camera in cameras], "virtual_scale": virtual_scale,
+        "others": list(others), "cameras": [_camera(camera) for camera in cameras], "virtual_scale": virtual_scale,
     }  # fmt: skip
 
 

@@ -16,7 +16,9 @@ import pytest
 
 import clod_adapter
 from clod_adapter.cli import view
+from clod_adapter.cli.commands import view as view_command
 from clod_adapter.cli.main import build_parser, main
+from clod_adapter.errors import ClodError
 
 
 def fetch(url: str) -> bytes:
@@ -111,3 +113,29 @@ def test_program_in_browser_variable_is_opened(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setenv("BROWSER", "lynx")
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("lynx"))
     assert not view.open_browser("http://127.0.0.1:1/")
+
+
+def test_a_folder_and_several_files(capture: Any, dialled: Path, tmp_path: Path) -> None:
+    """A folder's splats by name, numbers by value, without what is none; files with the same name by their folder."""
+    for name in ("lod10.ply", "lod2.ply"):
+        (tmp_path / name).write_bytes(dialled.read_bytes())
+    (tmp_path / "points.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more" / "lod2.ply").write_bytes(capture.ply.read_bytes())
+    words = ["view", str(tmp_path), str(tmp_path / "more" / "lod2.ply")]
+    args = build_parser("view").parse_args(words[1:])
+    view_command.VIEW.check(args)
+    answers, report = view.make_page(args, view.Console(True))
+    (config,) = re.findall(r'id="clod-config">(.*?)</script>', b"".join(answers["/"].blocks()).decode(), re.DOTALL)
+    config = json.loads(config)
+    entries = [config["model"], *config["others"]]
+    folder = tmp_path.name
+    assert [entry["name"] for entry in entries] == [f"{folder}/lod2.ply", f"{folder}/lod10.ply", "more/lod2.ply"]
+    assert [entry["max_sv"] > 1 for entry in entries] == [True, True, False]
+    for entry in entries:
+        (tmp_path / "served.ply").write_bytes(b"".join(answers[entry["href"]].blocks()))
+        assert len(clod_adapter.load(tmp_path / "served.ply").gaussians) == entry["count"]
+    assert report["model"].endswith("lod2.ply") and len(report["files"]) == 3
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ClodError, match="empty: has no splat in it"):
+        view_command.VIEW.check(build_parser("view").parse_args([str(tmp_path / "empty")]))

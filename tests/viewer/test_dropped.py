@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
@@ -117,6 +118,66 @@ def test_no_growth_and_exponents_of_0_are_the_same_picture(shown: Shown, gaussia
         drop_file(shown, tmp_path / "a.ply", 4.0)
         pictures.append(shown.picture())
     assert np.array_equal(*pictures)
+
+
+def with_columns(path: Path, **columns: np.ndarray) -> Path:
+    """The file with further columns, as another trainer writes it: without our comments."""
+    rows = PlyData.read(str(path), mmap=False)["vertex"].data
+    wider = np.empty(len(rows), rows.dtype.descr + [(name, "<f4") for name in columns])
+    for name in wider.dtype.names or ():
+        wider[name] = columns[name] if name in columns else rows[name]
+    PlyData([PlyElement.describe(wider, "vertex")], byte_order="<").write(str(path))
+    return path
+
+
+def test_masks_and_filters_of_other_trainers(
+    shown: Shown, save: Any, plain: Gaussians, artefacts: Path, tmp_path: Path
+) -> None:
+    """MaskGaussian's masks and Mip-Splatting's filter, as ``load`` reads them; each is named in a note.
+
+    The Gaussians are smaller than a pixel, so that Mip-Splatting's screen-space filter differs from the classic one.
+    """
+    small = plain.replace(log_scales=plain.log_scales - 3.0)
+    filters = np.linspace(0, 0.005, 400, dtype=np.float32)
+    filters[7] = np.nan
+    masks = {"masks_0": np.linspace(-1, 1, 400, dtype=np.float32), "masks_1": np.zeros(400, np.float32)}
+    masks["masks_0"][300] = np.inf
+    for name, columns, kept, note in (
+        ("filter.ply", {"filter_3D": filters}, 399, "filter_3D is fused"),
+        ("masks.ply", masks, 199, "200 of 400 Gaussians are masked out"),
+    ):
+        path = with_columns(save(small, name), **columns)
+        found = clod_adapter.load(path).gaussians
+        assert len(found) == kept
+        drop_file(shown, path, 1.0)
+        assert_same(shown, render(found, CAMERA), artefacts / f"{name}.png")
+        with pytest.raises(AssertionError):
+            assert_same(shown, render(small, CAMERA), artefacts / "not_read.png")
+        shown.page.reload()
+        shown.run("clod.ready")
+        drop(shown, path.name, path.read_bytes())
+        shown.until(f"document.title === '{name}'")
+        assert note in str(shown.page.text_content("#target-note"))
+
+
+@pytest.mark.parametrize("kind", ["dial", "growth, mip", "plain"])
+def test_glb(shown: Shown, gaussians: Gaussians, plain: Gaussians, artefacts: Path, tmp_path: Path, kind: str) -> None:
+    """With the dial, its settings and the screen-space filter; a plain one has no dial."""
+    pytest.importorskip("pygltflib")
+    model = {"dial": gaussians, "plain": plain}.get(kind, gaussians)
+    if kind == "growth, mip":
+        settings = replace(gaussians.attenuation, reference_distance=1.5, max_sv=6.0)
+        growth_d, small = torch.linspace(-1, 1, 400), gaussians.log_scales - 2.0
+        model = model.replace(growth_d=growth_d, attenuation=settings, log_scales=small, screen_filter=FILTERS["mip"])
+    path = tmp_path / "model.glb"
+    write(path, model)
+    drop_file(shown, path, 1.0 if kind == "plain" else 4.0)
+    assert shown.page.is_enabled("#dial") == (kind != "plain")
+    assert_same(shown, render(model, CAMERA, 1.0 if kind == "plain" else 4.0), artefacts / f"glb_{kind[:4]}.png")
+    drop(shown, "cut.glb", path.read_bytes()[:-100])
+    assert "truncated" in message(shown, "cut.glb")
+    drop(shown, "mesh.glb", path.read_bytes().replace(b"KHR_gaussian_splatting", b"KHR_gaussian_splatters"))
+    assert "mesh" in message(shown, "mesh.glb")
 
 
 def test_a_damaged_file_is_an_error_and_the_picture_stays(shown: Shown, model: Path) -> None:

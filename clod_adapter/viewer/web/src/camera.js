@@ -1,7 +1,7 @@
 // A pinhole camera in OpenCV axes, as in clod_adapter/cameras.py, that orbits and flies.
 import { add, cross, dot, row, rotated, unit } from "./vector.js";
 
-const DEFAULT_FOV = (50 * Math.PI) / 180; // across the shorter side, without a configured camera
+const DEFAULT_FOV = (50 * Math.PI) / 180; // without a configured camera
 const NEAR = 0.01; // depth of the near plane, world units, as in clod_adapter/cameras.py
 const MAX_PITCH = 0.995; // of |forward . up|: orbiting stops before it looks straight up or down
 
@@ -10,15 +10,16 @@ export function createCamera() {
     rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], // rows: right, down, forward, in world axes
     eye: [0, 0, 0], up: [0, -1, 0], distance: 1, // distance: from the eye to the pivot, the point ahead that orbiting rotates about
     near: NEAR,
-    fov: DEFAULT_FOV, // across the canvas's shorter side, radians
+    fov: DEFAULT_FOV, aspect: 1, // of the picture that the canvas shows in full: across its shorter side, radians; width over height
+    panel: [0, 0], // shares of the canvas that the panel covers from the left and from the bottom, with what is beside it
     intrinsics: null, // {fx, fy, cx, cy, width, height} of a camera to reproduce exactly, until the view moves
 
     /** The view that the renderer and the worker take, for a canvas of this size in pixels. */
     view(width, height) {
       const { rotation, eye, near, intrinsics } = camera;
       if (intrinsics) return { rotation: [...rotation], eye: [...eye], near, ...intrinsics };
-      const f = Math.min(width, height) / 2 / Math.tan(camera.fov / 2);
-      return { rotation: [...rotation], eye: [...eye], near, fx: f, fy: f, cx: width / 2, cy: height / 2, width, height };
+      const { side, cx, cy } = placed(camera.aspect, width, height, camera.panel), f = side / 2 / Math.tan(camera.fov / 2);
+      return { rotation: [...rotation], eye: [...eye], near, fx: f, fy: f, cx, cy, width, height };
     },
 
     /** Takes pose and intrinsics of a camera of the configuration. */
@@ -30,6 +31,32 @@ export function createCamera() {
       camera.intrinsics = { fx: K[0][0], fy: K[1][1], cx: K[0][2], cy: K[1][2], width, height };
       const [side, f] = width < height ? [width, K[0][0]] : [height, K[1][1]];
       camera.fov = 2 * Math.atan(side / 2 / f);
+      camera.aspect = width / height;
+    },
+
+    /** Pose and field of view, as an animation takes them (motion.js). */
+    get pose() {
+      const { rotation, eye, fov, aspect, distance } = camera;
+      return { forward: row(rotation, 2), down: row(rotation, 1), eye, fov, aspect, distance };
+    },
+    set pose({ forward, down, ...rest }) {
+      const ahead = unit(forward), right = unit(cross(down, ahead));
+      Object.assign(camera, rest, { rotation: [...right, ...cross(ahead, right), ...ahead], intrinsics: null });
+    },
+
+    /** The pose that looks at `point` from the same place. */
+    lookingAt(point) {
+      const ray = add(point, camera.eye, -1), forward = unit(ray), level = cross(forward, camera.up);
+      const right = Math.hypot(...level) > 1e-3 ? unit(level) : row(camera.rotation, 0);
+      return { ...camera.pose, forward, down: cross(forward, right), distance: Math.hypot(...ray) };
+    },
+
+    /** Sets the axis that orbiting rotates about, and levels the view. */
+    setUp(up) {
+      camera.up = unit(up);
+      const pivot = add(camera.eye, row(camera.rotation, 2), camera.distance), before = row(camera.rotation, 2);
+      const climb = dot(before, camera.up), forward = climb > -MAX_PITCH && climb < 0.5 ? before : lookingDown(camera.up);
+      camera.place(add(pivot, forward, -camera.distance), forward);
     },
 
     /** Puts the camera at `eye` with its axis along the unit vector `forward`. */
@@ -66,26 +93,40 @@ export function createCamera() {
       camera.distance = distance;
     },
 
-    /** Shows the first of `cameras`, with the pivot where they look and their mean up vector; without cameras, the Gaussians. */
-    fit(extent, cameras) {
+    /** Shows the first of `cameras`, with the pivot where they look; without cameras, all Gaussians of the extent. */
+    fit(extent, cameras, up) {
       const { centre, radius } = extent;
+      camera.up = up;
       if (cameras.length) {
-        const ups = cameras.map(({ viewmat }) => viewmat[1].slice(0, 3));
-        const up = ups.reduce((sum, down) => add(sum, down, -1), [0, 0, 0]);
-        if (Math.hypot(...up) > 1e-3 * cameras.length) camera.up = unit(up);
         camera.set(cameras[0]);
         camera.distance = focusDistance(cameras) ?? Math.max(dot(row(camera.rotation, 2), add(centre, camera.eye, -1)), 0.1 * radius);
         return;
       }
-      camera.up = [0, -1, 0]; // COLMAP's y axis points down
       camera.near = Math.min(NEAR, 1e-3 * radius);
-      camera.fov = DEFAULT_FOV;
-      camera.distance = (1.1 * radius) / Math.tan(DEFAULT_FOV / 2);
-      const forward = unit([0, 0.25, 1]);
+      [camera.fov, camera.aspect] = [DEFAULT_FOV, 1];
+      camera.distance = radius / Math.sin(DEFAULT_FOV / 2);
+      const forward = lookingDown(up);
       camera.place(add(centre, forward, -camera.distance), forward);
     },
   };
   return camera;
+}
+
+/** The shorter side and the centre of a picture in a canvas, the largest that the panel does not hide: in the middle, else
+ *  in the part to the right of the panel or in that above it. */
+function placed(aspect, width, height, [left, bottom]) {
+  const within = (w, h) => ({ side: Math.min(w / Math.max(aspect, 1), h * Math.min(aspect, 1)), cx: width - w / 2, cy: h / 2 });
+  const middle = within(width, height), { side } = middle;
+  const hidden = width - side * Math.max(aspect, 1) < 2 * left * width && height - side / Math.min(aspect, 1) < 2 * bottom * height;
+  if (!hidden) return middle;
+  const [beside, above] = [within(width * (1 - left), height), within(width, height * (1 - bottom))];
+  return beside.side > above.side ? beside : above;
+}
+
+/** Along the z axis, or y where z is up, and slightly down. */
+function lookingDown(up) {
+  const axis = Math.abs(up[2]) < 0.9 ? [0, 0, 1] : [0, 1, 0];
+  return unit(add(unit(add(axis, up, -dot(axis, up))), up, -0.25));
 }
 
 /** Depth in the first camera of the point nearest to all axes (least squares); null where there is none in front of it. */

@@ -1,6 +1,7 @@
 // Pointer, wheel, touch and keys on the canvas, which orbit or fly the camera.
 
 const ROTATION = 0.005; // radians per pixel
+const SLIP = 6, DOUBLE = 350; // pixels and milliseconds: a press that moves less is no drag; two presses within are a double click
 const MIN_PRESS = 1 / 30; // seconds that a key press counts for at least
 const KEYS = { // right, down, forward
   w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], pageup: [0, -1, 0], pagedown: [0, 1, 0],
@@ -8,17 +9,21 @@ const KEYS = { // right, down, forward
 const ZOOMS = { "+": -1, "=": -1, "-": 1 };
 const ARROWS = { arrowleft: [-1, 0], arrowright: [1, 0], arrowup: [0, -1], arrowdown: [0, 1] };
 
-/** Calls `onMove()` after every change of the camera. Returns the mode, {flying}. */
-export function createControls(canvas, camera, onMove) {
+const apart = (a, b) => Math.hypot(a.x - b.x, a.y - b.y);
+
+/** Calls `onMove()` after every change of the camera, and `onDouble(x, y)` after a double click or tap, in shares of the
+ *  canvas's size. Returns the mode, {flying}. */
+export function createControls(canvas, camera, onMove, onDouble) {
   const mode = { flying: false };
   const pointers = new Map(), pressed = new Map(); // keys by code, because Shift changes event.key
-  let last = 0, fast = false;
+  let last = 0, fast = false, press = null, tap = null; // the pointer's last press; the last release without a drag
 
   function drag(event) {
     const before = pointers.get(event.pointerId);
     if (!before) return;
     const now = { x: event.clientX, y: event.clientY, button: before.button };
     const dx = now.x - before.x, dy = now.y - before.y;
+    if (!dx && !dy) return;
     if (pointers.size === 2) pinch(event.pointerId, before, now);
     else if (before.button === 0 && !event.shiftKey) rotate(dx, dy);
     else pan(dx, dy);
@@ -30,7 +35,7 @@ export function createControls(canvas, camera, onMove) {
   const rotate = (dx, dy) => camera.rotate(-dx * ROTATION, -dy * ROTATION, !mode.flying);
 
   function pan(dx, dy) {
-    const pixel = (2 * camera.distance * Math.tan(camera.fov / 2)) / Math.min(canvas.clientWidth, canvas.clientHeight);
+    const pixel = camera.distance / camera.view(canvas.clientWidth, canvas.clientHeight).fx;
     camera.move(-dx * pixel, -dy * pixel, 0);
   }
 
@@ -70,9 +75,17 @@ export function createControls(canvas, camera, onMove) {
     target === canvas || target === document.body || (key.length === 1 && !target.closest("input[type=text], select, dialog"));
 
   canvas.addEventListener("pointerdown", (event) => {
+    canvas.classList.add("pointed"); // no focus ring until the focus comes by the keyboard
     canvas.focus({ preventScroll: true });
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, button: event.button });
+    press = pointers.size === 1 && event.button === 0 ? { x: event.clientX, y: event.clientY } : null;
+  });
+  canvas.addEventListener("pointerup", (event) => {
+    const now = { x: event.clientX, y: event.clientY, time: performance.now() };
+    const isTap = press && apart(press, now) < SLIP, isDouble = isTap && tap && now.time - tap.time < DOUBLE && apart(tap, now) < 3 * SLIP;
+    tap = isTap && !isDouble ? now : null;
+    if (isDouble) onDouble(now.x / canvas.clientWidth, now.y / canvas.clientHeight);
   });
   canvas.addEventListener("pointermove", drag);
   for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => pointers.delete(event.pointerId));
@@ -98,5 +111,6 @@ export function createControls(canvas, camera, onMove) {
   });
   document.addEventListener("keyup", (event) => pressed.delete(event.code));
   for (const target of [canvas, window]) target.addEventListener("blur", () => pressed.clear());
+  canvas.addEventListener("blur", () => canvas.classList.remove("pointed"));
   return mode;
 }

@@ -1,15 +1,19 @@
 // The view as the fragment of a link: #eye=..&axes=..&fov=..&distance=..&dial=..&equation=off&wipe=..&other=..
-// eye: position, world units. axes: right and down, unit vectors. fov: radians across the shorter side. distance: to the
-// pivot, world units. wipe: share of the width. other: a dial value or "base".
+// eye: position, world units. axes: right and down, unit vectors. fov: radians across the shorter side of the picture, and
+// its width over height. distance: to the
+// pivot, world units. up: the axis, if one was chosen. file: its number, from 1.
+// wipe: share of the width. other: a dial value or "base".
 
 const digits = (values) => values.map((value) => Number(value.toPrecision(7))).join(",");
 
-export function writeLink(camera, state) {
+export function writeLink(camera, state, up, file) {
   const [right, down] = [camera.rotation.slice(0, 3), camera.rotation.slice(3, 6)];
   const parts = {
-    eye: digits(camera.eye), axes: digits([...right, ...down]), fov: digits([camera.fov]), distance: digits([camera.distance]),
+    eye: digits(camera.eye), axes: digits([...right, ...down]), fov: digits([camera.fov, camera.aspect]), distance: digits([camera.distance]),
     dial: digits([state.dial]),
   };
+  if (up) parts.up = up;
+  if (file) parts.file = file + 1;
   if (!state.equation) parts.equation = "off";
   if (state.wipe !== null) {
     parts.wipe = digits([state.wipe]);
@@ -28,12 +32,13 @@ export function readLink(hash) {
     return parts.has(name) && values.length === count && values.every(Number.isFinite) ? values : null;
   };
   const axes = numbers("axes", 6);
-  const [fov] = numbers("fov", 1) ?? [null], [distance] = numbers("distance", 1) ?? [null];
+  const [fov, aspect] = numbers("fov", 2) ?? [numbers("fov", 1)?.[0] ?? null, 1], [distance] = numbers("distance", 1) ?? [null];
   return {
     eye: numbers("eye", 3), rotation: axes && orthonormal(axes.slice(0, 3), axes.slice(3)),
-    fov: fov > 0.01 && fov < 3 ? fov : null, distance: distance > 0 ? distance : null,
+    fov: fov > 0.01 && fov < 3 ? fov : null, aspect: aspect > 0.01 && aspect < 100 ? aspect : 1, distance: distance > 0 ? distance : null,
     dial: numbers("dial", 1)?.[0] ?? null, equation: parts.get("equation") !== "off",
     wipe: numbers("wipe", 1)?.[0] ?? null, other: numbers("other", 1)?.[0] ?? "base",
+    up: numbers("up", 3), file: (numbers("file", 1)?.[0] ?? 1) - 1,
   };
 }
 

@@ -2,10 +2,13 @@
 import { WIDTH, dataTexture, heightOf, maxTexels } from "./gpu.js";
 import { half } from "./half.js";
 import { SH_TEXELS } from "./shaders.js";
+import { upOfPoints } from "./up.js";
+import { add } from "./vector.js";
 import workerSource from "worker:./worker.js";
 
 const SH_C0 = 0.28209479177387814;
 const RECORD_TEXELS = 4;
+const VISIBLE = 3.4; // standard deviations to alpha 1/255
 
 /** `metadata`: name, attenuation or null, screen_filter, no_dial, max_sv, calibration. `gaussians`: from a reader in formats/. */
 export function createModel(gl, gaussians, metadata) {
@@ -71,16 +74,22 @@ function fillSh(target, { count, degree, shN }, texels) {
   }
 }
 
-/** {centre, radius} of the bulk of the Gaussians: the median of their means; the distance from it that contains 80 % of
- *  a sample, and at least three times the median size. */
-function extentOf({ means, logScales }) {
-  const step = Math.max(Math.floor(means.length / 3 / 20000), 1), axes = [[], [], []];
-  for (let i = 0; i < means.length / 3; i += step) for (let k = 0; k < 3; k++) axes[k].push(means[3 * i + k]);
-  const centre = axes.map((axis) => Float64Array.from(axis).sort()[axis.length >> 1]);
-  const distances = Float64Array.from(axes[0], (x, i) => Math.hypot(x - centre[0], axes[1][i] - centre[1], axes[2][i] - centre[2]));
-  const sizes = Float64Array.from(axes[0], (_, i) => Math.exp(Math.max(...logScales.subarray(3 * step * i, 3 * step * i + 3))));
-  const radius = Math.max(distances.sort()[Math.floor(0.8 * distances.length)], 3 * sizes.sort()[sizes.length >> 1]);
-  return { centre, radius: Math.min(Math.max(radius, 1e-6), 1e30) };
+/** {centre, radius, up} of a sample: a ball that contains its Gaussians, and the up axis. Where more than 2 % of them are
+ *  beyond twice the radius that contains 80 %, a background, it is the ball of these about the median. */
+function extentOf({ means, logScales, up }) {
+  const step = Math.max(Math.floor(means.length / 3 / 20000), 1), points = [], sizes = [];
+  for (let at = 0; at < means.length; at += 3 * step) {
+    points.push([means[at], means[at + 1], means[at + 2]]);
+    sizes.push(VISIBLE * Math.exp(Math.max(logScales[at], logScales[at + 1], logScales[at + 2])));
+  }
+  const reachesFrom = (centre) => Float64Array.from(points, (point, i) => Math.hypot(...add(point, centre, -1)) + sizes[i]);
+  const median = [0, 1, 2].map((k) => Float64Array.from(points, (point) => point[k]).sort()[points.length >> 1]);
+  const reaches = reachesFrom(median), sorted = reaches.slice().sort();
+  const bulk = sorted[Math.floor(0.8 * sorted.length)], bounded = sorted[Math.floor(0.98 * sorted.length)] < 2 * bulk;
+  const inside = points.filter((_, i) => reaches[i] <= (bounded ? 2 : 1) * bulk), bounds = [0, 1, 2].map((k) => inside.map((point) => point[k]));
+  const centre = bounded ? bounds.map((values) => (values.reduce((a, b) => Math.min(a, b)) + values.reduce((a, b) => Math.max(a, b))) / 2) : median;
+  const radius = bounded ? reachesFrom(centre).filter((_, i) => reaches[i] <= 2 * bulk).reduce((a, b) => Math.max(a, b)) : bulk;
+  return { centre, radius: Math.min(Math.max(radius, 1e-6), 1e30), up: up ?? upOfPoints(inside) };
 }
 
 function startWorker() {

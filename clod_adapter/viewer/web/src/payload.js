@@ -6,7 +6,7 @@ import { inflate } from "./formats/zip.js";
 /** The page's configuration; a page without one starts empty, as a viewer for dropped files. */
 export function readConfig() {
   const element = document.getElementById("clod-config");
-  return { title: "", model: null, base: null, cameras: [], virtual_scale: 1, ...(element ? JSON.parse(element.textContent) : {}) };
+  return { title: "", model: null, base: null, others: [], cameras: [], virtual_scale: 1, ...(element ? JSON.parse(element.textContent) : {}) };
 }
 
 /** {gaussians, metadata} of the configuration's `model` or `base`; calls `onProgress(fraction)` during the transfer. */
@@ -30,28 +30,28 @@ export async function fetchModel(entry, onProgress) {
 
 /** Bytes from the same origin (`href`), or from base64 in the elements with the id `element`, which are then removed. */
 async function bytesOf({ href, element, gzip }, onProgress) {
-  if (href) {
-    const response = await fetch(href);
-    if (!response.ok) throw new Error(`the server answered ${response.status} ${response.statusText}`);
-    return readBody(response, onProgress);
-  }
+  if (href) return download(href, onProgress);
   const elements = [...document.querySelectorAll(`[id="${element}"]`)];
   if (!elements.length) throw new Error("the page does not contain its data; export the page again");
   const data = new Blob(elements.map(takeBytes));
   return gzip ? (await inflate(data, "gzip")).buffer : data.arrayBuffer();
 }
 
-async function readBody(response, onProgress) {
-  const size = Number(response.headers.get("Content-Length"));
-  if (!size || response.headers.has("Content-Encoding")) return response.arrayBuffer();
-  const bytes = new Uint8Array(size), reader = response.body.getReader();
-  let at = 0;
-  for (let { done, value } = await reader.read(); !done; { done, value } = await reader.read()) {
-    bytes.set(value, at);
-    at += value.length;
-    onProgress(at / size);
-  }
-  return bytes.buffer;
+/** By XMLHttpRequest: where a script reads the body of a fetch as a stream, for its progress, Chromium reports some of the
+ *  complete requests as aborted. */
+function download(href, onProgress = () => {}) {
+  return new Promise((resolve, reject) => {
+    const request = new XMLHttpRequest();
+    request.open("GET", href);
+    request.responseType = "arraybuffer";
+    request.onprogress = ({ lengthComputable, loaded, total }) => lengthComputable && onProgress(loaded / total);
+    request.onerror = () => reject(new Error("the server does not answer; start clod-adapt view again"));
+    request.onload = () => {
+      if (request.status === 200) resolve(request.response);
+      else reject(new Error(`the server answered ${request.status} ${request.statusText}`));
+    };
+    request.send();
+  });
 }
 
 /** Removes the element, for its memory, and decodes its text. */

@@ -17,7 +17,6 @@ export function createRenderer(canvas) {
   function resize(view) {
     if (view.width === width && view.height === height) return;
     ({ width, height } = view);
-    [canvas.width, canvas.height] = [width, height];
     gl.deleteTexture(image.texture);
     gl.deleteFramebuffer(image.target);
     image.texture = halfFloat
@@ -41,7 +40,7 @@ export function createRenderer(canvas) {
     return projectors.get(degree);
   }
 
-  function project(side, view) {
+  function project(side, view, depthUnit = 0) {
     const { model } = side, { handle, uniforms: u } = projector(model.degree);
     resizeProjected(heightOf(model.count));
     gl.bindFramebuffer(gl.FRAMEBUFFER, projected.target);
@@ -56,6 +55,8 @@ export function createRenderer(canvas) {
     gl.uniform1f(u.blur, model.screen_filter.variance);
     gl.uniform1i(u.compensate, model.screen_filter.compensate);
     gl.uniform1i(u.attenuated, side.attenuated);
+    gl.uniform1i(u.marks, side.marks);
+    gl.uniform1f(u.depth_unit, depthUnit);
     if (side.attenuated) {
       gl.uniform1f(u.dial, side.dial);
       gl.uniform1f(u.distance_unit, side.distance);
@@ -100,9 +101,24 @@ export function createRenderer(canvas) {
       gl.deleteTexture(side.order);
       side.order = null;
     },
-    /** Draws each side in its range [from, to] of the image's width, in [0, 1], and shows the image. */
-    draw(sides, view) {
+    /** The depth at a pixel, the mean over the Gaussians there by their share of the picture; null where there is none. */
+    depthAt(side, view, x, y, depthUnit) {
       resize(view);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, image.target);
+      gl.clearColor(0, 0, 0, 0);
+      gl.clear(gl.COLOR_BUFFER_BIT);
+      project(side, view, depthUnit);
+      blend(side, view);
+      const pixel = halfFloat ? new Float32Array(4) : new Uint8Array(4);
+      gl.readPixels(x, height - 1 - y, 1, 1, gl.RGBA, halfFloat ? gl.FLOAT : gl.UNSIGNED_BYTE, pixel);
+      const share = pixel[0] / pixel[3];
+      return pixel[3] > (halfFloat ? 0.1 : 25) && share < 1 ? (share * depthUnit) / (1 - share) : null;
+    },
+    /** Draws each side in its range [from, to] of the image's width, in [0, 1], and shows the image in the canvas, or in
+     *  `target`, {framebuffer, transparent} of a headset, `at` [x, y]. */
+    draw(sides, view, target = null, at = [0, 0]) {
+      resize(view);
+      if (!target && (canvas.width !== width || canvas.height !== height)) [canvas.width, canvas.height] = [width, height];
       gl.bindFramebuffer(gl.FRAMEBUFFER, image.target);
       gl.clearColor(0, 0, 0, 0);
       gl.clear(gl.COLOR_BUFFER_BIT);
@@ -111,9 +127,11 @@ export function createRenderer(canvas) {
         project(side, view);
         blend(side, view);
       }
-      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-      gl.viewport(0, 0, width, height);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, target?.framebuffer ?? null);
+      gl.viewport(...at, width, height);
       gl.useProgram(copy.handle);
+      gl.uniform2i(copy.uniforms.offset, ...at);
+      gl.uniform1i(copy.uniforms.transparent, target?.transparent ?? false);
       bindTextures(gl, copy.uniforms, { image: image.texture });
       gl.bindVertexArray(empty);
       gl.drawArrays(gl.TRIANGLES, 0, 3);

@@ -7,11 +7,11 @@ const SLOW = 50, FAST = 25; // ms per frame, above and below which the resolutio
 const IDLE = 180; // ms without motion, until a frame at full resolution
 
 export function createStage(renderer, canvas, camera) {
-  const state = { dial: 1, equation: true, wipe: null, other: "base" };
+  const state = { dial: 1, equation: true, marks: false, wipe: null, other: "base", steady: false }; // steady: full resolution in motion
   const listeners = { frame: () => {}, held: () => {}, error: () => {} };
   let main = makeSide(), second = makeSide(), model = null, base = null;
   let version = 0, drawnVersion = -1, resolution = 1, lastMotion = -Infinity, idleTimer = 0, frame = 0, frameMs = null;
-  let timing = false, warmedUp = false, newOrder = false, skipped = false, hold = null;
+  let timing = false, warmedUp = false, newOrder = false, skipped = false, hold = null, eyes = null;
   const callbacks = []; // of whenDrawn
 
   function makeSide() {
@@ -38,7 +38,7 @@ export function createStage(renderer, canvas, camera) {
   function change({ moving = false } = {}) {
     version++;
     hold?.wake();
-    if (moving) {
+    if (moving && !state.steady) {
       lastMotion = performance.now();
       clearTimeout(idleTimer);
       idleTimer = setTimeout(() => resolution < 1 && change(), IDLE + 20);
@@ -55,7 +55,7 @@ export function createStage(renderer, canvas, camera) {
 
   async function draw() {
     frame = 0;
-    if (!model || renderer.gl.isContextLost()) return;
+    if (eyes || !model || renderer.gl.isContextLost()) return;
     const current = version, view = camera.view(...size()), shown = sides();
     for (const each of shown) requestOrder(each, view, current);
     if (shown.some(({ side, model: of }) => side.sortedVersion < 0 || side.model !== of)) return; // never sorted yet
@@ -65,12 +65,7 @@ export function createStage(renderer, canvas, camera) {
     const complete = shown.every(({ side }) => side.sortedVersion === current);
     if (!complete && !newOrder && performance.now() - lastMotion > IDLE) return;
     newOrder = false;
-    shown.forEach(({ side, dial, equation, model: of }, k) => {
-      side.dial = dial;
-      side.attenuated = equation && of.attenuation !== null;
-      side.from = k === 0 ? 0 : state.wipe;
-      side.to = shown.length === 1 || k === 1 ? 1 : state.wipe;
-    });
+    shown.forEach(prepare);
     const render = () => renderer.draw(shown.map(({ side }) => side), view);
     if (timing) render();
     else measure(render);
@@ -79,6 +74,13 @@ export function createStage(renderer, canvas, camera) {
       if (isDrawn()) for (const resolve of callbacks.splice(0)) resolve();
     }
     listeners.frame();
+  }
+
+  function prepare({ side, dial, equation, model: of }, k, { length }) {
+    const attenuated = equation && of.attenuation !== null;
+    Object.assign(side, { dial, attenuated, marks: state.marks && attenuated });
+    side.from = k === 0 ? 0 : state.wipe;
+    side.to = length === 1 || k === 1 ? 1 : state.wipe;
   }
 
   async function measure(render) {
@@ -126,7 +128,7 @@ export function createStage(renderer, canvas, camera) {
     if (side.busy || (side.sortedVersion === current && side.model === of)) return;
     side.busy = true;
     try {
-      await of.order({ view, dial, equation }, ({ rows, drawn: count, kept, distance }) => {
+      await of.order({ view, dial, equation, marks: state.marks }, ({ rows, drawn: count, kept, distance }) => {
         if (of.destroyed) return;
         if (side.model !== of) renderer.release(side);
         Object.assign(side, { model: of, sortedVersion: current, kept, distance });
@@ -143,7 +145,7 @@ export function createStage(renderer, canvas, camera) {
   return {
     state, listeners, change,
     show(next, nextBase) {
-      for (const old of [model, base]) if (old) { old.destroyed = true; old.destroy(); }
+      for (const old of [model, base]) if (old && old !== nextBase) { old.destroyed = true; old.destroy(); }
       [model, base] = [next, nextBase];
       for (const side of [main, second]) renderer.release(side);
       [main, second] = [makeSide(), makeSide()]; // the old ones may wait for a worker that has ended
@@ -164,6 +166,31 @@ export function createStage(renderer, canvas, camera) {
     otherCounts: () => (state.wipe === null ? null : { total: second.model?.count ?? 0, kept: second.kept }),
     /** Resolves once the current state is drawn, and a held frame rate has settled. */
     whenDrawn: () => (isDrawn() || !model ? Promise.resolve() : new Promise((resolve) => { callbacks.push(resolve); schedule(); })),
+    /** The point under a position of the canvas, in shares of its size; null where nothing is. */
+    pick(x, y) {
+      if (main.model !== model || !model) return null;
+      const view = camera.view(...size()), { rotation: r } = view;
+      const column = Math.min(Math.floor(x * view.width), view.width - 1), line = Math.min(Math.floor(y * view.height), view.height - 1);
+      const depth = renderer.depthAt({ ...main, marks: false, from: 0, to: 1 }, view, column, line, camera.distance);
+      if (depth === null) return null;
+      const across = [(column + 0.5 - view.cx) / view.fx, (line + 0.5 - view.cy) / view.fy, 1];
+      return [0, 1, 2].map((k) => view.eye[k] + depth * (across[0] * r[k] + across[1] * r[3 + k] + r[6 + k]));
+    },
+    /** Draws the model for the eyes of a headset, [{view, at}], culled and sorted for the view `head`, in place of the
+     *  canvas until `endEyes`. */
+    drawEyes(head, views, target) {
+      eyes = views;
+      version++;
+      const shown = { side: main, model, dial: state.dial, equation: state.equation };
+      requestOrder(shown, head, version);
+      if (main.sortedVersion < 0 || main.model !== model) return;
+      prepare(shown, 0, [shown]);
+      for (const { view, at } of views) renderer.draw([main], view, target, at);
+    },
+    endEyes() {
+      eyes = null;
+      change();
+    },
     /** Ends the lower resolution during motion at once. */
     endMotion() {
       if (performance.now() - lastMotion >= IDLE) return;

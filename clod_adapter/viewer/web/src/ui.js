@@ -28,9 +28,10 @@ export function createUi(elements, stage, actions) {
   function update() {
     const { model } = stage, hasDial = Boolean(model?.attenuation), mode = comparison();
     for (const control of [elements.dial, elements.rate, elements.hold, elements.target, elements.equation]) control.disabled = !hasDial;
-    for (const control of [elements.reset, elements.link, elements.move]) control.disabled = !model;
+    for (const control of [elements.reset, elements.move, elements.menuOpen]) control.disabled = !model;
     elements.compare.disabled = !hasDial && !stage.base;
-    elements.compare.options[1].textContent = stage.base ? "with the base" : "without the equation";
+    elements.compare.options[1].textContent = stage.base ? "with the base" : "without the dial";
+    elements.target.placeholder = hasDial ? `e.g. ${integer(Math.ceil(model.count / 2))}` : "";
     elements.noDial.hidden = !model || hasDial;
     elements.noDial.textContent = model?.no_dial ?? "";
     setSlider(elements.dial, elements.dialValue, hasDial ? state.dial : null);
@@ -58,8 +59,8 @@ export function createUi(elements, stage, actions) {
     const psnr = model?.attenuation && state.equation ? interpolatePsnr(model.calibration, state.dial) : null;
     elements.quality.textContent = psnr === null ? "" : `${psnr.toFixed(1)} dB`;
     if (!other) return;
-    const left = !model.attenuation ? model.name : state.equation ? formatDial(state.dial) : "equation off";
-    const right = state.other === "base" ? (stage.base ? "base" : "equation off") : state.equation ? formatDial(state.other) : "equation off";
+    const left = !model.attenuation ? model.name : state.equation ? formatDial(state.dial) : "dial off";
+    const right = state.other === "base" ? (stage.base ? "base" : "dial off") : state.equation ? formatDial(state.other) : "dial off";
     elements.wipeLeft.textContent = `${left} · ${integer(kept)}`;
     elements.wipeRight.textContent = `${right} · ${integer(other.kept)}`;
   }
@@ -77,13 +78,11 @@ export function createUi(elements, stage, actions) {
   elements.compare.addEventListener("change", () => actions.compare(elements.compare.value));
   elements.target.addEventListener("change", () => actions.setTarget(elements.target.value));
   elements.target.addEventListener("keydown", (event) => event.key === "Enter" && actions.setTarget(elements.target.value)); // change does not fire for the same text
+  elements.files.addEventListener("change", () => actions.showFile(elements.files.selectedIndex));
   elements.camera.addEventListener("change", () => actions.goTo(elements.camera.selectedIndex));
   elements.move.addEventListener("click", actions.toggleFlying);
   elements.reset.addEventListener("click", actions.reset);
-  elements.link.addEventListener("click", actions.copyLink);
   elements.open.addEventListener("click", () => elements.file.click());
-  elements.full.hidden = !document.fullscreenEnabled; // false on iPhones
-  elements.full.addEventListener("click", actions.fullScreen);
   elements.helpOpen.addEventListener("click", () => elements.help.showModal());
   elements.fold.addEventListener("click", toggleControls);
   elements.dismiss.addEventListener("click", () => { elements.message.hidden = true; });
@@ -96,17 +95,26 @@ export function createUi(elements, stage, actions) {
   function toggleControls() {
     elements.more.hidden = !elements.more.hidden;
     elements.fold.setAttribute("aria-expanded", !elements.more.hidden);
+    actions.layOut();
   }
-  if (window.matchMedia("(max-width: 34rem), (max-height: 28rem)").matches) toggleControls();
+  if (window.matchMedia("(max-width: 34rem), (max-height: 28rem)").matches) {
+    elements.more.hidden = true;
+    elements.fold.setAttribute("aria-expanded", false);
+  }
 
   const keys = {
     r: () => elements.hold.disabled || holdRate(!stage.holds),
     e: () => elements.equation.disabled || actions.setEquation(!state.equation),
     c: () => elements.compare.disabled || actions.compare({ off: "base", base: stage.model?.attenuation ? "dial" : "off", dial: "off" }[comparison()]),
-    v: () => elements.move.disabled || actions.toggleFlying(), l: () => elements.link.disabled || actions.copyLink(), f: actions.fullScreen, m: toggleControls, 0: () => elements.reset.disabled || actions.reset(),
+    v: () => elements.move.disabled || actions.toggleFlying(), f: actions.fullScreen, m: toggleControls, 0: () => elements.reset.disabled || actions.reset(),
     o: () => elements.file.click(), n: () => actions.nextCamera(1), p: () => actions.nextCamera(-1),
     "[": () => stepDial(-20), "]": () => stepDial(20), "?": () => elements.help.showModal(),
-    h: () => { elements.panel.hidden = !elements.panel.hidden; },
+    h: () => {
+      elements.panel.hidden = !elements.panel.hidden;
+      actions.layOut();
+    },
+    l: () => stage.model && actions.copyLink(), k: () => elements.marks.disabled || actions.setMarks(!state.marks),
+    " ": () => stage.model && actions.play(), t: () => stage.model && actions.turntable(), x: () => stage.model && actions.savePicture(),
   };
   const stepDial = (ticks) => {
     if (stage.model?.attenuation) actions.setDial(toDial(Math.min(Math.max(toTick(state.dial, maxDial()) + ticks, 0), TICKS), maxDial()));
@@ -114,8 +122,8 @@ export function createUi(elements, stage, actions) {
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || elements.help.open) return;
     if (event.repeat && !"[]".includes(event.key)) return;
-    if (event.target.matches("input[type=text], select")) return;
-    const action = keys[event.key.toLowerCase()];
+    if (event.target.matches("input[type=text], select") || (event.key === " " && event.target.matches("button, input"))) return;
+    const action = keys[event.key.toLowerCase()] ?? (/^[1-9]$/.test(event.key) ? () => actions.showFile(event.key - 1) : null);
     if (!action) return;
     event.preventDefault();
     action();
@@ -127,6 +135,15 @@ export function createUi(elements, stage, actions) {
     showMessage(text) {
       elements.message.hidden = !text;
       elements.message.firstElementChild.textContent = text ?? "";
+    },
+    /** Shows the name of the file, or its number in the list where there are several; null for one that is not listed. */
+    showName(name, number, names = []) {
+      document.title = elements.title.textContent = name;
+      if (names.length) elements.files.replaceChildren(...names.map((each) => new Option(each)));
+      const listed = elements.files.length > 1;
+      [elements.files.hidden, elements.filesHelp.hidden] = [!listed, !listed];
+      elements.title.hidden = listed && number !== null;
+      elements.files.selectedIndex = number ?? -1;
     },
     /** Lists the cameras by name. */
     listCameras(cameras) {

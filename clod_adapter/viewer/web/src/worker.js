@@ -14,11 +14,11 @@ const jobs = {
   },
 
   /** Writes the rows to draw, farthest first, into the buffer `rows`, which is transferred in both directions. */
-  order({ view, dial, equation, rows }) {
+  order({ view, dial, equation, marks, rows }) {
     const on = equation && attenuation !== null;
     const distance = on ? normalizingDistance(means, view, attenuation) : 1;
     const order = new Uint32Array(rows);
-    const [kept, drawn] = cullAndSort(order, view, on ? { dial, distance } : null);
+    const [kept, drawn] = cullAndSort(order, view, on ? { dial, distance } : null, marks);
     return [{ rows, kept, drawn, distance }, [rows]];
   },
 
@@ -30,8 +30,8 @@ const jobs = {
 };
 
 /** Fills `order` with the kept rows in front of the camera, farthest first; returns the counts of kept and of drawn
- *  Gaussians. `attenuated`: {dial, distance}; null keeps all. */
-function cullAndSort(order, { rotation: r, eye, near }, attenuated) {
+ *  Gaussians. `attenuated`: {dial, distance}; null keeps all. With `marks` the culled ones are in the order too. */
+function cullAndSort(order, { rotation: r, eye, near }, attenuated, marks) {
   const [ex, ey, ez] = eye;
   const k = attenuated ? (attenuated.dial / attenuated.distance) ** 2 : 0;
   const threshold = attenuated ? Math.log(attenuation.tau * attenuated.dial) : 0;
@@ -39,8 +39,9 @@ function cullAndSort(order, { rotation: r, eye, near }, attenuated) {
   let kept = 0, drawn = 0;
   for (let i = 0, at = 0; at < means.length; i++, at += 3) {
     const x = means[at] - ex, y = means[at + 1] - ey, z = means[at + 2] - ez;
-    if (attenuated && !(prepared.logA[i] - k * (x * x + y * y + z * z) * prepared.inverse[i] > threshold)) continue;
-    kept++;
+    const culled = attenuated && !(prepared.logA[i] - k * (x * x + y * y + z * z) * prepared.inverse[i] > threshold);
+    if (culled && !marks) continue;
+    if (!culled) kept++;
     depth[0] = r[6] * x + r[7] * y + r[8] * z;
     if (!(depth[0] >= near)) continue;
     keys[drawn] = ~bits[0]; // positive floats have the order of their bits

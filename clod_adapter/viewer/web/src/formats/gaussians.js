@@ -25,18 +25,28 @@ export function smallestThree(largest, three) {
   return [...three.slice(0, largest), rest, ...three.slice(largest)];
 }
 
+function removals(masked, invalid, count) {
+  const notes = masked ? [`${masked} of ${count} Gaussians are masked out by MaskGaussian and were removed`] : [];
+  return invalid ? [...notes, `${invalid} of ${count} Gaussians cannot be drawn and were removed`] : notes;
+}
+
 /** Removes the rows that cannot be drawn: with a non-finite value, or a zero quaternion (io/ply/rows.py). */
 export function removeInvalid(gaussians) {
-  const { count, means, quats, logScales, opacityLogits, sh0, shN, coefficients } = gaussians;
+  const { count, means, quats, logScales, opacityLogits, sh0, shN, coefficients, exists } = gaussians;
   const finite = (array, size, i) => {
     for (let k = size * i; k < size * (i + 1); k++) if (!Number.isFinite(array[k])) return false;
     return true;
   };
+  let masked = 0;
   const keep = [], dial = Object.values(DIAL).filter((name) => gaussians[name]);
   for (let i = 0; i < count; i++) {
+    if (exists && exists[i] === 0) {
+      masked++;
+      continue;
+    }
     const rotated = quats[4 * i] || quats[4 * i + 1] || quats[4 * i + 2] || quats[4 * i + 3];
     const opaque = Number.isFinite(opacityLogits[i]) || opacityLogits[i] === Infinity;
-    if (rotated && opaque && finite(means, 3, i) && finite(quats, 4, i) && finite(logScales, 3, i) && finite(sh0, 3, i)
+    if (rotated && opaque && !(exists && Number.isNaN(exists[i])) && finite(means, 3, i) && finite(quats, 4, i) && finite(logScales, 3, i) && finite(sh0, 3, i)
       && finite(shN, 3 * coefficients, i) && dial.every((name) => Number.isFinite(gaussians[name][i]))) keep.push(i);
   }
   if (!keep.length) throw new Error("no Gaussian in it can be drawn: values are not finite or rotations are 0; export it again");
@@ -50,6 +60,6 @@ export function removeInvalid(gaussians) {
     ...gaussians, count: keep.length, means: pick(means, 3), quats: pick(quats, 4), logScales: pick(logScales, 3),
     opacityLogits: pick(opacityLogits, 1), sh0: pick(sh0, 3), shN: pick(shN, 3 * coefficients),
     ...Object.fromEntries(dial.map((name) => [name, pick(gaussians[name], 1)])),
-    notes: [...gaussians.notes, `${count - keep.length} of ${count} Gaussians cannot be drawn and were removed`],
+    notes: [...gaussians.notes, ...removals(masked, count - keep.length - masked, count)],
   };
 }

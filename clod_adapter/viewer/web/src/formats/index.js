@@ -1,6 +1,7 @@
 // Selects the reader of a file by its first bytes, and collects its metadata.
 import { isCompressed, readCompressed } from "./compressed.js";
 import { removeInvalid } from "./gaussians.js";
+import { readGlb } from "./glb.js";
 import { readHeader, readPly } from "./ply.js";
 import { readCalibration, readScreenFilter, readSettings } from "./settings.js";
 import { readSog } from "./sog.js";
@@ -18,10 +19,10 @@ export async function readFile(buffer, name) {
   return {
     gaussians,
     metadata: {
-      name, attenuation: settings, screen_filter: gaussians.screenFilter ?? readScreenFilter(gaussians.comments, hasDial, gaussians.constants),
+      name, attenuation: settings, screen_filter: gaussians.screenFilter ?? readScreenFilter(gaussians, hasDial),
       max_sv: settings?.max_sv ?? 1, notes: gaussians.notes,
       no_dial: hasDial ? null : noDial(name),
-      calibration: readCalibration(gaussians.comments, gaussians.count),
+      calibration: gaussians.calibration ?? readCalibration(gaussians.comments, gaussians.count),
     },
   };
 }
@@ -41,7 +42,8 @@ async function readGaussians(bytes, name) {
   }
   if (magic.startsWith("\x1f\x8b")) return readSpz(await inflate(bytes, "gzip"));
   if (magic === "NGSP") throw new Error("it is .spz of version 4, which this page does not read; export it as version 3 or as .ply");
+  if (magic === "glTF") return readGlb(bytes);
   if (magic.startsWith("PK")) return readSog(bytes);
   if (/\.splat$/i.test(name) && bytes.length % 32 === 0) return readSplat(bytes); // .splat has no magic number
-  throw new Error("it is not a splat in a format that this page reads; open a .ply, .compressed.ply, .sog, .spz or .splat file");
+  throw new Error("it is not a splat in a format that this page reads; open a .ply, .compressed.ply, .sog, .spz, .glb or .splat file");
 }

@@ -60,7 +60,42 @@ export function readPly(bytes, header) {
     }
     gaussians.constants = constantsOf(vertex, columns);
   }
-  return gaussians;
+  if (has("masks_0") && has("masks_1")) readMasks(gaussians, read);
+  return has("filter_3D") ? fuseFilter(gaussians, read) : gaussians;
+}
+
+/** Marks the rows that MaskGaussian leaves out, existence probability sigmoid(masks_0 - masks_1) < 0.5 (io/ply/rows.py). */
+function readMasks(gaussians, read) {
+  const masks = new Float32Array(2 * gaussians.count);
+  for (let k = 0; k < 2; k++) read(masks, 2, k, `masks_${k}`);
+  // 0: left out; NaN: a mask is not finite
+  gaussians.exists = Float32Array.from({ length: gaussians.count }, (_, i) => {
+    const [there, absent] = [masks[2 * i], masks[2 * i + 1]];
+    return there < absent ? 0 : Number.isFinite(there) && Number.isFinite(absent) ? 1 : NaN;
+  });
+}
+
+/** Applies Mip-Splatting's filter f: scales sqrt(s^2 + f^2), opacity a sqrt(det(s^2) / det(s^2 + f^2)) (io/ply/values.py). */
+function fuseFilter(gaussians, read) {
+  const { count, logScales, opacityLogits } = gaussians, filter = new Float32Array(count);
+  read(filter, 1, 0, "filter_3D");
+  for (let i = 0; i < count; i++) {
+    const size = 2 * Math.log(Math.abs(filter[i]));
+    let shrink = 0;
+    for (let k = 3 * i; k < 3 * i + 3; k++) {
+      const scale = 2 * logScales[k], high = Math.max(scale, size);
+      const wider = high === -Infinity || Number.isNaN(high) ? high : 0.5 * (high + Math.log1p(Math.exp(Math.min(scale, size) - high)));
+      shrink += logScales[k] - wider;
+      logScales[k] = wider;
+    }
+    if (shrink === 0) continue; // unfiltered
+    const logit = opacityLogits[i], logOpacity = shrink - Math.max(-logit, 0) - Math.log1p(Math.exp(-Math.abs(logit)));
+    opacityLogits[i] = logOpacity < 0 ? logOpacity - Math.log(-Math.expm1(logOpacity)) : Infinity;
+  }
+  return {
+    ...gaussians, impliedFilter: { variance: 0.1, compensate: true },
+    notes: [...gaussians.notes, "Mip-Splatting's filter_3D is fused into scale and opacity"],
+  };
 }
 
 /** The value of each clod_* column, which is the same in all rows (io/ply/constants.py). */

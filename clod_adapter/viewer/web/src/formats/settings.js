@@ -47,7 +47,7 @@ function shortest(value) {
 }
 
 /** The screen-space filter from comments, ours or another program's, or from columns; as in io/screen_filter.py. */
-export function readScreenFilter(comments, hasDial, { clod_screen_variance, clod_compensate } = {}) {
+export function readScreenFilter({ comments, constants: { clod_screen_variance, clod_compensate } = {}, impliedFilter }, hasDial) {
   const written = entries(comments).findLast(([name]) => name === "screen_filter")?.[1];
   if (written) {
     const [, variance, compensate] = /^(\S+) (True|False)$/.exec(written) ?? [];
@@ -58,6 +58,7 @@ export function readScreenFilter(comments, hasDial, { clod_screen_variance, clod
     return { variance: clod_screen_variance === undefined ? 0.3 : shortest(clod_screen_variance), compensate: Boolean(clod_compensate) };
   }
   // A dial was trained with the default filter, unless the file names another.
+  if (impliedFilter && !hasDial) return impliedFilter;
   const compensate = !hasDial && comments.some((comment) => /^\s*(splatrendermode:\s*mip|antialiased 1)\s*$/i.test(comment));
   return { variance: compensate && comments.includes("Exported from Brush") ? 0.1 : 0.3, compensate };
 }

@@ -1,0 +1,87 @@
+// The files that the page shows: those of its server or its own, and dropped ones.
+import { readFile } from "./formats/index.js";
+import { fetchModel } from "./payload.js";
+
+/** `show(model, base, cameras, dial)` shows another scene, `replace(model)` another model of the same, `update()` a changed
+ *  state (main.js). */
+export function createFiles(elements, viewer, config, { show, replace, update, clampDial }) {
+  let loadCount = 0;
+
+  const fetchNamed = (entry) => {
+    const onProgress = (fraction) => viewer.ui.showProgress(`Loading ${entry.name}: ${Math.floor(100 * fraction)} %`);
+    return fetchModel(entry, onProgress).catch((error) => { throw new Error(`${entry.name}: ${error.message}`); });
+  };
+
+  /** Shows another file, from a buffer or a promise of one; of concurrent calls, the last. If reading fails, the page shows
+   *  an error and keeps the previous file. */
+  async function load(buffer, name) {
+    const { ui, stage } = viewer, number = ++loadCount;
+    ui.showProgress(`Reading ${name}`);
+    try {
+      const read = await readFile(await buffer, name);
+      if (number !== loadCount) return;
+      show(read, null, [], 1);
+      ui.showNote(read.metadata.notes.join("; "));
+      viewer.file = null;
+      ui.showName(name, null);
+      ui.showMessage(null);
+      await stage.whenDrawn();
+    } catch (error) {
+      const message = `${name}: ${error.message}`;
+      if (number === loadCount) ui.showMessage(message);
+      throw new Error(message);
+    } finally {
+      if (number === loadCount) ui.showProgress(null);
+    }
+  }
+
+  function openFile(file) {
+    const refuse = () => { throw new Error("the browser cannot read it: it is a folder or too large"); };
+    return load(file.arrayBuffer().catch(refuse), file.name).catch(() => {});
+  }
+
+  function listenForFiles() {
+    const showTarget = (on) => { elements.drop.hidden = !on; };
+    window.addEventListener("dragover", (event) => { event.preventDefault(); showTarget(true); });
+    window.addEventListener("dragleave", (event) => { if (!event.relatedTarget) showTarget(false); });
+    window.addEventListener("drop", (event) => {
+      event.preventDefault();
+      showTarget(false);
+      const [file] = event.dataTransfer.files;
+      if (file) openFile(file);
+    });
+  }
+
+  listenForFiles();
+  return {
+    load, openFile,
+    /** Shows the configured file, unless another one was dropped meanwhile; resolves with whether it did. */
+    async open() {
+      const [model, base] = await Promise.all([config.model, config.base].map((entry) => entry && fetchNamed(entry)));
+      if (loadCount) return false;
+      show(model, base, config.cameras, config.virtual_scale);
+      return true;
+    },
+    /** Shows another of the files, from the same view and at the same dial value. */
+    async showFile(number) {
+      const entry = viewer.files[number], { stage, ui } = viewer, fromDropped = viewer.file === null;
+      if (!entry || !stage.model) return;
+      const count = ++loadCount;
+      try {
+        const [read, base] = await Promise.all([entry, fromDropped && config.base].map((each) => each && fetchNamed(each)));
+        if (count !== loadCount) return;
+        if (fromDropped) show(read, base, config.cameras, config.virtual_scale);
+        else replace(read);
+        viewer.file = number;
+        ui.showName(entry.name, number);
+        if (stage.model.attenuation) stage.state.dial = clampDial(stage.state.dial);
+        update();
+        await stage.whenDrawn();
+      } catch (error) {
+        ui.showMessage(error.message);
+      } finally {
+        if (count === loadCount) ui.showProgress(null);
+      }
+    },
+  };
+}
