@@ -1,14 +1,16 @@
-"""gsplat 1.5.3's own ``rasterization`` without CUDA: its Python as it stands, torch in place of its five kernels.
+"""gsplat's own ``rasterization`` and ``rasterization_2dgs`` without CUDA: its Python, with torch for its kernels.
 
-Slow: for a few dozen Gaussians on a few tiles. It follows the kernels: rows of an opacity below 1/255 are dropped
-in the projection and narrow by their opacity, packed rows, tiles and keys are in the kernels' order, and what the
-packed kernels cannot do (a background, gsplat's issue 764) is refused.
+Slow: for a few dozen Gaussians on a few tiles. It follows the kernels of the installed version, 1.4.0 or 1.5.3: where
+the projection has opacities, rows below 1/255 are dropped in it and narrow by their opacity; packed rows, tiles and
+keys are in the kernels' order, and what the packed kernels cannot do (a background, gsplat's issue 764) is refused.
 """
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import math
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -27,27 +29,39 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
     def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
         return _torch_impl._spherical_harmonics(degree, dirs, coeffs)
 
-    for module in (rendering, gsplat):
-        for function in (fully_fused_projection, isect_tiles, rasterize_to_pixels, spherical_harmonics):
-            monkeypatch.setattr(module, function.__name__, function)
-        monkeypatch.setattr(module, "isect_offset_encode", _torch_impl._isect_offset_encode)
+    by_opacity = "opacities" in inspect.signature(gsplat.fully_fused_projection).parameters
+    replaced: dict[str, Any] = {
+        "fully_fused_projection": fully_fused_projection if by_opacity else projection_without_opacities,
+        "fully_fused_projection_2dgs": projection_2dgs,
+        "isect_tiles": isect_tiles,
+        "isect_offset_encode": _torch_impl._isect_offset_encode,
+        "rasterize_to_pixels": rasterize_to_pixels,
+        "rasterize_to_pixels_2dgs": pixels_2dgs,
+        "spherical_harmonics": spherical_harmonics,
+    }
+    for name, function in replaced.items():
+        monkeypatch.setattr(function, "__signature__", inspect.signature(getattr(gsplat, name)), raising=False)
+        for module in (rendering, gsplat):
+            monkeypatch.setattr(module, name, function)
+    monkeypatch.setattr(rendering, "torch", _OnCpu("torch"))
+
+
+class _OnCpu(ModuleType):
+    """torch, with the one device that gsplat's ``rasterization_2dgs`` has written into it left out."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(torch, name)
+
+    @staticmethod
+    def zeros_like(like: Tensor, device: Any = None, **options: Any) -> Tensor:
+        return torch.zeros_like(like, **options)
 
 
 def fully_fused_projection(
     means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, *, eps2d: float, packed: bool, near_plane: float, far_plane: float, radius_clip: float,
-    sparse_grad: bool, calc_compensations: bool, camera_model: str, opacities: Tensor,
+    width: int, height: int, *, packed: bool, opacities: Tensor, **options: Any,
 ) -> tuple[Any, ...]:  # fmt: skip
-    from gsplat.cuda import _torch_impl
-
-    if covars is None:
-        quats = quats / quats.norm(dim=-1, keepdim=True)  # as the kernel: of any length, and NaN where it is 0
-        covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
-    else:
-        covars = covars[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))  # from the upper triangle
-    radii, *values, compensations = _torch_impl._fully_fused_projection(
-        means, covars, viewmats, Ks, width, height, eps2d, near_plane, far_plane, calc_compensations, camera_model
-    )
+    radii, *values, compensations = _projection(means, covars, quats, scales, viewmats, Ks, width, height, **options)
     shown = opacities[..., None, :] * (1 if compensations is None else compensations)
     narrower = (2 * (shown / ALPHA_MIN).clamp(min=1).log()).sqrt() / 3.33
     radii = torch.ceil(radii * narrower.clamp(max=1)[..., None]).int() * (shown >= ALPHA_MIN)[..., None].int()
@@ -59,13 +73,47 @@ def fully_fused_projection(
     return *ids, *rows, None if compensations is None else compensations.reshape(flat.shape[:3])[ids]
 
 
+def projection_without_opacities(
+    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, *, packed: bool, **options: Any,
+) -> tuple[Any, ...]:  # fmt: skip
+    """gsplat 1.4.0's: one radius for both directions, no batches."""
+    found = _projection(means, covars, quats, scales, viewmats, Ks, width, height, **options)
+    if not packed:
+        return found
+    ids = torch.nonzero(found[0] > 0, as_tuple=True)
+    return *ids, *(None if value is None else value[ids] for value in found)
+
+
+def _projection(
+    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, *, eps2d: float, near_plane: float, far_plane: float, radius_clip: float,
+    sparse_grad: bool, calc_compensations: bool, camera_model: str,
+) -> tuple[Any, ...]:  # fmt: skip
+    from gsplat.cuda import _torch_impl
+
+    if covars is None:
+        assert quats is not None
+        quats = quats / quats.norm(dim=-1, keepdim=True)  # as the kernel: of any length, and NaN where it is 0
+        covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
+    else:
+        covars = covars[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))  # from the upper triangle
+    return _torch_impl._fully_fused_projection(
+        means, covars, viewmats, Ks, width, height, eps2d, near_plane, far_plane, calc_compensations, camera_model
+    )  # type: ignore[no-any-return]
+
+
 @torch.no_grad()
 def isect_tiles(
     means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int, *,
-    segmented: bool, packed: bool, n_images: int, image_ids: Tensor | None, gaussian_ids: Tensor | None,
+    packed: bool, gaussian_ids: Tensor | None, segmented: bool = False, n_images: int = 0, n_cameras: int = 0,
+    image_ids: Tensor | None = None, camera_ids: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    image_ids = camera_ids if image_ids is None else image_ids
     if image_ids is None:
-        image_ids = torch.arange(n_images, device=depths.device).repeat_interleave(means2d.shape[-2])
+        image_ids = torch.arange(n_images or n_cameras, device=depths.device).repeat_interleave(means2d.shape[-2])
+    if radii.dim() == depths.dim():
+        radii = radii[..., None].expand(*radii.shape, 2)
     centre, reach, depth = means2d.reshape(-1, 2) / tile_size, radii.reshape(-1, 2) / tile_size, depths.flatten()
     most = torch.tensor([tile_width, tile_height], device=depths.device)
     low = torch.floor(centre - reach).long().clamp(min=torch.zeros_like(most), max=most)
@@ -104,13 +152,64 @@ def rasterize_to_pixels(
     return drawn.unflatten(0, images), alphas.unflatten(0, images)
 
 
+def projection_2dgs(
+    means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int, eps2d: float,
+    near_plane: float, far_plane: float, radius_clip: float, packed: bool, sparse_grad: bool,
+) -> tuple[Tensor, ...]:  # fmt: skip
+    """Opacities play no part, as in the kernel."""
+    from gsplat.cuda import _torch_impl_2dgs
+
+    assert not packed, "rows of 2DGS are not packed here"
+    quats = quats / quats.norm(dim=-1, keepdim=True)
+    found = _torch_impl_2dgs._fully_fused_projection_2dgs(
+        means, quats, scales, viewmats, Ks, width, height, near_plane, far_plane
+    )
+    return found  # type: ignore[no-any-return]
+
+
+def pixels_2dgs(
+    means2d: Tensor, ray_transforms: Tensor, colors: Tensor, opacities: Tensor, normals: Tensor, densify: Tensor,
+    width: int, height: int, tile_size: int, isect_offsets: Tensor, flatten_ids: Tensor, *, backgrounds: Tensor | None,
+    packed: bool, absgrad: bool, distloss: bool,
+) -> tuple[Tensor, ...]:  # fmt: skip
+    """Every Gaussian with a tile, in order of the first: exact where Gaussians do not overlap differently by tile."""
+    images, n = means2d.shape[:-2], means2d.shape[-2]
+    centres = (means2d + densify).reshape(-1, n, 2)
+    if absgrad:
+        means2d.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient.abs()))
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    values = torch.cat([colors.expand(*images, n, -1), normals], -1).reshape(len(centres), n, -1)
+    drawn = []
+    for image, transforms in enumerate(ray_transforms.reshape(-1, n, 3, 3)):
+        ids = flatten_ids[flatten_ids // n == image].long().unique() - image * n
+        ids = ids[transforms[ids, 2, 2].argsort()]  # by depth
+        rays, shown = transforms[ids], opacities.reshape(-1, n)[image, ids]
+        across = torch.cross(
+            rays[:, 2] * x[..., None, None] - rays[:, 0], rays[:, 2] * y[..., None, None] - rays[:, 1], dim=-1
+        )
+        local = (across[..., :2] / across[..., 2:]).square().sum(-1)
+        flat = 2 * ((x[..., None] - centres[image, ids, 0]) ** 2 + (y[..., None] - centres[image, ids, 1]) ** 2)
+        weights = _weights(shown * torch.exp(-0.5 * torch.minimum(local, flat)))
+        drawn.append(torch.cat([weights @ values[image, ids], weights.sum(-1, keepdim=True)], -1))
+    canvas = torch.stack(drawn).unflatten(0, images)
+    image, normal, alphas = canvas[..., :-4], canvas[..., -4:-1], canvas[..., -1:]
+    if backgrounds is not None:
+        image = image + (1 - alphas) * backgrounds[..., None, None, :]
+    return image, alphas, normal, 0 * alphas, 0.5 * alphas
+
+
 def _blend(table: list[Tensor], x: Tensor, y: Tensor) -> Tensor:
     """Colours and alpha ``[H, W, D + 1]`` of Gaussians in order of depth."""
     centres, conics, opacities, colors = table
     dx, dy = x[..., None] - centres[:, 0], y[..., None] - centres[:, 1]
     a, b, c = conics.unbind(-1)
-    alpha = (opacities * torch.exp(-(0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy))).clamp(max=ALPHA_MAX)
+    weights = _weights(opacities * torch.exp(-(0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy)))
+    return torch.cat([weights @ colors, weights.sum(-1, keepdim=True)], -1)
+
+
+def _weights(alpha: Tensor) -> Tensor:
+    """Weights of blending ``[..., N]`` from opacities at each pixel, in order of depth."""
+    alpha = alpha.clamp(max=ALPHA_MAX)
     alpha = alpha * (alpha >= ALPHA_MIN)
     after = torch.cumprod(1 - alpha, -1)
-    weights = alpha * torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], -1) * (after > TRANSMITTANCE_MIN)
-    return torch.cat([weights @ colors, weights.sum(-1, keepdim=True)], -1)
+    return alpha * torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], -1) * (after > TRANSMITTANCE_MIN)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 import gsplat_in_torch
-from clod_adapter import Gaussians, evaluate, render
+from clod_adapter import Gaussians, attach, evaluate, from_gsplat, render, to_gsplat
 from clod_adapter.adapter import detach
 from clod_adapter.alignment.check import check_alignment
 from clod_adapter.bake import bake, order_by_extinction
@@ -242,3 +242,24 @@ def test_dial_and_adam_do_not_synchronize_with_the_device(monkeypatch: pytest.Mo
         optimizer._step_plain(gradients, dialled.keep, {"means": 0.1, "sigma": 0.1})
     with pytest.raises(AssertionError, match="waits"), Silent():
         own.means[dialled.keep]
+
+
+def test_a_dial_of_ones_own_loop(setup: Setup) -> None:
+    """Its parameters are where the splats are; loss and gradients match the CPU's."""
+    grown = []
+    for model in (setup.there, setup.own):
+        splats = torch.nn.ParameterDict({n: torch.nn.Parameter(x.clone()) for n, x in to_gsplat(model).items()})
+        dialled = attach(from_gsplat(splats), setup.cameras, CONFIG)
+        groups = dialled.param_groups(splats=True)
+        assert len(groups) == 8 and all(each["params"][0].device == model.means.device for each in groups)
+        view, s = setup.scene.train[0], dialled.sample()
+        shown = render(dialled.differentiable(), view.camera, 2.0).image
+        loss = dialled.loss(2.0, photometric_loss(shown, view.image.to(model.means.device)))
+        loss.backward()
+        found = [each["params"][0].grad.cpu() for each in groups if each["name"] in ("log_sigma", "opacity_logits")]
+        grown.append((s, loss.detach().cpu(), found))
+        assert dialled(view.camera, 2.0).drawn.device == dialled.gaussians().sigma_d.device == model.means.device
+    (s, loss, found), (want_s, want, slopes) = grown
+    assert s == want_s and float(loss) == pytest.approx(float(want), rel=1e-2) and len(found) == 2
+    for mine, own in zip(found, slopes, strict=True):
+        assert float((mine - own).norm()) <= 2e-2 * float(own.norm())

@@ -34,7 +34,7 @@ ORDER: list[set[str]] = [
     {"io.formats"},
     {"io.adapter_file"},
     {"alignment", "report", "training", "viewer"},
-    {"blocks", "demo", "evaluation", "inspection"},
+    {"blocks", "demo", "evaluation", "inspection", "nerfstudio"},
     {""},  # the package itself, whose __init__ re-exports from the rows above
     {"cli.shared"},
     {"cli.commands"},

@@ -15,7 +15,7 @@ from ..shared.dials import add_dial_options, given_budget
 from ..shared.outputs import check_outputs
 from .checks import check_checkpoint, check_dials, check_scene, model_has_dial
 from .command import Command
-from .export_formats import FORMATS, LOD_META, PACKED, PAGE, format_table, level_paths, suffix_of, suffixes
+from .export_formats import FORMATS, LOD_META, PACKED, PAGE, TILESET, format_table, level_paths, suffix_of, suffixes
 from .options import add_activated, add_antialiasing, add_device
 
 DIGITS = 6  # significant digits of a level, all of them in its file's name
@@ -53,6 +53,10 @@ def export_options(parser: ArgumentParser) -> None:
         help="write the levels as one streaming set for PlayCanvas's viewers, in the new folder OUT",
     )  # fmt: skip
     output.add_argument(
+        "--3dtiles", dest="tiles", action="store_true",
+        help="write the levels as one 3D Tiles set for CesiumJS and iTwin, in the new folder OUT",
+    )  # fmt: skip
+    output.add_argument(
         "--order", choices=["extinction"],
         help="sort the Gaussians by the dial value at which they are culled, latest first, for prefix rendering",
     )  # fmt: skip
@@ -76,10 +80,15 @@ def check_export(args: Namespace) -> None:
         raise ClodError(f"{args.model}: has no sigma_d, so no dial value can be baked; export it without one")
     if args.order and not dial:
         raise ClodError(f"{args.model}: has no sigma_d to order its Gaussians by; adapt it first")
-    if not args.lod_meta:
+    if folder_option(args) is None:
         check_format(args, bakes, dial)
-    if args.lod_meta or args.pack or suffix_of(Path(args.out)) in PACKED:
+    if args.lod_meta or args.pack or (not args.tiles and suffix_of(Path(args.out)) in PACKED):
         SplatTransform.find()
+
+
+def folder_option(args: Namespace) -> str | None:
+    """The option with which OUT is a folder of levels."""
+    return "--lod-meta" if args.lod_meta else "--3dtiles" if args.tiles else None
 
 
 def measured_budgets(args: Namespace) -> tuple[str, ...]:
@@ -94,10 +103,13 @@ def check_together(args: Namespace, bakes: bool) -> None:
     """Refuses options that do not go together."""
     if args.levels and (args.sv is not None or given_budget(args) is not None):
         raise ClodError("--levels gives the dial values; give no other option for them")
-    if args.lod_meta and not args.levels:
-        raise ClodError("--lod-meta needs several levels; give them, as in --levels 1,2,4,7")
-    if args.lod_meta and args.order:
-        raise ClodError("--lod-meta sorts the Gaussians itself; remove --order")
+    folder = folder_option(args)
+    if args.lod_meta and args.tiles:
+        raise ClodError("--lod-meta and --3dtiles write a folder each; give one of them")
+    if folder and not (args.levels and len(args.levels) > 1):
+        raise ClodError(f"{folder} needs several levels; give them, as in --levels 1,2,4,7")
+    if folder and args.order:
+        raise ClodError(f"{folder} sorts the Gaussians itself; remove --order")
     if args.camera is not None and args.images is None:
         raise ClodError("--camera needs the scene of the photograph; give --images too")
     page = Path(args.out).suffix.lower() == PAGE
@@ -113,15 +125,17 @@ def check_together(args: Namespace, bakes: bool) -> None:
 
 def check_export_outputs(args: Namespace) -> None:
     out = Path(args.out)
-    if not args.lod_meta:
+    option = folder_option(args)
+    if option is None:
         for path in level_paths(out, args.levels) if args.levels else [out]:
             suffix_of(path)
             check_outputs([path], [args.model], args.images)
         return
     if out.suffix.lower() in (".json", *suffixes()):
-        raise ClodError(f"{out}: with --lod-meta, --out names the folder for {LOD_META}, not a file")
+        index = LOD_META if args.lod_meta else TILESET
+        raise ClodError(f"{out}: with {option}, --out names the folder for {index}, not a file")
     if out.exists() and not out.is_dir():
-        raise ClodError(f"{out}: is a file; with --lod-meta, --out must name a new folder")
+        raise ClodError(f"{out}: is a file; with {option}, --out must name a new folder")
     if not out.name:  # ".", the current folder, which cannot be replaced
         raise ClodError(f"{out}: is the current folder; --out must name a new one")
     check_target(out)
@@ -176,6 +190,10 @@ levels and order:
   chunks that a streaming viewer loads. Its leaves have tables of errors,
   measured from the cameras above, by which the viewer spends its budget of
   Gaussians.
+  With --3dtiles OUT is a new folder with tileset.json and .glb tiles, packed
+  as in .spz, as CesiumJS wants them; cells have at most 262,144 Gaussians.
+  geometricError is measured from the same cameras: with a viewer's default of
+  16 pixels a level differs from the finest like a shift of one pixel.
   --order extinction is for renderers that draw the first n rows: for any n
   these are the rows of --keep n, with the opacities and scales of the file.
   They pop where the dial fades.
@@ -198,6 +216,7 @@ examples:
   clod-adapt export garden_clod.ply -o garden.glb
   clod-adapt export garden_clod.ply --images garden -o garden.html
   clod-adapt export garden_clod.ply --levels 1,2,4,7 --lod-meta -o garden_lod
+  clod-adapt export garden_clod.ply --levels 1,2,4,7 --3dtiles -o garden_tiles
   clod-adapt export garden_clod.ply --order extinction -o sorted.ply
 """,
     add_arguments=export_options,

@@ -10,6 +10,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import WRITABLE
 
 LOD_META = "lod-meta.json"
+TILESET = "tileset.json"
 PAGE = ".html"
 
 

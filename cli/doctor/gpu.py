@@ -20,7 +20,7 @@ TORCH_CUDA = f"{TORCH} --index-url https://download.pytorch.org/whl/cu128"
 GPU = "pip install gsplat==1.5.3 setuptools"
 DRIVER = "install NVIDIA's driver: https://www.nvidia.com/drivers (a container needs --gpus all)"
 COMPILE = 'python -c "from gsplat.cuda._backend import _C"'
-GSPLAT = (1, 5, 3)  # the oldest supported version
+GSPLAT = (1, 4, 0)  # the oldest supported version
 TIMEOUT = 10.0  # seconds, of nvidia-smi or a collective
 PCI = Path("/sys/bus/pci/devices")
 NVIDIA = "0x10de"

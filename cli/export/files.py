@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 from clod_adapter.bake import bake
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
+from clod_adapter.evaluation.geometric_error import geometric_errors
 from clod_adapter.evaluation.level_errors import level_errors, looking
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
@@ -16,6 +17,7 @@ from clod_adapter.io.checkpoint import Checkpoint, load
 from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.lod_meta import cutting_options, read_leaves, write_errors
 from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
+from clod_adapter.io.formats.tileset import write_tileset
 from clod_adapter.io.ply.header import PREFIX
 from clod_adapter.origin import NOWHERE
 from clod_adapter.viewer.page import write_viewer_page
@@ -105,6 +107,16 @@ class Export:
                 words += [source, "-l", str(k)]
             notes = self._transform(words, folder / LOD_META, sum(counts))
         return counts, notes + self._add_errors(folder / LOD_META, [gaussians for gaussians, _ in contents])
+
+    def write_tiles(self, folder: Path, levels: list[float]) -> tuple[list[int], tuple[str, ...]]:
+        """Writes a 3D Tiles set to ``folder``; the number of Gaussians per level, and notes."""
+        folder.mkdir()
+        contents = [self.content(level)[0] for level in levels]
+        prepare_kernels(self.console, contents[0].means.device, training=False)
+        with self.console.meter("errors of levels") as meter:
+            errors = geometric_errors(contents, looking(self.target.cameras, contents[-1]), progress=meter)
+        notes = write_tileset(folder, contents, errors.tolist(), origin=self.model.origin)
+        return [len(each) for each in contents], notes
 
     def _add_errors(self, index: Path, levels: list[Gaussians]) -> tuple[str, ...]:
         """Adds the leaves' errors at each level to a streaming set; a note if its leaves are unknown."""

@@ -18,7 +18,7 @@ from clod_adapter.io.ply.columns import MASKS, dial_columns, inria_dtype
 from clod_adapter.io.ply.constants import PREFIX
 from clod_adapter.io.scene.poses import load_cameras
 
-from ..commands.export_formats import LOD_META, PAGE, level_paths, suffix_of
+from ..commands.export_formats import LOD_META, PAGE, TILESET, level_paths, suffix_of
 from ..shared.antialiasing import with_filter
 from ..shared.budgets import solve_dials
 from ..shared.console import Console, put
@@ -117,7 +117,7 @@ def dropped_columns(model: Checkpoint) -> list[str]:
 
 def filter_notes(args: argparse.Namespace, gaussians: Gaussians, dials: list[float] | None) -> list[str]:
     """A note on an antialiasing filter that readers of the output do not find in the file."""
-    suffix = LOD_META if args.lod_meta else suffix_of(Path(args.out))
+    suffix = LOD_META if args.lod_meta else ".glb" if args.tiles else suffix_of(Path(args.out))
     dialled = gaussians.sigma_d is not None and dials is None
     if not gaussians.screen_filter.compensate or dialled or suffix in STORE_FILTER:
         return []
@@ -133,8 +133,8 @@ def write_export(
     """Writes all files of the command; a description of each, and notes."""
     out = Path(args.out)
     with output_lock(out):
-        if args.lod_meta:
-            return write_set(export, out, dials)
+        if args.lod_meta or args.tiles:
+            return write_set(export, out, dials, LOD_META if args.lod_meta else TILESET)
         return write_files(export, level_paths(out, args.levels) if args.levels else [out], dials)
 
 
@@ -151,14 +151,16 @@ def write_files(export: Export, paths: list[Path], dials: list[float] | None) ->
     return outputs, notes
 
 
-def write_set(export: Export, out: Path, dials: list[float] | None) -> tuple[list[dict[str, Any]], list[str]]:
-    """Writes a streaming set; a description of it, and notes."""
+def write_set(
+    export: Export, out: Path, dials: list[float] | None, index: str
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Writes a streaming set with this index; a description of it, and notes."""
     assert dials is not None  # checked by check_export
     with atomic_path(out) as folder:
-        counts, notes = export.write_levels(folder, dials)
+        counts, notes = (export.write_levels if index == LOD_META else export.write_tiles)(folder, dials)
         total = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     levels = [{"virtual_scale": dial, "count": count} for dial, count in zip(dials, counts, strict=True)]
-    return [{"file": str(out / LOD_META), "levels": levels, "count": sum(counts), "bytes": total}], list(notes)
+    return [{"file": str(out / index), "levels": levels, "count": sum(counts), "bytes": total}], list(notes)
 
 
 def add_psnr(output: dict[str, Any], export: Export, photographs: Photographs, drop: float) -> list[str]:

@@ -1,4 +1,4 @@
-"""gsplat's ``rasterization`` with a dial: same arguments plus four, same results.
+"""gsplat's functions with a dial: same arguments plus four, same results.
 
 from clod_adapter.integrations import gsplat as clod_gsplat
 colors, alphas, meta = clod_gsplat.rasterization(
@@ -9,50 +9,92 @@ colors, alphas, meta = clod_gsplat.rasterization(
 gsplat takes one opacity and scale per Gaussian for all cameras; the dial gives one for each camera. So each camera is
 one call of gsplat, and the results are joined in gsplat's form, including ids, order and gradients. (A batch of scenes
 could share a call, but gsplat 1.5.3's packed projection culls all scenes by the opacities of the first.) Culled
-Gaussians get opacity 0: gsplat drops such rows in its projection, before colours, sorting and blending, so nothing has
-to be gathered, and rows and ids stay those of the caller. Written for gsplat 1.5.3.
+Gaussians cost no more than Gaussians out of view. Nothing is gathered: rows and ids stay those of the caller.
+
+For gsplat 1.4.0 to 1.6.0, by the signature that is installed. The signatures here, for type checkers and readers, have
+the arguments of all these versions; those that not all have are keywords.
 """
 
 from __future__ import annotations
 
+import functools
 import inspect
-import math
-import weakref
-from collections.abc import Iterator, Sequence
-from functools import partial
-from itertools import accumulate, pairwise
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Literal, TypeVar
 
-import numpy as np
-import torch
 from torch import Tensor
 
-from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.errors import ClodError
-from clod_adapter.hook import Hook
+from clod_adapter.integrations.gsplat_cameras import render
 
 try:
     import gsplat
 except ImportError as error:
     raise ImportError("gsplat cannot be imported; it needs torch and CUDA: pip install gsplat==1.5.3") from error
 
-PER_GAUSSIAN = ("means", "quats", "scales", "opacities", "covars", "sigma_d", "growth_d")
-PER_CAMERA = (
-    "viewmats", "Ks", "backgrounds", "viewmats_rs", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs",
-)  # fmt: skip
+__all__ = ["rasterization", "rasterization_2dgs", "rasterization_2dgs_inria_wrapper", "rasterization_inria_wrapper"]
 
-Rendered = tuple[Tensor, Tensor, dict[str, Any]]
+RenderMode = Literal["RGB", "d", "Ed", "D", "ED", "RGB-d", "RGB-Ed", "RGB+D", "RGB+ED"]
+CameraModel = Literal["pinhole", "ortho", "fisheye", "ftheta", "lidar"]
+Meta = dict[str, Any]
+Typed = TypeVar("Typed", bound=Callable[..., Any])
 
 
+def _of_gsplat(typed: Typed) -> Typed:
+    """gsplat's function of the same name with the four arguments; ``typed`` has their types and text."""
+    name = typed.__name__
+    projection = inspect.signature(gsplat.fully_fused_projection).parameters
+    hide = not (name == "rasterization" and "opacities" in projection)  # else that projection culls opacity 0
+
+    @functools.wraps(typed)
+    def dialled(
+        *args: Any,
+        sigma_d: Tensor | None = None,
+        virtual_scale: float = 1.0,
+        attenuation: AttenuationConfig | None = None,
+        growth_d: Tensor | None = None,
+        **kwargs: Any,
+    ) -> Any:
+        function = getattr(gsplat, name)
+        if sigma_d is None:
+            return function(*args, **kwargs)
+        bound = inspect.signature(function).bind(*args, **kwargs)
+        bound.apply_defaults()
+        given = bound.arguments | bound.arguments.pop("kwargs", {}) | {"sigma_d": sigma_d, "growth_d": growth_d}
+        return render(function, given, virtual_scale, attenuation or AttenuationConfig(), hide)
+
+    dialled.__signature__ = _signature(getattr(gsplat, name), typed)  # type: ignore[attr-defined]
+    return dialled  # type: ignore[return-value]
+
+
+def _signature(theirs: Callable[..., Any], typed: Callable[..., Any]) -> inspect.Signature:
+    """Parameters of the installed gsplat and the four, for help() and editors."""
+    added = [
+        inspect.signature(typed).parameters[name] for name in ("sigma_d", "virtual_scale", "attenuation", "growth_d")
+    ]
+    signature = inspect.signature(theirs)
+    parameters = list(signature.parameters.values())
+    rest = [each for each in parameters if each.kind is each.VAR_KEYWORD]
+    return signature.replace(parameters=[*(each for each in parameters if each not in rest), *added, *rest])
+
+
+@_of_gsplat
 def rasterization(
-    *args: Any,
-    sigma_d: Tensor | None = None,
-    virtual_scale: float = 1.0,
-    attenuation: AttenuationConfig | None = None,
-    growth_d: Tensor | None = None,
-    **kwargs: Any,
-) -> Rendered:
+    means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, colors: Tensor | None,
+    viewmats: Tensor, Ks: Tensor, width: int, height: int, near_plane: float = 0.01, far_plane: float = 1e10,
+    radius_clip: float = 0.0, eps2d: float = 0.3, sh_degree: int | None = None, packed: bool = True,
+    tile_size: int = 16, backgrounds: Tensor | None = None, render_mode: RenderMode = "RGB",
+    sparse_grad: bool = False, absgrad: bool = False, rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    channel_chunk: int = 32, distributed: bool = False, camera_model: CameraModel = "pinhole", *,
+    segmented: bool = False, covars: Tensor | None = None, with_ut: bool = False, with_eval3d: bool = False,
+    return_normals: bool = False, global_z_order: bool = True, rays: Tensor | None = None,
+    radial_coeffs: Tensor | None = None, tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None, ftheta_coeffs: Any = None, lidar_coeffs: Any = None,
+    external_distortion_coeffs: Any = None, rolling_shutter: Any = None, viewmats_rs: Tensor | None = None,
+    ut_params: Any = None, extra_signals: Tensor | None = None, extra_signals_sh_degree: int | None = None,
+    renderer_config: Any = None, sigma_d: Tensor | None = None, virtual_scale: float = 1.0,
+    attenuation: AttenuationConfig | None = None, growth_d: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Meta]:  # fmt: skip
     """``gsplat.rasterization`` with the opacities and scales of one dial value, for each camera.
 
     Equals gsplat called with the opacities of ``attenuation.attenuate`` and ``scales`` times its growth (``covars``,
@@ -70,7 +112,6 @@ def rasterization(
     pinhole camera with these ``Ks``; ``scene``, the default, needs none.
 
     Args:
-        args, kwargs: those of gsplat, by position or by name.
         sigma_d: ``[..., N]`` like ``opacities``; None calls gsplat's function unchanged.
         virtual_scale: the dial s >= 1.
         attenuation: settings of the equation, ``Gaussians.attenuation`` of the file; by default
@@ -78,131 +119,68 @@ def rasterization(
         growth_d: ``[..., N]`` exponents of the growth of the scales, which begins at ``reference_distance`` of the
             attenuation or, where that is 0, at 1 world unit; None for no growth.
 
+    The others are those of the installed gsplat, by position or by name, with its defaults.
+
     Returns:
         ``render_colors [..., C, H, W, X]``, ``render_alphas [..., C, H, W, 1]`` and ``meta``.
 
     Raises:
-        ClodError: the dial is below 1, sigma_d or growth_d differs from opacities in shape, or ``distributed`` is set,
-            with which the cameras of all processes share one opacity.
+        ClodError: the dial is below 1, sigma_d or growth_d differs from opacities in shape, ``distributed`` is set,
+            with which the cameras of all processes share one opacity, or several cameras come with a tensor that none
+            of the known versions has.
+        TypeError: an argument is missing, or the installed gsplat does not have it.
     """
-    if sigma_d is None:
-        return gsplat.rasterization(*args, **kwargs)
-    bound = inspect.signature(gsplat.rasterization).bind(*args, **kwargs)
-    bound.apply_defaults()
-    ours = {"sigma_d": sigma_d, "growth_d": growth_d}
-    given: dict[str, Any] = {**bound.arguments, **ours}
-    if given["distributed"]:
-        raise ClodError("distributed=True shares one opacity among all cameras, a dial needs one each; set it to False")
-    for name, value in ours.items():
-        if value is not None and value.shape != given["opacities"].shape:
-            shapes = f"{name} is {tuple(value.shape)} and opacities {tuple(given['opacities'].shape)}"
-            raise ClodError(f"{shapes}; both must be [..., N]")
-    shape = given["viewmats"].shape[:-2]
-    config = attenuation or AttenuationConfig()
-    if math.prod(shape) == 1:
-        return _one_camera(given, virtual_scale, config)
-    parts = [_one_camera(one, virtual_scale, config) for one in _cameras(given, shape)]
-    colors, alphas, metas = zip(*parts, strict=True)
-    return torch.cat(colors).unflatten(0, shape), torch.cat(alphas).unflatten(0, shape), _joined(metas, shape)
+    raise NotImplementedError
 
 
-def _signature() -> inspect.Signature:
-    """Parameters of the installed gsplat followed by ours, for help() and editors."""
-    ours = inspect.signature(rasterization).parameters
-    added = [parameter for parameter in ours.values() if parameter.kind is parameter.KEYWORD_ONLY]
-    theirs = inspect.signature(gsplat.rasterization)
-    return theirs.replace(parameters=[*theirs.parameters.values(), *added])
+@_of_gsplat
+def rasterization_2dgs(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, near_plane: float = 0.01, far_plane: float = 1e10, radius_clip: float = 0.0,
+    eps2d: float = 0.3, sh_degree: int | None = None, packed: bool = False, tile_size: int = 16,
+    backgrounds: Tensor | None = None, render_mode: RenderMode = "RGB", sparse_grad: bool = False,
+    absgrad: bool = False, distloss: bool = False, depth_mode: Literal["expected", "median"] = "expected", *,
+    sigma_d: Tensor | None = None, virtual_scale: float = 1.0, attenuation: AttenuationConfig | None = None,
+    growth_d: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor, Meta]:  # fmt: skip
+    """``gsplat.rasterization_2dgs`` with the opacities and scales of one dial value; see ``rasterization``.
 
+    The gradients for densification are in ``meta["gradient_2dgs"]``, as with gsplat.
 
-rasterization.__signature__ = _signature()  # type: ignore[attr-defined]
-
-
-def _one_camera(given: dict[str, Any], virtual_scale: float, config: AttenuationConfig) -> Rendered:
-    """gsplat's result for a single camera with any batch dimensions."""
-    camera = Camera(
-        given["viewmats"].reshape(4, 4), given["Ks"].reshape(3, 3), given["width"], given["height"],
-        near=given["near_plane"],
-    )  # fmt: skip
-    arguments = dict(given)
-    sigma_d, growth_d = (arguments.pop(name) for name in ("sigma_d", "growth_d"))
-    hook = Hook(sigma_d.flatten(), config, virtual_scale, None if growth_d is None else growth_d.flatten())
-    opacities = given["opacities"]
-    shown = hook.attenuate(given["means"].reshape(-1, 3), opacities.flatten(), camera)
-    arguments["opacities"] = shown.drawn.to(opacities).reshape(opacities.shape)
-    if shown.growth is not None:
-        name, growth = ("scales", shown.growth) if given.get("covars") is None else ("covars", shown.growth.square())
-        old = given[name]
-        arguments[name] = old * growth.to(old).reshape(opacities.shape + (1,) * (old.dim() - opacities.dim()))
-    return gsplat.rasterization(**arguments)
-
-
-def _cameras(given: dict[str, Any], shape: torch.Size) -> Iterator[dict[str, Any]]:
-    """Arguments for each camera, without batch dimensions, in gsplat's order of images."""
-    values = 1 if given["sh_degree"] is None else 2  # dimensions of one Gaussian's colour
-    for index in np.ndindex(*shape):
-        batch, camera = index[:-1], slice(index[-1], index[-1] + 1)
-        of_scene, of_camera = batch or ..., (*batch, camera)
-        colors = of_camera if given["colors"].dim() == len(shape) + 1 + values else of_scene
-        places = dict.fromkeys(PER_GAUSSIAN, of_scene) | dict.fromkeys(PER_CAMERA, of_camera) | {"colors": colors}
-        yield {
-            name: value[places[name]] if name in places and value is not None else value
-            for name, value in given.items()
-        }
-
-
-def _joined(metas: Sequence[dict[str, Any]], shape: torch.Size) -> dict[str, Any]:
-    """gsplat's ``meta`` of all images from that of each: rows concatenated, ids offset."""
-    first, images = metas[0], range(len(metas))
-    packed = first["gaussian_ids"] is not None
-    rows = [0, *accumulate(meta["depths"].numel() for meta in metas)]
-    pairs = [0, *accumulate(len(meta["isect_ids"]) for meta in metas)]
-    tile_bits = (first["tile_width"] * first["tile_height"]).bit_length()
-    counted = {
-        "batch_ids": [image // shape[-1] for image in images],
-        "camera_ids": [image % shape[-1] for image in images],
-        "flatten_ids": rows,
-        "isect_offsets": pairs,
-        "isect_ids": [image << 32 + tile_bits for image in images],  # image, tile, depth: gsplat's sorting key
-    }
-    joined = {**first, "n_batches": math.prod(shape[:-1]), "n_cameras": shape[-1]}
-    for name, value in first.items():
-        if isinstance(value, Tensor):
-            values = [meta[name] for meta in metas]
-            if name in counted:
-                values = [ids + start for ids, start in zip(values, counted[name], strict=False)]
-            joined[name] = torch.cat(values)
-            if name == "isect_offsets" or not (packed or name in counted):
-                joined[name] = joined[name].unflatten(0, shape)
-    _pass_gradients_on([meta["means2d"] for meta in metas], joined["means2d"], rows)
-    return joined
-
-
-def _pass_gradients_on(parts: list[Tensor], whole: Tensor, rows: list[int]) -> None:
-    """Gives ``whole`` the ``grad`` and ``absgrad`` of the parts, which gsplat rendered from.
-
-    As with gsplat: ``grad`` if it is retained, summed over backward passes; ``absgrad`` of the last one.
+    Returns:
+        Colours, alphas, normals, normals from depth (None without a depth), distortion and median depth of
+        ``[..., C, H, W, X]``, and ``meta``.
     """
-    if not whole.requires_grad:
-        return
-    whole.parts = parts  # type: ignore[attr-defined]
-    weak: Any = weakref.ref(whole)  # the graph of whole holds the hooks; a strong reference would be a cycle
-    seen: list[Any] = [0] * len(parts)  # gradients that came through whole and are in its grad already
+    raise NotImplementedError
 
-    def by_whole(gradient: Tensor) -> None:
-        seen[:] = gradient.reshape(-1, 2).split([stop - start for start, stop in pairwise(rows)])
 
-    def by_part(gradient: Tensor, number: int) -> None:
-        drawn, seen[number] = gradient.reshape(-1, 2) - seen[number], 0
-        if (whole := weak()) is None:
-            return
-        place = slice(rows[number], rows[number + 1])
-        if whole.retains_grad:
-            whole.grad = torch.zeros_like(whole) if whole.grad is None else whole.grad.clone()
-            whole.grad.view(-1, 2)[place] += drawn
-        if hasattr(whole.parts[number], "absgrad"):
-            whole.absgrad = getattr(whole, "absgrad", torch.zeros_like(whole))
-            whole.absgrad.view(-1, 2)[place] = whole.parts[number].absgrad.view(-1, 2)
+@_of_gsplat
+def rasterization_inria_wrapper(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, near_plane: float = 0.01, far_plane: float = 100.0, eps2d: float = 0.3,
+    sh_degree: int | None = None, backgrounds: Tensor | None = None, *, sigma_d: Tensor | None = None,
+    virtual_scale: float = 1.0, attenuation: AttenuationConfig | None = None, growth_d: Tensor | None = None,
+    **kwargs: Any,
+) -> tuple[Tensor, None, Meta]:  # fmt: skip
+    """``gsplat.rasterization_inria_wrapper`` with a dial; see ``rasterization``.
 
-    whole.register_hook(by_whole)
-    for number, part in enumerate(parts):
-        part.register_hook(partial(by_part, number=number))
+    gsplat 1.5 and 1.6 return one camera's image without the camera's dimension, and refuse several; several are
+    returned as ``[C, H, W, X]`` here, as gsplat 1.4.0 returns them.
+    """
+    raise NotImplementedError
+
+
+@_of_gsplat
+def rasterization_2dgs_inria_wrapper(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, near_plane: float = 0.01, far_plane: float = 100.0, eps2d: float = 0.3,
+    sh_degree: int | None = None, backgrounds: Tensor | None = None, depth_ratio: int = 0, *,
+    sigma_d: Tensor | None = None, virtual_scale: float = 1.0, attenuation: AttenuationConfig | None = None,
+    growth_d: Tensor | None = None, **kwargs: Any,
+) -> tuple[tuple[Tensor, Tensor], Meta]:  # fmt: skip
+    """``gsplat.rasterization_2dgs_inria_wrapper`` with a dial; see ``rasterization``.
+
+    Of several cameras gsplat returns the alphas and the maps of the last one; here they are of all. ``means2d`` of
+    ``meta`` is ``[N, 3]`` for one camera and ``[C, N, 3]`` for several.
+    """
+    raise NotImplementedError

@@ -1,4 +1,4 @@
-"""Splatting on an NVIDIA GPU by gsplat 1.5.3's kernels, restricted to the rows that are drawn.
+"""Splatting on an NVIDIA GPU by the kernels of gsplat 1.4.0 to 1.5.3, restricted to the rows that are drawn.
 
 gsplat's projection tests the opacity last, after all other work on a row, and packed mode does that work twice. Rows
 below 1/255, such as culled ones, are therefore removed first: only their opacity (4 bytes) is read. The geometry of the
@@ -12,9 +12,11 @@ over pixels in no fixed order, so results repeat except for rounding.
 from __future__ import annotations
 
 import contextlib
+import inspect
 import math
 import re
 import sys
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -29,7 +31,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.rasterizers.protocol import ALPHA_MIN, require_float32
 
 TILE = 16
-OLDEST, INSTALL = (1, 5, 3), "pip install gsplat==1.5.3"
+OLDEST, INSTALL = (1, 4, 0), "pip install gsplat==1.5.3"
 
 
 @lru_cache(maxsize=1)
@@ -101,10 +103,11 @@ def _project(
 
     means, quats, scales, opacities = geometry
     viewmat, K, eye = _camera(camera, means)
-    _, _, ids, radii, means2d, depths, conics, compensations = gsplat.fully_fused_projection(
-        means, None, quats, scales, viewmat, K, camera.width, camera.height, eps2d=screen_filter.variance, packed=True,
-        near_plane=camera.near, far_plane=math.inf, radius_clip=0.0, sparse_grad=False,
-        calc_compensations=screen_filter.compensate, camera_model="pinhole", opacities=opacities.detach(),
+    *_, ids, radii, means2d, depths, conics, compensations = _call(
+        gsplat.fully_fused_projection, means, None, quats, scales, viewmat, K, camera.width, camera.height,
+        eps2d=screen_filter.variance, packed=True, near_plane=camera.near, far_plane=math.inf, radius_clip=0.0,
+        sparse_grad=False, calc_compensations=screen_filter.compensate, camera_model="pinhole",
+        opacities=opacities.detach(),
     )  # fmt: skip
     coefficients = _Rows.apply(rows[ids], sh0, shN)
     degree = math.isqrt(coefficients.shape[1]) - 1
@@ -126,9 +129,9 @@ def _blend(drawn: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor]:
     across, down = -(-camera.width // TILE), -(-camera.height // TILE)
     depths, means2d = drawn["depths"], drawn["means2d"]
     ids = torch.zeros(len(depths), dtype=torch.int64, device=depths.device)  # all of one image
-    _, keys, order = gsplat.isect_tiles(
-        means2d, drawn["radii"], depths, TILE, across, down, segmented=False, packed=True, n_images=1, image_ids=ids,
-        gaussian_ids=ids,
+    _, keys, order = _call(
+        gsplat.isect_tiles, means2d, drawn["radii"], depths, TILE, across, down, segmented=False, packed=True,
+        n_images=1, image_ids=ids, n_cameras=1, camera_ids=ids, gaussian_ids=ids,
     )  # fmt: skip
     offsets = gsplat.isect_offset_encode(keys, 1, across, down)
     image, alpha = gsplat.rasterize_to_pixels(
@@ -136,6 +139,12 @@ def _blend(drawn: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor]:
         order, backgrounds=None, packed=True, absgrad=False,
     )  # fmt: skip
     return image[0], alpha[0, ..., 0]
+
+
+def _call(function: Callable[..., Any], *args: Any, **options: Any) -> Any:
+    """The result of gsplat's function, without the options that the installed version does not have."""
+    known = inspect.signature(function).parameters
+    return function(*args, **{name: value for name, value in options.items() if name in known})
 
 
 def _camera(camera: Camera, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:

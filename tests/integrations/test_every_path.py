@@ -102,6 +102,7 @@ def test_paths_agree(draw: Draw, checkpoint: Checkpoint, monkeypatch: pytest.Mon
     torch.testing.assert_close(draw(checkpoint, monkeypatch), wanted(adapted()), rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.filterwarnings("ignore:virtual_scale")
 def test_growth_and_fading_are_visible() -> None:
     """Without growth, and without the dial, the image is another: the comparison above measures both."""
     model = adapted()

@@ -20,7 +20,7 @@ def test_unusable_says_what_gsplat_lacks(monkeypatch: pytest.MonkeyPatch, missin
     package = ModuleType("gsplat.cuda")
     package._backend = backend
     top = ModuleType("gsplat")
-    top.__version__ = "1.4.0" if missing == "a version" else "1.5.3+pt24cu124"
+    top.__version__ = "1.3.0" if missing == "a version" else "1.5.3+pt24cu124"
     for name, module in (("gsplat", top), ("gsplat.cuda", package), ("gsplat.cuda._backend", backend)):
         monkeypatch.setitem(sys.modules, name, None if missing == "the package" else module)
     real = builtins.__import__
@@ -39,6 +39,6 @@ def test_unusable_says_what_gsplat_lacks(monkeypatch: pytest.MonkeyPatch, missin
     assert ("pip install gsplat==1.5.3" in reason) != (missing == "its kernels")
     expected = {
         "the package": "gsplat", "its kernels": "install nvcc", "a library": "libcudart.so.12",
-        "a version": "gsplat 1.4.0 is too old",
+        "a version": "gsplat 1.3.0 is too old",
     }  # fmt: skip
     assert expected[missing] in reason

@@ -180,10 +180,10 @@ def test_no_gsplat_and_an_old_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", None)
     assert find("gsplat") == Check("gsplat", False, "not installed", "pip install gsplat==1.5.3 setuptools")
     old: Any = ModuleType("gsplat")
-    old.__version__, old.__spec__ = "1.4.0+pt24cu124", object()
+    old.__version__, old.__spec__ = "1.3.0+pt24cu124", object()
     monkeypatch.setitem(sys.modules, "gsplat", old)
     found = find("gsplat")
-    assert found == Check("gsplat", False, "1.4.0+pt24cu124, 1.5.3 is needed", "pip install gsplat==1.5.3 setuptools")
+    assert found == Check("gsplat", False, "1.3.0+pt24cu124, 1.4.0 is needed", "pip install gsplat==1.5.3 setuptools")
 
 
 @pytest.mark.parametrize("toolkit", [None, "/usr/local/cuda"])

@@ -153,6 +153,19 @@ def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
     assert "one_s2.glb" in files(tmp_path)
 
 
+def test_3dtiles(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    """A folder with the index and one tile a level; errors are measured, none for the finest."""
+    report = json.loads(clod("export", dialled, "--levels", "1,2,4", "--3dtiles", "-o", "tiles", "--json").out)
+    counts = [len(baked(dialled, s)) for s in (1.0, 2.0, 4.0)]
+    assert [level["count"] for level in report["outputs"][0]["levels"]] == counts
+    root = json.loads((tmp_path / "tiles" / "tileset.json").read_text())["root"]
+    middle = root["children"][0]
+    finest = middle["children"][0]
+    assert [tile["content"]["uri"] for tile in (root, middle, finest)] == ["root.glb", "0_1.glb", "0_0.glb"]
+    assert root["geometricError"] > middle["geometricError"] > finest["geometricError"] == 0
+    assert sorted(files(tmp_path / "tiles")) == ["0_0.glb", "0_1.glb", "root.glb", "tileset.json"]
+
+
 @pytest.mark.parametrize("failure", [KeyboardInterrupt(), OSError(28, "No space left on device")])
 def test_levels_appear_together_or_not_at_all(
     clod: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException

@@ -1,0 +1,150 @@
+"""3D Tiles 1.1 (OGC 22-025r4): ``tileset.json`` over ``.glb`` files of several levels, for CesiumJS and iTwin.
+
+CesiumJS 1.145 draws Gaussians only from glTF with ``KHR_gaussian_splatting_compression_spz_2``, named in the index: a
+buffer with the bytes of an SPZ file, attributes without data, and a node with a ``matrix``.
+
+The root has the coarsest level of the whole scene. Its children are cells of at most LARGEST Gaussians of the finest
+level, each a chain of tiles from the next finer level to the finest; a tile replaces its parent (refine REPLACE).
+``geometricError`` is that of the level (``evaluation.geometric_error``).
+
+Viewers turn glTF's y-up axes into z-up ones, (x, y, z) to (x, -z, y), after the node's half turn. So a point (x, y, z)
+of the model is at (-x, -z, -y) of the tile set, in which the bounding boxes are.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from clod_adapter._support.version import package_version
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.file_formats import History
+from clod_adapter.io.formats.glb import COLOR_SPACE, DEGREE, EXTENSION, coefficient
+from clod_adapter.io.formats.spz import write_spz
+from clod_adapter.origin import Origin
+
+TILESET = "tileset.json"
+SPZ = "KHR_gaussian_splatting_compression_spz_2"
+_FLOAT, _BYTE = 5126, 5121
+LARGEST = 1 << 18  # Gaussians of the finest level in a cell, unless they share one centre
+STRAY = 0.02  # share of the centres that may be outside of a tile's box, along each axis
+
+Rows = list[np.ndarray]
+"""Row numbers of each level."""
+
+
+def write_tileset(
+    folder: Path, levels: Sequence[Gaussians], errors: Sequence[float], *, origin: Origin
+) -> tuple[str, ...]:
+    """Writes ``tileset.json`` and its tiles to an existing folder; what the files do not store.
+
+    Args:
+        levels: without a dial, the finest first, at least two.
+        errors: ``geometricError`` of each level, world units; 0 for the finest, ascending.
+    """
+    notes: list[str] = []
+    centres = [level.means.cpu().double().numpy() for level in levels]
+
+    def tile(level: int, rows: Rows, name: str, children: list[dict[str, Any]]) -> dict[str, Any]:
+        """A tile and its file; without one where it has no Gaussians."""
+        found: dict[str, Any] = {"boundingVolume": {"box": _box(levels, rows, origin)}, "geometricError": errors[level]}
+        if len(rows[level]):
+            gaussians = levels[level].select(torch.from_numpy(rows[level]))
+            notes.extend(write_tile(folder / name, gaussians, origin))
+            found["content"] = {"uri": name}
+        return found | ({"children": children} if children else {})
+
+    coarsest, chains = len(levels) - 1, []
+    whole = [np.arange(len(each)) for each in centres]
+    for cell, rows in enumerate(_cells(centres, whole)):
+        chain: list[dict[str, Any]] = []
+        for level in range(coarsest):
+            chain = [tile(level, rows, f"{cell}_{level}.glb", chain)]
+        chains += chain
+    root = tile(coarsest, whole, "root.glb", chains) | {"refine": "REPLACE"}
+    extensions = {"extensionsUsed": [EXTENSION, SPZ], "extensionsRequired": [EXTENSION, SPZ]}
+    index = {
+        "asset": {"version": "1.1", "generator": f"clod-adapter {package_version()}"},
+        "extensionsUsed": ["3DTILES_content_gltf"],
+        "extensions": {"3DTILES_content_gltf": extensions},
+        "geometricError": 2 * errors[coarsest],  # of showing nothing; it only has to exceed the root's
+        "root": root,
+    }
+    (folder / TILESET).write_text(json.dumps(index, indent=1), encoding="utf-8")
+    return tuple(dict.fromkeys(notes))
+
+
+def write_tile(path: Path, gaussians: Gaussians, origin: Origin) -> tuple[str, ...]:
+    """Writes a ``.glb`` whose only buffer is an SPZ file; what that rounds."""
+    packed = path.with_suffix(".spz")
+    notes = write_spz(packed, gaussians, History())
+    data = packed.read_bytes()
+    packed.unlink()
+    lowest, highest = gaussians.means.amin(0).tolist(), gaussians.means.amax(0).tolist()
+    shapes = {
+        "POSITION": "VEC3", "COLOR_0": "VEC4", f"{EXTENSION}:SCALE": "VEC3", f"{EXTENSION}:ROTATION": "VEC4",
+    }  # fmt: skip
+    for band in range(1, min(gaussians.sh_degree, DEGREE) + 1):
+        shapes |= {coefficient(band, index): "VEC3" for index in range(2 * band + 1)}
+    accessors: list[dict[str, Any]] = [
+        {"componentType": _FLOAT, "count": len(gaussians), "type": shape} for shape in shapes.values()
+    ]
+    accessors[0] |= {"min": lowest, "max": highest}
+    accessors[1] |= {"componentType": _BYTE, "normalized": True}
+    x, y, z = origin
+    how = {
+        "kernel": "ellipse", "colorSpace": COLOR_SPACE, "projection": "perspective",
+        "sortingMethod": "cameraDistance", "extensions": {SPZ: {"bufferView": 0}},
+    }  # fmt: skip
+    attributes = {name: index for index, name in enumerate(shapes)}
+    gltf = {
+        "asset": {"version": "2.0", "generator": f"clod-adapter {package_version()}"},
+        "extensionsUsed": [EXTENSION, SPZ],
+        "extensionsRequired": [EXTENSION, SPZ],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "matrix": [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, -x, -y, z, 1]}],  # a half turn about z
+        "meshes": [{"primitives": [{"attributes": attributes, "mode": 0, "extensions": {EXTENSION: how}}]}],
+        "accessors": accessors,
+        "bufferViews": [{"buffer": 0, "byteLength": len(data)}],
+        "buffers": [{"byteLength": len(data)}],
+    }
+    text = json.dumps(gltf, separators=(",", ":")).encode()
+    chunks = [(b"JSON", text + b" " * (-len(text) % 4)), (b"BIN\0", data + b"\0" * (-len(data) % 4))]
+    body = b"".join(struct.pack("<I4s", len(chunk), kind) + chunk for kind, chunk in chunks)
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+    return notes
+
+
+def _cells(centres: Sequence[np.ndarray], rows: Rows) -> Iterator[Rows]:
+    """The rows of each cell: halves of the finest level's, across the longest side."""
+    inside = centres[0][rows[0]]
+    if len(inside) <= LARGEST or not np.ptp(inside, 0).any():
+        yield rows
+        return
+    axis = int(np.argmax(np.ptp(inside, 0)))
+    plane = float(np.median(inside[:, axis]))
+    if not (inside[:, axis] < plane).any():
+        plane = float(inside[inside[:, axis] > plane, axis].min())
+    low = [points[each, axis] < plane for points, each in zip(centres, rows, strict=True)]
+    yield from _cells(centres, [each[mask] for each, mask in zip(rows, low, strict=True)])
+    yield from _cells(centres, [each[~mask] for each, mask in zip(rows, low, strict=True)])
+
+
+def _box(levels: Sequence[Gaussians], rows: Rows, origin: Origin) -> list[float]:
+    """A box around the centres of all levels but STRAY of them, as 3D Tiles has it: the centre and three half axes.
+
+    Viewers take the distance to the box for the choice of levels. Floaters far off would put the viewer inside.
+    """
+    points = np.concatenate([
+        level.means.cpu().double().numpy()[each] for level, each in zip(levels, rows, strict=True)
+    ])  # fmt: skip
+    turned = -(np.quantile(points, [STRAY / 2, 1 - STRAY / 2], 0) + np.array(origin))[::-1, [0, 2, 1]]
+    centre, half = turned.mean(0), (turned[1] - turned[0]) / 2
+    return [*centre.tolist(), *np.diag(half).ravel().tolist()]

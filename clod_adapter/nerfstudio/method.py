@@ -1,0 +1,155 @@
+"""The method ``clod-splatfacto``, which nerfstudio finds by the entry point ``nerfstudio.method_configs``."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from clod_adapter.config import AdaptConfig, ScreenFilter
+from clod_adapter.errors import ClodError
+from clod_adapter.nerfstudio.model import ClodSplatfactoModelConfig
+from clod_adapter.nerfstudio.splatfacto import state_of, view_of, write_ply
+
+OWN = "_model.dial."
+EXPORTER = "nerfstudio.scripts.exporter"
+
+# Learning rates in nerfstudio's checkpoints are numpy's numbers, which torch 2.6 and newer refuse to read, in
+# nerfstudio's own commands too. These names run no code.
+SCALAR: Any = np.float64(0).__reduce__()[0]
+torch.serialization.add_safe_globals([
+    (SCALAR, "numpy._core.multiarray.scalar"), (SCALAR, "numpy.core.multiarray.scalar"), np.dtype, type(np.dtype("f8")),
+])  # fmt: skip
+
+
+class ClodPipeline(VanillaPipeline):  # type: ignore[misc]
+    """Attaches the dial once the Gaussians are loaded, in ns-train and in all commands that read its result."""
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        saved = {name.removeprefix(OWN): value for name, value in loaded_state.items() if name.startswith(OWN)}
+        super().load_pipeline({name: value for name, value in loaded_state.items() if not name.startswith(OWN)}, step)
+        cameras = self.datamanager.train_dataset.cameras
+        self.model.attach([view_of(cameras[i : i + 1]) for i in range(len(cameras))], saved)
+        self._export_with_dial()
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        state: dict[str, Any] = super().state_dict(*args, **kwargs)
+        dial = self.model.dial
+        return state if dial is None else state | {OWN + name: value for name, value in state_of(dial).items()}
+
+    def _export_with_dial(self) -> None:
+        """In ns-export, whose commands no plugin can add to: the function that writes the PLY's rows."""
+        exporter = getattr(sys.modules.get(EXPORTER) or sys.modules["__main__"], "ExportGaussianSplat", None)
+        if exporter is None:
+            return
+        plain, screen_filter = (
+            exporter.write_ply,
+            ScreenFilter(compensate=self.model.config.rasterize_mode != "classic"),
+        )
+        adapted = partial(write_ply, dial=self.model.dial, screen_filter=screen_filter)
+
+        def write(filename: str, count: int, map_to_tensors: dict[str, Any]) -> None:
+            if "f_dc_0" in map_to_tensors:
+                adapted(filename, map_to_tensors)
+            else:
+                plain(filename, count, map_to_tensors)  # --ply-color-mode rgb: another kind of file
+
+        exporter.write_ply = staticmethod(write)
+
+
+class ClodTrainer(Trainer):  # type: ignore[misc]
+    """Starts from a trained splatfacto; its optimizers are made anew, for the loaded Gaussians and the dial."""
+
+    def setup_optimizers(self) -> Optimizers:
+        dial = self.pipeline.model.dial
+        if dial is None:  # before the checkpoint is loaded
+            return Optimizers({}, {})
+        rates = {group["name"]: group["lr"] for group in dial.param_groups(splats=True) if group["lr"] > 0}
+        steps, final = self.config.max_num_iterations, AdaptConfig().lr_final
+        own = {
+            name: {
+                "optimizer": AdamOptimizerConfig(lr=rate, eps=1e-15),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=final * rate, max_steps=steps),
+            }
+            for name, rate in rates.items()
+        }
+        return Optimizers(self.config.optimizers | own, self.pipeline.get_param_groups())
+
+    def _load_checkpoint(self) -> None:
+        """Of splatfacto: its Gaussians, for a new dial from step 0. Of this method: everything, from the next step."""
+        state = torch.load(self._checkpoint(), map_location="cpu", weights_only=True)
+        resumed = any(name.startswith(OWN) for name in state["pipeline"])
+        self._start_step = state["step"] + 1 if resumed else 0
+        self.pipeline.load_pipeline(state["pipeline"], state["step"])
+        self.optimizers = self.setup_optimizers()
+        if resumed:
+            self.optimizers.load_optimizers(state["optimizers"])
+            self.optimizers.load_schedulers(state["schedulers"])
+            self.grad_scaler.load_state_dict(state["scalers"])
+
+    def _checkpoint(self) -> Path:
+        folder, step = self.config.load_dir, self.config.load_step
+        if folder is None and self.config.load_checkpoint is None:
+            raise ClodError(
+                "clod-splatfacto adapts a trained splatfacto: give its folder with --load-dir "
+                "outputs/SCENE/splatfacto/DATE/nerfstudio_models, or one file with --load-checkpoint"
+            )
+        if folder is None:
+            return Path(self.config.load_checkpoint)
+        found = sorted(Path(folder).glob("step-*.ckpt" if step is None else f"step-{step:09d}.ckpt"))
+        if not found:
+            raise ClodError(f"{folder}: has no checkpoint{'' if step is None else f' of step {step}'} (step-*.ckpt)")
+        return found[-1]
+
+
+@dataclass
+class ClodTrainerConfig(TrainerConfig):  # type: ignore[misc]
+    """nerfstudio's settings of a training."""
+
+    _target: type = field(default_factory=lambda: ClodTrainer)
+
+
+method = MethodSpecification(
+    config=ClodTrainerConfig(
+        method_name="clod-splatfacto",
+        steps_per_eval_image=100,
+        steps_per_eval_batch=0,
+        steps_per_save=2000,
+        steps_per_eval_all_images=1000,
+        max_num_iterations=AdaptConfig().iters,
+        mixed_precision=False,
+        pipeline=VanillaPipelineConfig(
+            _target=ClodPipeline,
+            datamanager=FullImageDatamanagerConfig(
+                dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
+            ),
+            model=ClodSplatfactoModelConfig(),
+        ),
+        optimizers={
+            "camera_opt": {
+                "optimizer": AdamOptimizerConfig(lr=1e-4, eps=1e-15),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=5e-7, max_steps=30000),
+            },
+            "bilateral_grid": {
+                "optimizer": AdamOptimizerConfig(lr=2e-3, eps=1e-15),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=1e-4, max_steps=30000),
+            },
+        },
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+        vis="viewer",
+    ),
+    description="A quality dial for a trained splatfacto (clod-adapter); needs --load-dir or --load-checkpoint.",
+)

@@ -1,0 +1,121 @@
+"""Between splatfacto's parameters and a dial; nothing here imports nerfstudio."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from clod_adapter.cameras import Camera, StoredView, View
+from clod_adapter.config import AdaptConfig, AttenuationConfig, ScreenFilter
+from clod_adapter.equation.attenuation import check_dial
+from clod_adapter.errors import ClodError
+from clod_adapter.integrations.splats import from_gsplat
+from clod_adapter.io.checkpoint import save
+from clod_adapter.training.dial import Dial, attach
+
+VIRTUAL_SCALE = "CLOD_VIRTUAL_SCALE"
+SETTINGS = "attenuation"
+NEARLY = 1e-6  # the logit of an opacity this close to 0 or 1 has no useful gradient
+
+
+def view_of(camera: Any) -> View:
+    """The first camera of nerfstudio's ``Cameras``, as a view without its photograph.
+
+    nerfstudio's cameras look along -z with y up; ``camera_to_worlds`` is ``[..., 3, 4]``.
+    """
+    pose = camera.camera_to_worlds.reshape(-1, 3, 4)[0].detach().cpu().float()
+    rotation = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])
+    viewmat = torch.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -rotation.T @ pose[:, 3]
+    fx, fy, cx, cy, width, height = (
+        float(getattr(camera, name).flatten()[0]) for name in ("fx", "fy", "cx", "cy", "width", "height")
+    )
+    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    found = Camera(viewmat, K, int(width), int(height))
+    return StoredView(found, lambda: torch.zeros(found.height, found.width, 3, dtype=torch.uint8))
+
+
+def shown(parameters: Mapping[str, Tensor], dial: Dial, camera: Camera, virtual_scale: float) -> dict[str, Tensor]:
+    """What splatfacto is to draw in place of its ``means``, ``scales`` and ``opacities`` for a camera and dial value.
+
+    Scales are logarithms and opacities logits, as splatfacto activates them itself. Culled Gaussians get the logit of
+    opacity 0 and a centre behind the camera, where gsplat's projection culls them before it sorts. Differentiable in
+    the parameters and the dial; culled rows have gradient 0.
+    """
+    found = dial(camera, virtual_scale)
+    means, opacities, scales = (parameters[name] for name in ("means", "opacities", "scales"))
+    keep = found.keep[:, None]
+    logits = torch.logit(found.drawn[:, None].where(keep, 0.5), eps=NEARLY)
+    behind = (camera.position - camera.viewmat[2, :3]).to(means)
+    changed = {
+        "means": torch.where(keep, means, behind),
+        "opacities": logits.where(keep, -torch.inf).to(opacities),
+    }
+    return changed if found.growth is None else changed | {"scales": scales + found.growth.log().to(scales)[:, None]}
+
+
+def new_dial(
+    parameters: Mapping[str, Tensor], views: Sequence[View], config: AdaptConfig, saved: Mapping[str, Any]
+) -> Dial:
+    """The dial that ``saved`` describes (``state_of``), or an initialized one if it is empty.
+
+    Raises:
+        ClodError: the saved dial is for another range, or ``attach`` does.
+    """
+    if not saved:
+        return attach(parameters, views, config)
+    attenuation = AttenuationConfig(**saved[SETTINGS])
+    if attenuation.max_sv != config.max_sv:
+        raise ClodError(f"the dial was trained up to {attenuation.max_sv:g}; set --pipeline.model.max-sv to that")
+    tensors = {name: value.to(parameters["means"].device) for name, value in saved.items() if name != SETTINGS}
+    start = from_gsplat({name: value.detach() for name, value in parameters.items()}).replace(
+        sigma_d=tensors["log_sigma"].exp(), growth_d=tensors.get("growth_d"), attenuation=attenuation
+    )
+    dial = Dial(parameters, start, views, config)
+    dial.load_state_dict(tensors)
+    return dial
+
+
+def state_of(dial: Dial) -> dict[str, Any]:
+    """What a checkpoint has to hold for ``new_dial``: tensors, and the settings as plain numbers and names."""
+    return {**dial.state_dict(), SETTINGS: asdict(dial.attenuation)}
+
+
+def chosen(default: float) -> float:
+    """The dial value of ``CLOD_VIRTUAL_SCALE``, or the default.
+
+    Raises:
+        ClodError: it is no number, or below 1.
+    """
+    text = os.environ.get(VIRTUAL_SCALE, "")
+    try:
+        value = float(text) if text else default
+        check_dial(value)
+    except (ValueError, ClodError) as error:
+        raise ClodError(f"{VIRTUAL_SCALE} is {text!r}, it must be a number of at least 1") from error
+    return value
+
+
+def write_ply(path: str, columns: Mapping[str, np.ndarray[Any, Any]], dial: Dial, screen_filter: ScreenFilter) -> None:
+    """The rows that nerfstudio exports, with their dial, as an extended PLY.
+
+    nerfstudio drops rows (faint, not finite, outside of a box) and keeps the order of the others. The dial's rows are
+    found by their attributes.
+
+    Args:
+        columns: those of nerfstudio's PLY, ``[M]`` or ``[M, 1]`` each.
+    """
+    gaussians = dial.gaussians().cpu().replace(screen_filter=screen_filter)
+    exported = np.stack([columns[name].ravel() for name in ("x", "y", "z", "opacity")], 1).astype(np.float32)
+    values = torch.cat([gaussians.means, gaussians.opacity_logits[:, None]], 1).numpy()
+    own = enumerate(row.tobytes() for row in values)
+    rows = [next((i for i, mine in own if mine == each.tobytes()), -1) for each in exported]
+    if -1 in rows:
+        raise ClodError(f"{path}: nerfstudio exports other rows than those of the dial; nothing is written")
+    save(path, gaussians[rows])

@@ -1,0 +1,45 @@
+"""The error of a level as the shift of the finest level with the same error."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from clod_adapter.cameras import Camera
+from clod_adapter.evaluation.geometric_error import ALLOWED, geometric_errors
+from clod_adapter.gaussians import Gaussians
+from scenes import gaussians
+
+WIDTH, HEIGHT, FOCAL, DISTANCE = 96, 72, 90.0, 6.0
+
+
+def smooth() -> Gaussians:
+    """Wide Gaussians at one distance, so that a shift of the image is the same everywhere."""
+    found = gaussians(40, 0, 3, size=0.3)
+    means = found.means * torch.tensor([0.7, 0.5, 0.0]) + torch.tensor([0.0, 0.0, DISTANCE])
+    return found.replace(means=means, opacity_logits=found.opacity_logits.clamp(-1, 2))
+
+
+def view() -> Camera:
+    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    return Camera(torch.eye(4), K, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("pixels", [0.25, 0.5])
+def test_a_shift_has_its_own_length(pixels: float) -> None:
+    """Moved across by so many pixels, seen from so far: pixels d / f, times what viewers allow."""
+    finest = smooth()
+    length = pixels * DISTANCE / FOCAL
+    moved = finest.replace(means=finest.means + torch.tensor([length, length, 0.0]) / 2**0.5)
+    errors = geometric_errors([finest, moved], [view()])
+    assert errors[0] == 0
+    assert errors[1] == pytest.approx(ALLOWED * length, rel=0.15)
+
+
+def test_errors_ascend_and_grow_with_what_is_missing() -> None:
+    """A level that happens to be nearer to the finest than the level before has that one's error."""
+    finest = smooth()
+    order = finest.opacity_logits.argsort(descending=True)
+    half, few = finest[order[:20]], finest[order[:5]]
+    errors = geometric_errors([finest, half, few, half], [view(), view()])
+    assert 0 == errors[0] < errors[1] < errors[2] == errors[3]

@@ -1,0 +1,196 @@
+"""``clod-splatfacto`` with the real nerfstudio on a CPU: its trainer, its commands' loading, its viewer and its export.
+
+Installed without CUDA as docs/dependencies.md describes. gsplat's kernels are torch (``gsplat_in_torch``); open3d,
+pymeshlab and the weights of LPIPS are absent.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import json
+import sys
+import tomllib
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from PIL import Image
+
+import gsplat_in_torch
+import scenes
+from clod_adapter import load
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.render import render
+
+ROOT = Path(__file__).parents[2]
+N, WIDTH, HEIGHT, STEPS = 60, 32, 24, 16
+
+
+@pytest.fixture
+def nerfstudio(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The module of the method, with nerfstudio on the CPU."""
+    pytest.importorskip("nerfstudio", reason="nerfstudio is not installed")
+    monkeypatch.setenv("TORCHDYNAMO_DISABLE", "1")
+    import torchmetrics.image.lpip
+
+    monkeypatch.setattr(torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", lambda **_: torch.nn.Module())
+    monkeypatch.setattr(torch.Tensor, "cuda", lambda self, *args, **kwargs: self)
+    for name in ("open3d", "pymeshlab", "mediapy"):  # of exports that are not tested here
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    gsplat_in_torch.install(monkeypatch)
+    return importlib.import_module("clod_adapter.nerfstudio.method")
+
+
+def write_capture(folder: Path) -> Gaussians:
+    """transforms.json with photographs; the splat that is to be adapted, in its frame."""
+    base, scene = scenes.capture(N, 8, WIDTH, HEIGHT)
+    frames = []
+    for view in (*scene.train, *scene.test):
+        Image.fromarray(view.image.numpy()).save(folder / view.camera.name)
+        pose = torch.linalg.inv(view.camera.viewmat) * torch.tensor([1.0, -1.0, -1.0, 1.0])
+        K = view.camera.K
+        intrinsics = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        frame = {name: float(value) for name, value in intrinsics.items()}
+        frames.append({"file_path": view.camera.name, "transform_matrix": pose.tolist(), **frame})
+    size = {"w": WIDTH, "h": HEIGHT, "camera_model": "OPENCV"}
+    (folder / "transforms.json").write_text(json.dumps({**size, "frames": frames}))
+    return base
+
+
+def configured(method: Any, folder: Path, load_dir: Path) -> Any:
+    """What ``ns-train clod-splatfacto --load-dir ...`` makes, in world coordinates and with a short training."""
+    config = copy.deepcopy(method.config)
+    parser = config.pipeline.datamanager.dataparser
+    parser.data, parser.orientation_method, parser.center_method, parser.auto_scale_poses = (
+        folder,
+        "none",
+        "none",
+        False,
+    )
+    model = config.pipeline.model
+    model.random_init, model.num_random, model.sh_degree = True, 10, 1
+    model.background_color = "black"
+    model.warmup_length, model.refine_every, model.stop_split_at, model.cull_alpha_thresh = 0, 2, 10**6, 0.5  # all off
+    config.load_dir, config.output_dir, config.max_num_iterations = load_dir, folder / "outputs", STEPS
+    config.vis, config.machine.device_type, config.experiment_name = "tensorboard", "cpu", "capture"
+    config.steps_per_eval_image = config.steps_per_eval_all_images = 1000
+    config.set_timestamp()
+    return config
+
+
+def write_splatfacto(config: Any, base: Gaussians, folder: Path) -> None:
+    """The checkpoint of a splatfacto whose Gaussians are ``base``."""
+    from nerfstudio.models.splatfacto import SplatfactoModelConfig
+    from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+
+    own = config.pipeline
+    model = SplatfactoModelConfig(random_init=True, num_random=10, sh_degree=1)
+    pipeline = VanillaPipelineConfig(datamanager=own.datamanager, model=model).setup(device="cpu", test_mode="val")
+    values = {
+        "means": base.means, "scales": base.log_scales, "quats": base.quats, "features_dc": base.sh0[:, 0],
+        "features_rest": base.shN, "opacities": base.opacity_logits[:, None],
+    }  # fmt: skip
+    for name, value in values.items():
+        pipeline.model.gauss_params[name] = torch.nn.Parameter(value.clone())
+    folder.mkdir()
+    state = {"step": 29999, "pipeline": pipeline.state_dict(), "optimizers": {}, "schedulers": {}, "scalers": {}}
+    torch.save(state, folder / "step-000029999.ckpt")
+
+
+def trained(config: Any) -> Any:
+    """The trainer after what ns-train does."""
+    trainer = config.setup(local_rank=0, world_size=1)
+    config.save_config()
+    trainer.setup()
+    trainer.train()
+    return trainer
+
+
+@pytest.fixture
+def run(nerfstudio: Any, tmp_path: Path) -> SimpleNamespace:
+    """A dial trained on a splatfacto checkpoint."""
+    base = write_capture(tmp_path)
+    config = configured(nerfstudio.method, tmp_path, tmp_path / "splatfacto")
+    write_splatfacto(config, base, tmp_path / "splatfacto")
+    return SimpleNamespace(base=base, trainer=trained(config), config=config, folder=tmp_path, method=nerfstudio.method)
+
+
+def test_the_entry_point_is_the_method(nerfstudio: Any) -> None:
+    from nerfstudio.plugins.types import MethodSpecification
+
+    entries = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
+    module, _, name = entries["nerfstudio.method_configs"]["clod-splatfacto"].partition(":")
+    found = getattr(importlib.import_module(module), name)
+    assert isinstance(found, MethodSpecification) and found.config.method_name == "clod-splatfacto"
+
+
+def test_a_dial_is_trained_and_found_by_the_other_commands(
+    run: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Training, its checkpoint as ns-render and ns-viewer load it, ns-export's PLY, and training that goes on."""
+    from nerfstudio.scripts.exporter import ExportGaussianSplat
+    from nerfstudio.utils.eval_utils import eval_setup
+    from nerfstudio.viewer.utils import parse_object
+    from nerfstudio.viewer.viewer_elements import ViewerElement
+
+    model = run.trainer.pipeline.model
+    assert model.num_points == N and set(run.trainer.optimizers.optimizers) == {
+        "means", "scales", "quats", "features_dc", "opacities", "log_sigma", "growth_d"
+    }  # fmt: skip
+    assert not torch.equal(model.means, run.base.means) and torch.equal(model.features_rest, run.base.shN)
+    start = untrained(run, run.folder / "splatfacto")
+    assert float((model.dial.log_sigma - start.log_sigma).abs().mean()) > 0.05
+
+    written = run.config.get_base_dir() / "config.yml"
+    monkeypatch.setenv("CLOD_VIRTUAL_SCALE", "3")
+    pipeline = eval_setup(written, test_mode="test")[1]
+    assert [element.name for _, element in parse_object(pipeline, ViewerElement, "Custom Elements")] == ["Dial s"]
+    scene = dict(
+        zip((path.name for path in pipeline.datamanager.train_dataset.image_filenames), range(99), strict=False)
+    )
+    view = next(view for view in scenes.ring(8, WIDTH, HEIGHT) if view.name in scene)
+    camera = pipeline.datamanager.train_dataset.cameras[scene[view.name] : scene[view.name] + 1]
+    for dial in (3.0, 1.0):
+        pipeline.model.slider.default_value = dial
+        image = pipeline.model.get_outputs_for_camera(camera)["rgb"]
+        want = render(model.dial.gaussians(), view, dial).image.clamp(0, 1)
+        assert float((image - want).abs().max()) < 0.02
+        assert pipeline.model.means is pipeline.model.gauss_params["means"]
+
+    monkeypatch.setattr(ExportGaussianSplat, "write_ply", ExportGaussianSplat.write_ply)  # restored afterwards
+    ExportGaussianSplat(load_config=written, output_dir=run.folder / "export").main()
+    exported, own = load(run.folder / "export" / "splat.ply").gaussians, model.dial.gaussians()
+    faint = own.opacity_logits < -5.5373
+    assert len(exported) == N - int(faint.sum()) and exported.attenuation == own.attenuation
+    for name, value in exported.tensors().items():
+        torch.testing.assert_close(value, own.tensors()[name][~faint].detach(), rtol=1e-6, atol=1e-6)
+
+    again = configured(run.method, run.folder, run.config.get_checkpoint_dir())
+    again.timestamp = "again"
+    trainer = again.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    assert trainer._start_step == STEPS and torch.equal(trainer.pipeline.model.dial.log_sigma, model.dial.log_sigma)
+    assert trainer.optimizers.optimizers["log_sigma"].state_dict()["state"][0]["step"] == STEPS
+
+
+def untrained(run: SimpleNamespace, folder: Path) -> Any:
+    """The dial before the first step."""
+    config = configured(run.method, run.folder, folder)
+    config.timestamp = "start"
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer.pipeline.model.dial
+
+
+def test_without_a_checkpoint_the_command_says_what_it_needs(nerfstudio: Any, tmp_path: Path) -> None:
+    write_capture(tmp_path)
+    config = configured(nerfstudio.method, tmp_path, tmp_path / "none")
+    with pytest.raises(ClodError, match="none: has no checkpoint"):
+        config.setup(local_rank=0, world_size=1).setup()
+    config.load_dir = None
+    with pytest.raises(ClodError, match="give its folder with --load-dir"):
+        config.setup(local_rank=0, world_size=1).setup()

@@ -1,0 +1,99 @@
+"""3D Tiles: the index, the boxes, and the tiles as the SPZ reader finds them."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import scenes
+from clod_adapter import load
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.formats import tileset
+from clod_adapter.io.formats.tileset import TILESET, write_tileset
+from clod_adapter.origin import NOWHERE
+
+ERRORS = [0.0, 0.25, 1.0]
+
+
+def levels(n: int = 400) -> list[Gaussians]:
+    whole = scenes.gaussians(n, 2, 0)
+    return [whole, whole[::4], whole[::16]]
+
+
+def tiles_of(tile: dict[str, Any], depth: int = 0) -> list[tuple[int, dict[str, Any]]]:
+    return [(depth, tile), *(each for child in tile.get("children", ()) for each in tiles_of(child, depth + 1))]
+
+
+def read_tile(path: Path, folder: Path) -> tuple[dict[str, Any], Gaussians]:
+    """The JSON of a tile, and its Gaussians by the reader of .spz."""
+    data = path.read_bytes()
+    assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data)) and len(data) % 4 == 0
+    length, kind = struct.unpack_from("<I4s", data, 12)
+    gltf = json.loads(data[20 : 20 + length])
+    more, binary = struct.unpack_from("<I4s", data, 20 + length)
+    assert (kind, binary, 28 + length + more) == (b"JSON", b"BIN\0", len(data))
+    found = folder / "tile.spz"
+    found.write_bytes(data[28 + length : 28 + length + gltf["buffers"][0]["byteLength"]])
+    return gltf, load(found).gaussians
+
+
+def test_index_and_tiles(tmp_path: Path) -> None:
+    """One chain of levels, coarsest first; errors descend; what is packed is what was given."""
+    given = levels()
+    notes = write_tileset(tmp_path, given, ERRORS, origin=NOWHERE)
+    assert any("rounded" in note for note in notes)
+    index = json.loads((tmp_path / TILESET).read_text())
+    assert index["asset"]["version"] == "1.1" and index["root"]["refine"] == "REPLACE"
+    required = index["extensions"]["3DTILES_content_gltf"]["extensionsRequired"]
+    assert required == ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
+    chain = [tile for _, tile in tiles_of(index["root"])]
+    assert [tile["geometricError"] for tile in chain] == ERRORS[::-1] and index["geometricError"] > ERRORS[-1]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0_0.glb", "0_1.glb", "root.glb", TILESET]
+    for tile, want in zip(chain, given[::-1], strict=True):
+        gltf, found = read_tile(tmp_path / tile["content"]["uri"], tmp_path)
+        torch.testing.assert_close(found.means, want.means, rtol=0, atol=1e-4)
+        torch.testing.assert_close(found.log_scales, want.log_scales, rtol=0, atol=0.04)
+        primitive = gltf["meshes"][0]["primitives"][0]
+        assert primitive["extensions"]["KHR_gaussian_splatting"]["extensions"] == {tileset.SPZ: {"bufferView": 0}}
+        assert {accessor["count"] for accessor in gltf["accessors"]} == {len(want)}
+        assert sum("SH_DEGREE" in name for name in primitive["attributes"]) == 8  # of degree 1 and 2, as readers count
+        assert gltf["accessors"][primitive["attributes"]["POSITION"]]["min"] == want.means.amin(0).tolist()
+
+
+def test_boxes_are_where_viewers_place_the_gaussians(tmp_path: Path) -> None:
+    """The node's matrix, then glTF's y-up axes into z-up ones, with a large origin; floaters are left out."""
+    origin = (1000.0, -2000.0, 50.0)
+    given = [level.replace(means=level.means * torch.tensor([3.0, 1.0, 0.5])) for level in levels()]
+    given[0].means[0] = 1e4
+    write_tileset(tmp_path, given, ERRORS, origin=origin)
+    root = json.loads((tmp_path / TILESET).read_text())["root"]
+    gltf, found = read_tile(tmp_path / "0_0.glb", tmp_path)
+    matrix = np.array(gltf["nodes"][0]["matrix"], float).reshape(4, 4).T
+    placed = given[0].means.double().numpy() @ matrix[:3, :3].T + matrix[:3, 3]
+    upright = np.stack([placed[:, 0], -placed[:, 2], placed[:, 1]], 1)
+    box = np.array(root["boundingVolume"]["box"]).reshape(4, 3)
+    inside = (np.abs(upright - box[0]) <= np.diag(box[1:])).all(1)
+    assert 0.9 < inside.mean() < 1 and not inside[0]
+    assert (np.diag(box[1:]) < 20).all() and (box[1:] == np.diag(np.diag(box[1:]))).all()
+
+
+def test_cells_hold_every_gaussian_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tileset, "LARGEST", 60)
+    given = levels()
+    given[0].means[:100] = given[0].means[0]  # more in one place than a cell holds
+    write_tileset(tmp_path, given, ERRORS, origin=NOWHERE)
+    root = json.loads((tmp_path / TILESET).read_text())["root"]
+    assert len(root["children"]) >= 6
+    for level, want in enumerate(given[:2]):
+        of_level = [tile for depth, tile in tiles_of(root) if depth == 2 - level and "content" in tile]
+        parts = [read_tile(tmp_path / tile["content"]["uri"], tmp_path)[1].means for tile in of_level]
+        assert all(len(part) <= 100 for part in parts)
+        found = torch.cat(parts).double().sum(0)
+        assert sum(map(len, parts)) == len(want)
+        torch.testing.assert_close(found, want.means.double().sum(0), rtol=0, atol=0.02)
