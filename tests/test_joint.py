@@ -114,7 +114,9 @@ def gsplat(model: Gaussians) -> list[Tensor]:
         return opacities, scales
 
     installed = ModuleType("gsplat")
-    installed.rasterization = rasterization  # type: ignore[attr-defined]
+    others = ("rasterization_2dgs", "rasterization_inria_wrapper", "rasterization_2dgs_inria_wrapper")
+    for name in ("rasterization", *others, "fully_fused_projection"):
+        setattr(installed, name, rasterization)
     view = CAMERAS[0]
     dial: Any = {"sigma_d": model.sigma_d, "growth_d": model.growth_d, "attenuation": model.attenuation}
     found = copy_with("gsplat", installed, "gsplat").rasterization(

@@ -95,9 +95,9 @@ runs until Ctrl-C.
 The page shows the Gaussians kept and the frame time, switches the attenuation
 on and off, and compares two dial values, or MODEL.ply and BASE.ply, on the two
 sides of a line. Drop another file on the page to open it. The address holds the
-view. With --images the page can jump between the scene's cameras. Several files,
-such as levels or variants, and a folder of files open with a list to switch
-between them; the view and the dial value stay.
+view. With --images the page can jump between the scene's cameras. Several
+files, such as levels or variants, and a folder of files open with a list to
+switch between them; the view and the dial value stay.
 
 Other machines cannot reach the page, and it loads nothing from the network. To
 see it from another machine, forward the port (-t passes Ctrl-C on):
