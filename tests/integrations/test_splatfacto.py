@@ -101,6 +101,7 @@ def test_culled_rows_are_behind_the_camera_with_gradient_0(
 def test_an_opaque_gaussian_has_finite_gradients(parameters: dict[str, Tensor], dial: Dial, views: list[Any]) -> None:
     """sigmoid(30) is 1 in float32, whose logit is infinite."""
     parameters["opacities"].data[:] = 30.0
+    dial.log_sigma.data[:] = 10.0
     changed = shown(parameters, dial, views[0].camera, 1.0)
     changed["opacities"].sigmoid().sum().backward()
     assert parameters["opacities"].grad is not None and parameters["opacities"].grad.isfinite().all()
