@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -28,6 +29,8 @@ TALL = {"width": 640, "height": 600}  # the whole panel is shown
 WITHIN = 45.0  # dB between the page and our renderer
 COUNTS = 1e-3  # of the count
 SECONDS = 10  # until waiting ends
+# A script that hides from a page that Chromium's WebGPU is software, on which the page does not sort.
+REAL_GPU = "Object.defineProperty(GPUAdapterInfo.prototype, 'isFallbackAdapter', { get: () => false });"
 
 
 @dataclass
@@ -132,6 +135,16 @@ def take(shown: Shown, path: Path) -> None:
     """Shows another file in the tab, by the page's own function, and waits until it is drawn."""
     script = "clod.load(Uint8Array.from(atob(given[1]), (letter) => letter.charCodeAt(0)).buffer, given[0])"
     shown.run(script, [path.name, base64.b64encode(path.read_bytes()).decode()])
+
+
+def sorts_on_gpu(shown: Shown, seconds: float = SECONDS) -> bool:
+    """Waits until WebGPU sorts the model of the page; False if it never does."""
+    until = time.monotonic() + seconds
+    while not shown.run("clod.order()")["onGpu"]:
+        if time.monotonic() > until:
+            return False
+        shown.page.wait_for_timeout(50)
+    return True
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import dial, render
-from shown import SIZE, TALL, Shown, assert_alike, serve, take
+from shown import REAL_GPU, SIZE, TALL, Shown, assert_alike, serve, sorts_on_gpu, take
 
 C0 = 0.28209479177387814
 ORANGE = np.array([1.0, 0.42, 0.05])
@@ -204,8 +204,10 @@ def test_removed_gaussians_are_shown_in_orange(shown: Shown, save: Any, artefact
 
 HEADSET = """
     const matrix = (x) => Float32Array.from([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, x, 0, 0, 1]);
-    const projectionMatrix = Float32Array.from([1.5, 0, 0, 0, 0, 1.2, 0, 0, 0.2, -0.1, -1, -1, 0, 0, -0.02, 0]);
-    const views = [-0.03, 0.03].map((x, k) => ({ k, transform: { matrix: matrix(x) }, projectionMatrix }));
+    const projectionOf = (side) => Float32Array.from([1.5, 0, 0, 0, 0, 1.2, 0, 0, side, -0.1, -1, -1, 0, 0, -0.02, 0]);
+    const views = [[-0.03, 0.6], [0.03, -0.6]].map(([x, side], k) => (
+        { k, transform: { matrix: matrix(x) }, projectionMatrix: projectionOf(side) }
+    ));
     const pose = { transform: { matrix: matrix(0) }, views };
     const session = new EventTarget();
     let next = null;
@@ -232,8 +234,9 @@ HEADSET = """
 """
 
 
-def test_a_headset_shows_the_splat_to_each_eye(tabs: Any, artefacts: Path, save: Any) -> None:
-    """A simulated one; the right stick turns the dial."""
+@pytest.mark.parametrize("script", ["", REAL_GPU], ids=["worker", "webgpu"])
+def test_a_headset_shows_the_splat_to_each_eye(tabs: Any, artefacts: Path, save: Any, script: str) -> None:
+    """A simulated one, each of whose eyes sees what the other one does not; the right stick turns the dial."""
     model = scenes.dialled(1500, 0, 7)
     camera = scenes.camera(400, 320)
     level = torch.eye(4)
@@ -241,8 +244,10 @@ def test_a_headset_shows_the_splat_to_each_eye(tabs: Any, artefacts: Path, save:
     with serve(save(model), "--sv", 2) as url:
         page = tabs.new_page()
         page.set_viewport_size(SIZE)
-        page.add_init_script(HEADSET)
+        page.add_init_script(HEADSET + script)
         shown = Shown(page).ready(url)
+        if script and not sorts_on_gpu(shown):
+            pytest.skip("this Chromium has no WebGPU adapter")
         shown.camera(replace(camera, viewmat=level))
         scale = float(link(shown)["distance"][0]) / 1.5
         shown.until("!document.getElementById('immersive-vr').hidden")
@@ -252,8 +257,8 @@ def test_a_headset_shows_the_splat_to_each_eye(tabs: Any, artefacts: Path, save:
         page.wait_for_timeout(300)
         data = base64.b64decode(page.evaluate("headset.frame(1)").partition(",")[2])
         picture = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
-        K = torch.tensor([[150.0, 0, 80.0], [0, 192.0, 144.0], [0, 0, 1]])
         for k in range(2):
+            K = torch.tensor([[150.0, 0, (40.0, 160.0)[k]], [0, 192.0, 144.0], [0, 0, 1]])
             viewmat = level.clone()
             viewmat[0, 3] -= (-0.03, 0.03)[k] * scale
             eye = Camera(viewmat, K, 200, 320)

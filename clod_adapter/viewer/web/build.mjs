@@ -4,7 +4,7 @@ import { readFileSync, readdirSync, writeFileSync } from "node:fs";
 import { build } from "esbuild";
 
 const here = new URL(".", import.meta.url), out = new URL("../static/", here);
-const shared = { bundle: true, minify: true, format: "iife", target: "es2022", write: false, loader: { ".glsl": "text" } };
+const shared = { bundle: true, minify: true, format: "iife", target: "es2022", write: false, loader: { ".glsl": "text", ".wgsl": "text" } };
 
 /** `worker:./x.js` is the text of x.js with what it imports, for a Worker out of a Blob. */
 const worker = {
@@ -24,7 +24,8 @@ const css = await build({ ...shared, entryPoints: [new URL("src/style.css", here
 writeFileSync(new URL("viewer.css", out), css.outputFiles[0].text);
 writeFileSync(new URL("page.html", out), readFileSync(new URL("src/page.html", here)));
 
-const sources = ["../../integrations/shaders/attenuation.glsl", "build.mjs", "package-lock.json", "package.json"];
+const shaders = ["glsl", "wgsl"].map((kind) => `../../integrations/shaders/attenuation.${kind}`);
+const sources = [...shaders, "build.mjs", "package-lock.json", "package.json"];
 sources.push(...readdirSync(new URL("src", here), { recursive: true }).filter((name) => /\.\w+$/.test(name)).map((name) => `src/${name}`));
 const lines = sources.sort().map((name) => `${createHash("sha256").update(readFileSync(new URL(name, here))).digest("hex")}  ${name}`);
 writeFileSync(new URL("SOURCES.sha256", out), `${lines.join("\n")}\n`);

@@ -9,6 +9,7 @@ import { createMotion } from "./motion.js";
 import { readConfig } from "./payload.js";
 import { createPlayback } from "./playback.js";
 import { createRenderer } from "./renderer.js";
+import { sortingDevice } from "./sorter.js";
 import { createStage } from "./stage.js";
 import { createUi, elementsOf } from "./ui.js";
 import { createViews } from "./views.js";
@@ -17,6 +18,7 @@ import { xrModes } from "./xr.js";
 
 const elements = elementsOf(document), config = readConfig();
 const viewer = { cameraNumber: 0, cameras: config.cameras, up: "", recording: null, file: 0 };
+viewer.device = sortingDevice();
 viewer.files = config.model ? [config.model, ...config.others] : [];
 
 async function start() {
@@ -56,7 +58,7 @@ async function start() {
   await stage.whenDrawn();
 }
 
-const upload = ({ gaussians, metadata }) => createModel(viewer.renderer.gl, gaussians, metadata);
+const upload = ({ gaussians, metadata }) => createModel(viewer.renderer.gl, gaussians, metadata, viewer.device);
 
 /** Shows another scene, and starts anew. */
 function show(model, base, cameras, dial) {
@@ -175,6 +177,7 @@ window.clod = {
   },
   whenDrawn: () => viewer.stage.whenDrawn(),
   counts: () => viewer.stage.counts(),
+  order: () => viewer.stage.order(),
   async capture() {
     viewer.stage.endMotion();
     await viewer.stage.whenDrawn();

@@ -1,7 +1,8 @@
-// A splat on the GPU, and its worker, which culls and sorts the Gaussians.
+// A splat on the GPU, and what culls and sorts its Gaussians: WebGPU, or else a worker.
 import { WIDTH, dataTexture, heightOf, maxTexels } from "./gpu.js";
 import { half } from "./half.js";
 import { SH_TEXELS } from "./shaders.js";
+import { createSorter } from "./sorter.js";
 import { upOfPoints } from "./up.js";
 import { add } from "./vector.js";
 import workerSource from "worker:./worker.js";
@@ -10,24 +11,38 @@ const SH_C0 = 0.28209479177387814;
 const RECORD_TEXELS = 4;
 const VISIBLE = 3.4; // standard deviations to alpha 1/255
 
-/** `metadata`: name, attenuation or null, screen_filter, no_dial, max_sv, calibration. `gaussians`: from a reader in formats/. */
-export function createModel(gl, gaussians, metadata) {
+/** `metadata`: name, attenuation or null, screen_filter, no_dial, max_sv, calibration. `gaussians`: from a reader in formats/.
+ *  `device`: promise of sorter.js. */
+export function createModel(gl, gaussians, metadata, device) {
   const { count, degree, means, opacityLogits } = gaussians, { records, sh } = upload(gl, gaussians);
   const attenuation = gaussians.sigmaD ? metadata.attenuation : null, extent = extentOf(gaussians), worker = startWorker();
+  const sorting = createSorter(device, gaussians, { ...metadata, attenuation }).catch(() => null);
+  let sorter = null;
+  sorting.then((made) => { sorter = made; });
   worker.request("model", { means, opacityLogits, sigmaD: attenuation && gaussians.sigmaD, attenuation }, [means.buffer]);
   const spare = []; // buffers for orders, which are transferred to the worker and back
+
+  async function orderByWorker(state) {
+    const buffer = spare.pop() ?? new ArrayBuffer(4 * WIDTH * heightOf(count));
+    const result = await worker.request("order", { ...state, rows: buffer }, [buffer]);
+    return { ...result, rows: new Uint32Array(result.rows), done: () => spare.push(result.rows) };
+  }
+
   return {
     ...metadata, attenuation, count, degree, records, sh, extent,
-    /** Requests the rows to draw from the worker, and calls `use({rows, drawn, kept, distance})`. */
+    get sortsOnGpu() { return sorter !== null; },
+    /** Requests the rows to draw, and calls `use({rows, drawn, kept, distance})`; `rows` is valid until it returns. A lost
+     *  device is replaced by the worker. */
     async order(state, use) {
-      const buffer = spare.pop() ?? new ArrayBuffer(4 * WIDTH * heightOf(count));
-      const result = await worker.request("order", { ...state, rows: buffer }, [buffer]);
-      use({ ...result, rows: new Uint32Array(result.rows) });
-      spare.push(result.rows);
+      const byGpu = sorter && (await sorter.order(state).catch(() => { sorter = null; }));
+      const result = byGpu ?? (await orderByWorker(state));
+      use(result);
+      result.done();
     },
     dialFor: (view, target) => worker.request("dialFor", { view, target, maxSv: metadata.max_sv }),
     destroy() {
       worker.stop();
+      sorting.then((made) => made?.destroy());
       gl.deleteTexture(records);
       gl.deleteTexture(sh);
     },

@@ -123,12 +123,12 @@ export function createStage(renderer, canvas, camera) {
     listeners.held(hold.outOfReach(model.max_sv));
   }
 
-  /** Requests the order for the current state from the worker, one at a time for each side. */
+  /** Requests the order for the current state, one at a time for each side. A headset shows more than the view. */
   async function requestOrder({ side, model: of, dial, equation }, view, current) {
     if (side.busy || (side.sortedVersion === current && side.model === of)) return;
     side.busy = true;
     try {
-      await of.order({ view, dial, equation, marks: state.marks }, ({ rows, drawn: count, kept, distance }) => {
+      await of.order({ view, dial, equation, marks: state.marks, frustum: !eyes }, ({ rows, drawn: count, kept, distance }) => {
         if (of.destroyed) return;
         if (side.model !== of) renderer.release(side);
         Object.assign(side, { model: of, sortedVersion: current, kept, distance });
@@ -164,6 +164,15 @@ export function createStage(renderer, canvas, camera) {
     view: () => camera.view(...size()),
     counts: () => ({ total: model?.count ?? 0, kept: main.kept, drawn: main.drawn }),
     otherCounts: () => (state.wipe === null ? null : { total: second.model?.count ?? 0, kept: second.kept }),
+    /** Culls and sorts the left side for the current state, for tests and benchmarks: {ms, onGpu, kept, rows}. */
+    async order() {
+      const [{ model: of, dial, equation }] = sides(), start = performance.now();
+      let found = null;
+      await of.order({ view: camera.view(...size()), dial, equation, marks: state.marks, frustum: true }, ({ rows, drawn: count, kept }) => {
+        found = { ms: performance.now() - start, onGpu: of.sortsOnGpu, kept, rows: [...rows.subarray(0, count)] };
+      });
+      return found;
+    },
     /** Resolves once the current state is drawn, and a held frame rate has settled. */
     whenDrawn: () => (isDrawn() || !model ? Promise.resolve() : new Promise((resolve) => { callbacks.push(resolve); schedule(); })),
     /** The point under a position of the canvas, in shares of its size; null where nothing is. */
