@@ -95,11 +95,11 @@ function pack({ count, means, logScales, opacityLogits, sigmaD, growthD }) {
 
 /** The struct Frame. */
 function frameOf({ rotation: r, eye, near, fx, fy, cx, cy, width, height }, attenuated, blur, flags, count) {
-  const { dial, eps, tau, distance, cut } = attenuated ?? { dial: 1, eps: 1, tau: 0, distance: 1 };
+  const { dial, eps, tau, distance } = attenuated ?? { dial: 1, eps: 1, tau: 0, distance: 1 };
   const reach = attenuated ? growthDistance(attenuated) : 1;
   const values = [...r.slice(0, 3), fx, ...r.slice(3, 6), fy, ...r.slice(6), near, ...eye, distance, cx, cy, width, height];
   const frame = new Float32Array([...values, dial, eps, tau, reach, blur, ...Array(7).fill(0)]);
-  new Uint32Array(frame.buffer).set([count, attenuated !== null, cut === "soft", ...flags], 25);
+  new Uint32Array(frame.buffer).set([count, attenuated !== null, ...flags], 25);
   return frame;
 }
 

@@ -11,8 +11,8 @@ struct Frame {
   eye: vec3f, distance_unit: f32,
   centre: vec2f, size: vec2f,
   dial: f32, eps: f32, tau: f32, reach: f32,
-  blur: f32, count: u32, attenuated: u32, soft: u32,
-  marks: u32, frustum: u32,  // marks: culled Gaussians are sorted too
+  blur: f32, count: u32, attenuated: u32, marks: u32,  // marks: culled Gaussians are sorted too
+  frustum: u32,
 }
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -39,7 +39,7 @@ fn keyOf(row: u32) -> u32 {
   var culled = false;
   if (frame.attenuated != 0u) {
     let distance = length(ray) / frame.distance_unit;
-    culled = clodOpacity(mean.w, shape.y, distance, frame.dial, frame.eps, frame.tau, frame.soft != 0u) == 0.0;
+    culled = clodOpacity(mean.w, shape.y, distance, frame.dial, frame.eps, frame.tau, false) == 0.0;
     if (!culled) { scale *= clodScale(shape.z, distance, frame.dial, frame.reach); }
   }
   if (!culled) { atomicAdd(&kept, 1u); }
