@@ -133,7 +133,9 @@ def print_rows(file: str, *columns: str) -> None:
 def fill_in(page: Path, name: str, text: str) -> None:
     """Puts the text between the page's comments of this name, and prints it."""
     between = rf"(<!-- {name}: [^>]*-->\n).*(\n<!-- end of {name} -->)"
-    filled = re.sub(between, lambda ends: f"{ends[1]}\n{text}\n{ends[2]}", page.read_text("utf-8"), flags=re.S)
+    filled, count = re.subn(between, lambda ends: f"{ends[1]}\n{text}\n{ends[2]}", page.read_text("utf-8"), flags=re.S)
+    if not count:
+        sys.exit(f"{page}: there is no place for {name}, between <!-- {name}: ... --> and <!-- end of {name} -->")
     page.write_text(filled, encoding="utf-8")
     print(text)
 

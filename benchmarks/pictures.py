@@ -1,7 +1,7 @@
-"""The pictures of the viewer and of a report for README, of the demo's scene, by a headless Chromium.
+"""The pictures of the viewer and of a report for README and docs, of the demo's scene, by a headless Chromium.
 
 clod-adapt demo                  # makes demo/base.ply, demo/gallery.ply and demo/capture
-python benchmarks/pictures.py    # docs/images/viewer.webp and docs/images/report.webp
+python benchmarks/pictures.py    # viewer.webp, viewer_menu.webp and report.webp in docs/images
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from shown import Shown, serve  # noqa: E402
 
 IMAGES = ROOT / "docs" / "images"
 SIZE, TALL = {"width": 1280, "height": 800}, {"width": 1100, "height": 1300}
+PHONE, GAP = {"width": 390, "height": 800}, 20
 LARGEST = 300_000  # bytes
 VIEW = 0  # the held-out view across the whole room
 DIAL = 5.0
@@ -35,8 +36,8 @@ def main() -> None:
     parser.add_argument("demo", nargs="?", default="demo", help="the folder of clod-adapt demo (default: demo)")
     folder = Path(parser.parse_args().demo)
     with browser.launch() as chromium:
-        for name, picture in (("viewer", viewer(chromium, folder)), ("report", report(chromium, folder))):
-            keep(IMAGES / f"{name}.webp", picture)
+        for name, picture in (("viewer", viewer), ("viewer_menu", menu), ("report", report)):
+            keep(IMAGES / f"{name}.webp", picture(chromium, folder))
 
 
 def viewer(chromium: Any, folder: Path) -> bytes:
@@ -53,6 +54,28 @@ def viewer(chromium: Any, folder: Path) -> bytes:
         shown.page.wait_for_timeout(250)  # longer than the page draws fewer pixels after a movement
         shown.run("clod.whenDrawn()")
         return bytes(shown.page.screenshot(timeout=120_000))
+
+
+def menu(chromium: Any, folder: Path) -> bytes:
+    """The open menu with the removed Gaussians in orange: on a desktop in light, on a phone in dark."""
+    sheet = Image.new("RGB", (SIZE["width"] + GAP + PHONE["width"], SIZE["height"]), "white")
+    words = [folder / "gallery.ply", "--images", folder / "capture", "--sv", 2]
+    with serve(*words) as url:
+        for left, size, scheme in ((0, SIZE, "light"), (SIZE["width"] + GAP, PHONE, "dark")):
+            touch = size is PHONE
+            options = {"viewport": size, "color_scheme": scheme, "has_touch": touch, "is_mobile": touch}
+            with chromium.new_context(**options) as context:
+                shown = Shown(context.new_page()).ready(url)
+                shown.page.keyboard.press("k")
+                if touch:
+                    shown.page.tap("#fold")
+                shown.page.click("#menu-open")
+                shown.page.evaluate("document.getElementById('frame').style.visibility = 'hidden'")
+                shown.run("clod.whenDrawn()")
+                sheet.paste(Image.open(io.BytesIO(shown.page.screenshot(timeout=120_000))), (left, 0))
+    file = io.BytesIO()
+    sheet.save(file, "PNG")
+    return file.getvalue()
 
 
 def report(chromium: Any, folder: Path) -> bytes:

@@ -27,7 +27,7 @@ from .shared.kernels import announced_compiling, prepare_kernels
 from .shared.outputs import check_outputs
 from .shared.report import Stopwatch
 
-POINTS, FIT_STEPS, ADAPT_STEPS, MAX_SV = 60_000, 2000, 1000, 5.0
+POINTS, FIT_STEPS, ADAPT_STEPS, MAX_SV = 60_000, 2000, 1500, 5.0
 DIALS = (1.0, 2.0, 3.0, 5.0)
 EXTRA = {"matplotlib": "matplotlib", "skimage": "scikit-image"}  # module, and the package that brings it
 VIEW = 0  # the held-out view on the strip: across the whole room

@@ -87,11 +87,15 @@ class View:
         return View(camera, self.image)
 
     def halved(self) -> View:
-        """The photograph at half the size, by means of 2x2 pixels, with the camera for it."""
-        camera, image = self.camera.halved(), self.image
-        rows, columns = 2 * camera.height, 2 * camera.width
-        corners = [image[y:rows:2, x:columns:2].short() for y in (0, 1) for x in (0, 1)]
-        return View(camera, (sum(corners[1:], corners[0] + 2) >> 2).to(torch.uint8))
+        """The photograph at half the size, by means of 2x2 pixels, with the camera for it; made when it is read."""
+        camera = self.camera.halved()
+
+        def image() -> Tensor:
+            whole, rows, columns = self.image, 2 * camera.height, 2 * camera.width
+            corners = [whole[y:rows:2, x:columns:2].short() for y in (0, 1) for x in (0, 1)]
+            return (sum(corners[1:], corners[0] + 2) >> 2).to(torch.uint8)
+
+        return StoredView(camera, image)
 
 
 class StoredView(View):

@@ -162,7 +162,9 @@ class AdaptConfig:
     parameter: str = option("log", "trained parameter: log (of sigma_d) or linear (sigma_d itself, the paper's)")
     sampling: str = option("log", "dial value of a step: log-uniform (log) or uniform (the paper's)")
     full_share: float = option(0.5, "share of steps at s = 1 instead")
-    coarse: float = option(0.6, "share of steps, the first ones, with photographs of half the size (not of small ones)")
+    coarse: float = option(
+        0.6, "share of steps or of the time budget, at first, with photographs of half the size (not small ones)"
+    )
     target: str = option(
         "count", "what the dial reduces: count (of Gaussians, the paper's) or cost (the work of rendering them)"
     )

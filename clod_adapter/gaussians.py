@@ -87,6 +87,7 @@ class Gaussians:
         """
         if not isinstance(rows, slice):
             rows = torch.as_tensor(rows, device=self.means.device)
+            rows = rows.long() if rows.shape == (0,) and rows.dtype != torch.bool else rows  # [] is float
             if rows.dim() != 1 or (rows.dtype == torch.bool and len(rows) != len(self)):
                 raise ClodError(
                     f"rows has shape {tuple(rows.shape)}; give a slice, indices [M] or a mask [{len(self)}]"

@@ -66,7 +66,7 @@ def photometric_loss_plain(image: Tensor, target: Tensor, ssim_weight: float = 0
 
 def unit(photograph: Tensor, like: Tensor) -> Tensor:
     """A uint8 photograph in [0, 1], of the type and on the device of ``like``; transferred as bytes."""
-    return photograph.to(like.device, non_blocking=True).to(like.dtype) / 255
+    return photograph.to(like.device, non_blocking=like.device.type != "cpu").to(like.dtype) / 255
 
 
 def _compare(image: Tensor, target: Tensor, l1: float, dssim: float) -> tuple[Tensor, float, float]:

@@ -39,8 +39,8 @@ def main(checkpoint: str, folder: str, out: str = "dial.ply", device: str = "cud
 
     ends = (1, dial.config.max_sv)
     before = clod.evaluate(dial.gaussians(), scene.train, ends)
-    for step in range(steps):
-        view = scene.train[step % len(scene.train)]
+    for _ in range(steps):
+        view = scene.train[int(torch.randint(len(scene.train), ()))]
         colors = torch.cat([splats["sh0"], splats["shN"]], 1)
         s = dial.sample()  # dial
         renders, _, _ = rasterization(

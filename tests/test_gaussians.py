@@ -105,6 +105,10 @@ def test_other_rows_are_refused(rows: object) -> None:
         list(adapted())
 
 
+def test_no_rows_are_selected_by_an_empty_list() -> None:
+    assert len(adapted()[[]]) == 0
+
+
 def test_arrays_become_tensors() -> None:
     some = adapted()
     arrays = {name: value.double().numpy() for name, value in some.tensors().items()}

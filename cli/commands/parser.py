@@ -32,7 +32,7 @@ def make_parser(command: Command, prog: str) -> Parser:
     """The parser of a command, with the options that all commands have."""
     parser = Parser(
         prog=prog, usage=f"{prog} {command.usage}", description=command.description, epilog=command.epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter, add_help=False,
+        formatter_class=argparse.RawDescriptionHelpFormatter, add_help=False, allow_abbrev=False,
     )  # fmt: skip
     command.add_arguments(parser)
     parser.general = parser.add_argument_group("general")

@@ -29,7 +29,7 @@ def fit_base(
     """
     config = AdaptConfig(
         max_sv=1, iters=iters, lr_sigma=0, lr_means=1.6e-4, lr_quats=1e-3, lr_scales=5e-3,
-        lr_opacities=5e-2, lr_sh0=2.5e-3, lr_shN=1.25e-4, lr_final=0.05, average=0.0,
+        lr_opacities=5e-2, lr_sh0=2.5e-3, lr_shN=1.25e-4, lr_final=0.05, average=0.0, coarse=0.0,
     )  # fmt: skip
     initial = from_points(points, colors)
     frozen = torch.full((len(initial),), SIGMA_MAX / 10)  # no fading; SIGMA_MAX would be initialized

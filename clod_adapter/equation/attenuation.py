@@ -157,7 +157,7 @@ def _centres(means: Tensor, camera: Camera, config: AttenuationConfig) -> tuple[
     """Centres, the camera's position and D: what the compiled pass computes distances from."""
     with torch.autocast(means.device.type, enabled=False):
         means = means.detach().to(torch.promote_types(means.dtype, torch.float32))
-        position = camera.position.to(means, non_blocking=True)
+        position = camera.position.to(means, non_blocking=means.device.type != "cpu")
         if config.normalizer == "scene":
             return means, position, config.scene_distance
         return means, position, normalizing_distance(euclidean(means, position), means, camera, config)

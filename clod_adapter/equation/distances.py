@@ -37,7 +37,7 @@ def normalized_distances(means: Tensor, camera: Camera, config: AttenuationConfi
     """
     means = means.to(torch.promote_types(means.dtype, torch.float32))  # float16's square overflows from 256 on
     with torch.autocast(means.device.type, enabled=False):  # it would round the camera's position to 3 digits
-        distances = euclidean(means, camera.position.to(means, non_blocking=True))
+        distances = euclidean(means, camera.position.to(means, non_blocking=means.device.type != "cpu"))
         return distances.div_(normalizing_distance(distances, means, camera, config))
 
 
@@ -75,7 +75,7 @@ def normalizing_distance(distances: Tensor, means: Tensor, camera: Camera, confi
 
 def in_frustum(means: Tensor, camera: Camera) -> Tensor:
     """``[N]`` bool: the centre projects into the image, from beyond the near plane."""
-    projection = (camera.K @ camera.viewmat[:3].to(camera.K)).to(means, non_blocking=True)
+    projection = (camera.K @ camera.viewmat[:3].to(camera.K)).to(means, non_blocking=means.device.type != "cpu")
     x, y, z = projection[:, :3] @ means.T + projection[:, 3:]
     return (z > camera.near) & (x >= 0) & (x < camera.width * z) & (y >= 0) & (y < camera.height * z)
 

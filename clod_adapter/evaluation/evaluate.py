@@ -23,6 +23,8 @@ from clod_adapter.progress import Listener, Phase, Progress
 from clod_adapter.rasterizers import wait_for
 from clod_adapter.render import Rendering, render
 
+SCORED = 4  # views whose SSIM is computed at a time: each takes 83 bytes a pixel
+
 
 @dataclass(frozen=True)
 class Row:
@@ -111,7 +113,7 @@ def _compared(
     gaussians: Gaussians, views: Sequence[View], virtual_scale: float
 ) -> Iterator[tuple[View, Rendering, float, tuple[float, float]]]:
     """Each view with its rendering, the seconds that took, and its PSNR and SSIM; these of several views at a time."""
-    workers = torch.get_num_threads()
+    workers = min(torch.get_num_threads(), SCORED)
     with ThreadPoolExecutor(workers) as pool:
         for first in range(0, len(views), workers):
             some = views[first : first + workers]

@@ -73,7 +73,7 @@ class Dial(nn.Module):
     def __init__(self, splats: Splats, start: Gaussians, views: Sequence[View], config: AdaptConfig) -> None:
         super().__init__()
         assert start.sigma_d is not None and start.attenuation is not None
-        self._given = lambda: splats  # a ParameterDict that is an attribute would be a part of the module
+        self._given = (splats,)  # a ParameterDict that is an attribute would be a part of the module
         self.attenuation, self.config = start.attenuation, config
         self.log_sigma = nn.Parameter(start.sigma_d.detach().float().clamp(*SIGMA_RANGE).log())
         growth_d = (
@@ -106,17 +106,18 @@ class Dial(nn.Module):
         rates = {"log_sigma": root * self.config.lr_sigma, "growth_d": root * self.config.lr_growth}
         found = [{"params": [value], "lr": rates[name], "name": name} for name, value in self.named_parameters()]
         if splats:
-            given = self._given()
+            (given,) = self._given
             for name, value in (given.tensors() if isinstance(given, Gaussians) else given).items():
                 rate = self._rates.get(ATTRIBUTE_OF.get(name, name))
-                if rate is not None and value.requires_grad:
+                if rate is not None and getattr(value, "requires_grad", False):
                     found.append({"params": [value], "lr": rate, "name": name})
         return found
 
     def sample(self) -> float:
         """The next dial value: s = 1 in ``full_share`` of the steps, else (log-)uniform in [1, max_sv].
 
-        Called once a step, it also keeps the parameters in the range in which the equation has a gradient.
+        Called once a step, it also keeps the parameters in the range in which the equation has a gradient. Dial values
+        are evenly spread, not random: take the views in random order, or some meet the same dial values each round.
         """
         self._clamp()
         self._sampled += 1
@@ -170,7 +171,7 @@ class Dial(nn.Module):
         Raises:
             ClodError: their number has changed.
         """
-        given = self._given()
+        (given,) = self._given
         current = given if isinstance(given, Gaussians) else from_gsplat(given)
         if len(current) != len(self.log_sigma):
             raise ClodError(

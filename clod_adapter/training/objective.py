@@ -134,7 +134,7 @@ class Objective:
         screen_filter = self.screen_filter.halved() if halved else self.screen_filter
         rendered = self._rendered_by_kernels if self._compiled(decay) else self._rendered
         image, kept, term = rendered(leaves, view.camera, s, screen_filter)
-        loss = photometric_loss(image, view.image.to(decay.device, non_blocking=True), config.ssim_weight)
+        loss = photometric_loss(image, view.image, config.ssim_weight)
         plain, weight = loss.detach().double(), loss_weight(s, config)
         total = weight * (loss if term is None else loss + term)
         found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])

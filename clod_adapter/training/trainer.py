@@ -99,7 +99,7 @@ class Trainer:
             found = self.group.sum(found) if self.group else found
             self._updating = True
             self._update(found, share_done)
-            loss = float(found.loss) / self.config.batch  # the one time in a step that the host waits for a GPU
+            loss = float(found.loss) / self.config.batch  # the host waits for a GPU, as else only gsplat does
             if not math.isfinite(loss):
                 self._updating = False
                 names = ", ".join(view.camera.name or "a view without a name" for view, *_ in samples)

@@ -82,7 +82,7 @@ def test_arguments_for_adapting() -> None:
     args = build_parser("demo").parse_args(["--out=-odd", *flags])
     files = [Path("-odd") / name for name in ("base.ply", "capture", "gallery.ply")]
     given = demo.adapt_arguments(args, *files)
-    words = ["--images=-odd/capture", "--max-sv=5", "--iters=1000", "--out=-odd/gallery.ply", *flags, "--"]
+    words = ["--images=-odd/capture", "--max-sv=5", "--iters=1500", "--out=-odd/gallery.ply", *flags, "--"]
     words.append("-odd/base.ply")
     assert vars(given) == vars(build_parser("").parse_args(words))
 

@@ -14,7 +14,12 @@ from clod_adapter.cli.main import ADAPT
 from clod_adapter.cli.shared import manual
 from fences import ROOT
 
-SOURCES = [*(ROOT / "cli").rglob("*.py"), *(ROOT / "clod_adapter").rglob("*.py"), *(ROOT / "docs").glob("*.md")]
+SOURCES = [
+    ROOT / "README.md",
+    *(ROOT / "cli").rglob("*.py"),
+    *(ROOT / "clod_adapter").rglob("*.py"),
+    *(ROOT / "docs").glob("*.md"),
+]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -185,3 +186,14 @@ def test_what_does_not_fit_is_refused(captured: Pair) -> None:
         splats[name] = value
     with pytest.raises(ClodError, match="5 splats now, but the dial is for 300"):
         dial.loss(1.0, torch.tensor(1.0))
+
+
+def test_copies_have_the_splats_they_are_copied_with(captured: Pair, tmp_path: Any) -> None:
+    """As in a copy of a whole model; and a module is saved as others are."""
+    splats = trainable(captured[0])
+    dial = attach(splats, captured[1])
+    splats_too, copied = copy.deepcopy((splats, dial))
+    assert copied.differentiable().means is splats_too["means"]
+    torch.save(dial, tmp_path / "dial.pt")
+    again = torch.load(tmp_path / "dial.pt", weights_only=False)
+    assert torch.equal(again.gaussians().means, splats["means"])

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from clod_adapter.cameras import View
+from clod_adapter.cameras import StoredView, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.training.view_sampler import ViewSampler
@@ -78,3 +78,15 @@ def test_first_steps_have_photographs_of_half_the_size() -> None:
     for view, share_done, expected in ((large, 0.49, True), (large, 0.5, False), (small, 0.0, False)):
         sample = ViewSampler((view,), AdaptConfig(coarse=0.5)).draw(0, share_done)
         assert sample.halved == expected and (sample.view is view) != expected
+
+
+def test_photographs_are_read_after_the_draw() -> None:
+    """By the process whose share of the batch they are; a failure to read does not advance the sampler."""
+
+    def image() -> torch.Tensor:
+        raise OSError("not here")
+
+    camera = replace(VIEWS[0].camera, width=300, height=258)
+    sample = ViewSampler((StoredView(camera, image),), AdaptConfig(coarse=0.5)).draw(0, 0.0)
+    with pytest.raises(OSError, match="not here"):
+        _ = sample.view.image

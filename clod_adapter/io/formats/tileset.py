@@ -53,7 +53,10 @@ def write_tileset(
 
     def tile(level: int, rows: Rows, name: str, children: list[dict[str, Any]]) -> dict[str, Any]:
         """A tile and its file; without one where it has no Gaussians."""
-        found: dict[str, Any] = {"boundingVolume": {"box": _box(levels, rows, origin)}, "geometricError": errors[level]}
+        found: dict[str, Any] = {
+            "boundingVolume": {"box": _box(centres, rows, origin)},
+            "geometricError": errors[level],
+        }
         if len(rows[level]):
             gaussians = levels[level].select(torch.from_numpy(rows[level]))
             notes.extend(write_tile(folder / name, gaussians, origin))
@@ -137,14 +140,12 @@ def _cells(centres: Sequence[np.ndarray], rows: Rows) -> Iterator[Rows]:
     yield from _cells(centres, [each[~mask] for each, mask in zip(rows, low, strict=True)])
 
 
-def _box(levels: Sequence[Gaussians], rows: Rows, origin: Origin) -> list[float]:
+def _box(centres: Sequence[np.ndarray], rows: Rows, origin: Origin) -> list[float]:
     """A box around the centres of all levels but STRAY of them, as 3D Tiles has it: the centre and three half axes.
 
     Viewers take the distance to the box for the choice of levels. Floaters far off would put the viewer inside.
     """
-    points = np.concatenate([
-        level.means.cpu().double().numpy()[each] for level, each in zip(levels, rows, strict=True)
-    ])  # fmt: skip
+    points = np.concatenate([centre[each] for centre, each in zip(centres, rows, strict=True)])
     turned = -(np.quantile(points, [STRAY / 2, 1 - STRAY / 2], 0) + np.array(origin))[::-1, [0, 2, 1]]
     centre, half = turned.mean(0), (turned[1] - turned[0]) / 2
     return [*centre.tolist(), *np.diag(half).ravel().tolist()]
