@@ -78,7 +78,7 @@ export function createFiles(elements, viewer, config, { show, replace, update, c
         update();
         await stage.whenDrawn();
       } catch (error) {
-        ui.showMessage(error.message);
+        if (count === loadCount) ui.showMessage(error.message);
       } finally {
         if (count === loadCount) ui.showProgress(null);
       }

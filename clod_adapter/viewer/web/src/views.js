@@ -1,6 +1,7 @@
 // Changes of the view by keys, buttons and links.
 import { readLink, writeLink } from "./link.js";
 import { upOfCameras } from "./up.js";
+import { unit } from "./vector.js";
 
 /** `viewer`: camera, cameras, stage, motion, ui, up (main.js); `update()` shows a changed state. */
 export function createViews(elements, viewer, { update, showFile, clampDial }) {
@@ -64,7 +65,7 @@ export function createViews(elements, viewer, { update, showFile, clampDial }) {
       const { camera, stage } = viewer;
       if (viewer.file !== null && file !== viewer.file) await showFile(file);
       viewer.motion.stop();
-      if (up) [viewer.up, camera.up] = [String(up), up];
+      if (up && Math.hypot(...up) > 0) [viewer.up, camera.up] = [String(up), unit(up)];
       if (eye && rotation) {
         Object.assign(camera, { eye, rotation, intrinsics: null, aspect });
         viewer.ui.selectCamera(null);

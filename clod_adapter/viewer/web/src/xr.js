@@ -12,13 +12,21 @@ export async function xrModes() {
   return modes.filter((_, k) => supported[k]);
 }
 
-/** Starts a session. The headset starts at the camera; its y axis is the camera's up axis. `turnDial(factor)`: of the stick. */
-export async function startXr(mode, { renderer, stage, camera, turnDial }, ended) {
-  const { gl } = renderer, session = await navigator.xr.requestSession(mode);
+async function prepare(session, gl) {
   await gl.makeXRCompatible();
   const layer = new XRWebGLLayer(session, gl, { antialias: false, depth: false, stencil: false, ignoreDepthValues: true });
   session.updateRenderState({ baseLayer: layer });
-  const space = await session.requestReferenceSpace("local"), world = worldOf(camera);
+  return { layer, space: await session.requestReferenceSpace("local") };
+}
+
+/** Starts a session. The headset starts at the camera; its y axis is the camera's up axis. `turnDial(factor)`: of the stick. */
+export async function startXr(mode, { renderer, stage, camera, turnDial }, ended) {
+  const { gl } = renderer, session = await navigator.xr.requestSession(mode);
+  const { layer, space } = await prepare(session, gl).catch(async (error) => {
+    await session.end();
+    throw error;
+  });
+  const world = worldOf(camera);
   let last = null;
 
   function frame(time, xrFrame) {
