@@ -54,7 +54,7 @@ def export_options(parser: ArgumentParser) -> None:
     )  # fmt: skip
     output.add_argument(
         "--3dtiles", dest="tiles", action="store_true",
-        help="write the levels as one 3D Tiles set for CesiumJS and iTwin, in the new folder OUT",
+        help="write the levels as one 3D Tiles set, for CesiumJS, in the new folder OUT",
     )  # fmt: skip
     output.add_argument(
         "--order", choices=["extinction"],

@@ -1,4 +1,4 @@
-"""3D Tiles 1.1 (OGC 22-025r4): ``tileset.json`` over ``.glb`` files of several levels, for CesiumJS and iTwin.
+"""3D Tiles 1.1 (OGC 22-025r4): ``tileset.json`` over ``.glb`` files of several levels, for CesiumJS.
 
 CesiumJS 1.145 draws Gaussians only from glTF with ``KHR_gaussian_splatting_compression_spz_2``, named in the index: a
 buffer with the bytes of an SPZ file, attributes without data, and a node with a ``matrix``.
