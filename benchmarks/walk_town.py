@@ -36,7 +36,7 @@ class Town:
     photographs: int = 96
     samples: int = 3  # of the truth and of photographs, along each side of a pixel
     tuning: int = 400  # steps that the checkpoint is trained for
-    iters: int = 1700  # steps of adapting
+    iters: int = 1600  # steps of adapting
     max_sv: float = 8.0
     # Of the checkpoint and of adapting, times the extent of the cameras: 1 cm a step. That extent is 300 m, and the
     # default of adapting, 15 cm a step, destroys what is seen from a doorstep.

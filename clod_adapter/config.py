@@ -140,7 +140,7 @@ class AdaptConfig:
     """
 
     max_sv: float = option(5.0, "largest dial value to train for")
-    iters: int = option(1700, "training steps")
+    iters: int = option(1600, "training steps")
     batch: int = option(1, "views per step; learning rates scale with its square root")
     time_budget: float | None = option(
         None, "stop training after this many seconds; schedules are scaled to it (default: no limit)"
