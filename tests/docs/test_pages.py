@@ -78,7 +78,7 @@ def test_table_of_long_dials_matches_the_results() -> None:
         own = "defaults" if float(max_sv) == AdaptConfig().max_sv else f"max_sv {max_sv}"
         run = [
             row for row in rows
-            if (row["scene"], row["label"]) == (scene, f"one dial value, {own}")
+            if (row["scene"], row["label"]) == (scene, f"near growth, {own}")
             and row["config"]["iters"] == AdaptConfig().iters and row["config"]["seed"] == 0
         ][-1]  # fmt: skip
         columns.append({f"s = {row['virtual_scale']:g}": cell(row) for row in run["rows"]})
