@@ -1,0 +1,240 @@
+"""The page against SuperSplat's viewer: the same files, canvas and cameras in a headless Chromium.
+
+    python benchmarks/viewer_rivals.py --record    # adds rows to results/viewer_rivals.jsonl, and fills in docs/viewing.md
+
+The camera turns on a circle: in a street of the synthetic town (``city.py``), round the whole town, and round
+plush_half, where an adapted file of it is given (``--file``). A frame's time is the mean interval between drawn frames
+over some seconds after a warm-up; that of the first picture is from the navigation until two frames after the page says
+that it is complete. SuperSplat's viewer knows no dial: it draws all Gaussians. It is installed by npm into a temporary
+folder, at a fixed version. WebGL and WebGPU are software (SwiftShader), so the times say nothing about a GPU.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import clod_adapter as clod
+from city import city, city_cameras, look_at
+from city_surfaces import extent
+from clod_adapter.equation.extinction import sigma_for_extinction
+from common import ROOT, Row, append, arguments, fill_in, stored, table
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(ROOT / "tests"))
+import browser  # noqa: E402
+from shown import REAL_GPU, Shown, serve, sorts_on_gpu  # noqa: E402
+
+from clod_adapter.viewer.payload import page_config  # noqa: E402
+
+FILE, PAGE = "viewer_rivals.jsonl", ROOT / "docs" / "viewing.md"
+PACKAGE = "@playcanvas/supersplat-viewer@1.36.2"
+SIZE = {"width": 640, "height": 400}
+DIALS = (1.0, 3.0, 7.0)
+EFFECTS = ("sharpness", "bloom", "grading", "vignette", "fringing")  # of SuperSplat's viewer
+STEPS, TURN, FOV = 72, 20.0, 65.0  # cameras of a circle; seconds of a turn; degrees across the width
+WARM, SECONDS = 4.0, 12.0  # of turning, before and while frames are counted
+PHOTO_CENTRES = 0.5  # quantile of the centres of a capture, about which its cameras turn
+
+# Notes the time of each animation frame in which a picture was drawn: WebGL draws quads, or WebGPU's queue gets work.
+COUNT = """
+    window.drawnAt = [];
+    let drawn = false;
+    const count = (type, name) => {
+        const real = type?.prototype[name];
+        if (real) type.prototype[name] = function (...all) { drawn = true; return real.apply(this, all); };
+    };
+    count(WebGL2RenderingContext, "drawElementsInstanced");
+    if (!window.location.search.startsWith("?ours")) count(window.GPUQueue, "submit");
+    const tick = (now) => { if (drawn) drawnAt.push(now); drawn = false; requestAnimationFrame(tick); };
+    requestAnimationFrame(tick);
+    const shown = () => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(performance.now()))));
+    window.complete = new Promise((done) => { window.firstFrame = () => shown().then(done); });
+"""
+TURNING = """(cameras) => {
+    const began = performance.now();
+    const step = (now) => {
+        clod.setCamera(cameras[Math.floor((now - began) / 1000 / %s * cameras.length) %% cameras.length]);
+        requestAnimationFrame(step);
+    };
+    requestAnimationFrame(step);
+}"""
+
+
+class Course(NamedTuple):
+    """A file, and the circle of cameras: eyes and targets ``[STEPS, 3]``."""
+
+    name: str
+    path: Path
+    eyes: np.ndarray
+    targets: np.ndarray
+
+    def cameras(self) -> list[clod.Camera]:
+        poses = zip(self.eyes, self.targets, strict=True)
+        return [look_at(eye, target, *SIZE.values(), f"{k}") for k, (eye, target) in enumerate(poses)]
+
+
+def main() -> None:
+    parser = arguments(__doc__, record=FILE)
+    parser.add_argument("counts", nargs="*", type=int, default=(100_000, 500_000), help="Gaussians of the towns")
+    parser.add_argument("--file", type=Path, help="an adapted file of plush_half")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder, browser.launch() as chromium:
+        rival = install(Path(folder))
+        for course in courses(Path(folder), options.counts, options.file):
+            row = measure(chromium, course, rival)
+            print(json.dumps(row))
+            if options.record:
+                append(FILE, row)
+    if options.record:
+        fill_in(PAGE, "rivals", summary())
+
+
+def install(folder: Path) -> Path:
+    """The folder of SuperSplat's page, fetched by npm; exits without it."""
+    if not shutil.which("npm"):
+        sys.exit(f"npm is not on the PATH; it fetches {PACKAGE}")
+    npm = ["npm", "install", "--prefix", str(folder), "--no-audit", "--no-fund", "--no-save", PACKAGE]
+    ran = subprocess.run(npm, capture_output=True, text=True)
+    if ran.returncode:
+        sys.exit(f"npm cannot fetch {PACKAGE}: {ran.stderr.strip().splitlines()[-1]}")
+    return folder / "node_modules" / "@playcanvas" / "supersplat-viewer" / "public"
+
+
+def courses(folder: Path, counts: list[int], capture: Path | None) -> Iterator[Course]:
+    turn = 2 * np.pi * np.arange(STEPS) / STEPS
+    for count in counts:
+        path, (camera,) = folder / f"town{count}.ply", city_cameras(1, 8, 8, where="near", count=count)
+        clod.save(path, with_dial(city(count), camera))
+        eye = camera.position.double().numpy()
+        ahead = np.stack([np.sin(turn), 0 * turn, np.cos(turn)], 1)
+        yield Course(f"town of {count:,}, street", path, eye + 0 * ahead, eye + ahead)
+        far = 0.8 * float(extent(count).max())
+        round_ = np.stack([far * np.sin(turn), 0 * turn - 0.6 * far, far * np.cos(turn)], 1)
+        yield Course(f"town of {count:,}, air", path, round_, 0 * ahead)
+    if capture:
+        means = clod.load(capture).gaussians.means.double().numpy()
+        centre = np.quantile(means, PHOTO_CENTRES, axis=0)
+        far = 2.0 * float(np.median(np.linalg.norm(means - centre, axis=1)))
+        round_ = centre + np.stack([far * np.sin(turn), 0 * turn - 0.3 * far, far * np.cos(turn)], 1)
+        yield Course("plush_half", capture, round_, centre + 0 * round_)
+
+
+def with_dial(gaussians: clod.Gaussians, camera: clod.Camera) -> clod.Gaussians:
+    """The town with a dial: of the distances from a camera, s keeps a share of s^-1.2, the smallest ones leave first."""
+    attenuation = clod.AttenuationConfig(max_sv=7.0)
+    order = gaussians.log_scales.max(1).values.argsort(descending=True)
+    rank = torch.empty(len(order)).scatter_(0, order, (torch.arange(len(order)) + 1.0) / len(order))
+    d = (gaussians.means - camera.position).norm(dim=1)
+    sigma_d = sigma_for_extinction(gaussians.opacity_logits, d, rank ** (-1 / 1.2), attenuation)
+    return gaussians.replace(sigma_d=sigma_d, attenuation=attenuation)
+
+
+def measure(chromium: Any, course: Course, rival: Path) -> Row:
+    row: Row = {"course": course.name, "canvas": SIZE, "chromium": chromium.version, "package": PACKAGE}
+    row |= {"gaussians": len(clod.load(course.path).gaussians), "software": True}
+    for name, script in (("worker", ""), ("webgpu", REAL_GPU)):
+        row[name] = ours(chromium, course, script)
+    for name, words in (("supersplat, webgl", "webgl&"), ("supersplat, webgpu", "")):
+        row[name] = theirs(chromium, course, rival, words)
+    return row
+
+
+@contextmanager
+def tab(chromium: Any, *scripts: str) -> Iterator[Any]:
+    with chromium.new_context(viewport=SIZE) as context:
+        context.set_default_timeout(300_000)
+        page = context.new_page()
+        for script in scripts:
+            page.add_init_script(script)
+        yield page
+
+
+def ours(chromium: Any, course: Course, script: str) -> Row:
+    """Frames at each dial value; a ``script`` makes the page sort by WebGPU, where s = 1 says enough."""
+    cameras = page_config({"name": ""}, None, course.cameras(), 1.0)["cameras"]
+    with serve(course.path) as url, tab(chromium, COUNT, script) as page:
+        shown = Shown(page).ready(f"{url}?ours")
+        page.evaluate("firstFrame()")
+        found: Row = {"first_picture_ms": page.evaluate("complete")}
+        if script and not sorts_on_gpu(shown, 60):
+            return found | {"absent": "no WebGPU adapter"}
+        shown.run("clod.setCamera(given)", cameras[0])
+        page.evaluate(TURNING % TURN, cameras)
+        for dial in (1.0,) if script else DIALS:
+            page.evaluate("(dial) => clod.setDial(dial)", dial)
+            found[f"s = {dial:g}"] = frames(page) | page.evaluate("clod.counts()")
+        assert not shown.errors, shown.errors
+        return found
+
+
+def theirs(chromium: Any, course: Course, public: Path, words: str) -> Row:
+    """``words``: of the address. In its world x and y are the negative of the file's."""
+    flip = np.array([-1.0, -1.0, 1.0])
+    seconds = TURN / STEPS * np.arange(STEPS)
+    poses = {"position": (course.eyes * flip).ravel().tolist(), "target": (course.targets * flip).ravel().tolist()}
+    track = {
+        "name": "circle", "duration": TURN, "frameRate": 1, "loopMode": "repeat", "interpolation": "spline",
+        "smoothness": 1, "keyframes": {"times": seconds.tolist(), "values": poses | {"fov": [FOV] * STEPS}},
+    }  # fmt: skip
+    settings = {
+        "version": 2, "tonemapping": "none", "highPrecisionRendering": False, "background": {"color": [0, 0, 0]},
+        "postEffectSettings": {name: {"enabled": False} for name in EFFECTS}, "animTracks": [track], "cameras": [], "annotations": [], "startMode": "animTrack",
+    }  # fmt: skip
+    (public / "settings.json").write_text(json.dumps(settings))
+    scene = public / "scene.ply"
+    scene.unlink(missing_ok=True)
+    scene.symlink_to(course.path.resolve())
+    with static(public) as url, tab(chromium, COUNT) as page:
+        errors: list[str] = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(f"{url}index.html?{words}noui&content=scene.ply")
+        found: Row = {"first_picture_ms": page.evaluate("complete")}
+        found["all"] = frames(page)
+        assert page.evaluate("(({width, height}) => ({width, height}))(document.querySelector('canvas'))") == SIZE
+        return {"absent": errors[0][:120]} if errors else found  # software WebGPU loses its device
+
+
+@contextmanager
+def static(folder: Path) -> Iterator[str]:
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder))) as server:
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+
+
+def frames(page: Any) -> Row:
+    """The mean interval of drawn frames, while the camera turns."""
+    page.wait_for_timeout(1000 * WARM)
+    page.evaluate("drawnAt.length = 0")
+    page.wait_for_timeout(1000 * SECONDS)
+    at = page.evaluate("drawnAt")
+    while len(at) < 3:
+        page.wait_for_timeout(1000)
+        at = page.evaluate("drawnAt")
+    return {"ms": (at[-1] - at[0]) / (len(at) - 1), "frames": len(at)}
+
+
+def summary() -> str:
+    return ""
+
+
+if __name__ == "__main__":
+    main()
