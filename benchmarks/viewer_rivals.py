@@ -4,23 +4,24 @@
 
 The camera turns on a circle: in a street of the synthetic town (``city.py``), round the whole town, and round
 plush_half, where an adapted file of it is given (``--file``). A frame's time is the mean interval between drawn frames
-over some seconds after a warm-up; that of the first picture is from the navigation until two frames after the page says
-that it is complete. SuperSplat's viewer knows no dial: it draws all Gaussians. It is installed by npm into a temporary
-folder, at a fixed version. WebGL and WebGPU are software (SwiftShader), so the times say nothing about a GPU.
+over some seconds after a warm-up, and the CPU time of the browser's processes for each; the latter depends less on what
+else the machine does. The first picture is from the navigation until two frames after the page says that it is complete.
+SuperSplat's viewer knows no dial: it draws all Gaussians. npm installs it into a temporary folder, at a fixed version.
+WebGL and WebGPU are software (SwiftShader), so the times say nothing about a GPU.
 """
 
 from __future__ import annotations
 
 import functools
 import json
-import math
+import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,9 +37,8 @@ import torch
 
 sys.path.insert(0, str(ROOT / "tests"))
 import browser  # noqa: E402
-from shown import REAL_GPU, Shown, serve, sorts_on_gpu  # noqa: E402
-
 from clod_adapter.viewer.payload import page_config  # noqa: E402
+from shown import REAL_GPU, Shown, serve, sorts_on_gpu  # noqa: E402
 
 FILE, PAGE = "viewer_rivals.jsonl", ROOT / "docs" / "viewing.md"
 PACKAGE = "@playcanvas/supersplat-viewer@1.36.2"
@@ -46,7 +46,7 @@ SIZE = {"width": 640, "height": 400}
 DIALS = (1.0, 3.0, 7.0)
 EFFECTS = ("sharpness", "bloom", "grading", "vignette", "fringing")  # of SuperSplat's viewer
 STEPS, TURN, FOV = 72, 20.0, 65.0  # cameras of a circle; seconds of a turn; degrees across the width
-WARM, SECONDS = 4.0, 12.0  # of turning, before and while frames are counted
+WARM, SECONDS = 3.0, 10.0  # of turning, before and while frames are counted
 PHOTO_CENTRES = 0.5  # quantile of the centres of a capture, about which its cameras turn
 
 # Notes the time of each animation frame in which a picture was drawn: WebGL draws quads, or WebGPU's queue gets work.
@@ -145,12 +145,9 @@ def with_dial(gaussians: clod.Gaussians, camera: clod.Camera) -> clod.Gaussians:
 
 def measure(chromium: Any, course: Course, rival: Path) -> Row:
     row: Row = {"course": course.name, "canvas": SIZE, "chromium": chromium.version, "package": PACKAGE}
-    row |= {"gaussians": len(clod.load(course.path).gaussians), "software": True}
     for name, script in (("worker", ""), ("webgpu", REAL_GPU)):
         row[name] = ours(chromium, course, script)
-    for name, words in (("supersplat, webgl", "webgl&"), ("supersplat, webgpu", "")):
-        row[name] = theirs(chromium, course, rival, words)
-    return row
+    return row | {"supersplat": theirs(chromium, course, rival)}
 
 
 @contextmanager
@@ -181,8 +178,8 @@ def ours(chromium: Any, course: Course, script: str) -> Row:
         return found
 
 
-def theirs(chromium: Any, course: Course, public: Path, words: str) -> Row:
-    """``words``: of the address. In its world x and y are the negative of the file's."""
+def theirs(chromium: Any, course: Course, public: Path) -> Row:
+    """In its world x and y are the negative of the file's; its script needs all settings."""
     flip = np.array([-1.0, -1.0, 1.0])
     seconds = TURN / STEPS * np.arange(STEPS)
     poses = {"position": (course.eyes * flip).ravel().tolist(), "target": (course.targets * flip).ravel().tolist()}
@@ -192,20 +189,25 @@ def theirs(chromium: Any, course: Course, public: Path, words: str) -> Row:
     }  # fmt: skip
     settings = {
         "version": 2, "tonemapping": "none", "highPrecisionRendering": False, "background": {"color": [0, 0, 0]},
-        "postEffectSettings": {name: {"enabled": False} for name in EFFECTS}, "animTracks": [track], "cameras": [], "annotations": [], "startMode": "animTrack",
+        "postEffectSettings": {name: {"enabled": False} for name in EFFECTS}, "animTracks": [track], "cameras": [],
+        "annotations": [], "startMode": "animTrack",
     }  # fmt: skip
     (public / "settings.json").write_text(json.dumps(settings))
     scene = public / "scene.ply"
     scene.unlink(missing_ok=True)
     scene.symlink_to(course.path.resolve())
-    with static(public) as url, tab(chromium, COUNT) as page:
-        errors: list[str] = []
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(f"{url}index.html?{words}noui&content=scene.ply")
-        found: Row = {"first_picture_ms": page.evaluate("complete")}
-        found["all"] = frames(page)
-        assert page.evaluate("(({width, height}) => ({width, height}))(document.querySelector('canvas'))") == SIZE
-        return {"absent": errors[0][:120]} if errors else found  # software WebGPU loses its device
+    found: Row = {}
+    with static(public) as url:
+        for name, words in (("webgl", "webgl&"), ("webgpu", "")):
+            with tab(chromium, COUNT) as page:
+                errors: list[str] = []
+                page.on("pageerror", lambda error, errors=errors: errors.append(str(error)))
+                page.goto(f"{url}index.html?{words}noui&content=scene.ply")
+                took = {"first_picture_ms": page.evaluate("complete")} | frames(page)
+                canvas = page.evaluate("(({ width, height }) => ({ width, height }))(document.querySelector('canvas'))")
+                assert canvas == SIZE
+                found[name] = {"lost": errors[0][:120]} if errors else took
+    return found
 
 
 @contextmanager
@@ -224,16 +226,44 @@ def frames(page: Any) -> Row:
     """The mean interval of drawn frames, while the camera turns."""
     page.wait_for_timeout(1000 * WARM)
     page.evaluate("drawnAt.length = 0")
-    page.wait_for_timeout(1000 * SECONDS)
-    at = page.evaluate("drawnAt")
+    began = cpu_seconds()
+    at: list[float] = []
     while len(at) < 3:
-        page.wait_for_timeout(1000)
+        page.wait_for_timeout(1000 * SECONDS)
         at = page.evaluate("drawnAt")
-    return {"ms": (at[-1] - at[0]) / (len(at) - 1), "frames": len(at)}
+    cpu = cpu_seconds() - began
+    return {"ms": (at[-1] - at[0]) / (len(at) - 1), "cpu_ms": 1000 * cpu / len(at), "frames": len(at)}
+
+
+def cpu_seconds() -> float:
+    """Of all processes that this one started, and of theirs."""
+    found = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            fields = path.read_text("utf-8").rpartition(")")[2].split()
+            found[int(path.parent.name)] = int(fields[1]), int(fields[11]) + int(fields[12])
+
+    def ours(pid: int) -> bool:
+        return pid in found and (found[pid][0] == os.getpid() or ours(found[pid][0]))
+
+    return sum(ticks for pid, (_, ticks) in found.items() if ours(pid)) / os.sysconf("SC_CLK_TCK")
 
 
 def summary() -> str:
-    return ""
+    """The last row of each course: CPU ms of a frame, and in brackets the share of SuperSplat's; Markdown."""
+    rows = {row["course"]: row for row in stored(FILE)}
+    heads = ["", "SuperSplat", *(f"s = {dial:g}" for dial in DIALS), "first picture, s", "SuperSplat"]
+    return table(heads, (cells(row) for row in rows.values()), 1)
+
+
+def cells(row: Row) -> list[str]:
+    theirs, ours = row["supersplat"]["webgl"], row["worker"]
+    rival = theirs["cpu_ms"]
+    own = [ours[f"s = {dial:g}"]["cpu_ms"] for dial in DIALS]
+    return [
+        row["course"], f"{rival:.0f}", *(f"{ms:.0f} ({ms / rival:.0%})".replace("%", " %") for ms in own),
+        *(f"{each['first_picture_ms'] / 1000:.1f}" for each in (ours, theirs)),
+    ]  # fmt: skip
 
 
 if __name__ == "__main__":

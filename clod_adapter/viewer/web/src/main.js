@@ -178,7 +178,7 @@ window.clod = {
   },
   whenDrawn: () => viewer.stage.whenDrawn(),
   counts: () => viewer.stage.counts(),
-  order: () => viewer.stage.order(),
+  order: (frustum) => viewer.stage.order(frustum),
   async capture() {
     viewer.stage.endMotion();
     await viewer.stage.whenDrawn();
