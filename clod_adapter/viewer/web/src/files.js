@@ -76,6 +76,7 @@ export function createFiles(elements, viewer, config, { show, replace, update, r
       }
       const inParts = file === 0 && wipe === null; // a link to a comparison or another file needs these
       await showRead(...await Promise.all([fetchNamed(config.model, inParts && showRead), config.base && fetchNamed(config.base)]));
+      if (!loadCount) viewer.ui.showProgress(null);
     },
     /** Shows another of the files, from the same view and at the same dial value. */
     async showFile(number) {

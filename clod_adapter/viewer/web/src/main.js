@@ -75,7 +75,6 @@ function show(model, base, cameras, dial) {
   actions.layOut();
   actions.reset();
   stage.state.dial = clampDial(dial);
-  ui.showProgress(null);
   update();
 }
 
