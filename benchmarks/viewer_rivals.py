@@ -2,8 +2,8 @@
 
     python benchmarks/viewer_rivals.py --record    # adds rows to results/viewer_rivals.jsonl; the table of the page
 
-The camera turns in a street of the synthetic town (``city.py``), and on a circle round plush_half, where an adapted file
-of it is given (``--file``). A frame's time is the mean interval between drawn frames over a turn, after a warm-up, and
+The camera turns in a street of the synthetic town (``city.py``), and round plush_half, where an adapted file of it is
+given (``--file``). A frame's time is the mean interval between drawn frames over a turn, after a warm-up, and
 the CPU time of the browser's processes for each; the latter depends less on what else the machine does. The first
 picture ends two frames after the page says that it is complete. SuperSplat's viewer knows no dial: it draws all
 Gaussians. npm installs it into a temporary folder, at a fixed version. It draws with WebGL, as its WebGPU loses the

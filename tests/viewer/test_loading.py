@@ -19,7 +19,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
 from shown import Shown, assert_same, serve
 
-COUNT = 25_000  # a twentieth has more bytes than the page requests at least
+COUNT = 6000  # a twentieth has more bytes than the page requests at least
 SIZE = {"width": 200, "height": 150}
 PARTS = [0.05, 0.1, 0.2, 0.4, 0.8, 1.0]  # of the bytes, at which requests end
 # The first picture of the page: {total, text, picture}.
@@ -32,7 +32,7 @@ FIRST = """async () => {
 
 @pytest.fixture(scope="module")
 def coarse_first() -> Gaussians:
-    model = scenes.dialled(COUNT, 0, 7)
+    model = scenes.dialled(COUNT, 3, 7)
     model = model.replace(log_scales=model.log_scales - 1.0)
     return model.select(order_by_extinction(model, [scenes.camera(*SIZE.values())]))
 
