@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import clod_adapter
@@ -32,9 +33,26 @@ FIRST = """async () => {
 
 @pytest.fixture(scope="module")
 def coarse_first() -> Gaussians:
-    model = scenes.dialled(COUNT, 3, 7)
-    model = model.replace(log_scales=model.log_scales - 1.0)
-    return model.select(order_by_extinction(model, [scenes.camera(*SIZE.values())]))
+    """A wall of large Gaussians and of fine ones with nearly the same colours, which the dial culls first."""
+    camera, coarse = scenes.camera(*SIZE.values()), COUNT // 20
+    x, y = torch.meshgrid(torch.linspace(-2.4, 2.4, 20), torch.linspace(-1.8, 1.8, coarse // 20), indexing="ij")
+    random = torch.Generator().manual_seed(1)
+    fine = (torch.rand(COUNT - coarse, 2, generator=random) - 0.5) * torch.tensor([4.8, 3.6])
+    at = torch.cat([torch.stack([x.flatten(), y.flatten()], 1), fine])
+    first = torch.arange(COUNT) < coarse
+    depth = 3.0 + 0.1 * first + 0.05 * torch.rand(COUNT, generator=random)  # at equal ones, rounding decides the order
+    colours = torch.stack([at[:, 0].sin(), at[:, 1].cos(), (at[:, 0] + at[:, 1]).cos()], 1)
+    model = scenes.dialled(COUNT, 3, 7).replace(
+        means=scenes.in_front(camera, torch.cat([at, depth[:, None]], 1)),
+        log_scales=torch.where(first, 0.2, 0.02).log()[:, None].repeat(1, 3),
+        opacity_logits=torch.where(first, 3.0, 0.0),
+        sh0=(colours + 0.1 * torch.randn(COUNT, 3, generator=random))[:, None],
+        shN=0.01 * torch.randn(COUNT, 15, 3, generator=random),
+        sigma_d=torch.where(first, 30.0, 3.0),
+    )
+    rows = order_by_extinction(model, [camera])
+    assert set(rows[:coarse].tolist()) == set(range(coarse))
+    return model.select(rows)
 
 
 class Slow:
