@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -29,7 +30,7 @@ from typing import Any, NamedTuple
 import clod_adapter as clod
 from city import city, city_cameras, look_at
 from clod_adapter.equation.extinction import sigma_for_extinction
-from common import ROOT, Row, append, arguments, fill_in, stored, table
+from common import ROOT, Row, append, arguments, fill_in, photographs, stored, table
 
 import numpy as np
 import torch
@@ -42,11 +43,10 @@ from shown import REAL_GPU, Shown, serve, sorts_on_gpu  # noqa: E402
 FILE, PAGE = "viewer_rivals.jsonl", ROOT / "docs" / "viewing.md"
 PACKAGE = "@playcanvas/supersplat-viewer@1.36.2"
 SIZE = {"width": 640, "height": 400}
-DIALS = (1.0, 3.0, 7.0)
+STATES = {"dial off": 0.0, "s = 1": 1.0, "s = 3": 3.0, "s = 7": 7.0}
 EFFECTS = ("sharpness", "bloom", "grading", "vignette", "fringing")  # of SuperSplat's viewer
 STEPS, TURN, FOV = 72, 8.0, 65.0  # cameras of a circle; seconds of a turn; degrees across the width
 WARM, SECONDS = 2.0, TURN  # before and while frames are counted
-PHOTO_CENTRES = 0.5  # quantile of the centres of a capture, about which its cameras turn
 
 # Notes the time of each animation frame in which a picture was drawn.
 COUNT = """
@@ -122,11 +122,21 @@ def courses(folder: Path, counts: list[int], capture: Path | None) -> Iterator[C
         ahead = np.stack([np.sin(turn), 0 * turn, np.cos(turn)], 1)
         yield Course(f"town of {count:,}, street", path, eye + 0 * ahead, eye + ahead)
     if capture:
-        means = clod.load(capture).gaussians.means.double().numpy()
-        centre = np.quantile(means, PHOTO_CENTRES, axis=0)
-        far = 2.0 * float(np.median(np.linalg.norm(means - centre, axis=1)))
-        round_ = centre + np.stack([far * np.sin(turn), 0 * turn - 0.3 * far, far * np.cos(turn)], 1)
-        yield Course("plush_half", capture, round_, centre + 0 * round_)
+        views = [view.camera for view in photographs("plush_half").train]
+        eyes, axes = map(np.array, zip(*map(placed, views), strict=True))
+        centre, (_, spread, sides) = eyes.mean(0), np.linalg.svd(eyes - eyes.mean(0), full_matrices=False)
+        far = math.sqrt(2 / len(eyes)) * spread[:2, None]
+        round_ = centre + np.stack([np.sin(turn), np.cos(turn)], 1) @ (far * sides[:2])
+        across = np.eye(3) - axes[:, :, None] * axes[:, None]
+        target = np.linalg.solve(across.sum(0), (across @ eyes[:, :, None]).sum(0))[
+            :, 0
+        ]  # the point nearest to all axes
+        yield Course("plush_half", capture, round_, target + 0 * round_)
+
+
+def placed(camera: clod.Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Eye and viewing direction."""
+    return camera.position.double().numpy(), camera.viewmat[2, :3].double().numpy()
 
 
 def with_dial(gaussians: clod.Gaussians, camera: clod.Camera) -> clod.Gaussians:
@@ -157,7 +167,7 @@ def tab(chromium: Any, *scripts: str) -> Iterator[Any]:
 
 
 def ours(chromium: Any, course: Course, script: str) -> Row:
-    """Frames at each dial value; a ``script`` makes the page sort by WebGPU, where s = 1 says enough."""
+    """Frames without the dial and at each value; a ``script`` makes the page sort by WebGPU, without the dial only."""
     cameras = page_config({"name": ""}, None, course.cameras(), 1.0)["cameras"]
     with serve(course.path) as url, tab(chromium, COUNT, script) as page:
         began = cpu_seconds()
@@ -168,9 +178,9 @@ def ours(chromium: Any, course: Course, script: str) -> Row:
             return found | {"absent": "no WebGPU adapter"}
         shown.run("clod.setCamera(given)", cameras[0])
         page.evaluate(TURNING % TURN, cameras)
-        for dial in (1.0,) if script else DIALS:
-            page.evaluate("(dial) => clod.setDial(dial)", dial)
-            found[f"s = {dial:g}"] = frames(page) | page.evaluate("clod.counts()")
+        for name, dial in {"dial off": 0.0}.items() if script else STATES.items():
+            page.evaluate("(dial) => (clod.setEquation(dial > 0), clod.setDial(dial || 1))", dial)
+            found[name] = frames(page) | page.evaluate("clod.counts()")
         assert not shown.errors, shown.errors
         return found
 
@@ -251,14 +261,14 @@ def cpu_seconds() -> float:
 def summary() -> str:
     """The last row of each course: CPU ms of a frame, and in brackets the share of SuperSplat's; Markdown."""
     rows = {row["course"]: row for row in stored(FILE)}
-    heads = ["", "SuperSplat", *(f"s = {dial:g}" for dial in DIALS), "first picture", "SuperSplat"]
+    heads = ["", "SuperSplat", *STATES, "first picture", "SuperSplat"]
     return table(heads, (cells(row) for row in rows.values()), 1)
 
 
 def cells(row: Row) -> list[str]:
     theirs, ours = row["supersplat"], row["worker"]
     rival = theirs["cpu_ms"]
-    own = [ours[f"s = {dial:g}"]["cpu_ms"] for dial in DIALS]
+    own = [ours[name]["cpu_ms"] for name in STATES]
     return [
         row["course"], f"{rival:.0f}", *(f"{ms:.0f} ({ms / rival:.0%})".replace("%", " %") for ms in own),
         *(f"{each['first_picture']['cpu_ms']:.0f}" for each in (ours, theirs)),

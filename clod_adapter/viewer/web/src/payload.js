@@ -5,7 +5,8 @@ import { inflate } from "./formats/zip.js";
 
 const PARTS = [0.05, 0.1, 0.2, 0.4, 0.8, 1]; // of a file: ends of its requests, at which the rows so far are shown
 const LEAST = 1 << 16; // bytes of a request
-const SOON = 1000; // ms: a rest that takes no longer is requested at once, and nothing is shown before it
+const SOON = 2000; // ms: a rest that takes no longer is requested at once, and nothing is shown before it
+const PAUSE = 1000; // ms between two of the pictures before the whole
 
 /** The page's configuration; a page without one starts empty, as a viewer for dropped files. */
 export function readConfig() {
@@ -51,7 +52,7 @@ async function bytesOf({ href, size, element, gzip }, onProgress, onPart) {
 /** In parts, where `onPart` shows them: it is called with the bytes so far. */
 async function download(href, size, onProgress, onPart) {
   const bytes = new Uint8Array(size);
-  let loaded = 0, ms = 0, soon = !onPart;
+  let loaded = 0, ms = 0, soon = !onPart, shown = -Infinity;
   while (loaded < size) {
     const from = loaded, began = performance.now(), next = PARTS.find((share) => share * size > from) * size;
     loaded = soon ? size : Math.min(Math.ceil(Math.max(next, from + LEAST)), size);
@@ -61,8 +62,10 @@ async function download(href, size, onProgress, onPart) {
     bytes.set(new Uint8Array(response), from);
     ms += performance.now() - began;
     soon ||= ms * (size / loaded - 1) < SOON;
+    if (soon || performance.now() - shown < PAUSE) continue;
     const part = bytes.subarray(0, loaded);
-    if (!soon) setTimeout(() => onPart(part).catch(() => {})); // after the next request; errors come with the whole file
+    shown = performance.now();
+    setTimeout(() => onPart(part).catch(() => {})); // after the next request; errors come with the whole file
   }
   return bytes.buffer;
 }
