@@ -4,6 +4,7 @@
     python benchmarks/cost.py plush_half bonsai146           # measures them: frames of all in turn, on a quiet machine
     python benchmarks/cost.py --fit plush_half               # the cost's weights, fitted to times of frames
     python benchmarks/cost.py --table                        # the rows as a Markdown table
+    python benchmarks/cost.py --interpolated                 # frame times from the cost and the times at both ends
 
 A row of ``results/cost.jsonl`` has for each target and dial value, as means over the held-out views: PSNR, the shares
 kept of Gaussians and of the base's cost, and the median time of a frame. The same of the base; of the base with a dial
@@ -37,12 +38,15 @@ MAX_SV, THREADS, REPEATS = 7.0, 2, 5
 
 def main() -> None:
     parser = arguments(__doc__, table=print_table)
-    parser.add_argument("scenes", nargs="+")
+    parser.add_argument("scenes", nargs="*")
     parser.add_argument("--train", action="store_true", help="adapt and store the files, measure nothing")
     parser.add_argument("--fit", action="store_true", help="fit the weights of the cost to times instead")
+    parser.add_argument("--interpolated", action="store_true", help="errors of frame times by the stored costs")
     parser.add_argument("--iters", type=int, default=clod.AdaptConfig().iters)
     parser.add_argument("--targets", nargs="+", default=TARGETS)
     args = parser.parse_args()
+    if args.interpolated:
+        print_interpolated()
     for scene in args.scenes:
         if args.train:
             for target in args.targets:
@@ -149,6 +153,19 @@ def print_table() -> None:
                     cells = [f"{at['virtual_scale']:g}", f"{at['psnr']:.2f}", kept, cost]
                     lines.append([row["scene"], target, *cells, f"{at['frame_ms']:.1f}", f"{share:.0%}"])
     print(table(["scene", "target", "s", "PSNR", "Gaussians", "cost", "frame, ms", "of the base's"], lines))
+
+
+def print_interpolated() -> None:
+    """How far the times between the ends of the dial are from ``a + b cost`` with the times at both ends."""
+    lines = []
+    for row in stored(FILE):
+        if row["kind"] == "targets":
+            for target in TARGETS:
+                cost, ms = (np.array([at[name] for at in row[target]]) for name in ("cost", "frame_ms"))
+                error = np.interp(cost, cost[[-1, 0]], ms[[-1, 0]]) / ms - 1
+                worst = f"{abs(error).max():.1%}"
+                lines.append([row["commit"], row["scene"], target, f"{np.median(abs(error)):.1%}", worst])
+    print(table(["commit", "scene", "target", "median error", "largest"], lines))
 
 
 if __name__ == "__main__":

@@ -63,8 +63,11 @@ def run(scene: str, iters: int | None, python: str) -> Row:
 
 
 def latest() -> list[Row]:
-    """The last row of each run, by scene, those before first, by steps."""
-    rows = {(row["scene"], not row["before"], row["steps"]): row for row in stored(FILE)}
+    """The last row of each run of the last two versions, by scene, that before first, by steps."""
+    found = stored(FILE)
+    versions = {(row["scene"], row["before"]): row["measured"] for row in found if row["default"]}
+    own = [row for row in found if row["measured"] == versions[row["scene"], row["before"]]]
+    rows = {(row["scene"], not row["before"], row["steps"]): row for row in own}
     return [rows[key] for key in sorted(rows)]
 
 

@@ -63,7 +63,7 @@ def tune(
     parameters = {name: getattr(start, name).detach().to(**own) for name in ATTRIBUTES}
     rates = config.rates | {"means": config.rates["means"] * camera_extent([view.camera for view in views])}
     tuned = [name for name in ATTRIBUTES if rates[name] > 0 and parameters[name].numel()]
-    optimizer, random = RowAdam(parameters), np.random.default_rng(config.seed)
+    optimizer, random = RowAdam({name: parameters[name] for name in tuned}), np.random.default_rng(config.seed)
     everyone, order = torch.ones(len(start), dtype=torch.bool), []
     # Compiled before the clock starts.
     _gradients(start, parameters, tuned, views[0], len(start) if config.draw else None)

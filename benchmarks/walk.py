@@ -10,6 +10,7 @@ in turn:
 
 - ``base``: the checkpoint;
 - ``dial, s = 1``: the adapted file; distance alone decides;
+- ``cost, s = 1``: the same, adapted with the target ``cost`` in place of ``count``;
 - ``dial, held``: the adapted file at the smallest dial value with at most ``--budget`` Gaussians in view;
 - ``levels``: the checkpoint, then the adapted file baked at s = 1, 2, 4 and 8, switched block by block (``choose``);
 - ``merged``: as many Gaussians as these, merged from the checkpoint by ``splat-transform --decimate-adaptive``,
@@ -17,7 +18,7 @@ in turn:
 
 The change between successive frames is taken from one camera (``evaluation/popping.py``), so it is that of the level of
 detail alone. Time at equal quality: in some frames the fastest of all dial values, or of all levels drawn everywhere,
-that is at most so many dB below the base.
+that is at most so many dB below the base. In the same frames, both targets at each dial value.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ def main() -> None:
 
 
 def measure(town: Town, frames: int, repeats: int, budget: float) -> Row:
-    model, about = adapted(town)
+    (model, about), (costed, about_cost) = adapted(town), adapted(town, "cost")
     base, path = checkpoint(town), town.path(frames)
     baked = [clod.bake(model, s, cameras=town.cameras()) for s in LEVELS]
     merged = [merge(base, len(each))[0].replace(screen_filter=model.screen_filter) for each in baked]
@@ -77,6 +78,7 @@ def measure(town: Town, frames: int, repeats: int, budget: float) -> Row:
     methods: Methods = {
         "base": lambda k: (full, 1.0),
         "dial, s = 1": lambda k: (model, 1.0),
+        "cost, s = 1": lambda k: (costed, 1.0),
         "dial, held": lambda k: (model, dials[k]),
         "levels": lambda k: (levels.drawn(chosen[k]), 1.0),
         "merged": lambda k: (others.drawn(chosen[k]), 1.0),
@@ -84,12 +86,13 @@ def measure(town: Town, frames: int, repeats: int, budget: float) -> Row:
     some = [round(k * (frames - 1) / (SOME - 1)) for k in range(SOME)]
     settings = {
         "dial": [(model, s) for s in TURNED],
+        "cost": [(costed, s) for s in TURNED],
         "levels": [(each, 1.0) for each in baked],
         "merged": [(each, 1.0) for each in merged],
     }
     return {
-        "benchmark": "walk", "town": asdict(town), "adapted": about, "repeats": repeats,
-        "counts": {"base": len(full), "levels": [len(each) for each in baked]}, "dials": LEVELS,
+        "benchmark": "walk", "town": asdict(town), "adapted": about, "adapted_cost": about_cost, "repeats": repeats,
+        "counts": {"base": len(full), "levels": [len(each) for each in baked]}, "dials": LEVELS, "turned": TURNED,
         "distances": distances(frames), "held": dials, "chosen": chosen, "budget": round(budget * len(full)),
         "frames": walk(methods, town, path, repeats), "changes": changes(methods, path),
         "equal": [equal(full, settings, town, path[k], 2 * repeats) for k in some],

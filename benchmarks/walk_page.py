@@ -6,20 +6,22 @@ from itertools import pairwise
 from statistics import fmean
 from typing import Any
 
-from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, PURPLE, label_log, new_figure, save_figure, tidy
+from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, PURPLE, QUIET, label_log, new_figure, save_figure, tidy
 from common import ROOT, Row, table
 from walk_town import NEAREST, TIMES, Town
 
 FILE = "walk.jsonl"
 PICTURE, PAGE = ROOT / "docs" / "images" / "walk.png", ROOT / "docs" / "method.md"
-COLOURS = {"base": INK, "dial, s = 1": BLUE, "dial, held": GREEN, "levels": ORANGE, "merged": PURPLE}
+COLOURS = {
+    "base": INK, "dial, s = 1": BLUE, "cost, s = 1": QUIET, "dial, held": GREEN, "levels": ORANGE, "merged": PURPLE
+}  # fmt: skip
 BANDS = (1.0, 3.0, 10.0, 30.0, 100.0)  # times the nearest distance
 WITHIN = ((0.1, False), (0.25, False), (0.25, True))  # dB below the base; or below the better of it and s = 1
 
 
 def summary(row: Row) -> str:
-    """Time and PSNR against the base by distance; time saved at equal quality, and the largest change. Markdown."""
-    return f"{by_distance(row)}\n\n{at_equal_quality(row)}"
+    """Time and PSNR against the base by distance; time saved at equal quality, and the largest change; targets."""
+    return f"{by_distance(row)}\n\n{at_equal_quality(row)}\n\n{of_targets(row)}"
 
 
 def by_distance(row: Row) -> str:
@@ -44,9 +46,25 @@ def at_equal_quality(row: Row) -> str:
         shares = [f"{saved(row, name, within, better):.0%}".replace("%", " %") for name in methods]
         lines.append([f"time saved, at most {within:g} dB below {than}", *shares])
     for key, text in (("largest", "largest change between frames"), ("persistence", "its persistence")):
-        names = {"dial": "dial, s = 1"} | {name: name for name in ("levels", "merged")}
+        names = {name: name if name in row["changes"] else f"{name}, s = 1" for name in methods}
         lines.append([text, *(f"{row['changes'][names[name]][key]:.2f}" for name in methods)])
     return table(["", *methods], lines)
+
+
+def of_targets(row: Row) -> str:
+    """Both targets at each dial value, against the base: shares of its time and of its Gaussians in view; PSNR."""
+    lines = []
+    base = [frame["base"][0] for frame in row["equal"]]
+    for k, s in enumerate(row["turned"]):
+        cells = []
+        for name in ("dial", "cost"):
+            found = [frame[name][k] for frame in row["equal"]]
+            ms, seen = (sum(x[key] for x in found) / sum(x[key] for x in base) for key in ("ms", "in_view"))
+            psnr = fmean(x["psnr"] for x in found) - fmean(x["psnr"] for x in base)
+            cells += [f"{ms:.0%}".replace("%", " %"), f"{seen:.0%}".replace("%", " %"), f"{psnr:+.2f} dB"]
+        lines.append([f"{s:.3g}", *cells])
+    heads = [f"{target}: {what}" for target in ("count", "cost") for what in ("time", "in view", "PSNR")]
+    return table(["s", *heads], lines)
 
 
 def saved(row: Row, method: str, within: float, better: bool) -> float:
@@ -92,7 +110,8 @@ def draw_changes(axes: Any, row: Row) -> None:
     """A line for a dial; a point for each switch of levels."""
     for name, found in row["changes"].items():
         points = [(d, each) for d, each in zip(row["distances"][1:], found["each"], strict=True) if each > 0]
-        style = {"linewidth": 1.6} if name.startswith("dial") else {"linestyle": "none", "marker": "o", "markersize": 4}
+        dialled = name.endswith(("s = 1", "held"))
+        style = {"linewidth": 1.6} if dialled else {"linestyle": "none", "marker": "o", "markersize": 4}
         label = f"{name}: largest {found['largest']:.2g}"
         axes.plot(*zip(*points, strict=True), color=COLOURS[name], label=label, **style)
     axes.set_yscale("log")

@@ -36,7 +36,7 @@ class Town:
     photographs: int = 96
     samples: int = 3  # of the truth and of photographs, along each side of a pixel
     tuning: int = 400  # steps that the checkpoint is trained for
-    iters: int = 600  # steps of adapting
+    iters: int = 1600  # steps of adapting
     max_sv: float = 8.0
     # Of the checkpoint and of adapting, times the extent of the cameras: 1 cm a step. That extent is 300 m, and the
     # default of adapting, 15 cm a step, destroys what is seen from a doorstep.
@@ -124,14 +124,14 @@ def checkpoint(town: Town, scene: clod.Scene | None = None) -> clod.Checkpoint:
     return clod.load(path)
 
 
-def adapted(town: Town) -> tuple[clod.Gaussians, Row]:
+def adapted(town: Town, target: str = "count") -> tuple[clod.Gaussians, Row]:
     """The checkpoint adapted to the photographs as ``clod-adapt`` does, with a plan; and when, in how many seconds."""
-    path = CACHE / f"walk-{town.key}.ply"
+    path = CACHE / f"walk-{town.key}-{target}.ply"
     about = path.with_suffix(".json")
     if not (path.exists() and about.exists()):
         scene, at = town.scene(), commit()
         base = checkpoint(town, scene)
-        config = clod.AdaptConfig(iters=town.iters, max_sv=town.max_sv, lr_means=town.lr_means)
+        config = clod.AdaptConfig(iters=town.iters, max_sv=town.max_sv, lr_means=town.lr_means, target=target)
         plan = clod.make_plan(base.gaussians, scene, config)
         with Console().meter("adapting") as meter:
             result = plan.adapt(scene, lambda now: meter.update(now.share, f"loss {now.loss or 0:.4f}"))

@@ -20,6 +20,7 @@ from clod_adapter.viewer.page import policy, served_page
 from clod_adapter.viewer.payload import Payload, page_config
 from clod_adapter.viewer.server import Response, Server
 
+from .commands.checks import check_stored_cameras
 from .commands.view import view_files
 from .shared.antialiasing import with_filter, with_filter_of
 from .shared.browsers import open_browser
@@ -54,6 +55,8 @@ def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Res
     """The answers of the server by path, and the report."""
     files, base = view_files(args.models), None
     model = with_filter(read_checkpoint(files[0], console, args.activated), args, console)
+    if args.device_preset and args.images is None:
+        check_stored_cameras(files[0], bool(model.viewpoints))
     others = [
         with_filter(read_checkpoint(file, console, args.activated, model.origin), args, console) for file in files[1:]
     ]

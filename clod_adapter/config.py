@@ -56,7 +56,7 @@ class AttenuationConfig:
     quantile: float = option(0.95, "quantile of the distances in the frustum that is D (normalizer quantile)")
     scene_distance: float = option(1.0, "D in world units (normalizer scene); files have 1, sigma_d in world units")
     reference_distance: float = option(
-        0.0, "typical distance in the training views, world units, from which on scales grow; 0 if unknown"
+        0.0, "median distance in the nearest training views, world units, from which on scales grow; 0 if unknown"
     )
     max_sv: float = option(5.0, "largest dial value of training")
 
@@ -140,7 +140,7 @@ class AdaptConfig:
     """
 
     max_sv: float = option(5.0, "largest dial value to train for")
-    iters: int = option(2000, "training steps")
+    iters: int = option(1600, "training steps")
     batch: int = option(1, "views per step; learning rates scale with its square root")
     time_budget: float | None = option(
         None, "stop training after this many seconds; schedules are scaled to it (default: no limit)"
@@ -150,7 +150,7 @@ class AdaptConfig:
     cut: str = option("soft", "culling threshold: hard (opacity drops to 0 at tau s, the paper's) or soft (fades to 0)")
     eps: float = option(1e-8, "the paper's epsilon, added to 2 sigma_d^2")
     normalizer: str = option("scene", "divisor D of distances: scene, quantile or max (the paper's)")
-    quantile: float = option(0.95, "quantile of the distances that is D (normalizers scene and quantile)")
+    quantile: float = option(0.95, "quantile of the distances in the frustum that is D (normalizer quantile)")
     start: str = option(
         "importance",
         "initialization of sigma_d: importance (by rank of importance; replaceable neighbours are culled earlier), "
@@ -163,7 +163,7 @@ class AdaptConfig:
     sampling: str = option("log", "dial value of a step: log-uniform (log) or uniform (the paper's)")
     full_share: float = option(0.5, "share of steps at s = 1 instead")
     coarse: float = option(
-        0.6, "share of steps or of the time budget, at first, with photographs of half the size (not small ones)"
+        0.95, "share of steps or of the time budget, at first, with photographs of half the size (not small ones)"
     )
     target: str = option(
         "count", "what the dial reduces: count (of Gaussians, the paper's) or cost (the work of rendering them)"

@@ -78,7 +78,8 @@ def projection_without_opacities(
     width: int, height: int, *, packed: bool, **options: Any,
 ) -> tuple[Any, ...]:  # fmt: skip
     """gsplat 1.4.0's: one radius for both directions, no batches."""
-    found = _projection(means, covars, quats, scales, viewmats, Ks, width, height, **options)
+    radii, *values = _projection(means, covars, quats, scales, viewmats, Ks, width, height, **options)
+    found = (radii.amax(-1) if radii.dim() == 3 else radii, *values)  # later torch code has two
     if not packed:
         return found
     ids = torch.nonzero(found[0] > 0, as_tuple=True)

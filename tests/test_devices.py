@@ -235,11 +235,12 @@ def test_dial_and_adam_do_not_synchronize_with_the_device(monkeypatch: pytest.Mo
     model = own.replace(sigma_d=torch.ones(30), attenuation=CONFIG.attenuation(3.0))
     optimizer = RowAdam({"means": own.means.clone(), "sigma": torch.ones(30)})
     camera = ring(1, 20, 14)[0]
-    optimizer._step_plain({"means": own.means}, torch.ones(30, dtype=torch.bool), {"means": 0.1})  # its table is there
+    rates = {"means": 0.1, "sigma": 0.1}
+    optimizer._step_plain(optimizer.parameters, torch.ones(30, dtype=torch.bool), rates)  # its table is there
     with Silent():
         dialled = dial(model, camera, 2.0)
         gradients = {"means": own.means, "sigma": dialled.drawn}
-        optimizer._step_plain(gradients, dialled.keep, {"means": 0.1, "sigma": 0.1})
+        optimizer._step_plain(gradients, dialled.keep, rates)
     with pytest.raises(AssertionError, match="waits"), Silent():
         own.means[dialled.keep]
 

@@ -1,4 +1,4 @@
-"""``--memory`` for scenes that do not fit: training in blocks, in one process or as separate jobs."""
+"""``--memory`` for scenes that do not fit: training in blocks, in one process or as separate jobs (``block_job``)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 from clod_adapter._support.version import package_version
 from clod_adapter.blocks.divide import Division, check_divisible, divide
@@ -26,8 +25,6 @@ from clod_adapter.training.planner import make_plan
 from clod_adapter.training.state import Adapted
 
 from ..shared.console import duration
-from ..shared.files import size
-from ..shared.report import machine
 from .block_files import BlockFiles
 from .display import ProgressDisplay
 from .inputs import Inputs
@@ -108,49 +105,6 @@ class Blocks:
             plan.whole(inputs.base.gaussians, merged), steps, seconds, start_seconds, interrupted=False,
             failed="; ".join(failed) or None, held=held,
         )  # fmt: skip
-
-    def run_job(self, inputs: Inputs) -> dict[str, Any]:
-        """Does the job of ``--block``, the initialization or the next pass of one block; returns the report."""
-        args, result, number = self.setup.args, None, 1
-        if args.block != "start" and not self.files.start.exists():
-            self._require_block(args.block, self.plan.blocks)
-        divided = self.divided(inputs)
-        division, files, block = divided.division, divided.files, args.block
-        path = files.start
-        if block == "start":
-            complete(divided.plan, self.setup, inputs)
-        else:
-            self._require_block(block, division.count)
-            block = int(block) - 1
-            number = 1 if not files.block(block, 1).exists() else division.passes
-            before = self.first_pass(divided) if number == 2 else None
-            result = self.train(inputs, divided, Pass(block, number, before))
-            path = files.block(block, number)
-        number = next((n for n in range(1, division.passes + 1) if files.missing(n)), 0)
-        missing = files.missing(number) if number else []
-        print(f"{size(path):>9}  {path}")
-        print(f"pass {number}: blocks {missing} are missing" if number else "all blocks are done: leave out --block")
-        return {
-            "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
-            "block": block, "blocks": division.count, "passes": division.passes, "pass": number, "missing": missing,
-            "steps": result.steps if result else 0, "memory": asdict(self.plan), "machine": machine(),
-            "outputs": {"block": str(path)}, "exit_code": 1 if result and result.failed else 0,
-        }  # fmt: skip
-
-    @staticmethod
-    def _require_block(block: str, count: int) -> None:
-        if int(block) > count:
-            raise ClodError(f"--block is {block}, and the number of blocks is {count}; give a number from 1 to {count}")
-
-    def first_pass(self, divided: Divided) -> Gaussians:
-        """The merged result of the first pass, from its files."""
-        division, files = divided.division, divided.files
-        if missing := files.missing(1):
-            raise ClodError(
-                f"block {self.setup.args.block} has its first pass, and the second needs the first of all: run --block "
-                f"{missing[0]} first ({len(missing)} are missing)"
-            )
-        return merge(division, [files.load_learned(division, block, 1) for block in range(division.count)])
 
     def divided(self, inputs: Inputs) -> Divided:
         """The plan and the division in the file, which is made if it does not exist.

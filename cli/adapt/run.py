@@ -19,6 +19,7 @@ from clod_adapter.training.state import Adapted
 from ..shared.console import duration
 from ..shared.files import Outputs
 from ..shared.pages import AdaptPage
+from .block_job import run_job
 from .blocks import Blocks
 from .display import ProgressDisplay
 from .inputs import Inputs, read_inputs, with_base_rows
@@ -44,7 +45,7 @@ def adapt_and_report(args: argparse.Namespace) -> dict[str, Any]:
     blocks = Blocks.of(setup, inputs)
     if blocks is None:
         return adapt_whole(setup, inputs)
-    return blocks.run_job(inputs) if args.block else adapt_blocks(setup, inputs, blocks)
+    return run_job(blocks, inputs) if args.block else adapt_blocks(setup, inputs, blocks)
 
 
 def adapt_whole(setup: Setup, inputs: Inputs) -> dict[str, Any]:

@@ -45,15 +45,25 @@ def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fp
     if not model_has_dial(model):
         raise ClodError(f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ...")
     needed = name != "keep" and name not in measured
-    if needed and format_of(Path(model)) is PLY and not _has_calibration(model):  # others fail when read
+    if needed and not may_store(model, ROW):
         raise ClodError(
             f"{model}: has no calibration in its header, which {option} needs; adapt it again without interrupting, "
             "or give --sv or --keep"
         )
 
 
-def _has_calibration(model: str) -> bool:
-    return any(comment.startswith(f"{PREFIX}{ROW} ") for comment in all_comments(read_head(Path(model)).ply))
+def may_store(model: str, name: str) -> bool:
+    """Whether a PLY's header has a comment of this name (``ply.header``); True of other formats, which must be read."""
+    path = Path(model)
+    if format_of(path) is not PLY:
+        return True
+    return any(comment.startswith(f"{PREFIX}{name} ") for comment in all_comments(read_head(path).ply))
+
+
+def check_stored_cameras(model: str, stored: bool) -> None:
+    """Refuses --device-preset without a scene, of a file that stores no cameras."""
+    if not stored:
+        raise ClodError(f"{model}: stores no cameras, which --device-preset needs; give --images")
 
 
 def model_has_dial(model: str) -> bool:

@@ -19,7 +19,11 @@ OPTIONS: dict[str, Any] = {
     "seed": ("N", int), "target": ("count|cost", str), "growth": ("on|off", str),
 }  # fmt: skip
 # Defaults that depend on another option: the number of views seen stays the same for every batch.
-DEFAULTS = {"iters": "2000 divided by the batch", "batch": "1 per process", "growth": "on, with --form paper off"}
+DEFAULTS = {
+    "iters": f"{AdaptConfig().iters} divided by the batch",
+    "batch": "1 per process",
+    "growth": "on, with --form paper off",
+}
 
 
 def add_settings(options: _ActionsContainer, without: Sequence[str] = ()) -> None:

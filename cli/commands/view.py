@@ -11,9 +11,10 @@ from typing import Any
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import FORMATS
+from clod_adapter.io.ply.header import VIEWPOINT
 
 from ..shared.dials import add_device_preset
-from .checks import check_checkpoint, check_scene, model_has_dial
+from .checks import check_checkpoint, check_scene, check_stored_cameras, may_store, model_has_dial
 from .command import Command
 from .options import add_activated, add_antialiasing
 
@@ -79,6 +80,8 @@ def check_view(args: Namespace) -> None:
         raise ClodError(f"{files[0]}: has no sigma_d, which --device-preset needs; adapt it first")
     if args.images is not None:
         check_scene(args.images)
+    elif args.device_preset:
+        check_stored_cameras(files[0], may_store(files[0], VIEWPOINT))
 
 
 VIEW = Command(

@@ -45,12 +45,13 @@ def step_columns(parameter, first, second, gradient, rows, width, at, many, lane
 
 @kernel
 def adam_rows(  # type: ignore[no-untyped-def]
-    worker, workers, parameter, first, second, gradient, mask, steps, corrections, rate, beta1, beta2, epsilon
+    worker, workers, parameter, first, second, gradient, mask, steps, counted, corrections, rate, beta1, beta2, epsilon
 ):
     """Updates the rows of ``parameter [N, width]`` and of its moments where ``mask [N]`` is set, with ``gradient``.
 
-    ``steps[row]`` counts the updates of the row. For n updates ``corrections[0, n]`` is ``1 / (1 - beta1^n)`` and
-    ``corrections[1, n]`` is ``1 / sqrt(1 - beta2^n)``; the last entry holds for all larger n.
+    ``steps[row]`` counts the updates of the row: ``counted``, 1 or 0, is added first. For n updates
+    ``corrections[0, n]`` is ``1 / (1 - beta1^n)`` and ``corrections[1, n]`` is ``1 / sqrt(1 - beta2^n)``; the last
+    entry holds for all larger n.
     """
     width, most, rate = parameter.shape[1], corrections.shape[1] - 1, float32(rate)
     i, end = len(parameter) * worker // workers, len(parameter) * (worker + 1) // workers
@@ -64,7 +65,7 @@ def adam_rows(  # type: ignore[no-untyped-def]
             break
         for lane in range(16):
             if lane < found:
-                steps[rows[lane]] += 1
+                steps[rows[lane]] += counted
             else:
                 rows[lane] = rows[0]
             count = min(steps[rows[lane]], most)

@@ -146,7 +146,8 @@ def block_config(division: Division, block: int, config: AdaptConfig, *, first: 
         config.lighter(middle), lr_sigma=middle * config.lr_sigma, lr_growth=middle * config.lr_growth,
         lr_final=config.lr_final / middle, average=min(config.average * steps / max(light, 1), 1.0),
     )  # fmt: skip
-    settings = replace(config, lr_final=middle) if first else replace(last, coarse=0.0)
-    if first and light:
-        settings = replace(settings, coarse=min(config.coarse / (1 - SECOND), 1.0))
-    return replace(settings, iters=own, time_budget=budget, seed=seed)
+    settings = replace(config, lr_final=middle) if first else last
+    # The second pass takes up where the first one ends.
+    begun = 0.0 if first else 1 - light / max(steps, 1)
+    coarse = min(max(config.coarse - begun, 0.0) * steps / max(own, 1), 1.0)
+    return replace(settings, iters=own, time_budget=budget, seed=seed, coarse=coarse)

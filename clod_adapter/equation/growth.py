@@ -2,11 +2,11 @@
 
 For an exponent ``h`` (``growth_d``), a normalised distance ``d`` (``distances``) and a dial value ``s``::
 
-    m   = max(1, d s / r)          r: d at the typical distance of the training views
+    m   = max(1, d s / r)          r: d at the median distance in the nearest training views
     g   = m^h                      factor of the three scales, in [e^-20, e^20]
 
 Opacity fades and scale grows by the same number ``d s``: a camera that moves away and a dial that is turned have the
-same effect. At s = 1 nothing changes within the typical distance. The culling rule has no growth in it, so kept sets,
+same effect. At s = 1 nothing changes nearer than r. The culling rule has no growth in it, so kept sets,
 counts and extinction scales are those of CLoD-GS's Eq. 2.
 
 Accuracy, measured against mpmath (benchmarks/stability_equation.py), in relative errors: g is within

@@ -1,9 +1,9 @@
-"""The unit of sigma_d: world units in results and files, the typical distance of the scene while it is trained.
+"""The unit of sigma_d: world units in results and files, the reference distance of the scene while it is trained.
 
 The attenuation factor, ``exp(-(d / D s)^2 / (2 sigma^2 + eps))``, is the same for another D' where
 ``D'^2 (2 sigma'^2 + eps) = D^2 (2 sigma^2 + eps)``. In world units D is 1, and sigma_d alone determines how far a
-Gaussian is seen. Training divides by the typical distance: its learning rates, range of sigma_d and initialization are
-about 1.
+Gaussian is seen. Training divides by the reference distance, where growth begins: its range of sigma_d and its
+initialization are about 1.
 """
 
 from __future__ import annotations

@@ -27,10 +27,9 @@ from torch import Tensor
 from clod_adapter.cameras import Camera
 from clod_adapter.evaluation.level_errors import VIEWS
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.formats.tileset import ALLOWED
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
-
-ALLOWED = 16.0  # pixels of screen-space error that viewers allow by default
 
 
 @torch.no_grad()

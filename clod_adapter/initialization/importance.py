@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -34,6 +35,7 @@ MOST_VIEWS = 64
 # at most this share of the removal error at s = 1.
 FAINT_SHARE = 0.05
 TAU_MIN = 1e-6
+NEAREST = 0.05
 FADING = 1.5  # times the culling threshold: below, the soft cut reduces the opacity (attenuation)
 
 
@@ -58,7 +60,7 @@ def initialize(
         own = dataclasses.replace(base.attenuation, max_sv=config.max_sv, reference_distance=known)
         return in_world_units(with_growth(base.replace(attenuation=own), config, base.growth_d))
     views = spread(views, MOST_VIEWS)
-    attenuation = config.attenuation(scene_distance(base, views, config.quantile))
+    attenuation = config.attenuation(scene_distance(base, views))
     if config.start in ("constant", "identity"):
         value = 1.0 if config.start == "constant" else WIDEST * config.max_sv
         constant = torch.full_like(base.means[:, 0], value)
@@ -87,7 +89,7 @@ def with_growth(initial: Gaussians, config: AdaptConfig, growth_d: Tensor | None
 
 
 def for_training(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> Gaussians:
-    """``initial`` with sigma_d in units of the scene's typical distance, measured in the views where it is unknown."""
+    """``initial`` with sigma_d in units of the reference distance, ``scene_distance`` where it is unknown."""
     known = _reference_distance(initial, views, config)
     assert initial.attenuation is not None
     own = dataclasses.replace(initial.attenuation, reference_distance=known)
@@ -95,9 +97,9 @@ def for_training(initial: Gaussians, views: Sequence[View], config: AdaptConfig)
 
 
 def _reference_distance(dialled: Gaussians, views: Sequence[View], config: AdaptConfig) -> float:
-    """The typical distance, world units, measured in the views where it is unknown; growth begins there."""
+    """Where growth begins, world units; ``scene_distance`` of the views where it is unknown."""
     assert dialled.attenuation is not None
-    return known_distance(dialled.attenuation) or scene_distance(dialled, spread(views, MOST_VIEWS), config.quantile)
+    return known_distance(dialled.attenuation) or scene_distance(dialled, spread(views, MOST_VIEWS))
 
 
 def has_dial(base: Gaussians) -> bool:
@@ -150,13 +152,15 @@ def spread(views: Sequence[T], most: int) -> Sequence[T]:
     return [views[k * len(views) // most] for k in range(most)] if len(views) > most else views
 
 
-def scene_distance(base: Gaussians, views: Sequence[View], quantile: float) -> float:
-    """D of the scene normaliser: mean over views of the ``quantile`` distance in the frustum, world units."""
-    config = AttenuationConfig(normalizer="quantile", quantile=quantile)
-    total = 0.0  # not sum(): it rounds differently from Python 3.12 on
-    for view in views:
-        total += camera_unit(base.means, view.camera, config)
-    return total / len(views)
+def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
+    """D of the scene normaliser, world units: the median distance in the frustum, of the nearest views.
+
+    That of the NEAREST share of the views with the smallest medians, the last of these. Growth begins there: farther
+    away, what it does not do, scales and opacities do, at all distances (docs/method.md, "Near to far").
+    """
+    config = AttenuationConfig(normalizer="quantile", quantile=0.5)
+    medians = sorted(camera_unit(base.means, view.camera, config) for view in views)
+    return medians[math.ceil(NEAREST * len(medians)) - 1]
 
 
 def removal_error(

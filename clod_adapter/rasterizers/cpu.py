@@ -137,7 +137,7 @@ def kept(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
     means, _, _, logits, sigma_d, *_ = _arrays(_stored(gaussians))
     given = camera_vector(camera, gaussians.screen_filter), _dial_vector(gaussians, camera, virtual_scale)
     threads.run(dial.mark_kept, workers_for(len(found)), means, logits, sigma_d, *given, found)
-    return torch.from_numpy(found).bool()
+    return torch.from_numpy(found).view(torch.bool)
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Splatting on an NVIDIA GPU by the kernels of gsplat 1.4.0 to 1.5.3, restricted to the rows that are drawn.
+"""Splatting on an NVIDIA GPU by the kernels of gsplat 1.4.0 to 1.6.0, restricted to the rows that are drawn.
 
 gsplat's projection tests the opacity last, after all other work on a row, and packed mode does that work twice. Rows
 below 1/255, such as culled ones, are therefore removed first: only their opacity (4 bytes) is read. The geometry of the
@@ -103,15 +103,14 @@ def _project(
 
     means, quats, scales, opacities = geometry
     viewmat, K, eye = _camera(camera, means)
-    *_, ids, radii, means2d, depths, conics, compensations = _call(
+    *found, radii, means2d, depths, conics, compensations = _call(
         gsplat.fully_fused_projection, means, None, quats, scales, viewmat, K, camera.width, camera.height,
         eps2d=screen_filter.variance, packed=True, near_plane=camera.near, far_plane=math.inf, radius_clip=0.0,
         sparse_grad=False, calc_compensations=screen_filter.compensate, camera_model="pinhole",
         opacities=opacities.detach(),
     )  # fmt: skip
-    coefficients = _Rows.apply(rows[ids], sh0, shN)
-    degree = math.isqrt(coefficients.shape[1]) - 1
-    colors = 0.5 + gsplat.spherical_harmonics(degree, _Rows.apply(ids, means) - eye, coefficients)
+    ids = found[:3][-1]  # of cameras, Gaussians; 1.5.3 has batches before them, 1.6.0 also the bounds of each image
+    colors = _colors(_Rows.apply(ids, means), viewmat, eye, _Rows.apply(rows[ids], sh0, shN))
     shown = _Rows.apply(ids, opacities) * (1 if compensations is None else compensations)
     # Rows with values that are not finite are not drawn; the kernels would draw them opaque.
     sound = (means2d.sum(1) + conics.sum(1) + colors.sum(1) + shown).detach().isfinite()
@@ -120,6 +119,16 @@ def _project(
         "means2d": means2d.where(rows_of, 0), "conics": conics.where(rows_of, 0), "radii": radii, "depths": depths,
         "colors": colors.where(rows_of, 0).clamp(min=0), "opacities": shown.where(sound, 0),
     }  # fmt: skip
+
+
+def _colors(means: Tensor, viewmat: Tensor, eye: Tensor, coefficients: Tensor) -> Tensor:
+    """``[N, 3]``; gsplat 1.6.0 finds the directions from the camera itself, earlier versions take them."""
+    import gsplat
+
+    degree = math.isqrt(coefficients.shape[1]) - 1
+    if "viewmats" in inspect.signature(gsplat.spherical_harmonics).parameters:
+        return 0.5 + gsplat.spherical_harmonics(degree, means, viewmat, coefficients)[0]  # type: ignore[no-any-return]
+    return 0.5 + gsplat.spherical_harmonics(degree, means - eye, coefficients)  # type: ignore[no-any-return]
 
 
 def _blend(drawn: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor]:

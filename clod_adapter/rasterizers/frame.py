@@ -161,7 +161,7 @@ def prepare(
     across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
     listing = workers_for(len(order))
     histogram, totals = np.empty((listing, across * down), np.int64), np.empty(listing, np.int64)
-    offsets, slots = np.empty(across * down + 1, np.int64), buffers.get("slots", (2 * n,), np.int64)
+    offsets, slots = np.empty(across * down + 1, np.int64), buffers.get("slots", (2 * n,), np.int32)
     threads.run(tiles.count_tiles, listing, records, order, across, histogram, totals)
     total = tiles.tile_offsets(histogram, offsets, totals)
     entries, entry_slots = buffers.get("entries", (total,), np.int32), buffers.get("entry_slots", (total,), np.int32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,13 +13,16 @@ from clod_adapter._support.fusing import Fused, Number
 
 
 class RowAdam:
-    """Adam (Kingma and Ba 2015) over named ``[N, ...]`` parameters, a subset of rows a step.
+    """Adam (Kingma and Ba 2015) over named ``[N, ...]`` parameters, the same subset of their rows in a step.
 
     A row that is not stepped keeps its value and its moments, and costs next to nothing; the bias
     correction counts a row's own steps, so its first step is as long as anyone's.
 
     Args:
-        parameters: updated in place; float32, contiguous, as the leading rows of a larger tensor are.
+        parameters: at least one; updated in place; float32, contiguous, as the leading rows of a larger tensor are.
+
+    Attributes:
+        steps: ``[N]`` int32, of each row.
     """
 
     def __init__(
@@ -27,7 +31,8 @@ class RowAdam:
         self.parameters = parameters
         self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
         self._moments = {name: (_zeros(p), _zeros(p)) for name, p in parameters.items()}
-        self._steps = {name: torch.zeros(len(p), dtype=torch.int32, device=p.device) for name, p in parameters.items()}
+        some = next(iter(parameters.values()))
+        self.steps = torch.zeros(len(some), dtype=torch.int32, device=some.device)
         # After so many steps of its own a row's bias corrections are 1 in float32.
         last = math.ceil(-25 * math.log(2) / math.log(max(beta1, beta2)))
         count = np.arange(1, last + 2)
@@ -35,16 +40,13 @@ class RowAdam:
         self._corrections = np.pad(np.stack(corrections), ((0, 0), (1, 0))).astype(np.float32)
         self._table: Tensor | None = None  # the same, where the parameters are if that is not the CPU
 
-    def state(self) -> dict[str, dict[str, Tensor]]:
-        """The tensors themselves that it keeps of each parameter: ``first`` and ``second`` moment, ``steps`` by row."""
-        moments = {
-            kind: {n: both[k] for n, both in self._moments.items()} for k, kind in enumerate(("first", "second"))
-        }
-        return {**moments, "steps": self._steps}
+    def moments(self) -> dict[str, dict[str, Tensor]]:
+        """The tensors themselves that it keeps of each parameter: ``first`` and ``second``."""
+        return {kind: {n: both[k] for n, both in self._moments.items()} for k, kind in enumerate(("first", "second"))}
 
     @torch.no_grad()
     def step(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
-        """Steps the parameters named in ``gradients``, each at its rate, where ``rows`` (bool ``[N]``) is set.
+        """Steps all parameters, each at its rate, where ``rows`` (bool ``[N]``) is set.
 
         A gradient has the shape of its parameter; what it holds elsewhere does not matter.
         """
@@ -57,11 +59,12 @@ class RowAdam:
         from clod_adapter._kernels import threads
         from clod_adapter._kernels.adam import adam_rows
 
-        jobs = []
-        for name, gradient in gradients.items():
-            tensors = (self.parameters[name], *self._moments[name], gradient.contiguous())
+        jobs = list[tuple[Any, ...]]()
+        for name, parameter in self.parameters.items():
+            tensors = (parameter, *self._moments[name], gradients[name].contiguous())
             flat = [x.view(len(x), math.prod(x.shape[1:])).numpy() for x in tensors]
-            jobs.append((*flat, rows.numpy(), self._steps[name].numpy(), self._corrections, rates[name]))
+            counted = 0 if jobs else 1
+            jobs.append((*flat, rows.numpy(), self.steps.numpy(), counted, self._corrections, rates[name]))
 
         def adam(worker: int, workers: int) -> None:
             for job in jobs:
@@ -73,12 +76,12 @@ class RowAdam:
         """The plain twin of the fused step: all rows, without asking which (a GPU would have to answer first)."""
         if self._table is None or self._table.device != rows.device:
             self._table = torch.from_numpy(self._corrections).to(rows.device)
-        for name, gradient in gradients.items():
-            steps = self._steps[name].add_(rows)
-            length, correction = self._table[:, steps.clamp(max=self._table.shape[1] - 1)].unsqueeze(2)
-            values = (self.parameters[name], *self._moments[name], gradient)
-            flat = [x.view(len(x), math.prod(x.shape[1:])) for x in values[:3]]
-            flat.append(gradient.reshape(flat[0].shape))
+        self.steps.add_(rows)
+        length, correction = self._table[:, self.steps.clamp(max=self._table.shape[1] - 1)].unsqueeze(2)
+        for name, parameter in self.parameters.items():
+            values = (parameter, *self._moments[name])
+            flat = [x.view(len(x), math.prod(x.shape[1:])) for x in values]
+            flat.append(gradients[name].reshape(flat[0].shape))
             _adam(*flat, rows[:, None], length, correction, rates[name], self.beta1, self.beta2, self.epsilon)
 
 

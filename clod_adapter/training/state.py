@@ -27,8 +27,8 @@ class TrainingState:
 
     Attributes:
         tensors: by kind and name, as in ``parameter.means``: of each trained attribute its ``parameter``, Adam's
-            ``first`` and ``second`` moment, the number of ``steps`` of each row, and the ``mean`` if there is one.
-            float32, the steps int32.
+            ``first`` and ``second`` moment, and the ``mean`` if there is one. float32. ``steps.kept`` and ``steps.all``
+            count Adam's steps of each row of parameters that move where the dial keeps the row, or always; int32.
         attenuation: the settings that sigma_d is defined by.
         random: the state of NumPy's generator; order: the remaining views of this round, the next one last.
         loss: its running mean; averaged: the number of steps in the mean.

@@ -73,7 +73,9 @@ class Trainer:
         if config.growth == "on":
             assert start.growth_d is not None
             self.parameters["growth_d"] = start.growth_d.detach().float().clamp(*GROWTH_RANGE)
-        self.optimizer = RowAdam(self._trained(), beta1=BETA1**config.batch, beta2=BETA2**config.batch)
+        # The paper's count term has a gradient for opacities too, also of culled Gaussians.
+        everywhere = {self.decay} | ({"opacity_logits"} if config.count_term == "paper" else set())
+        self.optimizers = [self._optimizer(set(self.stepped) - everywhere), self._optimizer(everywhere)]
         self.empty_sh: Tensor | None = None  # the whole shN of a base whose empty degrees were removed
         self.done, self.seconds, self.start_seconds, self.loss = 0, 0.0, 0.0, math.nan
         self.mean: dict[str, Tensor] = {}
@@ -116,14 +118,13 @@ class Trainer:
 
     def _update(self, found: GradientSum, share_done: float) -> None:
         """Moves the rows whose gradients are finite; none if the loss is not, without asking which."""
-        learned, spoilt = torch.as_tensor(found.loss).isfinite(), spoilt_rows(found.gradients)
-        finite = learned & ~spoilt
-        self.held |= learned & spoilt
+        learned, rows = torch.as_tensor(found.loss).isfinite(), spoilt_rows(found.gradients)
+        self.held |= learned & rows
+        finite = rows.logical_not_().logical_and_(learned)
         rates = {name: rate * self.config.lr_final**share_done for name, rate in self.rates.items()}
-        # The paper's count term has a gradient for opacities too, also of culled Gaussians.
-        everywhere = {self.decay} | ({"opacity_logits"} if self.config.count_term == "paper" else set())
-        for rows, names in ((found.kept & finite, set(self.stepped) - everywhere), (finite, everywhere)):
-            self.optimizer.step({name: found.gradients[name] for name in self.stepped if name in names}, rows, rates)
+        for optimizer, rows in zip(self.optimizers, (found.kept.logical_and_(finite), finite), strict=True):
+            if optimizer:
+                optimizer.step(found.gradients, rows, rates)
         self.parameters[self.decay].clamp_(*self.decay_range)
         if self.config.growth == "on":
             self.parameters["growth_d"].clamp_(*GROWTH_RANGE)
@@ -181,13 +182,21 @@ class Trainer:
         """Views of the rows of the parameters that steps change."""
         return {name: self.parameters[name][: self.objective.trained] for name in self.stepped}
 
+    def _optimizer(self, names: set[str]) -> RowAdam | None:
+        """Of these parameters; None without any."""
+        own = {name: value for name, value in self._trained().items() if name in names}
+        return RowAdam(own, beta1=BETA1**self.config.batch, beta2=BETA2**self.config.batch) if own else None
+
     def _changing(self) -> dict[str, Tensor]:
         """All tensors that steps change, named as in ``TrainingState``."""
-        kinds = {"parameter": self._trained(), **self.optimizer.state(), "mean": self.mean}
-        cost = {} if self.objective.cost is None else {"cost.measured": self.objective.cost.measured}
-        return cost | {
-            f"{kind}.{name}": values[name] for kind, values in kinds.items() for name in self.stepped if name in values
-        }
+        found = {f"parameter.{name}": value for name, value in self._trained().items()}
+        for optimizer, rows in zip(self.optimizers, ("kept", "all"), strict=True):
+            if optimizer:
+                moments = optimizer.moments().items()
+                found |= {f"{kind}.{name}": value for kind, values in moments for name, value in values.items()}
+                found[f"steps.{rows}"] = optimizer.steps
+        found |= {f"mean.{name}": value for name, value in self.mean.items()}
+        return found if self.objective.cost is None else found | {"cost.measured": self.objective.cost.measured}
 
 
 def learning_rates(config: AdaptConfig, extent: float) -> dict[str, float]:

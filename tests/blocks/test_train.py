@@ -123,11 +123,15 @@ def test_rows_left_out_of_the_context_are_not_needed(captured: tuple[Gaussians, 
             assert float((whole - part).abs().mean()) <= 2 * LEFT_OUT
 
 
-def test_coarse_steps_of_both_passes_are_those_of_an_undivided_run(divided: Division) -> None:
-    first, last = (block_config(divided, 0, CONFIG, first=first) for first in (True, False))
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.9, 1.0])
+def test_coarse_steps_of_both_passes_are_those_of_an_undivided_run(divided: Division, share: float) -> None:
+    config = replace(CONFIG, coarse=share)
+    first, last = (block_config(divided, 0, config, first=first) for first in (True, False))
     coarse = first.coarse * first.iters + last.coarse * last.iters
-    assert coarse == pytest.approx(CONFIG.coarse * divided.steps(0, CONFIG), abs=1) and last.coarse == 0
-    assert block_config(replace(divided, seen=divided.seen[:, :1]), 0, CONFIG, first=True).coarse == CONFIG.coarse
+    assert coarse == pytest.approx(share * divided.steps(0, config), abs=1)
+    assert last.coarse == 0 or first.coarse == 1
+    undivided = block_config(replace(divided, seen=divided.seen[:, :1]), 0, config, first=True)
+    assert undivided.coarse == pytest.approx(share)
 
 
 @pytest.mark.parametrize("left_out", [0, 100])

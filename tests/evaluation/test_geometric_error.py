@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from clod_adapter.cameras import Camera
-from clod_adapter.evaluation.geometric_error import ALLOWED, geometric_errors
+from clod_adapter.evaluation.geometric_error import geometric_errors
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.formats.tileset import ALLOWED
 from scenes import gaussians
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 96, 72, 90.0, 6.0

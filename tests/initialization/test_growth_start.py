@@ -109,7 +109,7 @@ def test_unknown_unit_of_growth_is_measured_once() -> None:
     views = photograph(some, ring(2, 16, 12))
     initial = initialize(with_dial(some, torch.full((60,), 3.0), None, torch.full((60,), 0.5)), views, AdaptConfig())
     assert initial.attenuation is not None
-    assert initial.attenuation.reference_distance == scene_distance(some, views, 0.95)
+    assert initial.attenuation.reference_distance == scene_distance(some, views)
     trained = for_training(initial, views[:1], AdaptConfig())
     before, after = (dial(one, views[0].camera, 2.0).growth for one in (initial, trained))
     assert before is not None and after is not None and (before > 1).any()

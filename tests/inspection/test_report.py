@@ -68,7 +68,7 @@ def adapter_of(path: Path, n: int = 40) -> Path:
 
 
 def state_of(path: Path) -> Path:
-    tensors = {"parameter.means": torch.zeros(7, 3), "steps.means": torch.zeros(7, dtype=torch.int32)}
+    tensors = {"parameter.means": torch.zeros(7, 3), "steps.kept": torch.zeros(7, dtype=torch.int32)}
     numbers = {"loss": math.nan, "averaged": 0, "steps": 9, "seconds": 1.5, "start_seconds": 0.5}
     state = TrainingState(tensors, ATTENUATION, np.random.default_rng(0).bit_generator.state, (1, 0), **numbers)
     save_state(path, state, {"base": "abc", "version": "0"})

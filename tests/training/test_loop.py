@@ -18,7 +18,7 @@ from clod_adapter.adapter import ATTRIBUTES, with_dial
 from clod_adapter.cameras import Scene, camera_extent
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import SIGMA_MAX, log_attenuation
-from clod_adapter.equation.distances import normalized_distances
+from clod_adapter.equation.distances import in_frustum, normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
@@ -127,7 +127,7 @@ def test_zero_steps_return_the_initialization(captured: Pair) -> None:
     base = base.replace(opacity_logits=base.opacity_logits.abs())  # so that all can last
     found = initialize(base, scene.train, config_of(start_share=0.7, exponent=1.5))
     assert found.attenuation.scene_distance == 1
-    assert found.attenuation.reference_distance == pytest.approx(scene_distance(base, scene.train, 0.95))
+    assert found.attenuation.reference_distance == pytest.approx(scene_distance(base, scene.train))
     for row in evaluate(found, scene.train, SCALES):
         s = row.virtual_scale
         assert row.kept_share == pytest.approx(1 / (s**1.5 + (1 / 0.7 - 1) * s**-1.5), rel=0.25)
@@ -137,7 +137,7 @@ def test_result_is_in_world_units_and_survives_saving(captured: Pair, trained: T
     """The saved file equals the evaluated result; no conversion rounds it."""
     result = trained[0].gaussians
     assert result.attenuation is not None and result.attenuation.scene_distance == 1
-    assert result.attenuation.reference_distance == pytest.approx(scene_distance(captured[0], captured[1].train, 0.95))
+    assert result.attenuation.reference_distance == pytest.approx(scene_distance(captured[0], captured[1].train))
     save(tmp_path / "a.ply", result)
     again = load(tmp_path / "a.ply").gaussians
     assert torch.equal(again.sigma_d, result.sigma_d) and again.attenuation == result.attenuation
@@ -147,7 +147,7 @@ def test_result_is_in_world_units_and_survives_saving(captured: Pair, trained: T
 
 @pytest.mark.parametrize("lost", [False, True], ids=["known", "lost"])
 def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Trained, lost: bool) -> None:
-    """No importance pass; the unit is the file's typical distance, or the views' where another tool dropped it."""
+    """No importance pass; the unit is the file's reference distance, or the views' where another tool dropped it."""
     first, phases, states = trained[0].gaussians, list[Phase](), list[float]()
     if lost:
         first = first.replace(attenuation=replace(first.attenuation, reference_distance=0.0))
@@ -159,7 +159,7 @@ def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Trained, l
 
     config = config_of(iters=1, max_sv=3.0)
     result = adapt(first, captured[1], config, follow).gaussians
-    want = scene_distance(first, captured[1].train, 0.95) if lost else first.attenuation.reference_distance
+    want = scene_distance(first, captured[1].train) if lost else first.attenuation.reference_distance
     assert phases == [Phase.TRAINING] and states == [pytest.approx(want)] and want > 2
     found = result.attenuation.reference_distance
     assert found == pytest.approx(want)
@@ -357,15 +357,25 @@ def test_an_error_is_reported_with_the_state_before_it(captured: Pair, monkeypat
     assert_equal(adapt(*captured, config, None, states[5]).gaussians, whole)
 
 
-def test_scene_distance_is_the_mean_over_views(captured: Pair) -> None:
+def test_growth_begins_at_the_median_distance_in_the_nearest_view(captured: Pair) -> None:
     base, scene = captured
-    config = AttenuationConfig(normalizer="quantile", quantile=0.5)
-    ratios = [
-        (base.means - v.camera.position).norm(dim=1) / normalized_distances(base.means, v.camera, config)
-        for v in scene.train
-    ]
-    want = torch.stack([ratio.median() for ratio in ratios]).mean().item()
-    assert scene_distance(base, scene.train, 0.5) == pytest.approx(want, rel=1e-5)
+    median = {}
+    for view in scene.train:
+        distances = (base.means - view.camera.position).norm(dim=1)[in_frustum(base.means, view.camera)]
+        median[view.camera.name] = float(distances.sort().values[(len(distances) - 1) // 2])
+    assert scene_distance(base, scene.train) == pytest.approx(min(median.values()), rel=1e-5)
+    assert max(median.values()) > 1.01 * min(median.values())
+
+
+def test_one_view_of_twenty_does_not_decide_where_growth_begins(captured: Pair) -> None:
+    base, far = captured[0], captured[1].train[0]
+    pose = far.camera.viewmat.clone()
+    pose[:3, 3] *= 0.6  # towards the middle of the scene
+    near = replace(far, camera=replace(far.camera, viewmat=pose))
+    nearer, farther = scene_distance(base, [near]), scene_distance(base, [far])
+    assert nearer < 0.9 * farther
+    assert scene_distance(base, [near, *[far] * 39]) == farther
+    assert scene_distance(base, [near, near, *[far] * 38]) == nearer
 
 
 def test_settings_as_keywords(captured: Pair) -> None:

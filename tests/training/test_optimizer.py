@@ -113,7 +113,7 @@ def test_a_row_is_independent_of_other_rows_and_threads(n: int = 100) -> None:
     g = torch.Generator().manual_seed(0)
     results = []
     for count, some in [(1, everything(n)), (2, everything(n)), (3, torch.rand(n, generator=g) < 0.6)]:
-        optimizer = RowAdam(parameters(n))
+        optimizer = RowAdam({"shN": parameters(n)["shN"]})
         for _ in range(3):
             with torch_threads(count):
                 optimizer.step({"shN": gradient}, some, {"shN": 0.01})

@@ -30,7 +30,7 @@ def state() -> TrainingState:
     return TrainingState(
         tensors={
             "parameter.means": torch.tensor([[-0.0, 1e-45, math.inf], [math.nan, 1 / 3, 2.0]]),
-            "steps.means": torch.tensor([3, 7], dtype=torch.int32),
+            "steps.kept": torch.tensor([3, 7], dtype=torch.int32),
             "mean.means": torch.zeros(3, 2).T,  # not contiguous
         },
         attenuation=AttenuationConfig(tau=0.01 + 0.02, scene_distance=1e-7), random=random.bit_generator.state,

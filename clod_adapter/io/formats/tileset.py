@@ -5,7 +5,9 @@ buffer with the bytes of an SPZ file, attributes without data, and a node with a
 
 The root has the coarsest level of the whole scene. Its children are cells of at most LARGEST Gaussians of the finest
 level, each a chain of tiles from the next finer level to the finest; a tile replaces its parent (refine REPLACE).
-``geometricError`` is that of the level (``evaluation.geometric_error``).
+``geometricError`` of a tile is that of its level (``evaluation.geometric_error``). That of the index is of showing
+nothing: viewers leave out the whole set where it covers at most ALLOWED pixels. It is ALLOWED diagonals of the root's
+box and the root's own error, so that a set is drawn until it is about one pixel large.
 
 Viewers turn glTF's y-up axes into z-up ones, (x, y, z) to (x, -z, y), after the node's half turn. So a point (x, y, z)
 of the model is at (-x, -z, -y) of the tile set, in which the bounding boxes are.
@@ -32,6 +34,7 @@ from clod_adapter.origin import Origin
 TILESET = "tileset.json"
 SPZ = "KHR_gaussian_splatting_compression_spz_2"
 _FLOAT, _BYTE = 5126, 5121
+ALLOWED = 16.0  # pixels of screen-space error that viewers allow by default
 LARGEST = 1 << 18  # Gaussians of the finest level in a cell, unless they share one centre
 STRAY = 0.02  # share of the centres that may be outside of a tile's box, along each axis
 
@@ -76,7 +79,7 @@ def write_tileset(
         "asset": {"version": "1.1", "generator": f"clod-adapter {package_version()}"},
         "extensionsUsed": ["3DTILES_content_gltf"],
         "extensions": {"3DTILES_content_gltf": extensions},
-        "geometricError": 2 * errors[coarsest],  # of showing nothing; it only has to exceed the root's
+        "geometricError": errors[coarsest] + ALLOWED * 2 * float(np.linalg.norm(root["boundingVolume"]["box"][3:])),
         "root": root,
     }
     (folder / TILESET).write_text(json.dumps(index, indent=1), encoding="utf-8")

@@ -1,7 +1,8 @@
 """What this package needs of pycolmap, in its names, where pycolmap has no wheel: COLMAP models in and out, cameras.
 
 A model holds cameras, images and points; rigs and frames are not read, as each image holds its own pose. Written models
-are of the form before rigs, which all versions of COLMAP read. Lenses are in ``colmap_lenses``.
+are of the form before rigs, which all versions of COLMAP read. Lenses are in ``colmap_lenses`` and
+``colmap_undistortion``.
 
 Source: COLMAP's documentation, "Output Format", and ``src/colmap/sensor/models.h``. Tests compare with pycolmap.
 """
@@ -16,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from clod_adapter.io.scene.colmap_lenses import MODELS, Lens, undistorted_camera, warp
+from clod_adapter.io.scene.colmap_lenses import MODELS, Lens
+from clod_adapter.io.scene.colmap_undistortion import undistorted_camera, warp
 
 __version__ = "plain-1"  # of the undistorted photographs that are kept
 

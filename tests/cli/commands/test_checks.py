@@ -66,7 +66,8 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
     (tmp_path / "cut.ply").write_bytes(capture.ply.read_bytes()[:-100])
     (tmp_path / "mine.ply").write_bytes(capture.ply.read_bytes())
     (tmp_path / "folder.ply").mkdir()
-    clod_adapter.save(tmp_path / "dialled.ply", clod_adapter.with_dial(capture.gaussians))
+    for suffix in (".ply", ".glb"):
+        clod_adapter.save(tmp_path / f"dialled{suffix}", clod_adapter.with_dial(capture.gaussians))
     scene = capture.scene
     return {"PLY": capture.ply, "SCENE": scene, "SCENE/images": scene / "images", "DIALLED": Path("dialled.ply")}
 
@@ -162,6 +163,8 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("view PLY --base text.ply", "text.ply: is not a PLY"),
         ("view PLY --images nowhere", "nowhere: is not a folder"),
         ("view PLY --port 65536", "--port is 65536, it must be between 1 and 65535"),
+        ("view DIALLED --device-preset phone", "dialled.ply: stores no cameras, which --device-preset needs; give"),
+        ("view dialled.glb --device-preset phone", "dialled.glb: stores no cameras, which --device-preset needs"),
         ("view PLY --sv 0.5", "--sv is 0.5, it must be at least 1"),
         ("robustness PLY PLY --images SCENE", "base.ply: is given twice"),
         ("robustness PLY --images SCENE --max-sv 1 0.5", "--max-sv is 0.5, it must be at least 1"),
@@ -189,6 +192,7 @@ PLY --images SCENE --max-sv 0 | PLY --images SCENE --out nowhere/dial.ply
 eval PLY --images SCENE --sv 0 | eval PLY --images SCENE --keep 10 | render PLY --images SCENE -o SCENE
 export PLY --sv 2 -o x.ply | export DIALLED --psnr-drop 2 -o x.ply | export DIALLED -o x.splat
 apply text.ply dial.safetensors -o dial.ply | inspect PLY
+view DIALLED DIALLED --device-preset phone | export PLY --device-preset phone -o x.ply
 """
 
 
@@ -209,4 +213,4 @@ def test_help_errors_and_inspect_do_not_import_torch(bad: dict[str, Path], tmp_p
     done = subprocess.run([sys.executable, "-c", script, words], cwd=tmp_path, capture_output=True, text=True)
     wanted = [0 if line[-1] in ("--help", "--version") or line[0] == "inspect" else 2 for line in lines]
     assert "Traceback" not in done.stderr and json.loads(done.stdout.splitlines()[-1]) == wanted, done
-    assert done.returncode == 2 and len(lines) == 19
+    assert done.returncode == 2 and len(lines) == 21

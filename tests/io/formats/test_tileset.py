@@ -53,7 +53,7 @@ def test_index_and_tiles(tmp_path: Path) -> None:
     required = index["extensions"]["3DTILES_content_gltf"]["extensionsRequired"]
     assert required == ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
     chain = [tile for _, tile in tiles_of(index["root"])]
-    assert [tile["geometricError"] for tile in chain] == ERRORS[::-1] and index["geometricError"] > ERRORS[-1]
+    assert [tile["geometricError"] for tile in chain] == ERRORS[::-1]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0_0.glb", "0_1.glb", "root.glb", TILESET]
     for tile, want in zip(chain, given[::-1], strict=True):
         gltf, found = read_tile(tmp_path / tile["content"]["uri"], tmp_path)
@@ -64,6 +64,38 @@ def test_index_and_tiles(tmp_path: Path) -> None:
         assert {accessor["count"] for accessor in gltf["accessors"]} == {len(want)}
         assert sum("SH_DEGREE" in name for name in primitive["attributes"]) == 8  # of degree 1 and 2, as readers count
         assert gltf["accessors"][primitive["attributes"]["POSITION"]]["min"] == want.means.amin(0).tolist()
+
+
+def test_index_by_the_schema(tmp_path: Path) -> None:
+    """Properties and ranges of tileset.schema.json and tile.schema.json of 3D Tiles 1.1; errors only descend."""
+    write_tileset(tmp_path, levels(), ERRORS, origin=NOWHERE)
+    index = json.loads((tmp_path / TILESET).read_text())
+    assert set(index) <= {"asset", "extensionsUsed", "extensions", "geometricError", "root"}
+    assert set(index["extensions"]) == set(index["extensionsUsed"])
+
+    def check(tile: dict[str, Any], allowed: float) -> None:
+        assert set(tile) - {"content", "children", "refine"} == {"boundingVolume", "geometricError"}
+        assert 0 <= tile["geometricError"] <= allowed
+        assert set(tile["boundingVolume"]) == {"box"} and len(tile["boundingVolume"]["box"]) == 12
+        assert all(isinstance(number, float) for number in tile["boundingVolume"]["box"])
+        assert set(tile.get("content", {"uri"})) == {"uri"} and tile.get("children", True)
+        for child in tile.get("children", ()):
+            check(child, tile["geometricError"])
+
+    check(index["root"], index["geometricError"])
+
+
+@pytest.mark.parametrize("size", [0.02, 1.0, 500.0])
+def test_a_set_is_drawn_until_it_is_a_pixel(tmp_path: Path, size: float) -> None:
+    """Viewers draw nothing where the index's error covers at most 16 pixels, whatever the levels' errors."""
+    given = [level.replace(means=level.means * size) for level in levels()]
+    write_tileset(tmp_path, given, [0.0, 1e-6, 2e-6], origin=NOWHERE)
+    index = json.loads((tmp_path / TILESET).read_text())
+    halves = np.diag(np.reshape(index["root"]["boundingVolume"]["box"], (4, 3))[1:])
+    focal = 1000.0  # pixels
+    for pixels, drawn in ((1.1, True), (0.9, False)):
+        distance = focal * 2 * float(np.linalg.norm(halves)) / pixels
+        assert (index["geometricError"] * focal / distance > 16) is drawn
 
 
 def test_boxes_are_where_viewers_place_the_gaussians(tmp_path: Path) -> None:
