@@ -75,7 +75,7 @@ class Payload:
         attenuation = self.gaussians.attenuation
         return {
             "name": self.name, "href": None, "element": None, "format": "ply", "columns": {},
-            "count": len(self.gaussians), "max_sv": attenuation.max_sv if attenuation else 1.0,
+            "size": self.size, "count": len(self.gaussians), "max_sv": attenuation.max_sv if attenuation else 1.0,
             "attenuation": asdict(attenuation) if attenuation else None,
             "screen_filter": asdict(self.gaussians.screen_filter),
             "no_dial": None if attenuation else no_dial(self.name), "calibration": _calibration_rows(self.calibration),

@@ -108,6 +108,17 @@ def test_table_of_frames_matches_the_results() -> None:
         assert f"| {' | '.join(cells)} |" in page
 
 
+def test_table_of_viewers_matches_the_results() -> None:
+    rows = [json.loads(line) for line in (RESULTS / "viewer_rivals.jsonl").read_text(encoding="utf-8").splitlines()]
+    last = {row["course"]: row for row in rows}
+    (page,) = [table for table in tables(DOCS / "viewing.md") if table[0][1:2] == ["SuperSplat"]]
+    assert [line[0] for line in page[1:]] == list(last)
+    for (_, theirs, *cells), row in zip(page[1:], last.values(), strict=True):
+        rival = row["supersplat"]["cpu_ms"]
+        own = [row["worker"][name]["cpu_ms"] for name in page[0][2:6]]
+        assert [theirs, *cells[:4]] == [f"{rival:.0f}", *(f"{ms:.0f} ({100 * ms / rival:.0f} %)" for ms in own)]
+
+
 def test_target_counts_match_training() -> None:
     config = AdaptConfig()
     (dials, shares) = next(rows for rows in tables(DOCS / "equation.md") if rows[0][0] == "s")

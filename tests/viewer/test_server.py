@@ -52,6 +52,18 @@ def test_responses(server: Server) -> None:
         assert "python" not in headers["server"].lower()
 
 
+def test_parts_of_a_response(server: Server) -> None:
+    """Across its blocks, and beyond its end; what is no part of it gets the whole."""
+    whole = b"".join(BLOCKS)
+    for asked, first, last in (("0-0", 0, 0), ("990-1009", 990, 1009), ("1000-9999", 1000, 1023), ("5-1023", 5, 1023)):
+        status, headers, body = request(server, "/files/model", Range=f"bytes={asked}")
+        assert (status, body) == (206, whole[first : last + 1]) and len(body) == int(headers["content-length"]), asked
+        assert headers["content-range"] == f"bytes {first}-{last}/1024"
+    for asked in ("bytes=9-5", "bytes=2000-3000", "bytes=-5", "bytes=5-", "bytes=0-1,5-6", "rows=1-2", "bytes=0-1023"):
+        status, headers, body = request(server, "/files/model", Range=asked)
+        assert (status, body) == (200, whole) and "content-range" not in headers, asked
+
+
 def test_other_requests_are_refused(server: Server) -> None:
     for path in ("/files", "/files/", "/files/base", "/files/../", "/etc/passwd", "/%2e%2e/", "/index.html", "*"):
         assert request(server, path)[0] == 404, path

@@ -1,4 +1,4 @@
-"""Culling and sorting by WebGPU, against the worker: the same order without the Gaussians outside the picture.
+"""Culling and sorting by WebGPU and by the worker: the same order, without the Gaussians outside the picture.
 
 The page refuses a software device, on which the worker is faster; ``REAL_GPU`` hides that Chromium's is one.
 """
@@ -18,8 +18,9 @@ import scenes
 from clod_adapter.cameras import Camera
 from clod_adapter.config import ScreenFilter
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.render import render
 from clod_adapter.viewer.payload import Payload
-from shown import COUNTS, REAL_GPU, Shown, serve, sorts_on_gpu, take
+from shown import COUNTS, REAL_GPU, Shown, assert_alike, serve, sorts_on_gpu, take
 
 SAME = 50.0  # dB between the two pictures
 COUNT = 5000  # Gaussians, more than one workgroup sorts
@@ -74,9 +75,13 @@ def compared(both: Tabs) -> Iterator[Tabs]:
     assert both.worker.errors == both.gpu.errors == []
 
 
-def compare(tabs: Tabs, gaussians: Gaussians, camera: Camera) -> tuple[list[int], list[int]]:
-    """The rows of both, whose order, count and picture agree; rows that only the worker has are outside the picture."""
+def compare(tabs: Tabs, gaussians: Gaussians, camera: Camera) -> tuple[list[int], list[int], list[int]]:
+    """The rows in front of the camera, and those that the worker and WebGPU draw: all with their centre in the picture.
+
+    Order, count and picture of both agree.
+    """
     tabs.camera(camera)
+    whole = tabs.worker.run("clod.order(false)")["rows"]
     slow, fast = tabs.run("clod.order()")
     assert fast["onGpu"] and not slow["onGpu"]
     assert abs(fast["kept"] - slow["kept"]) <= COUNTS * slow["kept"]
@@ -84,14 +89,15 @@ def compare(tabs: Tabs, gaussians: Gaussians, camera: Camera) -> tuple[list[int]
     depth = points[fast["rows"], 2].numpy()
     assert (np.diff(depth) <= 1e-5).all() and len(set(fast["rows"])) == len(fast["rows"])
     assert len(set(fast["rows"]) - set(slow["rows"])) <= COUNTS * slow["kept"]  # at the threshold
-    left_out = points[sorted(set(slow["rows"]) - set(fast["rows"]))]
-    pixel = left_out[:, :2] / left_out[:, 2:] @ camera.K[:2, :2].double().T + camera.K[:2, 2].double()
+    pixel = points[:, :2] / points[:, 2:] @ camera.K[:2, :2].double().T + camera.K[:2, 2].double()
     inside = ((pixel >= 0) & (pixel <= torch.tensor([camera.width, camera.height]))).all(1)
-    assert int(inside.sum()) <= COUNTS * slow["kept"]
+    for each in (slow, fast):
+        left_out = sorted(set(whole) - set(each["rows"]))
+        assert int(inside[left_out].sum()) <= COUNTS * slow["kept"]
     a, b = (each.picture().astype(np.float64) for each in tabs)
     assert a.std() > 5 and 10 * np.log10(255**2 / max(((a - b) ** 2).mean(), 1e-9)) >= SAME
     assert [each.counts()["drawn"] for each in tabs] == [len(slow["rows"]), len(fast["rows"])]
-    return slow["rows"], fast["rows"]
+    return whole, slow["rows"], fast["rows"]
 
 
 def small(count: int = COUNT, **settings: Any) -> Gaussians:
@@ -119,15 +125,15 @@ def test_the_order_and_the_picture_are_the_workers(
     model = small(**settings)
     compared.take(save(model))
     compared.run(script)
-    slow, fast = compare(compared, model, scenes.camera(160, 120, fov=20))
-    assert 100 < len(fast) < 0.9 * len(slow)
+    every, *some = compare(compared, model, scenes.camera(160, 120, fov=20))
+    assert all(100 < len(rows) < 0.9 * len(every) for rows in some)
     far = torch.eye(4)
     far[2, 3] = 12.0
     whole = replace(scenes.camera(160, 120), viewmat=far)
     compared.run("clod.setDial(1)")
     compared.run(script)
-    slow, fast = compare(compared, model, whole)
-    assert abs(len(fast) - len(slow)) <= COUNTS * len(slow)
+    every, *some = compare(compared, model, whole)
+    assert all(abs(len(rows) - len(every)) <= COUNTS * len(every) for rows in some)
 
 
 def test_the_extent_of_a_gaussian_outside_the_picture(
@@ -141,9 +147,12 @@ def test_the_extent_of_a_gaussian_outside_the_picture(
         path = tmp_path / "model.ply"
         path.write_bytes(b"".join(Payload("model.ply", model).blocks()))
         compared.take(path)
-        compared.run("clod.setDial(4)" if model is grown else "clod.setDial(1)")
-        slow, fast = compare(compared, model, scenes.camera(64, 48, fov=10))
-        assert len(fast) < len(slow)
+        s = 4.0 if model is grown else 1.0
+        compared.run(f"clod.setDial({s})")
+        camera = scenes.camera(64, 48, fov=10)
+        every, *some = compare(compared, model, camera)
+        assert all(len(rows) < len(every) for rows in some)
+        assert_alike(compared.worker.picture(), render(model, camera, s).pixels.numpy(), tmp_path / "picture.png")
 
 
 def test_equal_depths_keep_the_order_of_the_file(compared: Tabs, save: Callable[..., Path]) -> None:
@@ -155,7 +164,7 @@ def test_equal_depths_keep_the_order_of_the_file(compared: Tabs, save: Callable[
         for name in ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
     })  # fmt: skip
     compared.take(save(twice))
-    _, fast = compare(compared, twice, scenes.camera(160, 120))
+    *_, fast = compare(compared, twice, scenes.camera(160, 120))
     place = {row: at for at, row in enumerate(fast)}
     pairs = [(place[row], place[row + COUNT // 2]) for row in fast if row < COUNT // 2]
     assert len(pairs) > 1000 and all(second > first for first, second in pairs)

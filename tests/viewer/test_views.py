@@ -220,23 +220,44 @@ HEADSET = """
         frame(time, stick = 0) {
             session.inputSources[0].gamepad.axes[3] = stick;
             next(time, { getViewerPose: () => pose });
-            return document.getElementById("canvas").toDataURL();
+            return window.pixels ? pixels() : document.getElementById("canvas").toDataURL();
         },
     };
-    const supports = async (mode) => mode === "immersive-vr";
+    const supports = async (mode) => mode === `immersive-${window.mode ?? "vr"}`;
     const xr = { isSessionSupported: supports, requestSession: async () => session };
     Object.defineProperty(navigator, "xr", { value: xr });
     WebGL2RenderingContext.prototype.makeXRCompatible = async () => {};
     window.XRWebGLLayer = class {
-        framebuffer = null;
+        constructor(session, gl) { this.framebuffer = window.targetOf?.(gl) ?? null; }
         getViewport({ k }) { return { x: 200 * k, y: 0, width: 200, height: 320 }; }
     };
 """
 
 
-@pytest.mark.parametrize("script", ["", REAL_GPU], ids=["worker", "webgpu"])
+# Of a headset that shows what is behind the picture: the bytes of its RGBA image, in place of the canvas.
+TRANSPARENT = """
+    window.mode = "ar";
+    window.targetOf = (gl) => {
+        const texture = gl.createTexture(), framebuffer = gl.createFramebuffer();
+        gl.bindTexture(gl.TEXTURE_2D, texture);
+        gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA8, 400, 320);
+        gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+        gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+        window.pixels = () => {
+            const found = new Uint8Array(4 * 400 * 320);
+            gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+            gl.readPixels(0, 0, 400, 320, gl.RGBA, gl.UNSIGNED_BYTE, found);
+            return "," + btoa(Array.from(found, (byte) => String.fromCharCode(byte)).join(""));
+        };
+        return framebuffer;
+    };
+"""
+
+
+@pytest.mark.parametrize("script", ["", REAL_GPU, TRANSPARENT], ids=["worker", "webgpu", "transparent"])
 def test_a_headset_shows_the_splat_to_each_eye(tabs: Any, artefacts: Path, save: Any, script: str) -> None:
     """A simulated one, each of whose eyes sees what the other one does not; the right stick turns the dial."""
+    mode, other = ("ar", "vr") if script == TRANSPARENT else ("vr", "ar")
     model = scenes.dialled(1500, 0, 7)
     camera = scenes.camera(400, 320)
     level = torch.eye(4)
@@ -246,24 +267,30 @@ def test_a_headset_shows_the_splat_to_each_eye(tabs: Any, artefacts: Path, save:
         page.set_viewport_size(SIZE)
         page.add_init_script(HEADSET + script)
         shown = Shown(page).ready(url)
-        if script and not sorts_on_gpu(shown):
+        if script == REAL_GPU and not sorts_on_gpu(shown):
             pytest.skip("this Chromium has no WebGPU adapter")
         shown.camera(replace(camera, viewmat=level))
         scale = float(link(shown)["distance"][0]) / 1.5
-        shown.until("!document.getElementById('immersive-vr').hidden")
-        assert page.evaluate("document.getElementById('immersive-ar').hidden")
-        page.evaluate("document.getElementById('immersive-vr').click()")
+        shown.until(f"!document.getElementById('immersive-{mode}').hidden")
+        assert page.evaluate(f"document.getElementById('immersive-{other}').hidden")
+        page.evaluate(f"document.getElementById('immersive-{mode}').click()")
         shown.until("(() => { try { headset.frame(0); return true } catch { return false } })()")
         page.wait_for_timeout(300)
         data = base64.b64decode(page.evaluate("headset.frame(1)").partition(",")[2])
-        picture = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+        if script == TRANSPARENT:
+            picture = np.frombuffer(data, np.uint8).reshape(320, 400, 4)[::-1]
+        else:
+            picture = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
         for k in range(2):
             K = torch.tensor([[150.0, 0, (40.0, 160.0)[k]], [0, 192.0, 144.0], [0, 0, 1]])
             viewmat = level.clone()
             viewmat[0, 3] -= (-0.03, 0.03)[k] * scale
             eye = Camera(viewmat, K, 200, 320)
-            wanted = render(model, eye, 2.0).pixels.numpy()
-            assert_alike(picture[:, 200 * k : 200 * k + 200], wanted, artefacts / f"eye{k}.png")
+            wanted, part = render(model, eye, 2.0), picture[:, 200 * k : 200 * k + 200]
+            assert_alike(part[..., :3], wanted.pixels.numpy(), artefacts / f"eye{k}.png")
+            if script == TRANSPARENT:
+                alpha = (255 * wanted.alpha[..., None]).round().to(torch.uint8).numpy()
+                assert_alike(part[..., 3:].repeat(3, 2), alpha.repeat(3, 2), artefacts / f"alpha{k}.png")
         page.evaluate("[1000, 1100, 1200].forEach((time) => headset.frame(time, 1))")
         page.evaluate("headset.session.dispatchEvent(new Event('end'))")
         shown.until("document.getElementById('dial-value').textContent !== 's = 2.00'")

@@ -1,6 +1,6 @@
 // The dial's equation in float64, as in clod_adapter/equation/. A Gaussian is kept iff
 // log a - (d s)^2 / (2 v) > log(tau s),  d = |mean - eye| / D,  2 v = 2 relu(sigma_d)^2 + eps,  a the opacity. Runs in the
-// worker (worker.js), except for growth_d, which culling does not use: shaders.js multiplies the scales.
+// worker (worker.js). Culling by the dial does not use growth_d; by the picture's edges it does.
 
 const HUGE = 1e300; // replaces 1/0: 0 * HUGE is 0, as at d = 0 a Gaussian is not attenuated for any sigma_d
 
@@ -49,6 +49,10 @@ function inFrustum(px, py, pz, { rotation: r, eye, fx, fy, cx, cy, width, height
 export function growthDistance({ normalizer, reference_distance: reference, scene_distance: unit }) {
   return normalizer === "scene" && reference ? reference / unit : 1;
 }
+
+/** The factor of the scales of a kept Gaussian (equation/growth.py). `magnification`: s d / r. */
+export const growthFactor = (growth, magnification) =>
+  Math.exp(Math.min(Math.max(growth * Math.log(Math.min(Math.max(magnification, 1), 3e38)), -20), 20));
 
 /** Extinction scales s*, descending: a Gaussian is kept iff s < s*. In closed form by Lambert's W. */
 export function extinctionScales(means, { logA, inverse }, eye, distance, tau) {

@@ -1,15 +1,16 @@
 // The files that the page shows: those of its server or its own, and dropped ones.
 import { readFile } from "./formats/index.js";
+import { readLink } from "./link.js";
 import { fetchModel } from "./payload.js";
 
-/** `show(model, base, cameras, dial)` shows another scene, `replace(model)` another model of the same, `update()` a changed
+/** `show(model, base, cameras, dial)` shows another scene, `replace(model, base)` others of the same, `update()` a changed
  *  state (main.js). */
-export function createFiles(elements, viewer, config, { show, replace, update, clampDial }) {
+export function createFiles(elements, viewer, config, { show, replace, update, reset, clampDial }) {
   let loadCount = 0;
 
-  const fetchNamed = (entry) => {
+  const fetchNamed = (entry, onPart) => {
     const onProgress = (fraction) => viewer.ui.showProgress(`Loading ${entry.name}: ${Math.floor(100 * fraction)} %`);
-    return fetchModel(entry, onProgress).catch((error) => { throw new Error(`${entry.name}: ${error.message}`); });
+    return fetchModel(entry, onProgress, onPart).catch((error) => { throw new Error(`${entry.name}: ${error.message}`); });
   };
 
   /** Shows another file, from a buffer or a promise of one; of concurrent calls, the last. If reading fails, the page shows
@@ -55,12 +56,27 @@ export function createFiles(elements, viewer, config, { show, replace, update, c
   listenForFiles();
   return {
     load, openFile,
-    /** Shows the configured file, unless another one was dropped meanwhile; resolves with whether it did. */
-    async open() {
-      const [model, base] = await Promise.all([config.model, config.base].map((entry) => entry && fetchNamed(entry)));
-      if (loadCount) return false;
-      show(model, base, config.cameras, config.virtual_scale);
-      return true;
+    /** Shows the configured file, its first rows while it loads; `opened()` is called once something is shown. Ends early
+     *  if another file is opened meanwhile. */
+    async open(opened) {
+      const { file, wipe } = readLink(location.hash), { camera } = viewer, poseOf = () => JSON.stringify(camera.pose);
+      let pose = null;
+      async function showRead(read, base) {
+        if (loadCount) return;
+        if (pose) {
+          replace(read, base);
+          if (poseOf() !== pose || config.cameras.length) return update();
+          reset(); // the coarse scene may have another extent
+          pose = poseOf();
+        } else {
+          show(read, base, config.cameras, config.virtual_scale);
+          pose = poseOf();
+          await opened();
+        }
+      }
+      const inParts = file === 0 && wipe === null; // a link to a comparison or another file needs these
+      await showRead(...await Promise.all([fetchNamed(config.model, inParts && showRead), config.base && fetchNamed(config.base)]));
+      if (!loadCount) viewer.ui.showProgress(null);
     },
     /** Shows another of the files, from the same view and at the same dial value. */
     async showFile(number) {
@@ -68,10 +84,10 @@ export function createFiles(elements, viewer, config, { show, replace, update, c
       if (!entry || !stage.model) return;
       const count = ++loadCount;
       try {
-        const [read, base] = await Promise.all([entry, fromDropped && config.base].map((each) => each && fetchNamed(each)));
+        const [read, base] = await Promise.all([entry, !stage.base && config.base].map((each) => each && fetchNamed(each)));
         if (count !== loadCount) return;
         if (fromDropped) show(read, base, config.cameras, config.virtual_scale);
-        else replace(read);
+        else replace(read, base);
         viewer.file = number;
         ui.showName(entry.name, number);
         if (stage.model.attenuation) stage.state.dial = clampDial(stage.state.dial);

@@ -52,9 +52,10 @@ async function start() {
   viewer.ui.showName(config.title || "clod-adapter", 0, viewer.files.map(({ name }) => name));
   viewer.ui.update();
   if (!config.model) return viewer.ui.showProgress("Drop a splat here, or open one");
-  if (!await files.open()) return;
-  await actions.applyLink(location.hash);
-  window.addEventListener("hashchange", () => actions.applyLink(location.hash));
+  await files.open(async () => {
+    await actions.applyLink(location.hash);
+    window.addEventListener("hashchange", () => actions.applyLink(location.hash));
+  });
   await stage.whenDrawn();
 }
 
@@ -74,12 +75,11 @@ function show(model, base, cameras, dial) {
   actions.layOut();
   actions.reset();
   stage.state.dial = clampDial(dial);
-  ui.showProgress(null);
   update();
 }
 
-/** Shows another model of the same scene; the rest stays. */
-const replace = (model) => viewer.stage.show(upload(model), viewer.stage.base);
+/** Shows another model of the same scene and, if given, its base; the rest stays. */
+const replace = (model, base) => viewer.stage.show(upload(model), base ? upload(base) : viewer.stage.base);
 
 const clampDial = (dial) => Math.min(Math.max(dial, 1), viewer.stage.model.max_sv);
 
@@ -158,7 +158,7 @@ const actions = {
   fullScreen: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.()),
 };
 
-const files = createFiles(elements, viewer, config, { show, replace, update, clampDial });
+const files = createFiles(elements, viewer, config, { show, replace, update, clampDial, reset: () => actions.reset() });
 const ready = start().catch((error) => {
   elements.busy.hidden = true;
   elements.panel.hidden = !viewer.ui; // without it, no control works
@@ -177,7 +177,7 @@ window.clod = {
   },
   whenDrawn: () => viewer.stage.whenDrawn(),
   counts: () => viewer.stage.counts(),
-  order: () => viewer.stage.order(),
+  order: (frustum) => viewer.stage.order(frustum),
   async capture() {
     viewer.stage.endMotion();
     await viewer.stage.whenDrawn();

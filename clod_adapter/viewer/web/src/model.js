@@ -2,7 +2,7 @@
 import { WIDTH, dataTexture, heightOf, maxTexels } from "./gpu.js";
 import { half } from "./half.js";
 import { SH_TEXELS } from "./shaders.js";
-import { createSorter } from "./sorter.js";
+import { createSorter, largestScales } from "./sorter.js";
 import { upOfPoints } from "./up.js";
 import { add } from "./vector.js";
 import workerSource from "worker:./worker.js";
@@ -16,10 +16,11 @@ const VISIBLE = 3.4; // standard deviations to alpha 1/255
 export function createModel(gl, gaussians, metadata, device) {
   const { count, degree, means, opacityLogits } = gaussians, { records, sh } = upload(gl, gaussians);
   const attenuation = gaussians.sigmaD ? metadata.attenuation : null, extent = extentOf(gaussians), worker = startWorker();
-  const sorting = createSorter(device, gaussians, { ...metadata, attenuation }).catch(() => null);
+  const scales = largestScales(gaussians), sorting = createSorter(device, gaussians, scales, { ...metadata, attenuation }).catch(() => null);
   let sorter = null;
   sorting.then((made) => { sorter = made; });
-  worker.request("model", { means, opacityLogits, sigmaD: attenuation && gaussians.sigmaD, attenuation }, [means.buffer]);
+  const { sigmaD, growthD } = attenuation ? gaussians : {}, blur = metadata.screen_filter.variance;
+  worker.request("model", { means, opacityLogits, scales, sigmaD, growthD, attenuation, blur }, [means.buffer, scales.buffer]);
   const spare = []; // buffers for orders, which are transferred to the worker and back
 
   async function orderByWorker(state) {

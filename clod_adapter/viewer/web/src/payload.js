@@ -3,21 +3,33 @@ import { DIAL } from "./formats/gaussians.js";
 import { readFile } from "./formats/index.js";
 import { inflate } from "./formats/zip.js";
 
+const PARTS = [0.05, 0.1, 0.2, 0.4, 0.8, 1]; // of a file: ends of its requests, at which the rows so far are shown
+const LEAST = 1 << 16; // bytes of a request
+const SOON = 2000; // ms: a rest that takes no longer is requested at once, and nothing is shown before it
+const PAUSE = 1000; // ms between two of the pictures before the whole
+
 /** The page's configuration; a page without one starts empty, as a viewer for dropped files. */
 export function readConfig() {
   const element = document.getElementById("clod-config");
   return { title: "", model: null, base: null, others: [], cameras: [], virtual_scale: 1, ...(element ? JSON.parse(element.textContent) : {}) };
 }
 
-/** {gaussians, metadata} of the configuration's `model` or `base`; calls `onProgress(fraction)` during the transfer. */
-export async function fetchModel(entry, onProgress) {
-  const { gaussians, metadata } = await readFile(await bytesOf(entry, onProgress), entry.name);
+/** {gaussians, metadata} of the configuration's `model` or `base`; calls `onProgress(fraction)` during the transfer and,
+ *  where it is slow, `onPart(read)` with the first rows. */
+export async function fetchModel(entry, onProgress, onPart) {
+  const readPart = async (bytes) => onPart(described(entry, await readFile(bytes, entry.name, true)));
+  const read = await readFile(await bytesOf(entry, onProgress, onPart && readPart), entry.name), { gaussians } = read;
   for (const [name, place] of Object.entries(entry.columns)) {
     const values = gaussians[DIAL[name]] = new Float32Array(await bytesOf(place));
     if (values.length !== gaussians.count) {
       throw new Error(`it has ${gaussians.count} Gaussians and ${values.length} values of ${name}; export the page again`);
     }
   }
+  return described(entry, read);
+}
+
+/** The Gaussians of an entry, with what it says of them. */
+function described(entry, { gaussians, metadata }) {
   const attenuation = gaussians.sigmaD ? entry.attenuation ?? null : null;
   return {
     gaussians,
@@ -29,25 +41,47 @@ export async function fetchModel(entry, onProgress) {
 }
 
 /** Bytes from the same origin (`href`), or from base64 in the elements with the id `element`, which are then removed. */
-async function bytesOf({ href, element, gzip }, onProgress) {
-  if (href) return download(href, onProgress);
+async function bytesOf({ href, size, element, gzip }, onProgress, onPart) {
+  if (href) return download(href, size, onProgress, onPart);
   const elements = [...document.querySelectorAll(`[id="${element}"]`)];
   if (!elements.length) throw new Error("the page does not contain its data; export the page again");
   const data = new Blob(elements.map(takeBytes));
   return gzip ? (await inflate(data, "gzip")).buffer : data.arrayBuffer();
 }
 
+/** In parts, where `onPart` shows them: it is called with the bytes so far. */
+async function download(href, size, onProgress, onPart) {
+  const bytes = new Uint8Array(size);
+  let loaded = 0, ms = 0, soon = !onPart, shown = -Infinity;
+  while (loaded < size) {
+    const from = loaded, began = performance.now(), next = PARTS.find((share) => share * size > from) * size;
+    loaded = soon ? size : Math.min(Math.ceil(Math.max(next, from + LEAST)), size);
+    const { status, response } = await request(href, from, loaded, size, (count) => onProgress((from + count) / size));
+    if (status === 200) return response;
+    if (response.byteLength !== loaded - from) throw new Error("the server has sent another number of bytes; start clod-adapt view again");
+    bytes.set(new Uint8Array(response), from);
+    ms += performance.now() - began;
+    soon ||= ms * (size / loaded - 1) < SOON;
+    if (soon || performance.now() - shown < PAUSE) continue;
+    const part = bytes.subarray(0, loaded);
+    shown = performance.now();
+    setTimeout(() => onPart(part).catch(() => {})); // after the next request; errors come with the whole file
+  }
+  return bytes.buffer;
+}
+
 /** By XMLHttpRequest: where a script reads the body of a fetch as a stream, for its progress, Chromium reports some of the
  *  complete requests as aborted. */
-function download(href, onProgress = () => {}) {
+function request(href, from, to, size, onProgress) {
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();
     request.open("GET", href);
     request.responseType = "arraybuffer";
-    request.onprogress = ({ lengthComputable, loaded, total }) => lengthComputable && onProgress(loaded / total);
+    if (to - from < size) request.setRequestHeader("Range", `bytes=${from}-${to - 1}`);
+    request.onprogress = ({ loaded }) => onProgress(loaded);
     request.onerror = () => reject(new Error("the server does not answer; start clod-adapt view again"));
     request.onload = () => {
-      if (request.status === 200) resolve(request.response);
+      if (request.status === 200 || request.status === 206) resolve(request);
       else reject(new Error(`the server answered ${request.status} ${request.statusText}`));
     };
     request.send();

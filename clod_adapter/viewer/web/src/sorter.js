@@ -1,7 +1,8 @@
-// Culls and sorts the Gaussians of a model by WebGPU: what the worker does (worker.js), in float32, and without the
-// Gaussians outside the picture. The rows are read back, since WebGL draws them.
+// Culls and sorts the Gaussians of a model by WebGPU: what the worker does (worker.js), in float32. The rows are read back,
+// since WebGL draws them.
 import attenuationSource from "../../../integrations/shaders/attenuation.wgsl";
 import { growthDistance } from "./equation.js";
+import { frustumOf } from "./frustum.js";
 import { WIDTH, heightOf } from "./gpu.js";
 import source from "./sorter.wgsl";
 
@@ -26,11 +27,11 @@ export async function sortingDevice() {
   }
 }
 
-/** `device`: promise of that. Null where it cannot sort this model: the device has too little memory, or the unit of the
+/** `device`: promise of that; `scales`: from largestScales. Null where it cannot sort this model: the device has too little memory, or the unit of the
  *  distances depends on the view. */
-export async function createSorter(device, gaussians, { attenuation, screen_filter: filter }) {
+export async function createSorter(device, gaussians, scales, { attenuation, screen_filter: filter }) {
   if (!navigator.gpu || (attenuation && attenuation.normalizer !== "scene")) return null;
-  const { count } = gaussians, packed = pack(gaussians); // now, because the caller transfers the arrays
+  const { count } = gaussians, packed = pack(gaussians, scales); // now, because the caller transfers the arrays
   const { gpu, pipelines } = (await device) ?? {};
   if (!gpu || packed.byteLength > gpu.limits.maxStorageBufferBindingSize || count > MAX_GROUPS * LANES) return null;
   const buffers = await allocate(gpu, count);
@@ -61,7 +62,7 @@ export async function createSorter(device, gaussians, { attenuation, screen_filt
   }
 
   return {
-    /** As the worker's job of this name. `frustum`: without the Gaussians outside the picture. `done()` takes `rows` back. */
+    /** As the worker's job of this name. `done()` takes `rows` back. */
     async order({ view, dial, equation, marks, frustum }) {
       const on = equation && attenuation !== null, distance = on ? attenuation.scene_distance : 1;
       const size = TALLY_BYTES + 4 * WIDTH * heightOf(count);
@@ -81,12 +82,16 @@ export async function createSorter(device, gaussians, { attenuation, screen_filt
   };
 }
 
-function pack({ count, means, logScales, opacityLogits, sigmaD, growthD }) {
+/** The largest scale of each Gaussian. */
+export const largestScales = ({ count, logScales: s }) =>
+  Float32Array.from({ length: count }, (_, i) => Math.exp(Math.max(s[3 * i], s[3 * i + 1], s[3 * i + 2])));
+
+function pack({ count, means, opacityLogits, sigmaD, growthD }, scales) {
   const packed = new Float32Array(8 * count);
   for (let i = 0, at = 0; i < count; i++, at += 8) {
     for (let k = 0; k < 3; k++) packed[at + k] = means[3 * i + k];
     packed[at + 3] = 1 / (1 + Math.exp(-opacityLogits[i]));
-    packed[at + 4] = Math.exp(Math.max(logScales[3 * i], logScales[3 * i + 1], logScales[3 * i + 2]));
+    packed[at + 4] = scales[i];
     packed[at + 5] = sigmaD ? sigmaD[i] : 0;
     packed[at + 6] = growthD ? growthD[i] : 0;
   }
@@ -94,12 +99,13 @@ function pack({ count, means, logScales, opacityLogits, sigmaD, growthD }) {
 }
 
 /** The struct Frame. */
-function frameOf({ rotation: r, eye, near, fx, fy, cx, cy, width, height }, attenuated, blur, flags, count) {
+function frameOf(view, attenuated, blur, flags, count) {
+  const { rotation: r, eye, near } = view, { focal, shift, border, reach: extent } = frustumOf(view, blur);
   const { dial, eps, tau, distance } = attenuated ?? { dial: 1, eps: 1, tau: 0, distance: 1 };
   const reach = attenuated ? growthDistance(attenuated) : 1;
-  const values = [...r.slice(0, 3), fx, ...r.slice(3, 6), fy, ...r.slice(6), near, ...eye, distance, cx, cy, width, height];
-  const frame = new Float32Array([...values, dial, eps, tau, reach, blur, ...Array(7).fill(0)]);
-  new Uint32Array(frame.buffer).set([count, attenuated !== null, ...flags], 25);
+  const values = [...r.slice(0, 3), dial, ...r.slice(3, 6), eps, ...r.slice(6), near, ...eye, distance];
+  const frame = new Float32Array([...values, ...focal, ...shift, ...border, ...extent, tau, reach, ...Array(6).fill(0)]);
+  new Uint32Array(frame.buffer).set([count, attenuated !== null, ...flags], 26);
   return frame;
 }
 

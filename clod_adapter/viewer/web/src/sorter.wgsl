@@ -3,16 +3,13 @@
 const LANES = 256u;  // invocations of a workgroup, and values of a digit
 const ROUNDS = 16u;  // keys of an invocation
 const KEPT = 20u;    // place of the count of kept Gaussians in `tally`
-const MARGIN = 0.25; // of the picture on each side: Gaussians that a moving camera shows before the next order
-const RADIUS = 3.34; // standard deviations to alpha 1/255, and more than in shaders.js
 
 struct Frame {
-  right: vec3f, fx: f32, down: vec3f, fy: f32, forward: vec3f, near: f32,  // world to camera, OpenCV axes
+  right: vec3f, dial: f32, down: vec3f, eps: f32, forward: vec3f, near: f32,  // world to camera, OpenCV axes
   eye: vec3f, distance_unit: f32,
-  centre: vec2f, size: vec2f,
-  dial: f32, eps: f32, tau: f32, reach: f32,
-  blur: f32, count: u32, attenuated: u32, marks: u32,  // marks: culled Gaussians are sorted too
-  frustum: u32,
+  focal: vec2f, shift: vec2f, border: vec2f, extent: vec2f,  // of frustum.js
+  tau: f32, reach: f32, count: u32, attenuated: u32,
+  marks: u32, frustum: u32,  // marks: culled Gaussians are sorted too; frustum: without those outside the picture
 }
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -49,14 +46,9 @@ fn keyOf(row: u32) -> u32 {
   return ~bitcast<u32>(point.z);
 }
 
-/// Whether a Gaussian of at most this scale has no pixel in the picture and its margin: a bound of the extent in shaders.js.
+/// Whether a Gaussian of at most this scale has no pixel in the picture and its margin (frustum.js).
 fn outside(point: vec3f, scale: f32) -> bool {
-  let focal = vec2f(frame.fx, frame.fy);
-  let clamped = 0.15 * frame.size / focal;
-  let slope = clamp(point.xy / point.z, -frame.centre / focal - clamped, (frame.size - frame.centre) / focal + clamped);
-  let extent = RADIUS * (focal / point.z * sqrt(1.0 + slope * slope) * scale + sqrt(frame.blur)) + MARGIN * frame.size;
-  let centre = focal * point.xy / point.z + frame.centre;
-  return any(centre + extent < vec2f(0.0)) || any(centre - extent > frame.size);
+  return any(abs(frame.focal * point.xy + frame.shift * point.z) > frame.border * point.z + frame.extent * scale);
 }
 
 @group(0) @binding(3) var<storage, read> sizes: array<u32>;  // `tally`

@@ -164,11 +164,12 @@ export function createStage(renderer, canvas, camera) {
     view: () => camera.view(...size()),
     counts: () => ({ total: model?.count ?? 0, kept: main.kept, drawn: main.drawn }),
     otherCounts: () => (state.wipe === null ? null : { total: second.model?.count ?? 0, kept: second.kept }),
-    /** Culls and sorts the left side for the current state, for tests and benchmarks: {ms, onGpu, kept, rows}. */
-    async order() {
+    /** Culls and sorts the left side for the current state, for tests and benchmarks: {ms, onGpu, kept, rows}. `frustum`:
+     *  without the Gaussians outside the picture. */
+    async order(frustum = true) {
       const [{ model: of, dial, equation }] = sides(), start = performance.now();
       let found = null;
-      await of.order({ view: camera.view(...size()), dial, equation, marks: state.marks, frustum: true }, ({ rows, drawn: count, kept }) => {
+      await of.order({ view: camera.view(...size()), dial, equation, marks: state.marks, frustum }, ({ rows, drawn: count, kept }) => {
         found = { ms: performance.now() - start, onGpu: of.sortsOnGpu, kept, rows: [...rows.subarray(0, count)] };
       });
       return found;

@@ -153,9 +153,10 @@ export function createUi(elements, stage, actions) {
     /** Selects the camera of the present view in the list; null for none. */
     selectCamera(number) { elements.camera.selectedIndex = number ?? -1; },
     showNote(text) { elements.targetNote.textContent = text; },
-    /** Shows progress over the canvas; null hides it. */
+    /** Shows progress in the canvas, at its top where there is a picture; null hides it. */
     showProgress(text) {
       elements.busy.hidden = !text;
+      elements.busy.classList.toggle("tag", Boolean(stage.model));
       elements.busy.textContent = text ?? "";
     },
   };

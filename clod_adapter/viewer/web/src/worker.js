@@ -1,37 +1,53 @@
-// The worker of a model: culls the Gaussians for each camera and dial value, and sorts the kept ones by depth. Culled
-// Gaussians are neither sorted nor drawn.
-import { dialForCount, extinctionScales, normalizingDistance, prepare } from "./equation.js";
+// The worker of a model: culls the Gaussians for each camera and dial value, and sorts the kept ones by depth. Those that are
+// culled or outside the picture are neither sorted nor drawn.
+import { dialForCount, extinctionScales, growthDistance, growthFactor, normalizingDistance, prepare } from "./equation.js";
+import { frustumOf } from "./frustum.js";
 
-let means, attenuation, prepared, keys, scratchKeys, scratchRows;
+let means, scales, growthD, blur, attenuation, prepared, keys, scratchKeys, scratchRows;
 
 const jobs = {
   model(message) {
-    ({ means, attenuation } = message);
+    ({ means, scales, growthD, blur, attenuation } = message);
     const count = means.length / 3;
     prepared = attenuation && prepare(message.opacityLogits, message.sigmaD, attenuation.eps);
     [keys, scratchKeys, scratchRows] = [0, 1, 2].map(() => new Uint32Array(count));
     return [{}, []];
   },
 
-  /** Writes the rows to draw, farthest first, into the buffer `rows`, which is transferred in both directions. */
-  order({ view, dial, equation, marks, rows }) {
+  /** Writes the rows to draw, farthest first, into the buffer `rows`, which is transferred in both directions. `frustum`:
+   *  without the Gaussians outside the picture. */
+  order({ view, dial, equation, marks, frustum, rows }) {
     const on = equation && attenuation !== null;
     const distance = on ? normalizingDistance(means, view, attenuation) : 1;
     const order = new Uint32Array(rows);
-    const [kept, drawn] = cullAndSort(order, view, on ? { dial, distance } : null, marks);
+    const [kept, drawn] = cullAndSort(order, view, on ? { dial, distance } : null, marks, frustum ? insideOf(view, on && dial / distance) : () => true);
     return [{ rows, kept, drawn, distance }, [rows]];
   },
 
   dialFor({ view, target, maxSv }) {
     const distance = normalizingDistance(means, view, attenuation);
-    const scales = extinctionScales(means, prepared, view.eye, distance, attenuation.tau);
-    return [dialForCount(scales, target, maxSv), []];
+    const found = extinctionScales(means, prepared, view.eye, distance, attenuation.tau);
+    return [dialForCount(found, target, maxSv), []];
   },
 };
 
-/** Fills `order` with the kept rows in front of the camera, farthest first; returns the counts of kept and of drawn
- *  Gaussians. `attenuated`: {dial, distance}; null keeps all. With `marks` the culled ones are in the order too. */
-function cullAndSort(order, { rotation: r, eye, near }, attenuated, marks) {
+/** Whether row i, at [x, y, z] from the eye and a depth, has a pixel in the picture or its margin. `far`: s d per distance, of
+ *  growth; false without the equation. */
+function insideOf(view, far) {
+  const { rotation: r } = view, { focal, shift, border, reach } = frustumOf(view, blur), reference = far && growthDistance(attenuation);
+  const [fx, fy] = focal, [sx, sy] = shift, [bx, by] = border, [ex, ey] = reach;
+  return (i, x, y, z, depth) => {
+    const across = Math.abs(fx * (r[0] * x + r[1] * y + r[2] * z) + sx * depth) - bx * depth;
+    const down = Math.abs(fy * (r[3] * x + r[4] * y + r[5] * z) + sy * depth) - by * depth;
+    const needed = Math.max(across / ex, down / ey); // the scale that reaches the margin
+    if (needed <= scales[i]) return true; // or less, where it shrinks
+    return far && growthD && growthD[i] > 0 && needed <= scales[i] * growthFactor(growthD[i], far * Math.hypot(x, y, z) / reference);
+  };
+}
+
+/** Fills `order` with the kept rows in front of the camera and `inside`, farthest first; returns the counts of kept and of
+ *  drawn Gaussians. `attenuated`: {dial, distance}; null keeps all. With `marks` the culled ones are in the order too. */
+function cullAndSort(order, { rotation: r, eye, near }, attenuated, marks, inside) {
   const [ex, ey, ez] = eye;
   const k = attenuated ? (attenuated.dial / attenuated.distance) ** 2 : 0;
   const threshold = attenuated ? Math.log(attenuation.tau * attenuated.dial) : 0;
@@ -43,7 +59,7 @@ function cullAndSort(order, { rotation: r, eye, near }, attenuated, marks) {
     if (culled && !marks) continue;
     if (!culled) kept++;
     depth[0] = r[6] * x + r[7] * y + r[8] * z;
-    if (!(depth[0] >= near)) continue;
+    if (!(depth[0] >= near && inside(i, x, y, z, depth[0]))) continue;
     keys[drawn] = ~bits[0]; // positive floats have the order of their bits
     order[drawn++] = i;
   }

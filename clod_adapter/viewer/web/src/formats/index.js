@@ -11,9 +11,10 @@ import { inflate } from "./zip.js";
 
 const noDial = (name) => `${name} has no sigma_d, so it has no dial; add one: clod-adapt ${name} --images SCENE`;
 
-/** {gaussians, metadata} of a file, with the metadata that the page's configuration has for a served one. */
-export async function readFile(buffer, name) {
-  const gaussians = removeInvalid(await readGaussians(new Uint8Array(buffer), name).catch(rethrow));
+/** {gaussians, metadata} of a file, with the metadata that the page's configuration has for a served one. `prefix`: the
+ *  buffer has the first bytes of a PLY; the Gaussians are those of its complete rows. */
+export async function readFile(buffer, name, prefix = false) {
+  const gaussians = removeInvalid(await readGaussians(new Uint8Array(buffer), name, prefix).catch(rethrow));
   const hasDial = gaussians.sigmaD !== null;
   const settings = hasDial ? gaussians.settings ?? readSettings(gaussians.comments, gaussians.constants) : null;
   return {
@@ -33,11 +34,11 @@ function rethrow(error) {
   throw new Error("it is damaged or too large for this browser; copy or export it again", { cause: error });
 }
 
-async function readGaussians(bytes, name) {
+async function readGaussians(bytes, name, prefix) {
   if (!bytes.length) throw new Error("it is empty; copy or export it again");
   const magic = String.fromCharCode(...bytes.subarray(0, 4));
   if (/^ply[\r\n]/.test(magic)) {
-    const header = readHeader(bytes);
+    const header = readHeader(bytes, prefix);
     return isCompressed(header) ? readCompressed(bytes, header) : readPly(bytes, header);
   }
   if (magic.startsWith("\x1f\x8b")) return readSpz(await inflate(bytes, "gzip"));
