@@ -35,7 +35,7 @@ MOST_VIEWS = 64
 # at most this share of the removal error at s = 1.
 FAINT_SHARE = 0.05
 TAU_MIN = 1e-6
-NEAREST = 0.05
+NEAREST = 0.05  # share of the views in which growth may begin beyond the median distance
 FADING = 1.5  # times the culling threshold: below, the soft cut reduces the opacity (attenuation)
 
 

@@ -45,7 +45,7 @@ def adapt(
     ``target_count.count_gradient`` moves sigma_d so that the share of Gaussians kept at their typical distances follows
     the target-count curve; with the target ``cost``, ``target_cost.TargetCost`` does so for the cost of rendering.
     The result is the mean of the parameters over the last ``average`` of the steps, so learning rates can stay large
-    to the end. A base that has a sigma_d is continued from. Training divides sigma_d by the typical distance; the
+    to the end. A base that has a sigma_d is continued from. Training divides sigma_d by the reference distance; the
     result has it in world units.
 
     ``AdaptConfig.paper`` gives CLoD-GS's own objective instead (section 3.3): one s a step and

@@ -209,6 +209,6 @@ def learning_rates(config: AdaptConfig, extent: float) -> dict[str, float]:
 
 
 def position_unit(start: Gaussians, views: Sequence[View], subset: TrainableSubset) -> float:
-    """The unit of position steps, world units: the cameras' extent, or their typical distance if it is 0."""
+    """The unit of position steps, world units: the cameras' extent, or the reference distance if it is 0."""
     assert start.attenuation is not None
     return subset.extent or camera_extent([view.camera for view in views]) or start.attenuation.scene_distance

@@ -49,7 +49,7 @@ COLOR = 0.15  # of the range of bytes to one of sh0
 MAGNITUDE = 511 * math.sqrt(2)  # of the three components of a rotation that are not the largest
 _BITS = 6  # of a harmonic
 _MOST = float(np.finfo(np.float16).max)
-_FAR = 100.0  # world units: a typical distance from which on some sigma_d that fade at high dial values are beyond that
+_FAR = 25.0  # world units: a reference distance, from which on some sigma_d that fade at high dial values exceed that
 
 
 def write_spz(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
@@ -86,12 +86,12 @@ def write_spz(path: Path, gaussians: Gaussians, history: History) -> tuple[str, 
 
 
 def _within_float16(gaussians: Gaussians) -> Gaussians:
-    """With sigma_d in units of the typical distance where that is large: in world units float16 would cut it off."""
+    """With sigma_d in units of the reference distance where that is large: in world units float16 would cut it off."""
     config = gaussians.attenuation
     if config is None or config.normalizer != "scene":
         return gaussians
-    typical = known_distance(config) or estimated_distance(gaussians.means)
-    return with_distance(gaussians, typical) if typical > _FAR else gaussians
+    distance = known_distance(config) or estimated_distance(gaussians.means)
+    return with_distance(gaussians, distance) if distance > _FAR else gaussians
 
 
 def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, tuple[str, ...]]:

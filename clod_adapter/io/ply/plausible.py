@@ -10,7 +10,7 @@ from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.units import nominal_distance
 from clod_adapter.io.settings import WARNING
 
-# Adapted files of three captures keep 38 to 97 % here, with sigma_d in units of the typical distance 3 to 43 %.
+# Adapted files of three captures keep 38 to 97 % here, with sigma_d in other units 3 to 43 %.
 DOUBTFUL = 0.25
 
 
@@ -18,7 +18,7 @@ DOUBTFUL = 0.25
 def check_plausible(means: Tensor, opacity_logits: Tensor, sigma_d: Tensor, config: AttenuationConfig) -> list[str]:
     """A line with the share kept at s = 1 from the nominal distance; a warning where it is too small.
 
-    A sigma_d that is too small gives a small share: one in units of the typical distance (as earlier versions wrote),
+    A sigma_d that is too small gives a small share: one in units of a distance (as earlier versions wrote),
     or of a file whose positions were enlarged. One that is too large is not detected. Empty for normalisers other than
     ``scene``, which are invariant to scale.
 
