@@ -18,9 +18,10 @@ import scenes
 from clod_adapter.bake import order_by_extinction
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
-from shown import Shown, assert_same, serve
+from shown import Shown, assert_same, drop, serve
 
 COUNT = 6000  # a twentieth has more bytes than the page requests at least
+OTHER = 2000  # of the other file in the list
 SIZE = {"width": 200, "height": 150}
 PARTS = [0.05, 0.1, 0.2, 0.4, 0.8, 1.0]  # of the bytes, at which requests end
 # The first picture of the page: {total, text, picture}.
@@ -29,6 +30,17 @@ FIRST = """async () => {
     const picture = await clod.capture();
     return { total: clod.counts().total, text: document.getElementById("busy").textContent, picture };
 }"""
+# Notes the lengths of the large arrays of bytes that the page allocates or copies.
+ALLOCATED = """
+    window.allocated = [];
+    window.Uint8Array = new Proxy(Uint8Array, {
+        construct(target, given) {
+            const array = Reflect.construct(target, given);
+            if (!(given[0] instanceof ArrayBuffer) && array.length >= 1 << 16) allocated.push(array.length);
+            return array;
+        },
+    });
+"""
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +76,9 @@ class Slow:
         self.held: list[Any] = []
         self.ranges: list[str] = []
         page.route("**/files/model", self.hold)
+        page.add_init_script(ALLOCATED)
+        self.aborted: list[str] = []
+        page.on("requestfailed", lambda request: self.aborted.append(request.url))
         self.shown = Shown(page)
         page.goto(url)
         self.wait()
@@ -92,10 +107,11 @@ class Slow:
 
 @pytest.fixture
 def slow(tabs: Any, coarse_first: Gaussians, tmp_path: Path) -> Iterator[Callable[..., Slow]]:
-    """Opens the page of the file ``coarse_first`` at an address with this fragment."""
-    path = tmp_path / "model.ply"
+    """Opens the page of the file ``coarse_first`` and another one at an address with this fragment."""
+    path, other = tmp_path / "model.ply", tmp_path / "other.ply"
     clod_adapter.save(path, coarse_first)
-    with serve(path) as url:
+    clod_adapter.save(other, coarse_first.select(torch.arange(OTHER)))
+    with serve(path, other) as url:
         opened: list[Slow] = []
 
         def start(fragment: str = "") -> Slow:
@@ -139,3 +155,53 @@ def test_a_link_opens_its_view_at_the_first_picture(slow: Any) -> None:
     assert shown.counts()["total"] == COUNT and shown.text("#dial-value") == "s = 3.00"
     shown.page.keyboard.press("l")
     shown.until("location.hash.startsWith('#eye=0,0,-3&axes=1,0,0,0,1,0&fov=')")
+
+
+@pytest.mark.parametrize("listed", [False, True])
+def test_a_file_that_cannot_be_read_leaves_the_loading_one(slow: Any, listed: bool) -> None:
+    """Dropped or chosen from the list, it does not end the loading of the first file."""
+    loading = slow()
+    shown = loading.shown
+    shown.page.evaluate(FIRST)
+    loading.wait()
+    if listed:
+        shown.page.route("**/files/other0", lambda route: route.fulfill(body=b"good morning"))
+        shown.page.keyboard.press("2")
+    else:
+        drop(shown, "dropped.ply", b"good morning")
+    shown.until("document.getElementById('message').textContent.includes('it is not a splat')")
+    assert shown.text("#busy").startswith("Loading model.ply: ") and not loading.aborted
+    loading.finish()
+    assert shown.counts()["total"] == COUNT and shown.page.title() == "model.ply"
+
+
+@pytest.mark.parametrize("listed", [False, True])
+def test_a_file_shown_meanwhile_ends_the_loading(slow: Any, listed: bool, tmp_path: Path) -> None:
+    """Dropped or chosen from the list."""
+    loading = slow()
+    shown = loading.shown
+    shown.page.evaluate(FIRST)
+    loading.wait()
+    if listed:
+        shown.page.keyboard.press("2")
+    else:
+        drop(shown, "other.ply", (tmp_path / "other.ply").read_bytes())
+    shown.until("document.title === 'other.ply' && document.getElementById('busy').hidden")
+    shown.run("clod.ready")
+    assert shown.counts()["total"] == OTHER and len(loading.aborted) == 1
+    asked = len(loading.ranges)
+    shown.page.wait_for_timeout(300)
+    assert shown.page.is_hidden("#busy") and shown.page.is_hidden("#message") and len(loading.ranges) == asked
+    assert shown.counts()["total"] == OTHER and shown.page.title() == "other.ply"
+
+
+def test_the_bytes_of_a_file_are_kept_once(slow: Any) -> None:
+    """One array for a file in parts, none for one in a single response."""
+    loading = slow()
+    loading.shown.page.evaluate(FIRST)
+    loading.finish()
+    sizes = loading.shown.page.evaluate("allocated")
+    assert sizes == [int(loading.ranges[-1].rpartition("-")[2]) + 1]
+    loading.shown.page.keyboard.press("2")
+    loading.shown.until("document.title === 'other.ply' && document.getElementById('busy').hidden")
+    assert loading.shown.page.evaluate("allocated") == sizes

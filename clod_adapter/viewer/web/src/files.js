@@ -6,22 +6,43 @@ import { fetchModel } from "./payload.js";
 /** `show(model, base, cameras, dial)` shows another scene, `replace(model, base)` others of the same, `update()` a changed
  *  state (main.js). */
 export function createFiles(elements, viewer, config, { show, replace, update, reset, clampDial }) {
-  let loadCount = 0;
+  const first = new AbortController(); // ends the loading of the configured file, when another is shown
+  let other = new AbortController(); // ends the loading of another one, when the next is opened
+  const progress = { first: null, other: null }; // texts
 
-  const fetchNamed = (entry, onPart) => {
-    const onProgress = (fraction) => viewer.ui.showProgress(`Loading ${entry.name}: ${Math.floor(100 * fraction)} %`);
-    return fetchModel(entry, onProgress, onPart).catch((error) => { throw new Error(`${entry.name}: ${error.message}`); });
-  };
+  function showProgress(texts) {
+    Object.assign(progress, texts);
+    viewer.ui.showProgress(progress.other ?? progress.first);
+  }
+
+  function fetchNamed(entry, key, signal, onPart) {
+    const onProgress = (share) => showProgress({ [key]: `Loading ${entry.name}: ${Math.floor(100 * share)} %` });
+    const named = (error) => { throw new Error(`${entry.name}: ${error.message}`); };
+    return fetchModel(entry, { signal, onProgress, onPart }).catch(named);
+  }
+
+  /** Its signal is aborted when the next file is opened. */
+  function openOther() {
+    other.abort();
+    other = new AbortController();
+    return other.signal;
+  }
+
+  function endFirst() {
+    first.abort();
+    progress.first = null;
+  }
 
   /** Shows another file, from a buffer or a promise of one; of concurrent calls, the last. If reading fails, the page shows
    *  an error and keeps the previous file. */
   async function load(buffer, name) {
-    const { ui, stage } = viewer, number = ++loadCount;
-    ui.showProgress(`Reading ${name}`);
+    const { ui, stage } = viewer, signal = openOther();
+    showProgress({ other: `Reading ${name}` });
     try {
       const read = await readFile(await buffer, name);
-      if (number !== loadCount) return;
+      if (signal.aborted) return;
       show(read, null, [], 1);
+      endFirst();
       ui.showNote(read.metadata.notes.join("; "));
       viewer.file = null;
       ui.showName(name, null);
@@ -29,10 +50,10 @@ export function createFiles(elements, viewer, config, { show, replace, update, r
       await stage.whenDrawn();
     } catch (error) {
       const message = `${name}: ${error.message}`;
-      if (number === loadCount) ui.showMessage(message);
+      if (!signal.aborted) ui.showMessage(message);
       throw new Error(message);
     } finally {
-      if (number === loadCount) ui.showProgress(null);
+      if (!signal.aborted) showProgress({ other: null });
     }
   }
 
@@ -57,12 +78,12 @@ export function createFiles(elements, viewer, config, { show, replace, update, r
   return {
     load, openFile,
     /** Shows the configured file, its first rows while it loads; `opened()` is called once something is shown. Ends early
-     *  if another file is opened meanwhile. */
+     *  if another file is shown meanwhile. */
     async open(opened) {
       const { file, wipe } = readLink(location.hash), { camera } = viewer, poseOf = () => JSON.stringify(camera.pose);
       let pose = null;
       async function showRead(read, base) {
-        if (loadCount) return;
+        if (first.signal.aborted) return;
         if (pose) {
           replace(read, base);
           if (poseOf() !== pose || config.cameras.length) return update();
@@ -75,28 +96,35 @@ export function createFiles(elements, viewer, config, { show, replace, update, r
         }
       }
       const inParts = file === 0 && wipe === null; // a link to a comparison or another file needs these
-      await showRead(...await Promise.all([fetchNamed(config.model, inParts && showRead), config.base && fetchNamed(config.base)]));
-      if (!loadCount) viewer.ui.showProgress(null);
+      const fetchFirst = (entry, onPart) => entry && fetchNamed(entry, "first", first.signal, onPart);
+      try {
+        await showRead(...await Promise.all([fetchFirst(config.model, inParts && showRead), fetchFirst(config.base)]));
+      } catch (error) {
+        if (!first.signal.aborted) throw error;
+      } finally {
+        showProgress({ first: null });
+      }
     },
     /** Shows another of the files, from the same view and at the same dial value. */
     async showFile(number) {
       const entry = viewer.files[number], { stage, ui } = viewer, fromDropped = viewer.file === null;
       if (!entry || !stage.model) return;
-      const count = ++loadCount;
+      const signal = openOther(), fetchOther = (each) => each && fetchNamed(each, "other", signal);
       try {
-        const [read, base] = await Promise.all([entry, !stage.base && config.base].map((each) => each && fetchNamed(each)));
-        if (count !== loadCount) return;
+        const [read, base] = await Promise.all([entry, !stage.base && config.base].map(fetchOther));
+        if (signal.aborted) return;
         if (fromDropped) show(read, base, config.cameras, config.virtual_scale);
         else replace(read, base);
+        endFirst();
         viewer.file = number;
         ui.showName(entry.name, number);
         if (stage.model.attenuation) stage.state.dial = clampDial(stage.state.dial);
         update();
         await stage.whenDrawn();
       } catch (error) {
-        if (count === loadCount) ui.showMessage(error.message);
+        if (!signal.aborted) ui.showMessage(error.message);
       } finally {
-        if (count === loadCount) ui.showProgress(null);
+        if (!signal.aborted) showProgress({ other: null });
       }
     },
   };

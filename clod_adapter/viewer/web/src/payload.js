@@ -15,10 +15,11 @@ export function readConfig() {
 }
 
 /** {gaussians, metadata} of the configuration's `model` or `base`; calls `onProgress(fraction)` during the transfer and,
- *  where it is slow, `onPart(read)` with the first rows. */
-export async function fetchModel(entry, onProgress, onPart) {
+ *  where it is slow, `onPart(read)` with the first rows. `signal` aborts it. */
+export async function fetchModel(entry, { signal, onProgress, onPart }) {
   const readPart = async (bytes) => onPart(described(entry, await readFile(bytes, entry.name, true)));
-  const read = await readFile(await bytesOf(entry, onProgress, onPart && readPart), entry.name), { gaussians } = read;
+  const transfer = { signal, onProgress, onPart: onPart && readPart };
+  const read = await readFile(await bytesOf(entry, transfer), entry.name), { gaussians } = read;
   for (const [name, place] of Object.entries(entry.columns)) {
     const values = gaussians[DIAL[name]] = new Float32Array(await bytesOf(place));
     if (values.length !== gaussians.count) {
@@ -41,8 +42,8 @@ function described(entry, { gaussians, metadata }) {
 }
 
 /** Bytes from the same origin (`href`), or from base64 in the elements with the id `element`, which are then removed. */
-async function bytesOf({ href, size, element, gzip }, onProgress, onPart) {
-  if (href) return download(href, size, onProgress, onPart);
+async function bytesOf({ href, size, element, gzip }, transfer) {
+  if (href) return download(href, size, transfer);
   const elements = [...document.querySelectorAll(`[id="${element}"]`)];
   if (!elements.length) throw new Error("the page does not contain its data; export the page again");
   const data = new Blob(elements.map(takeBytes));
@@ -50,15 +51,16 @@ async function bytesOf({ href, size, element, gzip }, onProgress, onPart) {
 }
 
 /** In parts, where `onPart` shows them: it is called with the bytes so far. */
-async function download(href, size, onProgress, onPart) {
-  const bytes = new Uint8Array(size);
-  let loaded = 0, ms = 0, soon = !onPart, shown = -Infinity;
+async function download(href, size, { signal, onProgress, onPart }) {
+  let bytes = null, loaded = 0, ms = 0, soon = !onPart, shown = -Infinity;
   while (loaded < size) {
     const from = loaded, began = performance.now(), next = PARTS.find((share) => share * size > from) * size;
     loaded = soon ? size : Math.min(Math.ceil(Math.max(next, from + LEAST)), size);
-    const { status, response } = await request(href, from, loaded, size, (count) => onProgress((from + count) / size));
+    const onCount = (count) => onProgress((from + count) / size);
+    const { status, response } = await request(href, { from, to: loaded, size, signal, onCount });
     if (status === 200) return response;
     if (response.byteLength !== loaded - from) throw new Error("the server has sent another number of bytes; start clod-adapt view again");
+    bytes ??= new Uint8Array(size); // a whole file in one response needs no second copy
     bytes.set(new Uint8Array(response), from);
     ms += performance.now() - began;
     soon ||= ms * (size / loaded - 1) < SOON;
@@ -67,18 +69,21 @@ async function download(href, size, onProgress, onPart) {
     shown = performance.now();
     setTimeout(() => onPart(part).catch(() => {})); // after the next request; errors come with the whole file
   }
-  return bytes.buffer;
+  return bytes;
 }
 
 /** By XMLHttpRequest: where a script reads the body of a fetch as a stream, for its progress, Chromium reports some of the
  *  complete requests as aborted. */
-function request(href, from, to, size, onProgress) {
+function request(href, { from, to, size, signal, onCount }) {
   return new Promise((resolve, reject) => {
+    signal.throwIfAborted();
     const request = new XMLHttpRequest();
     request.open("GET", href);
     request.responseType = "arraybuffer";
     if (to - from < size) request.setRequestHeader("Range", `bytes=${from}-${to - 1}`);
-    request.onprogress = ({ loaded }) => onProgress(loaded);
+    request.onprogress = ({ loaded }) => onCount(loaded);
+    request.onabort = () => reject(signal.reason);
+    signal.addEventListener("abort", () => request.abort(), { once: true });
     request.onerror = () => reject(new Error("the server does not answer; start clod-adapt view again"));
     request.onload = () => {
       if (request.status === 200 || request.status === 206) resolve(request);

@@ -27,8 +27,8 @@ export async function sortingDevice() {
   }
 }
 
-/** `device`: promise of that; `scales`: from largestScales. Null where it cannot sort this model: the device has too little memory, or the unit of the
- *  distances depends on the view. */
+/** `device`: promise of that; `scales`: from largestScales. Null where it cannot sort this model: the device has too little
+ *  memory, or the unit of the distances depends on the view. */
 export async function createSorter(device, gaussians, scales, { attenuation, screen_filter: filter }) {
   if (!navigator.gpu || (attenuation && attenuation.normalizer !== "scene")) return null;
   const { count } = gaussians, packed = pack(gaussians, scales); // now, because the caller transfers the arrays

@@ -11,10 +11,11 @@ import { inflate } from "./zip.js";
 
 const noDial = (name) => `${name} has no sigma_d, so it has no dial; add one: clod-adapt ${name} --images SCENE`;
 
-/** {gaussians, metadata} of a file, with the metadata that the page's configuration has for a served one. `prefix`: the
- *  buffer has the first bytes of a PLY; the Gaussians are those of its complete rows. */
-export async function readFile(buffer, name, prefix = false) {
-  const gaussians = removeInvalid(await readGaussians(new Uint8Array(buffer), name, prefix).catch(rethrow));
+/** {gaussians, metadata} of a file, an ArrayBuffer or bytes, with the metadata that the page's configuration has for a
+ *  served one. `prefix`: these are the first bytes of a PLY; the Gaussians are those of its complete rows. */
+export async function readFile(data, name, prefix = false) {
+  const bytes = data instanceof Uint8Array ? data : new Uint8Array(data);
+  const gaussians = removeInvalid(await readGaussians(bytes, name, prefix).catch(rethrow));
   const hasDial = gaussians.sigmaD !== null;
   const settings = hasDial ? gaussians.settings ?? readSettings(gaussians.comments, gaussians.constants) : null;
   return {
