@@ -1,13 +1,15 @@
 """The page against SuperSplat's viewer: the same files, canvas and cameras in a headless Chromium.
 
-    python benchmarks/viewer_rivals.py --record    # adds rows to results/viewer_rivals.jsonl; the table of the page
+    clod-adapt plush_half/pretrained.ply --images plush_half --max-sv 7 -o plush7.ply
+    python benchmarks/viewer_rivals.py --record --file plush7.ply
 
 The camera turns in a street of the synthetic town (``city.py``), and round plush_half, where an adapted file of it is
 given (``--file``). A frame's time is the mean interval between drawn frames over a turn, after a warm-up, and
 the CPU time of the browser's processes for each; the latter depends less on what else the machine does. The first
 picture ends two frames after the page says that it is complete. SuperSplat's viewer knows no dial: it draws all
 Gaussians. npm installs it into a temporary folder, at a fixed version. It draws with WebGL, as its WebGPU loses the
-software device. All is software (SwiftShader), so the times say nothing about a GPU.
+software device. All is software (SwiftShader), so the times say nothing about a GPU. ``--record`` adds rows to
+``results/viewer_rivals.jsonl`` and fills in the table of docs/viewing.md.
 """
 
 from __future__ import annotations
@@ -44,6 +46,7 @@ FILE, PAGE = "viewer_rivals.jsonl", ROOT / "docs" / "viewing.md"
 PACKAGE = "@playcanvas/supersplat-viewer@1.36.2"
 SIZE = {"width": 640, "height": 400}
 STATES = {"dial off": 0.0, "s = 1": 1.0, "s = 3": 3.0, "s = 7": 7.0}
+MEASURES = {"CPU": "cpu_ms", "wall": "ms"}  # of a row
 EFFECTS = ("sharpness", "bloom", "grading", "vignette", "fringing")  # of SuperSplat's viewer
 STEPS, TURN, FOV = 72, 8.0, 65.0  # cameras of a circle; seconds of a turn; degrees across the width
 WARM, SECONDS = 2.0, TURN  # before and while frames are counted
@@ -128,10 +131,8 @@ def courses(folder: Path, counts: list[int], capture: Path | None) -> Iterator[C
         far = math.sqrt(2 / len(eyes)) * spread[:2, None]
         round_ = centre + np.stack([np.sin(turn), np.cos(turn)], 1) @ (far * sides[:2])
         across = np.eye(3) - axes[:, :, None] * axes[:, None]
-        target = np.linalg.solve(across.sum(0), (across @ eyes[:, :, None]).sum(0))[
-            :, 0
-        ]  # the point nearest to all axes
-        yield Course("plush_half", capture, round_, target + 0 * round_)
+        nearest = np.linalg.solve(across.sum(0), (across @ eyes[:, :, None]).sum(0))[:, 0]  # to all axes
+        yield Course("plush_half", capture, round_, nearest + 0 * round_)
 
 
 def placed(camera: clod.Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -259,19 +260,19 @@ def cpu_seconds() -> float:
 
 
 def summary() -> str:
-    """The last row of each course: CPU ms of a frame, and in brackets the share of SuperSplat's; Markdown."""
+    """The last row of each course: CPU and wall ms of a frame, and in brackets the share of SuperSplat's; Markdown."""
     rows = {row["course"]: row for row in stored(FILE)}
-    heads = ["", "SuperSplat", *STATES, "first picture", "SuperSplat"]
-    return table(heads, (cells(row) for row in rows.values()), 1)
+    heads = ["", "time", "SuperSplat", *STATES, "first picture", "SuperSplat"]
+    return table(heads, (cells(row, *measure) for row in rows.values() for measure in MEASURES.items()), 2)
 
 
-def cells(row: Row) -> list[str]:
+def cells(row: Row, time: str, key: str) -> list[str]:
     theirs, ours = row["supersplat"], row["worker"]
-    rival = theirs["cpu_ms"]
-    own = [ours[name]["cpu_ms"] for name in STATES]
+    rival = theirs[key]
+    own = [ours[name][key] for name in STATES]
     return [
-        row["course"], f"{rival:.0f}", *(f"{ms:.0f} ({ms / rival:.0%})".replace("%", " %") for ms in own),
-        *(f"{each['first_picture']['cpu_ms']:.0f}" for each in (ours, theirs)),
+        row["course"], time, f"{rival:.0f}", *(f"{ms:.0f} ({ms / rival:.0%})".replace("%", " %") for ms in own),
+        *(f"{each['first_picture'][key]:.0f}" for each in (ours, theirs)),
     ]  # fmt: skip
 
 

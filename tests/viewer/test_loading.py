@@ -165,7 +165,7 @@ def test_a_file_that_cannot_be_read_leaves_the_loading_one(slow: Any, listed: bo
     shown.page.evaluate(FIRST)
     loading.wait()
     if listed:
-        shown.page.route("**/files/other0", lambda route: route.fulfill(body=b"good morning"))
+        shown.page.route("**/files/1", lambda route: route.fulfill(body=b"good morning"))
         shown.page.keyboard.press("2")
     else:
         drop(shown, "dropped.ply", b"good morning")
