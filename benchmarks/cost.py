@@ -111,8 +111,12 @@ def empty(base: clod.Gaussians) -> clod.Gaussians:
 
 
 def same_quality(count: Sequence[Row], cost: Sequence[Row]) -> list[Row]:
-    """For the PSNR of the count target at each of COMPARED, the frame times of both; None where it is not reached."""
-    by_psnr = sorted(cost, key=lambda row: row["psnr"])
+    """For the PSNR of the count target at each of COMPARED, the frame times of both; None where it is not reached.
+
+    Dial values of the cost target at which a frame takes longer than at another one without being better do not count.
+    """
+    useful = [row for row in cost if not any(beats(other, row) for other in cost)]
+    by_psnr = sorted(useful, key=lambda row: row["psnr"])
     psnr, ms = ([row[name] for row in by_psnr] for name in ("psnr", "frame_ms"))
     found = []
     for row in (row for row in count if row["virtual_scale"] in COMPARED):
@@ -121,6 +125,10 @@ def same_quality(count: Sequence[Row], cost: Sequence[Row]) -> list[Row]:
         faster = row["frame_ms"] / at if at else None
         found.append({**row, "cost_frame_ms": at, "times_faster": faster})
     return found
+
+
+def beats(one: Row, other: Row) -> bool:
+    return one["frame_ms"] < other["frame_ms"] and one["psnr"] >= other["psnr"]
 
 
 def fitted(scene: str) -> Row:

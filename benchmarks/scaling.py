@@ -27,7 +27,7 @@ from common import CACHE, COMMAND, Process, Row, append, arguments, fill_in
 from scaling_rows import FEW, FILE, FLOOR, SERIES_COUNT, SIZES, latest, tables
 
 CITIES = CACHE / "scaling"
-# The last of STEPS has photographs of full size.
+# The last fifth of STEPS has photographs of full size.
 IMAGES, WIDTH, HEIGHT, STEPS, MAX_SV = 10, 640, 400, 20, 3
 MANY, SMALL = (16, 64, 256), (320, 200)  # photographs, of this size
 SHAPES = ((320, 200), (640, 400), (1280, 800), (1600, 1000))  # sizes, of FEW photographs

@@ -163,7 +163,7 @@ class AdaptConfig:
     sampling: str = option("log", "dial value of a step: log-uniform (log) or uniform (the paper's)")
     full_share: float = option(0.5, "share of steps at s = 1 instead")
     coarse: float = option(
-        0.95, "share of steps or of the time budget, at first, with photographs of half the size (not small ones)"
+        0.8, "share of steps or of the time budget, at first, with photographs of half the size (not small ones)"
     )
     target: str = option(
         "count", "what the dial reduces: count (of Gaussians, the paper's) or cost (the work of rendering them)"

@@ -40,10 +40,6 @@ class Rendering:
 
         Computed where it is first asked for, from the Gaussians as they are then: a frame does not need it.
         """
-        if self.gaussians.sigma_d is not None and _drawn_at_once(self.gaussians, None):
-            from clod_adapter.rasterizers import cpu
-
-            return cpu.kept(self.gaussians, self.camera, self.virtual_scale)
         return dial(self.gaussians, self.camera, self.virtual_scale).keep
 
     @property

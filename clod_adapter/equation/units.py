@@ -3,7 +3,7 @@
 The attenuation factor, ``exp(-(d / D s)^2 / (2 sigma^2 + eps))``, is the same for another D' where
 ``D'^2 (2 sigma'^2 + eps) = D^2 (2 sigma^2 + eps)``. In world units D is 1, and sigma_d alone determines how far a
 Gaussian is seen. Training divides by the reference distance, where growth begins: its range of sigma_d and its
-initialization are about 1.
+initialization are of the order of 1.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def known_distance(config: AttenuationConfig) -> float:
 
 
 def nominal_distance(means: Tensor, config: AttenuationConfig) -> float:
-    """The normalised distance d of a typical viewpoint, for scenes without cameras; > 0.
+    """The normalised distance d of a viewpoint, for scenes without cameras; > 0.
 
     ``known_distance`` over D, or where that is unknown ``estimated_distance`` over D; 1 for the normalisers ``max``
     and ``quantile``.

@@ -35,7 +35,7 @@ MOST_VIEWS = 64
 # at most this share of the removal error at s = 1.
 FAINT_SHARE = 0.05
 TAU_MIN = 1e-6
-NEAREST = 0.05  # share of the views in which growth may begin beyond the median distance
+NEAREST = 0.05  # share of the views that may be nearer than where growth begins
 FADING = 1.5  # times the culling threshold: below, the soft cut reduces the opacity (attenuation)
 
 
@@ -155,12 +155,13 @@ def spread(views: Sequence[T], most: int) -> Sequence[T]:
 def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
     """D of the scene normaliser, world units: the median distance in the frustum, of the nearest views.
 
-    That of the NEAREST share of the views with the smallest medians, the last of these. Growth begins there: farther
-    away, what it does not do, scales and opacities do, at all distances (docs/method.md, "Near to far").
+    That of the NEAREST share of the views, the farthest of these, and at least the second nearest of three or more: a
+    single view must not decide. Growth begins there. Beyond it growth fills the gaps; nearer, stored scales and
+    opacities must, and those act at all distances (docs/method.md, "Near to far").
     """
     config = AttenuationConfig(normalizer="quantile", quantile=0.5)
     medians = sorted(camera_unit(base.means, view.camera, config) for view in views)
-    return medians[math.ceil(NEAREST * len(medians)) - 1]
+    return medians[max(math.ceil(NEAREST * len(medians)), 2 if len(medians) > 2 else 1) - 1]
 
 
 def removal_error(

@@ -59,7 +59,7 @@ class Dial(nn.Module):
     Attributes:
         log_sigma: ``[N]`` parameter, the logarithm of sigma_d.
         growth_d: ``[N]`` parameter, or None if the config has no growth.
-        attenuation: settings of both; distances are in units of the scene's typical one.
+        attenuation: settings of both; distances are in units of the reference distance.
         config: settings of the training.
         typical: ``[N]`` normalised distances at which Gaussians are counted.
     """

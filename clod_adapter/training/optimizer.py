@@ -23,6 +23,9 @@ class RowAdam:
 
     Attributes:
         steps: ``[N]`` int32, of each row.
+
+    Raises:
+        ValueError: no parameters.
     """
 
     def __init__(
@@ -31,6 +34,8 @@ class RowAdam:
         self.parameters = parameters
         self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
         self._moments = {name: (_zeros(p), _zeros(p)) for name, p in parameters.items()}
+        if not parameters:
+            raise ValueError("there are no parameters to optimize")
         some = next(iter(parameters.values()))
         self.steps = torch.zeros(len(some), dtype=torch.int32, device=some.device)
         # After so many steps of its own a row's bias corrections are 1 in float32.

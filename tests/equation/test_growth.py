@@ -91,7 +91,7 @@ def test_edges_are_finite(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_nothing_grows_within_the_typical_distance(dtype: torch.dtype) -> None:
+def test_nothing_grows_within_the_reference_distance(dtype: torch.dtype) -> None:
     """Not even in the last bit where d s equals r."""
     h = torch.tensor([-300.0, -1.0, 0.5, 3.0, 1e6], dtype=dtype)
     for d in torch.rand(200, generator=torch.Generator().manual_seed(0), dtype=dtype):
@@ -157,7 +157,7 @@ def test_growth_needs_a_dial_and_one_shape() -> None:
         attenuate(three, three, (torch.ones(3, 3), camera()), 2.0, config(), growth_d=torch.ones(1))
 
 
-def test_growth_begins_at_the_typical_distance() -> None:
+def test_growth_begins_at_the_reference_distance() -> None:
     assert growth_distance(AttenuationConfig()) == 1.0
     assert growth_distance(AttenuationConfig(reference_distance=3.0)) == 3.0
     assert growth_distance(AttenuationConfig(scene_distance=4.0, reference_distance=3.0)) == 0.75

@@ -22,10 +22,10 @@ from formats import ATTENUATION, model, splat_transform, turned
 from scenes import camera
 
 
-@pytest.mark.parametrize(("typical", "known"), [(250.0, True), (40_000.0, False)])
+@pytest.mark.parametrize(("typical", "known"), [(50.0, True), (250.0, True), (40_000.0, False)])
 def test_sigma_of_large_units_is_not_clipped(tmp_path: Path, typical: float, known: bool) -> None:
     g = model(0)
-    sigma = typical * torch.logspace(-1, 1.5, len(g))
+    sigma = typical * torch.logspace(-1, 3.3, len(g))
     direction = torch.randn(len(g), 3, generator=torch.Generator().manual_seed(0))
     config = replace(ATTENUATION, reference_distance=typical if known else 0.0)
     means = typical * torch.nn.functional.normalize(direction)

@@ -33,7 +33,7 @@ def test_other_normalizers_need_no_note(normalizer: str) -> None:
     ],
 )
 def test_file_without_settings_has_a_note(tmp_path: Path, factor: float, begin: str, parts: list[str]) -> None:
-    """The file keeps six tenths at s = 1 from its typical distance; sigma_d is multiplied by ``factor``."""
+    """The file keeps six tenths at s = 1 from its reference distance; sigma_d is multiplied by ``factor``."""
     config, path, some = AttenuationConfig(), tmp_path / "a.ply", gaussians(500, 0, 1)
     some = some.replace(means=10 * some.means, opacity_logits=some.opacity_logits.clamp(min=-2))
     d = torch.full((500,), estimated_distance(some.means))
