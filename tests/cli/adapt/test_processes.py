@@ -20,6 +20,7 @@ import clod_adapter
 from clod_adapter.cli.commands.settings import make_config
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.launch import Launch, launched
+from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.training.state_file import load_state
 from runs import OUTPUTS, STATE, Server, log_of, names, wait_for
@@ -329,8 +330,10 @@ def test_rank_from_the_environment(monkeypatch: pytest.MonkeyPatch, environment:
 
 
 def test_default_steps_take_the_same_number_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = AdaptConfig().iters
     for words, size, want in (
-        ((), 1, (1, 2000)), ((), 4, (4, 500)), (("--batch", "3"), 2, (3, 667)), (("--batch", "4000"), 1, (4000, 1)),
+        ((), 1, (1, steps)), ((), 4, (4, round(steps / 4))), (("--batch", "3"), 2, (3, round(steps / 3))),
+        (("--batch", str(2 * steps)), 1, (2 * steps, 1)),
         (("--iters", "100"), 4, (4, 100)), (("--iters", "0"), 1, (1, 0)),
     ):  # fmt: skip
         for name, value in (AT | {"RANK": "0", "WORLD_SIZE": str(size)}).items():
