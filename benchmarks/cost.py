@@ -47,6 +47,8 @@ def main() -> None:
     args = parser.parse_args()
     if args.interpolated:
         print_interpolated()
+    elif not args.scenes:
+        parser.error("give scenes, or --interpolated")
     for scene in args.scenes:
         if args.train:
             for target in args.targets:
