@@ -89,6 +89,11 @@ def camera_unit(means: Tensor, camera: Camera, config: AttenuationConfig) -> flo
     return float(normalizing_distance(distances, means, camera, config))
 
 
+def median_distance(means: Tensor, camera: Camera) -> float:
+    """Of the centres ``means [N, 3]`` in the image, or of all if there is none; world units."""
+    return camera_unit(means, camera, AttenuationConfig(normalizer="quantile", quantile=0.5))
+
+
 def viewpoint_of(camera: Camera, means: Tensor, config: AttenuationConfig) -> Viewpoint:
     """The viewpoint of a camera that looks at Gaussians with centres ``means [N, 3]``, world units."""
     x, y, z = camera.position.to(means).double().tolist()

@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
+from clod_adapter.equation.distances import median_distance
 from clod_adapter.evaluation.level_errors import VIEWS
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.tileset import ALLOWED
@@ -48,7 +49,7 @@ def geometric_errors(
     for done, view in enumerate(cameras[k] for k in picked):
         images = [splat(level, level.opacities, view)[0].clamp(0, 1) for level in levels]
         slope = max(_slope(images[0]), 1e-6)
-        length = _distance(levels[0], view) / float(view.K[0, 0])
+        length = median_distance(levels[0].means, view) / float(view.K[0, 0])
         found[done] = [length / slope * float((image - images[0]).square().mean().sqrt()) for image in images]
         tell(progress, Phase.LEVELS, done + 1, len(picked))
     return ALLOWED * np.maximum.accumulate(found.mean(0))  # type: ignore[no-any-return]
@@ -58,13 +59,3 @@ def _slope(image: Tensor) -> float:
     """Root mean square of the differences between neighbouring pixels, along x and y."""
     across, down = image.diff(dim=1).square().mean(), image.diff(dim=0).square().mean()
     return float(((across + down) / 2).sqrt())
-
-
-def _distance(gaussians: Gaussians, camera: Camera) -> float:
-    """The median distance of the centres in the image, or of all if there is none."""
-    viewmat, K = camera.viewmat.to(gaussians.means), camera.K.to(gaussians.means)
-    places = gaussians.means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    points = (places @ K.T)[:, :2] / places[:, 2:]
-    size = torch.tensor([camera.width, camera.height]).to(points)
-    inside = (places[:, 2] > camera.near) & (points > 0).all(1) & (points < size).all(1)
-    return float((places[inside] if inside.any() else places).norm(dim=1).median())

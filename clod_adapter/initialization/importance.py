@@ -13,7 +13,7 @@ from torch import Tensor
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import SIGMA_MAX
-from clod_adapter.equation.distances import camera_unit, typical_distance
+from clod_adapter.equation.distances import median_distance, typical_distance
 from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.equation.units import in_world_units, known_distance, with_distance
 from clod_adapter.errors import ClodError
@@ -159,8 +159,7 @@ def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
     single view must not decide. Growth begins there. Beyond it growth fills the gaps; nearer, stored scales and
     opacities must, and those act at all distances (docs/method.md, "Near to far").
     """
-    config = AttenuationConfig(normalizer="quantile", quantile=0.5)
-    medians = sorted(camera_unit(base.means, view.camera, config) for view in views)
+    medians = sorted(median_distance(base.means, view.camera) for view in views)
     return medians[max(math.ceil(NEAREST * len(medians)), 2 if len(medians) > 2 else 1) - 1]
 
 
