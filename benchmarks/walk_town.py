@@ -38,9 +38,7 @@ class Town:
     tuning: int = 400  # steps that the checkpoint is trained for
     iters: int = 1600  # steps of adapting
     max_sv: float = 8.0
-    # Of the checkpoint and of adapting, times the extent of the cameras: 1 cm a step. That extent is 300 m, and the
-    # default of adapting, 15 cm a step, destroys what is seen from a doorstep.
-    lr_means: float = 3e-5
+    lr_means: float = 3e-5  # of the checkpoint's training, times the extent of its cameras, which is 300 m
 
     @property
     def key(self) -> str:
@@ -131,7 +129,7 @@ def adapted(town: Town, target: str = "count") -> tuple[clod.Gaussians, Row]:
     if not (path.exists() and about.exists()):
         scene, at = town.scene(), commit()
         base = checkpoint(town, scene)
-        config = clod.AdaptConfig(iters=town.iters, max_sv=town.max_sv, lr_means=town.lr_means, target=target)
+        config = clod.AdaptConfig(iters=town.iters, max_sv=town.max_sv, target=target)
         plan = clod.make_plan(base.gaussians, scene, config)
         with Console().meter("adapting") as meter:
             result = plan.adapt(scene, lambda now: meter.update(now.share, f"loss {now.loss or 0:.4f}"))

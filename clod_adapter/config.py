@@ -185,7 +185,7 @@ class AdaptConfig:
         "on", "growth of the Gaussians that remain, by a growth_d beside sigma_d: on or off (the paper's)"
     )
     lr_growth: float = option(1.2e-2, "learning rate of growth_d")
-    lr_means: float = option(5.2e-4, "learning rate of means, times the extent of the cameras")
+    lr_means: float = option(0.06, "learning rate of means, times the Gaussian's own size")
     lr_quats: float = option(1.6e-3, "learning rate of quats")
     lr_scales: float = option(1.6e-2, "learning rate of log_scales")
     lr_opacities: float = option(0.1, "learning rate of opacity_logits")
@@ -243,7 +243,7 @@ class AdaptConfig:
             "tau": 1 / 255, "cut": "hard", "normalizer": "max", "start": "constant", "parameter": "linear",
             "sampling": "uniform", "full_share": 0.0, "coarse": 0.0, "count_term": "paper", "reg_weight": 1.0,
             "weight_slope": 0.5, "lr_sigma": 1e-2,
-            "growth": "off", "temperature": 0.5, "average": 0.0, "lr_final": 0.05, "lr_means": 2.6e-4, "lr_quats": 8e-4,
+            "growth": "off", "temperature": 0.5, "average": 0.0, "lr_final": 0.05, "lr_means": 0.03, "lr_quats": 8e-4,
             "lr_scales": 8e-3, "lr_opacities": 5e-2, "lr_sh0": 2e-3,
         }  # fmt: skip
         return cls(**{**own, **changes})

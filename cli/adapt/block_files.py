@@ -61,7 +61,7 @@ class BlockFiles:
         if plan.kept is not None:
             tensors["kept"] = plan.kept
         about = {
-            "extent": division.extent, "attenuation": plan.start.attenuation, "sh_degree": plan.sh_degree,
+            "attenuation": plan.start.attenuation, "sh_degree": plan.sh_degree,
             "config": asdict(plan.config), "decisions": [asdict(decision) for decision in plan.decisions],
         }  # fmt: skip
         save_block(self.start, tensors, about, self.run_of)
@@ -85,14 +85,14 @@ class BlockFiles:
         if tensors["block"].unique().tolist() != list(range(count)):
             raise ClodError(f"{self.start}: a block has no Gaussians; delete it to make it again")
         with refused_if_damaged(self.start):
-            settings, extent = AttenuationConfig(**about["attenuation"]), float(about["extent"])
+            settings = AttenuationConfig(**about["attenuation"])
             config, degree = AdaptConfig(**about["config"]), int(about["sh_degree"])
             decisions = tuple(Decision(**each) for each in about["decisions"])
             few = base.without_bands(degree)
         dial = {name: tensors[name].to(device) for name in names}
         begun = with_dial(few, attenuation=settings, **dial)
         plan = Plan(decisions, begun, None if kept is None else kept.to(device), degree, config, {"start": 0.0})
-        division = Division(plan.lean, tensors["block"].to(device), tensors["seen"], extent, len(base))
+        division = Division(plan.lean, tensors["block"].to(device), tensors["seen"], len(base))
         return plan, division, replace(self, run_of=self.run_of | {"start": _digest(tensors)}, count=count)
 
     def save_learned(self, learned: Learned, block: int, number: int) -> None:

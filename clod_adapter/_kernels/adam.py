@@ -45,15 +45,30 @@ def step_columns(parameter, first, second, gradient, rows, width, at, many, lane
 
 @kernel
 def adam_rows(  # type: ignore[no-untyped-def]
-    worker, workers, parameter, first, second, gradient, mask, steps, counted, corrections, rate, beta1, beta2, epsilon
+    worker,
+    workers,
+    parameter,
+    first,
+    second,
+    gradient,
+    mask,
+    steps,
+    counted,
+    corrections,
+    units,
+    rate,
+    beta1,
+    beta2,
+    epsilon,
 ):
     """Updates the rows of ``parameter [N, width]`` and of its moments where ``mask [N]`` is set, with ``gradient``.
 
     ``steps[row]`` counts the updates of the row: ``counted``, 1 or 0, is added first. For n updates
     ``corrections[0, n]`` is ``1 / (1 - beta1^n)`` and ``corrections[1, n]`` is ``1 / sqrt(1 - beta2^n)``; the last
-    entry holds for all larger n.
+    entry holds for all larger n. ``units``, ``[N]`` or ``[1]`` for all, multiplies a row's rate.
     """
     width, most, rate = parameter.shape[1], corrections.shape[1] - 1, float32(rate)
+    each = int64(len(units) > 1)
     i, end = len(parameter) * worker // workers, len(parameter) * (worker + 1) // workers
     lanes, rows = scratch(f32x16, 64), scratch(int64, 16)
     length, correction = scratch(float32, 16), scratch(float32, 16)
@@ -69,7 +84,8 @@ def adam_rows(  # type: ignore[no-untyped-def]
             else:
                 rows[lane] = rows[0]
             count = min(steps[rows[lane]], most)
-            length[lane], correction[lane] = rate * corrections[0, count], corrections[1, count]
+            length[lane] = rate * units[each * rows[lane]] * corrections[0, count]
+            correction[lane] = corrections[1, count]
         # Constant widths, so that the compiler simplifies the transpositions.
         if width == 1:
             step_columns(parameter, first, second, gradient, rows, 1, 0, 1, lanes, length, correction, constants)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import View, camera_extent
+from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
@@ -28,14 +28,12 @@ class Division:
         initial: the Gaussians that are trained, N, with the initial dial.
         block: ``[N]`` int16, the block of each Gaussian.
         seen: ``[V, B]`` float32, the share of each view's image that each block covers.
-        extent: of all cameras, world units.
         total: number of Gaussians that target counts are shares of: N and those that a plan leaves out.
     """
 
     initial: Gaussians
     block: Tensor
     seen: Tensor
-    extent: float
     total: int
 
     @property
@@ -132,8 +130,7 @@ def divide(
         shown = coverage(initial, initial.opacities, reduced(view.camera)).double()
         seen[k] = (shown.new_zeros(count).index_add_(0, block.long(), shown) / shown.sum().clamp(min=1e-9)).float()
         tell(progress, Phase.COVERAGE, k + 1, len(views))
-    extent = camera_extent([view.camera for view in views]) or initial.attenuation.reference_distance
-    return Division(initial, block, seen, extent, total or len(initial))
+    return Division(initial, block, seen, total or len(initial))
 
 
 def check_divisible(config: AdaptConfig) -> None:

@@ -11,7 +11,6 @@ their rows are then merged.
 Each block has its share of an undivided run:
 
 - The initialization (importance, pruning order, sigma_d, growth_d, tau) is that of the whole scene.
-- The unit of position steps is the extent of all cameras.
 - A block takes as many steps as the undivided run takes of the views that see it, so that each Gaussian is stepped as
   often. All blocks together take more, as a view may see several.
 - The target-count curve counts all Gaussians. A block's target is its share of the Gaussians that the initialization
@@ -98,7 +97,7 @@ def adapt_block(
         own = _with_target_images(gaussians, len(rows), own, cache, progress)
     cameras = [view.camera for view in spread(views, MOST_VIEWS)]
     target = block_target(division, block, cameras, config, first=after is None)
-    part = TrainableSubset(len(rows), division.extent, after is None, target=target, cameras=cameras)
+    part = TrainableSubset(len(rows), after is None, target=target, cameras=cameras)
     settings = block_config(division, block, config, first=after is None)
     adapted = adapt(gaussians, Scene(tuple(own), ()), settings, progress, resume, subset=part)
     return _learned(division, rows, adapted)

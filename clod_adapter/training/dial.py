@@ -40,9 +40,9 @@ from clod_adapter.integrations.splats import NAMES, from_gsplat
 from clod_adapter.progress import Listener, shown
 from clod_adapter.render import dial as dialled_by
 from clod_adapter.training.loop import require_trainable
-from clod_adapter.training.objective import SIGMA_RANGE, TrainableSubset, loss_weight, within_reach
+from clod_adapter.training.objective import SIGMA_RANGE, loss_weight, within_reach
 from clod_adapter.training.target_count import count_gradient, target_share
-from clod_adapter.training.trainer import learning_rates, position_unit
+from clod_adapter.training.trainer import learning_rates, own_sizes
 from clod_adapter.training.view_sampler import ViewSampler
 
 ATTRIBUTE_OF = {**NAMES, "features_dc": "sh0", "features_rest": "shN"}
@@ -82,7 +82,8 @@ class Dial(nn.Module):
         self.register_parameter("growth_d", growth_d)
         cameras = [view.camera for view in spread(views, MOST_VIEWS)]
         self.register_buffer("typical", typical_distance(start.means, cameras, start.attenuation), persistent=False)
-        self._rates = learning_rates(config, position_unit(start, views, TrainableSubset(len(start))))
+        self._rates = learning_rates(config)
+        self._rates["means"] *= float(own_sizes(start.log_scales).median())  # an optimizer has one rate for all rows
         self._sampler, self._sampled = ViewSampler((), config), 0
 
     def __repr__(self) -> str:

@@ -35,7 +35,6 @@ class TrainableSubset:
 
     Attributes:
         trained: number of trained rows, the first ones; the others are the context: drawn, but not trained.
-        extent: of the whole scene's cameras, world units: the unit of position steps. By default that of the views.
         full_context: draw the context without a dial, instead of at the dial value of the trained rows.
         total: number of Gaussians that the target-count curve is a share of, where that is more than ``trained``
             (``target_count.target_share``).
@@ -44,7 +43,6 @@ class TrainableSubset:
     """
 
     trained: int
-    extent: float | None = None
     full_context: bool = False
     total: int | None = None
     target: Callable[[float], TargetShare] | None = None

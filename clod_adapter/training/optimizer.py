@@ -20,6 +20,7 @@ class RowAdam:
 
     Args:
         parameters: at least one; updated in place; float32, contiguous, as the leading rows of a larger tensor are.
+        units: ``[N]`` factors of the rates of each row, by parameter; by default 1.
 
     Attributes:
         steps: ``[N]`` int32, of each row.
@@ -29,9 +30,12 @@ class RowAdam:
     """
 
     def __init__(
-        self, parameters: dict[str, Tensor], *, beta1: float = 0.9, beta2: float = 0.999, epsilon: float = 1e-15
-    ):
+        self, parameters: dict[str, Tensor], *, beta1: float = 0.9, beta2: float = 0.999, epsilon: float = 1e-15,
+        units: dict[str, Tensor] | None = None,
+    ):  # fmt: skip
         self.parameters = parameters
+        one = torch.ones(1)
+        self._units = {name: (units or {}).get(name, one.to(p.device)) for name, p in parameters.items()}
         self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
         self._moments = {name: (_zeros(p), _zeros(p)) for name, p in parameters.items()}
         if not parameters:
@@ -69,7 +73,8 @@ class RowAdam:
             tensors = (parameter, *self._moments[name], gradients[name].contiguous())
             flat = [x.view(len(x), math.prod(x.shape[1:])).numpy() for x in tensors]
             counted = 0 if jobs else 1
-            jobs.append((*flat, rows.numpy(), self.steps.numpy(), counted, self._corrections, rates[name]))
+            own = rows.numpy(), self.steps.numpy(), counted, self._corrections, self._units[name].numpy()
+            jobs.append((*flat, *own, rates[name]))
 
         def adam(worker: int, workers: int) -> None:
             for job in jobs:
@@ -87,7 +92,8 @@ class RowAdam:
             values = (parameter, *self._moments[name])
             flat = [x.view(len(x), math.prod(x.shape[1:])) for x in values]
             flat.append(gradients[name].reshape(flat[0].shape))
-            _adam(*flat, rows[:, None], length, correction, rates[name], self.beta1, self.beta2, self.epsilon)
+            lengths = length * self._units[name][:, None]
+            _adam(*flat, rows[:, None], lengths, correction, rates[name], self.beta1, self.beta2, self.epsilon)
 
 
 @torch.no_grad()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.cameras import View, camera_extent
+from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.equation.growth import GROWTH_RANGE
@@ -50,7 +49,7 @@ class Trainer:
         subset = subset or TrainableSubset(len(start))
         assert start.sigma_d is not None and start.attenuation is not None
         self.config, self.group, self.sampler = config, group, ViewSampler(views, config)
-        rates = learning_rates(config, position_unit(start, views, subset))
+        rates = learning_rates(config)
         # A frozen attribute requests no gradient from the rasterizer.
         tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
         cameras = subset.cameras or [view.camera for view in spread(views, MOST_VIEWS)]
@@ -73,6 +72,7 @@ class Trainer:
         if config.growth == "on":
             assert start.growth_d is not None
             self.parameters["growth_d"] = start.growth_d.detach().float().clamp(*GROWTH_RANGE)
+        self.unit = own_sizes(start.log_scales[: subset.trained])
         # The paper's count term has a gradient for opacities too, also of culled Gaussians.
         everywhere = {self.decay} | ({"opacity_logits"} if config.count_term == "paper" else set())
         self.optimizers = [self._optimizer(set(self.stepped) - everywhere), self._optimizer(everywhere)]
@@ -185,7 +185,9 @@ class Trainer:
     def _optimizer(self, names: set[str]) -> RowAdam | None:
         """Of these parameters; None without any."""
         own = {name: value for name, value in self._trained().items() if name in names}
-        return RowAdam(own, beta1=BETA1**self.config.batch, beta2=BETA2**self.config.batch) if own else None
+        units = {"means": self.unit}
+        betas = {"beta1": BETA1**self.config.batch, "beta2": BETA2**self.config.batch}
+        return RowAdam(own, **betas, units=units) if own else None
 
     def _changing(self) -> dict[str, Tensor]:
         """All tensors that steps change, named as in ``TrainingState``."""
@@ -199,16 +201,19 @@ class Trainer:
         return found if self.objective.cost is None else found | {"cost.measured": self.objective.cost.measured}
 
 
-def learning_rates(config: AdaptConfig, extent: float) -> dict[str, float]:
-    """By attribute, for a batch; ``extent`` is ``position_unit``."""
+def learning_rates(config: AdaptConfig) -> dict[str, float]:
+    """By attribute, for a batch; that of means is in units of ``own_sizes``."""
     rates = {
-        "means": config.lr_means * extent, "quats": config.lr_quats, "log_scales": config.lr_scales,
+        "means": config.lr_means, "quats": config.lr_quats, "log_scales": config.lr_scales,
         "opacity_logits": config.lr_opacities, "sh0": config.lr_sh0, "shN": config.lr_shN,
     }  # fmt: skip
     return {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
 
 
-def position_unit(start: Gaussians, views: Sequence[View], subset: TrainableSubset) -> float:
-    """The unit of position steps, world units: the cameras' extent, or the reference distance if it is 0."""
-    assert start.attenuation is not None
-    return subset.extent or camera_extent([view.camera for view in views]) or start.attenuation.scene_distance
+@torch.no_grad()
+def own_sizes(log_scales: Tensor) -> Tensor:
+    """``[N]`` the unit of each Gaussian's position steps, world units: the geometric mean of its scales.
+
+    A length of the scene, 3DGS's unit, is a hundred times the size of most Gaussians in a scene of millions.
+    """
+    return log_scales.detach().float().mean(1).exp()

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from clod_adapter.adapter import ATTRIBUTES, with_dial
-from clod_adapter.cameras import Scene, camera_extent
+from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import SIGMA_MAX, log_attenuation
 from clod_adapter.equation.distances import in_frustum, normalized_distances
@@ -257,10 +257,10 @@ def test_degenerate_scenes(captured: Pair) -> None:
         one = gaussians(1, 0, 0).replace(means=torch.tensor(means))
         found = adapt(one, Scene(views, ()), config_of(iters=5)).gaussians
         assert all(value.isfinite().all() for value in found.tensors().values())
-    # Cameras in one place move means by the distances in their images, as their own are 0.
+    # Cameras in one place.
     base, scene = captured
     found = adapt(base, Scene(scene.train[:1] * 2, ()), config_of(iters=3)).gaussians
-    assert camera_extent([scene.train[0].camera] * 2) == 0 and not found.means.equal(base.means)
+    assert not found.means.equal(base.means)
 
 
 @pytest.mark.parametrize(
@@ -317,7 +317,8 @@ def test_a_row_with_a_nonfinite_gradient_is_not_stepped(captured: Pair, monkeypa
     )
     assert result.held == 2 and all(value.isfinite().all() for value in result.gaussians.tensors().values())
     first = initialize(base, scene.train, config)
-    assert torch.equal(seen[0].sigma_d[3:5], first.sigma_d[3:5]) and not torch.equal(seen[0].sigma_d, first.sigma_d[:9])
+    moved = (seen[0].sigma_d / first.sigma_d[:9] - 1).abs() > 1e-5
+    assert not moved[3:5].any() and moved.any()
     assert (result.gaussians.sigma_d[3:5] != first.sigma_d[3:5]).all()
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import with_dial
-from clod_adapter.cameras import Scene, camera_extent
+from clod_adapter.cameras import Scene
 from clod_adapter.config import FILTERS
 from clod_adapter.equation.growth import GROWTH_RANGE
 from clod_adapter.gaussians import Gaussians
@@ -67,14 +67,14 @@ def test_one_step_moves_kept_rows_by_their_rates(captured: Pair) -> None:
     assert seen[0].loss == pytest.approx(min(losses, key=lambda loss: abs(loss - seen[0].loss)), rel=1e-5)
     kept = render(before, view.camera).kept
     rates = {
-        "means": config.lr_means * camera_extent([view.camera for view in alone.train]), "quats": config.lr_quats,
+        "means": config.lr_means * before.log_scales.mean(1).exp()[kept], "quats": config.lr_quats,
         "log_scales": config.lr_scales, "sh0": config.lr_sh0,
     }  # fmt: skip
     for name, rate in rates.items():
         old, new = getattr(before, name), getattr(after, name)
         assert torch.equal(old[~kept], new[~kept]), name
-        moved = (new - old)[kept].abs().flatten(1).amax(1)
-        assert (moved > 0).sum() > 20 and moved.max() == pytest.approx(rate, rel=1e-2), name
+        moved = (new - old)[kept].abs().flatten(1).amax(1) / rate
+        assert (moved > 0).sum() > 20 and moved.max() == pytest.approx(1, rel=0.05), name  # positions are rounded
     moved = (after.sigma_d / before.sigma_d).log().abs()
     assert moved.max() == pytest.approx(config.lr_sigma, rel=1e-3) and (moved[~kept] < 1e-5).all()
     assert photometric_loss(render(after, view.camera).image, view.image) < seen[0].loss

@@ -92,6 +92,20 @@ def test_only_selected_rows_are_stepped(kind: type[RowAdam], more: int, filler: 
 
 
 @pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
+def test_units_multiply_the_rates_of_rows(kind: type[RowAdam], n: int = 40) -> None:
+    units = 10 ** torch.linspace(-4, 2, n)
+    one, other = ({"means": torch.zeros(n, 3), "sh0": torch.zeros(n, 1, 3)} for _ in range(2))
+    optimizers = kind(one), kind(other, units={"means": units})
+    for step in range(3):
+        given = {name: gradients(n, step)[name].view(n, *one[name].shape[1:]) for name in ("means",)}
+        given["sh0"] = given["means"].view(n, 1, 3)
+        for optimizer in optimizers:
+            optimizer.step(given, torch.arange(n) % 3 > 0, {"means": 0.1, "sh0": 0.1})
+    assert torch.equal(one["sh0"], other["sh0"])
+    torch.testing.assert_close(other["means"], units[:, None] * one["means"], rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
 def test_a_first_step_is_as_long_as_the_rate(kind: type[RowAdam]) -> None:
     """For any size of gradient and any number of earlier steps of other rows; also with empty tensors."""
     for size in (1e-8, 1e-3, 1.0, 1e6):

@@ -197,7 +197,7 @@ def test_files_of_another_run_are_refused(
     refused("a.block1.pass1.safetensors: is no block or damaged")
     first.unlink()
     save_block(start, tensors, {"attenuation": about["attenuation"]}, belongs)
-    refused("damaged (KeyError('extent'))", "--block", 1)
+    refused("damaged (KeyError('config'))", "--block", 1)
     for name, worse, message in (
         ("block", tensors["block"].clamp(max=1), "a block has no Gaussians"),
         ("kept", tensors["kept"].float(), "its kept is not that of this scene"),
