@@ -13,6 +13,7 @@ from clod_adapter.errors import ClodError
 
 NEAR = 0.01
 """Distance of the near plane, world units, as in gsplat."""
+SMALLEST = 128  # pixels a side that an image of half the size has at least: smaller ones show too little
 SMALL_EXTENT = 1.0  # extent of the cameras, world units, below which the near plane is scaled down
 ROUNDING = 1e-6  # of the distance from 0: float32 does not resolve cameras closer together than that
 
@@ -58,14 +59,19 @@ class Camera:
         return replace(self, K=K, width=self.width // 2, height=self.height // 2)
 
     @property
+    def halvable(self) -> bool:
+        """Whether an image of half the size shows enough: at least SMALLEST pixels a side."""
+        return min(self.width, self.height) >= 2 * SMALLEST
+
+    @property
     def position(self) -> Tensor:
         """``[3]`` the camera centre in world units, ``-R^T t``."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class View:
-    """One photograph and its camera.
+    """One photograph and its camera. Compares by identity.
 
     Attributes:
         camera: where it was taken from.
@@ -97,11 +103,17 @@ class View:
 
         return StoredView(camera, image)
 
+    def columns(self, first: int, end: int) -> View:
+        """The columns ``[first, end)`` of the photograph, with the camera for them; made when they are read."""
+        K = self.camera.K.clone()
+        K[0, 2] -= first
+        return StoredView(replace(self.camera, K=K, width=end - first), lambda: self.image[:, first:end])
+
 
 class StoredView(View):
     """A view that reads its photograph on every access instead of holding it.
 
-    Compares by identity; a pickle or a deep copy is a plain View that holds the photograph.
+    A pickle or a deep copy is a plain View that holds the photograph.
 
     Args:
         image: returns the pixels of ``View.image``; or the pixels themselves (``dataclasses.replace`` passes these).
@@ -110,9 +122,6 @@ class StoredView(View):
     def __init__(self, camera: Camera, image: Callable[[], Tensor] | Tensor) -> None:
         object.__setattr__(self, "camera", camera)
         object.__setattr__(self, "_read", (lambda: image) if isinstance(image, Tensor) else image)
-
-    __eq__ = object.__eq__
-    __hash__ = object.__hash__
 
     def __reduce__(self) -> tuple[type[View], tuple[Camera, Tensor]]:
         return View, (self.camera, self.image)

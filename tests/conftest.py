@@ -29,6 +29,7 @@ from clod_adapter.io.ply.columns import rows_of
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import render
 from clod_adapter.training import pseudo_views
+from runs import accepted
 from scenes import looking
 
 fake_gpu.register()
@@ -95,7 +96,7 @@ def dialled(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The capture's checkpoint with a dial up to 4 and its calibration, as clod-adapt writes it."""
     path = tmp_path_factory.mktemp("dialled") / "dial.ply"
     words = [capture.ply, "--images", capture.scene, "--iters", 12, "--max-sv", 4, "--out", path, "--quiet", "--json"]
-    assert main([str(word) for word in words]) == 0
+    assert main(accepted(words)) == 0
     return path
 
 

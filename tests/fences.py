@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from clod_adapter.cli.main import COMMANDS, build_parser, main
+from runs import accepted
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "examples" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -102,7 +103,7 @@ def run(words: list[str]) -> None:
 
 
 def _run_clod_adapt(words: list[str]) -> None:
-    code = main(shortened(words[1:]))
+    code = main(accepted(shortened(words[1:])))
     if code:
         raise ValueError(f"{shlex.join(words)}: exit code {code}")
 

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -66,6 +66,13 @@ for line in sys.stdin:
 """
 
 
+def accepted(words: Sequence[object]) -> list[str]:
+    """The words of a command, as text; adapting, which takes few steps here, accepts its loss."""
+    found = [str(word) for word in words]
+    adapts = bool(found) and Path(found[0]).suffix in (".ply", ".pt", ".spz", ".glb") and "--help" not in found
+    return [*found, "--accept-loss"] if adapts else found
+
+
 class Server:
     """Runs ``clod-adapt`` in forked processes, which start quickly."""
 
@@ -82,7 +89,7 @@ class Server:
     def start(self, folder: Path, *words: object, rank: object = "", before: str = "", **environment: object) -> int:
         """The process's id, valid until it is waited for; ``before`` is code that it runs first."""
         return self.ask(
-            folder=str(folder), log=f"{folder}{rank}.log", words=[str(word) for word in words], before=before,
+            folder=str(folder), log=f"{folder}{rank}.log", words=accepted(words), before=before,
             environment={name: str(value) for name, value in environment.items()},
         )  # fmt: skip
 

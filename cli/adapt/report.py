@@ -27,6 +27,9 @@ from .processes import describe_processes
 from .result import Measurements, Result, measure_result
 from .setup import Setup
 
+# dB: of s = 1 below the base, and against the checkpoint's renderings without photographs, what is told and what fails.
+LOST, ENOUGH = (0.1, 1.0), (33.0, 25.0)
+
 
 def finish(
     setup: Setup, inputs: Inputs, result: Result, page: AdaptPage | None, written: Callable[[bool], None]
@@ -50,6 +53,8 @@ def finish(
         report = add_page(setup, result, page, report)
     shown = table(measured.rows, measured.base, measured.plain) if measured.rows else ""
     print_summary(setup.outputs, shown, setup.args, setup.watch)
+    if "loss" in report:
+        setup.console.say(f"\nwarning: {report['loss']}")
     return report
 
 
@@ -106,9 +111,28 @@ def describe_run(setup: Setup, inputs: Inputs, result: Result, measured: Measure
         "alignment": inputs.alignment, "notes": notes, "base_rows": [row.as_dict() for row in measured.base],
         "rows": [row.as_dict() for row in measured.rows],
         "detached_row": measured.plain[0].as_dict() if measured.plain else None,
-        "plan": plan.as_dict(), "memory": inputs.memory and asdict(inputs.memory),
+        "watched": adapted.watched and asdict(adapted.watched), "plan": plan.as_dict(),
+        "memory": inputs.memory and asdict(inputs.memory),
     }  # fmt: skip
-    return report | ({"exit_code": 1} if adapted.failed else {})
+    line, failed = ("", False) if report["interrupted"] else judge(measured, args.images is not None)
+    failed = adapted.failed is not None or failed and not args.accept_loss
+    return report | ({"loss": line} if line else {}) | ({"exit_code": 1} if failed else {})
+
+
+def judge(measured: Measurements, photographs: bool) -> tuple[str, bool]:
+    """What is wrong with s = 1 and what to do, empty if nothing is; and whether the result has failed."""
+    full = [row.psnr for row in measured.rows if row.virtual_scale == 1]
+    if not full or not measured.base:
+        return "", False
+    if photographs:
+        lost = measured.base[0].psnr - full[0]
+        line = f"s = 1 is {lost:.2f} dB below the base on the held-out photographs"
+        bad, failed = not lost <= LOST[0], not lost <= LOST[1]
+    else:
+        line = f"s = 1 has {full[0]:.2f} dB against the checkpoint's own renderings"
+        bad, failed = not full[0] >= ENOUGH[0], not full[0] >= ENOUGH[1]
+    more = "" if photographs else ", or give the photographs (--images)"
+    return (f"{line}:\ntrain longer (--iters), keep more Gaussians (--start-share 1){more}" if bad else ""), failed
 
 
 def seconds(setup: Setup, result: Result) -> dict[str, float]:

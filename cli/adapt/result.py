@@ -75,6 +75,10 @@ def training_notes(inputs: Inputs, adapter: Adapter, adapted: Adapted) -> list[s
         notes.append(f"training ended at step {adapted.steps}: {explain(adapted.lost)}")
     if adapted.failed:
         notes.append(f"training ended early, and the result so far is written: {adapted.failed}")
+    if adapted.watched and (times := adapted.watched.rollbacks):
+        what = "attributes were frozen in the end" if adapted.watched.frozen else "learning rates were halved"
+        back = f"training made s = 1 worse on watched views and returned to an earlier state {times} times"
+        notes.append(f"{back}: {what}; the views watched are not trained on")
     if adapted.held:
         notes.append(f"{adapted.held:,} Gaussians were not moved by some steps: their gradients were not finite")
     return notes

@@ -45,6 +45,9 @@ def adapt_options(parser: ArgumentParser) -> None:
     add_settings(training)
     training.add_argument("--resume", action="store_true", help="continue the same command where it was interrupted")
     add_misaligned_ok(training)
+    training.add_argument(
+        "--accept-loss", action="store_true", help="exit code 0 even if s = 1 is far below the base (see exit codes)"
+    )
     add_device(training, "train and measure")
     add_advanced(parser.add_argument_group("advanced"))
 
@@ -137,6 +140,12 @@ alignment:
   mean colours, another frame (axes, scale, offset, normalised) or a white
   background fit better, the command stops and says which.
 
+watched views:
+  One in 24 training views, at least 2, is not trained on. They decide the share
+  of Gaussians at s = 1. If training makes s = 1 much worse there, it returns to
+  an earlier state with half the learning rates; after the third time attributes
+  are frozen.
+
 interruption:
   Ctrl-C or SIGTERM while training finishes the step and writes the result so
   far (exit code 0, "interrupted": true); a second one aborts at any time. A
@@ -154,9 +163,10 @@ large scenes, several processes:
   Processes of torchrun train together, each on a part of a step's views; the
   result is that of one process with the same --batch, up to rounding.
 
-exit codes: 0 written; 1 loss not finite (the result until then is written), or
-a fault of this program; 2 bad input or a full disk; 130 interrupted without a
-result
+exit codes: 0 written; 1 written, but a loss was not finite, or s = 1 is more
+than 1 dB below the base (without photographs: below 25 dB) and --accept-loss is
+not given, or a fault of this program; 2 bad input or a full disk; 130
+interrupted without a result
 
 examples:
   clod-adapt garden.ply --images garden --max-sv 5

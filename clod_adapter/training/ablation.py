@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from statistics import fmean
 
@@ -11,13 +10,12 @@ from torch import Tensor
 
 from clod_adapter.cameras import View
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import MOST_VIEWS, removal_error, spread
+from clod_adapter.initialization.importance import removal_error
 from clod_adapter.losses import psnr
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.rasterizers import ALPHA_MAX
 from clod_adapter.render import render, splat
-
-ERROR_FLOOR = 1e-3  # mean squared error of a render at 30 dB
+from clod_adapter.training.gate import decibels_below, squared_error
 
 
 @torch.no_grad()
@@ -40,21 +38,19 @@ def sh_degree_losses(base: Gaussians, views: Sequence[View], limit: float) -> It
             return
 
 
-def seen(base: Gaussians, views: Sequence[View], error: Tensor, seed: int, progress: Listener | None = None) -> Tensor:
-    """``[N]`` bool, which Gaussians change any pixel of any of the views.
+def seen(base: Gaussians, others: Sequence[View], error: Tensor, seed: int, progress: Listener | None = None) -> Tensor:
+    """``[N]`` bool, which Gaussians change any pixel of any of the views that ``error`` is from, and of the others.
 
     An image is linear in each opacity, so removing a Gaussian changes nothing if no pixel has a derivative by its
     opacity. The backward pass of ``removal_error`` sums the derivatives with random signs; that all of them cancel to
     exactly 0 is not relevant in practice, and ``largest_change`` bounds the effect. Rasterizers clamp alpha, where it
-    has no derivative: Gaussians that opaque count as seen. Views that ``error`` was computed from are not used again.
+    has no derivative: Gaussians that opaque count as seen.
 
     Args:
-        error: ``[N]`` the ``removal_error`` of ``spread(views, MOST_VIEWS)``, as ``importance.initialize`` takes it.
+        error: ``[N]`` from ``removal_error``.
         seed: of the signs.
         progress: called in ``Phase.IMPORTANCE`` after each of the other views.
     """
-    rendered = set(spread(range(len(views)), MOST_VIEWS))
-    others = [view for k, view in enumerate(views) if k not in rendered]
     moves = (error > 0) | (removal_error(base, others, seed=seed, progress=progress) > 0)
     return moves | (base.opacities > ALPHA_MAX)
 
@@ -63,9 +59,8 @@ def seen(base: Gaussians, views: Sequence[View], error: Tensor, seed: int, progr
 def needed_share(base: Gaussians, views: Sequence[View], error: Tensor, limit: float) -> tuple[float, float]:
     """The smallest share of the Gaussians that loses less than ``limit`` dB, in hundredths, and that loss.
 
-    In (0.5, 1], by bisection. The Gaussians with the largest removal error remain, unattenuated. The loss of a view is
-    ``10 log10(e' / e)``, and e, the base's mean squared error, at least ERROR_FLOOR: against its own renderings a
-    checkpoint would have no error, and every Gaussian would be needed.
+    In (0.5, 1], by bisection. The Gaussians with the largest removal error remain, unattenuated. The loss is
+    ``gate.decibels_below`` the base.
 
     Args:
         error: ``[N]`` from ``removal_error``.
@@ -76,11 +71,7 @@ def needed_share(base: Gaussians, views: Sequence[View], error: Tensor, limit: f
     def loss(percent: int) -> float:
         less = opacities.clone()
         less[order[max(round(percent / 100 * len(base)), 1) :]] = 0  # neither sorted nor drawn; a copy is large
-        return fmean(
-            10 * math.log10((_squared_error(base, less, view) + floor) / (mse + floor))
-            for view, mse in zip(views, whole, strict=True)
-            for floor in [max(ERROR_FLOOR - mse, 0.0)]
-        )
+        return decibels_below([_squared_error(base, less, view) for view in views], whole)
 
     low, high, found = 50, 100, 0.0
     while high - low > 1:
@@ -91,7 +82,7 @@ def needed_share(base: Gaussians, views: Sequence[View], error: Tensor, limit: f
 
 
 def _squared_error(gaussians: Gaussians, opacities: Tensor, view: View) -> float:
-    return 10 ** (-psnr(splat(gaussians, opacities, view.camera)[0], view.image) / 10)
+    return squared_error(splat(gaussians, opacities, view.camera)[0], view)
 
 
 @torch.no_grad()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -17,6 +18,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import for_training, initialize, usable_views, with_growth
 from clod_adapter.progress import Listener, Phase, Progress, shown
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost
+from clod_adapter.training.gate import split_views
 from clod_adapter.training.interrupts import DeferredInterrupt
 from clod_adapter.training.objective import TrainableSubset
 from clod_adapter.training.state import Adapted, StateRefused, TrainingState
@@ -93,13 +95,13 @@ def _adapt(
     began = time.perf_counter()
     # Empty higher SH degrees that are not tuned stay empty, so they are not rendered.
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
-    views = usable_views(base, scene.train)
+    views, watched = training_views(base, scene.train, config)
     begun = (
         _initialized(lean, views, config, progress, group)
         if resume is None
         else _initialized_from(lean, resume, config)
     )
-    trainer = Trainer(begun, views, config, subset, group)
+    trainer = Trainer(begun, views, config, subset, group, watched)
     trainer.empty_sh = None if lean is base else base.shN.clone()
     trainer.start_seconds = time.perf_counter() - began
     if resume is not None:
@@ -109,6 +111,18 @@ def _adapt(
             raise StateRefused(str(error)) from error
     del resume, begun, base, lean  # the trainer has copies
     return _train(trainer, progress)
+
+
+def training_views(
+    base: Gaussians, views: Sequence[View], config: AdaptConfig
+) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """The usable views to train on, and those that watch s = 1 (``gate.Gate``); none watch the paper's objective.
+
+    Raises:
+        ClodError: no view is usable.
+    """
+    usable = usable_views(base, views)
+    return (usable, ()) if config.count_term == "paper" else split_views(usable)
 
 
 def require_trainable(base: Gaussians, scene: Scene, config: AdaptConfig, group: ProcessGroup | None = None) -> None:
@@ -170,10 +184,11 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
             going, failed = False, str(error)
             _tell(trainer, progress, failed)
         trainer.seconds = time.perf_counter() - began
+        seen = trainer.gate.finish() if trainer.gate and not lost else None
         waiting, exchanging = (after - then for after, then in zip(_waits(group), before, strict=True))
         adapted = Adapted(
             trainer.gaussians(), trainer.done, trainer.seconds, trainer.start_seconds, not going, lost, waiting,
-            exchanging, failed, int(trainer.held.sum()),
+            exchanging, failed, int(trainer.held.sum()), watched=seen,
         )  # fmt: skip
     return replace(adapted, interrupted=adapted.interrupted or interrupt.received, signalled=interrupt.received)
 

@@ -128,10 +128,7 @@ class Objective:
         """Renders one view at its dial value, and differentiates the weighted loss."""
         (view, s, counted, halved), config, first = sample, self.config, slice(self.trained)
         leaves = {name: parameters[name].detach().requires_grad_(name in self.stepped) for name in parameters}
-        decay = leaves[self.decay]
-        screen_filter = self.screen_filter.halved() if halved else self.screen_filter
-        rendered = self._rendered_by_kernels if self._compiled(decay) else self._rendered
-        image, kept, term = rendered(leaves, view.camera, s, screen_filter)
+        image, kept, term = self._rendered(leaves, view.camera, s, halved)
         loss = photometric_loss(image, view.image, config.ssim_weight)
         plain, weight = loss.detach().double(), loss_weight(s, config)
         total = weight * (loss if term is None else loss + term)
@@ -147,6 +144,24 @@ class Objective:
                 for name, gradient in self._target_gradients(parameters, at, weighted).items():
                     gradients[name] = gradients[name] + gradient
         return GradientSum(gradients, kept, plain)
+
+    def image(self, parameters: dict[str, Tensor], camera: Camera, s: float, halved: bool) -> Tensor:
+        """The image ``[H, W, 3]`` of the parameters; ``halved`` if the camera is for images of half the size."""
+        return self._rendered(parameters, camera, s, halved)[0]
+
+    def undialled(self, parameters: dict[str, Tensor], camera: Camera, halved: bool) -> Tensor:
+        """``image`` without a dial: of untrained parameters it is the base's."""
+        attributes: Any = {name: parameters[name] for name in ATTRIBUTES}
+        shown = Gaussians(**attributes, screen_filter=self._filter(halved))
+        return splat(shown, shown.opacities, camera)[0]
+
+    def _filter(self, halved: bool) -> ScreenFilter:
+        return self.screen_filter.halved() if halved else self.screen_filter
+
+    def _rendered(self, leaves: dict[str, Tensor], camera: Camera, s: float, halved: bool) -> Rendered:
+        """The image, the trained rows that are kept, and the paper's count term."""
+        rendered = self._rendered_by_kernels if self._compiled(leaves["opacity_logits"]) else self._rendered_plain
+        return rendered(leaves, camera, s, self._filter(halved))
 
     def _compiled(self, like: Tensor) -> bool:
         """Whether the rasterizer of the CPU applies the dial itself: the paper's term needs the opacities."""
@@ -169,8 +184,10 @@ class Objective:
         kept = cpu.kept(shown, camera, s)[: self.trained]
         return cpu.draw(shown, camera, s, torch.zeros(3), trained=self.trained)[0], kept, None
 
-    def _rendered(self, leaves: dict[str, Tensor], camera: Camera, s: float, screen_filter: ScreenFilter) -> Rendered:
-        """The image, the trained rows that are kept, and the paper's count term."""
+    def _rendered_plain(
+        self, leaves: dict[str, Tensor], camera: Camera, s: float, screen_filter: ScreenFilter
+    ) -> Rendered:
+        """``_rendered`` in plain torch."""
         rows = slice(self.trained) if self.part.full_context else slice(None)
         attributes: Any = {name: leaves[name] for name in ATTRIBUTES}
         shown = Gaussians(**attributes, screen_filter=screen_filter)

@@ -53,6 +53,13 @@ class RowAdam:
         """The tensors themselves that it keeps of each parameter: ``first`` and ``second``."""
         return {kind: {n: both[k] for n, both in self._moments.items()} for k, kind in enumerate(("first", "second"))}
 
+    def forget(self) -> None:
+        """Sets all moments and counts of steps to 0."""
+        self.steps.zero_()
+        for moments in self._moments.values():
+            for moment in moments:
+                moment.zero_()
+
     @torch.no_grad()
     def step(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
         """Steps all parameters, each at its rate, where ``rows`` (bool ``[N]``) is set.

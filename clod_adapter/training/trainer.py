@@ -20,6 +20,7 @@ from clod_adapter.finite import LossNotFinite, require_finite, spoilt_rows
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, spread
 from clod_adapter.training.distributed import ProcessGroup
+from clod_adapter.training.gate import Gate
 from clod_adapter.training.objective import GradientSum, Objective, TrainableSubset
 from clod_adapter.training.optimizer import RowAdam, add_to_mean
 from clod_adapter.training.state import TrainingState
@@ -40,11 +41,12 @@ class Trainer:
         loss: running mean of the photometric loss, NaN before the first step.
         done: steps; seconds: spent in them; start_seconds: spent before the first.
         held: ``[trained]`` bool, rows that some step did not move because their gradient was not finite.
+        gate: watches s = 1; None without watched views.
     """
 
     def __init__(
         self, start: Gaussians, views: tuple[View, ...], config: AdaptConfig, subset: TrainableSubset | None = None,
-        group: ProcessGroup | None = None,
+        group: ProcessGroup | None = None, watched: tuple[View, ...] = (),
     ) -> None:  # fmt: skip
         subset = subset or TrainableSubset(len(start))
         assert start.sigma_d is not None and start.attenuation is not None
@@ -82,6 +84,7 @@ class Trainer:
         self.averaged = 0
         self.held = torch.zeros(subset.trained, dtype=torch.bool, device=start.means.device)
         self._updating = False
+        self.gate = Gate(self, watched, bool(set(map(id, watched)) & set(map(id, views)))) if watched else None
 
     @torch_on_one_thread()
     def step(self, share_done: float) -> None:
@@ -90,6 +93,8 @@ class Trainer:
         Raises:
             LossNotFinite, or any error of the rasterizer: nothing has changed.
         """
+        if self.gate:
+            self.gate.check(share_done)
         cost = self.objective.cost
         if cost is not None and cost.due(share_done):
             cost.measure(self._assembled(self.parameters), self.objective.typical, share_done)
@@ -112,7 +117,7 @@ class Trainer:
         self.loss = loss if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * loss
         if share_done >= 1 - self.config.average:  # the optimizer continues from the parameters, not from the mean
             self.averaged += 1
-            add_to_mean(self.mean, self._trained(), self.averaged)
+            add_to_mean(self.mean, self.trained(), self.averaged)
         self.done += 1
         self._updating = False
 
@@ -122,6 +127,7 @@ class Trainer:
         self.held |= learned & rows
         finite = rows.logical_not_().logical_and_(learned)
         rates = {name: rate * self.config.lr_final**share_done for name, rate in self.rates.items()}
+        rates = self.gate.weaken(rates) if self.gate else rates
         for optimizer, rows in zip(self.optimizers, (found.kept.logical_and_(finite), finite), strict=True):
             if optimizer:
                 optimizer.step(found.gradients, rows, rates)
@@ -151,7 +157,7 @@ class Trainer:
             ClodError: it is of other Gaussians, views or settings, or damaged.
         """
         if state.averaged:
-            self.mean = {name: torch.empty_like(value) for name, value in self._trained().items()}
+            self.mean = {name: torch.empty_like(value) for name, value in self.trained().items()}
         own = self._changing()
         state.check(own)
         self.sampler.restore(state.random, state.order)
@@ -163,11 +169,14 @@ class Trainer:
 
     def gaussians(self) -> Gaussians:
         """The result so far, in world units: the mean where there is one, else the parameters."""
+        found = self._assembled(self.parameters | self.averages())
+        return in_world_units(found if self.empty_sh is None else found.replace(shN=self.empty_sh))
+
+    def averages(self) -> dict[str, Tensor]:
+        """The mean parameters, of all rows; none before there is a mean."""
         rest = slice(self.objective.trained, None)
         whole = all(len(self.parameters[name][rest]) == 0 for name in self.mean)
-        mean = self.mean if whole else {n: torch.cat([m, self.parameters[n][rest]]) for n, m in self.mean.items()}
-        found = self._assembled(self.parameters | mean)
-        return in_world_units(found if self.empty_sh is None else found.replace(shN=self.empty_sh))
+        return self.mean if whole else {n: torch.cat([m, self.parameters[n][rest]]) for n, m in self.mean.items()}
 
     def _assembled(self, parameters: dict[str, Tensor]) -> Gaussians:
         """Gaussians of these parameters."""
@@ -178,26 +187,38 @@ class Trainer:
         }  # fmt: skip
         return Gaussians(**values, **dial, screen_filter=self.objective.screen_filter)
 
-    def _trained(self) -> dict[str, Tensor]:
+    def trained(self) -> dict[str, Tensor]:
         """Views of the rows of the parameters that steps change."""
         return {name: self.parameters[name][: self.objective.trained] for name in self.stepped}
 
+    def return_to(self, trained: dict[str, Tensor]) -> None:
+        """Continues from these values of the trained rows, without moments and mean."""
+        for name, own in self.trained().items():
+            own.copy_(trained[name])
+        for optimizer in filter(None, self.optimizers):
+            optimizer.forget()
+        self.mean, self.averaged = {}, 0
+
     def _optimizer(self, names: set[str]) -> RowAdam | None:
         """Of these parameters; None without any."""
-        own = {name: value for name, value in self._trained().items() if name in names}
+        own = {name: value for name, value in self.trained().items() if name in names}
         units = {"means": self.unit}
         betas = {"beta1": BETA1**self.config.batch, "beta2": BETA2**self.config.batch}
         return RowAdam(own, **betas, units=units) if own else None
 
     def _changing(self) -> dict[str, Tensor]:
         """All tensors that steps change, named as in ``TrainingState``."""
-        found = {f"parameter.{name}": value for name, value in self._trained().items()}
+        found = {f"parameter.{name}": value for name, value in self.trained().items()}
         for optimizer, rows in zip(self.optimizers, ("kept", "all"), strict=True):
             if optimizer:
                 moments = optimizer.moments().items()
                 found |= {f"{kind}.{name}": value for kind, values in moments for name, value in values.items()}
                 found[f"steps.{rows}"] = optimizer.steps
         found |= {f"mean.{name}": value for name, value in self.mean.items()}
+        if self.gate:
+            found |= {f"good.{name}": value for name, value in self.gate.good.items()} | {
+                "gate.checks": self.gate.numbers
+            }
         return found if self.objective.cost is None else found | {"cost.measured": self.objective.cost.measured}
 
 

@@ -13,7 +13,6 @@ from clod_adapter.training.pseudo_views import PseudoView
 from clod_adapter.training.state import OTHER_RUN
 
 COUNTED_BEYOND = 1.5  # times max_sv: counts at the end of the dial follow the curve as they do within it
-SMALLEST = 128  # pixels a side that an image of half the size has at least: smaller ones show too little
 GOLDEN = (5**0.5 - 1) / 2
 
 
@@ -59,7 +58,7 @@ class ViewSampler:
         view, config = self.views[self.order.pop()], self.config
         if isinstance(view, PseudoView):
             view = view.moved(self.random)
-        halved = share_done < config.coarse and min(view.camera.width, view.camera.height) >= 2 * SMALLEST
+        halved = share_done < config.coarse and view.camera.halvable
         view = view.halved() if halved else view
         return Sample(view, self.dial(number), self.counted(), halved)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from clod_adapter.cli.main import main
-from runs import Server
+from runs import Server, accepted
 
 ENDS = (signal.SIGINT, signal.SIGTERM)
 
@@ -45,7 +45,7 @@ def clod(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest
     def run(*words: object) -> Done:
         capsys.readouterr()
         try:
-            code = main([str(word) for word in words])
+            code = main(accepted(words))
         except SystemExit as done:  # argparse, for --help
             code = int(done.code or 0)
         return Done(code, *capsys.readouterr())
@@ -66,7 +66,7 @@ def spawn() -> Callable[..., subprocess.Popen[str]]:
     def start(*words: object, cwd: Path, line_every: float = 10) -> subprocess.Popen[str]:
         code = "import sys; from clod_adapter.cli import main; from clod_adapter.cli.shared import console; "
         code += f"console.LINE_EVERY = {line_every}"
-        command = [sys.executable, "-c", f"{code}; sys.exit(main.main())", *map(str, words)]
+        command = [sys.executable, "-c", f"{code}; sys.exit(main.main())", *accepted(words)]
         return subprocess.Popen(command, cwd=cwd, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
     return start

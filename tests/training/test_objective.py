@@ -22,6 +22,7 @@ from clod_adapter.progress import Progress
 from clod_adapter.rasterizers import cpu, reference
 from clod_adapter.render import render, splat
 from clod_adapter.training import objective
+from clod_adapter.training.gate import Gate
 from clod_adapter.training.loop import TrainingState, adapt
 from clod_adapter.training.objective import GradientSum, TrainableSubset, loss_weight
 from clod_adapter.training.trainer import Trainer
@@ -171,6 +172,8 @@ def test_steps_use_the_sampled_views_and_dial_values(captured: Pair, monkeypatch
     monkeypatch.setattr(objective, "count_gradient_at", lambda *a: taken.append(a[3]) or count(*a))
     monkeypatch.setattr(objective, "photometric_loss", lambda *a: taken.append(id(a[1])) or photometric_loss(*a))
     config = config_of(iters=14, max_sv=4.0)
+    monkeypatch.setattr(Gate, "check", lambda *_: None)
+    monkeypatch.setattr(Gate, "finish", lambda *_: None)
     adapt(with_dial(gaussians(5, 0, 0), torch.ones(5)), captured[1], config)
     sampler = ViewSampler(captured[1].train, config)
     draws = [sampler.draw(k, k / 14) for k in range(14)]

@@ -30,7 +30,7 @@ def test_training_is_the_same_if_nothing_is_left_out(visible: tuple[Gaussians, S
     plan = make_plan(base, scene, CONFIG)
     assert plan.kept is None and plan.config == CONFIG and not plan.trims(base)
     planned = plan.adapt(scene).gaussians
-    assert_equal(plan.whole(base, planned), adapt(base, scene, CONFIG).gaussians)
+    assert_equal(plan.whole(base, planned), adapt(plan.start, scene, CONFIG).gaussians)
     assert_equal(plan.adapt(scene).gaussians, planned)  # a plan can be used again
 
 
@@ -62,7 +62,7 @@ def test_unseen_gaussians_are_unchanged(visible: tuple[Gaussians, Scene]) -> Non
     assert plan.kept is not None and not plan.kept[~before].any()
     lean = plan.adapt(scene).gaussians
     assert len(lean) == int(plan.kept.sum())
-    whole, initial = plan.whole(base, lean), initialize(base, scene.train, CONFIG)
+    whole, initial = plan.whole(base, lean), plan.start
     for name in ATTRIBUTES:
         assert torch.equal(getattr(whole, name)[~plan.kept], getattr(base, name)[~plan.kept]), name
         assert torch.equal(getattr(whole, name)[plan.kept], getattr(lean, name)), name

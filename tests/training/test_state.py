@@ -86,7 +86,7 @@ def test_a_state_holds_trained_parameters_only(captured: Pair) -> None:
     adapt(*captured, config_of(iters=4, **still), states_of({1, 3}, states))
     changing = {"quats", "log_scales", "opacity_logits", "sh0", "log_sigma", "growth_d"}
     for step, kinds in ((1, {"parameter", "first", "second", "steps"}), (3, {"mean"})):
-        assert {name.split(".")[1] for name in states[step].tensors} == changing | {"kept", "all"}
+        assert {name.split(".")[1] for name in states[step].tensors} == changing | {"kept", "all", "checks"}
         assert kinds <= {name.split(".")[0] for name in states[step].tensors}
     assert "mean.quats" not in states[1].tensors and len(states[1].tensors["first.sh0"]) == len(base)
 
@@ -106,7 +106,7 @@ def test_a_state_of_another_run_is_refused(captured: Pair) -> None:
         with pytest.raises(ClodError, match="of other Gaussians, views or settings"):
             adapt(*other, None, state)
     grown = {name: tensor for name, tensor in state.tensors.items() if "growth_d" not in name}
-    assert len(grown) == len(state.tensors) - 3
+    assert len(grown) == len(state.tensors) - 4
     with pytest.raises(ClodError, match="of other Gaussians, views or settings"):
         adapt(base, scene, config, None, replace(state, tensors=grown))
     damaged = dict(state.tensors) | {"steps.kept": state.tensors["steps.kept"] - 2}

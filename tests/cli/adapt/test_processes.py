@@ -23,7 +23,7 @@ from clod_adapter.cli.shared.launch import Launch, launched
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.training.state_file import load_state
-from runs import OUTPUTS, STATE, Server, log_of, names, wait_for
+from runs import OUTPUTS, STATE, Server, accepted, log_of, names, wait_for
 
 TINY = ("--max-sv", 4, "--out", "dial.ply", "--batch", 2, "--iters", 12)
 LONG = (*TINY[:-1], 4000)  # does not end by itself
@@ -284,7 +284,7 @@ def test_torchrun_with_a_killed_process(words: list[Any], tmp_path: Path) -> Non
     environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     run = subprocess.Popen(
-        [*command, "-m", "clod_adapter", *map(str, words), *map(str, LONG), "--json"],
+        [*command, "-m", "clod_adapter", *accepted(words), *map(str, LONG), "--json"],
         cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
     until = time.monotonic() + 120

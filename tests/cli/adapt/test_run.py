@@ -84,7 +84,7 @@ def test_progress_has_eta_and_held_out_error(clod: Any, capture: Any, monkeypatc
     monkeypatch.setattr("clod_adapter.cli.adapt.display.CHECK_COST", 1e9)
     done = clod(capture.ply, "--images", capture.scene, *TINY)
     assert re.search(r"^base: \d+\.\d\d dB on the held-out photographs$", done.err, re.M), done
-    assert re.search(r"^importance  50%, \d.* left, 4/8$", done.err, re.M), done
+    assert re.search(r"^importance  50%, \d.* left, \d+/\d+$", done.err, re.M), done
     error = r"\d+\.\d\d dB (below|above) the base at s=1"
     assert re.search(rf"^training  50%, \d.* left, {error}$", done.err, re.M), done
     done = clod(capture.ply, "--iters", 12, "--max-sv", 4, "--out", "own.ply")  # against its own renders
@@ -263,7 +263,7 @@ def test_without_photographs(clod: Any, capture: Any, tmp_path: Path, monkeypatc
     assert len(report["notes"]) == 1 and report["notes"][0] in done.err
     assert re.match(r"no photographs: 84 pseudo views to train on, 12 held out, 186x138, ", report["notes"][0])
     assert "held-out photographs" not in done.err and "other coordinates" not in done.err
-    next_one = done.err.replace("\\\n", "").split("next:\n")[1]
+    next_one = done.err.replace("\\\n", "").split("next:\n")[1].split("\n\n")[0]
     assert shlex.split(next_one) == ["clod-adapt", "view", "dial.ply", "--base", str(capture.ply)]
     # The target images are renders of the base, rounded to bytes.
     assert report["base_rows"][0]["psnr"] > 50 > report["rows"][-1]["psnr"] and len(report["rows"]) == 7
