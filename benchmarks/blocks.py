@@ -129,7 +129,7 @@ def main() -> None:
     one = commands.add_parser("seams")
     one.add_argument("--scenes", nargs="+", default=["plush_half", "bonsai146"])
     one.add_argument("--blocks", type=int, nargs="+", default=[4, 8])
-    one.add_argument("--iters", type=int, default=clod.AdaptConfig().iters)
+    one.add_argument("--iters", type=int, default=clod.AdaptConfig().steps)
     one.set_defaults(run=seams)
     commands.add_parser("memory").set_defaults(run=memory)
     args = parser.parse_args()

@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--train", action="store_true", help="adapt and store the files, measure nothing")
     parser.add_argument("--fit", action="store_true", help="fit the weights of the cost to times instead")
     parser.add_argument("--interpolated", action="store_true", help="errors of frame times by the stored costs")
-    parser.add_argument("--iters", type=int, default=clod.AdaptConfig().iters)
+    parser.add_argument("--iters", type=int, default=clod.AdaptConfig().steps)
     parser.add_argument("--targets", nargs="+", default=TARGETS)
     args = parser.parse_args()
     if args.interpolated:
@@ -136,7 +136,7 @@ def beats(one: Row, other: Row) -> bool:
 def fitted(scene: str) -> Row:
     """Microseconds a Gaussian, a tile and a block, by least squares over dial values and views, on one thread."""
     base, views = checkpoint(scene).gaussians, photographs(scene).test[:4]
-    models = [base, clod.load(file_of(scene, "count", clod.AdaptConfig().iters)).gaussians]
+    models = [base, clod.load(file_of(scene, "count", clod.AdaptConfig().steps)).gaussians]
     counts, times = [], []
     for model, dials in zip(models, ((1.0,), DIALS), strict=True):
         for s in dials:

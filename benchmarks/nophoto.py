@@ -27,7 +27,7 @@ from adapt import at_shares
 from city import city, city_cameras, perturb
 from clod_adapter.initialization.coverage import reduced
 from clod_adapter.training import camera_score
-from clod_adapter.training.pseudo_views import LIGHTER, add_pseudo_views, render_pseudo_views, shown
+from clod_adapter.training.pseudo_views import LIGHTEST, add_pseudo_views, render_pseudo_views, shown
 from common import COMMAND, Process, append, arguments, checkpoint, stored, table
 from common import photographs as photographs_of
 from scaling import by_phase
@@ -46,7 +46,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS[:3])
     parser.add_argument("--few", type=int, metavar="K", help="of the photographs to train on, only K, evenly spread")
-    parser.add_argument("--iters", type=int, default=clod.AdaptConfig().iters)
+    parser.add_argument("--iters", type=int, default=clod.AdaptConfig().steps)
     parser.add_argument("--max-sv", type=float, default=7.0)
     parser.add_argument("--cameras", action="store_true", help="place cameras only; a scene may be city:N")
     parser.add_argument("--sample", type=int, default=camera_score.SAMPLE, help="Gaussians that score a camera")
@@ -79,7 +79,7 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
         views = clod.Scene(tuple(view.at(view.camera) for view in (*rendered.train, *rendered.test)), ())
     if kind == "placed":
         views = render_pseudo_views(base, clod.place_cameras(base, seed=config.seed))
-        config = config.lighter(LIGHTER)
+        config = config.lighter(LIGHTEST)
     if kind == "complemented":
         views, config = add_pseudo_views(base, photographs, config)
     seconds = time.perf_counter() - began

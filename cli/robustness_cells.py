@@ -80,7 +80,7 @@ class Cell:
         measuring = float(len(self.points) * test_views)
         if self.config is None:
             return measuring
-        return measuring + 3 * (self.config.batch * self.config.iters + min(train_views, 64))
+        return measuring + 3 * (self.config.batch * self.config.for_views(train_views).steps + min(train_views, 64))
 
 
 def cells_of(

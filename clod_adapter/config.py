@@ -19,6 +19,7 @@ SAMPLINGS = ("log", "uniform")
 COUNT_TERMS = ("law", "paper")
 GROWTHS = ("on", "off")
 TARGETS = ("count", "cost")
+STEPS, STEPS_PER_VIEW = 700, 5.5  # of training, by default, with one view a step
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
 
 
@@ -140,7 +141,9 @@ class AdaptConfig:
     """
 
     max_sv: float = option(5.0, "largest dial value to train for")
-    iters: int = option(1600, "training steps")
+    iters: int | None = option(
+        None, f"training steps (default: {STEPS}, or {STEPS_PER_VIEW:g} for each training view if that is more)"
+    )
     batch: int = option(1, "views per step; learning rates scale with its square root")
     time_budget: float | None = option(
         None, "stop training after this many seconds; schedules are scaled to it (default: no limit)"
@@ -161,7 +164,8 @@ class AdaptConfig:
     )
     parameter: str = option("log", "trained parameter: log (of sigma_d) or linear (sigma_d itself, the paper's)")
     sampling: str = option("log", "dial value of a step: log-uniform (log) or uniform (the paper's)")
-    full_share: float = option(0.5, "share of steps at s = 1 instead")
+    full_share: float = option(0.5, "share of steps at s = 1 instead, at first")
+    full_final: float = option(0.4, "full_share at the end, as a share of that at first")
     coarse: float = option(
         0.8, "share of steps or of the time budget, at first, with photographs of half the size (not small ones)"
     )
@@ -198,7 +202,7 @@ class AdaptConfig:
         for name, value in vars(self).items():
             require(not isinstance(value, float) or math.isfinite(value), name, value, "finite")
         require(self.max_sv >= 1, "max_sv", self.max_sv, "at least 1")
-        require(self.iters >= 0, "iters", self.iters, "at least 0")
+        require(self.iters is None or self.iters >= 0, "iters", self.iters, "at least 0")
         require(self.batch >= 1, "batch", self.batch, "at least 1")
         require(0 <= self.seed < 2**63, "seed", self.seed, "at least 0 and below 2^63")
         require(self.time_budget is None or self.time_budget > 0, "time_budget", self.time_budget, "positive seconds")
@@ -217,6 +221,7 @@ class AdaptConfig:
         need = "count, as cost needs count_term law and parameter log (not the paper's form)"
         require(self.target == "count" or following, "target", self.target, need)
         require(0 <= self.full_share <= 1, "full_share", self.full_share, "between 0 and 1")
+        require(0 <= self.full_final <= 1, "full_final", self.full_final, "between 0 and 1")
         require(0 <= self.coarse <= 1, "coarse", self.coarse, "between 0 and 1")
         require(0 < self.exponent < math.inf, "exponent", self.exponent, "positive and finite")
         require(0 <= self.reg_weight < math.inf, "reg_weight", self.reg_weight, "at least 0 and finite")
@@ -240,6 +245,7 @@ class AdaptConfig:
         wide, half the default learning rates decaying to a twentieth, no average of parameters.
         """
         own: dict[str, Any] = {
+            "iters": 1600,
             "tau": 1 / 255, "cut": "hard", "normalizer": "max", "start": "constant", "parameter": "linear",
             "sampling": "uniform", "full_share": 0.0, "coarse": 0.0, "count_term": "paper", "reg_weight": 1.0,
             "weight_slope": 0.5, "lr_sigma": 1e-2,
@@ -252,6 +258,17 @@ class AdaptConfig:
     def share(self) -> float:
         """``start_share``, or 0.62 if it is not set."""
         return 0.62 if self.start_share is None else self.start_share
+
+    @property
+    def steps(self) -> int:
+        """``iters``, or the default for few training views."""
+        return self.iters if self.iters is not None else self.for_views(0).steps
+
+    def for_views(self, views: int) -> AdaptConfig:
+        """A copy whose ``iters`` is set, by the number of training views and the batch where it is not."""
+        if self.iters is not None:
+            return self
+        return replace(self, iters=max(round(max(STEPS, STEPS_PER_VIEW * views) / self.batch), 1))
 
     @property
     def has_target_count(self) -> bool:

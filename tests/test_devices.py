@@ -203,7 +203,7 @@ def test_a_step_waits_for_the_device_once(setup: Setup, target: str) -> None:
     if setup.device.type == "cuda":
         pytest.skip("the simulated device tells where the host waits")
     views = setup.scene.train[:2]
-    moving = [PseudoView(view.camera, view.image, setup.there, 1.0) for view in views]
+    moving = [PseudoView(view.camera, setup.there, 1.0) for view in views]
     config = replace(CONFIG, target=target, batch=4)
     start = for_training(setup.there, views, config)
     trainer = Trainer(start, (*views, *moving), config)

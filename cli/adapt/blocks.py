@@ -134,7 +134,7 @@ class Blocks:
         console.say(
             f"{path}: the initialization of {division.count} blocks exists" if exists else
             f"wrote {path}: {division.count} blocks of {min(steps)} to {max(steps)} steps, {sum(steps)} in "
-            f"all (each takes {inputs.config.iters} times its share of the views)"
+            f"all (each takes {plan.config.steps} times its share of the views)"
         )  # fmt: skip
         return Divided(plan, division, views, files)
 

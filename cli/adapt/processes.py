@@ -220,5 +220,5 @@ def _cores() -> int:
 
 
 def _describe(launch: Launch, config: AdaptConfig, device: str) -> str:
-    views = f"{config.batch} views a step, {config.iters:,} steps"
-    return f"{launch.size} processes ({BACKENDS[device]}): {views}, {config.batch * config.iters:,} views in all"
+    views = f"{config.batch} views a step, {config.steps:,} steps"
+    return f"{launch.size} processes ({BACKENDS[device]}): {views}, {config.batch * config.steps:,} views in all"

@@ -132,7 +132,7 @@ def judge(measured: Measurements, photographs: bool) -> tuple[str, bool]:
         line = f"s = 1 has {full[0]:.2f} dB against the checkpoint's own renderings"
         bad, failed = not full[0] >= ENOUGH[0], not full[0] >= ENOUGH[1]
     more = "" if photographs else ", or give the photographs (--images)"
-    return (f"{line}:\ntrain longer (--iters), keep more Gaussians (--start-share 1){more}" if bad else ""), failed
+    return (f"{line}:\ntrain longer (--iters){more}, or keep the base for full quality" if bad else ""), failed
 
 
 def seconds(setup: Setup, result: Result) -> dict[str, float]:

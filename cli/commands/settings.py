@@ -18,9 +18,9 @@ OPTIONS: dict[str, Any] = {
     "max_sv": ("S", float), "iters": ("N", int), "batch": ("N", int), "time_budget": ("SEC", float),
     "seed": ("N", int), "target": ("count|cost", str), "growth": ("on|off", str),
 }  # fmt: skip
-# Defaults that depend on another option: the number of views seen stays the same for every batch.
+# Defaults that depend on another option or on the scene.
 DEFAULTS = {
-    "iters": f"{AdaptConfig().iters} divided by the batch",
+    "iters": "",  # its help has it
     "batch": "1 per process",
     "growth": "on, with --form paper off",
 }
@@ -33,7 +33,7 @@ def add_settings(options: _ActionsContainer, without: Sequence[str] = ()) -> Non
         if name in without:
             continue
         default = None if name in DEFAULTS else getattr(defaults, name)
-        shown = f" (default: {DEFAULTS[name]})" if name in DEFAULTS else ""
+        shown = f" (default: {DEFAULTS[name]})" if DEFAULTS.get(name) else ""
         shown = (
             shown if default is None else f" (default: {default if isinstance(default, str) else format(default, 'g')})"
         )
@@ -60,7 +60,7 @@ def make_config(args: argparse.Namespace) -> AdaptConfig:
     size = launched().size
     given["batch"] = size if given["batch"] is None else given["batch"]
     if given["iters"] is None:
-        given["iters"] = max(round(make().iters / max(given["batch"], 1)), 1)
+        del given["iters"]  # the default is by the scene
     given["growth"] = given["growth"] or make().growth
     for name, value in given.items():  # one at a time, so that the error can name the option
         try:

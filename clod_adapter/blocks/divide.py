@@ -61,7 +61,7 @@ class Division:
 
     def steps(self, block: int, config: AdaptConfig) -> int:
         """Training steps of a block in both passes: as many as an undivided run takes of the views that see it."""
-        return math.ceil(config.iters * len(self.views(block)) / len(self.seen))
+        return math.ceil(config.steps * len(self.views(block)) / len(self.seen))
 
 
 def split(means: Tensor, count: int) -> Tensor:

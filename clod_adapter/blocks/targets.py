@@ -140,13 +140,15 @@ def block_config(division: Division, block: int, config: AdaptConfig, *, first: 
     own = steps - light if first else light
     seed = (config.seed + 1 + block + (0 if first else division.count)) % 2**63
     budget = config.time_budget and config.time_budget * own / max(every, 1) or None
-    # Learning rates decay as in an undivided run: from 1 to middle to lr_final.
+    # Learning rates and the share of s = 1 fall as in an undivided run: from 1 to middle to the final value.
     middle = config.lr_final ** (1 - light / max(steps, 1))
+    fewer = 1 - (1 - config.full_final) * (1 - light / max(steps, 1))
     last = replace(
-        config.lighter(middle), lr_sigma=middle * config.lr_sigma, lr_growth=middle * config.lr_growth,
+        config.lighter(middle), full_share=fewer * config.full_share, full_final=config.full_final / max(fewer, 1e-9),
+        lr_sigma=middle * config.lr_sigma, lr_growth=middle * config.lr_growth,
         lr_final=config.lr_final / middle, average=min(config.average * steps / max(light, 1), 1.0),
     )  # fmt: skip
-    settings = replace(config, lr_final=middle) if first else last
+    settings = replace(config, lr_final=middle, full_final=fewer) if first else last
     # The second pass takes up where the first one ends.
     begun = 0.0 if first else 1 - light / max(steps, 1)
     coarse = min(max(config.coarse - begun, 0.0) * steps / max(own, 1), 1.0)

@@ -23,6 +23,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.origin import NOWHERE, Origin
 from clod_adapter.progress import Listener, Phase, Stopped, tell, within
 from clod_adapter.training.loop import adapt
+from clod_adapter.training.pseudo_views import PseudoView
 
 # Shares of the unadapted base that its baseline keeps.
 BASELINE_SHARES = (1.0, 0.8, 0.62, 0.48, 0.35, 0.25, 0.18, 0.12, 0.08, 0.05)
@@ -69,7 +70,7 @@ def adapt_at_range(
         Stopped: ``progress`` returned False, or Ctrl-C ended training: an incomplete adaptation is not a cell.
         ClodError: the loss of a step is not finite.
     """
-    base = detach(base)
+    base, config = detach(base), config.for_views(len(scene.train))
     adapted = adapt(base, scene, config, progress)
     if adapted.failed:
         raise ClodError(f"max_sv {config.max_sv:g}: {adapted.failed}; leave this range or checkpoint out")
@@ -135,6 +136,8 @@ def _histogram(values: Tensor, edges: Sequence[float]) -> dict[str, list[float]]
 def scene_fingerprint(scene: Scene, progress: Listener | None = None) -> str:
     """SHA-256, hex, of the photographs' pixels, their cameras and the split; independent of their folder.
 
+    Of a pseudo view the camera alone: the checkpoint that it shows has a hash of its own.
+
     Args:
         progress: called in ``Phase.FINGERPRINT`` after each photograph.
     """
@@ -142,7 +145,8 @@ def scene_fingerprint(scene: Scene, progress: Listener | None = None) -> str:
     for views in (scene.train, scene.test):
         digest.update(f"{len(views)};".encode())
         for view in views:
-            for tensor in (view.camera.viewmat, view.camera.K, view.image):
+            pixels = () if isinstance(view, PseudoView) else (view.image,)
+            for tensor in (view.camera.viewmat, view.camera.K, *pixels):
                 digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
             done += 1
             tell(progress, Phase.FINGERPRINT, done, len(scene.train) + len(scene.test))

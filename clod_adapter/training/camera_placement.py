@@ -15,7 +15,7 @@ other are chosen. The method needs no up direction, scene type or unit.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -26,10 +26,12 @@ from clod_adapter.cameras import Camera, near_plane
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.coverage import coverage
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.training.camera_score import WIDTH, largest_scale, sample, score
 
-VIEWS = 96
+VIEWS, MOST = 96, 384  # cameras of a round, and of all rounds
+SHOWN, COVERED = 0.99, 0.5  # share of the Gaussians to show, each with that many pixels
 HEIGHT = 368
 FIELD = 55.0  # horizontal, degrees: between a phone's 65 and the 35 of a portrait lens
 TRIES = 3  # candidates for each view, first anywhere, then as many near the best of those
@@ -52,7 +54,7 @@ class Candidate:
 def place_cameras(
     gaussians: Gaussians,
     *,
-    views: int = VIEWS,
+    views: int | None = None,
     seed: int = 0,
     field: float = FIELD,
     progress: Listener | None = None,
@@ -61,38 +63,74 @@ def place_cameras(
 
     Args:
         gaussians: a checkpoint; a dial it has is ignored.
-        views: number of cameras, at least 1.
+        views: number of cameras, at least 1; by default as many as the scene needs: rounds of VIEWS cameras, each
+            towards Gaussians that none has shown yet, until SHOWN of them are shown, by opacity, or there are MOST.
         seed: of the candidate cameras.
         field: horizontal field of view, degrees; ideally that of the original cameras.
         progress: called in ``Phase.CAMERAS`` after each candidate.
 
     Returns:
-        ``views`` cameras (fewer if fewer see anything) of 496x368 pixels, ordered so that every prefix is spread out.
+        ``views`` cameras (fewer if fewer see anything) of 496x368 pixels; every prefix of a round is spread out.
 
     Raises:
         ClodError: no Gaussian is visible and finite, or no camera sees anything.
         Stopped: ``progress`` returned False.
     """
-    require(views >= 1, "views", views, "at least 1")
-    plain, generator = detach(gaussians), torch.Generator().manual_seed(seed)
-    usable = _usable(plain)
-    seen = plain.replace(shN=plain.shN[:, :0]).select(usable)
-    reach, tries, zoom = typical_reach(seen, field), TRIES * views, _zoom(field)
-    few, growth = sample(plain, usable, seed)
-    judged: list[Candidate] = []
+    require(views is None or views >= 1, "views", views, "at least 1")
+    placement = _Placement(detach(gaussians), seed, field, progress)
+    found = placement.round(views or VIEWS)
+    while views is None and len(found) + VIEWS <= MOST and placement.shown_share(found[-VIEWS:]) < SHOWN:
+        try:
+            found += placement.round(VIEWS)
+        except ClodError:  # what is left cannot be shown
+            break
+    return [_resized(camera, WIDTH, HEIGHT, k) for k, camera in enumerate(found)]
 
-    def judge(cameras: Iterable[Camera]) -> None:
+
+class _Placement:
+    """Rounds of cameras for one checkpoint, each for what the cameras before do not show."""
+
+    def __init__(self, plain: Gaussians, seed: int, field: float, progress: Listener | None) -> None:
+        usable = _usable(plain)
+        self.few, self.growth = sample(plain, usable, seed)
+        self.reach = typical_reach(plain.replace(shN=plain.shN[:, :0]).select(usable), field)
+        self.zoom, self.generator, self.progress = _zoom(field), torch.Generator().manual_seed(seed), progress
+        self.judged = 0
+        # Each row stands for growth^2 of the checkpoint's.
+        self.weight = self.few.opacities if self.growth is None else self.few.opacities * self.growth**2
+        self.hidden = torch.ones_like(self.weight)
+
+    def round(self, views: int) -> list[Camera]:
+        """Cameras that look at rows not shown yet.
+
+        Raises:
+            ClodError: none sees anything.
+        """
+        tries, start = TRIES * views, self.judged
+        judged: list[Candidate] = []
+
+        def judge(cameras: Iterable[Camera]) -> None:
+            for camera in cameras:
+                judged.append(Candidate(camera, score(self.few, self.growth, camera)))
+                tell(self.progress, Phase.CAMERAS, start + len(judged), start + 2 * tries)
+
+        weight = self.weight * self.hidden
+        judge(_towards(self.few.means, weight / largest_scale(self.few).clamp(min=1e-12), tries, self.reach, self.zoom,
+                       self.generator))  # fmt: skip
+        good = _best(judged, math.inf, max(round(BEST * tries), 1))
+        if not good:
+            raise ClodError("no camera can be placed: the checkpoint is empty from every candidate camera")
+        judge(_beside(good, tries, self.reach, self.zoom, self.generator))
+        self.judged += len(judged)
+        good = _best(judged, good[-1].score, views)
+        return [c.camera for c in _spread(good, views, self.reach)]
+
+    def shown_share(self, cameras: Sequence[Camera]) -> float:
+        """The share of the Gaussians, by opacity, that these cameras and those before show: COVERED pixels or more."""
         for camera in cameras:
-            judged.append(Candidate(camera, score(few, growth, camera)))
-            tell(progress, Phase.CAMERAS, len(judged), 2 * tries)
-
-    judge(_anywhere(seen, tries, reach, zoom, generator))
-    good = _best(judged, math.inf, max(round(BEST * tries), 1))
-    if not good:
-        raise ClodError("no camera can be placed: the checkpoint is empty from every candidate camera")
-    judge(_beside(good, tries, reach, zoom, generator))
-    good = _best(judged, good[-1].score, views)
-    return [_resized(c.camera, WIDTH, HEIGHT, k) for k, c in enumerate(_spread(good, views, reach))]
+            pixels = coverage(self.few, self.few.opacities, camera, self.growth)
+            self.hidden *= pixels * (WIDTH / camera.width) ** 2 < COVERED
+        return 1 - float((self.weight * self.hidden).sum() / self.weight.sum())
 
 
 def typical_reach(gaussians: Gaussians, field: float = FIELD) -> float:
@@ -117,13 +155,14 @@ def _usable(gaussians: Gaussians) -> Tensor:
     return rows.nonzero()[:, 0]
 
 
-def _anywhere(gaussians: Gaussians, count: int, reach: float, zoom: float, generator: torch.Generator) -> list[Camera]:
-    """Cameras towards Gaussians sampled by opacity over size, from uniform directions, at half to twice the reach."""
-    interest = gaussians.opacities / largest_scale(gaussians).clamp(min=1e-12)
+def _towards(
+    means: Tensor, interest: Tensor, count: int, reach: float, zoom: float, generator: torch.Generator
+) -> list[Camera]:
+    """Cameras towards Gaussians sampled by interest ``[n]``, from uniform directions, at half to twice the reach."""
     # torch.multinomial has a limit of 2^24 weights.
     ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
     drawn = torch.searchsorted(ends, torch.rand(count, generator=generator, dtype=torch.float64) * ends[-1])
-    targets = gaussians.means[drawn.clamp(max=len(gaussians) - 1).to(gaussians.means.device)].cpu()
+    targets = means[drawn.clamp(max=len(means) - 1).to(means.device)].cpu()
     sides = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     away = reach * 2 ** (2 * torch.rand(count, 1, generator=generator) - 1)
     return [_looking(eye, target, zoom) for eye, target in zip(targets + away * sides, targets, strict=True)]

@@ -74,6 +74,7 @@ class Dial(nn.Module):
         super().__init__()
         assert start.sigma_d is not None and start.attenuation is not None
         self._given = (splats,)  # a ParameterDict that is an attribute would be a part of the module
+        config = config.for_views(len(views))
         self.attenuation, self.config = start.attenuation, config
         self.log_sigma = nn.Parameter(start.sigma_d.detach().float().clamp(*SIGMA_RANGE).log())
         growth_d = (
@@ -117,12 +118,14 @@ class Dial(nn.Module):
     def sample(self) -> float:
         """The next dial value: s = 1 in ``full_share`` of the steps, else (log-)uniform in [1, max_sv].
 
+        The share falls over ``config.steps`` calls.
+
         Called once a step, it also keeps the parameters in the range in which the equation has a gradient. Dial values
         are evenly spread, not random: take the views in random order, or some meet the same dial values each round.
         """
         self._clamp()
         self._sampled += 1
-        return self._sampler.dial(self._sampled - 1)
+        return self._sampler.dial(self._sampled - 1, min((self._sampled - 1) / max(self.config.steps, 1), 1.0))
 
     def forward(self, camera: Camera, virtual_scale: float) -> Attenuated:
         """The opacities ``drawn [N]`` and the factor ``growth [N]`` of the scales, for one camera and dial value.

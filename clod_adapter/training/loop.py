@@ -41,7 +41,7 @@ def adapt(
     """Learns sigma_d for ``base`` on the training views of ``scene``, and tunes the other attributes lightly.
 
     Each step samples ``batch`` views (1 by default) and follows the sum of their gradients. Each view is rendered at
-    one dial value, s = 1 in ``full_share`` of the steps and else log-uniform in [1, max_sv], to minimise ``w_s
+    one dial value, s = 1 in ``full_share`` of the steps at first and else log-uniform in [1, max_sv], to minimise ``w_s
     L_render(s)``, where L_render is ``losses.photometric_loss`` and ``w_s = (1 - weight_slope s / max_sv)^2``. In the
     first steps, a share ``coarse`` of all, photographs have half their size, unless that is below 128 pixels a side.
     ``target_count.count_gradient`` moves sigma_d so that the share of Gaussians kept at their typical distances follows
@@ -81,7 +81,7 @@ def adapt(
             views a step than processes, or a process was lost before the first step.
         Stopped: ``progress`` returned False before training.
     """
-    config = replace(config or AdaptConfig(), **settings)
+    config = replace(config or AdaptConfig(), **settings).for_views(len(scene.train))
     require_trainable(base, scene, config, group)
     with shown(False if progress is None and group and group.rank else progress) as listener:
         return _adapt(base, scene, config, listener, resume, subset, group)
@@ -208,7 +208,7 @@ def _step(trainer: Trainer, share: float, progress: Listener | None) -> None:
 def _progress(trainer: Trainer, seconds: float, error: str | None = None) -> Progress:
     budget = trainer.config.time_budget
     return Progress(
-        Phase.TRAINING, trainer.done, trainer.config.iters, seconds, seconds / budget if budget else 0.0, trainer.loss,
+        Phase.TRAINING, trainer.done, trainer.config.steps, seconds, seconds / budget if budget else 0.0, trainer.loss,
         trainer.gaussians, trainer.state, error,
     )  # fmt: skip
 

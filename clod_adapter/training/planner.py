@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Scene, View
@@ -18,6 +19,7 @@ from clod_adapter.progress import Listener, Phase, tell, within
 from clod_adapter.training.ablation import needed_share, seen, sh_degree_losses
 from clod_adapter.training.loop import require_trainable, training_views
 from clod_adapter.training.plan import NOT_NEEDED, RATES, Decision, Override, Plan
+from clod_adapter.training.pseudo_views import PseudoView
 
 # dB: the share kept at s = 1 loses less on views that the errors are not from. The checkpoint was trained on them too,
 # and fits them better than others: views that it never saw lose a half to a tenth of that (docs/method.md).
@@ -72,9 +74,11 @@ class _Planner:
     def __init__(
         self, base: Gaussians, scene: Scene, config: AdaptConfig, override: Override, progress: Listener | None
     ) -> None:
-        self.base, self.scene, self.config, self.override, self.progress = base, scene, config, override, progress
+        self.base, self.scene, self.override, self.progress = base, scene, override, progress
+        self.config = config.for_views(len(scene.train))
         require_trainable(base, scene, config)
         self.views, self.watched = training_views(base, scene.train, self.config)
+        self.placed = all(isinstance(view, PseudoView) for view in scene.train)  # there are no photographs
         self.decisions: list[Decision] = []
         self.seconds: dict[str, float] = {}
 
@@ -121,7 +125,8 @@ class _Planner:
         fold = spread(self.views, min(VIEWS, len(self.views) // 4))
         views = spread([view for view in self.views if view not in fold], MOST_VIEWS - len(fold))
         every = [*self.views, *(view for view in self.watched if view not in self.views)]
-        others, seed = [view for view in every if view not in views and view not in fold], self.config.seed
+        others = [] if self.placed else [view for view in every if view not in views and view not in fold]
+        seed = self.config.seed
         done = (0, len(views), len(views) + len(fold))
         told = [within(self.progress, k, len(every)) for k in done]
         with self._time("start"):
@@ -129,7 +134,10 @@ class _Planner:
             here = removal_error(few, fold, seed=seed, progress=told[1])
             error = (elsewhere * len(views) + here * len(fold)) / done[2]
         with self._time("unseen"):
-            return _Errors(error, seen(few, others, error, seed, told[2]), elsewhere, fold or views[:VIEWS], len(every))
+            shown = seen(few, others, error, seed, told[2])
+        if self.placed:  # a Gaussian that no placed camera shows is as important as others of its opacity and size
+            error, elsewhere = (supposed_error(few, found, shown) for found in (error, elsewhere))
+        return _Errors(error, shown, elsewhere, fold or views[:VIEWS], len(every))
 
     def _unseen(self, errors: _Errors | None) -> Tensor | None:
         """The rows to train."""
@@ -138,6 +146,9 @@ class _Planner:
             return None
         gone = len(errors.seen) - int(errors.seen.sum())
         why = f"of {len(errors.seen):,} change no pixel of {_counted(errors.views)}"
+        if self.placed:
+            self._decide("unseen Gaussians", "kept", f"{why}, which do not show everything", "unseen", float(gone))
+            return None
         if gone == len(errors.seen):  # an invisible checkpoint: no row can be preferred
             gone = 0
         self._decide("unseen Gaussians", "left out" if gone else "kept", why, "unseen" if gone else "", float(gone))
@@ -183,6 +194,20 @@ class _Planner:
         began = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+
+
+def supposed_error(gaussians: Gaussians, error: Tensor, shown: Tensor) -> Tensor:
+    """``[N]`` the removal error, where none is shown that of a shown one of equal ``opacity^2 * area``, in the median.
+
+    Args:
+        error: ``[N]`` from ``removal_error``; shown: ``[N]`` bool.
+    """
+    area = gaussians.log_scales.sum(1) - gaussians.log_scales.amin(1)
+    expected = gaussians.opacities.square() * (area - area.median()).clamp(-30, 30).exp()
+    measured = shown & (error > 0)
+    if not bool(measured.any()):
+        return error
+    return torch.where(shown, error, expected * (error[measured] / expected[measured]).median())
 
 
 def _counted(views: int) -> str:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial, reduce
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,39 +25,55 @@ from clod_adapter.training.camera_placement import place_cameras, typical_reach
 # Photographs are enough if there are MANY, or if TIMES of them show each part of at least SHOWN of the scene, as far as
 # CHECKED placed cameras see it. Otherwise ADDED pseudo views are added: up to half of them at the cameras of the
 # photographs, at most NEAR at each, from where they are moved WIDER; the others at placed cameras.
-MANY, SHOWN, TIMES, CHECKED, ADDED, NEAR, WIDER = 64, 0.95, 4, 24, 96, 4, 2.0
+MANY, SHOWN, TIMES, CHECKED, ADDED, NEAR, WIDER = 64, 0.97, 4, 24, 96, 4, 2.0
 COVERED = 0.5  # pixels that a Gaussian covers at least in a photograph that shows it
 TEST_EVERY = 8  # as with photographs
-LIGHTER = 0.5  # of the learning rates of all but the dial: what pseudo views show is the checkpoint, errors included
+# Of the learning rates of all but the dial, without photographs and with few: pseudo views show errors too.
+LIGHTEST, LIGHTER = 0.25, 0.5
 # Standard deviations of the random offset of a camera, of its distance to the scene, and of its direction, radians; and
 # the largest change of log focal length.
 MOVED, TURNED, ZOOMED = 0.1, 0.05, 0.15
+# Without photographs a share BACKED of the moved cameras also steps back, log-uniformly up to FARTHER reaches from the
+# scene: a dial that was learned near the scene only loses what is small in the distance.
+BACKED, FARTHER = 1 / 3, 4.0
 
 
-class PseudoView(View):
-    """A view whose photograph is a rendering of ``teacher``, which can be rendered from nearby as well.
+class PseudoView(StoredView):
+    """A view whose photograph is a rendering of ``teacher``, made when it is read, and from nearby in each step.
 
     With a fixed set of renderings Gaussians drift towards what only these cameras see. ``at`` returns a fixed one.
 
     Args:
         camera: the placed camera.
-        image: ``[H, W, 3]`` uint8, what the teacher shows from there.
         teacher: the checkpoint, rendered at s = 1.
         reach: unit of the offsets of moved cameras, world units: the distance of camera and scene.
+        backed: share of the moved cameras that step back as well.
     """
+
+    def __init__(self, camera: Camera, teacher: Gaussians, reach: float, backed: float = 0.0) -> None:
+        super().__init__(camera, lambda: render(teacher, camera).pixels.cpu())
+        self.__dict__.update(teacher=teacher, reach=reach, backed=backed)
 
     teacher: Gaussians
     reach: float
+    backed: float
 
-    def __init__(self, camera: Camera, image: Tensor, teacher: Gaussians, reach: float) -> None:
-        super().__init__(camera, image)
-        object.__setattr__(self, "teacher", teacher)
-        object.__setattr__(self, "reach", reach)
+    def __reduce__(self) -> tuple[type[PseudoView], tuple[Any, ...]]:  # type: ignore[override]
+        return PseudoView, (self.camera, self.teacher, self.reach, self.backed)
 
     def moved(self, random: np.random.Generator) -> View:
-        """A view from a random camera near this one; rendered when its image is read."""
+        """A view from a random camera near this one, or behind it; rendered when its image is read."""
         camera = moved(self.camera, self.reach, random)
+        if random.random() < self.backed:
+            camera = stepped_back(camera, self.reach * (FARTHER ** random.random() - 1))
         return StoredView(camera, lambda: render(self.teacher, camera).pixels)
+
+
+def stepped_back(camera: Camera, distance: float) -> Camera:
+    """The camera, moved against its direction of view, world units."""
+    viewmat = camera.viewmat.clone()
+    viewmat[2, 3] += distance
+    return replace(camera, viewmat=viewmat)
 
 
 def moved(camera: Camera, reach: float, random: np.random.Generator) -> Camera:
@@ -80,27 +97,28 @@ def render_pseudo_views(
 ) -> Scene:
     """A scene of ``cameras`` with the checkpoint's own renderings as photographs; every 8th is held out.
 
-    Training renders each from a camera near it instead (``PseudoView.moved``); ``view.at(view.camera)`` stays where it
-    is. ``clod-adapt`` also multiplies the learning rates of all but the dial by LIGHTER (``AdaptConfig.lighter``).
+    Those to train on are rendered when they are read, and training renders each from a camera near it instead
+    (``PseudoView.moved``); ``view.at(view.camera)`` stays where it is. ``clod-adapt`` also multiplies the learning
+    rates of all but the dial by LIGHTEST (``AdaptConfig.lighter``).
 
     Args:
         gaussians: the teacher, rendered at s = 1.
         wider: factor of the offsets of moved cameras' positions.
-        progress: called in ``Phase.PSEUDO_VIEWS`` after each view.
+        progress: called in ``Phase.PSEUDO_VIEWS`` after each view that is held out.
     """
     teacher = gaussians.without_empty_bands()
-    views, reach = list[View](), typical_reach(detach(teacher), _field(cameras[0])) if cameras else 0.0
-    for camera in cameras:
-        views.append(PseudoView(camera, render(teacher, camera).pixels.cpu(), teacher, wider * reach))
-        tell(progress, Phase.PSEUDO_VIEWS, len(views), len(cameras))
-    held_out = range(0, len(views), TEST_EVERY) if len(views) > 1 else range(0)
-    train = tuple(view for k, view in enumerate(views) if k not in held_out)
-    test = tuple(views[k] for k in held_out)
+    reach = wider * typical_reach(detach(teacher), _field(cameras[0])) if cameras else 0.0
+    held_out = range(0, len(cameras), TEST_EVERY) if len(cameras) > 1 else range(0)
+    train = tuple(PseudoView(c, teacher, reach, BACKED) for k, c in enumerate(cameras) if k not in held_out)
+    test = list[View]()
+    for k in held_out:
+        test.append(View(cameras[k], render(teacher, cameras[k]).pixels.cpu()))
+        tell(progress, Phase.PSEUDO_VIEWS, len(test), len(held_out))
     note = (
         f"no photographs: {len(train)} pseudo views to train on, {len(test)} held out, {_describe(cameras)}; the "
         "checkpoint is the teacher, and all numbers compare with its renderings, not with photographs"
     )
-    return Scene(train, test, (note,))
+    return Scene(train, tuple(test), (note,))
 
 
 def add_pseudo_views(
@@ -142,10 +160,11 @@ def _complementary(
 ) -> tuple[View, ...]:
     """ADDED pseudo views, at the cameras of the photographs and at placed ones."""
     each = max(min(NEAR, ADDED // 2 // len(photographs)), 1)
+    placed = place(views=max(ADDED - each * len(photographs), ADDED // 2))
     teacher = gaussians.without_empty_bands()  # one for all: it may be a copy
-    near = render_pseudo_views(teacher, [view.camera for view in photographs], wider=WIDER)
-    placed = render_pseudo_views(teacher, place(views=max(ADDED - each * len(photographs), ADDED // 2)))
-    return *each * (*near.train, *near.test), *placed.train, *placed.test
+    reach = typical_reach(detach(teacher), _field(photographs[0].camera))
+    near = [PseudoView(view.camera, teacher, WIDER * reach) for view in photographs]
+    return *each * near, *(PseudoView(camera, teacher, reach) for camera in placed)
 
 
 def teachers_to(views: Sequence[View], device: str) -> tuple[View, ...]:
@@ -157,7 +176,7 @@ def teachers_to(views: Sequence[View], device: str) -> tuple[View, ...]:
             if id(view.teacher) not in there:
                 there[id(view.teacher)] = view.teacher.to(device)
             teacher = there[id(view.teacher)]
-            view = PseudoView(view.camera, view.image, teacher, view.reach)
+            view = PseudoView(view.camera, teacher, view.reach, view.backed)
         found.append(view)
     return tuple(found)
 

@@ -60,7 +60,7 @@ class ViewSampler:
             view = view.moved(self.random)
         halved = share_done < config.coarse and view.camera.halvable
         view = view.halved() if halved else view
-        return Sample(view, self.dial(number), self.counted(), halved)
+        return Sample(view, self.dial(number, share_done), self.counted(), halved)
 
     def counted(self) -> float | None:
         """A log-uniform dial value that Gaussians are only counted at; None if there is no target-count curve."""
@@ -68,16 +68,19 @@ class ViewSampler:
             return None
         return (COUNTED_BEYOND * self.config.max_sv) ** self.random.random()
 
-    def dial(self, number: int) -> float:
+    def dial(self, number: int, share_done: float) -> float:
         """The dial value of a step: 1 with the probability ``full_share``, else (log-)uniform in [1, max_sv].
+
+        The probability falls linearly to ``full_final`` of itself: s = 1 is learned before the far end of the dial.
 
         Multiples of the golden ratio modulo 1 are spread more evenly than random numbers, in every stretch of a run:
         0.05 dB at s = 5 on plush_half.
         """
         place, config = (self.offset + number * GOLDEN) % 1, self.config
-        if place < config.full_share:
+        full = config.full_share * (1 - (1 - config.full_final) * share_done)
+        if place < full:
             return 1.0
-        place = (place - config.full_share) / (1 - config.full_share)
+        place = (place - full) / (1 - full)
         return 1 + (config.max_sv - 1) * place if config.sampling == "uniform" else config.max_sv**place
 
     def state(self) -> tuple[dict[str, Any], tuple[int, ...]]:

@@ -94,10 +94,13 @@ def test_a_block_has_the_views_that_see_it(divided: Division, captured: tuple[Ga
     assert division.steps(0, CONFIG) == 90 and division.steps(1, CONFIG) == 30
     config = replace(CONFIG, time_budget=8.0)
     passes = [[block_config(division, k, config, first=first) for first in (True, False)] for k in (0, 1)]
-    assert [[each.iters for each in both] for both in passes] == [[68, 22], [22, 8]]
+    assert [[each.steps for each in both] for both in passes] == [[68, 22], [22, 8]]
     ratios = [{name: getattr(both[1], name) / getattr(both[0], name) for name in RATES} for both in passes]
     assert all(each == pytest.approx(dict.fromkeys(RATES, CONFIG.lr_final**0.75), rel=0.05) for each in ratios)
     assert sum(each.time_budget for both in passes for each in both) == pytest.approx(8.0)
+    for one, two in passes:  # s = 1 becomes rarer as in an undivided run
+        assert two.full_share == pytest.approx(one.full_share * one.full_final)
+        assert two.full_share * two.full_final == pytest.approx(CONFIG.full_share * CONFIG.full_final)
     whole = replace(CONFIG, seed=2**63 - 1)
     seeds = {block_config(divided, k, whole, first=first).seed for k in range(BLOCKS) for first in (True, False)}
     assert len(seeds) == 2 * BLOCKS and whole.seed not in seeds
@@ -126,7 +129,7 @@ def test_rows_left_out_of_the_context_are_not_needed(captured: tuple[Gaussians, 
 def test_coarse_steps_of_both_passes_are_those_of_an_undivided_run(divided: Division, share: float) -> None:
     config = replace(CONFIG, coarse=share)
     first, last = (block_config(divided, 0, config, first=first) for first in (True, False))
-    coarse = first.coarse * first.iters + last.coarse * last.iters
+    coarse = first.coarse * first.steps + last.coarse * last.steps
     assert coarse == pytest.approx(share * divided.steps(0, config), abs=1)
     assert last.coarse == 0 or first.coarse == 1
     undivided = block_config(replace(divided, seen=divided.seen[:, :1]), 0, config, first=True)

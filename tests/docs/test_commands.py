@@ -43,7 +43,7 @@ def test_blocks_run_in_the_order_of_the_page(page: Path, desk: Path, tmp_path: P
 def short(**settings: Any) -> AdaptConfig:
     """Settings of a Python block, trained for STEPS steps at most."""
     config = AdaptConfig(**settings)
-    return replace(config, iters=min(config.iters, STEPS))
+    return replace(config, iters=min(config.steps, STEPS))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=IDS)

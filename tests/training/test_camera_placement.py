@@ -10,9 +10,9 @@ from torch import Tensor
 
 import clod_adapter as clod
 import scenes
-from clod_adapter.initialization.coverage import reduced
+from clod_adapter.initialization.coverage import coverage, reduced
 from clod_adapter.render import splat
-from clod_adapter.training import camera_score
+from clod_adapter.training import camera_placement, camera_score
 from clod_adapter.training.camera_placement import FIELD, HEIGHT, WIDTH, place_cameras, typical_reach
 from clod_adapter.training.pseudo_views import render_pseudo_views
 
@@ -51,6 +51,22 @@ def test_placed_cameras_are_valid_and_see_the_scene(blob: clod.Gaussians) -> Non
     plain = blob.replace(shN=blob.shN[:, :0])
     one, two, other = (torch.stack([c.viewmat for c in place_cameras(plain, views=4, seed=k)]) for k in (1, 1, 2))
     assert len(one) == 4 and torch.equal(one, two) and not torch.equal(one, other)
+
+
+def test_a_scene_gets_as_many_cameras_as_show_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two rows of spheres need more cameras than one sphere; nearly every disc is shown in the end."""
+    monkeypatch.setattr(camera_placement, "VIEWS", 8)
+    monkeypatch.setattr(camera_placement, "MOST", 64)
+    one = ball(300, torch.eye(3)[2]).select(torch.arange(300))
+    one = one.replace(shN=one.shN[:, :0])
+    places = [torch.tensor([8.0 * x, 0.0, 8.0 * z]) for x in range(8) for z in (0, 1)]
+    street = {name: torch.cat([value] * len(places)) for name, value in one.tensors().items()}
+    street["means"] = torch.cat([one.means + place for place in places])
+    many = clod.Gaussians(**street)
+    few, more = place_cameras(one), place_cameras(many)
+    assert 8 <= len(few) < len(more) <= 64 and len({c.name for c in more}) == len(more)
+    seen = torch.stack([coverage(many, many.opacities, camera) for camera in more]).amax(0)
+    assert float((seen >= 0.5).float().mean()) > 0.95
 
 
 @pytest.mark.parametrize(("axis", "few"), [(0, False), (1, False), (2, False), (2, True)])

@@ -138,7 +138,7 @@ def test_learning_rates_are_those_of_the_settings(captured: Pair) -> None:
 
 @pytest.mark.parametrize("sampling", ["log", "uniform"])
 def test_dial_values_follow_the_settings(captured: Pair, sampling: str) -> None:
-    dial = attach(*captured, max_sv=4, full_share=0.3, sampling=sampling)
+    dial = attach(*captured, max_sv=4, full_share=0.3, full_final=1.0, sampling=sampling)
     drawn = np.array([dial.sample() for _ in range(1000)])
     others = np.sort(drawn[drawn > 1])
     assert (drawn == 1).sum() == pytest.approx(300, abs=5) and others[-1] <= 4

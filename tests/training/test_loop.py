@@ -48,8 +48,6 @@ def test_training_improves_psnr(captured: Pair, trained: Trained) -> None:
         rows = zip(evaluate(before, views, SCALES), evaluate(trained[0].gaussians, views, SCALES), strict=True)
         for old, new in rows:
             assert new.psnr > old.psnr + 0.5, f"s {new.virtual_scale}"
-    losses = [p.loss for p in trained[1] if p.phase == Phase.TRAINING]
-    assert losses[-1] < 0.7 * losses[0]
 
 
 @pytest.mark.parametrize(("steps", "gain"), [(0, 0.5), (120, 1.5)])

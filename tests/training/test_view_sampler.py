@@ -54,11 +54,11 @@ def assert_uniform(values: torch.Tensor) -> None:
 
 @pytest.mark.parametrize("seed", [0, 5])
 def test_dial_values_follow_the_configured_distribution(seed: int) -> None:
-    """1 in ``full_share`` of the steps, else log-uniform or uniform in [1, max_sv]; in every stretch of a run."""
+    """1 in ``full_share`` of the steps (falling), else log-uniform or uniform in [1, max_sv]; in every stretch."""
 
-    def drawn(**changes: Any) -> torch.Tensor:
+    def drawn(share_done: float = 0.0, **changes: Any) -> torch.Tensor:
         sampler = ViewSampler(VIEWS, AdaptConfig(max_sv=4.0, seed=seed, **changes))
-        return torch.tensor([sampler.draw(k, 0.9).dial for k in range(480)], dtype=torch.float64)
+        return torch.tensor([sampler.draw(k, share_done).dial for k in range(480)], dtype=torch.float64)
 
     for stretch in drawn(full_share=0.25).split(120):
         places = stretch.log() / math.log(4)
@@ -66,6 +66,8 @@ def test_dial_values_follow_the_configured_distribution(seed: int) -> None:
         assert_uniform(places[places > 0])
     assert_uniform((drawn(sampling="uniform", full_share=0.0) - 1) / 3)
     assert (drawn(full_share=1.0) == 1).all()
+    late = drawn(0.5, full_share=0.5, full_final=0.5)
+    assert abs(int((late == 1).sum()) - 0.375 * 480) <= 1
     assert ViewSampler(VIEWS, AdaptConfig(max_sv=1.0, full_share=0.0)).draw(0, 0.0)[1:] == (1.0, None, False)
 
 

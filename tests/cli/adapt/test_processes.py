@@ -330,7 +330,7 @@ def test_rank_from_the_environment(monkeypatch: pytest.MonkeyPatch, environment:
 
 
 def test_default_steps_take_the_same_number_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    steps = AdaptConfig().iters
+    steps = AdaptConfig().steps
     for words, size, want in (
         ((), 1, (1, steps)), ((), 4, (4, round(steps / 4))), (("--batch", "3"), 2, (3, round(steps / 3))),
         (("--batch", str(2 * steps)), 1, (2 * steps, 1)),
@@ -339,4 +339,4 @@ def test_default_steps_take_the_same_number_of_views(monkeypatch: pytest.MonkeyP
         for name, value in (AT | {"RANK": "0", "WORLD_SIZE": str(size)}).items():
             monkeypatch.setenv(name, value)
         config = make_config(build_parser("").parse_args(["x.ply", *words]))
-        assert (config.batch, config.iters) == want, words
+        assert (config.batch, config.for_views(1).iters) == want, words
