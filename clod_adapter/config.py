@@ -19,7 +19,7 @@ SAMPLINGS = ("log", "uniform")
 COUNT_TERMS = ("law", "paper")
 GROWTHS = ("on", "off")
 TARGETS = ("count", "cost")
-STEPS, STEPS_PER_VIEW = 700, 5.5  # of training, by default, with one view a step
+STEPS, STEPS_PER_VIEW = 800, 5.5  # of training, by default, with one view a step
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
 
 

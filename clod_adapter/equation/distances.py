@@ -23,6 +23,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 
+OUTLIER = 16.0  # times the median distance from the scene's centre: one camera that far away must not decide
 NEAREST = 1e-6  # lower bound of d in the geometric mean: a camera in a Gaussian's centre must not decide alone
 
 
@@ -104,6 +105,9 @@ def viewpoint_of(camera: Camera, means: Tensor, config: AttenuationConfig) -> Vi
 def typical_distance(means: Tensor, places: Sequence[Camera | Viewpoint], config: AttenuationConfig) -> Tensor:
     """``[N]`` d_i, without unit, >= 0: the distances from one place, or the geometric mean over several.
 
+    Places more than OUTLIER times as far from the scene's centre as the median place, and as half of the Gaussians
+    are, do not count.
+
     Args:
         means: ``[N, 3]`` world units.
         places: at least one.
@@ -115,14 +119,28 @@ def typical_distance(means: Tensor, places: Sequence[Camera | Viewpoint], config
         raise ClodError("no camera is given, so there is no distance for the dial to fade by; give at least one")
     if len(places) == 1:
         return _from(places[0], means, config)
-    logs = torch.zeros_like(means[:, 0])
+    logs, places = torch.zeros_like(means[:, 0]), _without_outliers(means, places)
     for place in places:
         logs += _from(place, means, config).clamp(min=NEAREST).log()
     return (logs / len(places)).exp()
 
 
+def _without_outliers(means: Tensor, places: Sequence[Camera | Viewpoint]) -> Sequence[Camera | Viewpoint]:
+    if len(places) < 3:
+        return places
+    centre = means.median(0).values
+    away = torch.stack([(_position(place, means) - centre).norm() for place in places])
+    limit = OUTLIER * torch.maximum(away.median(), (means - centre).norm(dim=1).median())
+    return [place for place, distance in zip(places, away, strict=True) if bool(distance <= limit)]
+
+
+def _position(place: Camera | Viewpoint, means: Tensor) -> Tensor:
+    if isinstance(place, Camera):
+        return place.position.to(means)
+    return torch.tensor([place.x, place.y, place.z], dtype=means.dtype, device=means.device)
+
+
 def _from(place: Camera | Viewpoint, means: Tensor, config: AttenuationConfig) -> Tensor:
     if isinstance(place, Camera):
         return normalized_distances(means, place, config)
-    centre = torch.tensor([place.x, place.y, place.z], dtype=means.dtype, device=means.device)
-    return (means - centre).norm(dim=1) / place.unit
+    return (means - _position(place, means)).norm(dim=1) / place.unit

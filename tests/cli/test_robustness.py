@@ -59,7 +59,7 @@ def test_outputs_of_all_cells(run: Any, clod: Any, tmp_path: Path) -> None:
     assert report["missing"] == [] and not report["interrupted"]
     for cell in report["cells"]:
         dials = [row["virtual_scale"] for row in cell["rows"]]
-        assert dials == ([1.0] * len(BASELINE_SHARES) if cell["max_sv"] is None else [1, 1.25, 1.5, 2, 2.5, 3])
+        assert dials == ([1.0] * len(BASELINE_SHARES) if cell["max_sv"] is None else [1, 1.5, 2, 3])
         assert ("log10_sigma_d" in cell["distribution"]) == (cell["max_sv"] is not None)
     with open(folder / "robustness.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))

@@ -57,7 +57,7 @@ def test_writes_three_files(clod: Any, capture: Any, dialled: Path, tmp_path: Pa
     assert set(report["seconds"]) == {"load", "kernels", "plan", "start", "train", "evaluate", "total"}
     assert report["adapter_bytes"] == (tmp_path / "dial.safetensors").stat().st_size
     assert report["outputs"] == {"ply": "dial.ply", "adapter": "dial.safetensors", "report": "dial.json"}
-    assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.25, 1.5, 2, 2.5, 3, 4]
+    assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2, 3, 4]
     assert [row["kept"] for row in report["base_rows"]] == [300]
     shares = [row["kept_share"] for row in report["rows"]]
     assert shares == sorted(shares, reverse=True) and 0 < shares[-1] < 0.5
@@ -167,12 +167,12 @@ def test_interrupt_of_the_measurement_keeps_finished_rows(
 
     def evaluate(gaussians: Any, views: Any, dials: list[float], progress: Any, **rest: Any) -> Any:
         pressed = pressing(progress, signal.SIGINT, at=3 * len(views) + 1)
-        return real(gaussians, views, dials, progress=pressed if len(dials) == 7 else progress, **rest)
+        return real(gaussians, views, dials, progress=pressed if len(dials) == 5 else progress, **rest)
 
     monkeypatch.setattr(measure, "evaluate", evaluate)
     done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
     report = json.loads(done.out)
-    assert done.code == 0 and [row["virtual_scale"] for row in report["rows"]] == [1, 1.25, 1.5]
+    assert done.code == 0 and [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2]
     assert "measurements were interrupted" in report["notes"][0] in done.err and report["interrupted"] is False
     assert report["calibration"] is None and clod_adapter.load(tmp_path / "dial.ply").calibration is None
     assert names(tmp_path) == sorted([*OUTPUTS, STATE])
@@ -284,8 +284,8 @@ def test_invisible_checkpoint_without_photographs_is_refused(clod: Any, capture:
 
 
 def test_report_dials() -> None:
-    dials = [1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 7, 10, 14, 20]
-    for max_sv, want in ((1, [1]), (1.2, [1, 1.2]), (5, dials[:8]), (8.5, [*dials[:9], 8.5]), (20, dials)):
+    dials = [1, 1.5, 2, 3, 5, 7, 10, 14, 20]
+    for max_sv, want in ((1, [1]), (1.2, [1, 1.2]), (5, dials[:5]), (8.5, [*dials[:6], 8.5]), (20, dials)):
         assert report_dials(max_sv) == want
 
 
