@@ -1,0 +1,117 @@
+"""A large scene without photographs against what its user would take instead: PSNR at equal numbers of Gaussians.
+
+    python benchmarks/large.py FINEST.ply --levels LEVEL.ply ... --record
+    python benchmarks/large.py --table
+
+FINEST is adapted without options (max_sv 5). ``levels`` are the coarser ones that its author ships. splat-transform
+(``make peers``) decimates FINEST to the same counts, uniformly and adaptively, and ``export --lod-meta`` writes a
+streaming set of the adapted file with about these counts, which splat-transform reads back. PSNR is the mean over
+VIEWS cameras that training does not use, against renders of FINEST. ``--adapted`` takes a file of an earlier run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import clod_adapter as clod
+from clod_adapter.evaluation.baselines import matching_dial
+from common import COMMAND, ROOT, Process, Row, append, arguments, stored, table
+
+FILE, VIEWS, SEED = "large.jsonl", 16, 77
+OTHERS = {"decimated": "--decimate", "decimated adaptively": "--decimate-adaptive"}
+
+
+def main() -> None:
+    parser = arguments(__doc__, table=print_table, record=FILE)
+    parser.add_argument("finest", type=Path)
+    parser.add_argument("--levels", nargs="+", type=Path, required=True)
+    parser.add_argument("--adapted", type=Path, help="the file of an earlier run, which is not run again")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        for row in compared(args.finest, args.levels, args.adapted, Path(temporary)):
+            row = {"benchmark": "large", "scene": args.finest.stem, **row}
+            if args.record:
+                append(FILE, row)
+            else:
+                print(json.dumps(row), flush=True)
+
+
+def compared(finest: Path, levels: list[Path], adapted: Path | None, folder: Path) -> Iterator[Row]:
+    """The rows: the run, the dial at 1 and 2 and at each level's count, and its rivals there."""
+    base = clod.load(finest).gaussians
+    cameras = clod.place_cameras(base, views=VIEWS, seed=SEED)
+    views = [clod.View(camera, clod.render(base, camera).pixels) for camera in cameras]
+    out = adapted or folder / "adapted.ply"
+    if adapted is None:
+        run = Process([*COMMAND, finest, "--max-sv", 5, "--out", out, "--json", "--accept-loss"])
+        yield {"method": "run", "steps": json.loads(run.out)["steps"], **run.cost()}
+    dial = clod.load(out).gaussians
+    counts = [len(clod.load(level).gaussians) for level in levels]
+    for label, s in (("s = 1", 1.0), ("s = 2", 2.0), ("s = 5", 5.0)):
+        (row,) = clod.evaluate(dial, views, [s])
+        yield {"method": "dial", "level": label, "gaussians": row.kept, "share": row.kept_share, "psnr": row.psnr}
+    for count, level in zip(counts, levels, strict=True):
+        share = count / len(base)
+        (row,) = clod.evaluate(dial, views, [matching_dial(dial, cameras, count)])
+        yield {"method": "dial", "level": level.stem, "gaussians": row.kept, "share": row.kept_share, "psnr": row.psnr}
+        for name, file in rivals(finest, level, count, folder):
+            if file is None:
+                yield {"method": name, "level": level.stem, "failed": "needs a GPU at this size"}
+                continue
+            found = clod.load(file).gaussians
+            (row,) = clod.evaluate(found, views, [1.0])
+            yield {"method": name, "level": level.stem, "gaussians": len(found), "share": share, "psnr": row.psnr}
+    yield from streamed(out, [matching_dial(dial, cameras, count) for count in counts], views, len(base), folder)
+
+
+def rivals(finest: Path, level: Path, count: int, folder: Path) -> Iterator[tuple[str, Path | None]]:
+    """The author's level, and FINEST in ``count`` Gaussians by splat-transform; None where that fails."""
+    yield "author", level
+    for name, option in OTHERS.items():
+        out = folder / "decimated.ply"
+        words = [peer(), "-w", "-q", "-g", "cpu", finest, option, str(count), out]
+        failed = subprocess.run(words, capture_output=True, text=True)
+        if failed.returncode and "requires WebGPU" not in failed.stderr + failed.stdout:
+            sys.exit(failed.stderr)
+        yield name, None if failed.returncode else out
+
+
+def streamed(adapted: Path, dials: list[float], views: list[clod.View], whole: int, folder: Path) -> Iterator[Row]:
+    """Each level of the streaming set."""
+    out, level = folder / "lod", folder / "level.ply"
+    words = [f"--levels={','.join(f'{s:.4f}' for s in sorted(dials))}", "--lod-meta", "--out", out]
+    Process([*COMMAND, "export", adapted, *words], environment={"CLOD_SPLAT_TRANSFORM": peer()})
+    for number in range(len(dials)):
+        Process([peer(), "-w", "-q", "-g", "cpu", out / "lod-meta.json", "-L", number, level])
+        found = clod.load(level).gaussians
+        (row,) = clod.evaluate(found, views, [1.0])
+        share = len(found) / whole
+        yield {"method": "lod-meta", "level": number, "gaussians": len(found), "share": share, "psnr": row.psnr}
+
+
+def peer() -> str:
+    """splat-transform, of ``make peers`` or on the PATH."""
+    place = os.pathsep.join([str(ROOT / ".venv" / "peers" / "node_modules" / ".bin"), os.environ["PATH"]])
+    os.environ["PATH"] = place
+    return shutil.which("splat-transform") or sys.exit("splat-transform is absent: make peers installs it")
+
+
+def print_table() -> None:
+    """The last row of each method and level."""
+    last = {(row["scene"], row["method"], row.get("level")): row for row in stored(FILE)}
+    lines = [
+        [row["scene"], row["method"], str(row["level"]), f"{row['gaussians']:,.0f}", f"{row['share']:.1%}",
+         f"{row['psnr']:.2f}"] for row in last.values() if "psnr" in row
+    ]  # fmt: skip
+    print(table(["scene", "method", "level", "Gaussians", "share", "PSNR"], lines))
+
+
+if __name__ == "__main__":
+    main()
