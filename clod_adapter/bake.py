@@ -47,14 +47,14 @@ def bake(
 
     Args:
         gaussians: with a dial.
-        virtual_scale: the dial s >= 1; ``budget.dial_for(gaussians, keep=n, cameras=cameras, baked=True)`` gives the
+        virtual_scale: the dial s >= 0; ``budget.dial_for(gaussians, keep=n, cameras=cameras, baked=True)`` gives the
             one that keeps n.
         camera: the one from where the result is exact. Its direction matters for the normalisers ``quantile`` and
             ``max`` only.
         cameras: instead of ``camera``: the training cameras, or some of them, such as ``load(path).viewpoints``.
 
     Raises:
-        ClodError: no dial, neither or both of camera and cameras, a dial value below 1 or not finite, or one that
+        ClodError: no dial, neither or both of camera and cameras, a negative dial value or not finite, or one that
             keeps no Gaussian.
     """
     if gaussians.sigma_d is None or gaussians.attenuation is None:

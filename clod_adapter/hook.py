@@ -36,11 +36,11 @@ class Hook:
     Attributes:
         sigma_d: ``[N]``, in the order of the Gaussians that the hook is called with.
         attenuation: settings of ``sigma_d``.
-        virtual_scale: the dial s >= 1.
+        virtual_scale: the dial s >= 0.
         growth_d: ``[N]`` exponents of the growth of the scales, in the same order; None for no growth.
 
     Raises:
-        ClodError: the dial is below 1 or not finite.
+        ClodError: the dial is negative or not finite.
     """
 
     sigma_d: Tensor

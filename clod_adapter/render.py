@@ -57,7 +57,7 @@ def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float)
         seen_from: the camera, or ``[N]`` distances d where they are known.
 
     Raises:
-        ClodError: the dial is below 1 or not finite.
+        ClodError: the dial is negative or not finite.
     """
     where = seen_from if isinstance(seen_from, Tensor) else (gaussians.means, seen_from)
     return attenuate(
@@ -107,12 +107,12 @@ def render(
     Args:
         gaussians: adapted or not; without ``sigma_d`` the dial has no effect, and above s = 1 a warning says so.
         camera: the view.
-        virtual_scale: the dial s >= 1 (the paper's s_v).
+        virtual_scale: the dial s >= 0 (the paper's s_v).
         background: ``[3]``, tensor or array; black by default.
         rasterizer: the fastest one for the Gaussians' device by default.
 
     Raises:
-        ClodError: the dial is below 1 or not finite.
+        ClodError: the dial is negative or not finite.
     """
     check_dial(virtual_scale)
     if virtual_scale > 1 and gaussians.sigma_d is None:

@@ -145,7 +145,7 @@ def test_bad_arguments_are_refused() -> None:
     some, plain = spread(), gaussians(3, 0, 0)
     for message, call in {
         "no sigma_d": lambda: bake(plain, 1.0),
-        "virtual_scale is 0.5": lambda: bake(some, 0.5, camera()),
+        "virtual_scale is -0.5": lambda: bake(some, -0.5, camera()),
         "no Gaussian is kept at s = 200": lambda: bake(some, 200.0, camera()),
         "either camera or cameras": lambda: bake(some, 2.0),
         "either camera or cameras;": lambda: bake(some, 2.0, camera(), cameras=[camera()]),

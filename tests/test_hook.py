@@ -138,8 +138,8 @@ def test_bad_arguments_are_refused(tmp_path: Path) -> None:
         hook_of(model)(model.means, model.opacities, view.viewmat)
     with pytest.raises(ClodError, match=r"for 200 Gaussians, but means is \(199, 3\)"):
         hook_of(model)(model.means[1:], model.opacities, view.viewmat, view.K, 64, 48)
-    with pytest.raises(ClodError, match="virtual_scale is 0.5"):
-        hook_of(model, 0.5)
+    with pytest.raises(ClodError, match="virtual_scale is -0.5"):
+        hook_of(model, -0.5)
     clod_adapter.save(tmp_path / "plain.ply", gaussians(5, 0, 0))
     with pytest.raises(ClodError, match="plain.ply: it has no sigma_d, so there is no dial"):
         clod_adapter.load(tmp_path / "plain.ply").hook(virtual_scale=3)

@@ -125,7 +125,7 @@ def test_gradients_reach_sigma_and_all_attributes(s: float) -> None:
 
 def test_bad_arguments_are_refused() -> None:
     base = gaussians(5, 0, 0)
-    for value in (0.999, 0.0, -1.0, math.inf, math.nan):
+    for value in (-1e-3, -1.0, math.inf, math.nan):
         for some in (adapted(), base):
             with pytest.raises(ClodError, match="virtual_scale"):
                 render(some, camera(), value)

@@ -33,8 +33,8 @@ def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fp
         measured: budgets that the command solves by measuring, without a calibration.
     """
     for virtual_scale in args.sv or ():
-        if not 1 <= virtual_scale < math.inf:
-            raise ClodError(f"--sv has {virtual_scale:g}, dial values must be at least 1 (1 is full quality)")
+        if not 0 <= virtual_scale < math.inf:
+            raise ClodError(f"--sv has {virtual_scale:g}, it must be at least 0 (1 is full quality, 0 everything)")
     budget = given_budget(args)
     if budget is None:
         return

@@ -27,8 +27,8 @@ def levels_of(text: str) -> list[float]:
         levels = [float(f"{float(word):.{DIGITS}g}") for word in text.split(",")]
     except ValueError:
         levels = []
-    if not levels or levels[0] < 1 or not all(a < b for a, b in pairwise([*levels, inf])):
-        raise ArgumentTypeError(f"{text!r} must be ascending dial values of at least 1, as in 1,2,4,7")
+    if not levels or levels[0] < 0 or not all(a < b for a, b in pairwise([*levels, inf])):
+        raise ArgumentTypeError(f"{text!r} must be ascending dial values of at least 0, as in 1,2,4,7")
     return levels
 
 

@@ -71,8 +71,8 @@ def _is_checkpoint(path: Path) -> bool:
 def check_view(args: Namespace) -> None:
     if not 0 <= args.port < 1 << 16:
         raise ClodError(f"--port is {args.port}, it must be between 1 and 65535, or 0 for a free one")
-    if not 1 <= args.sv < math.inf:
-        raise ClodError(f"--sv is {args.sv:g}, it must be at least 1 (1 is full quality)")
+    if not 0 <= args.sv < math.inf:
+        raise ClodError(f"--sv is {args.sv:g}, it must be at least 0 (1 is full quality, 0 everything)")
     files = view_files(args.models)
     for path in (*files, *([args.base] if args.base else [])):
         check_checkpoint(path)

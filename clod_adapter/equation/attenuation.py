@@ -11,6 +11,9 @@ dial ``s`` (the paper's virtual distance scale)::
 Sources: a'' is Eq. 2 (section 3.2) of "CLoD-GS: Continuous Level-of-Detail via 3D Gaussian Splatting", ICLR 2026, and
 the culling rule is the mask M_i of the same section. g is this project's.
 
+Training and the paper have s >= 1. At s = 0 nothing is attenuated, culled or enlarged; between 0 and 1 the same
+equation holds.
+
 With the ``hard`` cut (the paper's) a kept Gaussian is drawn with opacity a'' and is culled at opacity ``tau s``, which
 pops. With the ``soft`` cut it is drawn with ``a'' min(1, 2 (a'' / (tau s) - 1))``: the opacity is a'' above 1.5 tau s
 and falls to 0 at the culling threshold. The same Gaussians are kept, and the image is continuous in dial and camera:
@@ -47,6 +50,9 @@ from clod_adapter.errors import ClodError
 
 SIGMA_MAX = 1e9
 """Stands for an infinite sigma_d. The factor is exactly 1 for d s < 2e5 in float32, d s < 10 in float64."""
+
+FAINTEST = 2.0**-126
+"""The smallest normal float32: at s = 0 only what is fainter is culled, which no rasterizer draws."""
 
 Scale = TypeVar("Scale", float, Tensor)
 Fields = tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]
@@ -89,14 +95,14 @@ def attenuate(
         opacities: ``[N]`` logits. At a logit of +inf, a is 1 and its gradient 0.
         seen_from: ``[N]`` distances d (``distances.normalized_distances``), or the centres ``[N, 3]``, world units, and
             the camera. Pass distances to use them for several dial values.
-        virtual_scale: the dial s, >= 1.
+        virtual_scale: the dial s, >= 0.
         activated: ``opacities`` are a itself, in [0, 1], as rasterizers take them. The gradient is finite: at a = 1
             it is that of the factor and the cut, as anywhere; at a = 0 that of a'' is the factor, and those of
             ``log_opacities`` (-inf) and ``drawn`` are 0.
         growth_d: ``[N]`` exponents h of the growth of the scales, finite; None for no growth.
 
     Raises:
-        ClodError: the dial is below 1 or not finite, or the shapes differ.
+        ClodError: the dial is negative or not finite, or the shapes differ.
     """
     check_dial(virtual_scale)
     if sigma_d is None or config is None:
@@ -130,11 +136,11 @@ def log_attenuation(sigma_d: Tensor, d: Tensor, virtual_scale: float, eps: float
     gives -inf. A slope that overflows is 0: no opacity is left there that it could change. Never NaN.
 
     Args:
-        virtual_scale: the dial s, >= 1.
+        virtual_scale: the dial s, >= 0.
         eps: the paper's epsilon, >= 0.
 
     Raises:
-        ClodError: the dial is below 1 or not finite, or the shapes differ.
+        ClodError: the dial is negative or not finite, or the shapes differ.
     """
     check_dial(virtual_scale)
     sigma_d, d = conform(sigma_d=sigma_d, d=d)
@@ -148,8 +154,8 @@ def culling_threshold(tau: float, virtual_scale: Scale) -> Scale:
 
 
 def log_threshold(tau: float, virtual_scale: float) -> float:
-    """Logarithm of ``culling_threshold``; log a'' must exceed it."""
-    return math.log(culling_threshold(tau, virtual_scale))
+    """Logarithm of ``culling_threshold``; log a'' must exceed it. At least that of FAINTEST, for s = 0."""
+    return math.log(max(culling_threshold(tau, virtual_scale), FAINTEST))
 
 
 @torch.no_grad()
@@ -210,8 +216,8 @@ def _cut(
 
 
 def check_dial(virtual_scale: float) -> None:
-    """Raises ClodError for a dial below 1 or not finite."""
-    require(1 <= virtual_scale < math.inf, "virtual_scale", virtual_scale, "at least 1 and finite")
+    """Raises ClodError for a dial that is negative or not finite."""
+    require(0 <= virtual_scale < math.inf, "virtual_scale", virtual_scale, "at least 0 and finite")
 
 
 def conform(**tensors: Tensor) -> list[Tensor]:

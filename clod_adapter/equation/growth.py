@@ -46,7 +46,7 @@ def growth_factors(growth_d: Tensor, d: Tensor, virtual_scale: float | Tensor, r
     Args:
         growth_d: ``[N]`` exponents h, finite.
         d: ``[N]`` normalised distances, >= 0.
-        virtual_scale: the dial s, >= 1.
+        virtual_scale: the dial s, >= 0.
         reach: r, from ``growth_distance``, > 0.
     """
     # d s is float64's: a dial beyond float32 times a distance of 0 would be NaN.

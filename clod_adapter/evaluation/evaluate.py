@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +12,7 @@ import numpy as np
 import torch
 
 from clod_adapter.cameras import View
-from clod_adapter.config import require
+from clod_adapter.equation.attenuation import check_dial
 from clod_adapter.equation.distances import in_frustum
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.perceptual import Metric
@@ -82,7 +81,7 @@ def evaluate(
     if not virtual_scales:
         raise ClodError("there are no dial values to evaluate at")
     for virtual_scale in virtual_scales:
-        require(1 <= virtual_scale < math.inf, "virtual_scale", virtual_scale, "at least 1 and finite")
+        check_dial(virtual_scale)
     gaussians = gaussians.without_empty_bands()
     dials = virtual_scales if gaussians.sigma_d is not None else [1.0] * len(virtual_scales)
     render(gaussians, views[0].camera, max(dials))  # compiled and warm before the clock starts

@@ -128,7 +128,7 @@ def path_popping(
     """Moves through the ``cameras`` in steps of equal length (``path``), at one dial value.
 
     Raises:
-        ClodError: fewer than two cameras or two steps, or the dial is below 1 or not finite.
+        ClodError: fewer than two cameras or two steps, or the dial is negative or not finite.
     """
     gaussians, shown = gaussians.without_empty_bands(), path(cameras, steps)
 

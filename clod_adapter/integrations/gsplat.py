@@ -113,7 +113,7 @@ def rasterization(
 
     Args:
         sigma_d: ``[..., N]`` like ``opacities``; None calls gsplat's function unchanged.
-        virtual_scale: the dial s >= 1.
+        virtual_scale: the dial s >= 0.
         attenuation: settings of the equation, ``Gaussians.attenuation`` of the file; by default
             ``AttenuationConfig()``, with distances in world units.
         growth_d: ``[..., N]`` exponents of the growth of the scales, which begins at ``reference_distance`` of the
@@ -125,7 +125,7 @@ def rasterization(
         ``render_colors [..., C, H, W, X]``, ``render_alphas [..., C, H, W, 1]`` and ``meta``.
 
     Raises:
-        ClodError: the dial is below 1, sigma_d or growth_d differs from opacities in shape, ``distributed`` is set,
+        ClodError: the dial is negative, sigma_d or growth_d differs from opacities in shape, ``distributed`` is set,
             with which the cameras of all processes share one opacity, or several cameras come with a tensor that none
             of the known versions has.
         TypeError: an argument is missing, or the installed gsplat does not have it.

@@ -63,14 +63,14 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
         Args:
             means3D, means2D, opacities, args, kwargs: those of the fork, by position or by name.
             sigma_d: ``[N]``; None calls the fork's function unchanged.
-            virtual_scale: the dial s >= 1.
+            virtual_scale: the dial s >= 0.
             attenuation: settings of the equation, ``Gaussians.attenuation`` of the file; by default
                 ``AttenuationConfig()``, with distances in world units.
             growth_d: ``[N]`` exponents of the growth of the scales, which begins at ``reference_distance`` of the
                 attenuation or, where that is 0, at 1 world unit; None for no growth.
 
         Raises:
-            ClodError: the dial is below 1, the shapes do not match, or the settings have ``prefiltered``, with which
+            ClodError: the dial is negative, the shapes do not match, or the settings have ``prefiltered``, with which
                 the rasterizer aborts at the first Gaussian out of view.
         """
         if sigma_d is None:

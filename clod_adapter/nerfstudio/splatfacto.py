@@ -91,14 +91,14 @@ def chosen(default: float) -> float:
     """The dial value of ``CLOD_VIRTUAL_SCALE``, or the default.
 
     Raises:
-        ClodError: it is no number, or below 1.
+        ClodError: it is no number, or negative.
     """
     text = os.environ.get(VIRTUAL_SCALE, "")
     try:
         value = float(text) if text else default
         check_dial(value)
     except (ValueError, ClodError) as error:
-        raise ClodError(f"{VIRTUAL_SCALE} is {text!r}, it must be a number of at least 1") from error
+        raise ClodError(f"{VIRTUAL_SCALE} is {text!r}, it must be a number of at least 0") from error
     return value
 
 

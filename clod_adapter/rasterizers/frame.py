@@ -13,7 +13,7 @@ from clod_adapter._kernels import blend, blocks, conventions, threads, tiles
 from clod_adapter._kernels.memory import aligned, recycled, release
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
-from clod_adapter.equation.attenuation import culling_threshold, log_threshold
+from clod_adapter.equation.attenuation import FAINTEST, culling_threshold, log_threshold
 from clod_adapter.equation.growth import growth_distance
 
 FEW = 4096  # rows that one thread projects or lists in about a tenth of a millisecond
@@ -126,7 +126,7 @@ def dial_vector(config: AttenuationConfig, virtual_scale: float, unit: float = 1
     out, rate = np.empty(conventions.DIAL, np.float32), virtual_scale / unit
     out[conventions.RATE], out[conventions.GROWTH_RATE] = rate, rate / growth_distance(config)
     out[conventions.HALF_EPS], out[conventions.SOFT] = config.eps / 2, config.cut == "soft"
-    out[conventions.THRESHOLD] = culling_threshold(config.tau, virtual_scale)
+    out[conventions.THRESHOLD] = max(culling_threshold(config.tau, virtual_scale), FAINTEST)
     out[conventions.LOG_THRESHOLD] = log_threshold(config.tau, virtual_scale)
     return out
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from statistics import fmean
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -13,11 +13,10 @@ from torch import Tensor
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.cameras import View
 from clod_adapter.losses import psnr
+from clod_adapter.training.distributed import ProcessGroup
+from clod_adapter.training.objective import Objective
 from clod_adapter.training.pseudo_views import PseudoView
 from clod_adapter.training.state import Watched
-
-if TYPE_CHECKING:
-    from clod_adapter.training.trainer import Trainer
 
 FEW, EVERY, MOST = 8, 24, 4  # of fewer than FEW views all are watched and trained on; else one of EVERY, 2 to MOST
 WORSE, RUINED = 1.0, 4.0  # dB that s = 1 may fall below its best, until the next check, and at all
@@ -62,6 +61,20 @@ def squared_error(image: Tensor, view: View) -> float:
     return 10 ** (-psnr(image, view.image) / 10)
 
 
+class Run(Protocol):
+    """What the gate needs of ``trainer.Trainer``."""
+
+    objective: Objective
+    group: ProcessGroup | None
+    parameters: dict[str, Tensor]
+
+    def trained(self) -> dict[str, Tensor]: ...
+
+    def averages(self) -> dict[str, Tensor]: ...
+
+    def return_to(self, trained: dict[str, Tensor]) -> None: ...
+
+
 class Gate:
     """Measures s = 1 against the base, from the first steps on, in images of half the size (not small ones).
 
@@ -78,7 +91,7 @@ class Gate:
         numbers: ``[4]`` float64: the best loss (``decibels_below``), rollbacks so far, CHECKS made, the last loss.
     """
 
-    def __init__(self, trainer: Trainer, views: Sequence[View], trained_on: bool) -> None:
+    def __init__(self, trainer: Run, views: Sequence[View], trained_on: bool) -> None:
         self.trainer, self.views, self.trained_on = trainer, views, trained_on
         self.base = [self._error(view, None) for view in views]
         self.good = {name: value.clone() for name, value in trainer.trained().items()}

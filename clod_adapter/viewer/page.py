@@ -50,7 +50,7 @@ def write_viewer_page(
         model: with or without a dial.
         base: shown for comparison; relative to the same origin.
         cameras: selectable viewpoints, in the frame of the Gaussians (relative to the origin).
-        virtual_scale: the initial dial value, >= 1.
+        virtual_scale: the initial dial value, >= 0.
         tool: packs the splats to a fifth of their size, with rounded values (``pack_sog``, which calls
             ``progress``); None stores them unpacked.
 

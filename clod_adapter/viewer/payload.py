@@ -94,7 +94,7 @@ def page_config(
     Args:
         model, base: from ``Payload.describe``.
         cameras: selectable viewpoints, in this order, in the frame of the Gaussians.
-        virtual_scale: the initial dial value, >= 1.
+        virtual_scale: the initial dial value, >= 0.
         others: further models to switch to, from ``Payload.describe``.
     """
     return {

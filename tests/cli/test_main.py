@@ -78,9 +78,9 @@ def test_unexpected_error_prints_a_traceback_and_where_to_report_it(
 def test_errors_are_one_json_object(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bad input, an interrupt and a fault of ours; on stdout, beside the line on stderr."""
     words = ("eval", capture.ply, "--images", capture.scene, "--json")
-    done = clod(*words, "--sv", 0)
+    done = clod(*words, "--sv=-1")
     assert json.loads(done.out) == {
-        "error": "--sv has 0, dial values must be at least 1 (1 is full quality)",
+        "error": "--sv has -1, it must be at least 0 (1 is full quality, 0 everything)",
         "code": 2,
     }
     for error, code, said in ((KeyboardInterrupt(), 130, "interrupted"), (ZeroDivisionError(), 1, "this is a bug in")):

@@ -247,8 +247,8 @@ def test_monotone_in_sigma(
 
 def test_bad_calls_are_named() -> None:
     three, four = torch.ones(3), torch.ones(4)
-    with pytest.raises(ClodError, match="virtual_scale is 0.5"):
-        attenuate(three, three, three, 0.5, config())
+    with pytest.raises(ClodError, match="virtual_scale is -0.5"):
+        attenuate(three, three, three, -0.5, config())
     with pytest.raises(ClodError, match=r"sigma_d \(4,\)"):
         extinction_scale(three, four, three, config())
     with pytest.raises(ClodError, match="virtual_scale is nan"):

@@ -95,7 +95,7 @@ def test_bad_calls_are_named_before_rendering(monkeypatch: pytest.MonkeyPatch) -
     for given, dials, message in (
         ([], [1.0], "no held-out views"),
         (views, [], "no dial values"),
-        (views, [1.0, 0.5], "virtual_scale is 0.5"),
+        (views, [1.0, -0.5], "virtual_scale is -0.5"),
         (views, [1.0, math.nan], "virtual_scale is nan"),
         (views, [1.0, math.inf], "virtual_scale is inf"),
     ):

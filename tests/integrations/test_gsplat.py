@@ -352,7 +352,7 @@ def test_bad_arguments_are_refused(tools: Tools) -> None:
         tools.ours(**given, **views, sigma_d=given["opacities"][1:])
     with pytest.raises(ClodError, match=r"growth_d is \(39,\) and opacities \(40,\)"):
         tools.ours(**given, **views, sigma_d=given["opacities"], growth_d=given["opacities"][1:])
-    with pytest.raises(ClodError, match="virtual_scale is 0.5"):
-        tools.ours(**given, **views, sigma_d=given["opacities"], virtual_scale=0.5)
+    with pytest.raises(ClodError, match="virtual_scale is -0.5"):
+        tools.ours(**given, **views, sigma_d=given["opacities"], virtual_scale=-0.5)
     with pytest.raises(TypeError, match="missing a required argument: 'viewmats'"):
         tools.ours(*given.values(), sigma_d=given["opacities"])

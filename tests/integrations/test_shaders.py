@@ -145,7 +145,8 @@ def test_golden_rows_cover_every_branch() -> None:
         assert any(0 < row["drawn"] < row["faded"] for row in mine) is soft
         assert any(row["distance"] == 0 and row["sigma"] <= 0 and row["eps"] == 0 and row["drawn"] > 0 for row in mine)
         assert any(row["distance"] > 0 and row["sigma"] <= 0 and row["eps"] == 0 for row in mine)
-        assert any(abs(row["faded"] / (row["tau"] * row["scale"]) - 1) < 0.01 for row in mine)
+        assert any(abs(row["faded"] - row["tau"] * row["scale"]) < 0.01 * row["faded"] for row in mine)
+        assert any(row["scale"] == 0 and row["drawn"] == row["opacity"] > 0 for row in mine)
 
 
 def test_golden_scale_rows_cover_every_branch() -> None:

@@ -2,7 +2,7 @@
 //   opacity   activated, in [0, 1]
 //   sigma     the file's sigma_d
 //   distance  |mean - camera| / D, at least 0
-//   scale     the dial s, at least 1
+//   scale     the dial s, at least 0
 //   eps, tau  of the file's header
 //   soft      the header's cut: true where it fades to 0, false for the paper's hard one
 // For highp floats; golden.json beside this file has values to test it with.
@@ -21,7 +21,7 @@ float clodOpacity(float opacity, float sigma, float distance, float scale, float
   }
   float threshold = tau * scale;
   if (!(faded > threshold)) return 0.0;
-  return soft ? faded * min(2.0 * (faded / threshold - 1.0), 1.0) : faded;
+  return soft && faded < 1.5 * threshold ? faded * 2.0 * (faded / threshold - 1.0) : faded;
 }
 
 // The factor of the three scales of a Gaussian: those that the dial keeps grow with distance and dial; 1 for growth 0.

@@ -2,7 +2,7 @@
 //   opacity   activated, in [0, 1]
 //   sigma     the file's sigma_d
 //   distance  |mean - camera| / D, at least 0
-//   scale     the dial s, at least 1
+//   scale     the dial s, at least 0
 //   eps, tau  of the file's header
 //   soft      the header's cut: true where it fades to 0, false for the paper's hard one
 // golden.json beside this file has values to test it with.
@@ -19,7 +19,8 @@ fn clodOpacity(opacity: f32, sigma: f32, distance: f32, scale: f32, eps: f32, ta
   }
   let threshold = tau * scale;
   if (!(faded > threshold)) { return 0.0; }
-  return select(faded, faded * min(2.0 * (faded / threshold - 1.0), 1.0), soft);
+  if (soft && faded < 1.5 * threshold) { return faded * 2.0 * (faded / threshold - 1.0); }
+  return faded;
 }
 
 // The factor of the three scales of a Gaussian: those that the dial keeps grow with distance and dial; 1 for growth 0.

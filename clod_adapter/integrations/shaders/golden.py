@@ -33,7 +33,7 @@ TAU, EPS = 0.02, 1e-8
 
 def rows() -> list[list[Any]]:
     """The inputs: ordinary and extreme values, then both sides of each culling threshold."""
-    ordinary = itertools.product((0.03, 0.4, 1.0), (0.2, 1.5), (0.05, 1.2), (1.0, 2.5, 7.0), (EPS,), (TAU,))
+    ordinary = itertools.product((0.03, 0.4, 1.0), (0.2, 1.5), (0.05, 1.2), (0.0, 0.5, 1.0, 2.5, 7.0), (EPS,), (TAU,))
     extreme = itertools.chain(
         itertools.product((0.0, 1.0), (-1.0, 0.0, 1e30), (0.0,), (1.0, 100.0), (0.0, EPS), (TAU,)),
         itertools.product((0.9,), (-1.0, 0.0, 1e-25, 1e-6, 1e30), (1e-25, 1e-6, 1e4), (40.0,), (0.0, EPS), (1 / 255,)),
@@ -44,14 +44,14 @@ def rows() -> list[list[Any]]:
     for opacity, sigma, distance in itertools.product((0.3, 0.999), (0.1, 0.8, 4.0), (0.0, 1.2)):
         culled = _culled_at(opacity, sigma, distance)
         shares = (0.5, 0.9, 0.999, 1.001)  # of the dial value that culls it; fading begins between the first two
-        dials = [scale for scale in (culled * share for share in shares) if 1 <= scale <= 100]
+        dials = [scale for scale in (culled * share for share in shares) if scale <= 100]
         found += [list(map(_float32, (opacity, sigma, distance, scale, EPS, TAU))) for scale in dials]
     return [[*row, soft] for row in found for soft in (False, True)]
 
 
 def scale_rows() -> list[list[float]]:
     """The inputs: ordinary values on both sides of the reach, then products and factors that overflow."""
-    ordinary = itertools.product((-1.0, 0.0, 0.3, 0.75, 3.0), (0.2, 1.0, 4.2), (1.0, 2.5, 7.0), (1.0, 3.8))
+    ordinary = itertools.product((-1.0, 0.0, 0.3, 0.75, 3.0), (0.2, 1.0, 4.2), (0.0, 1.0, 2.5, 7.0), (1.0, 3.8))
     extreme = itertools.chain(
         itertools.product((-1.0, 0.0, 0.75), (0.0, 1e-30, 1e30), (1.0, 100.0), (1e-4, 1e4)),
         itertools.product((-1e4, 1e4), (0.0, 1e3), (40.0,), (1.0,)),

@@ -102,7 +102,7 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("eval missing.ply --images SCENE", "missing.ply: .*check the path"),
         ("eval PLY --images SCENE --against PLY text.ply", "text.ply: is not a PLY"),
         ("eval PLY --images SCENE --base missing.ply", "missing.ply: .*check the path"),
-        ("eval PLY --images SCENE --sv 1 0.5", "--sv has 0.5, dial values must be at least 1"),
+        ("eval PLY --images SCENE --sv=-0.5", "--sv has -0.5, it must be at least 0"),
         ("eval PLY --images SCENE --sv", "--sv: expected at least one argument.*clod-adapt eval --help"),
         ("eval PLY --images SCENE --keep 10", "base.ply: has no sigma_d, which --keep needs; adapt it first"),
         ("eval PLY --images SCENE --keep 0 --json", "--keep has 0, it must be positive"),
@@ -111,7 +111,7 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("eval PLY --images SCENE --sv 2 --keep 10", "--keep: not allowed with argument --sv"),
         ("eval DIALLED --images SCENE --psnr-drop 1", "dialled.ply: has no calibration .* --psnr-drop needs; adapt it"),
         ("render PLY --images SCENE --json", "required: -o/--out"),
-        ("render PLY --images SCENE -o pictures --sv 0", "--sv has 0"),
+        ("render PLY --images SCENE -o pictures --sv=-1", "--sv has -1"),
         ("render PLY --images nowhere -o pictures", "nowhere: is not a folder"),
         ("render PLY --images SCENE -o text.ply", "text.ply: text.ply is a file; choose another --out"),
         ("render PLY --images SCENE -o SCENE", "the scene's own photographs may be there"),
@@ -125,11 +125,11 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("export DIALLED -o folder.ply --sv 2", "folder.ply: is a folder"),
         ("export DIALLED -o nowhere/x.glb", "nowhere/x.glb: folder nowhere does not exist"),
         ("export DIALLED -o x.ply --fps 60", "dialled.ply: has no calibration .* --fps needs"),
-        ("export DIALLED -o x.ply --sv 0.5", "--sv has 0.5, dial values must be"),
+        ("export DIALLED -o x.ply --sv=-0.5", "--sv has -0.5, it must be"),
         ("export DIALLED -o x.ply --sv 2 --levels 1,2", "--levels gives the dial values; give no other"),
         ("export DIALLED -o page.html --levels 1,2", "remove --levels, --camera and --order"),
         ("export DIALLED -o page.html --order extinction", "remove --levels, --camera and --order"),
-        ("export DIALLED -o x.ply --levels 1,4,2", "--levels: '1,4,2' must be ascending dial values of at least 1"),
+        ("export DIALLED -o x.ply --levels 1,4,2", "--levels: '1,4,2' must be ascending dial values of at least 0"),
         ("export DIALLED -o x.ply --levels nan,2", "--levels: 'nan,2' must be"),
         ("export DIALLED -o x.ply --levels 1,inf", "--levels: '1,inf' must be"),
         ("export DIALLED -o x --lod-meta", "--lod-meta needs several levels; give them"),
@@ -165,7 +165,7 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("view PLY --port 65536", "--port is 65536, it must be between 1 and 65535"),
         ("view DIALLED --device-preset phone", "dialled.ply: stores no cameras, which --device-preset needs; give"),
         ("view dialled.glb --device-preset phone", "dialled.glb: stores no cameras, which --device-preset needs"),
-        ("view PLY --sv 0.5", "--sv is 0.5, it must be at least 1"),
+        ("view PLY --sv=-0.5", "--sv is -0.5, it must be at least 0"),
         ("robustness PLY PLY --images SCENE", "base.ply: is given twice"),
         ("robustness PLY --images SCENE --max-sv 1 0.5", "--max-sv is 0.5, it must be at least 1"),
         ("robustness PLY missing.ply --images SCENE", "missing.ply: .*check the path"),
@@ -189,7 +189,7 @@ LINES = """
 --help | eval --help | --version | render --help | export --help
 --nonsense | missing.ply --images SCENE | mesh.ply --images SCENE | PLY --images empty
 PLY --images SCENE --max-sv 0 | PLY --images SCENE --out nowhere/dial.ply
-eval PLY --images SCENE --sv 0 | eval PLY --images SCENE --keep 10 | render PLY --images SCENE -o SCENE
+eval PLY --images SCENE --sv=-1 | eval PLY --images SCENE --keep 10 | render PLY --images SCENE -o SCENE
 export PLY --sv 2 -o x.ply | export DIALLED --psnr-drop 2 -o x.ply | export DIALLED -o x.splat
 apply text.ply dial.safetensors -o dial.ply | inspect PLY
 view DIALLED DIALLED --device-preset phone | export PLY --device-preset phone -o x.ply

@@ -81,7 +81,7 @@ function show(model, base, cameras, dial) {
 /** Shows another model of the same scene and, if given, its base; the rest stays. */
 const replace = (model, base) => viewer.stage.show(upload(model), base ? upload(base) : viewer.stage.base);
 
-const clampDial = (dial) => Math.min(Math.max(dial, 1), viewer.stage.model.max_sv);
+const clampDial = (dial) => Math.min(Math.max(dial, 0), viewer.stage.model.max_sv);
 
 /** Shows a changed state, and removes the note, which was of the former one. */
 function update() {
@@ -104,7 +104,7 @@ function otherDial({ dial, other }) {
 const actions = {
   isFlying: () => viewer.controls.flying,
   setDial(dial) {
-    if (!(dial >= 1)) throw new Error(`the dial value is ${dial}; it must be at least 1`);
+    if (!(dial >= 0)) throw new Error(`the dial value is ${dial}; it must be at least 0`);
     viewer.stage.state.dial = dial;
     actions.setHold(null);
   },

@@ -55,7 +55,7 @@ export function createPlayback(elements, viewer, { update, clampDial }) {
     async enter(mode) {
       try {
         viewer.motion.stop();
-        const { state } = viewer.stage, turnDial = (factor) => { state.dial = clampDial(state.dial * factor); };
+        const { state } = viewer.stage, turnDial = (factor) => { state.dial = clampDial(Math.max(state.dial, 0.1) * factor); };
         await startXr(mode, { ...viewer, turnDial }, update);
       } catch (error) {
         viewer.ui.showMessage(`the headset does not start (${error.message})`);

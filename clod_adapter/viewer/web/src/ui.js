@@ -1,13 +1,20 @@
 // The panel: its texts and its controls. All controls are native, so that keys and screen readers work.
 
-const TICKS = 1000; // of a slider, in equal steps of log s
+const TICKS = 1000, BELOW = 100; // of a slider: to s = 1 in equal steps of s, which begins at 0, and then of log s
 const integer = new Intl.NumberFormat("en").format;
 
 export const elementsOf = (document) =>
   new Proxy({}, { get: (_, name) => document.getElementById(name.replace(/[A-Z]/g, (c) => `-${c.toLowerCase()}`)) });
 
-const toDial = (tick, maxDial) => (maxDial > 1 ? maxDial ** (tick / TICKS) : 1);
-const toTick = (dial, maxDial) => (maxDial > 1 ? Math.round((TICKS * Math.log(dial)) / Math.log(maxDial)) : 0);
+const ticksBelow = (maxDial) => (maxDial > 1 ? BELOW : TICKS);
+function toDial(tick, maxDial) {
+  const below = ticksBelow(maxDial);
+  return tick <= below ? tick / below : maxDial ** ((tick - below) / (TICKS - below));
+}
+function toTick(dial, maxDial) {
+  const below = ticksBelow(maxDial);
+  return Math.round(dial <= 1 ? dial * below : below + ((TICKS - below) * Math.log(dial)) / Math.log(maxDial));
+}
 
 /** PSNR at a dial value, interpolated linearly in log s between the calibration's rows; null outside their range. */
 function interpolatePsnr(rows, dial) {
@@ -66,7 +73,7 @@ export function createUi(elements, stage, actions) {
   }
 
   const comparison = () => (state.wipe === null ? "off" : state.other === "base" ? "base" : "dial");
-  const formatDial = (dial) => `s = ${dial.toFixed(2)}`;
+  const formatDial = (dial) => (dial === 0 ? "all" : `s = ${dial.toFixed(2)}`);
   const percent = (kept, total) => `${((100 * kept) / total).toFixed(kept === total ? 0 : 1)} %`;
 
   elements.dial.addEventListener("input", () => actions.setDial(toDial(elements.dial.value, maxDial())));
