@@ -29,9 +29,10 @@ def main() -> None:
     for scene in args.scenes:
         for change, make in CHANGES.items():
             row = run(scene, change, *make(checkpoint(scene).gaussians, photographs(scene)))
-            print(json.dumps(row), flush=True)
             if args.record:
                 append(FILE, row)
+            else:
+                print(json.dumps(row), flush=True)
 
 
 def run(scene: str, change: str, base: clod.Gaussians, views: clod.Scene) -> Row:

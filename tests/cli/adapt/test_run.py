@@ -20,6 +20,7 @@ from safetensors import safe_open
 import clod_adapter
 from clod_adapter.cli.adapt import inputs, result, setup
 from clod_adapter.cli.adapt import report as reporting
+from clod_adapter.cli.main import main
 from clod_adapter.cli.shared import measure
 from clod_adapter.cli.shared.report import machine_name, report_dials
 from clod_adapter.config import AdaptConfig
@@ -322,3 +323,20 @@ def test_faint_gaussians_lower_tau(clod: Any, capture: Any, tmp_path: Path) -> N
     report = json.loads(done.out)
     assert report["attenuation"]["tau"] < 0.003 and report["config"]["tau"] == 0.02
     assert any("the Gaussians are faint" in note for note in report["notes"])
+
+
+@pytest.mark.parametrize("photographs", [True, False])
+def test_a_result_worse_than_its_base_fails_unless_that_is_accepted(
+    capture: Any, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch, photographs: bool
+) -> None:
+    """The files are written all the same; the last line says by how much, and what to do."""
+    monkeypatch.chdir(tmp_path)
+    words = [str(capture.ply), *map(str, TINY), "--seed", "1"]
+    words += ["--images", str(capture.scene)] if photographs else []
+    bad = (-99.0, -98.0) if photographs else (99.0, 98.0)  # any result is
+    monkeypatch.setattr(reporting, "LOST" if photographs else "ENOUGH", bad)
+    for more, code in ((["--json"], 1), (["--json", "--accept-loss"], 0)):
+        assert main([*words, *more]) == code and (tmp_path / "dial.ply").exists()
+        found = json.loads(capsys.readouterr().out)
+        assert "dB" in found["loss"] and "train longer (--iters)" in found["loss"]
+        assert ("below the base" if photographs else "own renderings") in found["loss"]
