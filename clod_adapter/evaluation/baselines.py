@@ -24,7 +24,7 @@ def mean_kept(gaussians: Gaussians, cameras: Sequence[Camera], virtual_scale: fl
 
 
 def matching_dial(gaussians: Gaussians, cameras: Sequence[Camera], count: float) -> float:
-    """The dial value that keeps ``count`` on average, at most max_sv; 1 without a dial."""
+    """The dial value that keeps ``count`` on average, clamped to [1, max_sv]; 1 without a dial."""
     if gaussians.attenuation is None:
         return 1.0
     try:

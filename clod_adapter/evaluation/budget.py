@@ -36,7 +36,6 @@ from clod_adapter.progress import Listener
 from clod_adapter.render import dial
 
 TIMED_DIALS = 6
-LEAST = 1e-6  # dial value above 0 that every search ends at
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class DialValue:
     """The dial value that meets a budget.
 
     Attributes:
-        virtual_scale: the dial s, in [0, max_sv].
+        virtual_scale: the dial s, in [1, max_sv].
         note: one line where the budget has no effect, else empty.
     """
 
@@ -160,20 +159,19 @@ def _for_psnr_drop(calibration: Calibration | None, drop: float) -> DialValue:
 def _for_count(views: _Views, keep: float) -> DialValue:
     largest, wanted = views.config.max_sv, math.floor(keep * len(views))
     # Counts come from renderings, not from the roots: these differ by rounding.
-    most, fewest = views.count(0.0), views.count(largest)
+    most, fewest = views.count(1.0), views.count(largest)
     if wanted >= most:
-        return DialValue(0.0, f"s = 0 shows all {most / len(views):,.0f}" if wanted > most else "")
-    if wanted == views.count(1.0):
-        return DialValue(1.0)
+        note = f"s = 1 keeps {most / len(views):,.0f} of {len(views.gaussians):,} already" if wanted > most else ""
+        return DialValue(1.0, note)
     if wanted < fewest:
         raise ClodError(
             f"{keep:,.0f} Gaussians are out of reach: at s = {largest:g}, the largest dial value it was trained for, "
             f"{fewest / len(views):,.0f} are kept"
         )
-    pooled = torch.cat([scales[(scales > 0) & (scales <= largest)] for scales in views.extinction_scales()])
+    pooled = torch.cat([scales[(scales > 1) & (scales <= largest)] for scales in views.extinction_scales()])
     remaining = min(max(wanted - fewest, 0), len(pooled))  # of those culled within the range of the dial
     upper = float(pooled.kthvalue(len(pooled) - remaining + 1).values) if remaining > 0 else largest
-    lower = float(pooled.kthvalue(len(pooled) - remaining).values) if remaining < len(pooled) else LEAST
+    lower = float(pooled.kthvalue(len(pooled) - remaining).values) if remaining < len(pooled) else 1.0
     return DialValue(_polished(math.sqrt(lower * upper), views, wanted))
 
 
@@ -181,9 +179,9 @@ def _polished(guess: float, views: _Views, wanted: int) -> float:
     """The dial value near ``guess`` that keeps ``wanted``; where ties prevent it, the smallest that keeps fewer."""
     if views.count(guess) == wanted:
         return guess
-    low, high = max(guess * (1 - 1e-4), LEAST), min(guess * (1 + 1e-4), views.config.max_sv)
+    low, high = max(guess * (1 - 1e-4), 1.0), min(guess * (1 + 1e-4), views.config.max_sv)
     if views.count(low) <= wanted:
-        low = LEAST
+        low = 1.0
     if views.count(high) > wanted:
         high = views.config.max_sv
     while high / low > 1 + 1e-9:

@@ -84,7 +84,9 @@ def test_against_at_matched_counts(clod: Any, capture: Any, dialled: Path, tmp_p
     pairs = [(Path(e["model"]).name, e["theirs"]["kept"], e["ours"]["kept"]) for e in report["against"]]
     assert [name for name, *_ in pairs] == ["few.ply", capture.ply.name, "dial.ply", "dial.ply"]
     assert pairs[0][1] == count == pytest.approx(pairs[0][2], abs=1)
-    assert pairs[1][1:] == (300, 300)  # at s = 0
+    assert pairs[1][1] == 300 > pairs[1][2] == report["rows"][0]["kept"]
+    (note,) = [note for note in report["notes"] if "keeps 300 Gaussians" in note]
+    assert note in done.err and "at most" in note
     for own, row in zip(report["against"][2:], report["rows"], strict=True):  # compared with itself
         assert own["theirs"]["psnr"] == row["psnr"] and own["ours"]["kept"] == pytest.approx(row["kept"], rel=2e-3)
     assert "the dial value with the same count" in done.err

@@ -63,7 +63,7 @@ def test_outputs_of_all_cells(run: Any, clod: Any, tmp_path: Path) -> None:
         assert ("log10_sigma_d" in cell["distribution"]) == (cell["max_sv"] is not None)
     with open(folder / "robustness.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * (len(BASELINE_SHARES) + 12)
+    assert len(rows) == 2 * (len(BASELINE_SHARES) + 8)
     (row,) = [r for r in rows if (r["checkpoint"], r["max_sv"], r["virtual_scale"]) == ("masked", "1.0", "2.0")]
     assert float(row["psnr"]) == at(report["cells"][4], 2)["psnr"] and row["within_range"] == "False"
     assert Image.open(folder / "robustness.png").size[0] > 2000

@@ -127,7 +127,7 @@ def test_the_dial_value_of_the_commands(monkeypatch: pytest.MonkeyPatch) -> None
     assert chosen(2.0) == 2.0
     monkeypatch.setenv("CLOD_VIRTUAL_SCALE", "3.5")
     assert chosen(2.0) == 3.5
-    for text in ("far", "0.5"):
+    for text in ("far", "-0.5"):
         monkeypatch.setenv("CLOD_VIRTUAL_SCALE", text)
         with pytest.raises(ClodError, match=f"CLOD_VIRTUAL_SCALE is '{text}', it must be a number of at least 0"):
             chosen(2.0)

@@ -88,10 +88,10 @@ export function countAt(scales, dial) {
   return low;
 }
 
-/** The smallest dial value in [0, maxSv] that keeps at most `target` Gaussians (budget.dial_for), and the number kept. */
+/** The smallest dial value in [1, maxSv] that keeps at most `target` Gaussians (budget.dial_for), and the number kept. */
 export function dialForCount(scales, target, maxSv) {
-  const maxCount = countAt(scales, 0), minCount = countAt(scales, maxSv);
-  if (target >= maxCount) return { dial: 0, kept: maxCount };
+  const maxCount = countAt(scales, 1), minCount = countAt(scales, maxSv);
+  if (target >= maxCount) return { dial: 1, kept: maxCount };
   if (target <= minCount) return { dial: maxSv, kept: minCount };
   const dial = Math.min(Math.sqrt(scales[target - 1] * scales[target]), maxSv);
   return { dial, kept: countAt(scales, dial) };
