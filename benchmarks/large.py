@@ -18,13 +18,14 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import clod_adapter as clod
 from clod_adapter.evaluation.baselines import matching_dial
 from common import COMMAND, ROOT, Process, Row, append, arguments, stored, table
 
-FILE, VIEWS, SEED = "large.jsonl", 16, 77
+FILE, VIEWS, SEED, LONGEST = "large.jsonl", 16, 77, 40.0
 OTHERS = {"decimated": "--decimate", "decimated adaptively": "--decimate-adaptive"}
 
 
@@ -53,13 +54,15 @@ def compared(finest: Path, levels: list[Path], adapted: Path | None, folder: Pat
         run = Process([*COMMAND, finest, "--max-sv", 5, "--out", out, "--json", "--accept-loss"])
         yield {"method": "run", "steps": json.loads(run.out)["steps"], **run.cost()}
     dial = clod.load(out).gaussians
+    assert dial.attenuation is not None
+    longer = dial.replace(attenuation=replace(dial.attenuation, max_sv=LONGEST))  # beyond what was trained
     counts = [len(clod.load(level).gaussians) for level in levels]
     for label, s in (("s = 1", 1.0), ("s = 2", 2.0), ("s = 5", 5.0)):
         (row,) = clod.evaluate(dial, views, [s])
         yield {"method": "dial", "level": label, "gaussians": row.kept, "share": row.kept_share, "psnr": row.psnr}
     for count, level in zip(counts, levels, strict=True):
         share = count / len(base)
-        (row,) = clod.evaluate(dial, views, [matching_dial(dial, cameras, count)])
+        (row,) = clod.evaluate(dial, views, [matching_dial(longer, cameras, count)])
         yield {"method": "dial", "level": level.stem, "gaussians": row.kept, "share": row.kept_share, "psnr": row.psnr}
         for name, file in rivals(finest, level, count, folder):
             if file is None:
