@@ -52,7 +52,8 @@ def row(gaussians: clod.Gaussians, views: list[clod.View], points: Tensor) -> di
     guess = guess_frame(gaussians, views, found, points) if suspect else None
     numbers = {key: round(value, 3) for key, value in found.as_dict().items()}
     return {
-        "stops": not found.fits or guess is not None, **numbers, "guess": guess and guess.description,
+        "fits": found.fits and guess is None, **numbers, "guess": guess and guess.frame.description,
+        "clear": guess and guess.clear,
         "guess_psnr": guess and round(guess.psnr, 2), "check_cpu_s": round(checked - began, 2),
         "guess_cpu_s": round(time.process_time() - checked, 2) if suspect else None,
     }  # fmt: skip

@@ -20,12 +20,12 @@ from pathlib import Path
 
 import clod_adapter as clod
 from clod_adapter.calibration import Viewpoint
+from clod_adapter.cameras import spread
 from clod_adapter.cli.export.baking import PLACED
 from clod_adapter.cli.shared.budgets import VIEWPOINTS
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.distances import viewpoint_of
 from clod_adapter.equation.extinction import extinction_scale
-from clod_adapter.initialization.importance import spread
 from common import append, arguments, photographs, print_rows
 
 import torch

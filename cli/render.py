@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PureWindowsPath
 from statistics import fmean
 from typing import Any
@@ -22,6 +22,7 @@ from clod_adapter.io.lock import output_lock
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
 
+from .shared.alignment import align
 from .shared.antialiasing import with_filter
 from .shared.budgets import solve_dials
 from .shared.console import Console, put
@@ -49,6 +50,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
     model, _, scene, device = read_model_and_scene(args, console)
     prepare_kernels(console, device, training=False)
+    aligned = align(model, scene, args.images, console, required=False)
+    scene = replace(aligned.scene, notes=(*scene.notes, *aligned.notes))
     model = with_filter(model, args, console, [*scene.test, *scene.train])
     views = pick_views(scene, args.views)
     check_images([out / name for name in image_names(views)], args)

@@ -22,7 +22,7 @@ from clod_adapter.report.robustness_figure import robustness_figure
 
 from .commands.settings import make_configs
 from .robustness_cells import Cell, cells_of
-from .shared.alignment import require_alignment
+from .shared.alignment import align
 from .shared.antialiasing import with_filter
 from .shared.console import Console, Meter, clipped, duration, put
 from .shared.devices import on_device, pick_device
@@ -52,20 +52,17 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     with watch.time("kernels"):
         prepare_kernels(console, device, training=False)
     with watch.time("evaluate"):
+        scene, notes = aligned_scene(checkpoints, scene, args, console)
         checkpoints = [with_filter(each, args, console, scene.test) for each in checkpoints]
     cells = plan(args, checkpoints, scene)
     found = {cell.name: read for cell in cells if (read := cell.read())}
-    missing, notes = [cell for cell in cells if cell.name not in found], list[str]()
+    missing = [cell for cell in cells if cell.name not in found]
     if found:
         console.say(f"{len(found)} of {len(cells)} cells are done already: {', '.join(found)}")
     if missing:
         with watch.time("kernels"):
             for screen_filter in dict.fromkeys(each.gaussians.screen_filter for each in checkpoints):
                 prepare_kernels(console, device, screen_filter=screen_filter)
-        with watch.time("evaluate"):
-            for checkpoint in checkpoints:
-                if any(cell.checkpoint is checkpoint for cell in missing):
-                    notes += require_alignment(checkpoint, scene, args, console)[1]
     make_folder(folder)  # only now: input that cannot be read leaves no folder
     make_folder(folder / "cells")
     check_outputs(outputs.values(), args.ply, args.images)
@@ -94,6 +91,23 @@ def read_checkpoints(args: argparse.Namespace, console: Console) -> list[Checkpo
         if found[-1].gaussians.sigma_d is not None:
             console.say(f"  note: the dial of {path} is ignored")
     return found
+
+
+def aligned_scene(
+    checkpoints: Sequence[Checkpoint], scene: Scene, args: argparse.Namespace, console: Console
+) -> tuple[Scene, list[str]]:
+    """The scene in the checkpoints' frame, and notes.
+
+    Raises:
+        ClodError: a checkpoint does not match, or they are in different frames.
+    """
+    notes = list[str]()
+    for number, checkpoint in enumerate(checkpoints):
+        aligned = align(checkpoint, scene, args.images, console, required=not args.misaligned_ok)
+        if number and aligned.scene is not scene:
+            raise ClodError(f"{checkpoint.path}: in another frame than {checkpoints[0].path}; give it alone")
+        scene, notes = aligned.scene, [*notes, *aligned.notes]
+    return scene, notes
 
 
 def plan(args: argparse.Namespace, checkpoints: Sequence[Checkpoint], scene: Scene) -> list[Cell]:

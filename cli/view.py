@@ -14,7 +14,6 @@ from clod_adapter._support.text import as_text
 from clod_adapter._support.version import package_version
 from clod_adapter.cameras import Camera
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.scene.poses import load_cameras
 from clod_adapter.progress import Stopped
 from clod_adapter.viewer.page import policy, served_page
 from clod_adapter.viewer.payload import Payload, page_config
@@ -22,6 +21,7 @@ from clod_adapter.viewer.server import Response, Server
 
 from .commands.checks import check_stored_cameras
 from .commands.view import view_files
+from .shared.alignment import read_cameras
 from .shared.antialiasing import with_filter, with_filter_of
 from .shared.browsers import open_browser
 from .shared.budgets import solve_dials
@@ -63,7 +63,7 @@ def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Res
     if args.base:
         base = with_filter(read_checkpoint(args.base, console, args.activated, model.origin), args, console)
         base = with_filter_of(base, model, args)
-    cameras, notes = load_cameras(args.images, model.origin) if args.images else (list[Camera](), list[str]())
+    cameras, notes = read_cameras(model, args.images, console) if args.images else (list[Camera](), list[str]())
     attenuation = model.gaussians.attenuation
     solved, asked = solve_dials(args, model, cameras or model.viewpoints, console)
     opening = solved[0] if args.device_preset and solved else args.sv

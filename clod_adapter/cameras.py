@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from clod_adapter._support.arrays import float_tensor, tensor_of
 from clod_adapter.errors import ClodError
 
+T = TypeVar("T")
 NEAR = 0.01
 """Distance of the near plane, world units, as in gsplat."""
 SMALLEST = 128  # pixels a side that an image of half the size has at least: smaller ones show too little
@@ -185,15 +187,20 @@ def near_plane(extent: float) -> float:
 
 
 def in_its_unit(scene: Scene) -> Scene:
-    """The scene with its near planes scaled by the extent of its cameras, if that is below 1.
+    """The scene with the near planes of ``near_plane``.
 
-    A scene in kilometres would otherwise lie in front of the near plane. Larger scenes keep 0.01.
+    A scene in kilometres would otherwise lie in front of the near plane. Cameras in one place keep theirs.
     """
     extent = camera_extent([view.camera for view in (*scene.train, *scene.test)])
-    if not 0 < extent < SMALL_EXTENT:
+    if extent == 0:
         return scene
 
     def nearer(views: tuple[View, ...]) -> tuple[View, ...]:
         return tuple(view.at(replace(view.camera, near=near_plane(extent))) for view in views)
 
     return replace(scene, train=nearer(scene.train), test=nearer(scene.test))
+
+
+def spread(views: Sequence[T], most: int) -> Sequence[T]:
+    """At most ``most`` of the views, evenly spread."""
+    return [views[k * len(views) // most] for k in range(most)] if len(views) > most else views

@@ -13,7 +13,7 @@ from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.progress import Stopped
 
-from ..shared.alignment import require_alignment
+from ..shared.alignment import align
 from ..shared.antialiasing import with_filter
 from ..shared.devices import on_device, pick_device
 from ..shared.inputs import place_scene, read_checkpoint, read_scene, with_pseudo_views
@@ -57,19 +57,22 @@ def read_inputs(setup: Setup) -> Inputs:
         photographs = read_scene(args.images, console, base.origin, image_cache(args)) if args.images else None
     with watch.time("kernels"):
         prepare_kernels(console, base.gaussians.means.device)
+    config, alignment, notes = setup.config, None, list[str]()
+    if photographs is not None:
+        with watch.time("evaluate"):
+            aligned = align(base, photographs, args.images, console, required=not args.misaligned_ok)
+            photographs, alignment, notes = aligned.scene, aligned.numbers, list(aligned.notes)
     with watch.time("evaluate"):
         views = [] if photographs is None else [*photographs.test, *photographs.train]
         base = with_filter(base, args, console, views)
     if base.gaussians.screen_filter.compensate:
         with watch.time("kernels"):
             prepare_kernels(console, base.gaussians.means.device, screen_filter=base.gaussians.screen_filter)
-    config, alignment, notes = setup.config, None, list[str]()
     if photographs is None:
         with watch.time("place"):
             scene, config = place_scene(base.gaussians, config, console)
     else:
         with watch.time("evaluate"):
-            alignment, notes = require_alignment(base, photographs, args, console)
             scene, config = with_pseudo_views(base.gaussians, photographs, config, console)
     return Inputs(base, scene, config, alignment, plan_memory(args, base, scene, console), tuple(notes))
 

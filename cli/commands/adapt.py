@@ -136,9 +136,10 @@ plan:
   --trim not at all.
 
 alignment:
-  Renders of eight views are compared with the photographs. If the photographs'
-  mean colours, another frame (axes, scale, offset, normalised) or a white
-  background fit better, the command stops and says which.
+  Renders of eight views are compared with the photographs. Where they match in
+  another frame (gsplat's or nerfstudio's normalization, axes, scale and offset,
+  inverted or OpenGL poses), the cameras are moved into it, and a line says so.
+  What matches in no frame, or over white, stops.
 
 watched views:
   One in 24 training views, at least 2, is not trained on. They decide the share

@@ -12,10 +12,10 @@ from clod_adapter.cameras import Camera, View
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.scene.poses import load_cameras
 from clod_adapter.progress import Stopped
 from clod_adapter.training.camera_placement import place_cameras
 
+from ..shared.alignment import align, read_cameras
 from ..shared.console import Console
 from ..shared.inputs import read_scene
 from ..shared.kernels import prepare_kernels
@@ -44,14 +44,14 @@ class Target:
 def find_target(args: argparse.Namespace, model: Checkpoint, console: Console) -> tuple[Target, list[str]]:
     """The cameras of --camera, --images or the model's file, else placed ones; and notes on them."""
     if args.camera is not None:
-        cameras, notes = load_cameras(args.images, model.origin)
+        cameras, notes = read_cameras(model, args.images, console)
         found = named(cameras, args.camera, "--camera")
         if len(found) > 1:
             both = f"{found[0].name} and {found[1].name}"
             raise ClodError(f"--camera: {args.camera!r} matches {both}; give the full name")
         return Target(found[0], found, "one camera"), notes
     if args.images is not None:
-        cameras, notes = load_cameras(args.images, model.origin, training=True)
+        cameras, notes = read_cameras(model, args.images, console, training=True)
         return Target(None, cameras, f"{len(cameras)} training cameras"), notes
     if model.viewpoints:
         return Target(None, model.viewpoints, f"{len(model.viewpoints)} training cameras"), []
@@ -101,6 +101,7 @@ def measure_drop(
         raise ClodError(f"{args.images}: there are no held-out photographs to measure on; give at least two")
     assert model.gaussians.attenuation is not None
     prepare_kernels(console, model.gaussians.means.device, training=False)
+    scene = align(model, scene, args.images, console, required=False).scene
     photographs = Photographs(scene.test, _psnr(model.gaussians, scene.test, console, "dial, s=1"))
 
     def lost(s: float) -> float:

@@ -1,61 +1,122 @@
-"""The alignment of checkpoint and photographs, checked before training."""
+"""The alignment of checkpoint and photographs: cameras are moved into the checkpoint's frame."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 
-from clod_adapter.alignment.check import DOUBTFUL, Alignment, check_alignment
+from clod_adapter.alignment.check import DOUBTFUL, MOST_VIEWS, Alignment, check_alignment
 from clod_adapter.alignment.frames import focus_of
-from clod_adapter.alignment.search import Guess, guess_frame
-from clod_adapter.cameras import Scene, View
+from clod_adapter.alignment.search import Guess, cameras_in, guess_frame, scene_in
+from clod_adapter.cameras import Camera, Scene, View
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.colmap import load_points
+from clod_adapter.io.scene.load import load_scene
+from clod_adapter.io.scene.poses import load_cameras
 from clod_adapter.origin import Origin
 
 from .console import Console
+from .kernels import prepare_kernels
 
 OTHER_COLOURS = (
     "warning: {ply} matches the photographs in {images}, but some differ more from it than from their own mean "
     "colours; check for another exposure, views that it does not cover, or a poor checkpoint"
 )
+SMALL = 320  # pixels, width of photographs that only tell the frame
 FLAT = "warning: the photographs in {images} have a single colour each, on which the checkpoint is trained"
 
 
-def require_alignment(
-    checkpoint: Checkpoint, scene: Scene, args: argparse.Namespace, console: Console
-) -> tuple[dict[str, Any], list[str]]:
-    """Compares renders with the photographs; for a poor match also in other frames, which takes some seconds.
+@dataclass(frozen=True)
+class Aligned:
+    """The scene with its cameras in the checkpoint's frame.
 
-    Returns:
-        The numbers of ``check_alignment`` and the ``guess``, for the report; and notes.
+    Attributes:
+        numbers: of ``check_alignment``, in the frame given; ``guess``, another frame that fits, in words; and
+            ``frame``, the one that the cameras were moved to, with its ``psnr``. For the report.
+        notes: for the report, printed already.
+    """
+
+    scene: Scene
+    numbers: dict[str, Any]
+    notes: tuple[str, ...] = ()
+
+
+def align(checkpoint: Checkpoint, scene: Scene, images: str, console: Console, *, required: bool) -> Aligned:
+    """Compares renders with the photographs; after a poor match tries other frames, and uses one that fits clearly.
+
+    Args:
+        required: raises where the checkpoint fits in no frame; otherwise warns.
 
     Raises:
-        ClodError: the checkpoint does not match, or matches clearly better in another frame; not with --misaligned-ok.
+        ClodError: the checkpoint does not match.
     """
     base, ply, views = checkpoint.gaussians, checkpoint.path, [*scene.test, *scene.train]
     with console.status("comparing the checkpoint with the photographs ..."):
         found = check_alignment(base, views)
-    guess = None
-    if not found.on_white and (not found.fits or found.margin < DOUBTFUL):
-        with console.status("poor match: trying other frames ..."):
-            guess = guess_frame(base, views, found, load_points(args.images, checkpoint.origin))
-    numbers = found.as_dict() | {"guess": guess and guess.description}
+    guess = _other_frame(checkpoint, views, found, images, console)
+    numbers = found.as_dict() | {"guess": guess and guess.frame.description, "frame": None}
+    if guess and guess.clear:
+        note = _moved(checkpoint, images, found, guess)
+        console.say(note)
+        frame = guess.frame.as_dict() | {"psnr": guess.psnr}
+        return Aligned(scene_in(scene, guess.frame), numbers | {"frame": frame}, (note,))
     if found.fits and guess is None:
-        notes = [FLAT.format(images=args.images)] if not found.views else []
-        notes += [OTHER_COLOURS.format(ply=ply, images=args.images)] if found.margin < 0 else []
-        for note in notes:
-            console.say(note)
-        return numbers, notes
-    message = f"{ply}: does not match {args.images}: {mismatch(checkpoint, views, found, guess)}"
-    if not args.misaligned_ok:
-        raise ClodError(f"{message}; use --misaligned-ok to train anyway")
-    console.say(f"warning: {message}")
-    return numbers, [f"warning: {message}"]
+        notes = [FLAT.format(images=images)] if not found.views else []
+        notes += [OTHER_COLOURS.format(ply=ply, images=images)] if found.margin < 0 else []
+    else:
+        message = f"{ply}: does not match {images}: {mismatch(checkpoint, views, found, guess)}"
+        if required:
+            raise ClodError(f"{message}; use --misaligned-ok to train anyway")
+        notes = [f"warning: {message}"]
+    for note in notes:
+        console.say(note)
+    return Aligned(scene, numbers, tuple(notes))
+
+
+def read_cameras(
+    model: Checkpoint, images: str, console: Console, *, training: bool = False
+) -> tuple[list[Camera], list[str]]:
+    """``load_cameras``, moved into the model's frame, which few small photographs tell; and notes."""
+    cameras, notes = load_cameras(images, model.origin, training=training)
+    try:
+        scene = load_scene(images, origin=model.origin, max_width=SMALL, most=MOST_VIEWS)
+    except ClodError:  # cameras alone will do
+        return cameras, notes
+    prepare_kernels(console, model.gaussians.means.device, training=False)
+    views = [*scene.test, *scene.train]
+    found = check_alignment(model.gaussians, views)
+    every = load_cameras(images, model.origin)[0] if training else cameras
+    guess = _other_frame(model, views, found, images, console, every)
+    if guess is None or not guess.clear:
+        return cameras, notes
+    return cameras_in(cameras, guess.frame), [*notes, _moved(model, images, found, guess)]
+
+
+def _moved(checkpoint: Checkpoint, images: str, found: Alignment, guess: Guess) -> str:
+    return (
+        f"{images}: the cameras are moved into the frame of {checkpoint.path} ({guess.frame.name}): renders have "
+        f"{guess.psnr:.1f} dB there, {found.psnr:.1f} dB as given"
+    )
+
+
+def _other_frame(
+    checkpoint: Checkpoint,
+    views: Sequence[View],
+    found: Alignment,
+    images: str,
+    console: Console,
+    cameras: Sequence[Camera] = (),
+) -> Guess | None:
+    """Another frame that explains the photographs better, sought where the given one explains them poorly."""
+    if found.on_white or (found.fits and not found.margin < DOUBTFUL):
+        return None
+    with console.status("poor match: trying other frames ..."):
+        points = load_points(images, checkpoint.origin)
+        return guess_frame(checkpoint.gaussians, views, found, points, cameras)
 
 
 def mismatch(checkpoint: Checkpoint, views: Sequence[View], found: Alignment, guess: Guess | None) -> str:
@@ -73,7 +134,7 @@ def mismatch(checkpoint: Checkpoint, views: Sequence[View], found: Alignment, gu
             "photographs with a transparent background (PNG; composited over black), or a checkpoint trained on black"
         )
     if guess:
-        return f"{facts}; in another frame renders have {guess.psnr:.1f} dB: {guess.description}"
+        return f"{facts}; in another frame renders have {guess.psnr:.1f} dB: {guess.frame.description}"
     return f"{facts}; {positions(checkpoint, views)}; give the checkpoint of this scene, in the cameras' frame"
 
 

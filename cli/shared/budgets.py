@@ -6,13 +6,12 @@ import argparse
 from collections.abc import Sequence
 
 from clod_adapter.calibration import Calibration, Viewpoint
-from clod_adapter.cameras import Camera, Scene
+from clod_adapter.cameras import Camera, Scene, spread
 from clod_adapter.equation.distances import viewpoint_of
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for, dial_for_times, frame_times
 from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import spread
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.origin import Origin
 

@@ -21,11 +21,10 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import View
+from clod_adapter.cameras import View, spread
 from clod_adapter.config import require
 from clod_adapter.equation.distances import in_frustum
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import spread
 from clod_adapter.losses import unit
 from clod_adapter.render import render
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -33,15 +34,36 @@ NERFSTUDIO_TURNS = (
 
 @dataclass(frozen=True)
 class Frame:
-    """A candidate frame of the file.
+    """A frame of the file, ``x_cameras = scale R x_file + offset``, after the poses were corrected.
 
     Attributes:
+        name: for the report, like ``gsplat``.
         description: cause and remedy, for messages.
-        viewmats: ``[V, 4, 4]`` the cameras in that frame.
+        rotation: ``[3, 3]`` R; a mirrored frame has determinant -1.
+        scale, offset: > 0, and ``[3]`` in the cameras' world units.
+        inverted: the poses given are camera to world.
+        opengl: the cameras look along -z with y up.
     """
 
+    name: str
     description: str
-    viewmats: Tensor
+    rotation: Tensor
+    scale: float
+    offset: Tensor
+    inverted: bool = False
+    opengl: bool = False
+
+    def of(self, viewmats: Tensor) -> Tensor:
+        """``[V, 4, 4]`` float64, world to camera in the file's frame, of cameras as they were given."""
+        viewmats = torch.linalg.inv(viewmats.double()) if self.inverted else viewmats.double()
+        if self.opengl:
+            viewmats = torch.diag(viewmats.new_tensor([1.0, -1, -1, 1])) @ viewmats
+        return into_file(viewmats, self.rotation, self.scale, self.offset)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The fields but ``description``, for reports."""
+        fields = {"name": self.name, "rotation": self.rotation.tolist(), "scale": self.scale}
+        return fields | {"offset": self.offset.tolist(), "inverted": self.inverted, "opengl": self.opengl}
 
 
 def known_frames(viewmats: Tensor, points: Tensor | None = None) -> list[Frame]:
@@ -51,7 +73,7 @@ def known_frames(viewmats: Tensor, points: Tensor | None = None) -> list[Frame]:
         viewmats: ``[V, 4, 4]`` float64, of all cameras: trainers normalize by all of them.
         points: ``[M, 3]`` of the COLMAP model, world units; gsplat's trainer uses them for its normalization.
     """
-    return [*_poses(viewmats), *_axes(viewmats), *_nerfstudio(viewmats), *_gsplat(viewmats, points)]
+    return [*_poses(), *_axes(viewmats), *_nerfstudio(viewmats), *_gsplat(viewmats, points)]
 
 
 def into_file(viewmats: Tensor, rotation: Tensor, scale: float, offset: Tensor) -> Tensor:
@@ -82,20 +104,29 @@ def median(rows: Tensor) -> Tensor:
     return rows.quantile(0.5, dim=0)
 
 
-def _poses(viewmats: Tensor) -> Iterator[Frame]:
+def _poses() -> Iterator[Frame]:
     """Wrong conventions of the individual poses."""
-    backward = torch.diag(viewmats.new_tensor([1.0, -1, -1, 1]))
-    inverse = torch.linalg.inv(viewmats)
+    here = torch.eye(3, dtype=torch.float64), 1.0, torch.zeros(3, dtype=torch.float64)
     yield Frame(
+        "OpenGL poses",
         "the cameras look along -z with y up (OpenGL), where COLMAP's look along z with y down: negate the y and z "
         "axes of their poses",
-        backward @ viewmats,
+        *here,
+        opengl=True,
     )
-    yield Frame("the poses are camera to world, where COLMAP's are world to camera: invert them", inverse)
     yield Frame(
+        "inverted poses",
+        "the poses are camera to world, where COLMAP's are world to camera: invert them",
+        *here,
+        inverted=True,
+    )
+    yield Frame(
+        "inverted OpenGL poses",
         "the poses are camera to world in OpenGL's axes, where COLMAP's are world to camera: negate their y and z axes "
         "and invert them",
-        backward @ inverse,
+        *here,
+        inverted=True,
+        opengl=True,
     )
 
 
@@ -112,7 +143,7 @@ def _axes(viewmats: Tensor) -> Iterator[Frame]:
             description = (
                 f"the cameras' x, y, z are the file's {names}{mirrored}: export the checkpoint without that rotation"
             )
-            yield Frame(description, into_file(viewmats, rotation, 1.0, viewmats.new_zeros(3)))
+            yield Frame(f"axes {names}", description, rotation, 1.0, viewmats.new_zeros(3))
 
 
 def _nerfstudio(viewmats: Tensor) -> Iterator[Frame]:
@@ -124,7 +155,7 @@ def _nerfstudio(viewmats: Tensor) -> Iterator[Frame]:
         rotation = _turning(up, viewmats.new_tensor([0.0, 0, 1]))
         farthest = float(((centres - centres.mean(0)) @ rotation.T).abs().max())
         if farthest > 0:
-            yield Frame(NERFSTUDIO, _normalised(viewmats, rotation @ turn, 1 / farthest, -rotation @ centres.mean(0)))
+            yield _normalized("nerfstudio", NERFSTUDIO, rotation @ turn, 1 / farthest, -rotation @ centres.mean(0))
 
 
 def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
@@ -136,7 +167,7 @@ def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
     distance = float((centres - focus).norm(dim=1).quantile(0.5))
     if distance == 0:
         return
-    yield Frame(GSPLAT, _normalised(viewmats, rotation, 1 / distance, -focus))
+    yield _normalized("gsplat", GSPLAT, rotation, 1 / distance, -focus)
     if points is None or len(points) < 3:
         return
     turned = points.to(viewmats) @ rotation.T
@@ -145,12 +176,12 @@ def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
     axes = axes * torch.linalg.det(axes).sign()
     for signs in ((1.0, 1, 1), (1.0, -1, -1), (-1.0, 1, -1), (-1.0, -1, 1)):  # eigenvectors have no sign
         turn = torch.diag(viewmats.new_tensor(signs)) @ axes
-        yield Frame(GSPLAT, _normalised(viewmats, turn @ rotation, 1 / distance, -turn @ middle))
+        yield _normalized("gsplat", GSPLAT, turn @ rotation, 1 / distance, -turn @ middle)
 
 
-def _normalised(viewmats: Tensor, rotation: Tensor, scale: float, offset: Tensor) -> Tensor:
-    """The cameras in the file's frame, for ``x_file = scale (rotation x_cameras + offset)``."""
-    return into_file(viewmats, rotation.T, 1 / scale, -rotation.T @ offset)
+def _normalized(name: str, description: str, rotation: Tensor, scale: float, offset: Tensor) -> Frame:
+    """The frame of ``x_file = scale (rotation x_cameras + offset)``."""
+    return Frame(name, description, rotation.T, 1 / scale, -rotation.T @ offset)
 
 
 def _turning(source: Tensor, target: Tensor) -> Tensor:

@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from clod_adapter.alignment.check import DOUBTFUL
-from clod_adapter.cameras import View
+from clod_adapter.cameras import View, spread
 from clod_adapter.config import FILTERS, ScreenFilter
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import spread
 from clod_adapter.losses import unit
 from clod_adapter.render import render
 

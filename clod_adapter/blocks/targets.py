@@ -13,12 +13,11 @@ from torch import Tensor
 
 from clod_adapter.adapter import detach
 from clod_adapter.blocks.divide import Division
-from clod_adapter.cameras import Camera, View
+from clod_adapter.cameras import Camera, View, spread
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.distances import normalized_distances, typical_distance
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.coverage import coverage
-from clod_adapter.initialization.importance import spread
 from clod_adapter.losses import unit
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import dial, splat

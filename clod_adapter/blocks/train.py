@@ -28,11 +28,11 @@ from torch import Tensor
 
 from clod_adapter.blocks.divide import Division
 from clod_adapter.blocks.targets import block_config, block_target, context_rows, target_image
-from clod_adapter.cameras import Scene, View
+from clod_adapter.cameras import Scene, View, spread
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import MOST_VIEWS, spread
+from clod_adapter.initialization.importance import MOST_VIEWS
 from clod_adapter.io.scene.image_cache import ImageCache
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.training.loop import adapt

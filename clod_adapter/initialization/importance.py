@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TypeVar
 
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import View
+from clod_adapter.cameras import View, spread
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.equation.distances import median_distance, typical_distance
@@ -23,8 +22,6 @@ from clod_adapter.initialization.growth_start import initial_growth
 from clod_adapter.initialization.pruning_order import pruning_order
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
-
-T = TypeVar("T")
 
 # With a sigma_d beyond this many times the distance times the largest dial value, opacity and gradient change by less
 # than a thousandth there: such a sigma would never change in training.
@@ -145,11 +142,6 @@ def fitting_tau(opacities: Tensor, error: Tensor, config: AdaptConfig) -> float:
     opaque = float(ordered[-wanted]) / config.max_sv
     lowered = min(max(faint / FADING, TAU_MIN), max(opaque / FADING, TAU_MIN))
     return min(config.tau, float(f"{lowered:.6g}"))
-
-
-def spread(views: Sequence[T], most: int) -> Sequence[T]:
-    """At most ``most`` of the views, evenly spread."""
-    return [views[k * len(views) // most] for k in range(most)] if len(views) > most else views
 
 
 def scene_distance(base: Gaussians, views: Sequence[View]) -> float:

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor, nn
 
-from clod_adapter.cameras import Camera, Scene, StoredView, View
+from clod_adapter.cameras import Camera, Scene, StoredView, View, spread
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.attenuation import Attenuated, attenuate
 from clod_adapter.equation.distances import typical_distance
@@ -35,7 +35,7 @@ from clod_adapter.equation.growth import GROWTH_RANGE
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import MOST_VIEWS, for_training, initialize, spread, usable_views
+from clod_adapter.initialization.importance import MOST_VIEWS, for_training, initialize, usable_views
 from clod_adapter.integrations.splats import NAMES, from_gsplat
 from clod_adapter.progress import Listener, shown
 from clod_adapter.render import dial as dialled_by

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import Scene, View
+from clod_adapter.cameras import Scene, View, spread
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, initialize, removal_error, spread
+from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, initialize, removal_error
 from clod_adapter.progress import Listener, Phase, tell, within
 from clod_adapter.training.ablation import needed_share, seen, sh_degree_losses
 from clod_adapter.training.loop import require_trainable, training_views

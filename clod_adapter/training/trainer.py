@@ -10,7 +10,7 @@ from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.cameras import View
+from clod_adapter.cameras import View, spread
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.equation.growth import GROWTH_RANGE
@@ -18,7 +18,7 @@ from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.finite import LossNotFinite, require_finite, spoilt_rows
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import MOST_VIEWS, spread
+from clod_adapter.initialization.importance import MOST_VIEWS
 from clod_adapter.training.distributed import ProcessGroup
 from clod_adapter.training.gate import Gate
 from clod_adapter.training.objective import GradientSum, Objective, TrainableSubset

@@ -18,7 +18,7 @@ import scenes
 from clod_adapter.alignment import check
 from clod_adapter.alignment.check import FLAT, check_alignment
 from clod_adapter.alignment.frames import NERFSTUDIO_TURNS, focus_of, into_file, known_frames
-from clod_adapter.alignment.search import guess_frame
+from clod_adapter.alignment.search import guess_frame, scene_in
 from clod_adapter.cameras import Scene, View
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
@@ -162,7 +162,9 @@ def test_another_frame_is_named(
     assert not found.fits
     guess = guess_frame(base, elsewhere, found)
     assert guess is not None and guess.psnr > found.mean_colour_psnr + 3
-    assert says.rstrip(": ") in re.sub(r"-?\d+(\.\d+)?", rounded, guess.description)
+    assert says.rstrip(": ") in re.sub(r"-?\d+(\.\d+)?", rounded, guess.frame.description) and guess.clear
+    back = scene_in(Scene(tuple(elsewhere), ()), guess.frame)
+    assert check_alignment(base, back.train).psnr > check_alignment(base, views).psnr - 1
 
 
 BACKWARD = torch.diag(torch.tensor([1.0, -1, -1, 1]))
@@ -178,7 +180,7 @@ def test_other_poses_are_named(pair: tuple[Gaussians, list[View]], case: str) ->
     base, views = pair
     elsewhere = [posed(view, POSES[case](view.camera.viewmat)) for view in views]
     guess = guess_frame(base, elsewhere, check_alignment(base, elsewhere))
-    assert guess is not None and guess.description.endswith(case)
+    assert guess is not None and guess.frame.description.endswith(case)
 
 
 def test_every_axis_permutation_has_one_frame(pair: tuple[Gaussians, list[View]]) -> None:
@@ -188,7 +190,7 @@ def test_every_axis_permutation_has_one_frame(pair: tuple[Gaussians, list[View]]
     for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)):
         rotation = torch.diag(EYE.new_tensor(signs)) @ EYE[list(order)]
         moved = torch.stack([v.camera.viewmat.double() for v in in_world(views, 1.0, rotation, NONE)])
-        turned = [frame.viewmats for frame in known_frames(moved) if "cameras' x" in frame.description]
+        turned = [frame.of(moved) for frame in known_frames(moved) if "cameras' x" in frame.description]
         near = [found for found in turned if (found - viewmats).abs().max() < 1e-4]
         assert len(near) == (0 if rotation.equal(EYE) else 1)
 
@@ -209,7 +211,7 @@ def test_frames_of_trainers(pair: tuple[Gaussians, list[View]]) -> None:
     of_nerfstudio = [frame for frame in frames if "nerfstudio" in frame.description]
     assert len(of_nerfstudio) == len(NERFSTUDIO_TURNS)
     for frame in of_nerfstudio:
-        poses = torch.linalg.inv(frame.viewmats)
+        poses = torch.linalg.inv(frame.of(viewmats))
         assert poses[:, :3, 3].mean(0).abs().max() < 1e-6
         assert poses[:, :3, 3].abs().max() == pytest.approx(1, abs=1e-6)
         up = -poses[:, :3, 1].mean(0)
@@ -219,7 +221,7 @@ def test_frames_of_trainers(pair: tuple[Gaussians, list[View]]) -> None:
     assert len(of_gsplat) == 5  # without the points, and with each sign of their axes
     for frame in of_gsplat[1:]:
         # The map that takes the cameras there, from where the first one is in both.
-        back, there = torch.linalg.inv(frame.viewmats), torch.linalg.inv(viewmats)
+        back, there = torch.linalg.inv(frame.of(viewmats)), torch.linalg.inv(viewmats)
         scale = (back[0, :3, 3] - back[1, :3, 3]).norm() / (there[0, :3, 3] - there[1, :3, 3]).norm()
         rotation = back[0, :3, :3] @ there[0, :3, :3].T
         moved = scale * (points.double() - there[0, :3, 3]) @ rotation.T + back[0, :3, 3]
@@ -241,7 +243,7 @@ def test_real_files_fit_in_their_frame_alone(shared_data: Callable[[str], Path])
     elsewhere = in_world(views, 1.0, FLIP, NONE)
     found = check_alignment(base, elsewhere)
     guess = guess_frame(base, elsewhere, found, load_points(shared_data("ci_banana")))
-    assert not found.fits and guess is not None and "x, -y, -z" in guess.description and guess.psnr > 26
+    assert not found.fits and guess is not None and "x, -y, -z" in guess.frame.description and guess.psnr > 26
     views = everything(clod_adapter.load_scene(shared_data("plush_half")))
     found = check_alignment(plush, views)
     assert found.fits and found.margin > 6 and not check_alignment(base, views).fits

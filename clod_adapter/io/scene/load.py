@@ -16,7 +16,7 @@ from PIL import Image
 
 from clod_adapter._kernels.memory import release
 from clod_adapter._support.workers import in_order
-from clod_adapter.cameras import Camera, Scene, View, in_its_unit
+from clod_adapter.cameras import Camera, Scene, View, in_its_unit, spread
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import read_colmap
 from clod_adapter.io.scene.dataparser import trained_frame
@@ -37,6 +37,7 @@ def load_scene(
     *,
     test_every: int = TEST_EVERY,
     max_width: int = 1600,
+    most: int | None = None,
     origin: Sequence[float] = NOWHERE,
     progress: Listener | None = None,
     cache: ImageCache | None = None,
@@ -63,6 +64,7 @@ def load_scene(
         test_every: one view in this many is held out; at least 2.
         max_width: wider images are scaled down to this many pixels, with Pillow's bicubic filter as
             in Inria's code; the intrinsics are scaled too, and a note states it.
+        most: reads at most so many photographs, evenly spread.
         origin: ``[3]`` what the cameras' world is to be relative to, in its units: ``Checkpoint.origin``.
         progress: called in ``Phase.PHOTOGRAPHS`` after each image.
         cache: keeps the photographs, where not all are to be in memory; they are then read again when looked at.
@@ -87,7 +89,7 @@ def load_scene(
     testing = held_out(images, test_every)
     if not any(image.name not in testing for image, _ in present):
         raise ClodError(f"{folder}: has no photograph to train on, as all that are there are held out; add more")
-    present = [(image.relative_to(origin), path) for image, path in present]
+    present = [(image.relative_to(origin), path) for image, path in spread(present, most or len(present))]
     views, sizes, done = _load(present, folder, max_width, progress, cache)
     train = tuple(view for view in views if view.camera.name not in testing)
     test = tuple(view for view in views if view.camera.name in testing)
