@@ -36,7 +36,7 @@ class Town:
     photographs: int = 96
     samples: int = 3  # of the truth and of photographs, along each side of a pixel
     tuning: int = 400  # steps that the checkpoint is trained for
-    iters: int = 1600  # steps of adapting
+    iters: int | None = None  # steps of adapting; None: the default
     max_sv: float = 8.0
     lr_means: float = 3e-5  # of the checkpoint's training, times the extent of its cameras, which is 300 m
 
