@@ -53,24 +53,37 @@ class CalibrationRow:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """The part of a camera that the equation uses.
+    """A camera as stored with the file: what the equation uses, and for viewers where it looks.
 
     Attributes:
         x, y, z: the camera's centre, world units.
         unit: the divisor D of distances from there, world units, > 0.
+        look_x, look_y, look_z: unit vector of its optical axis; 0 in files of earlier versions.
+        up_x, up_y, up_z: unit vector to the upper edge of its image.
+        fov: vertical angle of view, radians; 0 if unknown.
 
     Raises:
-        ClodError: a coordinate is not finite, or the unit is not positive and finite.
+        ClodError: a value is not finite, a vector is no unit vector, or the unit or the angle is not positive.
     """
 
     x: float
     y: float
     z: float
     unit: float
+    look_x: float = 0.0
+    look_y: float = 0.0
+    look_z: float = 0.0
+    up_x: float = 0.0
+    up_y: float = 0.0
+    up_z: float = 0.0
+    fov: float = 0.0
 
     def __post_init__(self) -> None:
-        centre = (self.x, self.y, self.z)
-        require(all(map(math.isfinite, centre)), "the centre of a viewpoint", centre, "finite")
+        values = astuple(self)
+        require(all(map(math.isfinite, values[:3])), "the centre of a viewpoint", values[:3], "finite")
+        lengths = math.hypot(*values[4:7]), math.hypot(*values[7:10])
+        known = 0 < self.fov < math.pi and max(abs(length - 1) for length in lengths) < 1e-3
+        require(known or not any(values[4:]), "the direction of a viewpoint", values[4:], "unit vectors and an angle")
         require(0 < self.unit < math.inf, "the unit of a viewpoint", self.unit, "positive and finite")
 
     def moved(self, by: Sequence[float]) -> Viewpoint:

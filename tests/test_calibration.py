@@ -15,11 +15,13 @@ from hypothesis import strategies as st
 
 from clod_adapter.adapter import extract, with_dial
 from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.distances import viewpoint_of
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
-from scenes import gaussians
+from scenes import gaussians, ring
 
 number = st.floats(-1e6, 1e6, allow_nan=False)
 rows = st.lists(
@@ -126,3 +128,17 @@ def test_a_table_without_its_kind_is_against_photographs(tmp_path: Path) -> None
     save(tmp_path / "b.ply", base.gaussians, base)
     assert load(tmp_path / "b.ply").calibration is None
     assert b"calibrated" not in (tmp_path / "b.ply").read_bytes()
+
+
+def test_stored_viewpoints_are_cameras_again(tmp_path: Path) -> None:
+    cameras = ring(3, 40, 30)
+    config = AttenuationConfig()
+    viewpoints = tuple(viewpoint_of(camera, torch.randn(50, 3), config) for camera in cameras)
+    stored = load(dialled(tmp_path / "a.ply", viewpoints=viewpoints))
+    assert len(stored.cameras) == 3 and stored.viewpoints == viewpoints
+    for camera, found in zip(cameras, stored.cameras, strict=True):
+        assert torch.allclose(found.viewmat, camera.viewmat, atol=1e-5)
+        assert float(found.K[1, 1]) / found.height == pytest.approx(float(camera.K[1, 1]) / camera.height, rel=1e-5)
+    assert not load(dialled(tmp_path / "b.ply", viewpoints=(Viewpoint(1.5, 2.5, 3.5, 4.5),))).cameras
+    with pytest.raises(ClodError, match="direction of a viewpoint"):
+        replace(viewpoints[0], up_x=7.0)

@@ -98,7 +98,23 @@ def median_distance(means: Tensor, camera: Camera) -> float:
 def viewpoint_of(camera: Camera, means: Tensor, config: AttenuationConfig) -> Viewpoint:
     """The viewpoint of a camera that looks at Gaussians with centres ``means [N, 3]``, world units."""
     x, y, z = camera.position.to(means).double().tolist()
-    return Viewpoint(x, y, z, camera_unit(means, camera, config))
+    down, look = camera.viewmat[1:3, :3].tolist()
+    return Viewpoint(
+        x, y, z, camera_unit(means, camera, config), look[0], look[1], look[2], -down[0], -down[1], -down[2],
+        fov=2 * math.atan(0.5 * camera.height / float(camera.K[1, 1])),
+    )  # fmt: skip
+
+
+def camera_of(viewpoint: Viewpoint, width: int, height: int, name: str = "") -> Camera:
+    """The camera of a viewpoint that has a direction, for images of this size."""
+    v = viewpoint
+    look, up = torch.tensor([[v.look_x, v.look_y, v.look_z], [v.up_x, v.up_y, v.up_z]], dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = torch.stack([torch.linalg.cross(look, up), -up, look])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([v.x, v.y, v.z], dtype=torch.float64)
+    focal = 0.5 * height / math.tan(0.5 * v.fov)
+    K = torch.tensor([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]])
+    return Camera(viewmat.float(), K, width, height, name)
 
 
 @torch.no_grad()

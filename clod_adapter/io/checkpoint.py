@@ -13,7 +13,9 @@ from torch import Tensor
 
 from clod_adapter.adapter import trim
 from clod_adapter.calibration import Calibration, Viewpoint
+from clod_adapter.cameras import Camera, camera_extent, near_plane
 from clod_adapter.config import CLASSIC
+from clod_adapter.equation.distances import camera_of
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
@@ -70,6 +72,17 @@ class Checkpoint:
         """Those of the calibration, relative to the origin as the Gaussians are; empty without a calibration."""
         stored = self.calibration.viewpoints if self.calibration else ()
         return tuple(viewpoint.moved([-value for value in self.origin]) for viewpoint in stored)
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The viewpoints as cameras with the size of the calibration's images; none in files of earlier versions."""
+        if self.calibration is None:
+            return []
+        size = self.calibration.width, self.calibration.height
+        seen = [viewpoint for viewpoint in self.viewpoints if viewpoint.fov > 0]
+        cameras = [camera_of(viewpoint, *size, f"viewpoint {k + 1}") for k, viewpoint in enumerate(seen)]
+        extent = camera_extent(cameras) if cameras else 0.0
+        return [replace(camera, near=near_plane(extent)) for camera in cameras] if extent else cameras
 
     def hook(self, virtual_scale: float = 1.0) -> Hook:
         """The dial for a renderer that has these Gaussians: attenuated opacities, and factors of the scales.

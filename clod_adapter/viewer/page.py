@@ -49,7 +49,8 @@ def write_viewer_page(
     Args:
         model: with or without a dial.
         base: shown for comparison; relative to the same origin.
-        cameras: selectable viewpoints, in the frame of the Gaussians (relative to the origin).
+        cameras: selectable viewpoints, in the frame of the Gaussians (relative to the origin); by default the stored
+            ones.
         virtual_scale: the initial dial value, >= 0.
         tool: packs the splats to a fifth of their size, with rounded values (``pack_sog``, which calls
             ``progress``); None stores them unpacked.
@@ -69,7 +70,7 @@ def write_viewer_page(
             entries.append(entry)
             packs.append(packed)
             data |= added
-    config = page_config(entries[0], entries[1] if base else None, cameras, virtual_scale)
+    config = page_config(entries[0], entries[1] if base else None, cameras or model.cameras, virtual_scale)
     meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.writelines(_document(config, _elements(data), meta))

@@ -126,11 +126,11 @@ def test_baking_for_a_camera(clod: Any, capture: Any, dialled: Path, monkeypatch
 
 
 def test_camera_that_matches_two_photographs(clod: Any, capture: Any, dialled: Path, monkeypatch: Any) -> None:
-    from clod_adapter.cli.export import baking
+    from clod_adapter.cli.shared import alignment
 
-    (first, second, *rest), notes = baking.load_cameras(capture.scene)
+    (first, second, *rest), notes = alignment.load_cameras(capture.scene)
     twins = [replace(first, name="a.jpg"), replace(second, name="a.png")]
-    monkeypatch.setattr(baking, "load_cameras", lambda *_: ([*twins, *rest], notes))
+    monkeypatch.setattr(alignment, "load_cameras", lambda *_, **__: ([*twins, *rest], notes))
     words = ("export", dialled, "--sv", 2, "--images", capture.scene, "-o", "x.ply", "--camera")
     done = clod(*words, "a")
     assert done.code == 2 and "--camera: 'a' matches a.jpg and a.png; give the full name" in done.err
