@@ -74,13 +74,26 @@ def failed(tab: Any, path: Path, script: str) -> str:
         return shown.text("#message")
 
 
-def test_a_model_beyond_the_device_limit_is_an_error_with_both_counts(tab: Any, save: Any) -> None:
+def test_of_a_model_beyond_the_device_limit_the_dial_leaves_out_some(tab: Any, save: Any) -> None:
     small = """const real = WebGL2RenderingContext.prototype.getParameter;
         WebGL2RenderingContext.prototype.getParameter = function (name) {
             return name === this.MAX_TEXTURE_SIZE ? 2 : real.call(this, name);
         };"""
-    error = failed(tab, save(scenes.gaussians(1100, 3, 5)), small)
-    assert "1,100 Gaussians" in error and "at most 682" in error
+    tab.add_init_script(small)
+    # The first 600 stay longer than the others, at any distance.
+    large = scenes.dialled(1100, 3, 5).replace(sigma_d=torch.where(torch.arange(1100) < 600, 1e3, 1e-3))
+    for model in (large, large.replace(sigma_d=None, attenuation=None)):
+        with serve(save(model)) as url:
+            shown = Shown(tab).ready(url)
+            assert shown.counts()["total"] == 682
+            assert "418 of 1,100 Gaussians do not fit on this graphics device" in shown.text("body")
+            if model is large:
+                camera = scenes.camera(320, 240)
+                shown.camera(camera)
+                shown.page.evaluate("clod.setDial(3)")
+                kept = int(dial(large, camera, 3.0).keep.sum())
+                assert 100 < kept < 600
+                shown.until(f"Math.abs(clod.counts().kept - {kept}) <= 1")
 
 
 def test_without_webgl_the_page_shows_an_error_and_no_panel(tab: Any, model: Path) -> None:

@@ -54,8 +54,11 @@ export function growthDistance({ normalizer, reference_distance: reference, scen
 export const growthFactor = (growth, magnification) =>
   Math.exp(Math.min(Math.max(growth * Math.log(Math.min(Math.max(magnification, 1), 3e38)), -20), 20));
 
-/** Extinction scales s*, descending: a Gaussian is kept iff s < s*. In closed form by Lambert's W. */
-export function extinctionScales(means, { logA, inverse }, eye, distance, tau) {
+/** Extinction scales s*, descending. */
+export const extinctionScales = (...of) => extinctions(...of).sort().reverse();
+
+/** Extinction scale s* of each Gaussian, which is kept iff s < s*. In closed form by Lambert's W. */
+export function extinctions(means, { logA, inverse }, eye, distance, tau) {
   const scales = new Float64Array(logA.length);
   for (let i = 0; i < logA.length; i++) {
     const d = Math.hypot(means[3 * i] - eye[0], means[3 * i + 1] - eye[1], means[3 * i + 2] - eye[2]) / distance;
@@ -63,7 +66,7 @@ export function extinctionScales(means, { logA, inverse }, eye, distance, tau) {
     const w = lambertOfExp(2 * (logA[i] - Math.log(tau) + Math.log(ratio)));
     scales[i] = w < 1 ? Math.exp(logA[i] - 0.5 * w) / tau : Math.sqrt(w) / ratio; // equal; each is used where it is exact
   }
-  return scales.sort().reverse();
+  return scales;
 }
 
 /** W(e^x): the w > 0 with w + log w = x (Fritsch, Shafer and Crowley, CACM 16(2), 1973). */

@@ -1,4 +1,5 @@
 // A splat on the GPU, and what culls and sorts its Gaussians: WebGPU, or else a worker.
+import { extinctions, prepare } from "./equation.js";
 import { WIDTH, dataTexture, heightOf, maxTexels } from "./gpu.js";
 import { half } from "./half.js";
 import { SH_TEXELS } from "./shaders.js";
@@ -13,7 +14,8 @@ const VISIBLE = 3.4; // standard deviations to alpha 1/255
 
 /** `metadata`: name, attenuation or null, screen_filter, no_dial, max_sv, calibration. `gaussians`: from a reader in formats/.
  *  `device`: promise of sorter.js. */
-export function createModel(gl, gaussians, metadata, device) {
+export function createModel(gl, all, metadata, device) {
+  const gaussians = fitted(all, roomFor(gl, all.degree), metadata.attenuation), leftOut = all.count - gaussians.count;
   const { count, degree, means, opacityLogits } = gaussians, { records, sh } = upload(gl, gaussians);
   const attenuation = gaussians.sigmaD ? metadata.attenuation : null, extent = extentOf(gaussians), worker = startWorker();
   const scales = largestScales(gaussians), sorting = createSorter(device, gaussians, scales, { ...metadata, attenuation }).catch(() => null);
@@ -30,7 +32,7 @@ export function createModel(gl, gaussians, metadata, device) {
   }
 
   return {
-    ...metadata, attenuation, count, degree, records, sh, extent,
+    ...metadata, attenuation, count, leftOut, degree, records, sh, extent,
     get sortsOnGpu() { return sorter !== null; },
     /** Requests the rows to draw, and calls `use({rows, drawn, kept, distance})`; `rows` is valid until it returns. A lost
      *  device is replaced by the worker. */
@@ -50,14 +52,42 @@ export function createModel(gl, gaussians, metadata, device) {
   };
 }
 
+/** The number of Gaussians that the device's textures hold. */
+const roomFor = (gl, degree) => Math.floor(maxTexels(gl) / Math.max(SH_TEXELS[degree], RECORD_TEXELS));
+
+/** Without the Gaussians beyond `most` that the dial removes first at the distance D; without a dial, the faintest and
+ *  smallest. */
+function fitted(gaussians, most, attenuation) {
+  const { count, opacityLogits, sigmaD, logScales } = gaussians;
+  if (count <= most) return gaussians;
+  let score;
+  if (sigmaD && attenuation) {
+    const { scene_distance: unit, tau, eps } = attenuation;
+    score = extinctions(new Float32Array(3 * count), prepare(opacityLogits, sigmaD, eps), [unit, 0, 0], unit, tau);
+  } else {
+    score = Float64Array.from(opacityLogits, (l, i) => {
+      const sizes = [logScales[3 * i], logScales[3 * i + 1], logScales[3 * i + 2]];
+      return sizes[0] + sizes[1] + sizes[2] - Math.min(...sizes) - Math.log1p(Math.exp(-l));
+    });
+  }
+  const least = score.slice().sort()[count - most - 1], rows = new Uint32Array(most);
+  let size = 0;
+  for (let i = 0; i < count; i++) if (score[i] > least) rows[size++] = i;
+  const taken = Object.entries(gaussians).map(([name, values]) => [name, ArrayBuffer.isView(values) ? select(values, rows.subarray(0, size), values.length / count) : values]);
+  return { ...Object.fromEntries(taken), count: size };
+}
+
+/** These rows of a table. */
+function select(values, rows, width) {
+  const found = new values.constructor(width * rows.length);
+  for (let i = 0; i < rows.length; i++) for (let k = 0; k < width; k++) found[width * i + k] = values[width * rows[i] + k];
+  return found;
+}
+
 /** A separate function, so that no closure of the model keeps the values in memory after the upload. */
 function upload(gl, gaussians) {
   const texels = SH_TEXELS[gaussians.degree], integer = new Intl.NumberFormat("en").format;
   if (gl.isContextLost()) throw new Error("the graphics device was lost; reload the page");
-  const max = Math.floor(maxTexels(gl) / Math.max(texels, RECORD_TEXELS));
-  if (gaussians.count > max) {
-    throw new Error(`it has ${integer(gaussians.count)} Gaussians of SH degree ${gaussians.degree}, and this graphics device supports at most ${integer(max)}; export it at a larger dial value (--sv)`);
-  }
   const textures = {
     records: dataTexture(gl, RECORD_TEXELS * gaussians.count, Float32Array, (target) => fillRecords(target, gaussians)),
     sh: dataTexture(gl, texels * gaussians.count, Uint32Array, (target) => fillSh(target, gaussians, texels)),

@@ -39,8 +39,12 @@ export function createUi(elements, stage, actions) {
     elements.compare.disabled = !hasDial && !stage.base;
     elements.compare.options[1].textContent = stage.base ? "with the base" : "without the dial";
     elements.target.placeholder = hasDial ? `e.g. ${integer(Math.ceil(model.count / 2))}` : "";
-    elements.noDial.hidden = !model || hasDial;
-    elements.noDial.textContent = model?.no_dial ?? "";
+    const left = model?.leftOut ?? 0;
+    elements.noDial.hidden = !model || (hasDial && !left);
+    elements.noDial.textContent = [
+      left ? `${integer(left)} of ${integer(left + model.count)} Gaussians do not fit on this graphics device; left out are those that the dial removes first.` : "",
+      model?.no_dial ?? "",
+    ].filter(Boolean).join(" ");
     setSlider(elements.dial, elements.dialValue, hasDial ? state.dial : null);
     elements.equation.checked = state.equation && hasDial;
     elements.hold.checked = stage.holds;
