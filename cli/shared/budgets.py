@@ -89,8 +89,10 @@ def calibrate(rows: Sequence[Row], measured: Gaussians, scene: Scene, against: s
     """The calibration of rows measured on this machine; a ClodError if a PSNR is infinite."""
     assert measured.attenuation is not None
     camera, machine = scene.test[0].camera, machine_name(measured.means.device.type)
-    stored = [view.camera for view in spread(scene.train, VIEWPOINTS)]
-    viewpoints = [viewpoint_of(each, measured.means, measured.attenuation).moved(origin) for each in stored]
+    stored = list(spread(scene.train, VIEWPOINTS))
+    if against != "photographs":  # of placed cameras some look at little; viewers open at the first
+        stored.sort(key=lambda view: float(view.image.float().std()), reverse=True)
+    viewpoints = [viewpoint_of(each.camera, measured.means, measured.attenuation).moved(origin) for each in stored]
     return Calibration.of(
         rows, total=len(measured), views=len(scene.test), size=(camera.width, camera.height), machine=machine,
         against=against, viewpoints=viewpoints,
