@@ -49,7 +49,8 @@ def align(checkpoint: Checkpoint, scene: Scene, images: str, console: Console, *
     """Compares renders with the photographs; after a poor match tries other frames, and uses one that fits clearly.
 
     Args:
-        required: raises where the checkpoint fits in no frame; otherwise warns.
+        required: for training: raises where the checkpoint fits in no frame, and warns of a poor match; otherwise
+            warns of the former alone.
 
     Raises:
         ClodError: the checkpoint does not match.
@@ -65,8 +66,8 @@ def align(checkpoint: Checkpoint, scene: Scene, images: str, console: Console, *
         frame = guess.frame.as_dict() | {"psnr": guess.psnr}
         return Aligned(scene_in(scene, guess.frame), numbers | {"frame": frame}, (note,))
     if found.fits and guess is None:
-        notes = [FLAT.format(images=images)] if not found.views else []
-        notes += [OTHER_COLOURS.format(ply=ply, images=images)] if found.margin < 0 else []
+        notes = [FLAT.format(images=images)] if required and not found.views else []
+        notes += [OTHER_COLOURS.format(ply=ply, images=images)] if required and found.margin < 0 else []
     else:
         message = f"{ply}: does not match {images}: {mismatch(checkpoint, views, found, guess)}"
         if required:
