@@ -12,10 +12,6 @@ VIEWS cameras that training does not use, against renders of FINEST. ``--adapted
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -23,7 +19,8 @@ from pathlib import Path
 
 import clod_adapter as clod
 from clod_adapter.evaluation.baselines import matching_dial
-from common import COMMAND, ROOT, Process, Row, append, arguments, stored, table
+from common import COMMAND, Process, Row, append, arguments, stored, table
+from tuning import TIMEOUT, find_tool
 
 FILE, VIEWS, SEED, LONGEST = "large.jsonl", 16, 77, 40.0
 OTHERS = {"decimated": "--decimate", "decimated adaptively": "--decimate-adaptive"}
@@ -79,31 +76,27 @@ def rivals(finest: Path, level: Path, count: int, folder: Path) -> Iterator[tupl
     yield "author", level
     for name, option in OTHERS.items():
         out = folder / "decimated.ply"
-        words = [peer(), "-w", "-q", "-g", "cpu", finest, option, str(count), out]
-        failed = subprocess.run(words, capture_output=True, text=True)
-        if failed.returncode and "requires WebGPU" not in failed.stderr + failed.stdout:
-            sys.exit(failed.stderr)
-        yield name, None if failed.returncode else out
+        out.unlink(missing_ok=True)
+        try:
+            find_tool().run("-q", finest, option, str(count), out, timeout=TIMEOUT)
+        except clod.ClodError as error:
+            if "requires WebGPU" not in str(error):
+                raise
+        yield name, out if out.exists() else None
 
 
 def streamed(adapted: Path, dials: list[float], views: list[clod.View], whole: int, folder: Path) -> Iterator[Row]:
     """Each level of the streaming set."""
     out, level = folder / "lod", folder / "level.ply"
     words = [f"--levels={','.join(f'{s:.4f}' for s in sorted(dials))}", "--lod-meta", "--out", out]
-    Process([*COMMAND, "export", adapted, *words], environment={"CLOD_SPLAT_TRANSFORM": peer()})
+    Process([*COMMAND, "export", adapted, *words])
     for number in range(len(dials)):
-        Process([peer(), "-w", "-q", "-g", "cpu", out / "lod-meta.json", "-L", number, level])
+        level.unlink(missing_ok=True)
+        find_tool().run("-q", out / "lod-meta.json", "-L", str(number), level, timeout=TIMEOUT)
         found = clod.load(level).gaussians
         (row,) = clod.evaluate(found, views, [1.0])
         share = len(found) / whole
         yield {"method": "lod-meta", "level": number, "gaussians": len(found), "share": share, "psnr": row.psnr}
-
-
-def peer() -> str:
-    """splat-transform, of ``make peers`` or on the PATH."""
-    place = os.pathsep.join([str(ROOT / ".venv" / "peers" / "node_modules" / ".bin"), os.environ["PATH"]])
-    os.environ["PATH"] = place
-    return shutil.which("splat-transform") or sys.exit("splat-transform is absent: make peers installs it")
 
 
 def print_table() -> None:

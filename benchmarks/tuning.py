@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 import tempfile
 import time
@@ -18,7 +19,7 @@ from clod_adapter.io.formats.splat_transform import SplatTransform
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import splat
 from clod_adapter.training.optimizer import RowAdam
-from common import CACHE
+from common import CACHE, ROOT
 
 import numpy as np
 import torch
@@ -97,7 +98,10 @@ def _gradients(
 
 
 def find_tool() -> SplatTransform:
-    """splat-transform without a GPU; exits with the install command where it is missing or too old."""
+    """splat-transform of ``make peers``, or on the PATH, without a GPU; exits where it is missing or too old."""
+    place = str(ROOT / ".venv" / "peers" / "node_modules" / ".bin")
+    if place not in os.environ["PATH"].split(os.pathsep):  # also for the commands that a benchmark starts
+        os.environ["PATH"] = os.pathsep.join([place, os.environ["PATH"]])
     try:
         return replace(SplatTransform.find(), gpu=False)
     except clod.ClodError as error:
