@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import clod_adapter as clod
-from clod_adapter.alignment.check import DOUBTFUL, check_alignment
+from clod_adapter.alignment.check import check_alignment
 from clod_adapter.alignment.search import guess_frame
 from clod_adapter.io.scene.colmap import load_points
 from common import append, arguments, capture, checkpoint, photographs
@@ -48,14 +48,13 @@ def row(gaussians: clod.Gaussians, views: list[clod.View], points: Tensor) -> di
     began = time.process_time()
     found = check_alignment(gaussians, views)
     checked = time.process_time()
-    suspect = not found.fits or found.margin < DOUBTFUL
-    guess = guess_frame(gaussians, views, found, points) if suspect else None
+    guess = guess_frame(gaussians, views, found, points) if found.doubtful else None
     numbers = {key: round(value, 3) for key, value in found.as_dict().items()}
     return {
         "fits": found.fits and guess is None, **numbers, "guess": guess and guess.frame.description,
         "clear": guess and guess.clear,
         "guess_psnr": guess and round(guess.psnr, 2), "check_cpu_s": round(checked - began, 2),
-        "guess_cpu_s": round(time.process_time() - checked, 2) if suspect else None,
+        "guess_cpu_s": round(time.process_time() - checked, 2) if found.doubtful else None,
     }  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 from clod_adapter._support.version import package_version
@@ -73,8 +73,7 @@ def prepare_inputs(
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
     with watch.time("kernels"):
         prepare_kernels(console, device, training=bool(args.base))
-    aligned = align(model, scene, args.images, console, required=False)
-    scene = replace(aligned.scene, notes=(*scene.notes, *aligned.notes))
+    scene, _ = align(model, scene, args.images, console, required=False)
     model = with_filter(model, args, console, scene.test)
     if model.gaussians.sigma_d is None:
         console.say(f"{args.model} has no sigma_d, so every dial value renders all of it")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 from statistics import fmean
 from typing import Any
@@ -50,8 +50,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
     model, _, scene, device = read_model_and_scene(args, console)
     prepare_kernels(console, device, training=False)
-    aligned = align(model, scene, args.images, console, required=False)
-    scene = replace(aligned.scene, notes=(*scene.notes, *aligned.notes))
+    scene, _ = align(model, scene, args.images, console, required=False)
     model = with_filter(model, args, console, [*scene.test, *scene.train])
     views = pick_views(scene, args.views)
     check_images([out / name for name in image_names(views)], args)

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     with watch.time("kernels"):
         prepare_kernels(console, device, training=False)
     with watch.time("evaluate"):
-        scene, notes = aligned_scene(checkpoints, scene, args, console)
+        scene = aligned_scene(checkpoints, scene, args, console)
         checkpoints = [with_filter(each, args, console, scene.test) for each in checkpoints]
     cells = plan(args, checkpoints, scene)
     found = {cell.name: read for cell in cells if (read := cell.read())}
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         interrupted = len(done) < len(missing)
         if not found:
             raise Stopped("stopped before the first cell was finished")
-        report = describe_cells(args, cells, found, interrupted, [*scene.notes, *notes]) | {
+        report = describe_cells(args, cells, found, interrupted, list(scene.notes)) | {
             "views": len(scene.test), "machine": machine(), "seconds": watch.report(),
             "outputs": {k: str(v) for k, v in outputs.items()},
         }  # fmt: skip
@@ -93,21 +93,17 @@ def read_checkpoints(args: argparse.Namespace, console: Console) -> list[Checkpo
     return found
 
 
-def aligned_scene(
-    checkpoints: Sequence[Checkpoint], scene: Scene, args: argparse.Namespace, console: Console
-) -> tuple[Scene, list[str]]:
-    """The scene in the checkpoints' frame, and notes.
+def aligned_scene(checkpoints: Sequence[Checkpoint], scene: Scene, args: argparse.Namespace, console: Console) -> Scene:
+    """The scene in the checkpoints' frame.
 
     Raises:
         ClodError: a checkpoint does not match, or they are in different frames.
     """
-    notes = list[str]()
     for number, checkpoint in enumerate(checkpoints):
-        aligned = align(checkpoint, scene, args.images, console, required=not args.misaligned_ok)
-        if number and aligned.scene is not scene:
+        scene, numbers = align(checkpoint, scene, args.images, console, required=not args.misaligned_ok)
+        if number and numbers["frame"]:
             raise ClodError(f"{checkpoint.path}: in another frame than {checkpoints[0].path}; give it alone")
-        scene, notes = aligned.scene, [*notes, *aligned.notes]
-    return scene, notes
+    return scene
 
 
 def plan(args: argparse.Namespace, checkpoints: Sequence[Checkpoint], scene: Scene) -> list[Cell]:

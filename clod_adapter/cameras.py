@@ -186,19 +186,20 @@ def near_plane(extent: float) -> float:
     return NEAR * min(extent / SMALL_EXTENT, 1.0)
 
 
-def in_its_unit(scene: Scene) -> Scene:
-    """The scene with the near planes of ``near_plane``.
+def with_near_planes(cameras: Sequence[Camera]) -> list[Camera]:
+    """All cameras of a scene, with the near plane of ``near_plane``.
 
     A scene in kilometres would otherwise lie in front of the near plane. Cameras in one place keep theirs.
     """
-    extent = camera_extent([view.camera for view in (*scene.train, *scene.test)])
-    if extent == 0:
-        return scene
+    extent = camera_extent(cameras) if cameras else 0.0
+    return [replace(camera, near=near_plane(extent)) for camera in cameras] if extent else list(cameras)
 
-    def nearer(views: tuple[View, ...]) -> tuple[View, ...]:
-        return tuple(view.at(replace(view.camera, near=near_plane(extent))) for view in views)
 
-    return replace(scene, train=nearer(scene.train), test=nearer(scene.test))
+def in_its_unit(scene: Scene) -> Scene:
+    """The scene with the near planes of ``with_near_planes``."""
+    views = (*scene.train, *scene.test)
+    moved = [view.at(own) for view, own in zip(views, with_near_planes([v.camera for v in views]), strict=True)]
+    return replace(scene, train=tuple(moved[: len(scene.train)]), test=tuple(moved[len(scene.train) :]))
 
 
 def spread(views: Sequence[T], most: int) -> Sequence[T]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from clod_adapter.adapter import dial_tensors
 from clod_adapter.blocks.memory import MemoryPlan
-from clod_adapter.cameras import Scene
+from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.io.checkpoint import Checkpoint
@@ -40,7 +40,7 @@ class Inputs:
     config: AdaptConfig
     alignment: dict[str, Any] | None
     memory: MemoryPlan | None
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
     base_rows: tuple[Row, ...] = ()
 
 
@@ -57,13 +57,11 @@ def read_inputs(setup: Setup) -> Inputs:
         photographs = read_scene(args.images, console, base.origin, image_cache(args)) if args.images else None
     with watch.time("kernels"):
         prepare_kernels(console, base.gaussians.means.device)
-    config, alignment, notes = setup.config, None, list[str]()
-    if photographs is not None:
-        with watch.time("evaluate"):
-            aligned = align(base, photographs, args.images, console, required=not args.misaligned_ok)
-            photographs, alignment, notes = aligned.scene, aligned.numbers, list(aligned.notes)
+    config, alignment, views = setup.config, None, list[View]()
     with watch.time("evaluate"):
-        views = [] if photographs is None else [*photographs.test, *photographs.train]
+        if photographs is not None:
+            photographs, alignment = align(base, photographs, args.images, console, required=not args.misaligned_ok)
+            views = [*photographs.test, *photographs.train]
         base = with_filter(base, args, console, views)
     if base.gaussians.screen_filter.compensate:
         with watch.time("kernels"):
@@ -74,7 +72,7 @@ def read_inputs(setup: Setup) -> Inputs:
     else:
         with watch.time("evaluate"):
             scene, config = with_pseudo_views(base.gaussians, photographs, config, console)
-    return Inputs(base, scene, config, alignment, plan_memory(args, base, scene, console), tuple(notes))
+    return Inputs(base, scene, config, alignment, plan_memory(args, base, scene, console))
 
 
 def with_base_rows(setup: Setup, inputs: Inputs) -> Inputs:

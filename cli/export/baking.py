@@ -101,7 +101,7 @@ def measure_drop(
         raise ClodError(f"{args.images}: there are no held-out photographs to measure on; give at least two")
     assert model.gaussians.attenuation is not None
     prepare_kernels(console, model.gaussians.means.device, training=False)
-    scene = align(model, scene, args.images, console, required=False).scene
+    scene, _ = align(model, scene, args.images, console, required=False)
     photographs = Photographs(scene.test, _psnr(model.gaussians, scene.test, console, "dial, s=1"))
 
     def lost(s: float) -> float:

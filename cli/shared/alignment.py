@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import torch
 
-from clod_adapter.alignment.check import DOUBTFUL, MOST_VIEWS, Alignment, check_alignment
+from clod_adapter.alignment.check import MOST_VIEWS, Alignment, check_alignment
 from clod_adapter.alignment.frames import focus_of
 from clod_adapter.alignment.search import Guess, cameras_in, guess_frame, scene_in
 from clod_adapter.cameras import Camera, Scene, View
@@ -26,31 +26,23 @@ OTHER_COLOURS = (
     "warning: {ply} matches the photographs in {images}, but some differ more from it than from their own mean "
     "colours; check for another exposure, views that it does not cover, or a poor checkpoint"
 )
-SMALL = 320  # pixels, width of photographs that only tell the frame
 FLAT = "warning: the photographs in {images} have a single colour each, on which the checkpoint is trained"
+SMALL = 320  # pixels, width of photographs that only tell the frame
 
 
-@dataclass(frozen=True)
-class Aligned:
-    """The scene with its cameras in the checkpoint's frame.
-
-    Attributes:
-        numbers: of ``check_alignment``, in the frame given; ``guess``, another frame that fits, in words; and
-            ``frame``, the one that the cameras were moved to, with its ``psnr``. For the report.
-        notes: for the report, printed already.
-    """
-
-    scene: Scene
-    numbers: dict[str, Any]
-    notes: tuple[str, ...] = ()
-
-
-def align(checkpoint: Checkpoint, scene: Scene, images: str, console: Console, *, required: bool) -> Aligned:
+def align(
+    checkpoint: Checkpoint, scene: Scene, images: str, console: Console, *, required: bool
+) -> tuple[Scene, dict[str, Any]]:
     """Compares renders with the photographs; after a poor match tries other frames, and uses one that fits clearly.
 
     Args:
         required: for training: raises where the checkpoint fits in no frame, and warns of a poor match; otherwise
             warns of the former alone.
+
+    Returns:
+        The scene with its cameras in the checkpoint's frame, and with notes, which are printed. For the report, the
+        numbers of ``check_alignment``, in the frame given; ``guess``, another frame that fits, in words; and ``frame``,
+        the one that the cameras were moved to, with its ``psnr``.
 
     Raises:
         ClodError: the checkpoint does not match.
@@ -58,14 +50,12 @@ def align(checkpoint: Checkpoint, scene: Scene, images: str, console: Console, *
     base, ply, views = checkpoint.gaussians, checkpoint.path, [*scene.test, *scene.train]
     with console.status("comparing the checkpoint with the photographs ..."):
         found = check_alignment(base, views)
-    guess = _other_frame(checkpoint, views, found, images, console)
-    numbers = found.as_dict() | {"guess": guess and guess.frame.description, "frame": None}
+    guess = _other_frame(checkpoint, views, found, images, console) if found.doubtful else None
+    numbers: dict[str, Any] = found.as_dict() | {"guess": guess and guess.frame.description, "frame": None}
     if guess and guess.clear:
-        note = _moved(checkpoint, images, found, guess)
-        console.say(note)
-        frame = guess.frame.as_dict() | {"psnr": guess.psnr}
-        return Aligned(scene_in(scene, guess.frame), numbers | {"frame": frame}, (note,))
-    if found.fits and guess is None:
+        scene, numbers["frame"] = scene_in(scene, guess.frame), guess.frame.as_dict() | {"psnr": guess.psnr}
+        notes = [_moved(checkpoint, images, found, guess)]
+    elif found.fits and guess is None:
         notes = [FLAT.format(images=images)] if required and not found.views else []
         notes += [OTHER_COLOURS.format(ply=ply, images=images)] if required and found.margin < 0 else []
     else:
@@ -75,7 +65,7 @@ def align(checkpoint: Checkpoint, scene: Scene, images: str, console: Console, *
         notes = [f"warning: {message}"]
     for note in notes:
         console.say(note)
-    return Aligned(scene, numbers, tuple(notes))
+    return replace(scene, notes=(*scene.notes, *notes)), numbers
 
 
 def read_cameras(
@@ -90,6 +80,8 @@ def read_cameras(
     prepare_kernels(console, model.gaussians.means.device, training=False)
     views = [*scene.test, *scene.train]
     found = check_alignment(model.gaussians, views)
+    if not found.doubtful:
+        return cameras, notes
     every = load_cameras(images, model.origin)[0] if training else cameras
     guess = _other_frame(model, views, found, images, console, every)
     if guess is None or not guess.clear:
@@ -112,9 +104,7 @@ def _other_frame(
     console: Console,
     cameras: Sequence[Camera] = (),
 ) -> Guess | None:
-    """Another frame that explains the photographs better, sought where the given one explains them poorly."""
-    if found.on_white or (found.fits and not found.margin < DOUBTFUL):
-        return None
+    """Another frame that explains the photographs better, if there is one."""
     with console.status("poor match: trying other frames ..."):
         points = load_points(images, checkpoint.origin)
         return guess_frame(checkpoint.gaussians, views, found, points, cameras)

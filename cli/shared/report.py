@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from clod_adapter.evaluation.evaluate import Row
     from clod_adapter.evaluation.popping import Popping
 
-# Round values, each about 1.4 times the last, closer below 3 where most Gaussians are culled; max_sv < 1/tau = 50.
+# Round values, each about 1.4 times the last, or more between 1 and 5; max_sv < 1/tau = 50.
 DIALS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
 
 

@@ -81,6 +81,11 @@ class Alignment:
         return self.psnr - self.mean_colour_psnr
 
     @property
+    def doubtful(self) -> bool:
+        """Whether another frame may explain the photographs better."""
+        return not self.on_white and not (self.fits and not self.margin < DOUBTFUL)
+
+    @property
     def on_white(self) -> bool:
         """Whether the renders are worse than the mean colours over black, but better over white."""
         return self.margin < 0 < self.white_psnr - self.mean_colour_psnr and self.white_psnr > self.psnr + CLEAR

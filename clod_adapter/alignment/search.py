@@ -17,7 +17,7 @@ from torch import Tensor
 
 from clod_adapter.alignment.check import CLEAR, DOUBTFUL, Alignment, check_alignment, compare_renders
 from clod_adapter.alignment.frames import Frame, centres_of, focus_of, known_frames
-from clod_adapter.cameras import Camera, Scene, View, camera_extent, in_its_unit, near_plane, spread
+from clod_adapter.cameras import Camera, Scene, View, in_its_unit, spread, with_near_planes
 from clod_adapter.gaussians import Gaussians
 
 COARSE = (72, 20_000)  # of the small renders: pixels of width, Gaussians
@@ -99,9 +99,7 @@ def scene_in(scene: Scene, frame: Frame) -> Scene:
 
 def cameras_in(cameras: Sequence[Camera], frame: Frame) -> list[Camera]:
     """The cameras of a scene in the file's frame, as ``scene_in``."""
-    found = [camera_in(camera, frame) for camera in cameras]
-    extent = camera_extent(found)
-    return [replace(camera, near=near_plane(extent)) for camera in found] if extent else found
+    return with_near_planes([camera_in(camera, frame) for camera in cameras])
 
 
 class _Stage:
@@ -110,7 +108,6 @@ class _Stage:
     def __init__(self, gaussians: Gaussians, views: Sequence[View], width: int, most: int):
         chosen = spread(range(len(views)), VIEWS)
         self.views = [_shrunk(views[k], width) for k in chosen]
-        self.middle = gaussians.means.double().median(dim=0).values.cpu()  # where cameras are
         if len(gaussians) > most:
             cover = F.logsigmoid(gaussians.opacity_logits) + gaussians.log_scales.topk(2, dim=1).values.sum(1)
             gaussians = gaussians.select(cover.topk(most).indices)
@@ -134,9 +131,9 @@ def _search(gaussians: Gaussians, views: Sequence[View], small: _Stage, viewmats
     """
     focus = focus_of(viewmats)
     unit = float((centres_of(viewmats) - focus).norm(dim=1).quantile(0.5).clamp(min=1e-9))
-    found = []
+    middle, found = gaussians.means.double().median(dim=0).values.cpu(), []  # where cameras are
     for towards in (0.0, 1.0):
-        places = [_placed(scale, towards * (focus - scale * small.middle), unit) for scale in SCALES]
+        places = [_placed(scale, towards * (focus - scale * middle), unit) for scale in SCALES]
         found.append(_climb(small, max(places, key=small.score), focus, unit, (0.1, 0.02)))
     score, frame = max(found, key=lambda pair: pair[0])
     if score < LOWEST_CORRELATION:

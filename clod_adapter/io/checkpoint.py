@@ -13,7 +13,7 @@ from torch import Tensor
 
 from clod_adapter.adapter import trim
 from clod_adapter.calibration import Calibration, Viewpoint
-from clod_adapter.cameras import Camera, camera_extent, near_plane
+from clod_adapter.cameras import Camera, with_near_planes
 from clod_adapter.config import CLASSIC
 from clod_adapter.equation.distances import camera_of
 from clod_adapter.equation.units import in_world_units
@@ -80,9 +80,7 @@ class Checkpoint:
             return []
         size = self.calibration.width, self.calibration.height
         seen = [viewpoint for viewpoint in self.viewpoints if viewpoint.fov > 0]
-        cameras = [camera_of(viewpoint, *size, f"viewpoint {k + 1}") for k, viewpoint in enumerate(seen)]
-        extent = camera_extent(cameras) if cameras else 0.0
-        return [replace(camera, near=near_plane(extent)) for camera in cameras] if extent else cameras
+        return with_near_planes([camera_of(each, *size, f"viewpoint {k + 1}") for k, each in enumerate(seen)])
 
     def hook(self, virtual_scale: float = 1.0) -> Hook:
         """The dial for a renderer that has these Gaussians: attenuated opacities, and factors of the scales.

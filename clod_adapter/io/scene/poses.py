@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from clod_adapter.cameras import Camera, camera_extent, near_plane
+from clod_adapter.cameras import Camera, with_near_planes
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import read_colmap
 from clod_adapter.io.scene.dataparser import trained_frame
@@ -53,6 +52,4 @@ def load_cameras(
         raise ClodError(
             f"{source}: has no size of a photograph, and no photograph is there; put them beside it, or w and h into it"
         )
-    extent = camera_extent(cameras)
-    cameras = [camera for camera in cameras if camera.name not in testing]
-    return [replace(camera, near=near_plane(extent)) if extent else camera for camera in cameras], notes
+    return [camera for camera in with_near_planes(cameras) if camera.name not in testing], notes

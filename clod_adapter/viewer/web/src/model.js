@@ -62,8 +62,8 @@ function fitted(gaussians, most, attenuation) {
   if (count <= most) return gaussians;
   let score;
   if (sigmaD && attenuation) {
-    const { scene_distance: unit, tau, eps } = attenuation;
-    score = extinctions(new Float32Array(3 * count), prepare(opacityLogits, sigmaD, eps), [unit, 0, 0], unit, tau);
+    const { tau, eps } = attenuation;
+    score = extinctions(new Float32Array(3 * count), prepare(opacityLogits, sigmaD, eps), [1, 0, 0], 1, tau);
   } else {
     score = Float64Array.from(opacityLogits, (l, i) => {
       const sizes = [logScales[3 * i], logScales[3 * i + 1], logScales[3 * i + 2]];
