@@ -27,7 +27,7 @@ STEPS = 20  # of a training that the pages run
 SKIPPED = {
     "pip": "would change the environment that the tests run in",
     "make": "makes an environment of its own; make test is what runs this",
-    "clod-adapt demo": "takes three minutes; tests/cli/test_demo.py runs it with the long parts replaced",
+    "clod-adapt demo": "takes a minute; tests/cli/test_demo.py runs it with the long parts replaced",
 }
 
 

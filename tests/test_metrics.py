@@ -6,11 +6,11 @@ import math
 
 import pytest
 import torch
+from skimage.data import coffee
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
 from clod_adapter import losses
-from clod_adapter.demo.textures import photograph
 from clod_adapter.metrics import psnr, psnr_ssim
 
 # The window has 11 taps: images smaller, as large and larger.
@@ -29,8 +29,7 @@ def random_target(height: int, width: int) -> Tensor:
 
 
 def real_target() -> Tensor:
-    image = photograph("coffee.png").crop((150, 100, 350, 260))
-    return torch.frombuffer(bytearray(image.tobytes()), dtype=torch.uint8).reshape(160, 200, 3)
+    return torch.from_numpy(coffee()[100:260, 150:350].copy())
 
 
 TARGETS = [pytest.param(random_target(*size), id="x".join(map(str, size))) for size in SIZES]

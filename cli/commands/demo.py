@@ -18,17 +18,17 @@ DEMO = Command(
     description="""\
 Run all steps on a scene that comes with the package.
 
-Ray-traces a gallery, trains a checkpoint on it, adapts and measures that, and
-draws two pictures. Takes a few minutes on two CPU cores; later runs reuse the
-gallery and the checkpoint.
+Unpacks photographs of a ray-traced gallery and a checkpoint that was trained
+on them to its end, adapts the checkpoint, measures the result and draws two
+pictures. Takes about a minute on two CPU cores.
 """,
     usage="[--out DIR] [options]",
     epilog="""\
 outputs in DIR:
-  capture/          64 images and their COLMAP model
-  base.ply          the checkpoint, as a 3DGS trainer writes it
+  capture/          80 images and their COLMAP model
+  base.ply          the checkpoint
   gallery.ply       the adapted file; gallery.safetensors, gallery.json
-  dial.png          one held-out view at several dial values
+  dial.png          one held-out view: photograph, base, several dial values
   curve.png         quality against the number of Gaussians
 """,
     add_arguments=demo_options,

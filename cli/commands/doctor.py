@@ -22,9 +22,9 @@ metric measured, a file was packed. Only the browser is not opened.
                  what gpu needs, in this order: fix the first that is off
   gsplat, inria  backends of the integrations of these names
   processes      torch.distributed, for several processes
-  plots, glb, splat-transform, demo, lpips, flip
-                 optional: figures and reports, .glb files, packed files, the
-                 demo, two columns of clod-adapt eval
+  plots, glb, splat-transform, lpips, flip
+                 optional: figures, reports and the demo, .glb files, packed
+                 files, two columns of clod-adapt eval
   cores, memory, cache
                  limits of this process, and folders for cached files
 

@@ -73,17 +73,6 @@ def splat_transform() -> str:
     return f"{tool.version}, {'on a GPU' if tool.gpu else 'without a GPU'}"
 
 
-def demo() -> str:
-    """Reads a photograph of the demo."""
-    from clod_adapter.demo.textures import photograph
-
-    try:
-        photograph("coffee.png")
-    except ClodError as error:
-        raise CheckFailed(first_line(error).partition(": pip")[0], "pip install scikit-image") from error
-    return "its photographs are installed"
-
-
 def metric(name: str) -> Probe:
     """A probe that measures the distance of an image to itself and to another."""
 
@@ -184,6 +173,6 @@ def _gaussians() -> Gaussians:
 
 
 TOOLS: dict[str, Probe] = {
-    "plots": plots, "glb": glb, "splat-transform": splat_transform, "demo": demo, "lpips": metric("lpips"),
+    "plots": plots, "glb": glb, "splat-transform": splat_transform, "lpips": metric("lpips"),
     "flip": metric("flip"), "browser": browser, "cores": cores, "memory": memory, "cache": cache,
 }  # fmt: skip

@@ -60,11 +60,11 @@ def one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def announced_compiling(console: Console, shares: Mapping[str, float] | None = None) -> Iterator[None]:
-    """Prints a line when something is compiled within the block.
+def announced_compiling(console: Console, shares: Mapping[str, float]) -> Iterator[None]:
+    """Prints a line when something is compiled within the block, and the progress.
 
     Args:
-        shares: of the compile time, by kernel and for ``OTHER`` ones: shows progress, and whether there is a cache.
+        shares: of the compile time, by kernel and for ``OTHER`` ones.
     """
     listener = _Compiling(console, shares)
     try:
@@ -77,24 +77,22 @@ def announced_compiling(console: Console, shares: Mapping[str, float] | None = N
 class _Compiling(Listener):  # type: ignore[misc]
     """Follows compilations; functions that a kernel calls are compiled within its own."""
 
-    def __init__(self, console: Console, shares: Mapping[str, float] | None) -> None:
+    def __init__(self, console: Console, shares: Mapping[str, float]) -> None:
         self.console, self.shares = console, shares
         self.meter: Meter | None = None
-        self.said, self.depth, self.done = False, 0, 0.0
+        self.depth, self.done = 0, 0.0
 
     def on_start(self, event: Event) -> None:
         self.depth += 1
-        if not self.said:
-            self.said = True
-            # The demo's ray tracer is never cached: its images are.
-            cached = not self.shares or not isinstance(event.data["dispatcher"]._cache, NullCache)
+        if not self.meter:
+            cached = not isinstance(event.data["dispatcher"]._cache, NullCache)
             nowhere = "on every run, as no cache folder is writable: set NUMBA_CACHE_DIR"
             self.console.say(f"compiling kernels ({'first run only, well under a minute' if cached else nowhere}) ...")
-            self.meter = Meter(self.console, "compiling", slow=True) if self.shares else None
+            self.meter = Meter(self.console, "compiling", slow=True)
 
     def on_end(self, event: Event) -> None:
         self.depth -= 1
-        if self.depth == 0 and self.meter and self.shares:
+        if self.depth == 0 and self.meter:
             self.done += self.shares.get(event.data["dispatcher"].py_func.__name__, self.shares[OTHER])
             self.meter.update(self.done)
 

@@ -1,1 +1,1 @@
-"""The demo: a small ray-traced gallery as ground truth, independent of splatting, and figures of the results."""
+"""The demo: the photographs of a ray-traced gallery, a checkpoint trained on them, and figures of the results."""

@@ -18,15 +18,15 @@ class Panel:
 
     Attributes:
         image: ``[H, W, 3]`` uint8, or float in 0..1; the same size in every panel.
-        virtual_scale: the dial value; None for the ground truth.
-        kept: Gaussians that are not culled.
+        heading: what it shows.
+        kept: Gaussians that are not culled; 0 for a photograph.
         kept_share: their share of all, in [0, 1].
         psnr: dB against the ground truth.
         frame_ms: time of a frame, milliseconds.
     """
 
     image: np.ndarray
-    virtual_scale: float | None = None
+    heading: str
     kept: float = 0.0
     kept_share: float = 0.0
     psnr: float = 0.0
@@ -36,11 +36,11 @@ class Panel:
 def dial_strip(
     path: str | Path, panels: Sequence[Panel], title: str, crop: tuple[int, int, int, int] | None = None
 ) -> None:
-    """Draws one view at several dial values side by side.
+    """Draws one view side by side: photograph, base, dial values.
 
     Args:
         path: the picture to write; its suffix chooses the format.
-        panels: from left to right, the ground truth first.
+        panels: from left to right.
         title: one line above.
         crop: left, top, width, height in pixels of a part to show enlarged in a second row.
 
@@ -80,12 +80,12 @@ def shown_panel(axes: Any, image: np.ndarray, crop: tuple[int, int, int, int] | 
 
 
 def write_caption(figure: Any, panel: Panel, x: float, y: float, down: float) -> None:
-    """The dial value, then count, PSNR and frame time, centred on x (share of the width) below y (inches of `down`)."""
-    heading, detail = "ground truth", "held out from training"
-    if panel.virtual_scale is not None:
-        heading = f"s = {panel.virtual_scale:g}"
-        detail = f"{panel.kept:,.0f} Gaussians ({panel.kept_share:.0%})\n{panel.psnr:.2f} dB,  {panel.frame_ms:.1f} ms"
-    figure.text(x, (y - 0.04) / down, heading, fontsize=10.5, weight="bold", ha="center", va="top")
+    """Heading, count, PSNR and frame time, centred on x (share of the width) below y (inches of `down`)."""
+    detail = "held out from training"
+    if panel.kept:
+        quality = f"{panel.psnr:.1f} dB,  {panel.frame_ms:.1f} ms a frame"
+        detail = f"{panel.kept:,.0f} Gaussians ({panel.kept_share:.0%})\n{quality}"
+    figure.text(x, (y - 0.04) / down, panel.heading, fontsize=10.5, weight="bold", ha="center", va="top")
     figure.text(x, (y - 0.24) / down, detail, fontsize=8.5, color=QUIET, ha="center", va="top", linespacing=1.35)
 
 

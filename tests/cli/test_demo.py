@@ -10,10 +10,15 @@ from typing import Any
 
 import pytest
 
+from clod_adapter import config
+from clod_adapter import demo as demo_package
 from clod_adapter.cli import demo
 from clod_adapter.cli.adapt import report, resume, saver
 from clod_adapter.cli.adapt.result import Measurements
 from clod_adapter.cli.main import build_parser
+from clod_adapter.evaluation.evaluate import evaluate
+from clod_adapter.io.checkpoint import load
+from clod_adapter.io.scene.load import load_scene
 
 PICTURES = ("dial.png", "curve.png")
 
@@ -22,17 +27,18 @@ PICTURES = ("dial.png", "curve.png")
 def short(monkeypatch: pytest.MonkeyPatch, capture: Any) -> None:
     """The tests' own capture in place of the gallery, a few steps, and empty pictures."""
 
-    def prepare(scene: Path, base: Path, console: object) -> None:
+    def unpack(scene: Path, base: Path) -> None:
         shutil.copytree(capture.scene, scene, dirs_exist_ok=True)
         shutil.copyfile(capture.ply, base)
 
-    def draw(scene: Path, model: Path, report: dict[str, Any], pictures: dict[str, Path]) -> None:
+    def draw(scene: Path, base: Path, model: Path, report: dict[str, Any], pictures: dict[str, Path]) -> None:
         for path in pictures.values():
             path.write_bytes(b"")
 
-    monkeypatch.setattr(demo, "make_inputs", prepare)
+    monkeypatch.setattr(demo, "unpack", unpack)
     monkeypatch.setattr(demo, "draw", draw)
-    monkeypatch.setattr(demo, "ADAPT_STEPS", 2)
+    monkeypatch.setattr(config, "STEPS", 2)
+    monkeypatch.setattr(config, "STEPS_PER_VIEW", 0)
     monkeypatch.setattr(report, "LOST", (99.0, 99.0))  # two steps cannot keep full quality
 
 
@@ -61,13 +67,22 @@ def test_figures_that_were_not_drawn_are_not_reported(
 
 
 def test_missing_package_is_named_at_the_start(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module, package in (("matplotlib", "matplotlib"), ("skimage", "scikit-image")):
-        with monkeypatch.context() as patch:
-            patch.setattr(demo, "EXTRA", {module: package})
-            patch.setitem(sys.modules, module, None)
-            done = clod("demo")
-        assert done.code == 2 and f"the demo needs {package}: pip install {package}" in done.err
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    done = clod("demo")
+    assert done.code == 2 and "matplotlib: pip install matplotlib" in done.err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_scene_and_base_of_the_package(tmp_path: Path) -> None:
+    """The base is trained to its end, and packing it and the photographs cost little."""
+    packed = [Path(demo_package.__file__).with_name(name) for name in ("base.spz", "capture.zip")]
+    assert packed[0].stat().st_size < 2e6 and sum(path.stat().st_size for path in packed) < 3e6
+    capture, base = tmp_path / "capture", tmp_path / "base.ply"
+    for _ in range(2):  # what exists is left
+        demo.unpack(capture, base)
+    scene, checkpoint = load_scene(capture), load(base)
+    assert (len(scene.train), len(scene.test), checkpoint.notes, scene.notes) == (70, 10, (), ())
+    assert evaluate(checkpoint.gaussians, scene.test, [0])[0].psnr > 30
 
 
 def test_folder_that_cannot_be_made(clod: Any, tmp_path: Path) -> None:
@@ -83,7 +98,7 @@ def test_arguments_for_adapting() -> None:
     args = build_parser("demo").parse_args(["--out=-odd", *flags])
     files = [Path("-odd") / name for name in ("base.ply", "capture", "gallery.ply")]
     given = demo.adapt_arguments(args, *files)
-    words = ["--images=-odd/capture", "--max-sv=5", "--iters=1500", "--out=-odd/gallery.ply", *flags, "--"]
+    words = ["--images=-odd/capture", "--max-sv=5", "--out=-odd/gallery.ply", *flags, "--"]
     words.append("-odd/base.ply")
     assert vars(given) == vars(build_parser("").parse_args(words))
 

@@ -27,7 +27,7 @@ from clod_adapter.rasterizers import reference
 
 NAMES = [
     "python", "torch", "cpu", "driver", "cuda", "gsplat", "gpu", "inria", "processes", "plots", "glb",
-    "splat-transform", "demo", "lpips", "flip", "browser", "cores", "memory", "cache",
+    "splat-transform", "lpips", "flip", "browser", "cores", "memory", "cache",
 ]  # fmt: skip
 TYPES = {"name": "str", "ok": "bool", "found": "str", "fix": "str"}
 
@@ -267,7 +267,7 @@ def test_processes_check(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(
     ("name", "module", "packages"),
-    [("plots", "matplotlib", "matplotlib"), ("glb", "pygltflib", "pygltflib"), ("demo", "skimage", "scikit-image"),
+    [("plots", "matplotlib", "matplotlib"), ("glb", "pygltflib", "pygltflib"),
      ("lpips", "lpips", "lpips flip-evaluator"), ("flip", "flip_evaluator", "lpips flip-evaluator")],
 )  # fmt: skip
 def test_extras_that_are_not_installed(monkeypatch: pytest.MonkeyPatch, name: str, module: str, packages: str) -> None:

@@ -12,11 +12,11 @@ from functools import partial
 from math import cos, pi, sin, sqrt
 from typing import Any
 
-import numpy as np
-
 from clod_adapter._support.workers import in_order
-from clod_adapter.demo.intersect import compiled, nearest, surface_point
-from clod_adapter.demo.raytrace import MIRROR_HEIGHT, Tables, radiance, trace_rays
+from gallery_intersect import compiled, nearest, surface_point
+from gallery_raytrace import MIRROR_HEIGHT, Tables, radiance, trace_rays
+
+import numpy as np
 
 LIFT = 1e-4  # world units from the surface to the origin of a ray
 GATHER_SPREAD = 0.2  # width of a gathering ray per unit of distance: coarse textures, less noise

@@ -7,27 +7,19 @@ from __future__ import annotations
 
 from importlib import resources
 
+from gallery_raytrace import decode_srgb
+
 import numpy as np
 from PIL import Image, ImageOps
-
-from clod_adapter.demo.raytrace import decode_srgb
-from clod_adapter.errors import ClodError
 
 SIDE = 512
 Colour = tuple[int, int, int]  # sRGB, 0..255
 
 
 def photograph(name: str) -> Image.Image:
-    """One of scikit-image's bundled photographs, as RGB.
-
-    Raises:
-        ClodError: scikit-image is missing, or the installed version does not include the file.
-    """
-    try:
-        with resources.as_file(resources.files("skimage") / "data" / name) as path:
-            return Image.open(path).convert("RGB")
-    except (ModuleNotFoundError, FileNotFoundError) as error:
-        raise ClodError(f"the demo's photograph {name} is missing: pip install 'scikit-image>=0.22'") from error
+    """One of scikit-image's bundled photographs, as RGB."""
+    with resources.as_file(resources.files("skimage") / "data" / name) as path:
+        return Image.open(path).convert("RGB")
 
 
 def linear(image: Image.Image) -> np.ndarray:

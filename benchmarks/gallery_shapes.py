@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from math import ceil
 
-import numpy as np
+from gallery_intersect import CYLINDER, DISC, GROUP, QUAD, SPHERE, SURFACE
+from gallery_raytrace import LEVEL, Tables
 
-from clod_adapter.demo.intersect import CYLINDER, DISC, GROUP, QUAD, SPHERE, SURFACE
-from clod_adapter.demo.raytrace import LEVEL, Tables
+import numpy as np
 
 DOWN = np.array([0.0, 1.0, 0.0])
 Vector = tuple[float, float, float]

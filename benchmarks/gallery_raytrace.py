@@ -14,11 +14,11 @@ from functools import partial
 from math import floor, log2, sqrt
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from clod_adapter._support.workers import in_order
 from clod_adapter.cameras import Camera
-from clod_adapter.demo.intersect import compiled, nearest, record, sphere_uv, surface_point
+from gallery_intersect import compiled, nearest, record, sphere_uv, surface_point
+
+import numpy as np
 
 MIRROR_HEIGHT = 24  # rows of a glossy surface's environment map; it is twice as wide
 ROWS = 16  # image rows per task: small enough to balance the cores

@@ -9,23 +9,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import gallery_textures as tx
+from clod_adapter.cameras import Camera
+from clod_adapter.io.scene.colmap import write_model
+from gallery_lightmaps import bake_light
+from gallery_paths import path_cameras
+from gallery_raytrace import Tables, camera_rays, encode_srgb, render_linear, trace_rays
+from gallery_shapes import Finish, SceneBuilder
+
 import numpy as np
 from PIL import Image
 
-from clod_adapter.cameras import Camera
-from clod_adapter.config import require
-from clod_adapter.demo import textures as tx
-from clod_adapter.demo.lightmaps import bake_light
-from clod_adapter.demo.paths import path_cameras
-from clod_adapter.demo.raytrace import Tables, camera_rays, encode_srgb, render_linear, trace_rays
-from clod_adapter.demo.shapes import Finish, SceneBuilder
-from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.scene.colmap import write_model
-from clod_adapter.progress import Listener, Phase, tell
-
 LOW, HIGH = np.array([-3.0, -3.0, 0.0]), np.array([3.0, 0.0, 8.0])
+WIDTH, HEIGHT, VIEWS = 480, 360, 80
 CANDIDATES = 4  # pixels sampled per point; those with detail are preferred
-HOLD_OUT = 8  # every 8th view by name is held out, from the point cloud too
+HOLD_OUT = 8  # every 8th view by name is held out
 OAK, BLACK, WHITE, GOLD = (122, 84, 52), (34, 32, 32), (226, 222, 214), (168, 128, 66)
 
 # name, wall, metres along the wall, height of the centre, width and height in metres, frame
@@ -33,7 +31,7 @@ PICTURES = (
     ("astronaut.png", "left", 1.6, 1.6, (1.1, 1.3), OAK),
     ("coffee.png", "left", 3.7, 1.6, (1.5, 1.1), BLACK),
     ("chelsea.png", "left", 6.0, 1.6, (1.5, 1.1), GOLD),
-    ("motorcycle_left.png", "right", 1.8, 1.6, (1.6, 1.15), BLACK),
+    ("coins.png", "right", 1.8, 1.6, (1.6, 1.25), BLACK),
     ("retina.jpg", "right", 4.0, 1.6, (1.2, 1.2), OAK),
     ("rocket.jpg", "right", 6.2, 1.6, (1.5, 1.1), WHITE),
     ("hubble_deep_field.jpg", "end", 0.0, 1.65, (2.3, 1.8), BLACK),
@@ -58,33 +56,28 @@ class Gallery:
         """``[H, W, 3]`` uint8 sRGB, anti-aliased: the mean of linear light over each pixel's square."""
         return encode_srgb(render_linear(self.tables, camera, self.samples))
 
-    def cameras(self, width: int = 320, height: int = 240, count: int = 64) -> list[Camera]:
-        """`count` cameras named from ``view_000.png`` on, along smooth paths, both far from and close to the surfaces.
+    def cameras(self) -> list[Camera]:
+        """The views, along smooth paths, both far from and close to the surfaces.
 
-        With the default count, held-out views (every 8th) lie between neighbours on their path.
+        Held-out views (every 8th) lie between neighbours on their path.
         """
-        return path_cameras(width, height, count)
+        return path_cameras(WIDTH, HEIGHT, VIEWS)
 
-    def sample_points(self, n: int, seed: int = 0, views: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    def sample_points(self, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """A point cloud like that of structure from motion, from rays of the training cameras.
 
         Args:
             n: number of points; denser on near surfaces and on detail, like feature matches.
             seed: of pixel selection and noise.
-            views: number of cameras in the capture, at least 2; every 8th is held out.
 
         Returns:
             points ``[n, 3]`` float32 metres, with noise of about 0.3 % of their distance, and colours ``[n, 3]`` uint8
             sRGB.
         """
-        require(views >= 2, "views", views, "at least 2")
         random = np.random.default_rng(seed)
-        cameras = [c for k, c in enumerate(self.cameras(count=views)) if k % HOLD_OUT]
-        shares = np.array_split(np.arange(n), len(cameras))
+        cameras = [camera for k, camera in enumerate(self.cameras()) if k % HOLD_OUT]
         points, colors = [], []
-        for camera, share in zip(cameras, shares, strict=True):
-            if len(share) == 0:
-                continue
+        for camera, share in zip(cameras, np.array_split(np.arange(n), len(cameras)), strict=True):
             pixels = random.random((CANDIDATES * len(share), 2)) * [camera.width, camera.height]
             seen, directions = self._look(camera, pixels)
             shades = [encode_srgb(seen[:, :3]).astype(float)]
@@ -191,30 +184,11 @@ def add_solids(scene: SceneBuilder) -> None:
         scene.box(foot, (0.35, 0.379, 0.06), Finish("dark"), turn=-0.1, faces="front back left right")
 
 
-def write_gallery(
-    folder: str | Path, *, width: int = 320, height: int = 240, count: int = 64, points: int = 20000,
-    progress: Listener | None = None,
-) -> Gallery:  # fmt: skip
-    """Renders the capture into a new `folder`: ``images/*.png`` and a COLMAP model with a point cloud.
-
-    Args:
-        folder: does not exist or is empty; it is created atomically.
-        count: number of views, at least 2; every 8th by name is held out.
-        points: size of the point cloud.
-        progress: called in ``Phase.PHOTOGRAPHS`` after each view.
-
-    Raises:
-        ClodError: the folder cannot be written, count is too small, or a bundled photograph is missing.
-    """
-    require(count >= 2, "count", count, "at least 2")
-    with atomic_path(folder) as part:
-        gallery = make_gallery()
-        cameras = gallery.cameras(width, height, count)
-        images = part / "images"
-        images.mkdir(parents=True)
-        for done, camera in enumerate(cameras, 1):
-            Image.fromarray(gallery.render(camera)).save(images / camera.name)
-            tell(progress, Phase.PHOTOGRAPHS, done, count)
-        xyz, rgb = gallery.sample_points(points, views=count)
-        write_model(part, cameras, [camera.name for camera in cameras], xyz, rgb)
-    return gallery
+def write_capture(folder: Path, gallery: Gallery, quality: int) -> None:
+    """Renders the views into a new `folder`: ``images/*.webp`` and a COLMAP model without points."""
+    (folder / "images").mkdir(parents=True)
+    cameras = gallery.cameras()
+    for camera in cameras:
+        picture = Image.fromarray(gallery.render(camera))
+        picture.save(folder / "images" / camera.name, quality=quality, method=6)
+    write_model(folder, cameras, [camera.name for camera in cameras])

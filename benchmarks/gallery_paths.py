@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from clod_adapter.cameras import Camera
+
 import numpy as np
 import torch
-
-from clod_adapter.cameras import Camera
 
 FIELD_OF_VIEW = 68.0  # degrees, across the width
 
@@ -72,10 +72,10 @@ def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: 
 
 
 def path_cameras(width: int, height: int, count: int) -> list[Camera]:
-    """`count` cameras named from ``view_000.png`` on, evenly spaced in time along each path in turn."""
+    """`count` cameras named from ``view_000.webp`` on, evenly spaced in time along each path in turn."""
     shares = np.array([path.share for path in PATHS])
     ends = np.rint(count * np.cumsum(shares) / shares.sum()).astype(int)
     poses = []
     for path, views in zip(PATHS, np.diff(ends, prepend=0), strict=True):
         poses += [path.pose((k + 0.5) / views) for k in range(views)]
-    return [look_at(eye, target, width, height, f"view_{k:03d}.png") for k, (eye, target) in enumerate(poses)]
+    return [look_at(eye, target, width, height, f"view_{k:03d}.webp") for k, (eye, target) in enumerate(poses)]
