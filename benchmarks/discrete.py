@@ -1,7 +1,7 @@
 """Two levels of detail with a hard switch against one file with its dial: a picture and the measured jump.
 
     clod-adapt demo                                      # makes demo/gallery.ply and demo/capture
-    python benchmarks/discrete.py                        # docs/images/discrete_vs_continuous.png
+    python benchmarks/discrete.py                        # docs/images/discrete_vs_continuous.webp
 
 The two levels are the file at both ends of its dial, so that only the switch differs. Adds a row to
 ``results/discrete.jsonl``.
@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-PICTURE = ROOT / "docs" / "images" / "discrete_vs_continuous.png"
+PICTURE = ROOT / "docs" / "images" / "discrete_vs_continuous.webp"
 STRIPS, FRAMES = 4, 120
 NAMES = ("two levels, a hard switch", "one file, its dial")
 

@@ -58,7 +58,7 @@ def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
 def save_figure(figure: Any, path: str | Path) -> None:
     """Writes the figure atomically."""
     # Text in a PNG by which a later run recognizes its own output.
-    about = {"Software": f"clod-adapter {package_version()}"} if Path(path).suffix.lower() == ".png" else {}
+    about = {"Software": f"clod-adapter {package_version()}"} if Path(path).suffix.lower() == ".png" else None
     with atomic_path(path) as part:
         figure.savefig(part, facecolor=PAPER, metadata=about)
 
