@@ -74,7 +74,8 @@ def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Res
     payloads = payloads_of([model, *others]) | ({BASE: Payload.of(base)} if base else {})
     entries = {path: payload.describe(href=path) for path, payload in payloads.items()}
     model_entry, base_entry = entries.pop(MODEL), entries.pop(BASE, None)
-    page = served_page(page_config(model_entry, base_entry, cameras or model.cameras, opening, tuple(entries.values())))
+    shown, placed, rest = cameras or model.cameras, model.placed and not cameras, tuple(entries.values())
+    page = served_page(page_config(model_entry, base_entry, shown, opening, rest, placed))
     answers = {"/": Response("text/html; charset=utf-8", len(page), lambda: (page,), policy("'self'"))}
     for path, payload in payloads.items():
         answers[path] = Response("application/octet-stream", payload.size, payload.blocks)

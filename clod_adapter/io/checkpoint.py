@@ -82,6 +82,11 @@ class Checkpoint:
         seen = [viewpoint for viewpoint in self.viewpoints if viewpoint.fov > 0]
         return with_near_planes([camera_of(each, *size, f"viewpoint {k + 1}") for k, each in enumerate(seen)])
 
+    @property
+    def placed(self) -> bool:
+        """Whether these cameras were placed without photographs, so that they do not tell which way is up."""
+        return self.calibration is not None and self.calibration.against == "checkpoint"
+
     def hook(self, virtual_scale: float = 1.0) -> Hook:
         """The dial for a renderer that has these Gaussians: attenuated opacities, and factors of the scales.
 

@@ -70,7 +70,8 @@ def write_viewer_page(
             entries.append(entry)
             packs.append(packed)
             data |= added
-    config = page_config(entries[0], entries[1] if base else None, cameras or model.cameras, virtual_scale)
+    shown, placed = cameras or model.cameras, model.placed and not cameras
+    config = page_config(entries[0], entries[1] if base else None, shown, virtual_scale, placed=placed)
     meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.writelines(_document(config, _elements(data), meta))

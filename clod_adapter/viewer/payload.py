@@ -88,6 +88,7 @@ def page_config(
     cameras: Sequence[Camera],
     virtual_scale: float,
     others: Sequence[Mapping[str, Any]] = (),
+    placed: bool = False,
 ) -> dict[str, Any]:
     """The page's configuration.
 
@@ -96,10 +97,12 @@ def page_config(
         cameras: selectable viewpoints, in this order, in the frame of the Gaussians.
         virtual_scale: the initial dial value, >= 0.
         others: further models to switch to, from ``Payload.describe``.
+        placed: the cameras are not photographs'; the page levels them by the scene's up axis.
     """
     return {
         "version": package_version(), "title": model["name"], "model": model, "base": base,
-        "others": list(others), "cameras": [_camera(camera) for camera in cameras], "virtual_scale": virtual_scale,
+        "others": list(others), "cameras": [_camera(camera) | {"placed": placed} for camera in cameras],
+        "virtual_scale": virtual_scale,
     }  # fmt: skip
 
 

@@ -126,7 +126,7 @@ def test_the_dial_follows_a_load_that_is_switched_on_and_off(held: Shown) -> Non
     assert 1 < before < 3
     for load in (1.6, 1.0):
         dials, times = zip(*turned(held, load), strict=True)
-        assert len(times) < 40 and all(0.9 * BUDGET < each < 1.1 * BUDGET for each in times[15:] or times[-1:]), times
+        assert len(times) < 50 and all(0.9 * BUDGET < each < 1.1 * BUDGET for each in times[15:] or times[-1:]), times
         assert all(max(a, b) <= 1.1 * min(a, b) + 0.01 for a, b in pairwise(dials))  # the text has two decimals
         assert dials[-1] > 1.4 * before if load > 1 else dials[-1] < 1.2 * before, (before, dials)
     drawn = "(window.trace.length = 0, new Promise((later) => setTimeout(later, 300)).then(() => window.trace.length))"

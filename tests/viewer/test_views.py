@@ -13,11 +13,15 @@ import pytest
 import torch
 from PIL import Image
 
+import clod_adapter
 import scenes
+from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.cameras import Camera
+from clod_adapter.equation.distances import viewpoint_of
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import dial, render
+from clod_adapter.viewer.page import write_viewer_page
 from shown import REAL_GPU, SIZE, TALL, Shown, assert_alike, serve, sorts_on_gpu, take
 
 C0 = 0.28209479177387814
@@ -66,20 +70,29 @@ def test_double_click_sets_the_orbit_centre(show: Any, save: Any) -> None:
     assert np.allclose(link(shown)["axes"], after["axes"])
 
 
-def test_the_up_axis(show: Any, save: Any, tmp_path: Path) -> None:
+ANGLE = np.radians(25)
+TURN = np.array([[1, 0, 0], [0, np.cos(ANGLE), -np.sin(ANGLE)], [0, np.sin(ANGLE), np.cos(ANGLE)]])
+
+
+@pytest.fixture
+def ground() -> Gaussians:
+    """A ground whose normal is TURN @ [0, -1, 0]: two thirds are flat and lie along it."""
+    model = points(np.random.default_rng(0).uniform(-1, 1, (1000, 3)) * [2, 0.02, 2] @ TURN.T, 0.01)
+    flat = torch.arange(1000)[:, None] % 3 > 0
+    scales = torch.where(flat, torch.tensor([0.0, -3.0, 0.0]), torch.tensor([-2.0, 0.0, 0.0]))
+    quats = torch.where(flat, torch.tensor([np.cos(ANGLE / 2), np.sin(ANGLE / 2), 0.0, 0.0]), model.quats).float()
+    return model.replace(log_scales=model.log_scales + scales, quats=quats)
+
+
+def test_the_up_axis(show: Any, save: Any, ground: Gaussians, tmp_path: Path) -> None:
     """That of a tilted ground; that of the photographs' cameras, if any; or a chosen one, which a link keeps."""
-    generator = np.random.default_rng(0)
-    ground = generator.uniform(-1, 1, (900, 3)) * [2, 0.02, 2]
-    ground = np.concatenate([ground, generator.uniform(-1, 1, (100, 3)) * [0.2, 0.4, 0.2] - [0, 0.4, 0]])
-    angle = np.radians(25)
-    turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
-    path = save(points(ground @ turn.T, 0.01))
+    path = save(ground)
     shown = show(path, viewport=TALL)
 
     def up_of(view: dict[str, np.ndarray], tilt: float) -> np.ndarray:
         return np.asarray(-np.cos(tilt) * view["axes"][3:] - np.sin(tilt) * forward(view))
 
-    assert up_of(link(shown), np.arctan(0.25)) @ (turn @ [0, -1, 0]) > np.cos(np.radians(5))
+    assert up_of(link(shown), np.arctan(0.5)) @ (TURN @ [0, -1, 0]) > np.cos(np.radians(5))
     shown.page.click("#menu-open")
     assert shown.page.inner_text("#up option") == "found from the scene"
     shown.page.select_option("#up", "0,0,1")
@@ -98,6 +111,27 @@ def test_the_up_axis(show: Any, save: Any, tmp_path: Path) -> None:
     shown.page.keyboard.press("ArrowLeft")
     turned, up = link(shown)["axes"], -sum(camera.viewmat[1, :3].numpy() for camera in cameras)
     assert abs((turned - before)[:3] @ up) < 1e-4 < np.abs(turned - before).max()
+
+
+def test_placed_cameras_are_levelled(tabs: Any, save: Any, ground: Gaussians, tmp_path: Path) -> None:
+    """By the scene's up axis; steep ones are last. Photographs' cameras stay."""
+    model = clod_adapter.load(save(scenes.dialled(1000, 0, 1).replace(**ground.tensors())))
+    up = TURN @ [0, -1, 0]
+    assert model.gaussians.attenuation is not None
+    towards = torch.tensor(np.array([-up, [1, 0, 0.5]])).float()
+    views = [Camera(scenes.looking(each), torch.eye(3), 4, 3) for each in towards]
+    places = tuple(viewpoint_of(view, model.gaussians.means, model.gaussians.attenuation) for view in views)
+    row = CalibrationRow(1.0, 9.0, 30.0, 0.9, 1.0)
+    for against in ("checkpoint", "photographs"):
+        measured = Calibration((row,), 1000, 1, 400, 300, "a", against, places)
+        write_viewer_page(tmp_path / "page.html", replace(model, calibration=measured))
+        page = tabs.new_page()
+        shown = Shown(page).ready((tmp_path / "page.html").as_uri())
+        view, placed = link(shown), against == "checkpoint"
+        assert shown.page.locator("#camera option").all_inner_texts()[0] == f"viewpoint {2 if placed else 1}"
+        assert (abs(view["axes"][:3] @ up) < 0.02 and view["axes"][3:] @ up < -0.5) or not placed
+        assert shown.errors == []
+        page.close()
 
 
 @pytest.mark.parametrize("viewport", [(390, 844), (900, 420), (1280, 800)], ids=["phone", "lying phone", "desktop"])

@@ -22,8 +22,8 @@ export function createCamera() {
       return { rotation: [...rotation], eye: [...eye], near, fx: f, fy: f, cx, cy, width, height };
     },
 
-    /** Takes pose and intrinsics of a camera of the configuration. */
-    set({ viewmat, K, width, height, near }) {
+    /** Takes pose and intrinsics of a camera of the configuration; one that was placed is levelled. */
+    set({ viewmat, K, width, height, near, placed = false }) {
       camera.rotation = [0, 1, 2].flatMap((k) => viewmat[k].slice(0, 3));
       const t = [0, 1, 2].map((k) => viewmat[k][3]);
       camera.eye = [0, 1, 2].map((k) => -dot([0, 1, 2].map((j) => viewmat[j][k]), t));
@@ -32,6 +32,8 @@ export function createCamera() {
       const [side, f] = width < height ? [width, K[0][0]] : [height, K[1][1]];
       camera.fov = 2 * Math.atan(side / 2 / f);
       camera.aspect = width / height;
+      const forward = row(camera.rotation, 2);
+      if (placed && Math.abs(dot(forward, camera.up)) < MAX_PITCH) camera.place(camera.eye, forward);
     },
 
     /** Pose and field of view, as an animation takes them (motion.js). */
@@ -123,10 +125,10 @@ function placed(aspect, width, height, [left, bottom]) {
   return beside.side > above.side ? beside : above;
 }
 
-/** Along the z axis, or y where z is up, and slightly down. */
+/** Along the z axis, or y where z is up, and down by 27 degrees. */
 function lookingDown(up) {
   const axis = Math.abs(up[2]) < 0.9 ? [0, 0, 1] : [0, 1, 0];
-  return unit(add(unit(add(axis, up, -dot(axis, up))), up, -0.25));
+  return unit(add(unit(add(axis, up, -dot(axis, up))), up, -0.5));
 }
 
 /** Depth in the first camera of the point nearest to all axes (least squares); null where there is none in front of it. */

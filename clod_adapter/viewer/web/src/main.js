@@ -12,9 +12,12 @@ import { createRenderer } from "./renderer.js";
 import { sortingDevice } from "./sorter.js";
 import { createStage } from "./stage.js";
 import { createUi, elementsOf } from "./ui.js";
+import { dot } from "./vector.js";
 import { createViews } from "./views.js";
 import { createWipe } from "./wipe.js";
 import { xrModes } from "./xr.js";
+
+const STEEP = 0.7; // sine of a placed camera's angle to the horizon
 
 const elements = elementsOf(document), config = readConfig();
 const viewer = { cameraNumber: 0, cameras: config.cameras, up: "", recording: null, file: 0 };
@@ -69,8 +72,9 @@ function show(model, base, cameras, dial) {
   viewer.up = "";
   stage.setHold(null);
   stage.show(uploaded, uploadedBase);
-  viewer.cameras = cameras;
-  ui.listCameras(cameras);
+  const isSteep = ({ placed, viewmat }) => placed && Math.abs(dot(viewmat[2], uploaded.extent.up)) > STEEP;
+  viewer.cameras = [...cameras.filter((each) => !isSteep(each)), ...cameras.filter(isSteep)];
+  ui.listCameras(viewer.cameras);
   ui.update(); // rows of the panel, before the picture is placed beside it
   actions.layOut();
   actions.reset();

@@ -9,7 +9,7 @@ export function createMenu(elements, viewer, actions, records) {
     elements.marks.disabled = !model?.attenuation;
     elements.marks.checked = state.marks;
     elements.up.value = viewer.up;
-    elements.up.options[0].textContent = viewer.cameras.length ? "as in the photographs" : "found from the scene";
+    elements.up.options[0].textContent = viewer.cameras.some(({ placed }) => !placed) ? "as in the photographs" : "found from the scene";
     elements.play.classList.toggle("playing", motion.running);
     elements.turn.textContent = motion.running ? "Stop" : "Turntable";
     elements.record.textContent = viewer.recording ? "Stop recording" : "Record video";

@@ -4,7 +4,7 @@ import { WIDTH, dataTexture, heightOf, maxTexels } from "./gpu.js";
 import { half } from "./half.js";
 import { SH_TEXELS } from "./shaders.js";
 import { createSorter, largestScales } from "./sorter.js";
-import { upOfPoints } from "./up.js";
+import { upOfGaussians } from "./up.js";
 import { add } from "./vector.js";
 import workerSource from "worker:./worker.js";
 
@@ -122,8 +122,8 @@ function fillSh(target, { count, degree, shN }, texels) {
 
 /** {centre, radius, up} of a sample: a ball that contains its Gaussians, and the up axis. Where more than 2 % of them are
  *  beyond twice the radius that contains 80 %, a background, it is the ball of these about the median. */
-function extentOf({ means, logScales, up }) {
-  const step = Math.max(Math.floor(means.length / 3 / 20000), 1), points = [], sizes = [];
+function extentOf(gaussians) {
+  const { means, logScales, up } = gaussians, step = Math.max(Math.floor(means.length / 3 / 20000), 1), points = [], sizes = [];
   for (let at = 0; at < means.length; at += 3 * step) {
     points.push([means[at], means[at + 1], means[at + 2]]);
     sizes.push(VISIBLE * Math.exp(Math.max(logScales[at], logScales[at + 1], logScales[at + 2])));
@@ -132,10 +132,10 @@ function extentOf({ means, logScales, up }) {
   const median = [0, 1, 2].map((k) => Float64Array.from(points, (point) => point[k]).sort()[points.length >> 1]);
   const reaches = reachesFrom(median), sorted = reaches.slice().sort();
   const bulk = sorted[Math.floor(0.8 * sorted.length)], bounded = sorted[Math.floor(0.98 * sorted.length)] < 2 * bulk;
-  const inside = points.filter((_, i) => reaches[i] <= (bounded ? 2 : 1) * bulk), bounds = [0, 1, 2].map((k) => inside.map((point) => point[k]));
+  const rows = [...points.keys()].filter((i) => reaches[i] <= (bounded ? 2 : 1) * bulk), bounds = [0, 1, 2].map((k) => rows.map((i) => points[i][k]));
   const centre = bounded ? bounds.map((values) => (values.reduce((a, b) => Math.min(a, b)) + values.reduce((a, b) => Math.max(a, b))) / 2) : median;
   const radius = bounded ? reachesFrom(centre).filter((_, i) => reaches[i] <= 2 * bulk).reduce((a, b) => Math.max(a, b)) : bulk;
-  return { centre, radius: Math.min(Math.max(radius, 1e-6), 1e30), up: up ?? upOfPoints(inside) };
+  return { centre, radius: Math.min(Math.max(radius, 1e-6), 1e30), up: up ?? upOfGaussians(gaussians, rows.map((i) => i * step)) };
 }
 
 function startWorker() {

@@ -14,7 +14,7 @@ export function createPlayback(elements, viewer, { update, clampDial }) {
       ui.selectCamera(number);
     };
     if (cameras.length < 2) motion.turntable(1, ended);
-    else motion.path(posesOf(cameras, camera.distance), select, ended);
+    else motion.path(posesOf(cameras, camera), select, ended);
     menu.update();
   }
 
@@ -65,8 +65,8 @@ export function createPlayback(elements, viewer, { update, clampDial }) {
   return playback;
 }
 
-function posesOf(cameras, distance) {
-  const each = createCamera();
+function posesOf(cameras, { distance, up }) {
+  const each = Object.assign(createCamera(), { up });
   return cameras.map((entry) => {
     each.set(entry);
     return { ...each.pose, distance };
