@@ -67,8 +67,10 @@ def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Res
     attenuation = model.gaussians.attenuation
     solved, asked = solve_dials(args, model, cameras or model.viewpoints, console)
     opening = solved[0] if args.device_preset and solved else args.sv
-    opening, more = initial_dial(opening, attenuation.max_sv if attenuation else None)
-    notes += [*asked, *more]
+    notes += asked
+    if opening is not None:
+        opening, more = initial_dial(opening, attenuation.max_sv if attenuation else None)
+        notes += more
     for note in notes:
         console.note(note)
     payloads = payloads_of([model, *others]) | ({BASE: Payload.of(base)} if base else {})

@@ -149,8 +149,10 @@ def sorts_on_gpu(shown: Shown, seconds: float = SECONDS) -> bool:
 
 @contextmanager
 def serve(*words: object) -> Iterator[str]:
-    """The address of a server of ``clod-adapt view`` with these arguments."""
-    answers, _ = make_page(build_parser("view").parse_args([str(word) for word in words]), Console(quiet=True))
+    """The address of a server of ``clod-adapt view`` with these arguments, by default at s = 1, where it stays."""
+    given = [str(word) for word in words]
+    given += [] if "--sv" in given or "--device-preset" in given else ["--sv", "1"]
+    answers, _ = make_page(build_parser("view").parse_args(given), Console(quiet=True))
     with Server(answers) as server:
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         yield server.url

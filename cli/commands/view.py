@@ -31,7 +31,10 @@ def view_options(parser: ArgumentParser) -> None:
     add_antialiasing(given, photographs=False)
     page = parser.add_argument_group("page")
     initial: Any = page.add_mutually_exclusive_group()
-    initial.add_argument("--sv", metavar="S", type=float, default=1.0, help="initial dial value (default: 1)")
+    initial.add_argument(
+        "--sv", metavar="S", type=float,
+        help="initial dial value (default: everything, then what the browser draws at 30 fps)",
+    )  # fmt: skip
     add_device_preset(initial)
     page.add_argument("--port", metavar="P", type=int, default=0, help="port of the server (default: a free one)")
     page.add_argument("--no-browser", action="store_true", help="print the address only")
@@ -71,7 +74,7 @@ def _is_checkpoint(path: Path) -> bool:
 def check_view(args: Namespace) -> None:
     if not 0 <= args.port < 1 << 16:
         raise ClodError(f"--port is {args.port}, it must be between 1 and 65535, or 0 for a free one")
-    if not 0 <= args.sv < math.inf:
+    if args.sv is not None and not 0 <= args.sv < math.inf:
         raise ClodError(f"--sv is {args.sv:g}, it must be at least 0 (1 is full quality, 0 everything)")
     files = view_files(args.models)
     for path in (*files, *([args.base] if args.base else [])):
@@ -95,12 +98,14 @@ runs until Ctrl-C.
 """,
     usage="MODEL.ply ... [--base BASE.ply] [--images DIR] [options]",
     epilog="""\
-The page shows the Gaussians kept and the frame time, switches the attenuation
-on and off, and compares two dial values, or MODEL.ply and BASE.ply, on the two
-sides of a line. Drop another file on the page to open it. The address holds the
-view. With --images the page can jump between the scene's cameras. Several
-files, such as levels or variants, and a folder of files open with a list to
-switch between them; the view and the dial value stay.
+The page opens with everything shown, then at the dial value at which the
+browser draws 30 frames per second; --sv sets one that stays. It shows the
+Gaussians kept and the frame time, switches the attenuation on and off, and
+compares two dial values, or MODEL.ply and BASE.ply, on the two sides of a line.
+Drop another file on the page to open it. The address holds the view. With
+--images the page can jump between the scene's cameras. Several files, such as
+levels or variants, and a folder of files open with a list to switch between
+them; the view and the dial value stay.
 
 Other machines cannot reach the page, and it loads nothing from the network. To
 see it from another machine, forward the port (-t passes Ctrl-C on):

@@ -69,7 +69,7 @@ class Export:
     def write(self, path: Path, suffix: str, virtual_scale: float | None) -> tuple[int, tuple[str, ...]]:
         """Writes a file; its number of Gaussians, and notes on losses of the format."""
         if suffix == PAGE:
-            return len(self.gaussians), self._write_page(path, virtual_scale or 1.0)
+            return len(self.gaussians), self._write_page(path, virtual_scale)
         gaussians, about = self.content(virtual_scale)
         if suffix in PACKED:
             return len(gaussians), self._pack(path, suffix, gaussians, about)
@@ -130,7 +130,7 @@ class Export:
         write_errors(index, meta, leaves, errors.tolist())
         return ()
 
-    def _write_page(self, path: Path, virtual_scale: float) -> tuple[str, ...]:
+    def _write_page(self, path: Path, virtual_scale: float | None) -> tuple[str, ...]:
         """Writes the page, with a packed splat if that was asked for; then a note on its loss."""
         if not self.pack:
             write_viewer_page(path, self.model, cameras=self.cameras, virtual_scale=virtual_scale)

@@ -38,7 +38,7 @@ def write_viewer_page(
     *,
     base: Checkpoint | None = None,
     cameras: Sequence[Camera] = (),
-    virtual_scale: float = 1.0,
+    virtual_scale: float | None = None,
     tool: SplatTransform | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> PackedSplat | None:
@@ -51,7 +51,7 @@ def write_viewer_page(
         base: shown for comparison; relative to the same origin.
         cameras: selectable viewpoints, in the frame of the Gaussians (relative to the origin); by default the stored
             ones.
-        virtual_scale: the initial dial value, >= 0.
+        virtual_scale: the initial dial value, >= 0; None for everything, and then what the device holds.
         tool: packs the splats to a fifth of their size, with rounded values (``pack_sog``, which calls
             ``progress``); None stores them unpacked.
 

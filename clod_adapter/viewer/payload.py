@@ -86,7 +86,7 @@ def page_config(
     model: Mapping[str, Any],
     base: Mapping[str, Any] | None,
     cameras: Sequence[Camera],
-    virtual_scale: float,
+    virtual_scale: float | None,
     others: Sequence[Mapping[str, Any]] = (),
     placed: bool = False,
 ) -> dict[str, Any]:
@@ -95,7 +95,7 @@ def page_config(
     Args:
         model, base: from ``Payload.describe``.
         cameras: selectable viewpoints, in this order, in the frame of the Gaussians.
-        virtual_scale: the initial dial value, >= 0.
+        virtual_scale: the initial dial value, >= 0; None for everything, and then what the device holds.
         others: further models to switch to, from ``Payload.describe``.
         placed: the cameras are not photographs'; the page levels them by the scene's up axis.
     """

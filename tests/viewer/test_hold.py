@@ -13,6 +13,7 @@ import pytest
 
 import clod_adapter
 from clod_adapter.frame_rate import excess, next_dial
+from clod_adapter.viewer.page import write_viewer_page
 from shown import Shown, serve, take
 
 LAW = Path(clod_adapter.__file__).parent / "viewer" / "web" / "src" / "frame_rate.js"
@@ -185,6 +186,43 @@ def test_without_queries_a_frame_ends_when_its_pixel_is_read(tabs: Any, url: str
     timed = frames(shown, "window.load = 100, clod.setHold(60)")
     assert timed[0][0] == 1 and timed[-1][0] == 5 and shown.errors == []
     shown.page.close()
+
+
+def test_a_file_opens_with_everything_and_moves_to_what_the_device_holds(
+    tabs: Any, model: Path, tmp_path: Path
+) -> None:
+    """30 frames per second, from 0 where there are no photographs, unless the dial is touched or a link has it."""
+    write_viewer_page(tmp_path / "page.html", clod_adapter.load(model))
+    url = (tmp_path / "page.html").as_uri()
+    fast, slow = opened(tabs, url, QUERIES), opened(tabs, url, QUERIES.replace("load: 1", "load: 2"))
+    assert fast.text("#dial-value") == "all" and fast.text("#target-note") == ""
+    assert 1 < dial_of(slow) < 5
+    assert slow.text("#target-note") == f"Moved to {slow.text('#dial-value')} for 30 fps on this device"
+    dials, times = zip(*slow.page.evaluate("window.trace"), strict=True)
+    assert times[-1] == pytest.approx(0.8 * 1000 / 30, rel=0.1) and times[0] == 44
+    assert all(b <= 1.1 * max(a, 1) + 0.01 for a, b in pairwise(map(float, dials[1:])))
+    assert not slow.page.is_checked("#hold")
+    take(slow, model)
+    assert 1 < dial_of(slow) < 5 and "Moved to s = " in slow.text("#target-note")
+    script = "clod.load(Uint8Array.from(atob(given), (letter) => letter.charCodeAt(0)).buffer, 'a.ply')"
+    touched = f"{script}.then(() => clod.setDial(0.5))"
+    slow.run(touched, base64.b64encode(model.read_bytes()).decode())
+    assert slow.text("#dial-value") == "s = 0.50" and slow.text("#target-note") == ""
+    hopeless = opened(tabs, url, QUERIES.replace("load: 1", "load: 20"))
+    assert hopeless.text("#dial-value") == "all" and "Dial not moved" in hopeless.text("#target-note")
+    linked = opened(tabs, f"{url}#dial=0", QUERIES.replace("load: 1", "load: 2"))
+    assert linked.text("#dial-value") == "all" and linked.errors == slow.errors == fast.errors == []
+    for each in (fast, slow, hopeless, linked):
+        each.page.close()
+
+
+def test_a_rate_is_held_from_everything_on(simulated: Shown) -> None:
+    simulated.run("clod.setDial(0)")
+    frames(simulated, "window.load = 1, clod.setHold(60)")
+    assert 1 < dial_of(simulated) < 3
+    simulated.run("clod.setDial(0)")
+    frames(simulated, "window.load = 0.1, clod.setHold(60)")
+    assert simulated.text("#dial-value") == "all"
 
 
 def test_without_a_dial_there_is_nothing_to_hold(show: Any, save: Any, plain: Any) -> None:

@@ -26,7 +26,7 @@ def test_page_holds_the_splat_and_its_dial(clod: Any, dialled: Path, tmp_path: P
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     (config,) = re.findall('id="clod-config">(.*?)</script>', text)
     model = json.loads(config)["model"]
-    assert json.loads(config)["virtual_scale"] == min(sv or 1, 4)
+    assert json.loads(config)["virtual_scale"] == (min(sv, 4) if sv else None)
     assert any("dial ends at s = 4" in note for note in report["notes"]) == (sv == 9)
     (tmp_path / "held.ply").write_bytes(base64.b64decode(re.findall('id="clod-model">(.*?)</script>', text)[0]))
     held = clod_adapter.load(tmp_path / "held.ply")

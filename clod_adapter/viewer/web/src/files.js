@@ -4,8 +4,8 @@ import { readLink } from "./link.js";
 import { fetchModel } from "./payload.js";
 
 /** `show(model, base, cameras, dial)` shows another scene, `replace(model, base)` others of the same, `update()` a changed
- *  state (main.js). */
-export function createFiles(elements, viewer, config, { show, replace, update, reset, clampDial }) {
+ *  state, `settle()` moves the dial to what the device holds (main.js). */
+export function createFiles(elements, viewer, config, { show, replace, update, settle, reset, clampDial }) {
   const first = new AbortController(); // ends the loading of the configured file, when another is shown
   let other = new AbortController(); // ends the loading of another one, when the next is opened
   const progress = { first: null, other: null }; // texts
@@ -41,13 +41,14 @@ export function createFiles(elements, viewer, config, { show, replace, update, r
     try {
       const read = await readFile(await buffer, name);
       if (signal.aborted) return;
-      show(read, null, [], 1);
+      show(read, null, [], config.virtual_scale && 1);
       endFirst();
       ui.showNote(read.metadata.notes.join("; "));
       viewer.file = null;
       ui.showName(name, null);
       ui.showMessage(null);
       await stage.whenDrawn();
+      settle();
     } catch (error) {
       const message = `${name}: ${error.message}`;
       if (!signal.aborted) ui.showMessage(message);

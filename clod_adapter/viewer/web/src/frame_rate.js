@@ -34,18 +34,21 @@ export function nextDial(frames, milliseconds, maxSv) {
 export function createHold(fps) {
   const milliseconds = (WORK * 1000) / fps;
   let frames = [], left = REST;
+  const excessAt = (dial) => (frames.length < NEWEST ? 0 : excess(frames, milliseconds) - EXPONENT * Math.log(dial / frames.at(-1)[0]));
   return {
+    /** log of the time of a frame at a dial value over the budget, expected from the frames so far; 0 before these. */
+    excessAt,
     /** The displayed state has changed: further frames are measured. */
     wake() { left = REST; },
     get settled() { return left <= 0; },
-    /** Takes a frame's time; returns the dial value of the next frame. */
+    /** Takes a frame's time; returns the dial value of the next frame. A value below 1 stays while it is fast enough. */
     took(dial, took, maxSv) {
-      frames = [...frames, [dial, took]].slice(-FRAMES);
-      const next = nextDial(frames, milliseconds, maxSv);
+      frames = [...frames, [Math.max(dial, 1), took]].slice(-FRAMES);
+      const held = nextDial(frames, milliseconds, maxSv), next = held > 1 ? held : Math.min(dial, 1);
       left -= next === dial ? UNCHANGED : 1;
       return next;
     },
     /** Whether frames at maxSv take longer than the budget. */
-    outOfReach: (maxSv) => frames.length >= NEWEST && frames.slice(-NEWEST).every(([dial]) => dial === maxSv) && excess(frames, milliseconds) > DEAD_BAND,
+    outOfReach: (maxSv) => frames.slice(-NEWEST).every(([dial]) => dial === maxSv) && excessAt(maxSv) > DEAD_BAND,
   };
 }

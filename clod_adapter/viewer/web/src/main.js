@@ -17,10 +17,12 @@ import { createViews } from "./views.js";
 import { createWipe } from "./wipe.js";
 import { xrModes } from "./xr.js";
 
+const OPENING = 30; // frames per second, for which the dial is moved when a file has been opened
+const HOPELESS = Math.log(2); // excess at the largest dial value, above which it is not moved
 const STEEP = 0.7; // sine of a placed camera's angle to the horizon
 
 const elements = elementsOf(document), config = readConfig();
-const viewer = { cameraNumber: 0, cameras: config.cameras, up: "", recording: null, file: 0 };
+const viewer = { cameraNumber: 0, cameras: config.cameras, up: "", recording: null, file: 0, opening: null }; // opening: the dial value that a file was opened at, null once that is settled
 viewer.device = sortingDevice();
 viewer.files = config.model ? [config.model, ...config.others] : [];
 
@@ -45,8 +47,9 @@ async function start() {
   viewer.menu = createMenu(elements, viewer, actions, canRecord());
   xrModes().then(viewer.menu.showModes);
   stage.listeners.frame = viewer.ui.updateFrame;
-  stage.listeners.held = (outOfReach) => {
+  stage.listeners.held = (outOfReach, excess) => {
     viewer.ui.update();
+    if (viewer.opening !== null && excess > HOPELESS) return keepAll();
     viewer.ui.showNote(outOfReach ? `s = ${stage.model.max_sv}, the largest trained value, is too slow for this frame rate` : "");
   };
   stage.listeners.error = (error) => viewer.ui.showMessage(error.message);
@@ -60,11 +63,28 @@ async function start() {
     window.addEventListener("hashchange", () => actions.applyLink(location.hash));
   });
   await stage.whenDrawn();
+  settle();
+}
+
+/** Moves the dial from where a file was opened to what the device holds, and says so. A touch of the dial ends it. */
+async function settle() {
+  const { stage, opening } = viewer, { model, state } = stage;
+  if (opening === null || !model?.attenuation) return;
+  stage.setHold(OPENING);
+  await stage.whenDrawn();
+  if (viewer.opening === null || stage.model !== model) return;
+  actions.setHold(null);
+  if (state.dial !== opening) viewer.ui.showNote(`Moved to s = ${state.dial.toFixed(2)} for ${OPENING} fps on this device`);
+}
+
+function keepAll() {
+  actions.setDial(viewer.opening);
+  viewer.ui.showNote(`Dial not moved: under ${OPENING / 2} fps at any value`);
 }
 
 const upload = ({ gaussians, metadata }) => createModel(viewer.renderer.gl, gaussians, metadata, viewer.device);
 
-/** Shows another scene, and starts anew. */
+/** Shows another scene, and starts anew. `dial`: null for everything, where the device holds it. */
 function show(model, base, cameras, dial) {
   const { stage, ui } = viewer;
   const [uploaded, uploadedBase] = [upload(model), base && upload(base)];
@@ -78,7 +98,8 @@ function show(model, base, cameras, dial) {
   ui.update(); // rows of the panel, before the picture is placed beside it
   actions.layOut();
   actions.reset();
-  stage.state.dial = clampDial(dial);
+  stage.state.dial = clampDial(dial ?? (cameras.some(({ placed }) => !placed) ? 1 : 0)); // s = 1 is fitted to photographs
+  viewer.opening = dial === null ? stage.state.dial : null;
   update();
 }
 
@@ -120,6 +141,7 @@ const actions = {
   /** Holds a frame rate by the dial, frames per second; null ends that. */
   setHold(fps) {
     const { stage } = viewer;
+    viewer.opening = null;
     if (fps) Object.assign(stage.state, { equation: true, marks: false });
     stage.setHold(fps);
     update();
@@ -162,7 +184,7 @@ const actions = {
   fullScreen: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.()),
 };
 
-const files = createFiles(elements, viewer, config, { show, replace, update, clampDial, reset: () => actions.reset() });
+const files = createFiles(elements, viewer, config, { show, replace, update, settle, clampDial, reset: () => actions.reset() });
 const ready = start().catch((error) => {
   elements.busy.hidden = true;
   elements.panel.hidden = !viewer.ui; // without it, no control works

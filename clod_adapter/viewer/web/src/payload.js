@@ -11,7 +11,7 @@ const PAUSE = 1000; // ms between two of the pictures before the whole
 /** The page's configuration; a page without one starts empty, as a viewer for dropped files. */
 export function readConfig() {
   const element = document.getElementById("clod-config");
-  return { title: "", model: null, base: null, others: [], cameras: [], virtual_scale: 1, ...(element ? JSON.parse(element.textContent) : {}) };
+  return { title: "", model: null, base: null, others: [], cameras: [], virtual_scale: null, ...(element ? JSON.parse(element.textContent) : {}) };
 }
 
 /** {gaussians, metadata} of the configuration's `model` or `base`; calls `onProgress(fraction)` during the transfer and,

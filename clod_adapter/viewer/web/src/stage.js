@@ -120,7 +120,7 @@ export function createStage(renderer, canvas, camera) {
     if (next !== dial) version++;
     state.dial = next;
     schedule();
-    listeners.held(hold.outOfReach(model.max_sv));
+    listeners.held(hold.outOfReach(model.max_sv), hold.excessAt(model.max_sv));
   }
 
   /** Requests the order for the current state, one at a time for each side. A headset shows more than the view. */

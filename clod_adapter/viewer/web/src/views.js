@@ -73,6 +73,7 @@ export function createViews(elements, viewer, { update, showFile, clampDial }) {
       camera.fov = fov ?? camera.fov;
       camera.distance = distance ?? camera.distance;
       stage.setHold(null);
+      if (dial !== null || wipe !== null || !equation) viewer.opening = null;
       const { attenuation } = stage.model, comparable = wipe !== null && (attenuation || stage.base);
       Object.assign(stage.state, {
         dial: clampDial(dial ?? stage.state.dial), equation, wipe: comparable ? Math.min(Math.max(wipe, 0), 1) : null,
