@@ -23,7 +23,7 @@ from clod_adapter.errors import ClodError
 HOST = "127.0.0.1"
 LOOPBACK = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?", re.ASCII)
 RANGE = re.compile(r"bytes=(\d{1,18})-(\d{1,18})", re.ASCII)  # of a request for a part of a response
-IDLE_TIMEOUT = 30  # of a connection, seconds
+IDLE_TIMEOUT = 30  # of a connection between responses, seconds
 
 
 @dataclass(frozen=True)
@@ -143,12 +143,14 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Range", f"bytes {first}-{last}/{response.size}")
         self.send_header("Content-Security-Policy", f"{response.policy}; frame-ancestors 'none'")
         self.end_headers()
+        self.connection.settimeout(None)  # a page that is busy with a file's first rows takes no bytes
         at = 0
         for block in response.blocks() if body else ():
             self.wfile.write(block[max(first - at, 0) : max(last + 1 - at, 0)])
             at += len(block)
             if at > last:
                 break
+        self.connection.settimeout(self.timeout)
 
     def end_headers(self) -> None:
         """Adds the headers of every response, including errors."""

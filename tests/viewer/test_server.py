@@ -5,11 +5,13 @@ from __future__ import annotations
 import http.client
 import socket
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
 
 from clod_adapter.errors import ClodError
+from clod_adapter.viewer import server as served
 from clod_adapter.viewer.server import Response, Server, names_loopback
 
 BLOCKS = (b"a" * 1000, b"b" * 24)
@@ -50,6 +52,22 @@ def test_responses(server: Server) -> None:
         assert headers["cache-control"] == "no-store" and headers["x-content-type-options"] == "nosniff"
         assert headers["cross-origin-resource-policy"] == "same-origin" and "access-control-allow-origin" not in headers
         assert "python" not in headers["server"].lower()
+
+
+def test_a_busy_page_gets_the_rest_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes no bytes for longer than an idle connection is kept."""
+    monkeypatch.setattr(served._Handler, "timeout", 0.1)
+    size = 1 << 25
+    with Server({"/": Response("text/html", size, lambda: (bytes(size),))}) as server:
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        with socket.create_connection(("127.0.0.1", server.port)) as connection:
+            connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            time.sleep(0.4)
+            found = 0
+            while found < size and (data := connection.recv(1 << 20)):
+                found += len(data)
+        assert found >= size
+        server.shutdown()
 
 
 def test_parts_of_a_response(server: Server) -> None:

@@ -4,7 +4,7 @@ import { readFile } from "./formats/index.js";
 import { inflate } from "./formats/zip.js";
 
 const PARTS = [0.05, 0.1, 0.2, 0.4, 0.8, 1]; // of a file: ends of its requests, at which the rows so far are shown
-const LEAST = 1 << 16; // bytes of a request
+const LEAST = 1 << 16, MOST = 2 ** 30; // bytes of a request; of 2 GB and more, Chromium gives a script none
 const SOON = 2000; // ms: a rest that takes no longer is requested at once, and nothing is shown before it
 const PAUSE = 1000; // ms between two of the pictures before the whole
 
@@ -55,7 +55,7 @@ async function download(href, size, { signal, onProgress, onPart }) {
   let bytes = null, loaded = 0, ms = 0, soon = !onPart, shown = -Infinity;
   while (loaded < size) {
     const from = loaded, began = performance.now(), next = PARTS.find((share) => share * size > from) * size;
-    loaded = soon ? size : Math.min(Math.ceil(Math.max(next, from + LEAST)), size);
+    loaded = Math.min(soon ? size : Math.ceil(Math.max(next, from + LEAST)), from + MOST, size);
     const onCount = (count) => onProgress((from + count) / size);
     const { status, response } = await request(href, { from, to: loaded, size, signal, onCount });
     if (status === 200) return response;
