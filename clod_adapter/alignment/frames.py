@@ -89,14 +89,23 @@ def centres_of(viewmats: Tensor) -> Tensor:
     return torch.linalg.inv(viewmats)[:, :3, 3]
 
 
-def focus_of(viewmats: Tensor) -> Tensor:
-    """``[3]`` the least-squares point closest to the optical axes; the mean centre if they are parallel."""
+def focus_of(viewmats: Tensor, rounds: int = 1) -> Tensor:
+    """``[3]`` the least-squares point closest to the optical axes; the mean centre if they are parallel.
+
+    After ``rounds``, with the inverse distances as weights, of least distances: one far camera does not decide it.
+    """
     poses = torch.linalg.inv(viewmats.double())
     centres, forward = poses[:, :3, 3], poses[:, :3, 2]
     across = torch.eye(3, dtype=poses.dtype) - forward[:, :, None] * forward[:, None, :]
     if float(torch.linalg.cond(across.mean(0))) > 1e4:
         return centres.mean(0)
-    return torch.linalg.solve(across.mean(0), (across @ centres[:, :, None]).mean(0))[:, 0]
+    weights = across.new_ones(len(across))
+    for _ in range(rounds):
+        rows = weights[:, None, None] * across
+        focus = torch.linalg.solve(rows.mean(0), (rows @ centres[:, :, None]).mean(0))[:, 0]
+        away = (across @ (focus - centres)[:, :, None]).flatten(1).norm(dim=1)
+        weights = 1 / away.clamp(min=max(0.01 * float(away.median()), 1e-9))
+    return focus
 
 
 def median(rows: Tensor) -> Tensor:

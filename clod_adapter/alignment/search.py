@@ -26,6 +26,7 @@ FINER = ((240, 20_000, (0.01, 0.001)), (480, 60_000, (0.001, 0.0001)))
 VIEWS = 4  # number of small renders
 SCALES = [10 ** (k / 12) for k in range(-24, 25)]  # a hundredth to a hundred, in steps of 21 %
 LOWEST_CORRELATION = 0.5  # after the coarse search; below it the search ends
+ROUNDS = 20  # of the point that most cameras look at
 MOST_TRIALS = 80  # of a pattern search, which usually takes a dozen steps
 BETTER_THAN_MEAN = 1.5  # dB
 
@@ -126,16 +127,16 @@ class _Stage:
 def _search(gaussians: Gaussians, views: Sequence[View], small: _Stage, viewmats: Tensor) -> Frame | None:
     """The best scale and offset; None if no correlation reaches LOWEST_CORRELATION.
 
-    Starts from the best scale about the origin, and from the best one about the point that the cameras look at with the
-    median of the Gaussians moved there; climbs from each to the nearest maximum of the correlation.
+    Starts from the best scale about the origin, and from the best one about the points that all and most cameras look
+    at with the median of the Gaussians moved there; climbs from each to the nearest maximum of the correlation.
     """
-    focus = focus_of(viewmats)
-    unit = float((centres_of(viewmats) - focus).norm(dim=1).quantile(0.5).clamp(min=1e-9))
     middle, found = gaussians.means.double().median(dim=0).values.cpu(), []  # where cameras are
-    for towards in (0.0, 1.0):
+    for towards, rounds in ((0.0, 1), (1.0, 1), (1.0, ROUNDS)):
+        focus = focus_of(viewmats, rounds)
+        unit = float((centres_of(viewmats) - focus).norm(dim=1).quantile(0.5).clamp(min=1e-9))
         places = [_placed(scale, towards * (focus - scale * middle), unit) for scale in SCALES]
-        found.append(_climb(small, max(places, key=small.score), focus, unit, (0.1, 0.02)))
-    score, frame = max(found, key=lambda pair: pair[0])
+        found.append((*_climb(small, max(places, key=small.score), focus, unit, (0.1, 0.02)), focus, unit))
+    score, frame, focus, unit = max(found, key=lambda start: start[0])
     if score < LOWEST_CORRELATION:
         return None
     for width, most, steps in FINER:

@@ -234,6 +234,14 @@ def test_frames_of_trainers(pair: tuple[Gaussians, list[View]]) -> None:
     assert focus_of(around).abs().max() < 1e-5 and torch.isfinite(focus_of(around[:1])).all()
 
 
+def test_one_far_camera_does_not_decide_what_most_cameras_look_at() -> None:
+    """It looks past the scene by 30 units; least squares moved the point by 6 units."""
+    around = torch.stack([camera.viewmat for camera in scenes.ring(8, 40, 30)])
+    past = scenes.ring(1, 40, 30, radius=120.0)[0].viewmat.clone()
+    past[0, 3] += 30
+    assert focus_of(torch.cat([around, past[None]]), 20).norm() < 0.1
+
+
 def test_real_files_fit_in_their_frame_alone(shared_data: Callable[[str], Path]) -> None:
     files = [shared_data(f"{name}/pretrained.ply") for name in ("ci_banana", "plush_half")]
     base, plush = (clod_adapter.load(path).gaussians for path in files)
