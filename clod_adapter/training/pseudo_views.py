@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial, reduce
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,14 @@ from torch import Tensor
 from clod_adapter.adapter import detach
 from clod_adapter.cameras import Camera, Scene, StoredView, View
 from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.distances import median_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.coverage import SMALLER, coverage, reduced
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import render
-from clod_adapter.training.camera_placement import place_cameras, typical_reach
+from clod_adapter.training.camera_placement import place_cameras
+from clod_adapter.training.camera_score import SAMPLE
 
 # Photographs are enough if there are MANY, or if TIMES of them show each part of at least SHOWN of the scene, as far as
 # CHECKED placed cameras see it. Otherwise ADDED pseudo views are added: up to half of them at the cameras of the
@@ -46,7 +49,7 @@ class PseudoView(StoredView):
     Args:
         camera: the placed camera.
         teacher: the checkpoint, rendered at s = 1.
-        reach: unit of the offsets of moved cameras, world units: the distance of camera and scene.
+        reach: unit of the offsets of moved cameras, world units (``reaches``).
         backed: share of the moved cameras that step back as well.
     """
 
@@ -92,9 +95,7 @@ def moved(camera: Camera, reach: float, random: np.random.Generator) -> Camera:
 
 
 @torch.no_grad()
-def render_pseudo_views(
-    gaussians: Gaussians, cameras: Sequence[Camera], *, wider: float = 1.0, progress: Listener | None = None
-) -> Scene:
+def render_pseudo_views(gaussians: Gaussians, cameras: Sequence[Camera], *, progress: Listener | None = None) -> Scene:
     """A scene of ``cameras`` with the checkpoint's own renderings as photographs; every 8th is held out.
 
     Those to train on are rendered when they are read, and training renders each from a camera near it instead
@@ -103,13 +104,11 @@ def render_pseudo_views(
 
     Args:
         gaussians: the teacher, rendered at s = 1.
-        wider: factor of the offsets of moved cameras' positions.
         progress: called in ``Phase.PSEUDO_VIEWS`` after each view that is held out.
     """
     teacher = gaussians.without_empty_bands()
-    reach = wider * typical_reach(detach(teacher), _field(cameras[0])) if cameras else 0.0
     held_out = range(0, len(cameras), TEST_EVERY) if len(cameras) > 1 else range(0)
-    train = tuple(PseudoView(c, teacher, reach, BACKED) for k, c in enumerate(cameras) if k not in held_out)
+    train = tuple(view for k, view in enumerate(_views(teacher, cameras, backed=BACKED)) if k not in held_out)
     test = list[View]()
     for k in held_out:
         test.append(View(cameras[k], render(teacher, cameras[k]).pixels.cpu()))
@@ -162,9 +161,25 @@ def _complementary(
     each = max(min(NEAR, ADDED // 2 // len(photographs)), 1)
     placed = place(views=max(ADDED - each * len(photographs), ADDED // 2))
     teacher = gaussians.without_empty_bands()  # one for all: it may be a copy
-    reach = typical_reach(detach(teacher), _field(photographs[0].camera))
-    near = [PseudoView(view.camera, teacher, WIDER * reach) for view in photographs]
-    return *each * near, *(PseudoView(camera, teacher, reach) for camera in placed)
+    near = _views(teacher, [view.camera for view in photographs], wider=WIDER)
+    return *each * near, *_views(teacher, placed)
+
+
+def _views(
+    teacher: Gaussians, cameras: Sequence[Camera], *, wider: float = 1.0, backed: float = 0.0
+) -> list[PseudoView]:
+    found = zip(cameras, reaches(teacher, cameras), strict=True)
+    return [PseudoView(camera, teacher, wider * reach, backed) for camera, reach in found]
+
+
+def reaches(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[float]:
+    """Of each camera its distance to the scene, world units: the median in its image, at most that of half the cameras.
+
+    Of a camera that looks past the scene, the median in the image is that of the background.
+    """
+    some = gaussians.means[:: len(gaussians) // SAMPLE + 1]
+    medians = [median_distance(some, camera) for camera in cameras]
+    return [min(each, median(medians)) for each in medians]
 
 
 def teachers_to(views: Sequence[View], device: str) -> tuple[View, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from clod_adapter.training.pseudo_views import (
     PseudoView,
     add_pseudo_views,
     moved,
+    reaches,
     render_pseudo_views,
     shown,
     teachers_to,
@@ -89,6 +91,20 @@ def test_moved_cameras_have_the_documented_offsets() -> None:
     assert torch.equal(zooms[:, 0], zooms[:, 1]) and 0.9 * ZOOMED < zooms.abs().max() <= 1.001 * ZOOMED
     for each in found[:9]:
         assert torch.equal(each.K[:, 2], camera.K[:, 2]) and (each.width, each.name) == (camera.width, camera.name)
+
+
+def test_offsets_follow_the_distance_of_camera_and_scene(blob: clod.Gaussians) -> None:
+    """In any unit, and whatever the sizes of the Gaussians; also for a camera that looks past the scene."""
+    cameras, rows = scenes.ring(5, 40, 30), torch.arange(len(blob)).repeat_interleave(8)
+    usual = reaches(blob, cameras)
+    assert usual == pytest.approx([float(camera.position.norm()) for camera in cameras], rel=0.3)
+    smaller = blob.select(rows).replace(log_scales=blob.log_scales[rows] - math.log(2))
+    assert reaches(smaller, cameras) == pytest.approx(usual)
+    larger = blob.replace(means=1000 * blob.means, log_scales=blob.log_scales + math.log(1000))
+    far = [dataclasses.replace(c, viewmat=c.viewmat * torch.tensor([[1.0, 1, 1, 1000]])) for c in cameras]
+    assert reaches(larger, far) == pytest.approx([1000 * each for each in usual], rel=1e-4)
+    (alone,) = scenes.ring(1, 40, 30, radius=100.0)
+    assert reaches(blob, [*cameras, alone])[-1] < 2 * max(usual)
 
 
 def test_training_on_pseudo_views_improves_held_out_views() -> None:
