@@ -10,8 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter import AdaptConfig, Camera, Gaussians, Scene, View, evaluate, make_plan
+from clod_adapter import AdaptConfig, AttenuationConfig, Camera, Gaussians, Scene, View, evaluate, make_plan
 from clod_adapter.cameras import in_its_unit
+from clod_adapter.equation.distances import typical_distance
+from clod_adapter.initialization.importance import scene_distance
+from clod_adapter.training.pseudo_views import reaches
 from scenes import gaussians, photograph, ring
 
 Pair = tuple[Gaussians, Scene]
@@ -121,29 +124,57 @@ def test_a_far_camera(pair: Pair, usual: list[tuple[float, float]]) -> None:
 
 def test_a_far_shell(pair: Pair, usual: list[tuple[float, float]]) -> None:
     """Gaussians around the scene, 100 times as far away: photographs show them between the others."""
-    base = gaussians(600, 0, 0, size=0.15)
-    random = torch.Generator().manual_seed(1)
-    sides = torch.nn.functional.normalize(torch.randn(200, 3, generator=random), dim=1)
-    shell = base.select(torch.arange(200)).replace(
-        means=400 * sides, log_scales=torch.full((200, 3), math.log(40.0)), opacity_logits=torch.full((200,), 2.0)
-    )
-    both = base.replace(**{n: torch.cat([t, shell.tensors()[n]]) for n, t in base.tensors().items()})
+    both = surrounded(gaussians(600, 0, 0, size=0.15))
     scene = taken(both)
     (before,) = evaluate(perturbed(both), scene.test, [1.0])
     assert results(perturbed(both), scene)[0][0] > before.psnr - 1
 
 
+def surrounded(base: Gaussians) -> Gaussians:
+    random = torch.Generator().manual_seed(1)
+    sides = torch.nn.functional.normalize(torch.randn(200, 3, generator=random), dim=1)
+    shell = base.select(torch.arange(200)).replace(
+        means=400 * sides, log_scales=torch.full((200, 3), math.log(40.0)), opacity_logits=torch.full((200,), 2.0)
+    )
+    return base.replace(**{n: torch.cat([t, shell.tensors()[n]]) for n, t in base.tensors().items()})
+
+
 def test_split_gaussians(pair: Pair) -> None:
     """Each in eight of a smaller size, with about the same integral: s = 1 is not below its base."""
     base, scene = pair
+    small = split(base)
+    (before,) = evaluate(small, scene.test, [1.0])
+    assert results(small, scene)[0][0] > before.psnr
+
+
+def split(base: Gaussians) -> Gaussians:
     corners = torch.tensor([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.5
     turns = torch.stack([quat_to_matrix(q) for q in base.quats.double()]).float()
     offsets = torch.einsum("nij,kj->nki", turns * base.scales[:, None, :], corners.float())
     rows = torch.arange(len(base)).repeat_interleave(8)
-    small = base.select(rows).replace(
+    return base.select(rows).replace(
         means=(base.means[:, None] + offsets).reshape(-1, 3),
         log_scales=base.log_scales[rows] + 0.5 * math.log(0.75),
         opacity_logits=torch.special.logit(1 - (1 - base.opacities[rows].clamp(max=0.999)) ** (1 / 6)),
     )
-    (before,) = evaluate(small, scene.test, [1.0])
-    assert results(small, scene)[0][0] > before.psnr
+
+
+@pytest.mark.parametrize("change", ["larger", "far camera", "split", "shell"])
+def test_lengths_of_the_scene(pair: Pair, change: str) -> None:
+    """Where growth begins, offsets of pseudo views, and typical distances: to a few per cent."""
+    base, scene = pair
+    own, views, scale = base, scene.train, 1.0
+    if change == "larger":
+        scale = 1000.0
+        own, larger = placed(base, scene, scale, torch.eye(3).double(), 0.0)
+        views = larger.train
+    elif change == "far camera":
+        views = (*views, *photograph(base, ring(1, 48, 36, radius=120.0)))
+    else:
+        own = split(base) if change == "split" else surrounded(base)
+    cameras, usual = ([view.camera for view in some] for some in (views, scene.train))
+    assert scene_distance(own, views) == pytest.approx(scale * scene_distance(base, scene.train), rel=0.05)
+    assert reaches(own, cameras)[: len(usual)] == pytest.approx([scale * r for r in reaches(base, usual)], rel=0.1)
+    means, middle = own.means[:: 8 if change == "split" else 1][: len(base)], AttenuationConfig(scene_distance=scale)
+    found, wanted = typical_distance(means, cameras, middle), typical_distance(base.means, usual, AttenuationConfig())
+    assert found.median() == pytest.approx(float(wanted.median()), rel=0.05)
