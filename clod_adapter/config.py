@@ -19,7 +19,7 @@ SAMPLINGS = ("log", "uniform")
 COUNT_TERMS = ("law", "paper")
 GROWTHS = ("on", "off")
 TARGETS = ("count", "cost")
-STEPS, STEPS_PER_VIEW = 800, 5.5  # of training, by default, with one view a step
+STEPS, STEPS_PER_VIEW = 900, 9.4  # of training, by default, with one view a step
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
 
 
@@ -164,7 +164,7 @@ class AdaptConfig:
     )
     parameter: str = option("log", "trained parameter: log (of sigma_d) or linear (sigma_d itself, the paper's)")
     sampling: str = option("log", "dial value of a step: log-uniform (log) or uniform (the paper's)")
-    full_share: float = option(0.5, "share of steps at s = 1 instead, at first")
+    full_share: float = option(0.5, "share of steps at s = 1 instead, at first; a quarter of these at s = 0")
     full_final: float = option(0.4, "full_share at the end, as a share of that at first")
     coarse: float = option(
         0.8, "share of steps or of the time budget, at first, with photographs of half the size (not small ones)"
@@ -264,11 +264,18 @@ class AdaptConfig:
         """``iters``, or the default for few training views."""
         return self.iters if self.iters is not None else self.for_views(0).steps
 
-    def for_views(self, views: int) -> AdaptConfig:
+    def for_views(self, views: int, each: float = STEPS_PER_VIEW) -> AdaptConfig:
         """A copy whose ``iters`` is set, by the number of training views and the batch where it is not."""
         if self.iters is not None:
             return self
-        return replace(self, iters=max(round(max(STEPS, STEPS_PER_VIEW * views) / self.batch), 1))
+        return replace(self, iters=max(round(max(STEPS, each * views) / self.batch), 1))
+
+    def beyond(self, factor: float) -> float:
+        """A dial value beyond max_sv: ``factor`` times as large, at most halfway to 1/tau, where all are culled.
+
+        Training goes on there, so that quality and counts do not break off at max_sv. The paper's ends at max_sv.
+        """
+        return min(factor * self.max_sv, (self.max_sv + 1 / self.tau) / 2) if self.has_target_count else self.max_sv
 
     @property
     def has_target_count(self) -> bool:

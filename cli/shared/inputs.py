@@ -15,7 +15,7 @@ from clod_adapter.io.scene.load import load_scene
 from clod_adapter.origin import Origin
 from clod_adapter.progress import Phase
 from clod_adapter.training.camera_placement import place_cameras
-from clod_adapter.training.pseudo_views import LIGHTEST, add_pseudo_views, render_pseudo_views
+from clod_adapter.training.pseudo_views import LIGHTEST, STEPS_PER_PLACED, add_pseudo_views, render_pseudo_views
 
 from .console import Console
 from .files import size
@@ -69,4 +69,4 @@ def place_scene(gaussians: Gaussians, config: AdaptConfig, console: Console) -> 
         scene = render_pseudo_views(gaussians, cameras, progress=meter)
     for note in scene.notes:
         console.say(note)
-    return scene, config.lighter(LIGHTEST)
+    return scene, config.lighter(LIGHTEST).for_views(len(scene.train), STEPS_PER_PLACED)

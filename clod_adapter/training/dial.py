@@ -40,7 +40,7 @@ from clod_adapter.integrations.splats import NAMES, from_gsplat
 from clod_adapter.progress import Listener, shown
 from clod_adapter.render import dial as dialled_by
 from clod_adapter.training.loop import require_trainable
-from clod_adapter.training.objective import SIGMA_RANGE, loss_weight, within_reach
+from clod_adapter.training.objective import SIGMA_RANGE, loss_weight
 from clod_adapter.training.target_count import count_gradient, target_share
 from clod_adapter.training.trainer import learning_rates, own_sizes
 from clod_adapter.training.view_sampler import ViewSampler
@@ -116,7 +116,7 @@ class Dial(nn.Module):
         return found
 
     def sample(self) -> float:
-        """The next dial value: s = 1 in ``full_share`` of the steps, else (log-)uniform in [1, max_sv].
+        """The next dial value: s = 1 in ``full_share`` of the steps, a quarter of these s = 0, else (log-)uniform.
 
         The share falls over ``config.steps`` calls.
 
@@ -138,8 +138,8 @@ class Dial(nn.Module):
     def loss(self, virtual_scale: float, rendering_loss: Tensor) -> Tensor:
         """0-d, the objective of one rendering at s: ``w_s rendering_loss`` and the target-count term.
 
-        ``w_s = (1 - weight_slope s / max_sv)^2``. Gaussians are counted at s and at a random dial value up to 1.5 times
-        ``max_sv``.
+        ``w_s = (1 - weight_slope s / max_sv)^2``. Gaussians are counted at s, if it is 1 or more, and at a random dial
+        value up to 1.5 times ``max_sv``.
 
         Args:
             rendering_loss: 0-d, of an image rendered at s.
@@ -148,8 +148,8 @@ class Dial(nn.Module):
         counted = self._sampler.counted()
         if counted is None:
             return weighted
-        beyond = self.count_loss(within_reach(counted, self.attenuation), rendering_loss)
-        return weighted + self.count_loss(virtual_scale, weighted) + beyond
+        found = weighted + self.count_loss(counted, rendering_loss)
+        return found if virtual_scale < 1 else found + self.count_loss(virtual_scale, weighted)
 
     def count_loss(self, virtual_scale: float, rendering_loss: Tensor) -> Tensor:
         """0-d, the target-count term ``L reg_weight (eta / target - 1)^2`` alone; eta is the share kept.

@@ -134,11 +134,11 @@ class Objective:
         total = weight * (loss if term is None else loss + term)
         found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
         gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}
-        counts = [(s, weight * plain)]
+        counts = [(s, weight * plain)] if s >= 1 else []  # below, all are to be kept
         if counted is not None:
             # Its weight is 1: with half of w_s, counts at the far end were 1.25 times the target, at a gain of 0.05 to
             # 0.1 dB at equal counts.
-            counts.append((within_reach(counted, self.attenuation), plain))
+            counts.append((counted, plain))
         if config.has_target_count:
             for at, weighted in counts:
                 for name, gradient in self._target_gradients(parameters, at, weighted).items():
@@ -226,11 +226,6 @@ class Objective:
 def loss_weight(virtual_scale: float, config: AdaptConfig) -> float:
     """``w_s = (1 - k s / max_sv)^2``, the weight of the loss at the dial value s."""
     return (1 - config.weight_slope * virtual_scale / config.max_sv) ** 2
-
-
-def within_reach(virtual_scale: float, attenuation: AttenuationConfig) -> float:
-    """A dial value to count at, at most halfway from max_sv to 1/tau, where nothing is kept."""
-    return min(virtual_scale, (attenuation.max_sv + 1 / attenuation.tau) / 2)
 
 
 def _ending_in(value: float, tensor: Tensor, trained: int) -> Tensor:

@@ -31,6 +31,7 @@ from clod_adapter.training.camera_score import SAMPLE
 MANY, SHOWN, TIMES, CHECKED, ADDED, NEAR, WIDER = 64, 0.97, 4, 24, 96, 4, 2.0
 COVERED = 0.5  # pixels that a Gaussian covers at least in a photograph that shows it
 TEST_EVERY = 8  # as with photographs
+STEPS_PER_PLACED = 5.5  # training steps for each placed camera, where there are no photographs
 # Of the learning rates of all but the dial, without photographs and with few: pseudo views show errors too.
 LIGHTEST, LIGHTER = 0.25, 0.5
 # Standard deviations of the random offset of a camera, of its distance to the scene, and of its direction, radians; and

@@ -12,7 +12,8 @@ from clod_adapter.errors import ClodError
 from clod_adapter.training.pseudo_views import PseudoView
 from clod_adapter.training.state import OTHER_RUN
 
-COUNTED_BEYOND = 1.5  # times max_sv: counts at the end of the dial follow the curve as they do within it
+RENDERED, COUNTED = 1.25, 1.5  # times max_sv: the largest dial values of steps, and of counts
+UNATTENUATED = 0.25  # of the steps at s = 1: at s = 0 instead, where every Gaussian is as it is stored
 GOLDEN = (5**0.5 - 1) / 2
 
 
@@ -66,22 +67,25 @@ class ViewSampler:
         """A log-uniform dial value that Gaussians are only counted at; None if there is no target-count curve."""
         if not self.config.has_target_count:
             return None
-        return (COUNTED_BEYOND * self.config.max_sv) ** self.random.random()
+        return self.config.beyond(COUNTED) ** self.random.random()
 
     def dial(self, number: int, share_done: float) -> float:
-        """The dial value of a step: 1 with the probability ``full_share``, else (log-)uniform in [1, max_sv].
+        """The dial value of a step: with the probability ``full_share`` 1 or 0, else (log-)uniform from 1 on.
 
         The probability falls linearly to ``full_final`` of itself: s = 1 is learned before the far end of the dial.
+        Steps at s = 0 train what cameras nearer than the photographs see, and viewers that do not know the dial.
 
         Multiples of the golden ratio modulo 1 are spread more evenly than random numbers, in every stretch of a run:
         0.05 dB at s = 5 on plush_half.
         """
         place, config = (self.offset + number * GOLDEN) % 1, self.config
         full = config.full_share * (1 - (1 - config.full_final) * share_done)
-        if place < full:
+        if config.max_sv == 1:
             return 1.0
-        place = (place - full) / (1 - full)
-        return 1 + (config.max_sv - 1) * place if config.sampling == "uniform" else config.max_sv**place
+        if place < full:
+            return 0.0 if place < UNATTENUATED * full else 1.0
+        place, end = (place - full) / (1 - full), config.beyond(RENDERED)
+        return 1 + (end - 1) * place if config.sampling == "uniform" else end**place
 
     def state(self) -> tuple[dict[str, Any], tuple[int, ...]]:
         """Everything that later samples depend on: the generator's state, and the order."""

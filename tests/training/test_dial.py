@@ -21,7 +21,7 @@ from clod_adapter.losses import photometric_loss
 from clod_adapter.training.dial import Dial, attach
 from clod_adapter.training.objective import SIGMA_RANGE, Objective, TrainableSubset
 from clod_adapter.training.target_count import count_gradient_at, target_share
-from clod_adapter.training.view_sampler import COUNTED_BEYOND, Sample
+from clod_adapter.training.view_sampler import COUNTED, RENDERED, Sample
 
 Pair = tuple[Gaussians, Scene]
 MAX_SV = 5.0
@@ -84,7 +84,7 @@ def test_the_loss_is_the_objective_of_adapt(captured: Pair, monkeypatch: pytest.
     base, scene = captured
     splats, s = trainable(base), 2.3
     dial = attach(splats, scene, seed=3)
-    counted = (COUNTED_BEYOND * MAX_SV) ** np.random.default_rng(3).random(2)[1]  # the first is of the dial values
+    counted = (COUNTED * MAX_SV) ** np.random.default_rng(3).random(2)[1]  # the first is of the dial values
     dial.loss(s, loss_of(dial, scene, s)).backward()
     tuned = ("means", "quats", "log_scales", "sh0")
     objective = Objective(dial.config, dial.attenuation, tuned, TrainableSubset(len(base)), dial.typical)
@@ -141,8 +141,10 @@ def test_dial_values_follow_the_settings(captured: Pair, sampling: str) -> None:
     dial = attach(*captured, max_sv=4, full_share=0.3, full_final=1.0, sampling=sampling)
     drawn = np.array([dial.sample() for _ in range(1000)])
     others = np.sort(drawn[drawn > 1])
-    assert (drawn == 1).sum() == pytest.approx(300, abs=5) and others[-1] <= 4
-    share = np.log(others) / math.log(4) if sampling == "log" else (others - 1) / 3
+    end = RENDERED * 4
+    assert (drawn == 1).sum() == pytest.approx(225, abs=5) and (drawn == 0).sum() == pytest.approx(75, abs=5)
+    assert others[-1] <= end
+    share = np.log(others) / math.log(end) if sampling == "log" else (others - 1) / (end - 1)
     assert np.abs(share - np.linspace(0, 1, len(share))).max() < 0.02
 
 

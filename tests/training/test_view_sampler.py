@@ -12,7 +12,7 @@ import torch
 from clod_adapter.cameras import StoredView, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.training.view_sampler import ViewSampler
+from clod_adapter.training.view_sampler import RENDERED, ViewSampler
 from scenes import capture
 
 VIEWS = capture(n=20)[1].train
@@ -54,20 +54,20 @@ def assert_uniform(values: torch.Tensor) -> None:
 
 @pytest.mark.parametrize("seed", [0, 5])
 def test_dial_values_follow_the_configured_distribution(seed: int) -> None:
-    """1 in ``full_share`` of the steps (falling), else log-uniform or uniform in [1, max_sv]; in every stretch."""
+    """1, or 0, in ``full_share`` of the steps (falling), else (log-)uniform from 1 on; in every stretch."""
+    end = RENDERED * 4.0
 
     def drawn(share_done: float = 0.0, **changes: Any) -> torch.Tensor:
         sampler = ViewSampler(VIEWS, AdaptConfig(max_sv=4.0, seed=seed, **changes))
         return torch.tensor([sampler.draw(k, share_done).dial for k in range(480)], dtype=torch.float64)
 
     for stretch in drawn(full_share=0.25).split(120):
-        places = stretch.log() / math.log(4)
-        assert abs(int((places == 0).sum()) - 30) <= 1
-        assert_uniform(places[places > 0])
-    assert_uniform((drawn(sampling="uniform", full_share=0.0) - 1) / 3)
-    assert (drawn(full_share=1.0) == 1).all()
+        assert abs(int((stretch <= 1).sum()) - 30) <= 1 and abs(int((stretch == 0).sum()) - 7.5) <= 1
+        assert_uniform(stretch[stretch > 1].log() / math.log(end))
+    assert_uniform((drawn(sampling="uniform", full_share=0.0) - 1) / (end - 1))
+    assert (drawn(full_share=1.0) <= 1).all()
     late = drawn(0.5, full_share=0.5, full_final=0.5)
-    assert abs(int((late == 1).sum()) - 0.375 * 480) <= 1
+    assert abs(int((late <= 1).sum()) - 0.375 * 480) <= 1
     assert ViewSampler(VIEWS, AdaptConfig(max_sv=1.0, full_share=0.0)).draw(0, 0.0)[1:] == (1.0, None, False)
 
 
