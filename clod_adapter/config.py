@@ -19,7 +19,7 @@ SAMPLINGS = ("log", "uniform")
 COUNT_TERMS = ("law", "paper")
 GROWTHS = ("on", "off")
 TARGETS = ("count", "cost")
-STEPS, STEPS_PER_VIEW = 900, 9.4  # of training, by default, with one view a step
+STEPS, STEPS_PER_VIEW = 900, 8.5  # of training, by default, with one view a step
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
 
 
@@ -167,7 +167,8 @@ class AdaptConfig:
     full_share: float = option(0.5, "share of steps at s = 1 instead, at first; a quarter of these at s = 0")
     full_final: float = option(0.4, "full_share at the end, as a share of that at first")
     coarse: float = option(
-        0.8, "share of steps or of the time budget, at first, with photographs of half the size (not small ones)"
+        0.9,
+        "share of the run, at first, in which steps beyond s = 1 have photographs of half the size (not small ones)",
     )
     target: str = option(
         "count", "what the dial reduces: count (of Gaussians, the paper's) or cost (the work of rendering them)"

@@ -59,9 +59,10 @@ class ViewSampler:
         view, config = self.views[self.order.pop()], self.config
         if isinstance(view, PseudoView):
             view = view.moved(self.random)
-        halved = share_done < config.coarse and view.camera.halvable
+        dial = self.dial(number, share_done)
+        halved = dial > 1 and share_done < config.coarse and view.camera.halvable
         view = view.halved() if halved else view
-        return Sample(view, self.dial(number, share_done), self.counted(), halved)
+        return Sample(view, dial, self.counted(), halved)
 
     def counted(self) -> float | None:
         """A log-uniform dial value that Gaussians are only counted at; None if there is no target-count curve."""

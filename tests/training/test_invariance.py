@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from statistics import fmean
 
 import pytest
 import torch
@@ -18,7 +19,7 @@ from clod_adapter.training.pseudo_views import reaches
 from scenes import gaussians, photograph, ring
 
 Pair = tuple[Gaussians, Scene]
-CONFIG = AdaptConfig(max_sv=4, iters=80, lr_shN=0)
+CONFIG, SEEDS = AdaptConfig(max_sv=4, iters=300, lr_shN=0), (0, 1, 2)
 TURN = torch.linalg.qr(torch.tensor([[0.3, 0.9, -0.2], [0.5, -0.4, 0.7], [0.8, 0.1, 0.6]], dtype=torch.float64))[0]
 TURN = TURN * TURN.det()
 
@@ -43,11 +44,14 @@ def taken(truth: Gaussians) -> Scene:
     return Scene(tuple(v for k, v in enumerate(seen) if k % 4), seen[::4])
 
 
-def results(base: Gaussians, scene: Scene) -> list[tuple[float, float]]:
-    """PSNR and share kept on the held-out views, at s = 1, 2 and 4."""
-    plan = make_plan(base, scene, CONFIG)
-    rows = evaluate(plan.whole(base, plan.adapt(scene).gaussians), scene.test, (1.0, 2.0, 4.0))
-    return [(row.psnr, row.kept_share) for row in rows]
+def results(base: Gaussians, scene: Scene, seeds: Sequence[int] = (0,)) -> list[tuple[float, float]]:
+    """PSNR and share kept on the held-out views, at s = 1, 2 and 4; means over the seeds."""
+    found = []
+    for seed in seeds:
+        plan = make_plan(base, scene, replace(CONFIG, seed=seed))
+        rows = evaluate(plan.whole(base, plan.adapt(scene).gaussians), scene.test, (1.0, 2.0, 4.0))
+        found.append([(row.psnr, row.kept_share) for row in rows])
+    return [(fmean(p for p, _ in each), fmean(k for _, k in each)) for each in zip(*found, strict=True)]
 
 
 @pytest.fixture(scope="module")
@@ -114,12 +118,12 @@ def assert_same(found: list[tuple[float, float]], wanted: list[tuple[float, floa
         assert psnr == pytest.approx(other, abs=0.5) and kept == pytest.approx(share, abs=0.02), (found, wanted)
 
 
-def test_a_far_camera(pair: Pair, usual: list[tuple[float, float]]) -> None:
-    """30 times farther away than the others."""
+def test_a_far_camera(pair: Pair) -> None:
+    """30 times farther away than the others. It changes the order of the views, as another seed does."""
     base, scene = pair
     far = photograph(base, ring(1, 48, 36, radius=120.0))
-    found = results(base, Scene((*scene.train, *far), scene.test))
-    assert_same(found, usual)
+    found = results(base, Scene((*scene.train, *far), scene.test), SEEDS)
+    assert_same(found, results(*pair, SEEDS))
 
 
 def test_a_far_shell(pair: Pair, usual: list[tuple[float, float]]) -> None:
@@ -127,7 +131,7 @@ def test_a_far_shell(pair: Pair, usual: list[tuple[float, float]]) -> None:
     both = surrounded(gaussians(600, 0, 0, size=0.15))
     scene = taken(both)
     (before,) = evaluate(perturbed(both), scene.test, [1.0])
-    assert results(perturbed(both), scene)[0][0] > before.psnr - 1
+    assert results(perturbed(both), scene, SEEDS)[0][0] > before.psnr
 
 
 def surrounded(base: Gaussians) -> Gaussians:

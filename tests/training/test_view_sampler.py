@@ -31,7 +31,7 @@ def test_draws_are_reproducible_from_a_seed_or_state(sampling: str) -> None:
     state, rest = one.state(), nine(one)
     one.restore(*state)
     assert nine(one) == rest and two.state() == state
-    assert all(1 <= s <= config.max_sv for _, s in first)
+    assert all(s == 0 or 1 <= s <= RENDERED * config.max_sv for _, s in first)
     names = [name for name, _ in [*first, *rest]]  # each view once a round
     for start in range(0, len(names) - len(VIEWS) + 1, len(VIEWS)):
         assert sorted(names[start : start + len(VIEWS)]) == sorted(view.camera.name for view in VIEWS)
@@ -72,13 +72,14 @@ def test_dial_values_follow_the_configured_distribution(seed: int) -> None:
 
 
 def test_first_steps_have_photographs_of_half_the_size() -> None:
-    """Unless these would be small."""
+    """Unless these would be small, or the step is at s = 1."""
     camera = replace(VIEWS[0].camera, width=301, height=258, K=torch.tensor([[90.0, 0, 150], [0, 90, 129], [0, 0, 1]]))
     image = torch.randint(256, (258, 301, 3), generator=torch.Generator().manual_seed(0)).byte()
     large, small = View(camera, image), View(replace(camera, height=255), image[:255])
 
-    for view, share_done, expected in ((large, 0.49, True), (large, 0.5, False), (small, 0.0, False)):
-        sample = ViewSampler((view,), AdaptConfig(coarse=0.5)).draw(0, share_done)
+    cases = ((large, 0.49, 0.0, True), (large, 0.5, 0.0, False), (small, 0.0, 0.0, False), (large, 0.0, 1.0, False))
+    for view, share_done, full, expected in cases:
+        sample = ViewSampler((view,), AdaptConfig(coarse=0.5, full_share=full)).draw(0, share_done)
         assert sample.halved == expected and (sample.view is view) != expected
 
 
