@@ -12,6 +12,7 @@ import tempfile
 import time
 import xml.etree.ElementTree as xml
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -94,6 +95,16 @@ def stored(file: str) -> list[Row]:
     """The rows of ``results/<file>``."""
     path = RESULTS / file
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+
+
+@torch.no_grad()
+def supersampled(shown: clod.Gaussians, camera: clod.Camera, samples: int) -> torch.Tensor:
+    """``[H, W, 3]`` uint8, a render with ``samples`` by ``samples`` samples in a pixel."""
+    K = camera.K * torch.tensor([[samples], [samples], [1.0]])
+    large = replace(camera, K=K, width=samples * camera.width, height=samples * camera.height)
+    image = clod.render(shown, large).image.clamp(0, 1)
+    image = image.reshape(camera.height, samples, camera.width, samples, 3).mean((1, 3))
+    return (255 * image).round().to(torch.uint8)
 
 
 def timed(jobs: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:

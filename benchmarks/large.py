@@ -1,12 +1,15 @@
-"""A large scene without photographs against what its user would take instead: PSNR at equal numbers of Gaussians.
+"""A large scene against what its user would take instead: PSNR at equal numbers of Gaussians.
 
-    python benchmarks/large.py FINEST.ply --levels LEVEL.ply ... --record
+    python benchmarks/large.py FINEST.ply --levels LEVEL.ply ... --record              # without photographs
+    python benchmarks/large.py LEVEL.ply --levels COARSER.ply ... --truth FINEST.ply --record
     python benchmarks/large.py --table
 
 FINEST is adapted without options (max_sv 5). ``levels`` are the coarser ones that its author ships. splat-transform
 (``make peers``) decimates FINEST to the same counts, uniformly and adaptively, and ``export --lod-meta`` writes a
 streaming set of the adapted file with about these counts, which splat-transform reads back. PSNR is the mean over
-VIEWS cameras that training does not use, against renders of FINEST. ``--adapted`` takes a file of an earlier run.
+VIEWS cameras that training does not use, against renders of FINEST. With ``--truth`` a coarser level is the
+checkpoint, and PHOTOGRAPHS supersampled renders of the finest one are its photographs. ``--adapted`` takes a file of an
+earlier run.
 """
 
 from __future__ import annotations
@@ -19,10 +22,14 @@ from pathlib import Path
 
 import clod_adapter as clod
 from clod_adapter.evaluation.baselines import matching_dial
-from common import COMMAND, Process, Row, append, arguments, stored, table
+from common import COMMAND, Process, Row, append, arguments, stored, supersampled, table
 from tuning import TIMEOUT, find_tool
 
+import torch
+from PIL import Image
+
 FILE, VIEWS, SEED, LONGEST = "large.jsonl", 16, 77, 40.0
+PHOTOGRAPHS, SAMPLES = 128, 2  # every 8th is held out; samples along each side of a pixel
 OTHERS = {"decimated": "--decimate", "decimated adaptively": "--decimate-adaptive"}
 
 
@@ -31,25 +38,33 @@ def main() -> None:
     parser.add_argument("finest", type=Path)
     parser.add_argument("--levels", nargs="+", type=Path, required=True)
     parser.add_argument("--adapted", type=Path, help="the file of an earlier run, which is not run again")
+    parser.add_argument("--truth", type=Path, help="what photographs show; without it there are none")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
-        for row in compared(args.finest, args.levels, args.adapted, Path(temporary)):
-            row = {"benchmark": "large", "scene": args.finest.stem, **row}
+        for row in compared(args.finest, args.levels, args.adapted, args.truth, Path(temporary)):
+            scene = args.finest.stem + (f" of {args.truth.stem}" if args.truth else "")
+            row = {"benchmark": "large", "scene": scene, **row}
             if args.record:
                 append(FILE, row)
             else:
                 print(json.dumps(row), flush=True)
 
 
-def compared(finest: Path, levels: list[Path], adapted: Path | None, folder: Path) -> Iterator[Row]:
-    """The rows: the run, the dial at 1 and 2 and at each level's count, and its rivals there."""
-    base = clod.load(finest).gaussians
-    cameras = clod.place_cameras(base, views=VIEWS, seed=SEED)
-    views = [clod.View(camera, clod.render(base, camera).pixels) for camera in cameras]
-    out = adapted or folder / "adapted.ply"
+def compared(finest: Path, levels: list[Path], adapted: Path | None, truth: Path | None, folder: Path) -> Iterator[Row]:
+    """The rows: the run, the dial at 1, 2 and 5 and at each level's count, and its rivals there."""
+    base, shown = clod.load(finest).gaussians, clod.load(truth or finest).gaussians
+    cameras = clod.place_cameras(shown, views=VIEWS, seed=SEED)
+    views = [clod.View(camera, supersampled(shown, camera, SAMPLES if truth else 1)) for camera in cameras]
+    out, images = adapted or folder / "adapted.ply", list[object]()
+    if truth:
+        images = ["--images", write_photographs(shown, folder / "photographs")]
+        (row,) = clod.evaluate(base, views, [1.0])
+        yield {"method": "base", "level": "all", "gaussians": len(base), "share": 1.0, "psnr": row.psnr}
     if adapted is None:
-        run = Process([*COMMAND, finest, "--max-sv", 5, "--out", out, "--json", "--accept-loss"])
-        yield {"method": "run", "steps": json.loads(run.out)["steps"], **run.cost()}
+        run = Process([*COMMAND, finest, *images, "--max-sv", 5, "--out", out, "--json", "--accept-loss"])
+        report = json.loads(run.out)
+        held_out = {row["virtual_scale"]: row["psnr"] for row in report["rows"]}
+        yield {"method": "run", "steps": report["steps"], "held_out": held_out, **run.cost()}
     dial = clod.load(out).gaussians
     assert dial.attenuation is not None
     longer = dial.replace(attenuation=replace(dial.attenuation, max_sv=LONGEST))  # beyond what was trained
@@ -69,6 +84,21 @@ def compared(finest: Path, levels: list[Path], adapted: Path | None, folder: Pat
             (row,) = clod.evaluate(found, views, [1.0])
             yield {"method": name, "level": level.stem, "gaussians": len(found), "share": share, "psnr": row.psnr}
     yield from streamed(out, [matching_dial(dial, cameras, count) for count in counts], views, len(base), folder)
+
+
+def write_photographs(shown: clod.Gaussians, folder: Path) -> Path:
+    """A folder of PHOTOGRAPHS from placed cameras, with their transforms.json."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for k, camera in enumerate(clod.place_cameras(shown, views=PHOTOGRAPHS, seed=SEED + 1)):
+        name = f"images/{k:04}.png"
+        Image.fromarray(supersampled(shown, camera, SAMPLES).numpy()).save(folder / name)
+        pose = torch.linalg.inv(camera.viewmat.double()) @ torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
+        K = camera.K.tolist()
+        size = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2], "w": camera.width, "h": camera.height}
+        frames.append({"file_path": name, "transform_matrix": pose.tolist(), **size})
+    (folder / "transforms.json").write_text(json.dumps({"frames": frames}), "utf-8")
+    return folder
 
 
 def rivals(finest: Path, level: Path, count: int, folder: Path) -> Iterator[tuple[str, Path | None]]:

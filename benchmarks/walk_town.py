@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 
 import clod_adapter as clod
@@ -15,7 +15,7 @@ from city_surfaces import FACADE, PITCH, blocks, build
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.config import FILTERS
 from clod_adapter.equation.distances import euclidean, in_frustum, typical_distance
-from common import CACHE, Row, commit
+from common import CACHE, Row, commit, supersampled
 from tuning import RATES, Tuning, tune
 
 import numpy as np
@@ -60,14 +60,9 @@ class Town:
             found.append(look_at(eye, np.array([0.0, -5.0, 0.0]), self.width, self.height, f"far_{k:04d}.png"))
         return found
 
-    @torch.no_grad()
     def photograph(self, camera: clod.Camera) -> clod.View:
         """The truth: ``samples`` by ``samples`` pixels of the whole, unperturbed city averaged to one."""
-        k, scale = self.samples, torch.tensor([[self.samples], [self.samples], [1.0]])
-        large = replace(camera, K=camera.K * scale, width=k * camera.width, height=k * camera.height)
-        image = clod.render(self.truth(), large).image.clamp(0, 1)
-        image = image.reshape(camera.height, k, camera.width, k, 3).mean((1, 3))
-        return clod.View(camera, (255 * image).round().to(torch.uint8))
+        return clod.View(camera, supersampled(self.truth(), camera, self.samples))
 
     def scene(self) -> clod.Scene:
         views = []
