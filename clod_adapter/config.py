@@ -271,12 +271,16 @@ class AdaptConfig:
             return self
         return replace(self, iters=max(round(max(STEPS, each * views) / self.batch), 1))
 
-    def beyond(self, factor: float) -> float:
+    def beyond(self, factor: float, tau: float | None = None) -> float:
         """A dial value beyond max_sv: ``factor`` times as large, at most halfway to 1/tau, where all are culled.
 
         Training goes on there, so that quality and counts do not break off at max_sv. The paper's ends at max_sv.
+
+        Args:
+            tau: that of the file, where it is not the config's.
         """
-        return min(factor * self.max_sv, (self.max_sv + 1 / self.tau) / 2) if self.has_target_count else self.max_sv
+        halfway = (self.max_sv + 1 / (tau or self.tau)) / 2
+        return max(min(factor * self.max_sv, halfway), self.max_sv) if self.has_target_count else self.max_sv
 
     @property
     def has_target_count(self) -> bool:

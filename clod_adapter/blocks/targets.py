@@ -40,7 +40,7 @@ def context_rows(
 ) -> Tensor:
     """``[m]`` int64, ascending: the Gaussians of other blocks that any of the views needs.
 
-    Those left out cover at most LEFT_OUT of each image together, at s = 1 and at the largest dial value; at most
+    Those left out cover at most LEFT_OUT of each image together, at s = 0, 1 and max_sv; at most
     CONTEXT_VIEWS views are rendered, evenly spread.
 
     Args:
@@ -52,7 +52,7 @@ def context_rows(
     drawn, views = torch.zeros_like(own), spread(views, CONTEXT_VIEWS)
     for k, view in enumerate(views):
         distances = normalized_distances(scene.means, view.camera, scene.attenuation)
-        for s in (1.0, scene.attenuation.max_sv):
+        for s in (0.0, 1.0, scene.attenuation.max_sv):
             dialled = dial(scene, distances, s)
             opacities, growth = dialled.drawn, dialled.growth
             if not after:

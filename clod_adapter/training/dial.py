@@ -85,7 +85,7 @@ class Dial(nn.Module):
         self.register_buffer("typical", typical_distance(start.means, cameras, start.attenuation), persistent=False)
         self._rates = learning_rates(config)
         self._rates["means"] *= float(own_sizes(start.log_scales).median())  # an optimizer has one rate for all rows
-        self._sampler, self._sampled = ViewSampler((), config), 0
+        self._sampler, self._sampled = ViewSampler((), config, start.attenuation.tau), 0
 
     def __repr__(self) -> str:
         return f"Dial({len(self.log_sigma):,} Gaussians, s from 1 to {self.config.max_sv:g}, {self.log_sigma.device})"
@@ -148,14 +148,16 @@ class Dial(nn.Module):
         counted = self._sampler.counted()
         if counted is None:
             return weighted
-        found = weighted + self.count_loss(counted, rendering_loss)
-        return found if virtual_scale < 1 else found + self.count_loss(virtual_scale, weighted)
+        return weighted + self.count_loss(virtual_scale, weighted) + self.count_loss(counted, rendering_loss)
 
     def count_loss(self, virtual_scale: float, rendering_loss: Tensor) -> Tensor:
         """0-d, the target-count term ``L reg_weight (eta / target - 1)^2`` alone; eta is the share kept.
 
         L is ``rendering_loss``, a constant. The gradient, of ``log_sigma`` only, is ``target_count.count_gradient``.
+        0 below s = 1, where there is no target.
         """
+        if virtual_scale < 1:
+            return self.log_sigma.new_zeros(())
         logits, sigma = self.differentiable().opacity_logits.detach(), self.sigma_d.detach()
         loss = torch.as_tensor(rendering_loss).detach().double()
         target = target_share(virtual_scale, len(logits), self.config)
@@ -166,7 +168,7 @@ class Dial(nn.Module):
         return value.to(sigma) + ((self.log_sigma - self.log_sigma.detach()) * gradient).sum()
 
     def target_share(self, virtual_scale: float) -> float:
-        """The share of the splats that the target-count curve keeps at s, in (0, 1]."""
+        """The share of the splats that the target-count curve keeps at s, in (0, 1]; 1 below s = 1."""
         return target_share(virtual_scale, len(self.log_sigma), self.config).share
 
     def differentiable(self) -> Gaussians:

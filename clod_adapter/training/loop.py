@@ -41,9 +41,10 @@ def adapt(
     """Learns sigma_d for ``base`` on the training views of ``scene``, and tunes the other attributes lightly.
 
     Each step samples ``batch`` views (1 by default) and follows the sum of their gradients. Each view is rendered at
-    one dial value, s = 1 in ``full_share`` of the steps at first and else log-uniform in [1, max_sv], to minimise ``w_s
-    L_render(s)``, where L_render is ``losses.photometric_loss`` and ``w_s = (1 - weight_slope s / max_sv)^2``. In the
-    first steps, a share ``coarse`` of all, photographs have half their size, unless that is below 128 pixels a side.
+    one dial value, s = 1 in ``full_share`` of the steps at first, a quarter of these s = 0, and else log-uniform from 1
+    to 1.25 max_sv, to minimise ``w_s L_render(s)``, where L_render is ``losses.photometric_loss`` and ``w_s = max(0, 1
+    - weight_slope s / max_sv)^2``. In the first steps, a share ``coarse`` of all, photographs have half their size
+    beyond s = 1, unless that is below 128 pixels a side.
     ``target_count.count_gradient`` moves sigma_d so that the share of Gaussians kept at their typical distances follows
     the target-count curve; with the target ``cost``, ``target_cost.TargetCost`` does so for the cost of rendering.
     The result is the mean of the parameters over the last ``average`` of the steps, so learning rates can stay large

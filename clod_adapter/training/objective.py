@@ -202,7 +202,7 @@ class Objective:
             growth = None if growth is None else torch.cat([growth, torch.ones_like(context)])
         # Culled rows have opacity 0: the rasterizer skips them, and they get no gradient.
         term = None
-        if self.config.count_term == "paper" and self.config.reg_weight > 0:
+        if self.config.count_term == "paper" and self.config.reg_weight > 0 and s >= 1:
             term = paper_count(dialled, s, self.attenuation.tau, self.config, self.part.total)
         return splat(shown, drawn, camera, growth=growth)[0], dialled.keep[: self.trained], term
 
@@ -224,8 +224,8 @@ class Objective:
 
 
 def loss_weight(virtual_scale: float, config: AdaptConfig) -> float:
-    """``w_s = (1 - k s / max_sv)^2``, the weight of the loss at the dial value s."""
-    return (1 - config.weight_slope * virtual_scale / config.max_sv) ** 2
+    """``w_s = max(0, 1 - k s / max_sv)^2``, the weight of the loss at the dial value s."""
+    return max(1 - config.weight_slope * virtual_scale / config.max_sv, 0.0) ** 2
 
 
 def _ending_in(value: float, tensor: Tensor, trained: int) -> Tensor:

@@ -36,8 +36,10 @@ def target_curve(virtual_scale: float, share: float, exponent: float) -> float:
     """The share of all Gaussians to keep at a dial value s: ``1 / (s^p + (1/share - 1) s^-p)``.
 
     ``share`` at s = 1, and close to the paper's target ``s^-p`` (section 3.3, p = 1.5) for larger s: with a share of
-    0.62, 7 % below it at s = 2 and 2 % at s = 3.
+    0.62, 7 % below it at s = 2 and 2 % at s = 3. 1 below s = 1.
     """
+    if virtual_scale < 1:
+        return 1.0
     power = virtual_scale**exponent
     return 1 / (power + (1 / share - 1) / power)
 

@@ -50,7 +50,7 @@ class Trainer:
     ) -> None:  # fmt: skip
         subset = subset or TrainableSubset(len(start))
         assert start.sigma_d is not None and start.attenuation is not None
-        self.config, self.group, self.sampler = config, group, ViewSampler(views, config)
+        self.config, self.group, self.sampler = config, group, ViewSampler(views, config, start.attenuation.tau)
         rates = learning_rates(config)
         # A frozen attribute requests no gradient from the rasterizer.
         tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]

@@ -36,13 +36,16 @@ class Sample(NamedTuple):
 class ViewSampler:
     """Samples views and dial values from ``config.seed``; the same in every process.
 
+    Args:
+        tau: the culling threshold at s = 1, where it is not the config's.
+
     Attributes:
         order: the numbers of the remaining views of this round, the next one last.
         offset: of the sequence of dial values.
     """
 
-    def __init__(self, views: tuple[View, ...], config: AdaptConfig) -> None:
-        self.views, self.config = views, config
+    def __init__(self, views: tuple[View, ...], config: AdaptConfig, tau: float | None = None) -> None:
+        self.views, self.config, self.tau = views, config, tau
         self.random = np.random.default_rng(config.seed)
         self.order: list[int] = []
         self.offset = self.random.random()
@@ -68,13 +71,14 @@ class ViewSampler:
         """A log-uniform dial value that Gaussians are only counted at; None if there is no target-count curve."""
         if not self.config.has_target_count:
             return None
-        return self.config.beyond(COUNTED) ** self.random.random()
+        return self.config.beyond(COUNTED, self.tau) ** self.random.random()
 
     def dial(self, number: int, share_done: float) -> float:
         """The dial value of a step: with the probability ``full_share`` 1 or 0, else (log-)uniform from 1 on.
 
         The probability falls linearly to ``full_final`` of itself: s = 1 is learned before the far end of the dial.
-        Steps at s = 0 train what cameras nearer than the photographs see, and viewers that do not know the dial.
+        Steps at s = 0 train what cameras nearer than the photographs see, and viewers that do not know the dial. With
+        max_sv 1 there is one dial value.
 
         Multiples of the golden ratio modulo 1 are spread more evenly than random numbers, in every stretch of a run:
         0.05 dB at s = 5 on plush_half.
@@ -85,7 +89,7 @@ class ViewSampler:
             return 1.0
         if place < full:
             return 0.0 if place < UNATTENUATED * full else 1.0
-        place, end = (place - full) / (1 - full), config.beyond(RENDERED)
+        place, end = (place - full) / (1 - full), config.beyond(RENDERED, self.tau)
         return 1 + (end - 1) * place if config.sampling == "uniform" else end**place
 
     def state(self) -> tuple[dict[str, Any], tuple[int, ...]]:

@@ -81,6 +81,18 @@ def test_one_step_moves_kept_rows_by_their_rates(captured: Pair) -> None:
     assert photometric_loss(render(after, view.camera).image, view.image) < seen[0].loss
 
 
+@pytest.mark.parametrize("changes", [{"count_term": "paper"}, {"weight_slope": 1.0}, {"target": "cost"}], ids=str)
+def test_steps_at_0_and_beyond_max_sv(captured: Pair, changes: dict[str, Any]) -> None:
+    """Every form of the objective trains there; no weight rises beyond max_sv."""
+    base, scene = captured
+    config = config_of(iters=12, max_sv=4.0, full_share=0.5, **changes)
+    drawn = [ViewSampler(scene.train, config).draw(k, 0.0).dial for k in range(12)]
+    assert min(drawn) == 0 and (max(drawn) > 4 or config.count_term == "paper")
+    assert loss_weight(5.0, config) <= loss_weight(4.0, config)
+    found = adapt(base, scene, config)
+    assert found.steps == 12 and not found.failed
+
+
 def test_batch_gradient_is_the_sum_over_views(captured: Pair) -> None:
     """The first step is longer by the square root of the batch size."""
     base, scene = captured

@@ -69,6 +69,7 @@ def test_dial_values_follow_the_configured_distribution(seed: int) -> None:
     late = drawn(0.5, full_share=0.5, full_final=0.5)
     assert abs(int((late <= 1).sum()) - 0.375 * 480) <= 1
     assert ViewSampler(VIEWS, AdaptConfig(max_sv=1.0, full_share=0.0)).draw(0, 0.0)[1:] == (1.0, None, False)
+    assert drawn(full_share=0.0, tau=0.2).max() < (4 + 1 / 0.2) / 2  # at 5 nothing is kept
 
 
 def test_first_steps_have_photographs_of_half_the_size() -> None:
