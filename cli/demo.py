@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import argparse
-import zipfile
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from clod_adapter.cameras import View
+from clod_adapter.demo.packed import unpack
 from clod_adapter.demo.pictures import Panel, dial_strip, quality_curve
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.checkpoint import load, save
+from clod_adapter.io.checkpoint import load
 from clod_adapter.io.lock import output_lock
 from clod_adapter.io.scene.load import load_scene
 from clod_adapter.render import render
@@ -84,17 +82,6 @@ def print_next(folder: Path, pictures: dict[str, Path], watch: Stopwatch) -> Non
     else:
         put("no figures: the measurements were interrupted")
     print("next, a splat of your own:\n  clod-adapt YOURS.ply --images YOUR_SCENE")
-
-
-def unpack(capture: Path, base: Path) -> None:
-    """Writes the capture and the base checkpoint that come with the package, unless they exist."""
-    packed = resources.files("clod_adapter.demo")
-    if not capture.exists():
-        with atomic_path(capture) as part, (packed / "capture.zip").open("rb") as file:
-            zipfile.ZipFile(file).extractall(part)
-    if not base.exists():
-        with resources.as_file(packed / "base.spz") as path:
-            save(base, load(path).gaussians)
 
 
 def draw(capture: Path, base: Path, model: Path, report: dict[str, Any], pictures: dict[str, Path]) -> None:

@@ -11,14 +11,10 @@ from typing import Any
 import pytest
 
 from clod_adapter import config
-from clod_adapter import demo as demo_package
 from clod_adapter.cli import demo
 from clod_adapter.cli.adapt import report, resume, saver
 from clod_adapter.cli.adapt.result import Measurements
 from clod_adapter.cli.main import build_parser
-from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.io.checkpoint import load
-from clod_adapter.io.scene.load import load_scene
 
 PICTURES = ("dial.png", "curve.png")
 
@@ -71,18 +67,6 @@ def test_missing_package_is_named_at_the_start(clod: Any, tmp_path: Path, monkey
     done = clod("demo")
     assert done.code == 2 and "matplotlib: pip install matplotlib" in done.err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_scene_and_base_of_the_package(tmp_path: Path) -> None:
-    """The base is trained to its end, and packing it and the photographs cost little."""
-    packed = [Path(demo_package.__file__).with_name(name) for name in ("base.spz", "capture.zip")]
-    assert packed[0].stat().st_size < 2e6 and sum(path.stat().st_size for path in packed) < 3e6
-    capture, base = tmp_path / "capture", tmp_path / "base.ply"
-    for _ in range(2):  # what exists is left
-        demo.unpack(capture, base)
-    scene, checkpoint = load_scene(capture), load(base)
-    assert (len(scene.train), len(scene.test), checkpoint.notes, scene.notes) == (70, 10, (), ())
-    assert evaluate(checkpoint.gaussians, scene.test, [0])[0].psnr > 30
 
 
 def test_folder_that_cannot_be_made(clod: Any, tmp_path: Path) -> None:
