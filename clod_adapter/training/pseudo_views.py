@@ -174,13 +174,15 @@ def _views(
 
 
 def reaches(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[float]:
-    """Of each camera its distance to the scene, world units: the median in its image, at most that of half the cameras.
+    """Of each camera its distance to the scene, world units.
 
-    Of a camera that looks past the scene, the median in the image is that of the background.
+    It is the median in its image, at most the median over the cameras: of a camera that looks past the scene, the
+    median in the image is that of the background.
     """
     some = gaussians.means[:: len(gaussians) // SAMPLE + 1]
     medians = [median_distance(some, camera) for camera in cameras]
-    return [min(each, median(medians)) for each in medians]
+    most = median(medians)
+    return [min(each, most) for each in medians]
 
 
 def teachers_to(views: Sequence[View], device: str) -> tuple[View, ...]:
