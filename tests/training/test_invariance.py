@@ -126,7 +126,7 @@ def test_a_far_camera(pair: Pair) -> None:
     assert_same(found, results(*pair, SEEDS))
 
 
-def test_a_far_shell(pair: Pair, usual: list[tuple[float, float]]) -> None:
+def test_a_far_shell() -> None:
     """Gaussians around the scene, 100 times as far away: photographs show them between the others."""
     both = surrounded(gaussians(600, 0, 0, size=0.15))
     scene = taken(both)

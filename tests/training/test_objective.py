@@ -60,7 +60,8 @@ def test_one_step_moves_kept_rows_by_their_rates(captured: Pair) -> None:
     """At s = 1 on one view, the loss is the render's, and culled rows do not move."""
     base, scene = captured
     alone = Scene(scene.train[:2], ())
-    config = config_of(iters=1, full_share=1.0, reg_weight=0.0, seed=1)  # its first step is at s = 1
+    config = config_of(iters=1, full_share=1.0, reg_weight=0.0, seed=1)
+    assert ViewSampler(alone.train, config).draw(0, 0.0).dial == 1
     before, seen = initialize(base, alone.train, config), []
     after = adapt(before, alone, config, seen.append).gaussians
     losses = [photometric_loss(render(before, view.camera).image, view.image).item() for view in alone.train]
