@@ -1,7 +1,9 @@
 """Time of a training step by section and kernel, on real checkpoints.
 
-Wall times are means over the steps after the first few, with the default settings at the start of training: steps with
-photographs of half the size, then as many with whole ones.
+Wall times are means over the steps after the first few, at the start of a training: steps with photographs of half the
+size (``coarse`` 1), then, in a training of its own, as many with whole ones (``coarse`` 0). None is at s = 1 or 0
+(``full_share`` 0), where photographs are never halved. The other settings are the defaults; a default training mixes
+these kinds of steps.
 ``splat_share`` is the rasterizer's share of a step. A row names the commit of the imported package: to measure another
 one, put it first on PYTHONPATH.
 """
@@ -12,6 +14,7 @@ import json
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import clod_adapter as clod
@@ -28,7 +31,7 @@ import torch
 FILE = "step.jsonl"
 THREADS = 2
 SECTIONS = {"count_gradient_at": "count", "photometric_loss": "loss"}
-HALVED, WHOLE = 0.0, 0.99  # shares of the training
+HALVED, WHOLE = 1.0, 0.0  # coarse: the share of the training with photographs of half the size
 
 
 class Clock:
@@ -78,22 +81,22 @@ def main() -> None:
 def profile(scene: str, steps: int, clock: Clock, warm: int = 5) -> Iterator[dict[str, Any]]:
     """Milliseconds a step, in all and by section; of half-size and of whole photographs."""
     base, views = checkpoint(scene).gaussians, photographs(scene).train
-    config = clod.AdaptConfig()
+    config = clod.AdaptConfig(full_share=0.0)
     begun = for_training(initialize(base, views, config), views, config)
-    run = Trainer(begun, views, config)
-    for share_done in (HALVED, WHOLE):
+    for coarse in (HALVED, WHOLE):
+        run = Trainer(begun, views, replace(config, coarse=coarse))
         for _ in range(warm):
-            run.step(share_done)
+            run.step(0.0)
         clock.seconds.clear()
         began = time.perf_counter()
         for _ in range(steps):
-            run.step(share_done)
+            run.step(0.0)
         total = (time.perf_counter() - began) / steps
         sections = {name: round(seconds / steps * 1e3, 2) for name, seconds in clock.seconds.items()}
         splat = (clock.seconds["splat forward"] + clock.seconds["splat backward"]) / steps
         yield {
-            "halved": share_done == HALVED, "steps": steps, "step_ms": round(total * 1e3, 2),
-            "splat_share": round(splat / total, 3), "ms": sections,
+            "halved": coarse == HALVED, "full_share": config.full_share, "steps": steps,
+            "step_ms": round(total * 1e3, 2), "splat_share": round(splat / total, 3), "ms": sections,
         }  # fmt: skip
 
 
