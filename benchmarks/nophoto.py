@@ -27,7 +27,7 @@ from adapt import at_shares
 from city import city, city_cameras, perturb
 from clod_adapter.initialization.coverage import reduced
 from clod_adapter.training import camera_score
-from clod_adapter.training.pseudo_views import LIGHTEST, add_pseudo_views, render_pseudo_views, shown
+from clod_adapter.training.pseudo_views import LIGHTEST, STEPS_PER_PLACED, add_pseudo_views, render_pseudo_views, shown
 from common import COMMAND, Process, append, arguments, checkpoint, stored, table
 from common import photographs as photographs_of
 from scaling import by_phase
@@ -46,7 +46,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS[:3])
     parser.add_argument("--few", type=int, metavar="K", help="of the photographs to train on, only K, evenly spread")
-    parser.add_argument("--iters", type=int, default=clod.AdaptConfig().steps)
+    parser.add_argument("--iters", type=int, help="training steps (default: by the number of views, as clod-adapt)")
     parser.add_argument("--max-sv", type=float, default=7.0)
     parser.add_argument("--cameras", action="store_true", help="place cameras only; a scene may be city:N")
     parser.add_argument("--sample", type=int, default=camera_score.SAMPLE, help="Gaussians that score a camera")
@@ -79,7 +79,7 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
         views = clod.Scene(tuple(view.at(view.camera) for view in (*rendered.train, *rendered.test)), ())
     if kind == "placed":
         views = render_pseudo_views(base, clod.place_cameras(base, seed=config.seed))
-        config = config.lighter(LIGHTEST)
+        config = config.lighter(LIGHTEST).for_views(len(views.train), STEPS_PER_PLACED)  # as the command does
     if kind == "complemented":
         views, config = add_pseudo_views(base, photographs, config)
     seconds = time.perf_counter() - began
@@ -97,12 +97,13 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
     })  # fmt: skip
 
 
-def run_command(count: int, iters: int, max_sv: float, memory: str) -> None:
+def run_command(count: int, iters: int | None, max_sv: float, memory: str) -> None:
     """Runs clod-adapt on a city's checkpoint of SH degree 0 without photographs; adds its time and memory by phase."""
     with tempfile.TemporaryDirectory() as temporary:
         ply, out = Path(temporary) / "city.ply", Path(temporary) / "out.ply"
         clod.save(ply, perturb(city(count, sh_degree=0)))
-        words = [ply, "--max-sv", max_sv, "--iters", iters, "--trim", "--memory", memory, "--out", out, "--json"]
+        words = [ply, "--max-sv", max_sv, "--trim", "--memory", memory, "--out", out, "--json"]
+        words += ["--iters", iters] if iters is not None else []
         run = Process([*COMMAND, *words], SAID)
         found = json.loads(run.out)
     peaks, cpu = by_phase(run, [*run.moments.items(), ("measure and write", run.seconds)])
