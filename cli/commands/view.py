@@ -33,7 +33,7 @@ def view_options(parser: ArgumentParser) -> None:
     initial: Any = page.add_mutually_exclusive_group()
     initial.add_argument(
         "--sv", metavar="S", type=float,
-        help="initial dial value (default: everything, then what the browser draws at 30 fps)",
+        help="initial dial value (default: 1 with photographs, else everything; then what the browser draws at 30 fps)",
     )  # fmt: skip
     add_device_preset(initial)
     page.add_argument("--port", metavar="P", type=int, default=0, help="port of the server (default: a free one)")
@@ -98,11 +98,12 @@ runs until Ctrl-C.
 """,
     usage="MODEL.ply ... [--base BASE.ply] [--images DIR] [options]",
     epilog="""\
-The page opens with everything shown, then at the dial value at which the
-browser draws 30 frames per second; --sv sets one that stays. It shows the
-Gaussians kept and the frame time, switches the attenuation on and off, and
-compares two dial values, or MODEL.ply and BASE.ply, on the two sides of a line.
-Drop another file on the page to open it. The address holds the view. With
+The page opens at s = 1 with photographs, else with everything shown, then at
+the dial value at which the browser draws 30 frames per second; --sv sets one
+that stays. It shows the Gaussians kept and the frame time, switches the
+attenuation on and off, and compares two dial values, or MODEL.ply and BASE.ply,
+on the two sides of a line. Drop another file on the page to open it; --sv
+holds for it too, within its trained range. The address holds the view. With
 --images the page can jump between the scene's cameras. Several files, such as
 levels or variants, and a folder of files open with a list to switch between
 them; the view and the dial value stay.

@@ -51,7 +51,8 @@ def write_viewer_page(
         base: shown for comparison; relative to the same origin.
         cameras: selectable viewpoints, in the frame of the Gaussians (relative to the origin); by default the stored
             ones.
-        virtual_scale: the initial dial value, >= 0; None for everything, and then what the device holds.
+        virtual_scale: the initial dial value, >= 0; None for 1 with photographs, else 0 (everything), and then what
+            the device holds.
         tool: packs the splats to a fifth of their size, with rounded values (``pack_sog``, which calls
             ``progress``); None stores them unpacked.
 

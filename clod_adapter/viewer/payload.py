@@ -95,7 +95,8 @@ def page_config(
     Args:
         model, base: from ``Payload.describe``.
         cameras: selectable viewpoints, in this order, in the frame of the Gaussians.
-        virtual_scale: the initial dial value, >= 0; None for everything, and then what the device holds.
+        virtual_scale: the initial dial value, >= 0; None for 1 with photographs, else 0 (everything), and then what
+            the device holds.
         others: further models to switch to, from ``Payload.describe``.
         placed: the cameras are not photographs'; the page levels them by the scene's up axis.
     """

@@ -19,7 +19,7 @@ from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.file_formats import write
 from clod_adapter.render import render
-from shown import Shown, assert_same, drop, message
+from shown import Shown, assert_same, drop, message, take
 
 CAMERA = scenes.camera(320, 240)
 
@@ -197,6 +197,18 @@ def test_a_damaged_file_is_an_error_and_the_picture_stays(shown: Shown, model: P
         drop(shown, name, content, fails=name == "folder")
         assert error in message(shown, name) and shown.text("#title") == "model.ply"
     assert np.array_equal(shown.picture(), before)
+
+
+def test_the_dial_value_of_the_command_line_is_that_of_dropped_files(
+    show: Any, save: Any, model: Path, gaussians: Gaussians
+) -> None:
+    """Or the largest trained value of the file."""
+    assert gaussians.attenuation is not None
+    less = gaussians.replace(attenuation=replace(gaussians.attenuation, max_sv=2.0))
+    shown = show(model, "--sv", 3)
+    for path, dial in ((save(less, "less.ply"), "s = 2.00"), (model, "s = 3.00")):
+        take(shown, path)
+        assert shown.text("#dial-value") == dial
 
 
 def test_the_last_of_two_dropped_files_is_shown(shown: Shown, save: Any, model: Path) -> None:

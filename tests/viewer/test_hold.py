@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from plyfile import PlyData
 
 import clod_adapter
 from clod_adapter.frame_rate import excess, next_dial
@@ -214,6 +215,25 @@ def test_a_file_opens_with_everything_and_moves_to_what_the_device_holds(
     assert linked.text("#dial-value") == "all" and linked.errors == slow.errors == fast.errors == []
     for each in (fast, slow, hopeless, linked):
         each.page.close()
+
+
+def test_notes_on_a_dropped_file_stay_when_the_dial_has_settled(tabs: Any, model: Path, tmp_path: Path) -> None:
+    """Followed by what became of the dial: kept, moved, or not moved on a device that is too slow."""
+    write_viewer_page(tmp_path / "page.html", clod_adapter.load(model))
+    file, invalid = PlyData.read(str(model), mmap=False), tmp_path / "invalid.ply"
+    file["vertex"]["x"][7] = np.nan
+    file.write(str(invalid))
+    shown = opened(tabs, (tmp_path / "page.html").as_uri(), QUERIES)
+    note = "1 of 400 Gaussians cannot be drawn and were removed"
+    ends = {1: "", 2: "; Moved to {} for 30 fps on this device", 20: "; Dial not moved: under 15 fps at any value"}
+    for load, end in ends.items():
+        shown.page.evaluate(f"window.load = {load}, window.trace.length = 0")
+        take(shown, invalid)
+        assert len(shown.page.evaluate("window.trace")) > 1
+        assert shown.text("#target-note") == note + end.format(shown.text("#dial-value"))
+    take(shown, model)
+    assert "cannot be drawn" not in shown.text("#target-note") and shown.errors == []
+    shown.page.close()
 
 
 def test_a_rate_is_held_from_everything_on(simulated: Shown) -> None:

@@ -41,9 +41,10 @@ export function createFiles(elements, viewer, config, { show, replace, update, s
     try {
       const read = await readFile(await buffer, name);
       if (signal.aborted) return;
-      show(read, null, [], config.virtual_scale && 1);
+      show(read, null, [], config.virtual_scale); // within the range of this file
       endFirst();
-      ui.showNote(read.metadata.notes.join("; "));
+      viewer.notes = read.metadata.notes.join("; ");
+      ui.showNote(viewer.notes);
       viewer.file = null;
       ui.showName(name, null);
       ui.showMessage(null);

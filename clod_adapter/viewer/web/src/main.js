@@ -22,7 +22,7 @@ const HOPELESS = Math.log(2); // excess at the largest dial value, above which i
 const STEEP = 0.7; // sine of a placed camera's angle to the horizon
 
 const elements = elementsOf(document), config = readConfig();
-const viewer = { cameraNumber: 0, cameras: config.cameras, up: "", recording: null, file: 0, opening: null }; // opening: the dial value that a file was opened at, null once that is settled
+const viewer = { cameraNumber: 0, cameras: config.cameras, up: "", recording: null, file: 0, opening: null, notes: "" }; // opening: the dial value that a file was opened at, null once that is settled; notes: on a dropped file
 viewer.device = sortingDevice();
 viewer.files = config.model ? [config.model, ...config.others] : [];
 
@@ -49,7 +49,7 @@ async function start() {
   stage.listeners.frame = viewer.ui.updateFrame;
   stage.listeners.held = (outOfReach, excess) => {
     viewer.ui.update();
-    if (viewer.opening !== null && excess > HOPELESS) return keepAll();
+    if (viewer.opening !== null) return excess > HOPELESS && keepAll(); // a note on the file stays
     viewer.ui.showNote(outOfReach ? `s = ${stage.model.max_sv}, the largest trained value, is too slow for this frame rate` : "");
   };
   stage.listeners.error = (error) => viewer.ui.showMessage(error.message);
@@ -74,22 +74,26 @@ async function settle() {
   await stage.whenDrawn();
   if (viewer.opening === null || stage.model !== model) return;
   actions.setHold(null);
-  if (state.dial !== opening) viewer.ui.showNote(`Moved to s = ${state.dial.toFixed(2)} for ${OPENING} fps on this device`);
+  noteAfterOpening(state.dial === opening ? "" : `Moved to s = ${state.dial.toFixed(2)} for ${OPENING} fps on this device`);
 }
 
 function keepAll() {
   actions.setDial(viewer.opening);
-  viewer.ui.showNote(`Dial not moved: under ${OPENING / 2} fps at any value`);
+  noteAfterOpening(`Dial not moved: under ${OPENING / 2} fps at any value`);
 }
+
+/** Shows the notes on the file again, which the end of the hold has removed, and what became of the dial. */
+const noteAfterOpening = (moved) => viewer.ui.showNote([viewer.notes, moved].filter(Boolean).join("; "));
 
 const upload = ({ gaussians, metadata }) => createModel(viewer.renderer.gl, gaussians, metadata, viewer.device);
 
-/** Shows another scene, and starts anew. `dial`: null for everything, where the device holds it. */
+/** Shows another scene, and starts anew. `dial`: null for s = 1 with photographs, else everything, then what the
+ *  device holds. */
 function show(model, base, cameras, dial) {
   const { stage, ui } = viewer;
   const [uploaded, uploadedBase] = [upload(model), base && upload(base)];
   Object.assign(stage.state, { dial: 1, equation: true, marks: false, wipe: null, other: "base" });
-  viewer.up = "";
+  viewer.up = viewer.notes = "";
   stage.setHold(null);
   stage.show(uploaded, uploadedBase);
   const isSteep = ({ placed, viewmat }) => placed && Math.abs(dot(viewmat[2], uploaded.extent.up)) > STEEP;
