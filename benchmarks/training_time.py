@@ -77,7 +77,7 @@ def plot() -> None:
     scenes = sorted({row["scene"] for row in rows}, reverse=True)
     with new_figure((4.6 * len(scenes), 3.6), layout="constrained") as figure:
         for scene, axes in zip(scenes, figure.subplots(1, len(scenes), squeeze=False)[0], strict=True):
-            for before, label in ((True, "1,600 steps"), (False, "800 steps, s = 1 first")):
+            for before, label in ((True, "1,600 steps by default"), (False, "now")):
                 line = [row for row in rows if (row["scene"], row["before"]) == (scene, before)]
                 axes.plot([row["seconds"] for row in line], [fmean(row["psnr"]) for row in line], "o-", label=label)
             axes.set_title(scene, loc="left", fontsize=10, weight="bold")
