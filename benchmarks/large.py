@@ -83,7 +83,8 @@ def compared(finest: Path, levels: list[Path], adapted: Path | None, truth: Path
             found = clod.load(file).gaussians
             (row,) = clod.evaluate(found, views, [1.0])
             yield {"method": name, "level": level.stem, "gaussians": len(found), "share": share, "psnr": row.psnr}
-    yield from streamed(out, [matching_dial(dial, cameras, count) for count in counts], views, len(base), folder)
+    if len(counts) > 1:  # a streaming set has several levels
+        yield from streamed(out, [matching_dial(dial, cameras, count) for count in counts], views, len(base), folder)
 
 
 def write_photographs(shown: clod.Gaussians, folder: Path) -> Path:
