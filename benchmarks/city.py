@@ -105,15 +105,17 @@ def in_air(count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndar
     return eye, np.array([aim[0], -5.0, aim[1]])
 
 
-def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: str) -> clod.Camera:
-    """An upright camera with a field of view of 65 degrees across the width."""
+def look_at(
+    eye: np.ndarray, target: np.ndarray, width: int, height: int, name: str, field: float = 65.0
+) -> clod.Camera:
+    """An upright camera that has ``target`` in the middle of its image; ``field`` of view across the width, degrees."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross([0.0, 1.0, 0.0], forward)
     right /= np.linalg.norm(right)
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    focal = width / 2 / math.tan(math.radians(65) / 2)
+    focal = width / 2 / math.tan(math.radians(field) / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return clod.Camera(torch.from_numpy(viewmat).float(), torch.from_numpy(K).float(), width, height, name)
 

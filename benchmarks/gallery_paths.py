@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from city import look_at
 from clod_adapter.cameras import Camera
 
 import numpy as np
-import torch
 
 FIELD_OF_VIEW = 68.0  # degrees, across the width
 
@@ -58,19 +58,6 @@ PATHS = (
 )  # fmt: skip
 
 
-def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: str) -> Camera:
-    """An upright camera at `eye` that has `target` at the middle of its image."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross([0.0, 1.0, 0.0], forward)
-    right /= np.linalg.norm(right)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    focal = width / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Camera(torch.from_numpy(viewmat).float(), torch.from_numpy(K).float(), width, height, name)
-
-
 def path_cameras(width: int, height: int, count: int) -> list[Camera]:
     """`count` cameras named from ``view_000.webp`` on, evenly spaced in time along each path in turn."""
     shares = np.array([path.share for path in PATHS])
@@ -78,4 +65,7 @@ def path_cameras(width: int, height: int, count: int) -> list[Camera]:
     poses = []
     for path, views in zip(PATHS, np.diff(ends, prepend=0), strict=True):
         poses += [path.pose((k + 0.5) / views) for k in range(views)]
-    return [look_at(eye, target, width, height, f"view_{k:03d}.webp") for k, (eye, target) in enumerate(poses)]
+    return [
+        look_at(eye, target, width, height, f"view_{k:03d}.webp", FIELD_OF_VIEW)
+        for k, (eye, target) in enumerate(poses)
+    ]

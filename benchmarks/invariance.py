@@ -19,7 +19,7 @@ from pathlib import Path
 import clod_adapter as clod
 from clod_adapter.cameras import in_its_unit
 from clod_adapter.io.checkpoint import blank
-from clod_adapter.rasterizers.reference import sh_basis
+from clod_adapter.rasterizers.reference import rotations, sh_basis
 from common import Row, append, arguments, checkpoint, photographs
 
 import torch
@@ -103,20 +103,10 @@ def turned(base: clod.Gaussians, views: clod.Scene) -> Pair:
     return base, with_cameras(views, lambda viewmat: torch.cat([viewmat[:, :3] @ turn.T, viewmat[:, 3:]], 1))
 
 
-def rotations(quats: Tensor) -> Tensor:
-    """``[N, 3, 3]`` of unit quaternions."""
-    w, x, y, z = quats.unbind(1)
-    return torch.stack([
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ], 1).reshape(-1, 3, 3)  # fmt: skip
-
-
 def split(base: clod.Gaussians, views: clod.Scene) -> Pair:
     """Each Gaussian in eight, at half a standard deviation along its axes, with about the same integral."""
     corners = 0.5 * torch.tensor([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]).float()
-    axes = rotations(torch.nn.functional.normalize(base.quats, dim=1)) * base.scales[:, None, :]
+    axes = rotations(base.quats) * base.scales[:, None, :]
     rows = torch.arange(len(base)).repeat_interleave(8)
     return base.select(rows).replace(
         means=(base.means[:, None] + torch.einsum("nij,kj->nki", axes, corners)).reshape(-1, 3),

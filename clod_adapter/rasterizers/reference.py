@@ -42,14 +42,6 @@ def project(
     points: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor]:
     """Image centres ``[n, 2]`` and P ``[n, 2, 3]`` of covariances P P^T by the local affine approximation (EWA)."""
-    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
-    rotations = torch.stack(
-        [
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ], 1,
-    ).reshape(-1, 3, 3)  # fmt: skip
     depth = points[:, 2]
     focal = torch.stack([K[0, 0], K[1, 1]])
     size = torch.tensor([camera.width, camera.height]).to(points)
@@ -59,9 +51,21 @@ def project(
     jacobian = torch.zeros(len(points), 2, 3).to(points)
     jacobian[:, 0, 0], jacobian[:, 1, 1] = focal[0] / depth, focal[1] / depth
     jacobian[:, :, 2] = -focal * ray / depth[:, None]
-    half = jacobian @ viewmat[:3, :3] @ rotations * scales[:, None, :]
+    half = jacobian @ viewmat[:3, :3] @ rotations(quats) * scales[:, None, :]
     centres = focal * points[:, :2] / depth[:, None] + K[:2, 2]
     return centres, half
+
+
+def rotations(quats: Tensor) -> Tensor:
+    """``[n, 3, 3]`` of quaternions wxyz of any length above 0."""
+    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
+    return torch.stack(
+        [
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ], 1,
+    ).reshape(-1, 3, 3)  # fmt: skip
 
 
 def blurred(half: Tensor, opacities: Tensor, screen_filter: ScreenFilter) -> tuple[Tensor, Tensor]:

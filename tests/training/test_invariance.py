@@ -15,6 +15,7 @@ from clod_adapter import AdaptConfig, AttenuationConfig, Camera, Gaussians, Scen
 from clod_adapter.cameras import in_its_unit
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.initialization.importance import scene_distance
+from clod_adapter.rasterizers.reference import rotations
 from clod_adapter.training.pseudo_views import reaches
 from scenes import gaussians, photograph, ring
 
@@ -67,7 +68,7 @@ def seen_by(scene: Scene, change: Callable[[Camera], Camera]) -> Scene:
 def placed(base: Gaussians, scene: Scene, scale: float, turn: Tensor, shift: float) -> Pair:
     """The scene with ``scale * turn x + shift`` in place of x."""
     means = scale * base.means.double() @ turn.T + shift
-    own = torch.stack([matrix_to_quat(turn @ quat_to_matrix(q)) for q in base.quats.double()])
+    own = torch.stack([matrix_to_quat(turn @ old) for old in rotations(base.quats.double())])
     moved = base.replace(means=means.float(), quats=own.float(), log_scales=base.log_scales + math.log(scale))
 
     def change(camera: Camera) -> Camera:
@@ -77,15 +78,6 @@ def placed(base: Gaussians, scene: Scene, scale: float, turn: Tensor, shift: flo
         return replace(camera, viewmat=new.float())
 
     return moved, seen_by(scene, change)
-
-
-def quat_to_matrix(quat: Tensor) -> Tensor:
-    w, x, y, z = (quat / quat.norm()).tolist()
-    return torch.tensor([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ], dtype=torch.float64)  # fmt: skip
 
 
 def matrix_to_quat(matrix: Tensor) -> Tensor:
@@ -153,7 +145,7 @@ def test_split_gaussians(pair: Pair) -> None:
 
 def split(base: Gaussians) -> Gaussians:
     corners = torch.tensor([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.5
-    turns = torch.stack([quat_to_matrix(q) for q in base.quats.double()]).float()
+    turns = rotations(base.quats.double()).float()
     offsets = torch.einsum("nij,kj->nki", turns * base.scales[:, None, :], corners.float())
     rows = torch.arange(len(base)).repeat_interleave(8)
     return base.select(rows).replace(
