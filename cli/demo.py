@@ -17,18 +17,17 @@ from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import load
-from clod_adapter.io.lock import output_lock
 from clod_adapter.io.scene.load import load_scene
 from clod_adapter.render import render
-from clod_adapter.report.style import check_matplotlib
 
 from .adapt import run as adapt
 from .commands.adapt import ADAPT
+from .commands.demo import picture_files
 from .commands.parser import make_parser
 from .shared.console import Console, duration, put
-from .shared.files import Outputs, make_folder
+from .shared.files import AdaptFiles
 from .shared.kernels import prepare_kernels
-from .shared.outputs import check_outputs
+from .shared.outputs import claimed
 from .shared.report import Stopwatch
 
 MAX_SV = 5.0
@@ -38,25 +37,17 @@ CROP = (150, 150, 150, 75)  # left, top, width and height of the part shown enla
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    folder = Path(args.out)
-    check_matplotlib()  # before a minute is spent
-    make_folder(folder)
-    with output_lock(folder / "demo", of=folder):
-        return run_demo(args, folder)
-
-
-def run_demo(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Runs the demo; the caller holds the lock of the folder."""
-    console, watch = Console(args.quiet), Stopwatch()
+    console, watch, folder = Console(args.quiet), Stopwatch(), Path(args.out)
     capture, base, model = folder / "capture", folder / "base.ply", folder / "gallery.ply"
-    pictures = {"dial": folder / "dial.png", "curve": folder / "curve.png"}
-    check_outputs((), (), beside=[*vars(Outputs.of(str(base), str(model))).values(), *pictures.values()])
+    pictures = picture_files(folder)
     if base.exists() and not capture.exists():
         raise ClodError(f"{base}: exists without {capture}, so the demo did not make it; choose another --out")
     prepare_kernels(console)
     unpack(capture, base)
     console.say(f"the scene is in {capture}, its checkpoint is {base}")
-    report = adapt.run(adapt_arguments(args, base, capture, model))
+    arguments = adapt_arguments(args, base, capture, model)
+    with claimed(ADAPT.outputs(arguments)):
+        report = adapt.run(arguments)
     for path in pictures.values():  # of an earlier run
         path.unlink(missing_ok=True)
     if report["rows"]:
@@ -71,7 +62,7 @@ def adapt_arguments(args: argparse.Namespace, base: Path, capture: Path, model: 
     """The arguments of the main command for the demo's files."""
     words = [f"--images={capture}", f"--max-sv={MAX_SV:g}", f"--out={model}"]
     words += [f"--{name}" for name in ("quiet", "json") if getattr(args, name)]
-    words += ["--resume"] if Outputs.of(str(base), str(model)).state.exists() else []
+    words += ["--resume"] if AdaptFiles.of(str(base), str(model)).state.exists() else []
     return make_parser(ADAPT, "clod-adapt").parse_args([*words, "--", str(base)])
 
 

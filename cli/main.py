@@ -33,6 +33,7 @@ from .commands.robustness import ROBUSTNESS
 from .commands.view import VIEW
 from .shared.interrupts import interrupt_as_stopped, sigterm_as_interrupt
 from .shared.launch import launched, silence_but_first
+from .shared.outputs import claimed
 from .shared.shortages import check_addresses, shortage
 
 PROG = "clod-adapt"
@@ -144,10 +145,11 @@ def run(command: Command, args: argparse.Namespace) -> int:
     from .shared.report import jsonable
 
     command.check(args)
-    module = import_command(command, args)
-    aside = io.StringIO() if args.quiet else sys.stderr
-    with redirect_stdout(aside) if args.json else nullcontext(), sigterm_as_interrupt():
-        report = module.run(args)
+    with claimed(command.outputs(args)):
+        module = import_command(command, args)
+        aside = io.StringIO() if args.quiet else sys.stderr
+        with redirect_stdout(aside) if args.json else nullcontext(), sigterm_as_interrupt():
+            report = module.run(args)
     if args.json and report is not None:
         print(json.dumps(jsonable(report), allow_nan=False))
     return int((report or {}).get("exit_code", 0))

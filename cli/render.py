@@ -18,7 +18,6 @@ from clod_adapter._support.version import package_version
 from clod_adapter.cameras import View
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.lock import output_lock
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
 
@@ -26,12 +25,11 @@ from .shared.alignment import align
 from .shared.antialiasing import with_filter
 from .shared.budgets import solve_dials
 from .shared.console import Console, put
-from .shared.files import make_folder
 from .shared.interrupts import GracefulStop
 from .shared.kernels import prepare_kernels
 from .shared.measure import choose_dials
 from .shared.models import read_model_and_scene
-from .shared.outputs import check_no_input, check_ours
+from .shared.outputs import Outputs, check_outputs, make_folder
 from .shared.report import Stopwatch
 from .shared.views import pick_views
 
@@ -53,7 +51,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     scene, _ = align(model, scene, args.images, console, required=False)
     model = with_filter(model, args, console, [*scene.test, *scene.train])
     views = pick_views(scene, args.views)
-    check_images([out / name for name in image_names(views)], args)
+    images = [out / name for name in image_names(views)]
+    check_outputs(Outputs(derived=images, folders=[out], inputs=[args.model], scene=args.images))
     solved, notes = solve_dials(args, model, [view.camera for view in views], console)
     dials, beyond = choose_dials(solved or [1.0], model.gaussians.attenuation)
     notes += beyond
@@ -62,8 +61,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     for note in notes:
         console.say(note)
     gaussians = model.gaussians.without_empty_bands()
-    make_folder(out)
-    pictures, interrupted = write_all(write_images(gaussians, views, dials, out, args.beside), len(views), out, console)
+    pictures, interrupted = write_all(write_images(gaussians, views, dials, out, args.beside), len(views), console)
     put(summary(pictures, dials, len(gaussians), out))
     return {
         "command": "render", "version": package_version(), "model": args.model, "scene": args.images,
@@ -73,12 +71,6 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def check_images(paths: Sequence[Path], args: argparse.Namespace) -> None:
-    check_no_input(paths, [args.model], args.images)
-    for path in paths:
-        check_ours(path)
-
-
 def image_names(views: Sequence[View]) -> list[Path]:
     """The PNG's name for each view: that of its photograph, with its suffix only where names would collide."""
     paths = [Path(file_name(str(Path(*PureWindowsPath(view.camera.name).parts)))) for view in views]
@@ -86,10 +78,10 @@ def image_names(views: Sequence[View]) -> list[Path]:
     return short if len(set(short)) == len(short) else [path.with_name(f"{path.name}.png") for path in paths]
 
 
-def write_all(images: Iterator[Written], total: int, out: Path, console: Console) -> tuple[list[Written], bool]:
+def write_all(images: Iterator[Written], total: int, console: Console) -> tuple[list[Written], bool]:
     """Writes the images with a progress bar; those written, and whether Ctrl-C ended it. A second one aborts."""
     written, stop = list[Written](), GracefulStop()
-    with output_lock(out / "pictures", of=out), console.meter("render") as meter, stop.listening():
+    with console.meter("render") as meter, stop.listening():
         for image in images:
             written.append(image)
             meter.update(len(written) / total, f"{len(written)}/{total}")
@@ -118,7 +110,7 @@ def write_png(path: Path, pixels: Tensor) -> None:
     make_folder(path.parent)
     with atomic_path(path) as temporary:
         about = PngImagePlugin.PngInfo()
-        about.add_text("Software", f"clod-adapter {package_version()}")  # check_ours looks for it
+        about.add_text("Software", f"clod-adapter {package_version()}")  # outputs.OURS looks for it
         Image.fromarray(pixels.cpu().numpy()).save(temporary, pnginfo=about)
 
 

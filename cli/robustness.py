@@ -16,21 +16,20 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.robustness import CellResult, adapt_at_range, baseline, scene_fingerprint
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.lock import output_lock
 from clod_adapter.progress import Listener, Phase, Progress, Stopped
 from clod_adapter.report.robustness_figure import robustness_figure
 
+from .commands.robustness import result_files
 from .commands.settings import make_configs
 from .robustness_cells import Cell, cells_of
 from .shared.alignment import align
 from .shared.antialiasing import with_filter
 from .shared.console import Console, Meter, clipped, duration, put
 from .shared.devices import on_device, pick_device
-from .shared.files import labels, make_folder
+from .shared.files import labels
 from .shared.inputs import read_checkpoint, read_scene
 from .shared.interrupts import GracefulStop
 from .shared.kernels import prepare_kernels
-from .shared.outputs import check_outputs
 from .shared.report import Stopwatch, machine, report_dials, write_report
 
 COLUMNS = (
@@ -41,8 +40,7 @@ LONGEST = 16  # characters of a checkpoint's name in the table
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     console, watch, stop = Console(args.quiet), Stopwatch(), GracefulStop()
-    folder = Path(args.out)
-    outputs = {kind: folder / f"robustness.{kind}" for kind in ("png", "csv", "json")}
+    outputs = result_files(Path(args.out))
     with watch.time("load"):
         checkpoints = read_checkpoints(args, console)
         scene = read_scene(args.images, console, checkpoints[0].origin)
@@ -63,10 +61,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         with watch.time("kernels"):
             for screen_filter in dict.fromkeys(each.gaussians.screen_filter for each in checkpoints):
                 prepare_kernels(console, device, screen_filter=screen_filter)
-    make_folder(folder)  # only now: input that cannot be read leaves no folder
-    make_folder(folder / "cells")
-    check_outputs(outputs.values(), args.ply, args.images)
-    with output_lock(outputs["json"], of=folder), stop.listening():
+    with stop.listening():
         with watch.time("cells"):
             done = run_cells(missing, scene, console, stop)
         found |= done

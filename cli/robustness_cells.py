@@ -14,6 +14,7 @@ from clod_adapter.evaluation.robustness import BASELINE_SHARES, CellResult
 from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.checkpoint import Checkpoint
 
+from .commands.robustness import cell_name
 from .shared.report import machine, write_report
 
 
@@ -38,7 +39,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        return f"{self.label}_sv{self.config.max_sv:g}" if self.config else f"{self.label}_base"
+        return cell_name(self.label, self.config.max_sv if self.config else None)
 
     @property
     def rows_file(self) -> Path:

@@ -18,7 +18,7 @@ from clod_adapter.io.checkpoint import Checkpoint, save
 
 from ..shared.budgets import calibrate
 from ..shared.console import command_line, duration, put
-from ..shared.files import Outputs, size
+from ..shared.files import AdaptFiles, size
 from ..shared.interrupts import GracefulStop
 from ..shared.pages import AdaptPage
 from ..shared.report import Stopwatch, machine, table, write_report
@@ -76,7 +76,7 @@ def write_result(setup: Setup, inputs: Inputs, result: Result, measured: Measure
 
 
 def write_files(
-    base: Checkpoint, adapter: Adapter, result: Gaussians, outputs: Outputs, report: dict[str, Any]
+    base: Checkpoint, adapter: Adapter, result: Gaussians, outputs: AdaptFiles, report: dict[str, Any]
 ) -> dict[str, Any]:
     """Writes the three files; returns the report with the calibration and the sizes of the other two.
 
@@ -159,7 +159,7 @@ def add_page(setup: Setup, result: Result, page: AdaptPage, report: dict[str, An
     return report
 
 
-def print_summary(outputs: Outputs, measured: str, args: argparse.Namespace, watch: Stopwatch) -> None:
+def print_summary(outputs: AdaptFiles, measured: str, args: argparse.Namespace, watch: Stopwatch) -> None:
     """Prints the measurements, the files, and what to do next."""
     if measured:
         put(f"\n{measured}\n")

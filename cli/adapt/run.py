@@ -10,14 +10,12 @@ from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
-from clod_adapter.io.lock import output_lock
 from clod_adapter.progress import Progress
 from clod_adapter.rasterizers.frame import release_memory
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 
 from ..shared.console import duration
-from ..shared.files import Outputs
 from ..shared.pages import AdaptPage
 from .block_job import run_job
 from .blocks import Blocks
@@ -34,12 +32,6 @@ from .setup import Setup
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    with output_lock(Outputs.of(args.ply, args.out).ply, shared=args.block is not None):
-        return adapt_and_report(args)
-
-
-def adapt_and_report(args: argparse.Namespace) -> dict[str, Any]:
-    """Runs the command; the caller holds the lock of the outputs."""
     setup = Setup.of(args)
     inputs = read_inputs(setup)
     blocks = Blocks.of(setup, inputs)

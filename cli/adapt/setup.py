@@ -7,11 +7,10 @@ from dataclasses import asdict, dataclass
 
 from clod_adapter.config import AdaptConfig
 from clod_adapter.io.adapter_file import check_config
-from clod_adapter.io.atomic import remove_leftovers
 
 from ..commands.settings import make_config
 from ..shared.console import Console
-from ..shared.files import Outputs
+from ..shared.files import AdaptFiles
 from ..shared.interrupts import GracefulStop
 from ..shared.launch import launched
 from ..shared.report import Stopwatch
@@ -29,7 +28,7 @@ class Setup:
 
     args: argparse.Namespace
     config: AdaptConfig
-    outputs: Outputs
+    outputs: AdaptFiles
     console: Console
     watch: Stopwatch
     stop: GracefulStop
@@ -39,10 +38,8 @@ class Setup:
     def of(cls, args: argparse.Namespace) -> Setup:
         """Raises the ClodError of options, or of a state file, that cannot be used."""
         console, stop = Console(args.quiet), GracefulStop(aborts=launched().size == 1)
-        config, outputs = make_config(args), Outputs.of(args.ply, args.out)
+        config, outputs = make_config(args), AdaptFiles.of(args.ply, args.out)
         check_config(asdict(config))
-        for path in (*vars(outputs).values(), outputs.state):
-            remove_leftovers(path)
         resume = args.resume and (not args.memory or outputs.state.exists())  # blocks have files of their own
         resumed = find_state(outputs.state, resume, config, console)
         return cls(args, config, outputs, console, Stopwatch(), stop, resumed)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clod_adapter.blocks.memory import parse_size
 from clod_adapter.errors import ClodError
 
-from ..shared.files import Outputs
+from ..shared.files import AdaptFiles, check_ply_name
 from ..shared.launch import launched
+from ..shared.outputs import Outputs
 from .checks import check_checkpoint, check_scene, page_files
 from .command import Command
 from .options import add_activated, add_antialiasing, add_device, add_misaligned_ok
@@ -75,10 +75,18 @@ def check_adapt(args: Namespace) -> None:
     check_checkpoint(args.ply)
     if args.images is not None:
         check_scene(args.images)
-    outputs, page = Outputs.of(args.ply, args.out), list[Path]()
-    if args.report:
-        page = page_files(outputs.ply.with_suffix(".html"), ["rendering", "adapting"])
-    outputs.check([args.ply], args.images, page)
+
+
+def adapt_outputs(args: Namespace) -> Outputs:
+    files = AdaptFiles.of(args.ply, args.out)
+    check_ply_name(files.ply, "--out")
+    page = page_files(files.ply.with_suffix(".html"), ["rendering", "adapting"]) if args.report else []
+    named, default = ([], [files.ply]) if args.out is None else ([files.ply], [])
+    blocks = files.blocks() if args.memory is not None else []
+    return Outputs(
+        named, [*default, files.adapter, files.report, files.state, *page, *blocks],
+        inputs=[args.ply], scene=args.images, shared=args.block is not None,
+    )  # fmt: skip
 
 
 def check_plan(args: Namespace) -> None:
@@ -178,4 +186,5 @@ examples:
 """,
     add_arguments=adapt_options,
     check=check_adapt,
+    outputs=adapt_outputs,
 )

@@ -8,7 +8,7 @@ from pathlib import Path
 from clod_adapter.errors import ClodError
 
 from ..shared.files import check_ply_name
-from ..shared.outputs import check_outputs
+from ..shared.outputs import Outputs
 from .checks import check_checkpoint
 from .command import Command
 from .options import add_activated
@@ -24,11 +24,9 @@ def apply_options(parser: ArgumentParser) -> None:
 
 
 def check_apply(args: Namespace) -> None:
-    out = Path(args.out)
-    check_ply_name(out, "--out")
+    check_ply_name(Path(args.out), "--out")
     if not Path(args.adapter).is_file():
         raise ClodError(f"{args.adapter}: No such file; give the .safetensors that clod-adapt wrote")
-    check_outputs([out], [args.base, args.adapter])
     check_checkpoint(args.base)
 
 
@@ -46,4 +44,5 @@ example:
 """,
     add_arguments=apply_options,
     check=check_apply,
+    outputs=lambda args: Outputs([Path(args.out)], inputs=[args.base, args.adapter]),
 )

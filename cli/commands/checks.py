@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from argparse import Namespace
 from collections.abc import Collection
 from pathlib import Path
@@ -81,12 +80,3 @@ def check_scene(folder: str) -> None:
     if not Path(folder).is_dir():
         raise ClodError(f"{folder}: is not a folder; give the one that holds images/ and sparse/0")
     find_cameras(Path(folder))
-
-
-def check_makeable(out: Path) -> None:
-    """Refuses an output folder that is a file, or cannot be made or written to."""
-    parent = next(folder for folder in (out, *out.parents) if folder.exists())
-    if not parent.is_dir():
-        raise ClodError(f"{out}: {parent} is a file; choose another --out")
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise ClodError(f"{out}: folder {parent} is not writable; choose another --out")

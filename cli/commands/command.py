@@ -6,6 +6,8 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ..shared.outputs import Outputs
+
 
 @dataclass(frozen=True)
 class Command:
@@ -16,6 +18,7 @@ class Command:
             torch.
         add_arguments: adds the options, in groups, to a parser.
         check: raises ClodError, before torch is imported, for arguments and files that cannot work.
+        outputs: the files that the arguments name for writing, and those they name for reading; after ``check``.
     """
 
     module: str
@@ -25,3 +28,4 @@ class Command:
     epilog: str
     add_arguments: Callable[[ArgumentParser], None]
     check: Callable[[Namespace], None]
+    outputs: Callable[[Namespace], Outputs] = lambda args: Outputs()

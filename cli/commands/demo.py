@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
 
+from clod_adapter.report.style import check_matplotlib
+
+from ..shared.files import AdaptFiles
+from ..shared.outputs import Outputs
 from .command import Command
 
 
 def demo_options(parser: ArgumentParser) -> None:
     output = parser.add_argument_group("output")
     output.add_argument("-o", "--out", metavar="DIR", default="demo", help="output folder (default: demo)")
+
+
+def demo_outputs(args: Namespace) -> Outputs:
+    folder = Path(args.out)
+    model = AdaptFiles.of("", str(folder / "gallery.ply"))
+    return Outputs(derived=[*vars(model).values(), *picture_files(folder).values()], folders=[folder])
+
+
+def picture_files(folder: Path) -> dict[str, Path]:
+    return {"dial": folder / "dial.png", "curve": folder / "curve.png"}
 
 
 DEMO = Command(
@@ -32,5 +47,6 @@ outputs in DIR:
   curve.png         quality against the number of Gaussians
 """,
     add_arguments=demo_options,
-    check=lambda args: None,
+    check=lambda args: check_matplotlib(),  # before a minute is spent
+    outputs=demo_outputs,
 )

@@ -9,7 +9,7 @@ from clod_adapter.errors import ClodError
 
 from ..shared.dials import BUDGETS, add_dial_options
 from ..shared.files import labels
-from ..shared.outputs import check_outputs
+from ..shared.outputs import Outputs
 from .checks import check_checkpoint, check_dials, check_scene, model_has_dial, page_files
 from .command import Command
 from .options import add_activated, add_antialiasing, add_device, add_images
@@ -52,10 +52,14 @@ def check_evaluate(args: Namespace) -> None:
                 f"{args.base}: has a dial (sigma_d); give --base the checkpoint that was adapted, or use --against"
             )
     check_scene(args.images)
-    if args.report:
-        inputs = [args.model, *args.against, *([args.base] if args.base else [])]
-        page, *charts = page_files(Path(args.report), ["rendering"])
-        check_outputs([page], inputs, args.images, beside=charts)
+
+
+def evaluate_outputs(args: Namespace) -> Outputs:
+    if not args.report:
+        return Outputs()
+    page, *charts = page_files(Path(args.report), ["rendering"])
+    inputs = [args.model, *args.against, *([args.base] if args.base else [])]
+    return Outputs([page], charts, inputs=inputs, scene=args.images)
 
 
 EVALUATE = Command(
@@ -96,4 +100,5 @@ examples:
 """,
     add_arguments=evaluate_options,
     check=check_evaluate,
+    outputs=evaluate_outputs,
 )

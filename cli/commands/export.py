@@ -8,11 +8,10 @@ from math import inf
 from pathlib import Path
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.atomic import check_target
 from clod_adapter.io.formats.splat_transform import SplatTransform
 
 from ..shared.dials import add_dial_options, given_budget
-from ..shared.outputs import check_outputs
+from ..shared.outputs import Outputs
 from .checks import check_checkpoint, check_dials, check_scene, model_has_dial
 from .command import Command
 from .export_formats import FORMATS, LOD_META, PACKED, PAGE, TILESET, format_table, level_paths, suffix_of, suffixes
@@ -72,7 +71,7 @@ def check_export(args: Namespace) -> None:
     check_together(args, bakes)
     if args.images is not None:
         check_scene(args.images)
-    check_export_outputs(args)
+    check_out(args)
     check_dials(args, args.model, measured=measured_budgets(args))
     check_checkpoint(args.model)
     dial = model_has_dial(args.model)
@@ -123,13 +122,12 @@ def check_together(args: Namespace, bakes: bool) -> None:
         raise ClodError(f"--images is used for baking, --order and {PAGE} only; add one of them, as in --sv 2")
 
 
-def check_export_outputs(args: Namespace) -> None:
+def check_out(args: Namespace) -> None:
+    """Refuses an OUT whose suffix is no format, or that cannot be a folder."""
     out = Path(args.out)
     option = folder_option(args)
     if option is None:
-        for path in level_paths(out, args.levels) if args.levels else [out]:
-            suffix_of(path)
-            check_outputs([path], [args.model], args.images)
+        suffix_of(out)
         return
     if out.suffix.lower() in (".json", *suffixes()):
         index = LOD_META if args.lod_meta else TILESET
@@ -138,7 +136,12 @@ def check_export_outputs(args: Namespace) -> None:
         raise ClodError(f"{out}: is a file; with {option}, --out must name a new folder")
     if not out.name:  # ".", the current folder, which cannot be replaced
         raise ClodError(f"{out}: is the current folder; --out must name a new one")
-    check_target(out)
+
+
+def export_outputs(args: Namespace) -> Outputs:
+    out, folder = Path(args.out), folder_option(args) is not None
+    levels = level_paths(out, args.levels) if args.levels and not folder else []
+    return Outputs([] if levels else [out], levels, whole=folder, inputs=[args.model], scene=args.images)
 
 
 def check_format(args: Namespace, bakes: bool, dial: bool) -> None:
@@ -221,4 +224,5 @@ examples:
 """,
     add_arguments=export_options,
     check=check_export,
+    outputs=export_outputs,
 )

@@ -9,7 +9,8 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.folder import find_cameras, photograph_folders
 
 from ..shared.dials import add_dial_options
-from .checks import check_checkpoint, check_dials, check_makeable, check_scene
+from ..shared.outputs import Outputs
+from .checks import check_checkpoint, check_dials, check_scene
 from .command import Command
 from .options import add_activated, add_antialiasing, add_device, add_images
 
@@ -40,8 +41,7 @@ def check_render(args: Namespace) -> None:
 
 
 def check_folder(out: Path, scene: Path) -> None:
-    """Refuses an output folder that cannot be made, or in which images could replace photographs of the scene."""
-    check_makeable(out)
+    """Refuses an output folder in which images could replace photographs of the scene."""
     cameras = find_cameras(scene)
     places = [folder.resolve() for folder in (scene, cameras.parent, cameras.parent.parent)]
     folders = photograph_folders(scene, cameras)
@@ -49,6 +49,11 @@ def check_folder(out: Path, scene: Path) -> None:
         folders.remove(scene)
     if out.resolve() in places or any(out.resolve().is_relative_to(folder.resolve()) for folder in folders):
         raise ClodError(f"{out}: the scene's own photographs may be there; choose another --out")
+
+
+def render_outputs(args: Namespace) -> Outputs:
+    """The folder; the names of the images in it are those of photographs, which are read later."""
+    return Outputs(folders=[Path(args.out)], inputs=[args.model], scene=args.images)
 
 
 RENDER = Command(
@@ -73,4 +78,5 @@ examples:
 """,
     add_arguments=render_options,
     check=check_render,
+    outputs=render_outputs,
 )

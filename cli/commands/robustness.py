@@ -8,8 +8,8 @@ from pathlib import Path
 from clod_adapter.report.style import check_matplotlib
 
 from ..shared.files import labels
-from ..shared.outputs import check_no_input
-from .checks import check_checkpoint, check_makeable, check_scene
+from ..shared.outputs import Outputs
+from .checks import check_checkpoint, check_scene
 from .command import Command
 from .options import add_activated, add_antialiasing, add_device, add_images, add_misaligned_ok
 from .settings import add_settings, make_configs
@@ -43,14 +43,27 @@ def check_robustness(args: Namespace) -> None:
     check_matplotlib()
     make_configs(args)
     labels(args.ply)
-    for folder in (Path(args.out), Path(args.out) / "cells"):
-        check_makeable(folder)
     for path in args.ply:
         check_checkpoint(path)
     check_scene(args.images)
-    folder = Path(args.out)
-    there = [*folder.glob("robustness.*"), *(folder / "cells").glob("*")]
-    check_no_input(there, args.ply, args.images)
+
+
+def robustness_outputs(args: Namespace) -> Outputs:
+    folder, cells = Path(args.out), Path(args.out) / "cells"
+    names = [cell_name(label, max_sv) for label in labels(args.ply) for max_sv in (None, *args.max_sv)]
+    files = [*result_files(folder).values()]
+    files += [cells / f"{name}{suffix}" for name in names for suffix in (".json", ".safetensors")]
+    return Outputs(derived=files, folders=[folder, cells], inputs=args.ply, scene=args.images)
+
+
+def result_files(folder: Path) -> dict[str, Path]:
+    """The figure and the measurements, by suffix."""
+    return {kind: folder / f"robustness.{kind}" for kind in ("png", "csv", "json")}
+
+
+def cell_name(label: str, max_sv: float | None) -> str:
+    """The name of a checkpoint's cell: at a range, or of the baseline for None."""
+    return f"{label}_base" if max_sv is None else f"{label}_sv{max_sv:g}"
 
 
 ROBUSTNESS = Command(
@@ -82,4 +95,5 @@ example:
 """,
     add_arguments=robustness_options,
     check=check_robustness,
+    outputs=robustness_outputs,
 )

@@ -13,7 +13,6 @@ from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.lock import output_lock
 from clod_adapter.io.ply.columns import MASKS, dial_columns, inria_dtype
 from clod_adapter.io.ply.constants import PREFIX
 from clod_adapter.io.scene.poses import load_cameras
@@ -132,10 +131,9 @@ def write_export(
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Writes all files of the command; a description of each, and notes."""
     out = Path(args.out)
-    with output_lock(out):
-        if args.lod_meta or args.tiles:
-            return write_set(export, out, dials, LOD_META if args.lod_meta else TILESET)
-        return write_files(export, level_paths(out, args.levels) if args.levels else [out], dials)
+    if args.lod_meta or args.tiles:
+        return write_set(export, out, dials, LOD_META if args.lod_meta else TILESET)
+    return write_files(export, level_paths(out, args.levels) if args.levels else [out], dials)
 
 
 def write_files(export: Export, paths: list[Path], dials: list[float] | None) -> tuple[list[dict[str, Any]], list[str]]:

@@ -9,19 +9,17 @@ from pathlib import Path
 
 from clod_adapter.errors import ClodError
 
-from .outputs import check_no_input, check_outputs
-
 
 @dataclass(frozen=True)
-class Outputs:
-    """The three output files of a run."""
+class AdaptFiles:
+    """The three output files of adapting."""
 
     ply: Path
     adapter: Path
     report: Path
 
     @classmethod
-    def of(cls, checkpoint: str, out: str | None) -> Outputs:
+    def of(cls, checkpoint: str, out: str | None) -> AdaptFiles:
         """From ``out``; by default the checkpoint's name with _clod, in the current folder."""
         ply = Path(out or f"{Path(checkpoint).stem}_clod.ply")
         return cls(ply, ply.with_suffix(".safetensors"), ply.with_suffix(".json"))
@@ -31,12 +29,11 @@ class Outputs:
         """The state for ``--resume``; exists only until the run is finished."""
         return self.ply.with_suffix(".resume.safetensors")
 
-    def check(self, inputs: Sequence[str], scene: str | None, more: Sequence[Path]) -> None:
-        """``check_outputs`` for these, for the state and blocks of a run, and for ``more``."""
-        check_ply_name(self.ply, "--out")
-        check_outputs([self.ply], inputs, scene, beside=[self.adapter, self.report, *more])
-        blocks = self.ply.parent.glob(f"{escape(self.ply.stem)}.*.safetensors")  # read if they exist
-        check_no_input([self.state, *blocks], inputs, scene)
+    def blocks(self) -> list[Path]:
+        """Existing files of an unfinished run in blocks (``adapt.block_files``)."""
+        stem = escape(self.ply.stem)
+        names = (f"{stem}.start.safetensors", f"{stem}.block*.pass*.safetensors")
+        return [path for name in names for path in self.ply.parent.glob(name)]
 
     def names(self) -> dict[str, str]:
         return {name: str(path) for name, path in vars(self).items()}
@@ -45,16 +42,6 @@ class Outputs:
 def check_ply_name(path: Path, option: str) -> None:
     if path.suffix.lower() != ".ply":
         raise ClodError(f"{path}: {option} names the PLY to write, so it must end in .ply")
-
-
-def make_folder(folder: Path) -> None:
-    """Makes the folder of ``--out`` if it does not exist."""
-    if folder.exists() and not folder.is_dir():
-        raise ClodError(f"{folder}: is a file; --out must name a folder")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ClodError(f"{folder}: cannot be made ({error.strerror or error}); choose another --out") from error
 
 
 def labels(paths: Sequence[str]) -> list[str]:

@@ -1,55 +1,119 @@
-"""Checks that outputs overwrite no input and no foreign file, before any work is done."""
+"""The files that a command writes: compared with existing files and with inputs, and locked, before it begins."""
 
 from __future__ import annotations
 
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.atomic import check_target
+from clod_adapter.io.atomic import check_target, remove_leftovers
+from clod_adapter.io.file_formats import read_model
+from clod_adapter.io.lock import output_lock
 from clod_adapter.io.scene.files import scene_files
 
-# Found at the beginning of every file that clod-adapt writes: in PLY comments, metadata, pages and reports.
-OURS = re.compile(rb'clod[-_]adapter|\A\{\s+"command": "')
+# Found at the beginning of the files that clod-adapt writes: in PLY comments, metadata, pages, reports and tables. An
+# .spz is compressed; .splat, .sog and .compressed.ply have no such text.
+OURS = re.compile(rb'clod[-_]adapter|\A\{\s+"(command|checkpoint)": "|\Acheckpoint,max_sv,')
+# The same of the files that adapting writes beside its PLY: adapter, state, report and page.
+BESIDE = re.compile(rb'\\"clod-adapter\\"|clod_adapter_state|\A\{\s+"command": "adapt"|, adaptation report')
+SUFFIXES = (".safetensors", ".resume.safetensors", ".json", ".html")  # of these files
 BEGINNING = 1 << 16  # bytes
 
 
-def check_outputs(
-    outputs: Iterable[Path], inputs: Sequence[str], scene: str | None = None, *, beside: Iterable[Path] = ()
-) -> None:
-    """Refuses outputs that cannot be written, or would replace an input or a foreign file.
+@dataclass(frozen=True)
+class Outputs:
+    """What a command writes, and what it reads.
 
-    Args:
-        outputs: named on the command line; existing files are replaced.
+    Attributes:
+        named: files named on the command line; existing ones are replaced.
+        derived: files whose names follow from these; existing ones are replaced if clod-adapt wrote them.
+        folders: made if missing. The first one is locked in place of the files, and contains all others.
+        whole: whether ``named`` is a new folder, not a file.
         inputs: files named to be read.
         scene: a scene folder, all of whose files are inputs (``scene_files``).
-        beside: outputs with derived names; existing files are replaced if clod-adapt wrote them.
+        shared: whether other runs that share the outputs may be at work, as the jobs of one run are.
+    """
+
+    named: Sequence[Path] = ()
+    derived: Sequence[Path] = ()
+    folders: Sequence[Path] = ()
+    whole: bool = False
+    inputs: Sequence[str] = ()
+    scene: str | None = None
+    shared: bool = False
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return *self.named, *self.derived
+
+
+@contextmanager
+def claimed(outputs: Outputs) -> Iterator[None]:
+    """Checks the outputs, and in the body holds their locks.
+
+    The folders exist in the body; those that it leaves empty are removed again.
 
     Raises:
-        ClodError: an output is a folder or no regular file; is an input, also by a hard or symbolic link; or would
-            replace a file that clod-adapt has not written.
+        ClodError: as ``check_outputs``, or another run writes one of them.
     """
-    outputs, beside = list(outputs), list(beside)
-    for path in (*outputs, *beside):
-        check_target(path)
-        if path.is_dir():
+    check_outputs(outputs)
+    with ExitStack() as stack:
+        for folder in outputs.folders:
+            stack.enter_context(_made(folder))
+        for folder in outputs.folders[:1]:
+            stack.enter_context(output_lock(folder / "outputs", of=folder))
+        for path in () if outputs.folders else outputs.files:
+            stack.enter_context(output_lock(path, shared=outputs.shared))
+        for path in () if outputs.shared else outputs.files:
+            remove_leftovers(path)
+        yield
+
+
+def check_outputs(outputs: Outputs) -> None:
+    """Refuses outputs that cannot be written, or would replace an input or a foreign file.
+
+    Raises:
+        ClodError: an output is a folder or no regular file; is an input, also by a hard or symbolic link; is named and
+            is what adapting wrote beside an input; is derived and not known to be written by clod-adapt.
+    """
+    for folder in outputs.folders:
+        _check_makeable(folder)
+    for path in outputs.files:
+        if path.parent.exists() or not set(outputs.folders) & set(path.parents):
+            check_target(path)
+        if path.is_dir() and not outputs.whole:
             raise ClodError(f"{path}: is a folder; give the name of a file in it")
-        if path.exists() and not path.is_file():
+        if path.exists() and not (path.is_file() or path.is_dir()):
             raise ClodError(f"{path}: is no regular file; choose another output")
-    check_no_input([*outputs, *beside], inputs, scene)
-    for path in beside:
-        check_ours(path)
+    _check_no_input(outputs)
+    _check_not_beside(outputs)
+    for path in outputs.derived:
+        if path.exists() and not _is_ours(path):
+            raise ClodError(
+                f"{path}: exists and is not known to be written by clod-adapt; move it, or choose another output"
+            )
 
 
-def check_no_input(outputs: Iterable[Path], inputs: Sequence[str], scene: str | None = None) -> None:
-    """Refuses outputs that are an input, by any name; see ``check_outputs``."""
-    taken = {key: path for path in outputs for key in _keys(path)}
+def _check_makeable(folder: Path) -> None:
+    parent = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    if not parent.is_dir():
+        raise ClodError(f"{folder}: {parent} is a file; choose another --out")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise ClodError(f"{folder}: folder {parent} is not writable; choose another --out")
+
+
+def _check_no_input(outputs: Outputs) -> None:
+    taken = {key: path for path in outputs.files for key in _keys(path)}
     if not taken:  # no output exists yet
         return
-    files = chain(map(Path, inputs), scene_files(Path(scene)) if scene is not None else ())
+    files: Iterable[Path] = map(Path, outputs.inputs)
+    if outputs.scene is not None:
+        files = chain(files, scene_files(Path(outputs.scene)))
     for file in files:
         for key in _keys(file):
             if key in taken:
@@ -59,14 +123,56 @@ def check_no_input(outputs: Iterable[Path], inputs: Sequence[str], scene: str | 
                 )
 
 
-def check_ours(path: Path) -> None:
-    """Refuses to replace a file that clod-adapt has not written; an empty file may be replaced."""
-    if not path.exists():
-        return
+def _check_not_beside(outputs: Outputs) -> None:
+    """Refuses a named output that adapting wrote beside an input."""
+    beside = {
+        key: file
+        for file in outputs.inputs
+        for name in (Path(file), Path(file).resolve())
+        for suffix in SUFFIXES
+        for key in _keys(name.with_suffix(suffix))
+    }
+    for path in outputs.named:
+        if found := [beside[key] for key in _keys(path) if key in beside and BESIDE.search(_beginning(path))]:
+            raise ClodError(f"{path}: is the adapter, state or report of {found[0]}; choose another output")
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether clod-adapt wrote the file; True of an empty one."""
+    start = _beginning(path)
+    if path.suffix.lower() != ".spz":
+        return not start or OURS.search(start) is not None
+    with suppress(ClodError):
+        return read_model(path).metadata.described
+    return not start
+
+
+def _beginning(path: Path) -> bytes:
+    if not path.is_file():
+        return b""
     with open(path, "rb") as file:
-        start = file.read(BEGINNING)
-    if start and not OURS.search(start):
-        raise ClodError(f"{path}: exists and was not written by clod-adapt; move it, or choose another output")
+        return file.read(BEGINNING)
+
+
+@contextmanager
+def _made(folder: Path) -> Iterator[None]:
+    """In the body the folder exists; if it was made for it and stays empty, it is removed again."""
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    make_folder(folder)
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # it is not empty
+            for each in made:
+                each.rmdir()
+
+
+def make_folder(folder: Path) -> None:
+    """Makes a folder and its parents, unless it exists."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ClodError(f"{folder}: cannot be made ({error.strerror or error}); choose another --out") from error
 
 
 def _keys(path: Path) -> Iterator[object]:

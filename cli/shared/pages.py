@@ -14,7 +14,6 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.lock import output_lock
 from clod_adapter.metrics import psnr
 from clod_adapter.progress import Phase, Progress, Stopped
 from clod_adapter.render import render
@@ -103,7 +102,7 @@ def _write(
     training: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     try:
-        with interrupt_as_stopped(), output_lock(path), console.status(f"writing {path} ..."):
+        with interrupt_as_stopped(), console.status(f"writing {path} ..."):
             frames, others = pictures(model, base, scene.test, own_teacher(report))
             written = write_tradeoff_report(path, jsonable(report), frames, others, jsonable(training))
     except Stopped:

@@ -65,14 +65,14 @@ def atomic_paths(*finals: str | Path) -> Iterator[tuple[Path, ...]]:
 def remove_leftovers(final: Path) -> None:
     """Removes temporaries of ``final`` that killed processes left, where permissions allow."""
     for path in final.parent.glob(f"{_mark(final)}*"):
-        if path != lock_file(final):
+        if not path.name.endswith("-lock"):  # of ``lock_file``
             with suppress(OSError):
                 _remove(path)
 
 
 def lock_file(final: Path) -> Path:
-    """The file beside ``final`` that ``lock.output_lock`` locks."""
-    return final.parent / f"{_mark(final)}lock"
+    """The file beside ``final`` that ``lock.output_lock`` locks: one for names that differ in case only."""
+    return final.parent / f"{_mark(final.with_name(final.name.casefold()))}lock"
 
 
 def check_target(final: Path) -> None:

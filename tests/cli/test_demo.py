@@ -69,14 +69,6 @@ def test_missing_package_is_named_at_the_start(clod: Any, tmp_path: Path, monkey
     assert list(tmp_path.iterdir()) == []
 
 
-def test_folder_that_cannot_be_made(clod: Any, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    (tmp_path / "file").write_text("")
-    for out, said in (("file", "file: is a file"), ("file/below", "file/below: cannot be made")):
-        done = clod("demo", "--out", out)
-        assert done.code == 2 and said in done.err and done.err.count("\n") == 1, done
-
-
 def test_arguments_for_adapting() -> None:
     flags = ["--quiet", "--json"]
     args = build_parser("demo").parse_args(["--out=-odd", *flags])

@@ -172,7 +172,8 @@ def test_levels_appear_together_or_not_at_all(
 ) -> None:
     from clod_adapter.cli.export import files as export_files
 
-    (tmp_path / "x_s1.ply").write_bytes(b"of an earlier run")
+    earlier = b"of an earlier run of clod-adapter"
+    (tmp_path / "x_s1.ply").write_bytes(earlier)
     real, calls = export_files.write, []
 
     def write(*args: Any, **options: Any) -> Any:
@@ -184,7 +185,7 @@ def test_levels_appear_together_or_not_at_all(
     monkeypatch.setattr(export_files, "write", write)
     done = clod("export", dialled, "--levels", "1,2,4", "-o", "x.ply")
     assert done.code == (130 if isinstance(failure, KeyboardInterrupt) else 2) and "Traceback" not in done.err
-    assert files(tmp_path) == ["x_s1.ply"] and (tmp_path / "x_s1.ply").read_bytes() == b"of an earlier run"
+    assert files(tmp_path) == ["x_s1.ply"] and (tmp_path / "x_s1.ply").read_bytes() == earlier
 
 
 def test_level_names() -> None:
