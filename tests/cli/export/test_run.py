@@ -426,12 +426,10 @@ def test_failure_of_the_tool_leaves_no_file(
 def test_ctrl_c_ends_the_tool_too(clod: Any, dialled: Path, tmp_path: Path, tool: Any, monkeypatch: Any) -> None:
     tool("import time; time.sleep(60)")
 
-    def enough(seconds: float) -> str:
-        if seconds > 0.5:
-            raise KeyboardInterrupt
-        return ""
+    def press(*_: object) -> None:
+        raise KeyboardInterrupt
 
-    monkeypatch.setattr("clod_adapter.cli.export.files.duration", enough)
+    monkeypatch.setattr("clod_adapter.cli.export.packing.Meter.update", press)
     done = clod("export", dialled, "--levels", "1,2", "--lod-meta", "-o", "out")
     assert done.code == 130 and files(tmp_path) == []
 
