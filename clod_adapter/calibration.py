@@ -16,6 +16,7 @@ from clod_adapter.config import require
 from clod_adapter.errors import ClodError
 
 AGAINST = ("photographs", "checkpoint")
+MOST = 1000  # rows and viewpoints, and characters of the machine's name, for which every file has room
 
 
 class Measured(Protocol):
@@ -127,6 +128,8 @@ class Calibration:
             raise ClodError("calibration has a value that is not finite")
         if min(self.total, self.views, self.width, self.height) < 1 or min(row.frame_ms for row in self.rows) <= 0:
             raise ClodError("calibration has a count, size or frame time that is not positive")
+        if len(self.rows) + len(self.viewpoints) > MOST:
+            raise ClodError(f"calibration has more than {MOST} rows and viewpoints, for which files have no room")
         if not self.machine or not self.machine.isascii() or self.machine != _plain(self.machine):
             raise ClodError(f"calibration has the machine {self.machine!r}, it must be one line of printable ASCII")
         if self.against not in AGAINST:
@@ -197,4 +200,4 @@ def crossing(dials: Sequence[float], values: Sequence[float], target: float) -> 
 
 
 def _plain(text: str) -> str:
-    return " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())
+    return " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())[:MOST].strip()

@@ -18,7 +18,6 @@ from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.lod_meta import cutting_options, read_leaves, write_errors
 from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
 from clod_adapter.io.formats.tileset import write_tileset
-from clod_adapter.io.ply.header import PREFIX
 from clod_adapter.origin import NOWHERE
 from clod_adapter.viewer.page import write_viewer_page
 
@@ -53,8 +52,7 @@ class Export:
 
     def content(self, virtual_scale: float | None) -> tuple[Gaussians, tuple[str, ...]]:
         """The Gaussians of one file, baked if there is a dial value; and its comments, those of the model first."""
-        about = [comment for comment in self.model.comments if not comment.startswith(PREFIX)]
-        gaussians = self.gaussians
+        about, gaussians = [*self.model.comments], self.gaussians
         if virtual_scale is not None:
             baked, camera = f"baked at s = {virtual_scale:.6g} by clod-adapter", self.target.camera
             if camera:

@@ -9,7 +9,7 @@ from typing import Any
 from clod_adapter.adapter import Adapter
 from clod_adapter.inspection.statistics import Spread
 from clod_adapter.io.adapter_file import FORMAT, KEY, load_adapter
-from clod_adapter.io.tensor_file import read_tensor_metadata
+from clod_adapter.io.tensor_file import read_tensor_header
 from clod_adapter.training.state_file import KEY as STATE_KEY
 from clod_adapter.training.state_file import load_state
 
@@ -20,7 +20,7 @@ def inspect_tensors(path: Path) -> tuple[str, dict[str, Any], tuple[str, ...]] |
     Raises:
         ClodError: it cannot be read, or is damaged.
     """
-    metadata = read_tensor_metadata(path)
+    metadata = read_tensor_header(path)[1]
     if STATE_KEY in metadata:
         return "the state of an interrupted run, for --resume", _state(path), ()
     if KEY in metadata and f'"{FORMAT}"' in metadata[KEY]:

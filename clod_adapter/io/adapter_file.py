@@ -20,8 +20,8 @@ from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.formats.metadata import FORMAT as MODEL
-from clod_adapter.io.settings import DAMAGE, damaged, document, read_metadata, stored_values
-from clod_adapter.io.tensor_file import load_tensors, write_tensors
+from clod_adapter.io.settings import DAMAGE, Metadata, damaged, document, read_metadata, stored_values
+from clod_adapter.io.tensor_file import load_tensors, read_tensor_header, write_tensors
 
 KEY = "clod_adapter"
 FORMAT = "clod-adapter"
@@ -53,6 +53,7 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
         tensors["kept"] = torch.from_numpy(np.packbits(adapter.kept.cpu().numpy()))
     with atomic_path(path) as temporary:
         write_tensors(temporary, tensors, metadata)
+        _description(temporary, read_tensor_header(temporary)[1])  # it can be read again
 
 
 def check_config(config: dict[str, Any]) -> None:
@@ -75,23 +76,7 @@ def load_adapter(path: str | Path) -> Adapter:
     """
     path = Path(path)
     tensors, metadata, _ = load_tensors(path)
-    if KEY not in metadata:
-        raise ClodError(f"{path}: is a safetensors file but not an adapter; give a file that this package wrote")
-    try:
-        about = json.loads(metadata[KEY])
-        kind, newer = about["format"], about["format"] == FORMAT and about["format_version"] > FORMAT_VERSION
-        for name, wanted in (("base_sha256", str), ("package_version", str), ("config", dict)):
-            if kind == FORMAT and not newer and not isinstance(about[name], wanted):
-                raise TypeError(f"{name} is {about[name]!r:.40}, not a {wanted.__name__}")
-    except DAMAGE as error:
-        raise damaged(path, error) from error
-    if kind == MODEL:
-        raise ClodError(f"{path}: is a whole model, not an adapter; it needs no base, give it in the model's place")
-    if kind != FORMAT:
-        raise ClodError(f"{path}: is not a clod-adapter file but {kind!r:.40}; give a file that this package wrote")
-    if newer:
-        raise ClodError(f"{path}: its format {about['format_version']} is too new; upgrade clod-adapter")
-    settings = read_metadata(path, about, dial=True)
+    about, settings = _description(path, metadata)
     assert settings.attenuation is not None
     try:
         trimmed = about.get("trimmed", {})
@@ -115,6 +100,27 @@ def load_adapter(path: str | Path) -> Adapter:
         raise damaged(path, error) from error
     except ClodError as error:
         raise ClodError(f"{path}: {error}") from error
+
+
+def _description(path: Path, metadata: dict[str, str]) -> tuple[dict[str, Any], Metadata]:
+    """The JSON document of an adapter, and the settings in it; refuses another file."""
+    if KEY not in metadata:
+        raise ClodError(f"{path}: is a safetensors file but not an adapter; give a file that this package wrote")
+    try:
+        about = json.loads(metadata[KEY])
+        kind, newer = about["format"], about["format"] == FORMAT and about["format_version"] > FORMAT_VERSION
+        for name, wanted in (("base_sha256", str), ("package_version", str), ("config", dict)):
+            if kind == FORMAT and not newer and not isinstance(about[name], wanted):
+                raise TypeError(f"{name} is {about[name]!r:.40}, not a {wanted.__name__}")
+    except DAMAGE as error:
+        raise damaged(path, error) from error
+    if kind == MODEL:
+        raise ClodError(f"{path}: is a whole model, not an adapter; it needs no base, give it in the model's place")
+    if kind != FORMAT:
+        raise ClodError(f"{path}: is not a clod-adapter file but {kind!r:.40}; give a file that this package wrote")
+    if newer:
+        raise ClodError(f"{path}: its format {about['format_version']} is too new; upgrade clod-adapter")
+    return about, read_metadata(path, about, dial=True)
 
 
 def _rows(packed: torch.Tensor, count: int) -> torch.Tensor:

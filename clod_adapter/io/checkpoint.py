@@ -22,14 +22,14 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.content import read_content
-from clod_adapter.io.file_formats import PLY, format_of, write
+from clod_adapter.io.file_formats import PLY, check_written, format_of, write
 from clod_adapter.io.ply.columns import SIGMA, column_map, in_shape, rows_of
 from clod_adapter.io.ply.constants import dial_constants, filter_constants
 from clod_adapter.io.ply.header import PREFIX, write_comments
 from clod_adapter.io.ply.plausible import check_plausible
 from clod_adapter.io.ply.values import Activated
 from clod_adapter.io.ply.write import write_rows
-from clod_adapter.io.settings import matching_calibration
+from clod_adapter.io.settings import matching_calibration, that_fit
 from clod_adapter.origin import NOWHERE, Origin
 
 
@@ -42,7 +42,8 @@ class Checkpoint:
             extended.
         vertex: ``[N]`` structured array, the same rows with every column of the file, in file order and type, native
             byte order; activated values and filters are undone.
-        comments: the header's, or the lines of history of another format.
+        comments: the header's but the settings, or the lines of history of another format; as far as an output has
+            room for them.
         notes: what was dropped or noticed, one line each.
         fingerprint: SHA-256 of the file's bytes, hex; preceded by "opacity:", "scales:" or "both:" where values were
             taken as activated.
@@ -132,8 +133,10 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
     if attenuation is not None and not metadata.described:
         notes += check_plausible(gaussians.means, gaussians.opacity_logits, tensors[SIGMA], attenuation)
     calibration, mismatch = matching_calibration(metadata, len(gaussians)) if dial else (None, [])
+    about = [comment for comment in content.comments if not comment.startswith(PREFIX)]
+    comments, dropped = that_fit([*about, *content.changes])
     return Checkpoint(
-        gaussians, content.vertex, (*content.comments, *content.changes), (*notes, *mismatch, *content.notes),
+        gaussians, content.vertex, comments, (*notes, *mismatch, *content.notes, *dropped),
         content.fingerprint, path, calibration, content.origin,
         filter_known=dial or metadata.screen_filter is not None,
     )  # fmt: skip
@@ -164,7 +167,8 @@ def save(
 
     Raises:
         ClodError: there are no Gaussians, they do not match the base, a new value is not finite, the target is the
-            base itself or cannot be written; or, for another format than PLY, as ``file_formats.write``.
+            base itself, cannot be written, or not be read again; or, for another format than PLY, as
+            ``file_formats.write``.
     """
     path = Path(path)
     if len(gaussians) == 0:
@@ -178,8 +182,7 @@ def save(
             f"({len(base.vertex)} of degree {base.gaussians.sh_degree}); save with the checkpoint they came from"
         )
     if format_of(path) is not PLY:
-        about = tuple(comment for comment in base.comments if not comment.startswith(PREFIX))
-        for note in write(path, gaussians, about, origin=base.origin, calibration=calibration):
+        for note in write(path, gaussians, base.comments, origin=base.origin, calibration=calibration):
             warnings.warn(f"{path}: {note}", stacklevel=2)
         return
     gaussians = in_world_units(gaussians)
@@ -187,8 +190,10 @@ def save(
     constants = dial_constants(gaussians.attenuation, gaussians.growth_d is not None)
     if gaussians.sigma_d is not None:  # a plain file has the columns of Inria's layout and no others
         constants |= filter_constants(gaussians.screen_filter)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        write_rows(file, path, gaussians, base.vertex, base.origin, comments, constants)
+    with atomic_path(path) as temporary:
+        with open(temporary, "wb") as file:
+            write_rows(file, path, gaussians, base.vertex, base.origin, comments, constants)
+        check_written(temporary)
 
 
 def blank(count: int, sh_degree: int, origin: Origin = NOWHERE) -> Checkpoint:

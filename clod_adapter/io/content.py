@@ -12,7 +12,6 @@ from clod_adapter.config import ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import PLY, Model, format_of, read_model
 from clod_adapter.io.ply.columns import column_map, dial_columns, in_shape, read_table, rows_of
-from clod_adapter.io.ply.header import PREFIX
 from clod_adapter.io.ply.rows import PlyRows, read_ply, usable_blocks, usable_rows
 from clod_adapter.io.ply.values import Activated, as_stored_by_inria
 from clod_adapter.io.screen_filter import implied_filter, tagged
@@ -94,7 +93,7 @@ def _model_content(path: Path, model: Model, activated: Activated | None, origin
     arrays, vertex = _usable(path, arrays, vertex, usable_rows(arrays, dropped), dropped)
     about = ["".join(c if c.isascii() and c.isprintable() else "?" for c in line) for line in metadata.about]
     implied = model.gaussians.screen_filter
-    comments = tuple(tagged([line for line in about if not line.startswith(PREFIX)], implied))
+    comments = tuple(tagged(about, implied))
     return Content(
         metadata, arrays, vertex, comments, _fingerprint(was, model.sha256), origin, changes, dropped, implied,
         model.notes,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from clod_adapter.errors import ClodError
+from clod_adapter.io.atomic import atomic_path
 from clod_adapter.origin import NOWHERE, Origin
 
 if TYPE_CHECKING:
@@ -48,7 +49,8 @@ class Format(NamedTuple):
     Attributes:
         read: a path to a ``Model``; of the PLY, to ``PlyRows``.
         check: refuses, by the first bytes and without torch, a file that is not of the format.
-        has_dial: whether a file has a sigma_d; "" where none can.
+        open: whether a file has a sigma_d; refuses what ``read`` would by header, settings and sizes, without reading
+            the values (but of an .spz). "" where no file has one, and ``check`` is all.
         write: called with path, Gaussians in world units and a ``History``; gives a line for each loss; "" where the
             format is only read.
         carries_sigma: whether the dial is written: sigma_d, growth_d and their settings.
@@ -56,26 +58,33 @@ class Format(NamedTuple):
 
     read: str
     check: str
-    has_dial: str = ""
+    open: str = ""
     write: str = ""
     carries_sigma: bool = False
 
 
-_CHECK, _DIAL = "formats.checks.check_model", "formats.checks.model_has_dial"
+_CHECK = "formats.checks.check_model"
 _CONVERTED = Format("formats.converted.load_converted", "formats.converted.check_converted")
-PLY = Format("ply.rows.read_ply", "ply.rows.check_ply", "ply.rows.ply_has_dial", "formats.ply.write_ply", True)
+PLY = Format("ply.rows.read_ply", "ply.rows.check_ply", "ply.rows.open_ply", "formats.ply.write_ply", True)
 FORMATS = {
     ".ply": PLY,
-    ".glb": Format("formats.glb_reader.load_glb", _CHECK, _DIAL, "formats.glb.write_glb", True),
-    ".spz": Format("formats.spz_reader.load_spz", _CHECK, _DIAL, "formats.spz.write_spz", True),
-    ".safetensors": Format(
-        "formats.safetensors.load_safetensors", _CHECK, _DIAL, "formats.safetensors.write_safetensors", True
+    ".glb": Format(
+        "formats.glb_reader.load_glb", _CHECK, "formats.glb_reader.open_glb", "formats.glb.write_glb", True
     ),
-    ".pt": Format("formats.pt_model.load_pt", "formats.pt.check_pt", _DIAL, "formats.pt_model.write_pt", True),
+    ".spz": Format(
+        "formats.spz_reader.load_spz", _CHECK, "formats.spz_reader.open_spz", "formats.spz.write_spz", True
+    ),
+    ".safetensors": Format(
+        "formats.safetensors.load_safetensors", _CHECK, "formats.safetensors.open_safetensors",
+        "formats.safetensors.write_safetensors", True,
+    ),
+    ".pt": Format(
+        "formats.pt_model.load_pt", "formats.pt.check_pt", "formats.pt_model.open_pt", "formats.pt_model.write_pt", True
+    ),
     ".splat": Format("formats.splat.load_splat", _CHECK, "", "formats.splat.write_splat"),
     ".sog": _CONVERTED,
     ".ksplat": _CONVERTED,
-}
+}  # fmt: skip
 WRITABLE = tuple(suffix for suffix, form in FORMATS.items() if form.write)
 
 
@@ -97,10 +106,24 @@ def file_has_dial(path: Path) -> bool:
     """Whether the file has a sigma_d.
 
     Raises:
-        ClodError: as ``check_readable``.
+        ClodError: as ``check_readable``, or its header, settings or sizes are damaged.
     """
-    has_dial = format_of(path).has_dial
-    return bool(has_dial) and _call(has_dial, path)
+    check_readable(path)
+    opened = format_of(path).open
+    return bool(opened) and _call(opened, path)
+
+
+def check_written(path: Path) -> None:
+    """Refuses a file just written, under its temporary name, that the reader of its format would refuse: ``open``.
+
+    Raises:
+        ClodError: it would.
+    """
+    try:
+        file_has_dial(path)
+    except ClodError as error:
+        reason = str(error).removeprefix(f"{path}: ")
+        raise ClodError(f"{path}: is not written, because it could not be read again: {reason}") from error
 
 
 def read_model(path: str | Path) -> Model:
@@ -137,7 +160,7 @@ def write(
 
     Raises:
         ClodError: an unknown suffix, sigma_d for a format that does not carry it, no Gaussians, a value that is not
-            finite (opacity = +inf aside), a missing package, or the file cannot be written.
+            finite (opacity = +inf aside), a missing package, or the file cannot be written or not be read again.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in WRITABLE:
@@ -147,7 +170,10 @@ def write(
     from clod_adapter.equation.units import in_world_units  # here: the table needs no torch
 
     history = History(tuple(about), origin, calibration)
-    return _call(FORMATS[suffix].write, Path(path), in_world_units(gaussians), history)
+    with atomic_path(path) as temporary:
+        notes: tuple[str, ...] = _call(FORMATS[suffix].write, temporary, in_world_units(gaussians), history)
+        check_written(temporary)
+    return notes
 
 
 def _call(function: str, *args: Any) -> Any:

@@ -15,7 +15,7 @@ calibration, which rendering does not need, is ignored with a note.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,8 @@ EARLIER: dict[str, Any] = {
 }  # fmt: skip
 DAMAGE = (AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError)
 _LONGEST = 1 << 16  # characters of ``about``; a PLY header must have room for them
+_INHERITED = 60_000  # of these, for lines that an output inherits; the rest is for its own
+_OVERHEAD = 9  # bytes of a PLY's comment besides its text
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,19 @@ def read_metadata(path: Path, values: Mapping[str, Any], *, dial: bool, describe
         )  # fmt: skip
     except (ClodError, *DAMAGE) as error:
         raise damaged(path, error) from error
+
+
+def that_fit(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The lines of a file's history that every output has room for, the last ones first; and a note on the others."""
+    kept, room = list[str](), _INHERITED
+    for line in reversed(lines):
+        if len(line) + _OVERHEAD <= room:
+            kept.append(line)
+            room -= len(line) + _OVERHEAD
+    if len(kept) == len(lines):
+        return tuple(lines), ()
+    note = f"{len(lines) - len(kept)} of {len(lines)} comments are not carried over to outputs, which have room for "
+    return tuple(reversed(kept)), (f"{note}{_INHERITED:,} characters",)
 
 
 def damaged(path: Path, error: Exception) -> ClodError:

@@ -64,14 +64,14 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str], str]:
         return *_content(file), file_sha256(file)
 
 
-def read_tensor_metadata(path: Path) -> dict[str, str]:
-    """The metadata alone, without torch.
+def read_tensor_header(path: Path) -> tuple[list[str], dict[str, str]]:
+    """The names of the tensors and the metadata, without torch.
 
     Raises:
         ClodError: as ``load_tensors``.
     """
     with _one_line_errors(path), open(path, "rb") as file, safe_open(handle_name(file), framework="np") as tensors:
-        return tensors.metadata() or {}
+        return list(tensors.keys()), tensors.metadata() or {}
 
 
 def _content(file: BufferedReader) -> tuple[dict[str, Tensor], dict[str, str]]:

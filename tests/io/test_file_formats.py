@@ -25,7 +25,18 @@ from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, check_readable, file_has_dial, format_of, read_model, write
 from clod_adapter.io.formats.safetensors import load_safetensors
-from formats import ABOUT, ATTENUATION, CALIBRATION, ORIGIN, damaged, model, rows_by_place, turned, write_elements
+from formats import (
+    ABOUT,
+    ATTENUATION,
+    CALIBRATION,
+    ORIGIN,
+    damaged,
+    model,
+    rows_by_place,
+    turned,
+    write_elements,
+    write_rows,
+)
 from packing import write_packed
 from scenes import gaussians
 
@@ -77,7 +88,7 @@ def same(suffix: str, g: Gaussians, again: Gaussians) -> None:
 
 def test_functions_of_the_table_exist() -> None:
     for form in FORMATS.values():
-        for function in filter(None, (form.read, form.check, form.has_dial, form.write)):
+        for function in filter(None, (form.read, form.check, form.open, form.write)):
             module, name = function.rsplit(".", 1)
             assert callable(getattr(import_module(f"clod_adapter.io.{module}"), name))
     assert format_of(Path("a.PT")) is FORMATS[".pt"]
@@ -277,6 +288,33 @@ def test_truncation_is_refused(tmp_path: Path, kind: str) -> None:
         path.write_bytes(whole[:size])
         with pytest.raises(ClodError, match=f"cut{kind}: "):
             load_adapter(path) if "adapter" in kind else load(path)
+
+
+@pytest.mark.parametrize(
+    "lines", [["x" * 70_000, "last"], ["x" * 1000] * 1030 + ["last"], [*map(str, range(70_000)), "last"]]
+)
+def test_long_history_is_cut(tmp_path: Path, lines: list[str]) -> None:
+    """To what every format has room for, the last lines first, so that the outputs can be read."""
+    write(tmp_path / "plain.ply", detach(model(0)))
+    write_rows(tmp_path / "a.ply", PlyData.read(tmp_path / "plain.ply")["vertex"].data, comments=lines)
+    found = load(tmp_path / "a.ply")
+    assert any("comments are not carried over to outputs" in note for note in found.notes)
+    save(tmp_path / "b.ply", found.gaussians, found)
+    for suffix in WRITABLE:
+        write(tmp_path / f"c{suffix}", found.gaussians, found.comments, calibration=CALIBRATION)
+    for path in tmp_path.glob("[bc].*"):
+        again = load(path)
+        assert again.comments == (() if path.suffix == ".splat" else found.comments), path
+        assert not any("not carried over" in note for note in again.notes)
+
+
+@pytest.mark.parametrize("suffix", DIAL)
+def test_what_cannot_be_read_again_is_not_written(tmp_path: Path, suffix: str) -> None:
+    (tmp_path / f"a{suffix}").write_bytes(b"earlier")
+    said = f"^{tmp_path}/a{suffix}: is not written, because it could not be read again: "
+    with pytest.raises(ClodError, match=said):
+        write(tmp_path / f"a{suffix}", model(0), ["x" * 1000] * 1100)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"earlier"]
 
 
 def test_text_is_made_ascii_and_infinite_opacity_finite(tmp_path: Path) -> None:

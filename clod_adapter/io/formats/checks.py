@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import check_readable, read_model
 from clod_adapter.io.formats.converted import check_converted
 from clod_adapter.io.formats.metadata import KEY
-from clod_adapter.io.ply.columns import SIGMA
 from clod_adapter.io.sniff import read_start, refuse, refuse_known
-from clod_adapter.io.tensor_file import read_tensor_metadata
+from clod_adapter.io.tensor_file import read_tensor_header
 
 NEW_SPZ = b"NGSP"  # first bytes of version 4, which splat-transform reads; earlier versions are gzipped
 _START: dict[str, tuple[bytes, ...]] = {".glb": (b"glTF",), ".spz": (b"\x1f\x8b", NEW_SPZ)}
@@ -31,14 +28,5 @@ def check_model(path: Path) -> None:
         check_converted(path, " of version 4")
     if suffix == ".splat" and path.stat().st_size % 32:
         raise ClodError(f"{path}: is not a .splat file, whose rows have 32 bytes; copy or export it again")
-    if suffix == ".safetensors" and '"clod-adapter"' in read_tensor_metadata(path).get(KEY, ""):
+    if suffix == ".safetensors" and '"clod-adapter"' in read_tensor_header(path)[1].get(KEY, ""):
         raise ClodError(f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply {path.name} -o OUT.ply")
-
-
-def model_has_dial(path: Path) -> bool:
-    """Whether the file has a sigma_d; of a .pt by its pickle, else by reading the file."""
-    check_readable(path)
-    if path.suffix.lower() == ".pt":
-        with zipfile.ZipFile(path) as archive:  # which check_pt has checked
-            return any(SIGMA.encode() in archive.read(name) for name in archive.namelist() if name.endswith("data.pkl"))
-    return not read_start(path).startswith(NEW_SPZ) and read_model(path).gaussians.sigma_d is not None

@@ -17,7 +17,6 @@ import numpy as np
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import History
 from clod_adapter.io.formats.arrays import arrays_of, colours_of, normalized, scales_of, sigmoid
 from clod_adapter.io.formats.metadata import KEY, write_metadata
@@ -70,8 +69,7 @@ def write_glb(path: Path, gaussians: Gaussians, history: History) -> tuple[str, 
     primitive = pygltflib.Primitive(attributes=attributes, mode=pygltflib.POINTS, extensions={EXTENSION: how})
     gltf.meshes = [pygltflib.Mesh(primitives=[primitive])]
     gltf.set_binary_blob(b"".join(array.tobytes() for array in columns.values()))
-    with atomic_path(path) as temporary:
-        gltf.save_binary(str(temporary))
+    gltf.save_binary(str(path))
     return dropped
 
 

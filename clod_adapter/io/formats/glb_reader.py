@@ -6,7 +6,7 @@ import json
 import struct
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib import recfunctions as rec
@@ -17,12 +17,13 @@ from clod_adapter.io.formats.arrays import gaussians_of, half_turn, logit, logs_
 from clod_adapter.io.formats.glb import COLOR_SPACE, DEGREE, DIAL, EXTENSION, HALF_TURN, coefficient
 from clod_adapter.io.formats.metadata import KEY, parse_metadata
 from clod_adapter.io.ply.columns import SIGMA, dial_columns
+from clod_adapter.io.settings import Metadata
 from clod_adapter.origin import AXES, NOWHERE, Origin, origin_of
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _FLOAT = 5126
-# Component types that the extension allows in the place of floats, and what their largest stands for 1 of.
-_KINDS = {5120: ("i1", 127), 5121: ("u1", 255), 5122: ("<i2", 32767), 5123: ("<u2", 65535), _FLOAT: ("<f4", 1)}
+# Component types: those that the extension allows in the place of floats, whose largest value stands for 1, and these.
+_KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _ATTRIBUTES = {
     "means": ("POSITION", 3), "quats": (f"{EXTENSION}:ROTATION", 4), "log_scales": (f"{EXTENSION}:SCALE", 3),
@@ -43,42 +44,73 @@ def load_glb(path: Path) -> Model:
         ClodError: the file cannot be read, is damaged, has no such primitive or a compressed one, or its node stands
             below another, is scaled, or turned in another way.
     """
+    data = read_whole(path)
+    parts = _parts(path, memoryview(data))
+    arrays, metadata, moved = {name: _values(view) for name, view in parts.views.items()}, parts.metadata, parts.moved
+    rest = [arrays.pop(name) for name in parts.bands]
+    arrays["shN"] = np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
+    stored = _stored(arrays) if parts.turned else half_turn(_stored(arrays), "z")
+    if moved != metadata.origin:  # another program moved the node
+        stored["means"], moved = _moved(stored["means"], moved)
+        metadata = replace(metadata, origin=moved)
+    return Model(gaussians_of(path, stored, metadata), metadata, sha256_of(data), tuple(parts.ignored))
+
+
+def open_glb(path: Path) -> bool:
+    """Whether a file has sigma_d, without reading its values; errors as ``load_glb``."""
+    return SIGMA in _parts(path, np.memmap(path, np.uint8, "r").data).views
+
+
+class _Parts(NamedTuple):
+    """A file without its values.
+
+    Attributes:
+        views: attributes by our names, spherical harmonics above degree 0 by their own, in ``bands``; each after
+            whether it is normalized.
+        turned, moved: of ``_placed``.
+        ignored: notes on the parts of the file that are not used.
+    """
+
+    views: dict[str, tuple[bool, np.ndarray]]
+    bands: list[str]
+    metadata: Metadata
+    turned: bool
+    moved: Origin
+    ignored: list[str]
+
+
+def _parts(path: Path, data: memoryview) -> _Parts:
     try:
-        data = read_whole(path)
         gltf, binary = _chunks(data)
         (mesh, primitive), *others = _find(gltf)
         attributes, ignored = primitive["attributes"], _ignored(primitive, len(others))
-        arrays = {key: _read(gltf, binary, attributes[name], width) for key, (name, width) in _ATTRIBUTES.items()}
+        views = {key: _view(gltf, binary, attributes[name], width) for key, (name, width) in _ATTRIBUTES.items()}
         degree = 0
         while degree < DEGREE and coefficient(degree + 1, 0) in attributes:
             degree += 1
         bands = [coefficient(band, index) for band in range(1, degree + 1) for index in range(2 * band + 1)]
-        rest = [_read(gltf, binary, attributes[name], 3) for name in bands]
-        arrays["shN"] = np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
+        views |= {name: _view(gltf, binary, attributes[name], 3) for name in bands}
         for name in dial_columns([name for name, attribute in DIAL.items() if attribute in attributes]):
-            arrays[name] = _read(gltf, binary, attributes[DIAL[name]], 1)
+            views[name] = _view(gltf, binary, attributes[DIAL[name]], 1)
+        if len({len(values) for _, values in views.values()}) > 1:
+            raise ClodError(f"its attributes are of different lengths; {_REMEDY}")
         text = gltf["asset"].get("extras", {}).get(KEY)
         turned, moved = _placed(gltf, mesh)
     except ClodError as error:
-        raise ClodError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+        raise ClodError(f"{path}: {error}") from error
     except (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
         raise ClodError(f"{path}: is damaged or no such .glb ({error!r:.80}); {_REMEDY}") from error
-    metadata = parse_metadata(path, text, dial=SIGMA in arrays)
-    stored = _stored(arrays) if turned else half_turn(_stored(arrays), "z")
-    if moved != metadata.origin:  # another program moved the node
-        stored["means"], moved = _moved(stored["means"], moved)
-        metadata = replace(metadata, origin=moved)
-    return Model(gaussians_of(path, stored, metadata), metadata, sha256_of(data), tuple(ignored))
+    return _Parts(views, bands, parse_metadata(path, text, dial=SIGMA in views), turned, moved, ignored)
 
 
-def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+def _chunks(data: memoryview) -> tuple[dict[str, Any], memoryview]:
     """The JSON and the binary chunk."""
-    if data[:4] != b"glTF":
+    if bytes(data[:4]) != b"glTF":
         raise ClodError(f"is no glTF binary file; {_REMEDY}")
     version, length = struct.unpack_from("<II", data, 4) if len(data) >= 12 else (0, 0)
     if version != 2 or length > len(data):
         raise ClodError("is truncated, or no glTF 2.0; copy or export it again")
-    found: dict[int, bytes] = {}
+    found: dict[int, memoryview] = {}
     start = 12
     while start + 8 <= length:
         size, kind = struct.unpack_from("<II", data, start)
@@ -88,7 +120,7 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
         start += 8 + size
     if _JSON not in found:
         raise ClodError("has no JSON chunk; export it again")
-    return json.loads(found[_JSON]), found.get(_BIN, b"")
+    return json.loads(bytes(found[_JSON])), found.get(_BIN, data[:0])
 
 
 def _find(gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
@@ -115,12 +147,12 @@ def _ignored(primitive: dict[str, Any], others: int) -> list[str]:
     return notes + ([f"{others} more primitives with Gaussians in it are left out"] if others else [])
 
 
-def _read(gltf: dict[str, Any], binary: bytes, number: int, width: int) -> np.ndarray:
-    """``[N, width]`` float32 of an accessor, ``[N]`` where the width is 1."""
+def _view(gltf: dict[str, Any], binary: memoryview, number: int, width: int) -> tuple[bool, np.ndarray]:
+    """Whether an accessor is normalized, and its values ``[N, width]`` as stored, ``[N]`` where the width is 1."""
     accessor = gltf["accessors"][_whole(number)]
     if "sparse" in accessor or _WIDTHS[accessor["type"]] != width:
         raise ClodError(f"an attribute is sparse or of type {accessor['type']!r:.20}; {_REMEDY}")
-    kind, largest = _KINDS[accessor["componentType"]]
+    kind = _KINDS[accessor["componentType"]]
     view = gltf["bufferViews"][_whole(accessor["bufferView"])]
     if _whole(view["buffer"]) or "uri" in gltf["buffers"][0] or view.get("extensions"):
         raise ClodError(f"its data are compressed, or in another file; {_REMEDY}")
@@ -130,10 +162,17 @@ def _read(gltf: dict[str, Any], binary: bytes, number: int, width: int) -> np.nd
     data = binary[_whole(view.get("byteOffset", 0)) :][: _whole(view["byteLength"])]
     if not count or stride < item * width or start + (count - 1) * stride + item * width > len(data):
         raise ClodError("an attribute has no values, or more than the file; copy or export it again")
-    values = np.ndarray((count, width), kind, data, start, (stride, item)).astype(np.float32)
-    if accessor.get("normalized"):
-        values = np.maximum(values / np.float32(largest), -1)
-    return values[:, 0] if width == 1 else values
+    values = np.ndarray((count, width), kind, data, start, (stride, item))
+    return bool(accessor.get("normalized")), values[:, 0] if width == 1 else values
+
+
+def _values(view: tuple[bool, np.ndarray]) -> np.ndarray:
+    """float32."""
+    normalized, stored = view
+    values = stored.astype(np.float32)
+    if normalized and stored.dtype.kind != "f":
+        values = np.maximum(values / np.float32(np.iinfo(stored.dtype).max), -1)
+    return values
 
 
 def _whole(value: Any) -> int:

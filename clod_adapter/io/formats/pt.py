@@ -72,18 +72,21 @@ def _check_pickle(path: Path, data: bytes) -> None:
         raise ClodError(f"{path}: is damaged ({error}); copy or export it again") from error
 
 
-def read_splats(path: Path) -> tuple[dict[str, np.ndarray], str | None, str]:
+def read_splats(path: Path, digest: bool = True) -> tuple[dict[str, np.ndarray], str | None, str]:
     """The parameters by gsplat's names, float32, in matching shapes; the JSON document, if any; the SHA-256, hex.
 
     Scales are logarithms, opacities logits, as in Inria's layout. Read with ``weights_only``: a pickle that calls
     anything but what makes tensors is refused, and nothing is called.
+
+    Args:
+        digest: whether to compute the SHA-256, which reads the whole file; else it is "".
 
     Raises:
         ClodError: not such a checkpoint, damaged, or more than tensors.
     """
     from clod_adapter.integrations.splats import NAMES  # here and not above, as check_pt does without torch
 
-    checkpoint, sha256 = _load(path)
+    checkpoint, sha256 = _load(path, digest)
     splats = checkpoint.get("splats") if isinstance(checkpoint, dict) else None
     if not isinstance(splats, dict):
         found = (
@@ -101,14 +104,15 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], str | None, str]:
     return values, text, sha256
 
 
-def _load(path: Path) -> tuple[Any, str]:
+def _load(path: Path, digest: bool) -> tuple[Any, str]:
     import torch
 
     check_pt(path)
     try:
         # Mapped, so that what else a checkpoint holds (optimisers, networks) is not read.
         with warnings.catch_warnings(action="ignore"), open(path, "rb") as file:
-            return torch.load(handle_name(file), map_location="cpu", weights_only=True, mmap=True), file_sha256(file)
+            found = torch.load(handle_name(file), map_location="cpu", weights_only=True, mmap=True)
+            return found, file_sha256(file) if digest else ""
     except pickle.UnpicklingError as error:
         raise ClodError(
             f"{path}: holds more than tensors, or is damaged, and was not unpickled; export the checkpoint as a PLY"

@@ -9,7 +9,6 @@ import torch
 
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.integrations.splats import NAMES
-from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import History, Model
 from clod_adapter.io.formats.arrays import arrays_of, gaussians_of
 from clod_adapter.io.formats.metadata import KEY, metadata_text, parse_metadata, write_metadata
@@ -26,9 +25,15 @@ def write_pt(path: Path, gaussians: Gaussians, history: History) -> tuple[str, .
     # By way of memory, as the entries of a file are named after it, and this one's name is temporary.
     buffer = io.BytesIO()
     torch.save({"step": 0, "splats": splats, KEY: text}, buffer)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(buffer.getbuffer())
+    path.write_bytes(buffer.getbuffer())
     return ()
+
+
+def open_pt(path: Path) -> bool:
+    """Whether a checkpoint has sigma_d, without reading its values; errors as ``load_pt``."""
+    values, text, _ = read_splats(path, digest=False)
+    parse_metadata(path, text, dial=SIGMA in values)
+    return SIGMA in values
 
 
 def load_pt(path: Path) -> Model:

@@ -13,7 +13,6 @@ import numpy as np
 
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
-from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import History, Model
 from clod_adapter.io.formats.arrays import (
     arrays_of,
@@ -46,8 +45,7 @@ def write_splat(path: Path, gaussians: Gaussians, history: History) -> tuple[str
     rows["means"], rows["scales"] = arrays["means"], scales
     rows["rgba"] = colours_of(arrays["sh0"], opacities)
     rows["quats"] = bytes_of(128 * normalized(arrays["quats"]) + 128)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(rows[order].tobytes())
+    path.write_bytes(rows[order].tobytes())
     notes = ["colours, opacities and rotations are rounded to 8 bits, and the rows are in another order"]
     notes += ["view-dependent colour is dropped"] if arrays["shN"].any() else []
     return (*notes, *(["the origin is dropped: coordinates are relative to it"] if any(history.origin) else []))

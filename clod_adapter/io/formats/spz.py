@@ -30,7 +30,6 @@ from clod_adapter.config import CLASSIC
 from clod_adapter.equation.units import estimated_distance, known_distance, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import History
 from clod_adapter.io.formats.arrays import arrays_of, bytes_of, normalized, sigmoid
 from clod_adapter.io.formats.metadata import metadata_text, write_metadata
@@ -79,9 +78,8 @@ def write_spz(path: Path, gaussians: Gaussians, history: History) -> tuple[str, 
         text = metadata_text(write_metadata(gaussians, history) | named).encode()
         values = b"".join(np.clip(arrays[name], -_MOST, _MOST).astype("<f2").tobytes() for name in columns)
         parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(values), len(text)) + text + values)
-    with atomic_path(path) as temporary:
-        gzip = zlib.compressobj(wbits=31)
-        temporary.write_bytes(gzip.compress(b"".join(parts)) + gzip.flush())
+    gzip = zlib.compressobj(wbits=31)
+    path.write_bytes(gzip.compress(b"".join(parts)) + gzip.flush())
     return (*moved, *_losses(arrays, bits, degree))
 
 

@@ -16,6 +16,7 @@ from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import Model
 from clod_adapter.io.formats.arrays import gaussians_of, half_turn, logits_of_bytes, read_whole, sha256_of
+from clod_adapter.io.formats.checks import NEW_SPZ
 from clod_adapter.io.formats.converted import load_converted
 from clod_adapter.io.formats.metadata import parse_metadata
 from clod_adapter.io.formats.spz import (
@@ -34,6 +35,7 @@ from clod_adapter.io.formats.spz import (
 from clod_adapter.io.ply.columns import GROWTH, SIGMA
 from clod_adapter.io.screen_filter import TAG
 from clod_adapter.io.settings import DAMAGE, damaged
+from clod_adapter.io.sniff import read_start
 
 QUANTISED = "quantised: positions in 24 bits, scales, opacities and harmonics in 8, rotations in 10 or 8"
 _BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10
@@ -52,7 +54,7 @@ def load_spz(path: Path) -> Model:
         ClodError: the file cannot be read, is damaged, of another version, or unpacks to far more than it could hold.
     """
     whole = read_whole(path)
-    if whole.startswith(MAGIC.to_bytes(4, "little")):
+    if whole.startswith(NEW_SPZ):
         return load_converted(path, " of version 4")
     data = _unpacked(path, whole)
     magic, version, count, degree, bits, flags, _ = HEADER.unpack_from(data)
@@ -78,6 +80,11 @@ def load_spz(path: Path) -> Model:
         gaussians = gaussians.replace(screen_filter=FILTERS["on"])
         metadata = replace(metadata, about=(*metadata.about, TAG))
     return Model(gaussians, metadata, sha256_of(whole), (QUANTISED,))
+
+
+def open_spz(path: Path) -> bool:
+    """Whether a file has sigma_d; reads all of it, which is never much. Errors as ``load_spz``."""
+    return not read_start(path).startswith(NEW_SPZ) and load_spz(path).gaussians.sigma_d is not None
 
 
 def _unpacked(path: Path, data: bytes) -> bytes:

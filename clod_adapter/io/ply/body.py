@@ -61,7 +61,7 @@ def read_elements(path: Path, choose: Callable[[Path, PlyData], Collection[str]]
             start = source.take_start(header.HEADER_LIMIT)
             head = parse_head(path, start)
             wanted = choose(path, head.ply)
-            _check_length(path, head, os.fstat(raw.fileno()).st_size)
+            check_length(path, head, os.fstat(raw.fileno()).st_size)
             source.back_to(head.size)
             with io.BufferedReader(source, _PIECE) as file:
                 read = _read_text if head.ply.text else _read_binary
@@ -108,7 +108,7 @@ class _Hashed(io.RawIOBase):
         return count
 
 
-def _check_length(path: Path, head: Head, length: int) -> None:
+def check_length(path: Path, head: Head, length: int) -> None:
     """Refuses a file that is too short for the least bytes that the rows of its header take."""
     least = head.size - (1 if head.ply.text else 0)  # the last line may lack its end
     for element, count in zip(head.ply, head.counts, strict=True):

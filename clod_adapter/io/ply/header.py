@@ -62,7 +62,8 @@ def parse_head(path: Path, start: bytes) -> Head:
         refuse(path, start)
     end = re.search(rb"[\r\n]end_header(\r?\n|\r)", start)
     if end is None:
-        raise ClodError(f"{path}: the PLY header has no end, so the file is truncated; copy or export it again")
+        most = f" in its first {HEADER_LIMIT:,} bytes" if len(start) >= HEADER_LIMIT else ""
+        raise ClodError(f"{path}: the PLY header has no end{most}, so the file is truncated; copy or export it again")
     header = re.sub(rb"\r\n?", b"\n", start[: end.end()])
     if re.search(rb"[^\t\n\x20-\x7e]", header):
         raise ClodError(

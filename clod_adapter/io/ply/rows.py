@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData
 
-from clod_adapter.io.ply.body import read_elements
+from clod_adapter.io.ply.body import check_length, read_elements
 from clod_adapter.io.ply.columns import MASKS, SIGMA, column_map, dial_columns, read_table, sh_degree_of
 from clod_adapter.io.ply.constants import constant_settings, read_constants
 from clod_adapter.io.ply.header import Head, all_comments, described, read_head, stored_settings
@@ -60,10 +60,14 @@ def check_ply(path: Path) -> None:
     _elements(path, read_head(path).ply)
 
 
-def ply_has_dial(path: Path) -> bool:
-    """Whether the header has a sigma_d."""
-    header = read_head(path).ply
-    return "vertex" in header and SIGMA in {column.name for column in header["vertex"].properties}
+def open_ply(path: Path) -> bool:
+    """Whether the header has a sigma_d; refuses damaged settings in it, and a file too short for its rows."""
+    head = read_head(path)
+    _elements(path, head.ply)
+    check_length(path, head, path.stat().st_size)
+    comments, dial = all_comments(head.ply), SIGMA in {column.name for column in head.ply["vertex"].properties}
+    read_metadata(path, stored_settings(comments), dial=dial, described=described(comments))
+    return dial
 
 
 def read_ply(path: Path) -> PlyRows:

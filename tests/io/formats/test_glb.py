@@ -79,7 +79,7 @@ def test_file_of_splat_transform(tmp_path: Path) -> None:
     ("change", "message"),
     [
         (lambda g: g["accessors"][0].update(count=1 << 60), "more than the file"),
-        (lambda g: g["accessors"][0].update(count=3), "has shape"),
+        (lambda g: g["accessors"][0].update(count=3), "of different lengths"),
         (lambda g: g["accessors"][0].update(count=-1), "is no count"),
         (lambda g: g["accessors"][0].update(count=1.5), "is no count"),
         (lambda g: g["bufferViews"][0].update(byteStride=0), "more than the file"),
