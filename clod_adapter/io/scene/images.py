@@ -1,4 +1,4 @@
-"""Photographs of any common format, decoded to 8-bit RGB."""
+"""Photographs of the common formats, decoded to 8-bit RGB."""
 
 from __future__ import annotations
 
@@ -33,6 +33,12 @@ class Photograph(NamedTuple):
     notes: list[Note]
 
 
+# Pillow opens files by content, and starts another program for some (PostScript). JPEG includes the MPO of phones.
+FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP")
+OTHERS = {
+    b"ftyphei": "HEIC", b"ftypmif1": "HEIC", b"ftypavif": "AVIF", b"jP  ": "JPEG 2000", b"GIF8": "GIF",
+    b"%!PS": "PostScript", b"%PDF": "PDF",
+}  # by what is in their first 12 bytes, for the message  # fmt: skip
 TRANSPARENT: Note = ("have transparency: laid over black", "")
 
 LARGE = 1 << 26  # pixels; a larger photograph is reduced first
@@ -62,7 +68,7 @@ def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Ima
         max_width: its final width at most.
 
     Raises:
-        ClodError: the file cannot be decoded, has too many pixels, or another shape than the camera.
+        ClodError: the file is not of FORMATS, cannot be decoded, has too many pixels, or another shape than the camera.
     """
     notes: list[Note] = []
     with _opened(path) as source:
@@ -100,18 +106,23 @@ def image_size(path: Path) -> tuple[int, int]:
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     try:
-        with Image.open(path) as source:
+        with Image.open(path, formats=FORMATS) as source:
             yield source
     except (ClodError, MemoryError):
         raise
     except UnidentifiedImageError as error:
-        raise ClodError(
-            f"{path}: cannot be decoded, is damaged or no known format; export it as JPEG or PNG"
-        ) from error
+        raise ClodError(f"{path}: cannot be decoded, is {_kind(path)}; export it as JPEG or PNG") from error
     except Image.DecompressionBombError as error:
         raise ClodError(f"{path}: has more than the 178 million pixels that are read; scale it down") from error
     except Exception as error:  # Pillow raises many kinds, some of its own, on damaged files
         raise ClodError(f"{path}: cannot be decoded ({error}); copy or export it again") from error
+
+
+def _kind(path: Path) -> str:
+    with open(path, "rb") as file:
+        start = file.read(12)
+    names = (name for mark, name in OTHERS.items() if mark in start)
+    return next(names, f"damaged or none of {', '.join(FORMATS)}")
 
 
 def _same_shape(size: tuple[int, int], width: int, height: int) -> bool:

@@ -76,7 +76,8 @@ def kept(folder: Path, image: PosedImage, path: Path, max_width: int, make: Call
         camera.params.tolist(), max_width, pycolmap.__version__, PIL.__version__,
     )  # fmt: skip
     file = folder / f"{hashlib.sha256(repr(made_of).encode()).hexdigest()[:32]}.png"
-    with suppress(Exception), Image.open(file) as source:  # absent, or damaged: Pillow raises many kinds
+    # Absent, or damaged: Pillow raises many kinds.
+    with suppress(Exception), Image.open(file, formats=["PNG"]) as source:
         about = json.loads(source.info[_KEY])
         notes = [(what, each) for what, each in about["notes"]]
         return Photograph(source.convert("RGB"), np.array(about["K"]), tuple(about["source"]), notes)

@@ -82,6 +82,17 @@ def test_transparency_is_laid_over_black(tmp_path: Path) -> None:
     assert got[0, 0].tolist() == [0, 0, 0] and len(notes) == 1
 
 
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "MPO", "TIFF", "WEBP", "BMP"])
+def test_formats(tmp_path: Path, kind: str) -> None:
+    """By content, whatever the name; MPO is a JPEG with further pictures, as phones write."""
+    photograph = Image.fromarray(np.full((30, 40, 3), 99, np.uint8))
+    photograph.save(
+        tmp_path / "a.jpg", kind, **({"save_all": True, "append_images": [photograph]} if kind == "MPO" else {})
+    )
+    got, notes = read(tmp_path / "a.jpg")
+    assert np.abs(got.astype(int) - 99).max() <= 1 and notes == []
+
+
 def test_cmyk_becomes_rgb(tmp_path: Path) -> None:
     smooth = np.broadcast_to(np.linspace(0, 255, 40).astype(np.uint8)[None, :, None], (30, 40, 3))
     Image.fromarray(smooth).convert("CMYK").save(tmp_path / "a.jpg", quality=95)
