@@ -91,6 +91,8 @@ def find_photographs(
     missing = [as_text(str(Path(*each))) for each, path in zip(parts, paths, strict=True) if path is None]
     if missing:
         what = f"({', '.join(missing[:3])}{', ...' if len(missing) > 3 else ''})"
+        if root.is_dir() and not os.access(root, os.X_OK):
+            raise ClodError(f"{root}: cannot be read; check its permissions")
         if len(missing) > MISSING * len(names):
             lists = cameras.name if cameras.is_file() else "the model"
             raise ClodError(

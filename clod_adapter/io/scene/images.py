@@ -114,6 +114,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise ClodError(f"{path}: cannot be decoded, is {_kind(path)}; export it as JPEG or PNG") from error
     except Image.DecompressionBombError as error:
         raise ClodError(f"{path}: has more than the 178 million pixels that are read; scale it down") from error
+    except PermissionError as error:
+        raise ClodError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
     except Exception as error:  # Pillow raises many kinds, some of its own, on damaged files
         raise ClodError(f"{path}: cannot be decoded ({error}); copy or export it again") from error
 
