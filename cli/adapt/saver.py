@@ -20,7 +20,9 @@ from ..shared.interrupts import GracefulStop
 from .resume import Resumed, RunKey
 
 SAVE_EVERY = 5.0  # seconds between saves, at least
-SAVE_COST = 0.015  # largest share of the training time that saving may take, except the first save
+SAVE_COST = 0.015  # share of the training time that saving may take, except the first save, within OLDEST
+OLDEST = 50.0  # seconds that the state may be old once the next step and save are done
+MOST_COST = 0.2  # share of the time that saving takes at most, whatever the disk
 
 
 class Saver:
@@ -39,7 +41,7 @@ class Saver:
         self.saved = resumed.state.steps if resumed else None
         self.latest: Progress | None = None
         self.seconds, self.saves, self.warned = 0.0, 0, False
-        self.began, self.due = math.inf, 0.0
+        self.began, self.due, self.oldest, self.heard = math.inf, 0.0, math.inf, math.inf
 
     def saving(self, listener: Listener) -> Listener:
         """The listener that also saves: after the first step, now and then, and when training stops or fails."""
@@ -52,8 +54,11 @@ class Saver:
                 self._save(now)
                 raise
             stopping = (not going or now.error) and not self.stop.aborted
-            if stopping or (time.perf_counter() >= self.due and now.share < 1):
+            at = time.perf_counter()
+            due = min(self.due, self.oldest - max(at - self.heard, 0.0))  # the next step may take as long as this one
+            if stopping or (at >= due and now.share < 1):
                 self._save(now)
+            self.heard = time.perf_counter()
             return going
 
         return listen
@@ -75,6 +80,7 @@ class Saver:
         cost = now - began
         self.seconds, self.saves = self.seconds + cost, self.saves + 1
         self.due = max(now + SAVE_EVERY, self.began + (self.seconds + cost) / SAVE_COST)
+        self.oldest = began + max(OLDEST - cost, cost / MOST_COST)
 
     def keep(self) -> None:
         """Saves the end of the training, so that later steps may fail; if that fails, ``rescue`` saves it elsewhere."""

@@ -295,19 +295,28 @@ def test_resuming_without_photographs(
         assert stripped((tmp_path / f"dial.{kind}").read_bytes()) == stripped((tmp_path / f"whole.{kind}").read_bytes())
 
 
-def test_saving_takes_a_small_share_of_the_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After the first step, then so that saves of 0.1 s take at most 1.5 % of the time."""
-    clock, saved = [0.0], []
+@pytest.mark.parametrize(
+    ("step", "save", "oldest", "share"),
+    [(0.1, 0.1, 15.0, 0.015), (1.0, 3.0, 60.0, 0.08), (25.0, 3.0, 60.0, 0.15), (55.0, 1.0, 60.0, 0.02),
+     (1.0, 30.0, 180.0, 0.25)],
+)  # fmt: skip
+def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: float, save: float, oldest: float, share: float
+) -> None:
+    """Seconds of a step and of a save; the largest age of the state, unless a save takes very long, and the share."""
+    clock, saved, ages = [0.0], [0.0], [0.0]
     monkeypatch.setattr("clod_adapter.cli.adapt.saver.time.perf_counter", lambda: clock[0])
 
-    def save(path: Path, state: int, run_of: Any) -> None:
+    def save_state(path: Path, state: float, run_of: Any) -> None:
+        clock[0] += save
+        ages.append(clock[0] - saved[-1])  # of the file that is replaced now
         saved.append(state)
-        clock[0] += 0.1
 
-    monkeypatch.setattr("clod_adapter.cli.adapt.saver.save_state", save)
+    monkeypatch.setattr("clod_adapter.cli.adapt.saver.save_state", save_state)
     saver = Saver(tmp_path / STATE, {}, None, Console(quiet=True), GracefulStop())
     follow = saver.saving(lambda progress: None)
-    for step in range(1, 601):
-        clock[0] += 0.1
-        follow(Progress(Phase.TRAINING, step, 600, clock[0], state=lambda step=step: step))
-    assert saved[0] == 1 and 0.012 < saver.seconds / clock[0] <= 0.015 and saver.saves == len(saved) > 5
+    for done in range(1, 601):
+        clock[0] += step
+        follow(Progress(Phase.TRAINING, done, 600, clock[0], state=lambda: clock[0]))
+    assert saved[1] == step and max(ages[2:]) <= oldest and saver.seconds / clock[0] <= share
+    assert saver.saves == len(saved) - 1 > 3
