@@ -31,10 +31,11 @@ from .commands.parser import Parser, make_parser
 from .commands.render import RENDER
 from .commands.robustness import ROBUSTNESS
 from .commands.view import VIEW
-from .shared.interrupts import interrupt_as_stopped, sigterm_as_interrupt
+from .shared.interrupts import interrupt_as_stopped, signals_as_interrupt
 from .shared.launch import launched, silence_but_first
 from .shared.outputs import claimed
 from .shared.shortages import check_addresses, shortage
+from .shared.streams import forget_stdout, print_anywhere
 
 PROG = "clod-adapt"
 INTERRUPTED = 130  # exit code
@@ -53,7 +54,7 @@ def main(argv: list[str] | None = None) -> int:
 
     A report may have its own exit_code. An unexpected error prints its traceback and returns 1.
     """
-    print_any_name()
+    print_anywhere()
     words = sys.argv[1:] if argv is None else argv
     try:
         with silence_but_first():
@@ -77,18 +78,6 @@ def refuse(why: str, code: int, words: list[str]) -> int:
         except BrokenPipeError:
             forget_stdout()
     return code
-
-
-def forget_stdout() -> None:
-    """After the reader of a pipe has ended; without this Python reports it again when it flushes at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def print_any_name() -> None:
-    """Makes stdout and stderr escape characters that their encoding lacks, as in names of files."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
 
 
 def _main(words: list[str]) -> int:
@@ -133,7 +122,7 @@ def run_here(command: Command, args: argparse.Namespace) -> int:
     from .adapt.processes import leading, take_part
 
     if launch.rank > 0:
-        with sigterm_as_interrupt():
+        with signals_as_interrupt():
             take_part()
         return 0
     with leading():
@@ -148,7 +137,7 @@ def run(command: Command, args: argparse.Namespace) -> int:
     with claimed(command.outputs(args)):
         module = import_command(command, args)
         aside = io.StringIO() if args.quiet else sys.stderr
-        with redirect_stdout(aside) if args.json else nullcontext(), sigterm_as_interrupt():
+        with redirect_stdout(aside) if args.json else nullcontext(), signals_as_interrupt():
             report = module.run(args)
     if args.json and report is not None:
         print(json.dumps(jsonable(report), allow_nan=False))

@@ -66,7 +66,7 @@ class ProgressDisplay:
             return True
         self.close()
         if training and not progress.error:
-            again = " (Ctrl-C again aborts without writing)" if self.stop.aborts else ""
+            again = " (Ctrl-C again aborts without writing)" if self.stop.aborts and self.stop.presses else ""
             self.console.say(f"stopping{again}")
         return False
 

@@ -40,14 +40,12 @@ def finish(
         written: called once the files are written, with whether the run is complete.
     """
     # After a Ctrl-C that ended training the next one aborts, as its message says.
-    stop = setup.stop if result.adapted.interrupted and setup.stop.requests else None
-    measured = measure_result(setup, inputs, result, stop)
-    stop = stop or GracefulStop(aborts=setup.stop.aborts)
-    before = stop.requests
-    with stop.listening():  # a first Ctrl-C lets the writing finish
+    stop = GracefulStop(setup.stop.aborts, setup.stop.presses if result.adapted.interrupted else 0)
+    with stop.listening():  # a first Ctrl-C ends the measurement, and lets the writing finish
+        measured = measure_result(setup, inputs, result, stop)
         report = write_result(setup, inputs, result, measured)
     written(not result.adapted.interrupted and not measured.interrupted)
-    if page and (measured.interrupted or stop.requests > before):
+    if page and (measured.interrupted or stop.requests):
         setup.console.say("interrupted: the page of --report was not written")
     elif page:  # after the report
         report = add_page(setup, result, page, report)

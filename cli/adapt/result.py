@@ -84,7 +84,7 @@ def training_notes(inputs: Inputs, adapter: Adapter, adapted: Adapted) -> list[s
     return notes
 
 
-def measure_result(setup: Setup, inputs: Inputs, result: Result, stop: GracefulStop | None) -> Measurements:
+def measure_result(setup: Setup, inputs: Inputs, result: Result, stop: GracefulStop) -> Measurements:
     """Measures the result on the held-out views, unless the run is to end now.
 
     That is after a Ctrl-C that came when training was complete, and if the launcher ends the processes.

@@ -158,11 +158,13 @@ watched views:
 interruption:
   Ctrl-C or SIGTERM while training finishes the step and writes the result so
   far (exit code 0, "interrupted": true); a second one aborts at any time. A
-  first one while measuring skips the rest; while writing it has no effect.
-  Training saves its state in OUT.resume.safetensors (at most 2 % of the time),
-  or in the temporary folder if that fails. After Ctrl-C, a crash or a full disk
-  the same command with --resume continues and gives the same Gaussians, bit for
-  bit (on as many threads).
+  first one while measuring skips the rest; while writing it has no effect. A
+  closed terminal (SIGHUP, unless ignored as by nohup) and the warnings of
+  schedulers (SIGUSR1, SIGUSR2, SIGXCPU) act as a first one, and never abort.
+  Training saves its state in OUT.resume.safetensors (2 % of the time, but at
+  least once a minute), or in the temporary folder if that fails. After Ctrl-C,
+  a crash or a full disk the same command with --resume continues and gives the
+  same Gaussians, bit for bit (on as many threads).
 
 large scenes, several processes:
   --memory 8GB plans the memory of every phase and trains a scene that does not

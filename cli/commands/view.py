@@ -118,7 +118,7 @@ cameras of --images or those stored in MODEL.ply.
 
 --json prints its object at the start: {"url": ..., ...}.
 
-exit codes: 0 ended by Ctrl-C or SIGTERM; 2 bad input, or the port is in use
+exit codes: 0 ended by Ctrl-C or a signal; 2 bad input, or the port is in use
 
 examples:
   clod-adapt view garden_clod.ply

@@ -45,17 +45,16 @@ def measure(
         stop: counts the signals, if it is not a new one.
     """
     stop = stop or GracefulStop(aborts=launched().size == 1)  # launchers repeat signals
-    before = stop.requests
     if not views:
         return [], False
     with console.meter(label) as meter, stop.listening():
 
         def show(now: Progress) -> bool:
             meter.update(now.share, f"s={virtual_scales[(now.done - 1) // len(views)]:g}")
-            return stop.requests == before
+            return stop.requests == 0
 
         rows = evaluate(gaussians, views, virtual_scales, metrics=metrics, progress=show)
-    return rows, stop.requests > before
+    return rows, stop.requests > 0
 
 
 def with_frame_times(
@@ -69,7 +68,7 @@ def with_frame_times(
     Then and without rows they are returned unchanged.
     """
     stop = stop or GracefulStop(aborts=launched().size == 1)
-    before, rows = stop.requests, [list(each) for _, each in measured]
+    rows = [list(each) for _, each in measured]
     dials = [sorted({row.virtual_scale for row in each}) for each in rows]
     if not any(rows):
         return rows, [], False
@@ -78,7 +77,7 @@ def with_frame_times(
 
             def show(now: Progress) -> bool:
                 meter(now)
-                return stop.requests == before
+                return stop.requests == 0
 
             models = [(some, each) for (some, _), each in zip(measured, dials, strict=True)]
             times = time_frames(models, [view.camera for view in views], show)

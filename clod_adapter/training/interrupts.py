@@ -6,9 +6,15 @@ import signal
 import threading
 from types import FrameType
 
+PRESSED = (signal.SIGINT, signal.SIGTERM)
+# Of a closed terminal, and of schedulers before a job's time is over; the same one may arrive several times. Not all
+# platforms have them.
+WARNINGS = ("SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU")
+ENDING = (*PRESSED, *(getattr(signal, name) for name in WARNINGS if hasattr(signal, name)))
+
 
 class DeferredInterrupt:
-    """Records the first Ctrl-C (or SIGTERM) instead of raising KeyboardInterrupt; a second one raises it at once.
+    """Records signals of ENDING instead of raising KeyboardInterrupt; a second Ctrl-C or SIGTERM raises it at once.
 
     Replaces Python's own handler only, from ``begin`` to the end of the block. A handler that the application has
     installed stays, as does the handler in a thread other than the main one, which signals do not reach.
@@ -18,14 +24,14 @@ class DeferredInterrupt:
     """
 
     def __init__(self) -> None:
-        self.received = False
+        self.received = self._pressed = False
         self._replaced: list[signal.Signals] = []
 
     def begin(self) -> None:
         """Starts to record; further calls do nothing."""
         if self._replaced or threading.current_thread() is not threading.main_thread():
             return
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in ENDING:
             if signal.getsignal(number) is signal.default_int_handler:
                 self._replaced.append(number)
                 signal.signal(number, self._record)
@@ -38,6 +44,6 @@ class DeferredInterrupt:
             signal.signal(number, signal.default_int_handler)
 
     def _record(self, number: int, frame: FrameType | None) -> None:
-        if self.received:
+        if self._pressed and number in PRESSED:
             signal.default_int_handler(number, frame)
-        self.received = True
+        self.received, self._pressed = True, self._pressed or number in PRESSED

@@ -11,18 +11,18 @@ from pathlib import Path
 import pytest
 
 from clod_adapter.cli.main import main
+from clod_adapter.training.interrupts import ENDING
 from runs import Server, accepted
-
-ENDS = (signal.SIGINT, signal.SIGTERM)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def signals_arrive() -> Iterator[None]:
-    """Ctrl-C and SIGTERM reach the tests and their child processes, also if the shell ignores or blocks them."""
-    blocked = signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDS)
-    before = [signal.signal(*pair) for pair in zip(ENDS, (signal.default_int_handler, signal.SIG_DFL), strict=True)]
+    """Signals reach the tests and their child processes, also if the shell ignores or blocks them."""
+    blocked = signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in ENDING}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    for number, earlier in zip(ENDS, before, strict=True):
+    for number, earlier in before.items():
         signal.signal(number, earlier)
     signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 

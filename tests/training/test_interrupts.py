@@ -98,12 +98,15 @@ def test_an_interrupt_before_the_first_step_is_raised(monkeypatch: pytest.Monkey
 
 
 def test_a_second_interrupt_is_raised_at_once() -> None:
+    """Not one of the signals that are repeated."""
+    before = signal.signal(signal.SIGHUP, signal.default_int_handler)
     with pytest.raises(KeyboardInterrupt), DeferredInterrupt() as interrupt:
         interrupt.begin()
+        for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGINT, signal.SIGHUP):
+            signal.raise_signal(number)
+            assert interrupt.received
         signal.raise_signal(signal.SIGINT)
-        assert interrupt.received
-        signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is signal.signal(signal.SIGHUP, before) is signal.default_int_handler
 
 
 def test_other_handlers_and_threads_are_not_affected() -> None:
